@@ -1,0 +1,138 @@
+/* The two-mass loop of the paper's simulation study in plain C: plant, model-free ESO of order 4, control law, and the lag-compensated
+ * Kalman learner with state and bias features. All sizes are known to the compiler, all arrays are static or on the stack: this is
+ * what a careful programmer would put on a target by hand. Built by build.py with gcc -O3 -march=native; the design (Phi, L, the taps
+ * of the lag filter) is handed over, so that the trajectory can be compared with quell's.
+ *
+ * Each row of the log holds r, y, measured y, u, w1, w2, x (4), x-hat (4), residual f, learned f, status, theta (5): 22 numbers. */
+#include <math.h>
+#include <stddef.h>
+
+#define NX 4
+#define N (NX + 1)
+#define P (NX + 1)
+#define M (P + 1)
+#define ROW 22
+
+typedef struct {
+    double dt;
+    double plant_A[NX][NX], plant_B[NX], plant_E[NX][2], plant_C[NX];
+    double phi[N][N], gamma_u[N], gamma_f[N], gain[N];
+    double law[NX], b0;
+    double pole, rise, taps[N];
+    double walk_bias, forget, noise_time, prior;
+} design_t;
+
+typedef struct {
+    double x[NX], z[N], u, f_learned;
+    int started;
+    double theta[P], cov[P][P], chain[M][N], filtered[M], power, filled;
+} state_t;
+
+static inline double step(const design_t *restrict d, state_t *restrict s, double r, double y)
+{
+    if (!s->started) {
+        for (int i = 0; i < N; i++) s->z[i] = 0.0;
+        s->z[0] = y;
+        s->started = 1;
+    } else {
+        double pred[N];
+        for (int i = 0; i < N; i++) {
+            double sum = d->gamma_u[i] * s->u + d->gamma_f[i] * s->f_learned;
+            for (int j = 0; j < N; j++) sum += d->phi[i][j] * s->z[j];
+            pred[i] = sum;
+        }
+        double error = y - pred[0];
+        for (int i = 0; i < N; i++) s->z[i] = pred[i] + d->gain[i] * error;
+
+        double innovation = s->z[N - 1] + s->filtered[P], spread = 0.0, g[P];
+        for (int i = 0; i < P; i++) {
+            double sum = 0.0;
+            for (int j = 0; j < P; j++) sum += s->cov[i][j] * s->filtered[j];
+            g[i] = sum;
+            innovation -= s->theta[i] * s->filtered[i];
+            spread += sum * s->filtered[i];
+        }
+        s->filled += d->forget * (1.0 - s->filled);
+        s->power += d->forget * (innovation * innovation - s->power);
+        double noise = s->power / s->filled * d->noise_time;
+        spread += noise / d->dt;
+        if (spread > 0.0) {
+            double per = 1.0 / spread;
+            for (int i = 0; i < P; i++) {
+                double share = g[i] * per;
+                s->theta[i] += share * innovation;
+                for (int j = 0; j < P; j++) s->cov[i][j] -= share * g[j];
+            }
+            s->cov[P - 1][P - 1] += d->walk_bias * noise * d->dt;
+        }
+    }
+    double f = s->theta[P - 1], u0 = d->law[0] * r;
+    for (int i = 0; i < NX; i++) {
+        f += s->theta[i] * s->z[i];
+        u0 -= d->law[i] * s->z[i];
+    }
+    double u = (u0 - f - s->z[N - 1]) / d->b0;
+    s->u = u;
+    s->f_learned = f;
+
+    for (int i = 0; i < M; i++) {
+        double input = i < NX ? s->z[i] : i < P ? 1.0 : f;
+        double carry = d->rise * input, sum = 0.0;
+        for (int j = 0; j < N; j++) {
+            double old = s->chain[i][j];
+            double new = d->pole * old + carry;
+            carry = d->rise * old;
+            s->chain[i][j] = new;
+            sum += d->taps[j] * new;
+        }
+        s->filtered[i] = sum;
+    }
+    return u;
+}
+
+static void rest(state_t *s)
+{
+    s->started = 0;
+    s->u = s->f_learned = 0.0;
+    for (int i = 0; i < NX; i++) s->x[i] = 0.0;
+    for (int i = 0; i < M; i++) {
+        s->filtered[i] = 0.0;
+        for (int j = 0; j < N; j++) s->chain[i][j] = 0.0;
+    }
+}
+
+/* The paper's scenario: sin t until rest_at, then from rest a unit step; sin(0.1 pi (t - 150)) on m2 from 150 s.
+ * noise[i] is held for `hold` samples. Returns the last output. */
+double run(const design_t *design, size_t samples, double rest_at, const double *noise, size_t hold, double *log)
+{
+    const design_t d = *design;
+    state_t s = {0};
+    for (int i = 0; i < NX; i++) s.cov[i][i] = d.prior * d.prior;
+    const size_t at_rest = (size_t)lround(rest_at / d.dt), from = (size_t)lround(150.0 / d.dt);
+    double y = 0.0;
+    for (size_t k = 0; k < samples; k++) {
+        if (k == at_rest) rest(&s);
+        double t = (double)k * d.dt;
+        double r = k < at_rest ? sin(t) : 1.0;
+        double w2 = k < from ? 0.0 : sin(0.1 * M_PI * (t - 150.0));
+        y = 0.0;
+        for (int i = 0; i < NX; i++) y += d.plant_C[i] * s.x[i];
+        double measured = y + noise[k / hold];
+        double u = step(&d, &s, r, measured);
+        if (log) {
+            double *row = log + k * ROW;
+            row[0] = r, row[1] = y, row[2] = measured, row[3] = u, row[4] = 0.0, row[5] = w2;
+            for (int i = 0; i < NX; i++) row[6 + i] = s.x[i], row[10 + i] = s.z[i];
+            row[14] = s.z[N - 1], row[15] = s.f_learned, row[16] = 0.0;
+            for (int i = 0; i < P; i++) row[17 + i] = s.theta[i];
+        }
+        double next[NX];
+        for (int i = 0; i < NX; i++) {
+            double sum = d.plant_B[i] * u + d.plant_E[i][0] * 0.0 + d.plant_E[i][1] * w2;
+            for (int j = 0; j < NX; j++) sum += d.plant_A[i][j] * s.x[j];
+            next[i] = sum;
+        }
+        for (int i = 0; i < NX; i++) s.x[i] = next[i];
+    }
+    return y;
+}

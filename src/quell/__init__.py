@@ -1,0 +1,73 @@
+"""quell: disturbance-rejection control that learns, and that its learning cannot break.
+
+The public names; each is imported when it is first used, so that ``import quell`` is quick::
+
+    import quell as ql
+
+    plant      = ql.plants.two_mass_spring()
+    observer   = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-3)
+    controller = ql.ADRC(observer, omega_c=1.0, learner=ql.learners.Kalman())
+    scenario   = ql.Scenario(reference=ql.signals.Step(), duration=60.0)
+    run        = ql.simulate(plant, controller, scenario)
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from quell import controllers, experiments, learners, metrics, observers, plants, signals
+    from quell.controllers.adrc import ADRC, Estimate
+    from quell.observers.canonical import canonical
+    from quell.observers.eso import ESO
+    from quell.simulation import Scenario, simulate
+    from quell.trajectory import Trajectory
+    from quell.types import Status
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "ADRC": "quell.controllers.adrc",
+    "ESO": "quell.observers.eso",
+    "Estimate": "quell.controllers.adrc",
+    "Scenario": "quell.simulation",
+    "Status": "quell.types",
+    "Trajectory": "quell.trajectory",
+    "canonical": "quell.observers.canonical",
+    "simulate": "quell.simulation",
+}
+_ROOMS = ("controllers", "experiments", "learners", "metrics", "observers", "plants", "signals")
+
+__all__ = [
+    "ADRC",
+    "ESO",
+    "Estimate",
+    "Scenario",
+    "Status",
+    "Trajectory",
+    "canonical",
+    "controllers",
+    "experiments",
+    "learners",
+    "metrics",
+    "observers",
+    "plants",
+    "signals",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        value = getattr(importlib.import_module(_HOME[name]), name)
+    elif name in _ROOMS:
+        value = importlib.import_module(f"quell.{name}")
+    else:
+        raise AttributeError(f"module 'quell' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

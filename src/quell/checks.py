@@ -1,0 +1,108 @@
+"""Checks of arguments: each error names the argument, its value and the rule."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from quell.types import Matrix, Vector
+
+
+def finite(name: str, value: Any) -> float:
+    """Return ``value`` as a float, or say that it must be a finite number."""
+    number = _number(name, value)
+    if not math.isfinite(number):
+        raise ValueError(f"{name} = {value!r}: must be a finite number")
+    return number
+
+
+def positive(name: str, value: Any, unit: str = "") -> float:
+    """Return ``value`` as a float above zero."""
+    number = _number(name, value)
+    if not (math.isfinite(number) and number > 0.0):
+        raise ValueError(f"{name} = {value!r}: must be finite and greater than zero{unit and f' [{unit}]'}")
+    return number
+
+
+def non_negative(name: str, value: Any, unit: str = "") -> float:
+    """Return ``value`` as a float of at least zero."""
+    number = _number(name, value)
+    if not (math.isfinite(number) and number >= 0.0):
+        raise ValueError(f"{name} = {value!r}: must be finite and not negative{unit and f' [{unit}]'}")
+    return number
+
+
+def nonzero(name: str, value: Any, why: str) -> float:
+    """Return ``value`` as a finite float other than zero; ``why`` completes the message."""
+    number = finite(name, value)
+    if number == 0.0:
+        raise ValueError(f"{name} = {value!r}: must not be zero, {why}")
+    return number
+
+
+def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """Return ``value`` as an int between ``least`` and ``most``."""
+    rule = f"must be a whole number of at least {least}" if most is None else f"must be a whole number from {least} to {most}"
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise ValueError(f"{name} = {value!r}: {rule}")
+    if value < least or (most is not None and value > most):
+        raise ValueError(f"{name} = {value!r}: {rule}")
+    return int(value)
+
+
+def interval(low_name: str, low: Any, high_name: str, high: Any) -> tuple[float, float]:
+    """Return two limits in order; either may be infinite, neither NaN."""
+    low_value, high_value = _number(low_name, low), _number(high_name, high)
+    if not low_value < high_value:
+        raise ValueError(f"{low_name} = {low!r}, {high_name} = {high!r}: {low_name} must be less than {high_name}")
+    return low_value, high_value
+
+
+def vector(name: str, value: Any, size: int | None = None) -> Vector:
+    """Return ``value`` as a finite, contiguous float vector, of ``size`` entries where that is given."""
+    array = _array(name, value)
+    if array.ndim == 0:
+        array = array.reshape(1)
+    if array.ndim != 1 or (size is not None and array.size != size):
+        wanted = "a vector" if size is None else f"a vector of {size}"
+        raise ValueError(f"{name} has shape {array.shape}: must be {wanted}")
+    return array
+
+
+def matrix(name: str, value: Any, rows: int | None = None, columns: int | None = None) -> Matrix:
+    """Return ``value`` as a finite, contiguous float matrix of the shape asked for."""
+    array = _array(name, value)
+    wanted = f"({'any' if rows is None else rows}, {'any' if columns is None else columns})"
+    if array.ndim != 2 or (rows is not None and array.shape[0] != rows) or (columns is not None and array.shape[1] != columns):
+        raise ValueError(f"{name} has shape {array.shape}: must be a matrix of shape {wanted}")
+    return array
+
+
+def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
+    """Return ``value`` if it is one of ``choices``."""
+    if value not in choices:
+        raise ValueError(f"{name} = {value!r}: must be one of {', '.join(choices)}")
+    return str(value)
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, str | bytes | bool):
+        raise ValueError(f"{name} = {value!r}: must be a number")
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} = {value!r}: must be a number") from None
+
+
+def _array(name: str, value: Any) -> Vector:
+    try:
+        array = np.array(value, dtype=np.float64, order="C")
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: must be an array of numbers, got {type(value).__name__}") from None
+    if not np.all(np.isfinite(array)):
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name}: entry {where} is {float(array[where])!r}; every entry must be finite")
+    return array

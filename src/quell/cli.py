@@ -1,0 +1,73 @@
+"""The command ``quell``: a thin layer over ``quell.experiments``.
+
+Heavy imports stand inside the commands, so that ``quell --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, CycloptsError, Parameter
+
+from quell import __version__
+
+app = App(
+    name="quell",
+    help="Disturbance-rejection control that learns, and that its learning cannot break.",
+    version=__version__,
+    print_error=False,
+    exit_on_error=False,
+)
+reproduce = App(name="reproduce", help="Run a published experiment again and judge its claims.")
+app.command(reproduce)
+
+
+@reproduce.command(name="two-mass")
+def two_mass(
+    *,
+    dt: float = 1e-3,
+    seed: int = 0,
+    omega_o: float = 10.0,
+    reset: bool = True,
+    json: Annotated[Path | None, Parameter(name="--json")] = None,
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+) -> None:
+    """Run the two-mass-spring study: MF-ESO, MB-ESO and L-ESO, with every claim judged.
+
+    Parameters
+    ----------
+    dt
+        Sample time [s].
+    seed
+        Seed of the measurement noise.
+    omega_o
+        Observer bandwidth [rad/s].
+    reset
+        Start the loop from rest at 110 s, before the step.
+    json
+        Write all results to this file, for programs.
+    figures
+        Put the figures into this folder, as PNG and SVG.
+    """
+    from quell.commands.two_mass import reproduce_two_mass
+
+    reproduce_two_mass(dt=dt, seed=seed, omega_o=omega_o, reset=reset, json_file=json, figures=figures)
+
+
+def main() -> None:
+    """Run the command line; a mistake in what was asked gives one line and exit code 2."""
+    try:
+        app()
+    except (CycloptsError, ValueError) as error:
+        message = " ".join(str(error).split())
+        print(f"quell: {message}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("quell: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

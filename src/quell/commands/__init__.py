@@ -1,0 +1,1 @@
+"""What the commands of ``quell`` print: one module for each."""

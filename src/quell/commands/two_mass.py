@@ -1,0 +1,107 @@
+"""``quell reproduce two-mass``: run, print, write."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from quell import plants
+from quell.dispatch import cache_is_cold
+from quell.experiments import two_mass_figures, two_mass_spring
+from quell.experiments.two_mass_spring import Result, Settings
+from quell.files import written_atomically
+from quell.simulation import Scenario, simulate
+
+_COLUMNS = (
+    ("overshoot", "overshoot\n[‰]", 1e3, ".2f"),
+    ("settling_time", "settling\n[s]", 1.0, ".2f"),
+    ("disturbance_peak", "peak\n[m]", 1.0, ".4f"),
+    ("disturbance_rms", "RMS\n[m]", 1.0, ".4f"),
+    ("control_variation", "variation\n[N]", 1.0, ".1f"),
+)
+
+
+def reproduce_two_mass(*, dt: float, seed: int, omega_o: float, reset: bool, json_file: Path | None, figures: Path | None) -> None:
+    """Run the study, print its two tables, write what was asked for.
+
+    Raises
+    ------
+    ValueError
+        for settings out of range, or a place that can't be written to.
+    """
+    settings = Settings(dt=dt, seed=seed, omega_o=omega_o, reset=reset)
+    two_mass_spring.controllers(settings)  # what can't be designed is said before anything is compiled
+    if json_file is not None:
+        with written_atomically(json_file) as part:  # likewise what can't be written, before the work is done
+            part.write_text("{}\n")
+    console = Console()
+    _compile(console, settings)
+    with Progress(TextColumn("{task.description:<15}"), BarColumn(), console=console, transient=True) as bar:
+        task = bar.add_task("simulating", total=1.0)
+
+        def tell(what: str, share: float) -> None:
+            bar.update(task, description=what, completed=share)
+
+        result = two_mass_spring.run(settings, tell)
+        paths = two_mass_figures.save(result, figures, tell) if figures is not None else []
+    _print(console, result)
+    if paths:
+        console.print(f"Figures: {', '.join(sorted({path.stem for path in paths}))} (PNG and SVG) in {figures}/")
+    if json_file is not None:
+        with written_atomically(json_file) as part:
+            part.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+        console.print(f"Results: {json_file}")
+
+
+def _compile(console: Console, settings: Settings) -> None:
+    """Compile what the study needs, or load it; where that takes long, say so beforehand and how long it took."""
+    cold = cache_is_cold()
+    if cold:
+        console.print("First run of this version: compiling, which takes about 15 seconds, once.")
+    began = time.perf_counter()
+    brief = Scenario(duration=10 * settings.dt, rest_at=(5 * settings.dt,))
+    for candidate in two_mass_spring.controllers(settings).values():
+        simulate(plants.two_mass_spring(), candidate, brief)
+    took = time.perf_counter() - began
+    if cold:
+        console.print(f"Compiled in {took:.1f} s; kept for later runs.")
+
+
+def _print(console: Console, result: Result) -> None:
+    settings = result.settings
+    claims = Table(title="What the paper claims in section IV, and what is measured here", title_justify="left", box=SIMPLE_HEAD)
+    claims.add_column("claim")
+    for heading in ("paper", "holds when", "measured", "holds"):
+        claims.add_column(heading, justify="right", no_wrap=True)
+    for claim in result.claims:
+        paper = claim.paper if isinstance(claim.paper, str) else f"{claim.paper:g}"
+        measured = "not reached" if claim.measured is None else _short(claim.measured)
+        name = f"{claim.claim} [{claim.unit}]" if claim.unit else claim.claim
+        claims.add_row(escape(name), paper, claim.rule, measured, "[green]yes[/]" if claim.holds else "[red]no[/]")
+    console.print(claims)
+    console.print("docs/theory explains each no.\n")
+    reset = "with" if settings.reset else "without"
+    about = f"dt = {settings.dt:g} s, seed {settings.seed}, omega_o = {settings.omega_o:g} rad/s, {reset} reset"
+    scores = Table(title=f"All controllers ({about})", title_justify="left", box=SIMPLE_HEAD)
+    scores.add_column("controller", no_wrap=True)
+    for _, heading, _, _ in _COLUMNS:
+        scores.add_column(heading, justify="right")
+    for name, score in result.scores.items():
+        values = [(score[key], factor, form) for key, _, factor, form in _COLUMNS]
+        scores.add_row(name, *("–" if value is None else format(factor * value, form) for value, factor, form in values))
+    console.print(scores)
+    console.print("Overshoot, settling (±0.2 %) and variation: step, 110–150 s. Peak and RMS of y − 1: force on m2, 170–250 s.\n")
+    for name, run in result.runs.items():
+        if run.status:
+            console.print(f"{name} ended at {run.ended:.1f} s. {run.status.message}")
+
+
+def _short(value: float) -> str:
+    return f"{value:.4f}" if abs(value) < 10.0 else f"{value:.2f}"

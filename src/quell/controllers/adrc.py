@@ -1,0 +1,305 @@
+"""Active disturbance rejection control: the law around an ESO and, where there is one, a learner.
+
+    u_0 = k_1 (r − x̂_1) − k_2 x̂_2 − … − k_n x̂_n,      k_i = C(n, i−1) omega_c^(n−i+1)
+    u   = sat( (u_0 − f_L − Δf̂ + a·x̂) / b0 )
+
+(Gao, ACC 2003; paper eq. (control), with the term ``a·x̂`` that the paper forgets.) With ``f_L = h + s u`` affine in u the
+loop through u is solved instead of closed a sample late: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+from quell.controllers.base import control, report, rest
+from quell.controllers.handle import bind, bound_control, entry_point
+from quell.controllers.limits import Limits, apply_limits, limits
+from quell.dispatch import kernel
+from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart
+from quell.observers.eso import ESO, EsoModel, eso_start, eso_update
+from quell.types import Status, Vector
+
+_MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
+_REFERENCE_HELD = int(Status.REFERENCE_HELD)
+_OVERFLOWED = int(Status.OVERFLOWED)
+
+# Places in AdrcState.loop.
+_U, _F_LEARNED, _R, _Y, _STARTED, _STATUS = range(6)
+
+
+class AdrcDesign(NamedTuple):
+    """Parameters of the controller, for a plant of order n; N = n + 1."""
+
+    eso: EsoModel
+    law: Vector
+    """k (n,)."""
+    cancel: Vector
+    """a (n,)."""
+    b0: float
+    limits: Limits
+    learner: Any
+
+
+class AdrcState(NamedTuple):
+    """State of the controller."""
+
+    z: Vector
+    """The observer's state (N,)."""
+    seen: Vector
+    """What the law may know of it (N,)."""
+    loop: Vector
+    """(6,): u applied, f_L, last good r and y, whether started, status."""
+    learner: Any
+
+
+@control.register(AdrcDesign)
+def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
+    loop, seen = state.loop, state.seen
+    status = 0
+    if math.isfinite(r):
+        loop[_R] = r
+    else:
+        status |= _REFERENCE_HELD
+    if math.isfinite(y):
+        loop[_Y] = y
+    else:
+        status |= _MEASUREMENT_HELD
+    if loop[_STARTED] == 0.0:
+        eso_start(state.z, seen, loop[_Y])
+        # Nothing is known before a first good measurement: start again when it comes.
+        loop[_STARTED] = 1.0 if status & _MEASUREMENT_HELD == 0 else 0.0
+    else:
+        eso_update(design.eso, state.z, seen, loop[_Y], loop[_U], loop[_F_LEARNED])
+        if status & _MEASUREMENT_HELD == 0:
+            adapt(design.learner, state.learner, seen, loop[_U])
+    constant, slope = predict(design.learner, state.learner, seen, loop[_U])
+    wished = _law(design, seen, loop[_R], constant, slope)
+    if not math.isfinite(wished):
+        status |= _OVERFLOWED
+        restart(design.learner, state.learner)
+        eso_start(state.z, seen, loop[_Y])
+        constant = slope = 0.0
+        wished = loop[_U]
+    u, cut = apply_limits(design.limits, wished, loop[_U])
+    f_learned = constant + slope * u
+    loop[_U] = u
+    loop[_F_LEARNED] = f_learned
+    loop[_STATUS] = status | cut
+    commit(design.learner, state.learner, seen, u, f_learned)
+    return u
+
+
+@kernel
+def _law(design: AdrcDesign, seen: Vector, r: float, constant: float, slope: float) -> float:
+    inverse_gain = 1.0 / (design.b0 + slope)
+    order = design.law.size
+    wished = design.law[0] * r - seen[order]
+    for i in range(order):
+        wished += (design.cancel[i] - design.law[i]) * seen[i]
+    return (wished - constant) * inverse_gain
+
+
+@report.register(AdrcDesign)
+def _report(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
+    order = design.law.size
+    for i in range(order + 1):
+        row[i] = state.seen[i]
+    row[order + 1] = state.loop[_F_LEARNED]
+    row[order + 2] = state.loop[_STATUS]
+    coefficients(design.learner, state.learner, row[order + 3 :])
+
+
+@rest.register(AdrcDesign)
+def _rest(design: AdrcDesign, state: AdrcState) -> None:
+    for i in range(state.loop.size):
+        state.loop[i] = 0.0
+    restart(design.learner, state.learner)
+
+
+class Estimate(NamedTuple):
+    """What the controller knows after a step."""
+
+    x: Vector
+    """(n,): y and its derivatives."""
+    f: float
+    """Total disturbance [y-unit/s^n]: ``f_learned + f_residual``."""
+    f_learned: float
+    """The learner's share, f_L."""
+    f_residual: float
+    """The observer's share, Δf̂."""
+    theta: dict[str, float]
+    """The learner's coefficients by feature."""
+    u: float
+    """The control signal applied."""
+    status: Status
+    """What the step had to report."""
+
+
+class ADRC:
+    """Active disturbance rejection control around an ESO, with or without a learner.
+
+    The object is immutable in all but its running state: ``step`` moves that on, ``simulate`` leaves it alone and uses a state of its own.
+
+    Parameters
+    ----------
+    observer
+        model-free or model-based; it brings order, b0 and dt.
+    omega_c
+        controller bandwidth [rad/s]: all poles of the ideal loop lie at −omega_c.
+    learner
+        what feeds f forward; none by default.
+    u_min, u_max
+        limits of the control signal [u-unit].
+    rate_limit
+        how fast it may move, in either direction [u-unit/s].
+
+    Raises
+    ------
+    ValueError
+        for a bandwidth that is not positive, limits in the wrong order, a rate limit that is not positive.
+
+    Examples
+    --------
+    >>> from quell.observers import ESO
+    >>> controller = ADRC(ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=2.0, u_min=-1.0, u_max=1.0)
+    >>> controller.step(r=1.0, y=0.0)
+    1.0
+    >>> controller.estimate.status
+    <Status.SATURATED: 4>
+    """
+
+    def __init__(
+        self,
+        observer: ESO,
+        omega_c: float,
+        *,
+        learner: Learner | None = None,
+        u_min: float = -math.inf,
+        u_max: float = math.inf,
+        rate_limit: float = math.inf,
+    ) -> None:
+        if not isinstance(observer, ESO):
+            raise ValueError(f"observer = {observer!r}: must be an ESO, from ESO.model_free or ESO.model_based")
+        self.observer = observer
+        self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
+        self.learner: Learner = NoLearner() if learner is None else learner
+        self.parameters = AdrcDesign(
+            eso=observer.model,
+            law=law_gains(observer.order, self.omega_c),
+            cancel=observer.a,
+            b0=observer.b0,
+            limits=limits(u_min, u_max, rate_limit, observer.dt),
+            learner=self.learner.design(observer),
+        )
+        self.features = self.learner.feature_names(observer.order)
+        self._state = self.initial_state()
+        self._arrays = _named_arrays(self._state)
+        self._handle: Any = None
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return self.observer.dt
+
+    @property
+    def channels(self) -> tuple[tuple[str, int], ...]:
+        """Name and width of what ``report`` writes, in order."""
+        return (
+            ("x_hat", self.observer.order),
+            ("f_residual", 1),
+            ("f_learned", 1),
+            ("status", 1),
+            ("theta", len(self.features)),
+        )
+
+    def initial_state(self) -> AdrcState:
+        """Return a state before the first sample, with nothing learned."""
+        size = self.observer.order + 1
+        memory = self.learner.memory(self.parameters.learner)
+        return AdrcState(np.zeros(size), np.zeros(size), np.zeros(6), memory)
+
+    def prepare(self) -> None:
+        """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
+        self._handle = bind(self.parameters, self._state)
+        # The first call is made on a state of its own: it must not count as a sample.
+        bound_control(bind(self.parameters, self.initial_state()), 0.0, 0.0)
+        self._step = entry_point(bound_control, self._handle, 0.0, 0.0)
+
+    def step(self, r: float, y: float) -> float:
+        """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
+
+        A value that is not finite is replaced by the last good one, and said in ``estimate.status``. The observer takes the returned
+        value for applied; limits belong in ``u_min``, ``u_max`` and ``rate_limit``, not behind the controller.
+
+        The first call compiles, or loads; ``prepare`` does that beforehand.
+        """
+        if self._handle is None:
+            self.prepare()
+        return self._step(self._handle, r, y)
+
+    def reset(self) -> None:
+        """Go back to the state before the first sample; what was learned is forgotten."""
+        self.state = _named_arrays(self.initial_state())
+
+    @property
+    def state(self) -> dict[str, NDArray[np.float64]]:
+        """The whole running state as named arrays, copied: ``numpy.savez(file, **controller.state)`` keeps it.
+
+        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then.
+        """
+        return {name: array.copy() for name, array in self._arrays.items()}
+
+    @state.setter
+    def state(self, saved: Mapping[str, Any]) -> None:
+        if set(saved) != set(self._arrays):
+            raise ValueError(f"state has {sorted(saved)}: must have {sorted(self._arrays)}")
+        # A learner that diverged may hold numbers that are not finite; its state is restored as it was.
+        checked = {name: np.asarray(value, dtype=np.float64) for name, value in saved.items()}
+        for name, value in checked.items():
+            if value.shape != self._arrays[name].shape:
+                raise ValueError(f"state[{name!r}] has shape {value.shape}: must have {self._arrays[name].shape}")
+        for name, value in checked.items():
+            self._arrays[name][...] = value
+
+    @property
+    def estimate(self) -> Estimate:
+        """What the controller knows after its last step."""
+        return self.read(self._state)
+
+    def read(self, state: AdrcState) -> Estimate:
+        """Return what is known in ``state``."""
+        order = self.observer.order
+        theta = np.zeros(len(self.features))
+        coefficients(self.parameters.learner, state.learner, theta)
+        learned, residual = float(state.loop[_F_LEARNED]), float(state.seen[order])
+        return Estimate(
+            x=state.seen[:order].copy(),
+            f=learned + residual,
+            f_learned=learned,
+            f_residual=residual,
+            theta=dict(zip(self.features, theta.tolist(), strict=True)),
+            u=float(state.loop[_U]),
+            status=Status(int(state.loop[_STATUS])),
+        )
+
+
+def law_gains(order: int, omega_c: float) -> Vector:
+    """Return ``k_i = C(n, i−1) omega_c^(n−i+1)``, i = 1 … n: all poles of ``s^n + k_n s^(n−1) + … + k_1`` lie at −omega_c."""
+    return np.array([math.comb(order, i) * omega_c ** (order - i) for i in range(order)])
+
+
+def _named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:
+    """Return the arrays of a nested NamedTuple by dotted name; the arrays themselves, not copies."""
+    found: dict[str, NDArray[np.float64]] = {}
+    for name, value in state._asdict().items():
+        if isinstance(value, tuple):
+            found |= _named_arrays(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = value
+    return found

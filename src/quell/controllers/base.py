@@ -1,0 +1,49 @@
+"""What the driver asks of a controller.
+
+A controller is an object with ``dt``, ``parameters`` (a NamedTuple), ``initial_state()`` (a NamedTuple of arrays) and ``channels`` (the
+names of what it reports). For the type of its parameters three functions are registered.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from quell.dispatch import generic
+from quell.types import Vector
+
+
+class Controller(Protocol):
+    """The part of a controller that the driver uses."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+
+    @property
+    def parameters(self) -> Any:
+        """What the compiled functions need, a NamedTuple."""
+
+    @property
+    def channels(self) -> tuple[tuple[str, int], ...]:
+        """Name and width of what ``report`` writes, in order."""
+
+    def initial_state(self) -> Any:
+        """Return the state before the first sample: a NamedTuple of arrays."""
+
+
+@generic
+def control(controller: Any, state: Any, r: float, y: float) -> float:
+    """Take one sample: the control signal to apply for the reference ``r`` and the measurement ``y``."""
+    raise TypeError
+
+
+@generic
+def report(controller: Any, state: Any, row: Vector) -> None:
+    """Write what the controller knows, as its ``channels`` say, into ``row``."""
+    raise TypeError
+
+
+@generic
+def rest(controller: Any, state: Any) -> None:
+    """Start from rest at the next sample, with what was learned."""
+    raise TypeError

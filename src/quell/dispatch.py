@@ -1,0 +1,170 @@
+"""Generic functions over NamedTuple types, compiled and interpreted alike.
+
+An algorithm is written once, as a plain function of immutable parameters (a NamedTuple of floats and arrays) and explicit state
+(a NamedTuple of arrays). Three decorators are all there is:
+
+``kernel``
+    a plain helper; interpreted when called from Python, inlined when called from compiled code.
+``generic``
+    a function with one implementation for each NamedTuple type of its first argument. The choice is made by the type: when
+    compiling by Numba's overload resolution, so it costs nothing at run time; when interpreting by a dictionary.
+``compiled``
+    an entry point, compiled once for each combination of types and cached on disk.
+
+Numba's own disk cache looks only at the file a function stands in. A kernel here calls kernels in other files, so the cache
+directory is named after a hash of all of the package's sources (and Numba's version): an edit anywhere starts a new one.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ParamSpec, Protocol, TypeVar, cast
+
+import numba
+import platformdirs
+from numba.core import config as numba_config
+from numba.core import types as nb_types
+from numba.extending import overload, register_jitable
+
+F = TypeVar("F", bound=Callable[..., Any])
+P = ParamSpec("P")
+R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
+
+
+class Generic(Protocol[P, R_co]):
+    """A generic function: called as its declaration says, with one implementation for each type of its first argument."""
+
+    implementations: dict[type, Callable[..., Any]]
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co:
+        """Call the implementation for the type of the first argument."""
+
+    def register(self, cls: type) -> Callable[[F], F]:
+        """Return a decorator that makes a function the implementation for ``cls``."""
+
+
+# Fused multiply-add and re-ordered sums, but NaN and Inf keep their meaning: guards test for them. Inlining is forced because a
+# NamedTuple of arrays is passed as some eighty words, which costs more than most kernels do.
+OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy", "forceinline": True}
+
+_CACHES_KEPT = 4
+
+
+def kernel(function: F) -> F:
+    """Mark a helper that runs interpreted from Python and compiled from compiled code."""
+    return register_jitable(**OPTIONS)(function)
+
+
+def generic(declaration: Callable[P, R]) -> Generic[P, R]:
+    """Make a generic function out of its declaration, whose docstring is the contract.
+
+    ``declaration.register(Type)`` decorates the implementation for the NamedTuple ``Type`` of the first argument;
+    ``declaration.implementations`` is the table of them.
+
+    Raises
+    ------
+    TypeError
+        on a call, when no implementation is registered for the first argument's type.
+    """
+    table: dict[type, Callable[..., Any]] = {}
+
+    @functools.wraps(declaration)
+    def call(head: Any, *rest: Any) -> Any:
+        try:
+            implementation = table[type(head)]
+        except KeyError:
+            raise TypeError(_no_implementation(declaration.__name__, type(head).__name__)) from None
+        return implementation(head, *rest)
+
+    def resolve(head: Any, *rest: Any) -> Any:
+        cls = getattr(head, "instance_class", None) if isinstance(head, nb_types.BaseNamedTuple) else None
+        return table.get(cls)  # type: ignore[arg-type]
+
+    def register(cls: type) -> Callable[[F], F]:
+        def add(implementation: F) -> F:
+            table[cls] = implementation
+            return implementation
+
+        return add
+
+    overload(call, strict=False, jit_options=dict(OPTIONS))(resolve)
+    call.register = register  # type: ignore[attr-defined]
+    call.implementations = table  # type: ignore[attr-defined]
+    return cast("Generic[P, R]", call)
+
+
+def compiled(function: F) -> F:
+    """Compile an entry point for the types it is called with; keep the code on disk; release the interpreter while it runs.
+
+    Reference counting is switched off: it would cost more than the arithmetic, and without it Numba refuses to compile whatever
+    allocates memory, so that compiled kernels provably do not.
+    """
+    with _cache_directory():
+        return numba.njit(function, cache=True, nogil=True, _nrt=False, **OPTIONS)
+
+
+def compiled_call(function: F) -> F:
+    """Compile an entry point for calls one at a time from Python, on a handle (``structref``): counts references, keeps the interpreter."""
+    with _cache_directory():
+        return numba.njit(function, cache=True, **OPTIONS)
+
+
+def interpreted(function: Any) -> Any:
+    """Return the plain Python function behind a compiled entry point (itself, where there is nothing behind it)."""
+    return getattr(function, "py_func", function)
+
+
+@functools.cache
+def cache_path() -> Path:
+    """Return the directory of this version's compiled code, made if need be.
+
+    It lies under ``NUMBA_CACHE_DIR`` when that is set, else under the user's cache directory.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    package = Path(__file__).parent
+    for source in sorted(package.rglob("*.py")):
+        digest.update(source.relative_to(package).as_posix().encode())
+        digest.update(source.read_bytes())
+    root = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(platformdirs.user_cache_dir("quell")) / "compiled")
+    path = root / f"quell-{digest.hexdigest()[:16]}"
+    if not path.is_dir():
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            _forget_old_caches(root, path)
+        except OSError:  # a read-only home: Numba falls back to its own choice or to no cache at all
+            return root
+    return path
+
+
+def cache_is_cold() -> bool:
+    """Tell whether nothing has been compiled yet for this version, so that a first run can say that it compiles."""
+    return not any(cache_path().rglob("*.nbi"))
+
+
+def _forget_old_caches(root: Path, current: Path) -> None:
+    """Remove all but the newest few caches of other versions of the package."""
+    others = sorted((p for p in root.glob("quell-*") if p != current), key=lambda p: p.stat().st_mtime, reverse=True)
+    for stale in others[_CACHES_KEPT - 1 :]:
+        shutil.rmtree(stale, ignore_errors=True)
+
+
+@contextmanager
+def _cache_directory() -> Iterator[None]:
+    """Point Numba's cache at ours while a dispatcher is made (it fixes its directory then), and only so long."""
+    before = numba_config.CACHE_DIR
+    numba_config.CACHE_DIR = str(cache_path())
+    try:
+        yield
+    finally:
+        numba_config.CACHE_DIR = before
+
+
+def _no_implementation(name: str, type_name: str) -> str:
+    return f"{name}() has no implementation for {type_name}; register one with @{name}.register({type_name}) before the first run"

@@ -1,0 +1,118 @@
+"""What the controller asks of a learner.
+
+A learner is an immutable description (``Kalman(...)``). ``design(observer)`` turns it into a NamedTuple of parameters, and ``memory`` of
+those into a NamedTuple of arrays, its whole state. For the type of the parameters the functions below are registered; each sample
+the controller calls, in this order:
+
+1. ``adapt`` with what the observer has just seen;
+2. ``predict``, for the feedforward ``f_L = constant + slope · u``: affine in u, so that a learner with u among its features is cancelled
+   exactly, not a sample late;
+3. ``commit`` with the u that was really applied and the f_L that follows from it.
+
+``restart`` is called where the loop starts anew from rest, ``coefficients`` where a run is recorded.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from quell.dispatch import generic
+from quell.observers.eso import ESO
+from quell.types import Vector
+
+
+class Learner(Protocol):
+    """A description of a learner."""
+
+    def design(self, observer: ESO) -> Any:
+        """Return the parameters (a NamedTuple) for an observer."""
+
+    def memory(self, parameters: Any) -> Any:
+        """Return the state before anything was learned: a NamedTuple of arrays."""
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return what each entry of θ multiplies, for a plant of order ``order``."""
+
+
+@generic
+def adapt(learner: Any, memory: Any, seen: Vector, u_before: float) -> None:
+    """Learn from ``seen = (x̂_1 … x̂_n, Δf̂)`` and the control signal applied during the sample that led to it."""
+    raise TypeError
+
+
+@generic
+def predict(learner: Any, memory: Any, seen: Vector, u_before: float) -> tuple[float, float]:
+    """Return ``(constant, slope)`` of the feedforward ``f_L = constant + slope · u`` [y-unit/s^n]."""
+    raise TypeError
+
+
+@generic
+def commit(learner: Any, memory: Any, seen: Vector, u: float, f_learned: float) -> None:
+    """Take note of the applied ``u`` and of the ``f_learned`` that the observer will be fed."""
+    raise TypeError
+
+
+@generic
+def restart(learner: Any, memory: Any) -> None:
+    """Forget what belongs to the moment (filters); keep what was learned, unless it is not finite: then learn from the beginning."""
+    raise TypeError
+
+
+@generic
+def coefficients(learner: Any, memory: Any, theta: Vector) -> None:
+    """Write θ into ``theta`` (p,), in the plant's units: ``f_L = θ · features``."""
+    raise TypeError
+
+
+class NoLearner:
+    """The learner that has nothing to say: it makes an L-ESO a plain ESO."""
+
+    def design(self, observer: ESO) -> NoLearnerDesign:
+        """Return no parameters."""
+        return NoLearnerDesign()
+
+    def memory(self, parameters: NoLearnerDesign) -> NoLearnerMemory:
+        """Return a state without content."""
+        return NoLearnerMemory(np.zeros(0))
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return no names."""
+        return ()
+
+
+class NoLearnerDesign(NamedTuple):
+    """Parameters of ``NoLearner``: none."""
+
+
+class NoLearnerMemory(NamedTuple):
+    """State of ``NoLearner``."""
+
+    theta: Vector
+    """(0,)."""
+
+
+@adapt.register(NoLearnerDesign)
+def _adapt(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u_before: float) -> None:
+    pass
+
+
+@predict.register(NoLearnerDesign)
+def _predict(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u_before: float) -> tuple[float, float]:
+    return 0.0, 0.0
+
+
+@commit.register(NoLearnerDesign)
+def _commit(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u: float, f_learned: float) -> None:
+    pass
+
+
+@restart.register(NoLearnerDesign)
+def _restart(learner: NoLearnerDesign, memory: NoLearnerMemory) -> None:
+    pass
+
+
+@coefficients.register(NoLearnerDesign)
+def _coefficients(learner: NoLearnerDesign, memory: NoLearnerMemory, theta: Vector) -> None:
+    pass

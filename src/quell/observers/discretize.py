@@ -1,0 +1,43 @@
+"""Exact zero-order-hold sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from quell.types import Matrix
+
+
+def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Matrix, list[Matrix]]:
+    """Sample ``x' = A x + Σ B_i u_i`` exactly, every ``u_i`` held over a sample.
+
+    All matrices come out of one exponential (Van Loan, *IEEE Trans. Automatic Control* 23, 1978)::
+
+        exp([[A, B], [0, 0]] dt) = [[Φ, Γ], [0, I]]
+
+    Parameters
+    ----------
+    A
+        (n, n), in 1/s.
+    inputs
+        each (n, m_i).
+    dt
+        sample time [s].
+
+    Returns
+    -------
+    tuple
+        Φ (n, n), and the list of Γ_i (n, m_i).
+    """
+    from scipy.linalg import expm
+
+    n = A.shape[0]
+    B = np.hstack([np.zeros((n, 0)), *inputs])
+    block = np.zeros((n + B.shape[1],) * 2)
+    block[:n, :n], block[:n, n:] = A, B
+    sampled = expm(block * dt)
+    edges = np.cumsum([0, *(b.shape[1] for b in inputs)]) + n
+    gammas = [np.ascontiguousarray(sampled[:n, i:j]) for i, j in pairwise(edges)]
+    return np.ascontiguousarray(sampled[:n, :n]), gammas

@@ -1,0 +1,44 @@
+"""What the driver asks of a plant.
+
+A plant is an object with ``order`` (number of states), ``disturbances`` (number of disturbance inputs), ``name``, and
+``sampled(dt)``, which returns a NamedTuple of parameters. For the type of that NamedTuple two functions are registered:
+``measure`` and ``advance``. See ``linear.py`` for a complete example.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from quell.dispatch import generic
+from quell.types import Vector
+
+
+class Plant(Protocol):
+    """The part of a plant that the driver, the observers' design and the plots use."""
+
+    @property
+    def name(self) -> str:
+        """What tables and plots call it."""
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbance inputs."""
+
+    def sampled(self, dt: float) -> Any:
+        """Return the parameters for a sample time ``dt`` [s]."""
+
+
+@generic
+def measure(plant: Any, x: Vector) -> float:
+    """Return the output y for the state ``x`` (n,)."""
+    raise TypeError
+
+
+@generic
+def advance(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+    """Move the state ``x`` (n,) on by a sample from the time ``t`` [s]; ``u`` and ``w`` (m,) hold. ``scratch`` has room for 6 n."""
+    raise TypeError

@@ -1,0 +1,104 @@
+"""Linear plants, sampled exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.observers.discretize import zero_order_hold
+from quell.plants.base import advance, measure
+from quell.types import Matrix, Vector
+
+
+class LinearModel(NamedTuple):
+    """A sampled linear plant: ``x⁺ = Φ x + Γ u + Γ_w w``, ``y = C x``."""
+
+    transition: Matrix
+    """Φ (n, n)."""
+    input: Vector
+    """Γ (n,)."""
+    disturbance: Matrix
+    """Γ_w (n, m)."""
+    output: Vector
+    """C (n,)."""
+
+
+@measure.register(LinearModel)
+def _measure(plant: LinearModel, x: Vector) -> float:
+    y = 0.0
+    for i in range(x.size):
+        y += plant.output[i] * x[i]
+    return y
+
+
+@advance.register(LinearModel)
+def _advance(plant: LinearModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+    size = x.size
+    for i in range(size):
+        total = plant.input[i] * u
+        for j in range(w.size):
+            total += plant.disturbance[i, j] * w[j]
+        for j in range(size):
+            total += plant.transition[i, j] * x[j]
+        scratch[i] = total
+    for i in range(size):
+        x[i] = scratch[i]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPlant:
+    """``x' = A x + B u + E w``, ``y = C x``, of any size, with one input, one output and any number of disturbances.
+
+    Parameters
+    ----------
+    A
+        (n, n).
+    B
+        (n,) or (n, 1).
+    C
+        (n,) or (1, n).
+    E
+        (n, m), m ≥ 0 disturbance inputs; by default the disturbance enters as u does.
+    name
+        for tables and plots.
+
+    Raises
+    ------
+    ValueError
+        where shapes do not fit or an entry is not finite.
+    """
+
+    A: Any
+    B: Any
+    C: Any
+    E: Any = None
+    name: str = "linear plant"
+
+    def __post_init__(self) -> None:
+        A = checks.matrix("A", self.A)
+        n = A.shape[0]
+        checks.matrix("A", A, n, n)
+        B = checks.matrix("B", np.reshape(self.B, (-1, 1)) if np.ndim(self.B) == 1 else self.B, n, 1)
+        C = checks.matrix("C", np.reshape(self.C, (1, -1)) if np.ndim(self.C) == 1 else self.C, 1, n)
+        E = B if self.E is None else checks.matrix("E", self.E, n)
+        for name, value in (("A", A), ("B", B), ("C", C), ("E", E)):
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbance inputs."""
+        return int(self.E.shape[1])
+
+    def sampled(self, dt: float) -> LinearModel:
+        """Return the plant sampled with zero-order hold on u and w at ``dt`` [s], for the driver."""
+        phi, (gamma, gamma_w) = zero_order_hold(self.A, [self.B, self.E], checks.positive("dt", dt, "s"))
+        return LinearModel(phi, gamma[:, 0].copy(), gamma_w, self.C[0].copy())

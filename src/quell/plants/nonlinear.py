@@ -1,0 +1,247 @@
+"""Nonlinear plants given by the user's own differential equation."""
+
+from __future__ import annotations
+
+import ctypes
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import types as nb_types
+from numba.extending import intrinsic, overload
+
+from quell import checks
+from quell.dispatch import generic, kernel
+from quell.plants.base import advance, measure
+from quell.types import Vector
+
+_RATE = ctypes.CFUNCTYPE(None, ctypes.c_double, ctypes.c_void_p, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
+_OUTPUT = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p)
+_POINTER = nb_types.CPointer(nb_types.float64)
+_RATE_SIGNATURE = nb_types.void(nb_types.float64, _POINTER, nb_types.float64, _POINTER, _POINTER)
+_OUTPUT_SIGNATURE = nb_types.float64(_POINTER)
+
+
+class CompiledNonlinear(NamedTuple):
+    """A nonlinear plant whose functions are compiled; they are given by address, so that the driver is compiled once for all."""
+
+    rate: int
+    output: int
+    step: float
+    """Length of a sub-step [s]."""
+    substeps: int
+
+
+class PythonNonlinear(NamedTuple):
+    """A nonlinear plant whose functions only Python can run."""
+
+    rate: Callable[..., Any]
+    output: Callable[..., Any]
+    step: float
+    substeps: int
+
+
+@generic
+def derivatives(plant: Any, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
+    """Write the derivatives of the state into ``dx`` (n,)."""
+    raise TypeError
+
+
+@kernel
+def _runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+    """Classical Runge-Kutta, ``substeps`` times (Hairer, Nørsett & Wanner, *Solving ODEs I*, table II.1.2)."""
+    n = x.size
+    k1, k2, k3 = scratch[:n], scratch[n : 2 * n], scratch[2 * n : 3 * n]
+    k4, at = scratch[3 * n : 4 * n], scratch[4 * n : 5 * n]
+    h = plant.step
+    for i in range(plant.substeps):
+        now = t + i * h
+        derivatives(plant, now, x, u, w, k1)
+        for j in range(n):
+            at[j] = x[j] + 0.5 * h * k1[j]
+        derivatives(plant, now + 0.5 * h, at, u, w, k2)
+        for j in range(n):
+            at[j] = x[j] + 0.5 * h * k2[j]
+        derivatives(plant, now + 0.5 * h, at, u, w, k3)
+        for j in range(n):
+            at[j] = x[j] + h * k3[j]
+        derivatives(plant, now + h, at, u, w, k4)
+        for j in range(n):
+            x[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
+
+
+def _call_rate(address: int, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
+    """Call the compiled rate function at an address; from compiled code this is a plain jump."""
+    _RATE(address)(t, x.ctypes.data, u, w.ctypes.data, dx.ctypes.data)
+
+
+def _call_output(address: int, x: Vector) -> float:
+    """Call the compiled output function at an address."""
+    return float(_OUTPUT(address)(x.ctypes.data))
+
+
+@intrinsic
+def _jump(typing_context: Any, address: Any, arguments: Any) -> Any:
+    """Call the function at an address with a tuple of numbers and arrays (by pointer); with one argument it returns a number."""
+    returns = nb_types.float64 if len(arguments) == 1 else nb_types.none
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        target, packed = values
+        passed = []
+        for i, kind in enumerate(arguments):
+            value = builder.extract_value(packed, i)
+            passed.append(context.make_array(kind)(context, builder, value).data if isinstance(kind, nb_types.Array) else value)
+        result = ir.DoubleType() if returns is nb_types.float64 else ir.VoidType()
+        function = builder.inttoptr(target, ir.FunctionType(result, [value.type for value in passed]).as_pointer())
+        called = builder.call(function, passed)
+        return called if returns is nb_types.float64 else context.get_dummy_value()
+
+    return returns(address, arguments), generate
+
+
+@overload(_call_rate, strict=False)
+def _compiled_call_rate(address: Any, t: Any, x: Any, u: Any, w: Any, dx: Any) -> Any:
+    return lambda address, t, x, u, w, dx: _jump(address, (t, x, u, w, dx))
+
+
+@overload(_call_output, strict=False)
+def _compiled_call_output(address: Any, x: Any) -> Any:
+    return lambda address, x: _jump(address, (x,))
+
+
+@measure.register(CompiledNonlinear)
+def _measure(plant: CompiledNonlinear, x: Vector) -> float:
+    return _call_output(plant.output, x)
+
+
+@advance.register(CompiledNonlinear)
+def _advance(plant: CompiledNonlinear, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+    _runge_kutta(plant, x, scratch, t, u, w)
+
+
+@derivatives.register(CompiledNonlinear)
+def _derivatives(plant: CompiledNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
+    _call_rate(plant.rate, t, x, u, w, dx)
+
+
+@measure.register(PythonNonlinear)
+def _measure_python(plant: PythonNonlinear, x: Vector) -> float:
+    return float(plant.output(x))
+
+
+@advance.register(PythonNonlinear)
+def _advance_python(plant: PythonNonlinear, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+    _runge_kutta(plant, x, scratch, t, u, w)
+
+
+@derivatives.register(PythonNonlinear)
+def _derivatives_python(plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
+    dx[:] = plant.rate(t, x, u, w)
+
+
+@dataclass(frozen=True, eq=False)
+class NonlinearPlant:
+    """``x' = f(t, x, u, w)`` with a function of the user's own, solved by Runge-Kutta of order 4 with a fixed sub-step.
+
+    Parameters
+    ----------
+    f
+        ``f(t, x, u, w)`` returns the n derivatives as a tuple, list or array; t [s], x (n,), u a number, w (m,). It is compiled by
+        Numba where that is possible; where not, it runs as Python, about a hundred times slower, and a warning says why.
+    order
+        number of states n.
+    output
+        what y is: a function ``h(x)``, or the row C of ``y = C x``; the first state by default.
+    disturbances
+        number m of disturbance inputs.
+    substeps
+        Runge-Kutta steps in a sample; u and w hold over the sample.
+    name
+        for tables and plots.
+
+    Raises
+    ------
+    ValueError
+        where ``f`` does not return n numbers, or ``output`` fits neither form.
+
+    Examples
+    --------
+    >>> pendulum = NonlinearPlant(lambda t, x, u, w: (x[1], u - 9.81 * math.sin(x[0])), order=2)
+    """
+
+    f: Callable[..., Any]
+    order: int
+    output: Any = None
+    disturbances: int = 1
+    substeps: int = 1
+    name: str = "nonlinear plant"
+
+    def __post_init__(self) -> None:
+        n = checks.whole("order", self.order, 1)
+        m = checks.whole("disturbances", self.disturbances, 0)
+        checks.whole("substeps", self.substeps, 1)
+        if not callable(self.f):
+            raise ValueError(f"f = {self.f!r}: must be a function f(t, x, u, w)")
+        returned = np.shape(self.f(0.0, np.zeros(n), 0.0, np.zeros(m)))
+        if returned != (n,):
+            raise ValueError(f"f returns shape {returned}: must return the {n} derivatives of the state")
+        if not callable(self.output):
+            checks.vector("output", self._row, n)
+
+    @property
+    def _row(self) -> Any:
+        return np.eye(self.order)[0] if self.output is None else self.output
+
+    @cached_property
+    def _measured(self) -> Callable[..., Any]:
+        if callable(self.output):
+            return self.output
+        row = tuple(np.asarray(self._row, dtype=float).tolist())
+
+        def linear(x: Vector) -> float:
+            y = 0.0
+            for i in range(len(row)):
+                y += row[i] * x[i]
+            return y
+
+        return linear
+
+    @cached_property
+    def _machine_code(self) -> tuple[Any, Any] | None:
+        """The two functions compiled, or None where they can't be; they are kept as long as their addresses are."""
+        n, m = self.order, self.disturbances
+        f, h = (function if hasattr(function, "py_func") else numba.njit(function) for function in (self.f, self._measured))
+
+        def rate(t, px, u, pw, pdx):  # type: ignore[no-untyped-def]
+            dx = numba.carray(pdx, (n,))
+            derivatives = f(t, numba.carray(px, (n,)), u, numba.carray(pw, (m,)))
+            for i in range(n):
+                dx[i] = derivatives[i]
+
+        def output(px):  # type: ignore[no-untyped-def]
+            return h(numba.carray(px, (n,)))
+
+        try:
+            return numba.cfunc(_RATE_SIGNATURE)(rate), numba.cfunc(_OUTPUT_SIGNATURE)(output)
+        except numba.core.errors.NumbaError as error:
+            reason = str(error).strip().splitlines()[-1]
+            warnings.warn(f"{self.name}: f or output can't be compiled and runs as Python, which is slow ({reason})", stacklevel=3)
+            return None
+
+    @property
+    def compiled(self) -> bool:
+        """Whether Numba could compile the functions."""
+        return self._machine_code is not None
+
+    def sampled(self, dt: float) -> CompiledNonlinear | PythonNonlinear:
+        """Return the plant for the driver, at the sample time ``dt`` [s]."""
+        step = checks.positive("dt", dt, "s") / self.substeps
+        if self._machine_code is None:
+            return PythonNonlinear(self.f, self._measured, step, self.substeps)
+        rate, output = self._machine_code
+        return CompiledNonlinear(rate.address, output.address, step, self.substeps)

@@ -1,0 +1,217 @@
+"""The one driver: a plant and a controller, sample by sample, through a scenario."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.controllers.base import Controller, control, report, rest
+from quell.dispatch import compiled, interpreted
+from quell.plants.base import Plant, advance, measure
+from quell.signals import Constant, Signal, as_signal, seeded_apart
+from quell.trajectory import Trajectory
+from quell.types import Matrix, Status, Vector
+
+# Signals are evaluated so many samples at a time: enough to make Python's share small, few enough to stay in cache.
+_BLOCK = 8192
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What happens to the loop.
+
+    Parameters
+    ----------
+    reference
+        what y has to follow [y-unit]; a signal or a number.
+    disturbances
+        one signal or number for each disturbance input of the plant, in its order; missing ones are zero.
+    noise
+        what is added to y before the controller sees it; none by default.
+    duration
+        how long it takes [s]; the record has the samples from 0 to ``duration``, both included.
+    x0
+        the plant's state at the start; zero by default.
+    rest_at
+        times [s] at which the plant is put back to ``x0`` and the controller starts from rest, with what it has learned.
+    seed
+        which noise; the same seed gives the same bits.
+
+    Raises
+    ------
+    ValueError
+        for a duration that is not positive, a seed below zero, or ``rest_at`` times that do not increase within the duration.
+    """
+
+    reference: Signal | float = 0.0
+    duration: float = 10.0
+    disturbances: Sequence[Signal | float] = ()
+    noise: Signal | float = 0.0
+    x0: Any = None
+    rest_at: Sequence[float] = field(default=())
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks.positive("duration", self.duration, "s")
+        checks.whole("seed", self.seed, 0)
+        times = checks.vector("rest_at", tuple(self.rest_at))
+        if times.size and (np.any(np.diff(times) <= 0.0) or times[0] <= 0.0 or times[-1] >= self.duration):
+            raise ValueError(f"rest_at = {self.rest_at!r}: must increase and lie within (0, duration = {self.duration!r})")
+
+    def seeded_signals(self, inputs: int) -> tuple[Signal, tuple[Signal, ...], Signal]:
+        """Return the reference, ``inputs`` disturbances and the noise, with all that is random drawn from ``seed``."""
+        if len(self.disturbances) > inputs:
+            raise ValueError(f"disturbances has {len(self.disturbances)} signals: the plant has {inputs} disturbance inputs")
+        given = (as_signal(self.reference), *map(as_signal, self.disturbances))
+        noise = as_signal(self.noise).seeded(self.seed)
+        # The noise takes the seed itself, so that its bits do not depend on how many disturbances there are.
+        reference, *disturbances = seeded_apart(given, self.seed)
+        return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise
+
+
+@compiled
+def run_block(
+    plant: Any,
+    x: Vector,
+    scratch: Vector,
+    design: Any,
+    state: Any,
+    t0: float,
+    dt: float,
+    r: Vector,
+    w: Matrix,
+    noise: Vector,
+    log: Matrix,
+    row: int,
+    every: int,
+    until_next: int,
+    limit: float,
+) -> tuple[int, int, int]:
+    """Run ``r.size`` samples from the time ``t0``; write every ``every``-th into ``log`` from ``row`` on.
+
+    Returns how many samples were run (fewer than asked where the loop diverged: ``|y|`` beyond ``limit``, or not finite), the next row,
+    and how many samples are left until it is written.
+    """
+    inputs = w.shape[1]
+    for k in range(r.size):
+        y = measure(plant, x)
+        measured = y + noise[k]
+        if not abs(y) <= limit:
+            return k, row, until_next
+        u = control(design, state, r[k], measured)
+        if until_next == 0:
+            log[row, 0] = r[k]
+            log[row, 1] = y
+            log[row, 2] = measured
+            log[row, 3] = u
+            for j in range(inputs):
+                log[row, 4 + j] = w[k, j]
+            for j in range(x.size):
+                log[row, 4 + inputs + j] = x[j]
+            report(design, state, log[row, 4 + inputs + x.size :])
+            row += 1
+            until_next = every
+        until_next -= 1
+        advance(plant, x, scratch, t0 + k * dt, u, w[k])
+    return r.size, row, until_next
+
+
+@compiled
+def start_from_rest(design: Any, state: Any) -> None:
+    """Start the controller from rest, with what it has learned."""
+    rest(design, state)
+
+
+def simulate(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    *,
+    record_every: int = 1,
+    limit: float = 1e6,
+    interpret: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Trajectory:
+    """Run a controller on a plant through a scenario.
+
+    The controller starts with nothing learned, on a state of its own: neither it nor the plant is changed.
+
+    Parameters
+    ----------
+    plant, controller, scenario
+        what to run; the sample time is the controller's.
+    record_every
+        keep every so-many-th sample; the memory used is that of the record.
+    limit
+        the run ends early, with ``Status.DIVERGED``, where ``|y|`` goes beyond it or is not finite [y-unit].
+    interpret
+        run the same functions as plain Python, to debug; about a thousand times slower.
+    progress
+        called with the share done, 0 to 1, every few thousand samples.
+
+    Returns
+    -------
+    Trajectory
+        what was recorded, as far as the run went.
+
+    Raises
+    ------
+    ValueError
+        for arguments out of range, an x0 of the wrong size, or more disturbances than the plant has inputs.
+    """
+    every = checks.whole("record_every", record_every, 1)
+    limit = checks.positive("limit", limit)
+    dt = controller.dt
+    samples = math.floor(scenario.duration / dt + 1e-9) + 1
+    x0 = np.zeros(plant.order) if scenario.x0 is None else checks.vector("x0", scenario.x0, plant.order)
+    reference, disturbances, noise = scenario.seeded_signals(plant.disturbances)
+
+    model, design, state = plant.sampled(dt), controller.parameters, controller.initial_state()
+    as_python = interpret or not getattr(plant, "compiled", True)
+    block, to_rest = (interpreted(run_block), interpreted(start_from_rest)) if as_python else (run_block, start_from_rest)
+    channels = (
+        *(("r", 1), ("y", 1), ("y_measured", 1), ("u", 1), ("w", plant.disturbances), ("x", plant.order)),
+        *controller.channels,
+    )
+    log = np.empty(((samples - 1) // every + 1, sum(width for _, width in channels)))
+    x, scratch = x0.copy(), np.zeros(6 * plant.order)
+    rests = {math.ceil(time / dt - 1e-9) for time in scenario.rest_at}
+    edges = sorted({*range(0, samples, _BLOCK), *(k for k in rests if k < samples), samples})
+    row = until_next = done = 0
+    status = Status.OK
+    # An interpreted loop that diverges would warn of every overflow; the status says it once.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for first, last in pairwise(edges):
+            if first in rests:
+                x[:] = x0
+                to_rest(design, state)
+            t = np.arange(first, last) * dt
+            w = np.empty((t.size, plant.disturbances))
+            for j, signal in enumerate(disturbances):
+                w[:, j] = signal(t)
+            ran, row, until_next = block(
+                *(model, x, scratch, design, state, first * dt, dt, reference(t), w, noise(t), log, row, every, until_next, limit)
+            )
+            done = first + ran
+            if ran < t.size:
+                status = Status.DIVERGED
+                break
+            if progress is not None:
+                progress(done / samples)
+    return Trajectory(
+        log=log[:row],
+        channels=channels,
+        dt=dt,
+        every=every,
+        status=status,
+        ended=(done if status else samples - 1) * dt,
+        plant=plant.name,
+        features=tuple(getattr(controller, "features", ())),
+        final_state=state,
+    )

@@ -1,0 +1,235 @@
+"""What a run returns."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quell import checks, metrics
+from quell.files import written_atomically
+from quell.types import Matrix, Status, Vector
+
+if TYPE_CHECKING:
+    import xarray
+
+_MEANINGS = {
+    "r": ("reference", "y-unit"),
+    "y": ("output", "y-unit"),
+    "y_measured": ("output as measured, with noise", "y-unit"),
+    "u": ("control signal as applied", "u-unit"),
+    "w": ("disturbances", "w-unit"),
+    "x": ("state of the plant", "state-unit"),
+    "x_hat": ("estimated output and its derivatives", "y-unit/s^i"),
+    "f_residual": ("residual total disturbance estimated by the observer", "y-unit/s^n"),
+    "f_learned": ("total disturbance fed forward by the learner", "y-unit/s^n"),
+    "f_hat": ("estimated total disturbance", "y-unit/s^n"),
+    "status": ("status flags of the step", "1"),
+    "theta": ("coefficients of the learner", "y-unit/s^n per feature-unit"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """The record of one run.
+
+    ``run["y"]`` is a channel: (samples,), or (samples, width) for ``w``, ``x``, ``x_hat`` and ``theta``; ``run.t`` are its times [s].
+    Besides what was recorded there is ``f_hat = f_learned + f_residual``.
+
+    Attributes
+    ----------
+    log : (samples, columns) array
+        all channels side by side.
+    channels : tuple of (name, width)
+        what the columns are, in order.
+    dt : float
+        sample time of the run [s]; recorded was every ``every``-th sample.
+    status : Status
+        ``OK``, or ``DIVERGED``; ``status.message`` says what to do.
+    ended : float
+        when the run ended [s].
+    plant : str
+        its name.
+    features : tuple of str
+        what the entries of ``theta`` multiply.
+    final_state
+        the controller's state at the end, a NamedTuple; ``controller.read(run.final_state)`` puts it in words.
+    """
+
+    log: Matrix
+    channels: tuple[tuple[str, int], ...]
+    dt: float
+    every: int = 1
+    status: Status = Status.OK
+    ended: float = 0.0
+    plant: str = ""
+    features: tuple[str, ...] = ()
+    final_state: Any = None
+
+    @property
+    def t(self) -> Vector:
+        """Times of the samples [s]."""
+        return np.arange(self.log.shape[0], dtype=np.float64) * (self.every * self.dt)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        recorded = tuple(name for name, width in self.channels if width)
+        return (*recorded, "f_hat") if {"f_learned", "f_residual"} <= set(recorded) else recorded
+
+    def __getitem__(self, name: str) -> Vector:
+        """Return a channel; a ``ValueError`` lists the channels there are."""
+        if checks.one_of("channel", name, self.names) == "f_hat":
+            return self["f_learned"] + self["f_residual"]
+        start = 0
+        for channel, width in self.channels:
+            if channel == name:
+                break
+            start += width
+        return self.log[:, start] if width == 1 and name not in ("w", "x", "x_hat", "theta") else self.log[:, start : start + width]
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return int(self.log.shape[0])
+
+    def window(self, start: float, stop: float) -> slice:
+        """Return the samples with ``start <= t < stop`` as a slice."""
+        step = self.every * self.dt
+        first, last = (max(int(np.ceil(time / step - 1e-9)), 0) for time in (start, stop))
+        return slice(first, min(last, len(self)))
+
+    def metrics(
+        self, start: float = 0.0, stop: float | None = None, *, target: float | None = None, band: float = 0.002
+    ) -> dict[str, float]:
+        """Judge the response in the window ``[start, stop)`` [s] as a step from its first value of y.
+
+        Parameters
+        ----------
+        start, stop
+            the window; to the end of the record by default.
+        target
+            where y should go; the reference at the end of the window by default.
+        band
+            half width of the settling band, as a fraction of the move.
+
+        Returns
+        -------
+        dict
+            ``overshoot`` (fraction of the move), ``settling_time`` and ``rise_time`` [s] (all three only where y has to move; NaN
+            where it does not get there), ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y, and ``control_variation``.
+
+        Raises
+        ------
+        ValueError
+            where the window holds no sample: for instance because the run ended before it.
+        """
+        part = (
+            self.window(start, np.inf if stop is None else stop) if stop is not None else slice(self.window(start, start).start, len(self))
+        )
+        if part.start >= len(self) or part.stop <= part.start:
+            raise ValueError(
+                f"start = {start!r}, stop = {stop!r}: the record ends at {self.ended:.6g} s ({self.status.message}); "
+                "the window must hold at least one sample"
+            )
+        t, y, u = self.t[part], self["y"][part], self["u"][part]
+        error = self["r"][part] - y
+        goal = float(self["r"][part][-1]) if target is None else checks.finite("target", target)
+        initial = float(y[0])
+        found: dict[str, float] = {}
+        if goal != initial:
+            found |= {
+                "overshoot": metrics.overshoot(y, goal, initial),
+                "settling_time": metrics.settling_time(t, y, goal, band, initial),
+                "rise_time": metrics.rise_time(t, y, goal, initial),
+            }
+        return found | {
+            "peak_error": metrics.peak(error),
+            "rms": metrics.rms(error),
+            "iae": metrics.iae(t, error),
+            "ise": metrics.ise(t, error),
+            "itae": metrics.itae(t, error),
+            "control_variation": metrics.control_variation(u),
+        }
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw output and reference, control signal and estimates of f, one below the other; return the three axes.
+
+        Parameters
+        ----------
+        axes
+            three matplotlib axes to draw into; a new figure by default.
+        """
+        from quell.plotting import plot_trajectory
+
+        return plot_trajectory(self, axes)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the record as an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
+        import xarray
+
+        labels: dict[str, Sequence[Any]] = {"theta": self.features}
+        variables: dict[str, Any] = {}
+        coordinates: dict[str, Any] = {"time": ("time", self.t, {"units": "s"})}
+        for name in self.names:
+            values = np.ascontiguousarray(self[name])
+            meaning, unit = _MEANINGS.get(name, (name, "1"))
+            attributes = {"long_name": meaning, "units": unit}
+            if values.ndim == 2:
+                axis = f"{name}_index"
+                coordinates[axis] = (axis, list(labels.get(name) or range(1, values.shape[1] + 1)), {})
+                variables[name] = (("time", axis), values, attributes)
+            else:
+                variables[name] = (("time",), values, attributes)
+        about = {
+            "plant": self.plant,
+            "dt": self.dt,
+            "every": self.every,
+            "status": int(self.status),
+            "ended": self.ended,
+            "message": self.status.message,
+        }
+        return xarray.Dataset(variables, coordinates, attrs=about)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the record to a NetCDF file, whole or not at all; ``Trajectory.load`` or any NetCDF reader opens it."""
+        dataset = self.to_xarray()
+        with written_atomically(path) as part:
+            dataset.to_netcdf(part, engine="h5netcdf")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Trajectory:
+        """Read back what ``save`` wrote (all but ``final_state``).
+
+        Raises
+        ------
+        ValueError
+            where the file is not such a record.
+        """
+        import xarray
+
+        try:
+            with xarray.open_dataset(Path(path), engine="h5netcdf") as dataset:
+                data = dataset.load()
+        except (OSError, ValueError) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise ValueError(f"path = {os.fspath(path)!r}: must be a NetCDF file written by Trajectory.save ({error})") from None
+        missing = {"dt", "every", "status", "ended", "plant"} - set(data.attrs)
+        if missing:
+            raise ValueError(f"path = {os.fspath(path)!r}: has no {', '.join(sorted(missing))}: it was not written by Trajectory.save")
+        names = [name for name in map(str, data.data_vars) if name != "f_hat"]
+        columns = [np.reshape(data[name].values, (data.sizes["time"], -1)) for name in names]
+        return cls(
+            log=np.hstack(columns),
+            channels=tuple((name, column.shape[1]) for name, column in zip(names, columns, strict=True)),
+            dt=float(data.attrs["dt"]),
+            every=int(data.attrs["every"]),
+            status=Status(int(data.attrs["status"])),
+            ended=float(data.attrs["ended"]),
+            plant=str(data.attrs["plant"]),
+            features=tuple(map(str, data["theta_index"].values)) if "theta_index" in data.coords else (),
+        )

@@ -1,0 +1,47 @@
+"""Array aliases, and the status that a step or a run reports."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector: TypeAlias = NDArray[np.float64]
+"""One-dimensional, contiguous, float64."""
+
+Matrix: TypeAlias = NDArray[np.float64]
+"""Two-dimensional, C-contiguous, float64."""
+
+
+class Status(IntFlag):
+    """What a controller's last step, or a run as a whole, has to report; flags add up.
+
+    ``OK`` is zero. ``message`` says in words what happened and what to do.
+    """
+
+    OK = 0
+    MEASUREMENT_HELD = 1
+    REFERENCE_HELD = 2
+    SATURATED = 4
+    RATE_LIMITED = 8
+    OVERFLOWED = 16
+    DIVERGED = 32
+
+    @property
+    def message(self) -> str:
+        """All that is reported, as sentences."""
+        return " ".join(text for flag, text in _MESSAGES.items() if flag in self) or "All is well."
+
+
+_MESSAGES = {
+    Status.MEASUREMENT_HELD: "The measurement was not finite; the last good one was used instead: look at the sensor.",
+    Status.REFERENCE_HELD: "The reference was not finite; the last good one was used instead: look at its source.",
+    Status.SATURATED: "The control signal lies on u_min or u_max; the observer was told the applied value.",
+    Status.RATE_LIMITED: "The control signal moves as fast as rate_limit allows; the observer was told the applied value.",
+    Status.OVERFLOWED: "The observer or the learner left the range of numbers and was started afresh: "
+    "lower the learning rate, omega_o or omega_c, or check b0.",
+    Status.DIVERGED: "The loop diverged and the run ended early: check the sign and size of b0, lower omega_c or omega_o, "
+    "or the learning rate.",
+}

@@ -1,0 +1,28 @@
+"""What several test files use."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import quell as ql
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator that is the same in every test."""
+    return np.random.default_rng(20240901)
+
+
+@pytest.fixture
+def two_mass_scenario() -> ql.Scenario:
+    """The paper's scenario, shortened: 20 s of training, a step from rest, a force on m2 from 35 s."""
+    return ql.Scenario(
+        reference=ql.signals.Sinusoid().until(20.0, then=ql.signals.Step(at=20.0)),
+        disturbances=(0.0, ql.signals.Sinusoid(omega=0.1 * math.pi, start=35.0)),
+        noise=ql.signals.BandLimitedNoise(power=1e-12, sample_time=0.01),
+        duration=45.0,
+        rest_at=(20.0,),
+    )

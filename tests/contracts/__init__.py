@@ -1,0 +1,1 @@
+"""What every plant, observer and learner must do, found by itself: a new one is tested by existing."""

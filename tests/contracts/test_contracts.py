@@ -1,0 +1,158 @@
+"""The contracts themselves."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell import plants as plant_room
+from quell.controllers.adrc import _named_arrays
+from quell.dispatch import interpreted
+from quell.learners.base import adapt, commit, predict
+from quell.observers.eso import eso_start, eso_update
+from quell.plants.base import advance, measure
+from quell.simulation import run_block
+
+from .examples import CHAIN, LEARNERS, OBSERVERS, PLANTS
+
+SCENARIO = ql.Scenario(
+    reference=ql.signals.Sinusoid(omega=1.5),
+    disturbances=(0.3 * ql.signals.Step(at=1.0),),
+    noise=ql.signals.BandLimitedNoise(1e-8, 0.01),
+    duration=3.0,
+    rest_at=(2.0,),
+)
+
+
+def law_for(plant: Any, **options: Any) -> ql.ADRC:
+    """A controller for a plant of its order."""
+    return ql.ADRC(ql.ESO.model_free(order=plant.order, b0=1.5, omega_o=12.0, dt=0.01), omega_c=1.5, **options)
+
+
+def check_run(plant: Any, controller: ql.ADRC) -> None:
+    """A run is repeatable, compiled once, and the same interpreted."""
+    first = ql.simutruth(plant, controller, SCENARIO)
+    compiled_before = len(run_block.signatures)
+    again = ql.simutruth(plant, controller, SCENARIO)
+    assert len(run_block.signatures) == compiled_before, "the second run compiled again"
+    np.testing.assert_array_equal(first.log, again.log)
+    assert np.all(np.isfinite(first.log))
+    plainly = ql.simutruth(plant, controller, SCENARIO, interpret=True)
+    # Fused multiply-add rounds otherwise, and a learner remembers it.
+    np.testing.assert_allclose(plainly["y"], first["y"], rtol=1e-6, atol=1e-8)
+
+
+def test_every_plant_has_an_example() -> None:
+    """Nothing public escapes the contracts."""
+    public = {name for name in plant_room.__all__ if name != "Plant"}
+    assert public == set(PLANTS)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_plant_runs_the_same_again_and_interpreted(name: str) -> None:
+    """Same seed, same output; no second compilation; interpreted = compiled."""
+    check_run(PLANTS[name], law_for(PLANTS[name]))
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_plant_changes_nothing_but_its_state(name: str, rng: np.random.Generator) -> None:
+    """Parameters and inputs stay; measuring changes nothing."""
+    plant = PLANTS[name]
+    model = plant.sampled(0.01)
+    before = copy.deepcopy(model)
+    x, w = rng.normal(size=plant.order), rng.normal(size=plant.disturbances)
+    x_before, w_before = x.copy(), w.copy()
+    y = measure(model, x)
+    np.testing.assert_array_equal(x, x_before)
+    advance(model, x, np.zeros(6 * plant.order), 0.0, 0.5, w)
+    assert np.any(x != x_before)
+    assert np.isfinite(y)
+    np.testing.assert_array_equal(w, w_before)
+    for one, other in zip(model, before, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state(name: str) -> None:
+    """On its own model: state and f are found, parameters stay."""
+    observer = OBSERVERS[name]
+    size, model = observer.order + 1, observer.model
+    before = [np.copy(field) for field in model]
+    f, u = 0.7, 0.4
+    truth = np.zeros(size)
+    truth[-1] = f
+    z, seen = np.zeros(size), np.zeros(size)
+    eso_start(z, seen, 0.0)
+    for _ in range(1500):
+        truth = model.transition @ truth + model.input * u
+        eso_update(model, z, seen, truth[0], u, 0.0)
+    scale = 12.0 ** -np.arange(size)
+    np.testing.assert_allclose(seen * scale, truth * scale, rtol=1e-5, atol=1e-5 * np.max(np.abs(truth * scale)))
+    for one, other in zip(model, before, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_learner_runs_the_same_again_and_interpreted(name: str) -> None:
+    """Same seed, same output; no second compilation; interpreted = compiled."""
+    check_run(CHAIN, law_for(CHAIN, learner=LEARNERS[name]))
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_learner_changes_only_its_memory(name: str, rng: np.random.Generator) -> None:
+    """What it is shown stays as it was; predicting changes nothing at all."""
+    learner = LEARNERS[name]
+    design = learner.design(OBSERVERS["model-free, order 2, current"])
+    memory = learner.memory(design)
+    for _ in range(200):
+        seen = rng.normal(size=3)
+        before = seen.copy()
+        adapt(design, memory, seen, 0.3)
+        commit(design, memory, seen, 0.3, 0.1)
+        np.testing.assert_array_equal(seen, before)
+    frozen = copy.deepcopy(memory)
+    first, again = (predict(design, memory, np.ones(3), 0.2) for _ in range(2))
+    assert first == again
+    assert np.all(np.isfinite(first))
+    for one, other in zip(memory, frozen, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_learner_names_its_coefficients(name: str) -> None:
+    """As many names as θ has entries, each once."""
+    learner = LEARNERS[name]
+    for order in (1, 4):
+        memory = learner.memory(learner.design(OBSERVERS[f"model-free, order {order}, current"]))
+        names = learner.feature_names(order)
+        assert len(names) == len(set(names)) == memory.theta.size
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_learner_stays_bounded_without_excitation(name: str) -> None:
+    """A constant reference for 1e5 samples: nothing winds up, drifts or leaves the numbers."""
+    controller = law_for(CHAIN, learner=LEARNERS[name])
+    scenario = ql.Scenario(reference=0.5, duration=1000.0, noise=ql.signals.BandLimitedNoise(1e-10, 0.01))
+    run = ql.simutruth(CHAIN, controller, scenario, record_every=100)
+    assert not run.status
+    assert np.max(np.abs(run["y"][run.t > 100.0] - 0.5)) < 1e-2
+    for label, array in _named_arrays(run.final_state).items():
+        assert np.all(np.abs(array) < 1e6), label
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("form", ["current", "predictor"])
+def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
+    """The loop is stable and ends where it should."""
+    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01, form=form)
+    run = ql.simutruth(CHAIN, ql.ADRC(observer, omega_c=1.5, learner=LEARNERS[name]), ql.Scenario(reference=1.0, duration=20.0))
+    assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
+
+
+def test_the_interpreted_driver_is_the_same_function() -> None:
+    """There is one algorithm, not two."""
+    assert interpreted(run_block).__name__ == run_block.__name__

@@ -1,0 +1,93 @@
+"""The command line and what importing costs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
+    return subprocess.run([sys.executable, "-m", "quell.cli", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def test_help_and_version_answer(tmp_path: Path) -> None:
+    """The commands are listed."""
+    shown = quell("--help", cwd=tmp_path)
+    assert shown.returncode == 0
+    assert "reproduce" in shown.stdout
+    assert "two-mass" in quell("reproduce", "--help", cwd=tmp_path).stdout
+    assert quell("--version", cwd=tmp_path).stdout.strip() == __import__("quell").__version__
+
+
+def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
+    """Tables, JSON in its fixed form, figures as PNG and SVG; without a terminal."""
+    shown = quell("reproduce", "two-mass", "--dt", "0.01", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    assert "What the paper claims" in shown.stdout
+    assert "nan" not in shown.stdout.lower()
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert set(result) >= {"settings", "controllers", "claims"}
+    assert list(result["controllers"]) == [
+        "MF-ESO", "MB-ESO", "L-ESO", "L-ESO (Algorithm 1)", "MF-ESO (3x bandwidth)", "MB-ESO (3x bandwidth)",
+    ]  # fmt: skip
+    for scores in result["controllers"].values():
+        assert set(scores) >= {"overshoot", "settling_time", "disturbance_peak", "disturbance_rms", "control_variation"}
+        assert all(isinstance(value, float) for value in scores.values())
+    for claim in result["claims"]:
+        assert set(claim) >= {"claim", "paper", "measured", "holds"}
+    assert result["settings"]["dt"] == 0.01
+    names = {"position", "control", "learning", "algorithm-1"}
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--dt", "-1"), "dt = -1.0: must be finite and greater than zero"),
+        (("--dt", "nan"), "dt = nan: must be finite and greater than zero"),
+        (("--omega-o", "400", "--dt", "0.01"), "omega_o * dt"),
+        (("--seed", "-1"), "seed = -1: must be a whole number"),
+        (("--dt", "fast"), "dt"),
+        (("--json", "nowhere/out.json"), "the folder 'nowhere' must exist"),
+        (("--colour", "red"), "colour"),
+    ],
+)
+def test_a_mistake_gives_one_line_and_exit_code_two(arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    """No traceback, nothing written."""
+    shown = quell("reproduce", "two-mass", *arguments, cwd=tmp_path)
+    assert shown.returncode == 2
+    assert message in shown.stderr
+    assert shown.stderr.startswith("quell: ")
+    assert len(shown.stderr.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_importing_quell_imports_nothing_heavy() -> None:
+    """Numba, scipy, xarray, matplotlib and python-control come when they are used."""
+    code = "import sys, quell; print([m for m in ('numba', 'scipy', 'xarray', 'matplotlib', 'control', 'numpy') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_simulating_imports_neither_plots_nor_files() -> None:
+    """They cost a second that a run does not need."""
+    code = (
+        "import sys, quell as ql; ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0); ql.Trajectory; ql.simulate;"
+        "print([m for m in ('xarray', 'matplotlib', 'control', 'rich', 'pydantic') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_every_public_name_can_be_had() -> None:
+    """The table of contents is true."""
+    import quell as ql
+
+    for name in ql.__all__:
+        assert getattr(ql, name) is not None
+    assert set(ql.__all__) <= set(dir(ql))
+    with pytest.raises(AttributeError, match="has no attribute 'PID2'"):
+        ql.PID2  # noqa: B018

@@ -1,0 +1,99 @@
+"""Generic functions, compiled and interpreted."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from numba.core.errors import NumbaError
+
+from quell import dispatch
+
+
+class Circle(NamedTuple):
+    """A shape."""
+
+    radius: float
+
+
+class Square(NamedTuple):
+    """Another shape."""
+
+    side: float
+
+
+@dispatch.generic
+def area(shape: Any, factor: float) -> float:
+    """Return the area times ``factor``."""
+    raise TypeError
+
+
+@area.register(Circle)
+def _circle(shape: Circle, factor: float) -> float:
+    return 3.0 * shape.radius**2 * factor
+
+
+@area.register(Square)
+def _square(shape: Square, factor: float) -> float:
+    return shape.side**2 * factor
+
+
+@dispatch.compiled
+def total(one: Any, other: Any) -> float:
+    """Add areas of any shapes."""
+    return area(one, 1.0) + area(other, 2.0)
+
+
+@dispatch.compiled
+def allocates(values: np.ndarray) -> float:
+    """Take memory for a sum."""
+    return (values + values)[0]
+
+
+def test_the_type_of_the_first_argument_chooses_the_implementation() -> None:
+    """Interpreted, a generic function calls what was registered for the type."""
+    assert area(Circle(2.0), 1.0) == 12.0
+    assert area(Square(2.0), 1.0) == 4.0
+
+
+def test_compiled_and_interpreted_code_agree() -> None:
+    """The same functions give the same numbers both ways."""
+    assert total(Circle(1.0), Square(3.0)) == dispatch.interpreted(total)(Circle(1.0), Square(3.0)) == 21.0
+
+
+def test_a_type_without_implementation_is_named_in_the_error() -> None:
+    """The message says which function, which type, and what to do."""
+    with pytest.raises(TypeError, match=r"area\(\) has no implementation for float; register one"):
+        area(1.0, 1.0)
+
+
+def test_a_second_call_with_the_same_types_does_not_compile_again() -> None:
+    """One compilation serves all values of the same types."""
+    total(Circle(1.0), Circle(2.0))
+    before = len(total.signatures)
+    total(Circle(5.0), Circle(6.0))
+    assert len(total.signatures) == before
+
+
+def test_compiled_code_cannot_allocate() -> None:
+    """Without reference counting Numba refuses whatever takes memory, which proves that kernels take none."""
+    with pytest.raises(NumbaError, match="NRT required"):
+        allocates(np.ones(3))
+
+
+def test_the_cache_lies_where_numba_is_told_and_is_named_after_the_sources(monkeypatch: Any, tmp_path: Any) -> None:
+    """``NUMBA_CACHE_DIR`` is respected; the name holds a hash, so that an edit starts a new cache."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    path = dispatch.cache_path.__wrapped__()
+    assert path.parent == tmp_path
+    assert path.name == dispatch.cache_path().name
+
+
+def test_only_the_newest_caches_of_other_versions_are_kept(tmp_path: Any) -> None:
+    """Old versions do not pile up, and the current one is never removed."""
+    for i in range(8):
+        (tmp_path / f"quell-{i}").mkdir()
+    dispatch._forget_old_caches(tmp_path, tmp_path / "quell-0")
+    assert (tmp_path / "quell-0").is_dir()
+    assert len(list(tmp_path.iterdir())) == 4

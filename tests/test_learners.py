@@ -1,0 +1,262 @@
+"""The lag filter, Algorithm 1 and the Kalman learner, each against an independent form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import quell as ql
+from quell.learners.base import adapt, commit, predict, restart
+from quell.learners.gradient import outputs
+from quell.learners.lag import lag_of, lag_push
+from quell.observers.eso import ESO, eso_start, eso_update
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    order=st.integers(1, 8),
+    dt=st.sampled_from([1e-3, 1e-2]),
+    form=st.sampled_from(["current", "predictor"]),
+    model=st.booleans(),
+    seed=st.integers(0, 100),
+)
+def test_the_lag_filter_is_the_observers_own_shadow(order: int, dt: float, form: str, model: bool, seed: int) -> None:
+    """Against the definition: the full observer, fed y = 0 and the input through Γ_f, for a thousand samples."""
+    rng = np.random.default_rng(seed)
+    observer = (
+        ESO.model_based((rng.normal(size=order), 1.0), omega_o=10.0, dt=dt, form=form)
+        if model
+        else ESO.model_free(order=order, b0=1.0, omega_o=10.0, dt=dt, form=form)
+    )
+    lag, size = lag_of(observer), order + 1
+    inputs = rng.normal(size=1000)
+    z, seen, chain = np.zeros(size), np.zeros(size), np.zeros((1, size))
+    shadow, quick = np.zeros(1000), np.zeros(1000)
+    for k in range(1, 1000):
+        eso_update(observer.model, z, seen, 0.0, 0.0, inputs[k - 1])
+        shadow[k] = -seen[-1]
+        quick[k] = lag_push(lag, chain, 0, inputs[k - 1])
+    np.testing.assert_allclose(quick, shadow, atol=1e-7 * max(np.max(np.abs(shadow)), 1e-3))
+
+
+@pytest.mark.parametrize("order", range(1, 9))
+def test_a_constant_passes_the_lag_filter_unchanged(order: int) -> None:
+    """Its gain at rest is one: the observer finds a constant disturbance."""
+    lag = lag_of(ESO.model_free(order=order, b0=1.0, omega_o=10.0, dt=1e-3))
+    assert np.sum(lag.taps) == pytest.approx(1.0, abs=1e-8)
+
+
+def test_what_a_plain_eso_would_have_estimated_is_known_exactly(rng: np.random.Generator) -> None:
+    """``Δf̂ + f_L^F`` is the plain ESO's estimate from the same y and u, whatever was fed forward."""
+    observer = ESO.model_free(order=3, b0=2.0, omega_o=15.0, dt=2e-3)
+    lag, chain = lag_of(observer), np.zeros((1, 4))
+    y, u, f_learned = (np.cumsum(rng.normal(size=2000)) * 1e-2 for _ in range(3))
+    z, seen, plain, plainly = (np.zeros(4) for _ in range(4))
+    eso_start(z, seen, y[0])
+    eso_start(plain, plainly, y[0])
+    for k in range(1, y.size):
+        eso_update(observer.model, z, seen, y[k], u[k - 1], f_learned[k - 1])
+        eso_update(observer.model, plain, plainly, y[k], u[k - 1], 0.0)
+        shown = lag_push(lag, chain, 0, f_learned[k - 1])
+        assert seen[-1] + shown == pytest.approx(plainly[-1], rel=1e-9, abs=1e-6)
+
+
+def literal_algorithm_1(seen: np.ndarray, u: np.ndarray, rate: float, batch: int) -> np.ndarray:
+    """Algorithm 1 as printed: three lists, popped and pushed, the whole batch labelled anew; O(n) a sample."""
+    inputs: list[np.ndarray] = []
+    residuals: list[float] = []
+    labels: list[float] = []
+    theta = np.zeros(seen.shape[1] + 1)
+    history = []
+    for row, before in zip(seen, u, strict=True):
+        feature = np.array([*row[:-1], before, 1.0])
+        if len(inputs) == batch:
+            inputs.pop(0)
+            residuals.pop(0)
+            labels.pop(0)
+        inputs.append(feature)
+        residuals.append(row[-1])
+        labels.append(feature @ theta)
+        if len(inputs) == batch:
+            batch_inputs = np.array(inputs)
+            targets = np.array(labels) + np.array(residuals)
+            theta = theta - rate * batch_inputs.T @ (batch_inputs @ theta - targets)
+            labels = list(batch_inputs @ theta)
+        history.append(theta.copy())
+    return np.array(history)
+
+
+@pytest.mark.parametrize("batch", [1, 2, 7, 50])
+def test_algorithm_1_by_sliding_sums_is_algorithm_1_as_printed(batch: int, rng: np.random.Generator) -> None:
+    """The same θ at every sample, and the same third buffer at the end."""
+    seen, u = rng.normal(size=(200, 4)), rng.normal(size=200)
+    learner = ql.learners.BatchGradient(rate=1e-3, batch=batch).design(ESO.model_free(order=3, b0=1.0, omega_o=10.0, dt=1e-2))
+    memory = ql.learners.BatchGradient(rate=1e-3, batch=batch).memory(learner)
+    expected = literal_algorithm_1(seen, u, 1e-3, batch)
+    for row, before, theta in zip(seen, u, expected, strict=True):
+        adapt(learner, memory, row, before)
+        np.testing.assert_allclose(memory.theta, theta, atol=1e-12)
+    newest = np.column_stack([seen[-batch:, :3], u[-batch:], np.ones(batch)]) @ memory.theta
+    np.testing.assert_allclose(np.sort(outputs(memory)), np.sort(newest), atol=1e-12)
+
+
+def test_algorithm_1_is_silent_until_its_buffers_are_full(rng: np.random.Generator) -> None:
+    """Warm-up as MF-ESO: no feedforward for the first n samples less one."""
+    learner = ql.learners.BatchGradient(rate=1.0, batch=20)
+    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2))
+    memory = learner.memory(design)
+    for k in range(20):
+        assert predict(design, memory, np.ones(3), 1.0) == (0.0, 0.0), k
+        adapt(design, memory, rng.normal(size=3), 0.1)
+    assert predict(design, memory, np.ones(3), 1.0) != (0.0, 0.0)
+
+
+def test_the_sliding_sum_of_algorithm_1_does_not_drift(rng: np.random.Generator) -> None:
+    """A datum 1e12 times larger than the rest leaves no trace once the ring has come round twice."""
+    learner = ql.learners.BatchGradient(rate=0.0, batch=16)
+    design = learner.design(ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=1e-2))
+    memory = learner.memory(design)
+    adapt(design, memory, np.array([1e6, 1e6]), 0.0)
+    for _ in range(40):
+        adapt(design, memory, rng.normal(size=2), 0.3)
+    np.testing.assert_allclose(memory.total, memory.residuals @ memory.features, rtol=1e-12)
+
+
+def kalman_memory(learner: ql.learners.Kalman, observer: ESO, noise_power: float) -> tuple[object, object]:
+    """Return a Kalman learner past its start, with its measurement noise fixed."""
+    design = learner.design(observer)._replace(forget=0.0, floor=0.0)
+    memory = learner.memory(design)
+    memory.moment[:] = noise_power, 1.0, 1e9
+    return design, memory
+
+
+def test_with_fixed_noise_and_no_walk_the_kalman_learner_is_ridge_regression(rng: np.random.Generator) -> None:
+    """The closed form: θ = (P0⁻¹ + Σ φφᵀ dt/R)⁻¹ Σ φ y dt/R."""
+    observer = ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2)
+    design, memory = kalman_memory(ql.learners.Kalman(bias=False, prior=3.0), observer, 0.2)
+    features, targets = rng.normal(size=(300, 4)), rng.normal(size=300)
+    for row, target in zip(features, targets, strict=True):
+        memory.filtered[:] = [*row, 0.0]
+        adapt(design, memory, np.array([0.0, 0.0, 0.0, 0.0, target]), 0.0)
+    weight = observer.dt / (0.2 * design.noise_time)
+    ridge = np.linalg.solve(np.eye(4) / 9.0 + weight * features.T @ features, weight * features.T @ targets)
+    np.testing.assert_allclose(memory.theta, ridge, atol=1e-10)
+
+
+@pytest.mark.parametrize("dt", [1e-3, 1e-2])
+def test_the_bias_follows_with_its_bandwidth_whatever_the_sample_time(dt: float) -> None:
+    """A step in what the bias must explain is learned with the time constant 1/λ."""
+    bandwidth = 2.0
+    learner = ql.learners.Kalman(state=False, bias_bandwidth=bandwidth)
+    design, memory = kalman_memory(learner, ESO.model_free(order=1, b0=1.0, omega_o=50.0, dt=dt), 1.0)
+    memory.filtered[0] = 1.0
+    for _ in range(round(10.0 / dt)):  # let P settle
+        adapt(design, memory, np.zeros(2), 0.0)
+    for _ in range(round(1.0 / bandwidth / dt)):
+        adapt(design, memory, np.array([0.0, 1.0]), 0.0)
+    assert memory.theta[0] == pytest.approx(1.0 - math.exp(-1.0), rel=0.02)
+
+
+def test_the_kalman_learner_finds_the_plant(two_mass_scenario: ql.Scenario) -> None:
+    """After 20 s of sin t it knows f = −2 y'' of the benchmark, from noisy y alone, and the prior does not matter."""
+    for prior in (3.0, 100.0):
+        controller = ql.ADRC(ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=2e-3), omega_c=1.0, learner=ql.learners.Kalman(prior=prior))
+        run = ql.simulate(ql.plants.two_mass_spring(), controller, two_mass_scenario)
+        learned = run["theta"][run.window(19.0, 20.0)][-1]
+        np.testing.assert_allclose(learned, [0.0, 0.0, -2.0, 0.0, 0.0], atol=0.1)
+
+
+def test_the_kalman_learner_finds_a_wrong_gain() -> None:
+    """With u among its features and enough excitation, b0 + θ_u is the plant's gain, though b0 was half of it."""
+    s = ql.signals
+    excitation = s.Chirp(omega_start=0.2, omega_end=3.0, duration=60.0) + 0.5 * s.Sinusoid(omega=1.7)
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.5]], [0.0, 2.0], [1.0, 0.0])
+    controller = ql.ADRC(
+        ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=5e-3),
+        omega_c=4.0,
+        learner=ql.learners.Kalman(u=True, bias=True, bias_bandwidth=0.05, gain_interval=(0.3, 3.0)),
+    )
+    run = ql.simulate(plant, controller, ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-10, 0.01)))
+    theta = controller.read(run.final_state).theta
+    assert 1.0 + theta["u"] == pytest.approx(2.0, rel=0.05)
+    assert theta["x1"] == pytest.approx(-3.0, rel=0.1)
+
+
+def test_the_effective_gain_stays_in_its_interval(rng: np.random.Generator) -> None:
+    """Whatever the data say, b0 + θ_u is kept away from zero, for either sign of b0."""
+    for b0 in (2.0, -2.0):
+        learner = ql.learners.Kalman(u=True, gain_interval=(0.4, 1.5))
+        observer = ESO.model_free(order=2, b0=b0, omega_o=10.0, dt=1e-2)
+        design = learner.design(observer)
+        memory = learner.memory(design)
+        for _ in range(2000):
+            seen, u = 10.0 * rng.normal(size=3), rng.normal()
+            adapt(design, memory, np.array([*seen[:2], -5.0 * b0 * u]), u)
+            slope = predict(design, memory, seen, u)[1]
+            assert 0.4 - 1e-12 <= (b0 + slope) / b0 <= 1.5 + 1e-12
+            commit(design, memory, seen, u, rng.normal())
+
+
+def test_rounding_is_not_data() -> None:
+    """At rest and without noise the learner stays where it is: nothing winds up."""
+    controller = ql.ADRC(ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2), omega_c=1.0, learner=ql.learners.Kalman())
+    scenario = ql.Scenario(reference=1.0, x0=[1.0, 1.0, 0.0, 0.0], duration=1000.0)
+    run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=100)
+    assert np.max(np.abs(run["theta"])) < 1e-3
+    assert np.max(np.abs(run["y"] - 1.0)) < 1e-9
+
+
+def test_the_learner_watches_before_it_learns() -> None:
+    """From rest it does not learn from the observer's own transient."""
+    observer = ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2)
+    learner = ql.learners.Kalman()
+    design = learner.design(observer)
+    memory = learner.memory(design)
+    for k in range(100):
+        adapt(design, memory, np.array([1.0, 2.0, 3.0]), 0.0)
+        commit(design, memory, np.array([1.0, 2.0, 3.0]), 0.0, 0.0)
+        if abs(k - 2 * 3 / 10.0 / 1e-2) > 1:
+            assert np.any(memory.theta != 0.0) == (k > 2 * 3 / 10.0 / 1e-2), k
+    restart(design, memory)
+    before = memory.theta.copy()
+    adapt(design, memory, np.array([1.0, 2.0, 3.0]), 0.0)
+    np.testing.assert_array_equal(memory.theta, before)
+
+
+@pytest.mark.parametrize("learner", [ql.learners.Kalman(u=True), ql.learners.BatchGradient(batch=4)])
+def test_a_learner_that_left_the_range_of_numbers_begins_anew(learner: object) -> None:
+    """Restarting keeps what was learned, but not where it is no number."""
+    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2))
+    memory = learner.memory(design)
+    memory.theta[:] = 0.25
+    restart(design, memory)
+    assert np.all(memory.theta == 0.25)
+    memory.theta[0] = np.inf
+    restart(design, memory)
+    for array, fresh in zip(memory, learner.memory(design), strict=True):
+        np.testing.assert_array_equal(array, fresh)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ql.learners.Kalman(state=False, bias=False), "at least one feature must be left"),
+        (lambda: ql.learners.Kalman(bias_bandwidth=-1.0), "bias_bandwidth = -1.0: must be finite and not negative"),
+        (lambda: ql.learners.Kalman(frequency=0.0), "frequency = 0.0: must be finite and greater than zero"),
+        (lambda: ql.learners.Kalman(prior=math.inf), "prior = inf: must be finite and greater than zero"),
+        (
+            lambda: ql.learners.Kalman(gain_interval=(1.2, 2.0)),
+            r"gain_interval = \(1.2, 2.0\): must be \(low, high\) with 0 < low <= 1 <= high",
+        ),
+        (lambda: ql.learners.BatchGradient(rate=-1e-3), "rate = -0.001: must be finite and not negative"),
+        (lambda: ql.learners.BatchGradient(batch=0), "batch = 0: must be a whole number of at least 1"),
+    ],
+)
+def test_a_mistake_is_named(make: object, message: str) -> None:
+    """With the argument, its value and the rule."""
+    with pytest.raises(ValueError, match=message):
+        make()  # type: ignore[operator]

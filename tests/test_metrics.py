@@ -1,0 +1,83 @@
+"""Metrics against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from quell import metrics
+
+T = np.linspace(0.0, 40.0, 400_001)
+FIRST = 1.0 - np.exp(-T)
+
+
+def test_overshoot_of_a_second_order_step_is_exp_minus_pi_zeta_over_root() -> None:
+    """The textbook formula, for ζ = 0.5, whatever the size and sign of the step."""
+    zeta = 0.5
+    damped = math.sqrt(1.0 - zeta**2)
+    y = 1.0 - np.exp(-zeta * T) * (np.cos(damped * T) + zeta / damped * np.sin(damped * T))
+    expected = math.exp(-math.pi * zeta / damped)
+    assert metrics.overshoot(y, 1.0) == pytest.approx(expected, rel=1e-6)
+    assert metrics.overshoot(2.0 - 3.0 * y, -1.0, initial=2.0) == pytest.approx(expected, rel=1e-6)
+
+
+def test_overshoot_is_zero_where_the_target_is_not_passed() -> None:
+    """Never negative."""
+    assert metrics.overshoot(FIRST, 1.0) == 0.0
+
+
+def test_settling_time_of_a_first_order_step_is_minus_log_of_the_band() -> None:
+    """``exp(−t) = band`` at ``t = −ln band``."""
+    for band in (0.02, 0.002):
+        assert metrics.settling_time(T, FIRST, 1.0, band) == pytest.approx(-math.log(band), abs=2e-4)
+
+
+def test_settling_time_counts_from_the_first_sample_and_may_be_zero_or_nan() -> None:
+    """The window sets the origin; never leaving gives 0, not arriving NaN."""
+    late = slice(10_000, None)
+    assert metrics.settling_time(T[late], FIRST[late], 1.0, 0.02) == pytest.approx(-math.log(0.02) - 1.0, abs=2e-4)
+    assert metrics.settling_time(T, np.ones_like(T), 1.0) == 0.0
+    assert math.isnan(metrics.settling_time(T[:100], FIRST[:100], 1.0))
+
+
+def test_rise_time_of_a_first_order_step_is_log_nine() -> None:
+    """From 10 % to 90 %."""
+    assert metrics.rise_time(T, FIRST, 1.0) == pytest.approx(math.log(9.0), abs=1e-6)
+    assert math.isnan(metrics.rise_time(T[:100], FIRST[:100], 1.0))
+
+
+def test_integrals_of_an_exponential_error_are_one_a_half_and_one() -> None:
+    """``∫e⁻ᵗ = 1``, ``∫e⁻²ᵗ = ½``, ``∫t e⁻ᵗ = 1``."""
+    error = np.exp(-T)
+    assert metrics.iae(T, -error) == pytest.approx(1.0, rel=1e-6)
+    assert metrics.ise(T, error) == pytest.approx(0.5, rel=1e-6)
+    assert metrics.itae(T + 7.0, error) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_peak_and_rms_of_a_sinusoid_are_its_amplitude_and_that_over_root_two() -> None:
+    """Over whole periods."""
+    wave = 3.0 * np.sin(2.0 * np.pi * T[:-1])
+    assert metrics.peak(-wave) == pytest.approx(3.0)
+    assert metrics.rms(wave) == pytest.approx(3.0 / math.sqrt(2.0))
+
+
+def test_variation_of_a_sinusoid_is_four_amplitudes_a_period() -> None:
+    """Up, down twice as far, up again."""
+    assert metrics.control_variation(np.sin(2.0 * np.pi * T)) == pytest.approx(4.0 * 40.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("measure", "message"),
+    [
+        (lambda: metrics.rms(np.zeros(0)), "must be a vector of at least one sample"),
+        (lambda: metrics.iae(T, T[1:]), "t has 400001 samples, the record 400000"),
+        (lambda: metrics.overshoot(T, 1.0, initial=1.0), "there is no move to overshoot"),
+        (lambda: metrics.settling_time(T, T, 1.0, band=0.0), "band = 0.0: must be finite and greater than zero"),
+    ],
+)
+def test_a_mistake_is_named(measure: object, message: str) -> None:
+    """With the argument and the rule."""
+    with pytest.raises(ValueError, match=message):
+        measure()  # type: ignore[operator]

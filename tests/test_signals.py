@@ -1,0 +1,151 @@
+"""Signals against their closed forms."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quell import signals as s
+
+T = np.linspace(0.0, 12.0, 1201)
+
+
+def test_a_step_begins_at_its_sample() -> None:
+    """An edge on a sample belongs to it, even where k·dt falls short of it by rounding."""
+    t = np.arange(5) * 0.1
+    np.testing.assert_array_equal(s.Step(height=2.0, at=0.3)(t), [0.0, 0.0, 0.0, 2.0, 2.0])
+
+
+def test_a_ramp_rises_between_start_and_stop() -> None:
+    """Slope times the time since the start, held afterwards."""
+    np.testing.assert_allclose(s.Ramp(slope=2.0, start=1.0, stop=3.0)([0.0, 1.0, 2.0, 3.0, 9.0]), [0.0, 0.0, 2.0, 4.0, 4.0])
+
+
+def test_a_sinusoid_is_a_sine_from_its_start() -> None:
+    """Zero before, phase counted from the start."""
+    wave = s.Sinusoid(amplitude=3.0, omega=2.0, phase=0.5, start=4.0)(T)
+    np.testing.assert_allclose(wave[T >= 4.0], 3.0 * np.sin(2.0 * (T[T >= 4.0] - 4.0) + 0.5))
+    assert np.all(wave[T < 4.0] == 0.0)
+
+
+def test_a_chirp_has_the_frequency_it_names_at_both_ends() -> None:
+    """The derivative of its phase, seen through its zero crossings, goes from start to end and stays."""
+    t = np.linspace(0.0, 40.0, 400_001)
+    wave = s.Chirp(omega_start=2.0, omega_end=10.0, duration=20.0)(t)
+    crossings = t[1:][(wave[:-1] < 0.0) & (wave[1:] >= 0.0)]
+    frequency = 2.0 * np.pi / np.diff(crossings)
+    middle = 0.5 * (crossings[1:] + crossings[:-1])
+    np.testing.assert_allclose(frequency, np.minimum(2.0 + 8.0 * middle / 20.0, 10.0), rtol=0.02)
+
+
+@given(distance=st.floats(-5.0, 5.0), duration=st.floats(0.5, 5.0), share=st.floats(0.05, 0.5))
+def test_a_trapezoid_starts_and_ends_at_rest_and_covers_its_distance(distance: float, duration: float, share: float) -> None:
+    """Its speed is continuous, its largest is distance/(duration − ramp)."""
+    ramp = share * duration
+    move = s.Trapezoid(distance=distance, duration=duration, ramp_time=ramp, start=1.0)
+    t = np.linspace(0.0, duration + 2.0, 20_001)
+    position = move(t)
+    speed = np.gradient(position, t)
+    assert position[0] == 0.0
+    assert position[-1] == pytest.approx(distance)
+    assert np.max(np.abs(speed)) == pytest.approx(abs(distance) / (duration - ramp), rel=1e-3, abs=1e-9)
+    assert np.max(np.abs(np.diff(speed))) <= 1.01 * abs(distance) / (duration - ramp) / ramp * (t[1] - t[0]) + 1e-9
+
+
+def test_signals_add_subtract_and_scale() -> None:
+    """The algebra is that of functions; numbers are constants."""
+    both = 2.0 * s.Sinusoid() - s.Step(at=3.0) + 1.0
+    np.testing.assert_allclose(both(T), 2.0 * np.sin(T) - (T >= 3.0 - 1e-9) + 1.0)
+    np.testing.assert_allclose((-s.Sinusoid())(T), -np.sin(T))
+
+
+def test_pieces_switch_at_their_times() -> None:
+    """Each piece holds from its time on, as a function of absolute time."""
+    pieces = s.Switched((3.0, 6.0), (s.Constant(1.0), s.Sinusoid(), s.Constant(-1.0)))
+    expected = np.where(T < 3.0 - 1e-9, 1.0, np.where(T < 6.0 - 1e-9, np.sin(T), -1.0))
+    np.testing.assert_allclose(pieces(T), expected)
+    np.testing.assert_allclose(s.Constant(1.0).until(3.0, then=s.Sinusoid()).until(6.0, then=s.Constant(-1.0))(T), expected)
+
+
+def test_recorded_samples_are_interpolated_or_held() -> None:
+    """Both ways go through the samples; the ends hold."""
+    times, values = [0.0, 1.0, 3.0], [0.0, 2.0, -2.0]
+    np.testing.assert_allclose(s.Samples(times, values)([-1.0, 0.5, 1.0, 2.0, 9.0]), [0.0, 1.0, 2.0, 0.0, -2.0])
+    np.testing.assert_allclose(s.Samples(times, values, hold="previous")([-1.0, 0.5, 1.0, 2.9, 3.0]), [0.0, 0.0, 2.0, 2.0, -2.0])
+
+
+def test_noise_has_the_variance_power_over_sample_time_and_is_held() -> None:
+    """As Simulink's Band-Limited White Noise: power is the height of the spectrum."""
+    noise = s.BandLimitedNoise(power=1e-4, sample_time=0.01, seed=1)
+    t = np.arange(1_000_000) * 1e-3
+    values = noise(t)
+    draws = values[::10]
+    assert np.var(draws) == pytest.approx(1e-4 / 0.01, rel=0.02)
+    np.testing.assert_array_equal(values, np.repeat(draws, 10))
+    assert abs(np.corrcoef(draws[1:], draws[:-1])[0, 1]) < 0.02
+
+
+@settings(deadline=None)
+@given(cuts=st.lists(st.integers(1, 99_999), max_size=6), dt=st.sampled_from([1e-3, 7e-4, 1e-2, 0.033]))
+def test_noise_does_not_depend_on_how_time_is_cut(cuts: list[int], dt: float) -> None:
+    """The same bits come out in pieces of any size, in any order."""
+    t = np.arange(100_000) * dt
+    noise = s.BandLimitedNoise(power=1.0, sample_time=0.01, seed=3)
+    edges = sorted({0, *cuts, t.size})
+    pieces = [noise(t[a:b]) for a, b in pairwise(edges)]
+    np.testing.assert_array_equal(np.concatenate(pieces), noise(t))
+
+
+def test_noise_can_be_asked_for_anywhere() -> None:
+    """Far apart, before the start, and nowhere."""
+    noise = s.BandLimitedNoise(power=1.0, sample_time=0.01)
+    sparse = noise(np.array([-1.0, 0.0, 1e5, 50.0]))
+    assert sparse[0] == 0.0
+    assert sparse[1] == noise(0.0)
+    assert sparse[2] == noise(1e5)
+    assert noise(np.zeros(0)).size == 0
+
+
+def test_two_noises_in_one_sum_are_seeded_apart() -> None:
+    """The scenario's seed reaches every noise, and no two share a stream."""
+    both = s.BandLimitedNoise(power=1.0) + s.BandLimitedNoise(power=1.0)
+    first, second = (term(T) for term in both.seeded(5).terms)
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.2
+    np.testing.assert_array_equal(both.seeded(5)(T), both.seeded(5)(T))
+    assert np.any(both.seeded(5)(T) != both.seeded(6)(T))
+
+
+def test_every_kind_is_made_by_its_name() -> None:
+    """The names of scenario files give the same signals as the classes."""
+    assert s.make("sinusoid", omega=2.0) == s.Sinusoid(omega=2.0)
+    for kind, cls in s.KINDS.items():
+        assert isinstance(s.make(kind, times=[0.0], values=[1.0]) if kind == "samples" else s.make(kind), cls)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: s.make("sine"), "signal = 'sine': must be one of constant, step, ramp"),
+        (lambda: s.make("sinusoid", frequency=1.0), "parameter of signal 'sinusoid' = 'frequency': must be one of amplitude"),
+        (lambda: s.Step(at=np.nan), "at = nan: must be a finite number"),
+        (lambda: s.Sinusoid(omega="fast"), "omega = 'fast': must be a number"),
+        (lambda: s.Trapezoid(duration=-1.0), "duration = -1.0: must be finite and greater than zero"),
+        (lambda: s.Trapezoid(duration=1.0, ramp_time=0.6), r"ramp_time = 0.6: must be in \(0, duration / 2 = 0.5\]"),
+        (lambda: s.Samples([0.0, 0.0], [1.0, 2.0]), "times: must hold at least one sample and increase"),
+        (lambda: s.Samples([0.0, 1.0], [1.0]), r"values has shape \(1,\): must be a vector of 2"),
+        (lambda: s.Samples([0.0], [np.nan]), r"values: entry \(0,\) is nan"),
+        (lambda: s.Switched((1.0,), (s.Step(),)), "there must be one piece more than times"),
+        (lambda: s.BandLimitedNoise(power=-1.0), "power = -1.0: must be finite and not negative"),
+        (lambda: s.BandLimitedNoise(seed=-1), "seed = -1: must be a whole number of at least 0"),
+        (lambda: s.Sinusoid() * np.inf, "factor = inf: must be a finite number"),
+        (lambda: s.Signal()(0.0), "must define evaluate"),
+    ],
+)
+def test_a_mistake_is_named_with_its_value_and_the_rule(make: object, message: str) -> None:
+    """Nothing wrong gets as far as a run."""
+    with pytest.raises((ValueError, TypeError), match=message):
+        make()  # type: ignore[operator]

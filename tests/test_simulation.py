@@ -1,0 +1,118 @@
+"""The driver."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell import simulation
+
+PLANT = ql.plants.two_mass_spring()
+
+
+def controller(dt: float = 5e-3, **options: object) -> ql.ADRC:
+    """The study's controller, a little coarser."""
+    return ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=dt), omega_c=1.0, **options)
+
+
+def test_the_same_seed_gives_the_same_bits(two_mass_scenario: ql.Scenario) -> None:
+    """And another seed gives others."""
+    runs = [ql.simulate(PLANT, controller(), two_mass_scenario) for _ in range(2)]
+    np.testing.assert_array_equal(runs[0].log, runs[1].log)
+    other = ql.Scenario(**{**vars(two_mass_scenario), "seed": 1})
+    assert np.any(ql.simulate(PLANT, controller(), other)["y_measured"] != runs[0]["y_measured"])
+
+
+def test_the_block_size_leaves_no_trace(two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Signals are made in pieces, the record is one."""
+    whole = ql.simulate(PLANT, controller(), two_mass_scenario)
+    monkeypatch.setattr(simulation, "_BLOCK", 77)
+    np.testing.assert_array_equal(ql.simulate(PLANT, controller(), two_mass_scenario).log, whole.log)
+
+
+@pytest.mark.parametrize("every", [2, 10, 333])
+def test_a_thinned_record_holds_every_so_many_th_sample(two_mass_scenario: ql.Scenario, every: int) -> None:
+    """And no more memory than that."""
+    whole = ql.simulate(PLANT, controller(), two_mass_scenario)
+    thin = ql.simulate(PLANT, controller(), two_mass_scenario, record_every=every)
+    np.testing.assert_array_equal(thin.log, whole.log[::every])
+    np.testing.assert_allclose(thin.t, whole.t[::every])
+    assert thin.log.nbytes == whole.log[::every].nbytes
+
+
+def test_the_loop_starts_from_rest_when_the_scenario_says_so() -> None:
+    """Plant at x0, observer at its first measurement, θ as learned."""
+    scenario = ql.Scenario(reference=ql.signals.Sinusoid(), duration=30.0, x0=[0.1, 0.1, 0.0, 0.0], rest_at=(20.0,))
+    run = ql.simulate(PLANT, controller(learner=ql.learners.Kalman()), scenario)
+    k = run.window(20.0, 20.1).start
+    np.testing.assert_array_equal(run["x"][k], [0.1, 0.1, 0.0, 0.0])
+    np.testing.assert_array_equal(run["x_hat"][k], [0.1, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(run["theta"][k], run["theta"][k - 1])
+    assert abs(run["theta"][k][2]) > 1.0
+
+
+def test_a_run_that_diverges_ends_early_and_keeps_what_it_has() -> None:
+    """The status says that it did, when, and what to do; nothing recorded is NaN."""
+    wrong = ql.ADRC(ql.ESO.model_free(order=4, b0=-1.0, omega_o=10.0, dt=5e-3), omega_c=1.0)
+    run = ql.simulate(PLANT, wrong, ql.Scenario(reference=1.0, duration=200.0))
+    assert run.status == ql.Status.DIVERGED
+    assert "b0" in run.status.message
+    assert 0.0 < run.ended < 200.0
+    assert len(run) == round(run.ended / 5e-3)
+    assert np.all(np.isfinite(run.log))
+    with pytest.raises(ValueError, match="the record ends at"):
+        run.metrics(150.0)
+
+
+def test_nothing_given_to_the_driver_is_changed(two_mass_scenario: ql.Scenario) -> None:
+    """The controller keeps its own state; the scenario's x0 stays."""
+    x0 = np.array([0.1, 0.2, 0.3, 0.4])
+    law = controller(learner=ql.learners.Kalman())
+    law.step(1.0, 0.5)
+    before = law.state
+    ql.simulate(PLANT, law, ql.Scenario(reference=1.0, duration=1.0, x0=x0))
+    np.testing.assert_array_equal(x0, [0.1, 0.2, 0.3, 0.4])
+    for name, array in law.state.items():
+        np.testing.assert_array_equal(array, before[name])
+
+
+def test_disturbances_that_are_not_given_are_zero_and_the_rest_are_in_order() -> None:
+    """w1 then w2, as the plant has them."""
+    run = ql.simulate(PLANT, controller(), ql.Scenario(duration=0.1, disturbances=(2.0,)))
+    np.testing.assert_array_equal(run["w"], np.tile([2.0, 0.0], (len(run), 1)))
+
+
+def test_progress_is_told_and_ends_at_one() -> None:
+    """Shares grow."""
+    shares: list[float] = []
+    ql.simulate(PLANT, controller(1e-3), ql.Scenario(duration=30.0), progress=shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_a_run_of_ten_million_samples_needs_the_memory_of_its_record() -> None:
+    """``record_every`` thins it: a hundred rows here, whatever the length."""
+    run = ql.simulate(PLANT, controller(), ql.Scenario(duration=10_000.0), record_every=20_000)
+    assert len(run) == 101
+    assert run.log.base is None or run.log.base.nbytes < 50_000
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ql.Scenario(duration=-1.0), "duration = -1.0: must be finite and greater than zero"),
+        (lambda: ql.Scenario(duration=10.0, rest_at=(5.0, 3.0)), r"rest_at = \(5.0, 3.0\): must increase"),
+        (lambda: ql.Scenario(duration=10.0, rest_at=(10.0,)), "must increase and lie within"),
+        (lambda: ql.Scenario(seed=-1), "seed = -1: must be a whole number"),
+        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(x0=[1.0])), r"x0 has shape \(1,\): must be a vector of 4"),
+        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(disturbances=(0, 0, 0))), "disturbances has 3 signals: the plant has 2"),
+        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(), record_every=0), "record_every = 0: must be a whole number"),
+        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(), limit=-1.0), "limit = -1.0: must be finite and greater"),
+        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(reference="sine")), "signal = 'sine': must be a number"),
+    ],
+)
+def test_a_mistake_is_named(make: object, message: str) -> None:
+    """With the argument, its value and the rule."""
+    with pytest.raises(ValueError, match=message):
+        make()  # type: ignore[operator]

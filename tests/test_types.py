@@ -1,0 +1,17 @@
+"""Status."""
+
+from quell import Status
+
+
+def test_every_flag_has_a_message_that_says_what_to_do_or_what_was_done() -> None:
+    """No status is a bare code."""
+    for flag in Status:
+        assert len(flag.message) > 20
+
+
+def test_messages_of_several_flags_add_up_and_ok_is_well() -> None:
+    """Flags are reported together; none is good news."""
+    both = Status.MEASUREMENT_HELD | Status.SATURATED
+    assert Status.MEASUREMENT_HELD.message in both.message
+    assert Status.SATURATED.message in both.message
+    assert Status.OK.message == "All is well."
