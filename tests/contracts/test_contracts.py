@@ -35,13 +35,13 @@ def law_for(plant: Any, **options: Any) -> ql.ADRC:
 
 def check_run(plant: Any, controller: ql.ADRC) -> None:
     """A run is repeatable, compiled once, and the same interpreted."""
-    first = ql.simutruth(plant, controller, SCENARIO)
+    first = ql.simulate(plant, controller, SCENARIO)
     compiled_before = len(run_block.signatures)
-    again = ql.simutruth(plant, controller, SCENARIO)
+    again = ql.simulate(plant, controller, SCENARIO)
     assert len(run_block.signatures) == compiled_before, "the second run compiled again"
     np.testing.assert_array_equal(first.log, again.log)
     assert np.all(np.isfinite(first.log))
-    plainly = ql.simutruth(plant, controller, SCENARIO, interpret=True)
+    plainly = ql.simulate(plant, controller, SCENARIO, interpret=True)
     # Fused multiply-add rounds otherwise, and a learner remembers it.
     np.testing.assert_allclose(plainly["y"], first["y"], rtol=1e-6, atol=1e-8)
 
@@ -137,7 +137,7 @@ def test_a_learner_stays_bounded_without_excitation(name: str) -> None:
     """A constant reference for 1e5 samples: nothing winds up, drifts or leaves the numbers."""
     controller = law_for(CHAIN, learner=LEARNERS[name])
     scenario = ql.Scenario(reference=0.5, duration=1000.0, noise=ql.signals.BandLimitedNoise(1e-10, 0.01))
-    run = ql.simutruth(CHAIN, controller, scenario, record_every=100)
+    run = ql.simulate(CHAIN, controller, scenario, record_every=100)
     assert not run.status
     assert np.max(np.abs(run["y"][run.t > 100.0] - 0.5)) < 1e-2
     for label, array in _named_arrays(run.final_state).items():
@@ -149,7 +149,7 @@ def test_a_learner_stays_bounded_without_excitation(name: str) -> None:
 def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
     """The loop is stable and ends where it should."""
     observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01, form=form)
-    run = ql.simutruth(CHAIN, ql.ADRC(observer, omega_c=1.5, learner=LEARNERS[name]), ql.Scenario(reference=1.0, duration=20.0))
+    run = ql.simulate(CHAIN, ql.ADRC(observer, omega_c=1.5, learner=LEARNERS[name]), ql.Scenario(reference=1.0, duration=20.0))
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
 
 
