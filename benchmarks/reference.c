@@ -1,6 +1,6 @@
 /* The two-mass loop of the paper's simulation study in plain C: plant, model-free ESO of order 4, control law, and the lag-compensated
  * Kalman learner with state and bias features. All sizes are known to the compiler, all arrays are static or on the stack: this is
- * what a careful programmer would put on a target by hand. Built by build.py with gcc -O3 -march=native; the design (Phi, L, the taps
+ * what a careful programmer would put on a target by hand. Built by speed.py with gcc -O3 -march=native; the design (Phi, L, the taps
  * of the lag filter) is handed over, so that the trajectory can be compared with quell's.
  *
  * Each row of the log holds r, y, measured y, u, w1, w2, x (4), x-hat (4), residual f, learned f, status, theta (5): 22 numbers. */
@@ -19,13 +19,13 @@ typedef struct {
     double phi[N][N], gamma_u[N], gamma_f[N], gain[N];
     double law[NX], b0;
     double pole, rise, taps[N];
-    double walk_bias, forget, noise_time, prior;
+    double walk_bias, forget, noise_time, prior, floor;
 } design_t;
 
 typedef struct {
     double x[NX], z[N], u, f_learned;
     int started;
-    double theta[P], cov[P][P], chain[M][N], filtered[M], power, filled;
+    double theta[P], cov[P][P], chain[M][N], filtered[M], power, filled, since;
 } state_t;
 
 static inline double step(const design_t *restrict d, state_t *restrict s, double r, double y)
@@ -52,11 +52,13 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
             innovation -= s->theta[i] * s->filtered[i];
             spread += sum * s->filtered[i];
         }
+        double least = d->floor * s->z[0];
+        s->power += d->forget * (innovation * innovation + least * least - s->power);
         s->filled += d->forget * (1.0 - s->filled);
-        s->power += d->forget * (innovation * innovation - s->power);
         double noise = s->power / s->filled * d->noise_time;
+        s->since += d->dt;
         spread += noise / d->dt;
-        if (spread > 0.0) {
+        if (s->since > 2.0 * d->noise_time && spread > 0.0) {
             double per = 1.0 / spread;
             for (int i = 0; i < P; i++) {
                 double share = g[i] * per;
@@ -93,7 +95,7 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
 static void rest(state_t *s)
 {
     s->started = 0;
-    s->u = s->f_learned = 0.0;
+    s->u = s->f_learned = s->since = 0.0;
     for (int i = 0; i < NX; i++) s->x[i] = 0.0;
     for (int i = 0; i < M; i++) {
         s->filtered[i] = 0.0;

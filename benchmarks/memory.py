@@ -1,0 +1,40 @@
+"""Memory of a run of 10^8 samples, above that of the process before it began.
+
+    python benchmarks/memory.py [--samples N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+
+import quell as ql
+from quell.experiments import two_mass_spring as study
+
+
+def main() -> None:
+    """Run the loop with the Kalman learner for a long time, recording every 10 000th sample."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--samples", type=float, default=1e8)
+    samples = int(parser.parse_args().samples)
+    settings, plant = study.Settings(), ql.plants.two_mass_spring()
+    controller = study.controllers(settings)[study.L]
+    ql.simulate(plant, controller, ql.Scenario(duration=1.0))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    scenario = ql.Scenario(
+        reference=ql.signals.Sinusoid(),
+        disturbances=(0.0, ql.signals.Sinusoid(omega=0.3)),
+        noise=ql.signals.BandLimitedNoise(1e-12, 0.01),
+        duration=(samples - 1) * settings.dt,
+    )
+    began = time.perf_counter()
+    run = ql.simulate(plant, controller, scenario, record_every=10_000)
+    took = time.perf_counter() - began
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"{samples:.0e} samples in {took:.1f} s ({took / samples * 1e9:.0f} ns each), {len(run)} rows recorded")
+    print(f"memory: {before:.0f} MB before, {after - before:.0f} MB more at the most (bar: 200 MB)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,222 @@
+"""How fast quell is, as ratios against references timed in the same run.
+
+    python benchmarks/speed.py [--json FILE]
+
+Times on a shared machine mean little; ratios of the best of several interleaved trials mean more. The references: the same loop in C
+(``reference.c``, which must give the same trajectory), pyadrc on the same second-order loop, python-control on the same two-mass loop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import subprocess
+import tempfile
+import time
+import timeit
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import quell as ql
+from quell.experiments import two_mass_spring as study
+
+HERE = Path(__file__).parent
+TRIALS = 15
+
+
+def best(*candidates: Callable[[], object], trials: int = TRIALS) -> list[float]:
+    """Time candidates in turn, several times; return the best time of each [s]."""
+    found = [float("inf")] * len(candidates)
+    for _ in range(trials):
+        for i, candidate in enumerate(candidates):
+            began = time.perf_counter()
+            candidate()
+            found[i] = min(found[i], time.perf_counter() - began)
+    return found
+
+
+def c_reference(folder: Path) -> Callable[[study.Settings, bool], np.ndarray]:
+    """Build ``reference.c``; return a function that runs the study's L-ESO in it and returns the log."""
+    library = folder / "reference.so"
+    command = ["gcc", "-O3", "-march=native", "-std=gnu11", "-shared", "-fPIC", "-o", str(library), str(HERE / "reference.c"), "-lm"]
+    subprocess.run(command, check=True)
+    run = ctypes.CDLL(str(library)).run
+    run.restype = ctypes.c_double
+    pointer = ctypes.c_void_p
+
+    def reference(settings: study.Settings, record: bool = True) -> np.ndarray:
+        design = study.controllers(settings)[study.L].parameters
+        kalman, plant = design.learner, ql.plants.two_mass_spring().sampled(settings.dt)
+        numbers = np.concatenate(
+            [
+                [settings.dt],
+                *(field.ravel() for field in plant),
+                *(field.ravel() for field in design.eso[:4]),
+                design.law,
+                [design.b0, kalman.lag.pole, kalman.lag.rise],
+                kalman.lag.taps,
+                [kalman.walk[-1], kalman.forget, kalman.noise_time, kalman.prior[0], kalman.floor],
+            ]
+        )
+        samples, hold = round(study.END / settings.dt) + 1, round(0.01 / settings.dt)
+        noise = study.scenario(settings).noise.seeded(settings.seed)(np.arange(samples // hold + 1) * 0.01)
+        log = np.empty((samples, 22) if record else 0)
+        run(
+            *(numbers.ctypes.data_as(pointer), ctypes.c_size_t(samples), ctypes.c_double(study.STEP_AT)),
+            *(noise.ctypes.data_as(pointer), ctypes.c_size_t(hold), log.ctypes.data_as(pointer) if record else None),
+        )
+        return log
+
+    return reference
+
+
+def against_c(rows: list[dict[str, object]]) -> None:
+    """Time the whole closed loop with the Kalman learner."""
+    settings, plant = study.Settings(), ql.plants.two_mass_spring()
+    controller, scenario = study.controllers(settings)[study.L], study.scenario(settings)
+    with tempfile.TemporaryDirectory() as folder:
+        reference = c_reference(Path(folder))
+        log, run = reference(settings), ql.simulate(plant, controller, scenario)
+        apart = max(np.max(np.abs(run["y"] - log[:, 1])), np.max(np.abs(run["u"] - log[:, 3])))
+        assert apart < 1e-6, f"quell and C differ by {apart}"
+        samples = len(run)
+        c_all, ours_all, c_bare, ours_bare = best(
+            lambda: reference(settings),
+            lambda: ql.simulate(plant, controller, scenario),
+            lambda: reference(settings, False),
+            lambda: ql.simulate(plant, controller, scenario, record_every=samples),
+        )
+    for label, c, ours in (("every sample recorded", c_all, ours_all), ("nothing recorded", c_bare, ours_bare)):
+        rows.append(
+            {
+                "what": f"closed loop, Kalman learner, {label}: quell / C",
+                "ratio": ours / c,
+                "bar": "≤ 2",
+                "times": f"{ours / samples * 1e9:.0f} / {c / samples * 1e9:.0f} ns a sample, apart by {apart:.0e}",
+            }
+        )
+
+
+def algorithm_1(rows: list[dict[str, object]]) -> None:
+    """Time Algorithm 1 with a small and a large batch."""
+    settings, plant = study.Settings(), ql.plants.two_mass_spring()
+    scenario = study.scenario(settings)
+    small, large = (study.controller(settings, learner=ql.learners.BatchGradient(1e-5 / n, n)) for n in (10, 10_000))
+    few, many = best(lambda: ql.simulate(plant, small, scenario), lambda: ql.simulate(plant, large, scenario))
+    rows.append(
+        {
+            "what": "Algorithm 1: batch of 10 000 / batch of 10",
+            "ratio": many / few,
+            "bar": "≤ 1.3",
+            "times": f"{many / 250_001 * 1e9:.0f} / {few / 250_001 * 1e9:.0f} ns a sample",
+        }
+    )
+
+
+def learners(rows: list[dict[str, object]]) -> None:
+    """Time each learner's loop against the loop without one."""
+    settings, plant = study.Settings(), ql.plants.two_mass_spring()
+    scenario = study.scenario(settings)
+    kinds = {"Algorithm 1": ql.learners.BatchGradient(1e-6, 10), "Kalman": ql.learners.Kalman(), "Kalman with u": ql.learners.Kalman(u=True)}
+    candidates = [study.controller(settings, learner=learner) for learner in (None, *kinds.values())]
+    plain, *learned = best(*(lambda c=c: ql.simulate(plant, c, scenario) for c in candidates))
+    for name, took in zip(kinds, learned, strict=True):
+        times = f"{took / 250_001 * 1e9:.0f} / {plain / 250_001 * 1e9:.0f} ns a sample"
+        rows.append({"what": f"closed loop: {name} / no learner", "ratio": took / plain, "bar": "", "times": times})
+
+
+def one_call(rows: list[dict[str, object]]) -> None:
+    """Time ``step`` from Python beside pyadrc's ``StateSpace``, after checking that both do the same."""
+    import pyadrc
+
+    observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=0.01)
+    ours = ql.ADRC(observer, omega_c=4.0, u_min=-3.0, u_max=3.0)
+    theirs = pyadrc.StateSpace(order=2, delta=0.01, b0=2.0, w_cl=4.0, k_eso=5.0, m_lim=(-3.0, 3.0))
+    y = speed = before = 0.0
+    for _ in range(2000):
+        u, other = ours.step(1.0, y), float(theirs(y, before, 1.0))
+        assert abs(u - other) < 1e-9, (u, other)
+        y, speed, before = y + 0.01 * speed, speed + 0.01 * (2.0 * u - 0.5 * speed), u
+    learned = ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, 1e-3), omega_c=1.0, learner=ql.learners.Kalman())
+    learned.prepare()
+    calls = 20_000
+    empty, plain, kalman, peer = (
+        took / calls
+        for took in best(
+            lambda: timeit.timeit(lambda: None, number=calls),
+            lambda: timeit.timeit(lambda: ours.step(1.0, 0.5), number=calls),
+            lambda: timeit.timeit(lambda: learned.step(1.0, 0.5), number=calls),
+            lambda: timeit.timeit(lambda: theirs(0.5, 0.1, 1.0), number=calls // 10),
+            trials=9,
+        )
+    )
+    peer = 10 * peer - empty
+    plain, kalman = plain - empty, kalman - empty
+    for label, took in (("order 2, no learner", plain), ("order 4, Kalman learner", kalman)):
+        rows.append({"what": f"step() from Python, {label}: µs", "ratio": took * 1e6, "bar": "≤ 1", "times": f"{took * 1e9:.0f} ns"})
+    rows.append(
+        {
+            "what": "one call, second order: pyadrc / quell",
+            "ratio": peer / plain,
+            "bar": "> 1",
+            "times": f"{peer * 1e9:.0f} / {plain * 1e9:.0f} ns, same outputs",
+        }
+    )
+
+
+def against_python_control(rows: list[dict[str, object]]) -> None:
+    """Time the two-mass loop with MF-ESO beside python-control's ``input_output_response``, after checking that both agree."""
+    import control as ct
+
+    settings, plant = study.Settings(), ql.plants.two_mass_spring()
+    law, samples = study.controllers(settings)[study.MF], 2001
+    design, sampled = law.parameters, plant.sampled(settings.dt)
+    gains = np.append(design.law, 1.0)
+
+    def update(t: float, z: np.ndarray, inputs: np.ndarray, params: object) -> np.ndarray:
+        corrected = z + design.eso.gain * (inputs[1] - z[0])
+        return design.eso.transition @ corrected + design.eso.input * output(t, z, inputs, params)
+
+    def output(t: float, z: np.ndarray, inputs: np.ndarray, params: object) -> float:
+        corrected = z + design.eso.gain * (inputs[1] - z[0])
+        return design.law[0] * inputs[0] - gains @ corrected
+
+    eso = ct.nlsys(update, output, inputs=["r", "y"], outputs=["u"], states=5, dt=settings.dt, name="eso")
+    masses = ct.ss(sampled.transition, sampled.input[:, None], sampled.output[None, :], 0.0, settings.dt, inputs=["u"], outputs=["y"], name="m")
+    loop = ct.interconnect([masses, eso], inputs=["r"], outputs=["y"])
+    t = np.arange(samples) * settings.dt
+    scenario = ql.Scenario(reference=1.0, duration=t[-1])
+    apart = np.max(np.abs(ct.input_output_response(loop, t, np.ones(samples)).outputs - ql.simulate(plant, law, scenario)["y"]))
+    assert apart < 1e-9, f"quell and python-control differ by {apart}"
+    (theirs,) = best(lambda: ct.input_output_response(loop, t, np.ones(samples)), trials=3)
+    longer = ql.Scenario(reference=1.0, duration=100.0)
+    (ours,) = best(lambda: ql.simulate(plant, law, longer))
+    ours /= 100_001
+    theirs /= samples
+    times = f"{theirs * 1e6:.0f} µs / {ours * 1e9:.0f} ns a sample, apart by {apart:.0e}"
+    rows.append({"what": "two-mass loop, MF-ESO: python-control / quell", "ratio": theirs / ours, "bar": "≥ 300", "times": times})
+
+
+def main() -> None:
+    """Run all benchmarks and print one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    arguments = parser.parse_args()
+    rows: list[dict[str, object]] = []
+    for measure in (against_c, algorithm_1, learners, one_call, against_python_control):
+        measure(rows)
+    table = Table("what", "measured", "bar", "times")
+    for row in rows:
+        table.add_row(str(row["what"]), f"{row['ratio']:.2f}", str(row["bar"]), str(row["times"]))
+    Console().print(table)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""What it costs to begin: import, help, the second run of the study. Best of several processes.
+
+    python benchmarks/startup.py
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+
+from rich.console import Console
+from rich.table import Table
+
+
+def best(command: list[str], trials: int) -> float:
+    """Return the shortest time a command took [s]."""
+    found = float("inf")
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(trials):
+            began = time.perf_counter()
+            subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
+            found = min(found, time.perf_counter() - began)
+    return found
+
+
+def main() -> None:
+    """Time all three and print one table."""
+    python = [sys.executable, "-c"]
+    bare = best([*python, "pass"], 7)
+    rows = [
+        ("import quell", best([*python, "import quell"], 7) - bare, 0.3),
+        ("quell --help", best([sys.executable, "-m", "quell.cli", "--help"], 7), 0.6),
+        ("quell reproduce two-mass, cache warm, with figures", best([sys.executable, "-m", "quell.cli", "reproduce", "two-mass"], 4), 5.0),
+    ]
+    table = Table("what", "measured [s]", "bar [s]")
+    for what, took, bar in rows:
+        table.add_row(what, f"{took:.3f}", f"≤ {bar:g}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
