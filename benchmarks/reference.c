@@ -44,7 +44,7 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
         double error = y - pred[0];
         for (int i = 0; i < N; i++) s->z[i] = pred[i] + d->gain[i] * error;
 
-        double innovation = s->z[N - 1] + s->filtered[P], spread = 0.0, g[P];
+        double target = s->z[N - 1] + s->filtered[P], innovation = target, spread = 0.0, g[P];
         for (int i = 0; i < P; i++) {
             double sum = 0.0;
             for (int j = 0; j < P; j++) sum += s->cov[i][j] * s->filtered[j];
@@ -52,8 +52,8 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
             innovation -= s->theta[i] * s->filtered[i];
             spread += sum * s->filtered[i];
         }
-        double least = d->floor * s->z[0];
-        s->power += d->forget * (innovation * innovation + least * least - s->power);
+        double doubt = 0.1 * target, least = d->floor * s->z[0];
+        s->power += d->forget * (innovation * innovation + doubt * doubt + least * least - s->power);
         s->filled += d->forget * (1.0 - s->filled);
         double noise = s->power / s->filled * d->noise_time;
         s->since += d->dt;

@@ -21,7 +21,7 @@ def overshoot(y: Vector, target: float, initial: float = 0.0) -> float:
 
 
 def settling_time(t: Vector, y: Vector, target: float, band: float = 0.002, initial: float = 0.0) -> float:
-    """Return how long after ``t[0]`` y enters for good the band of ±``band`` · |target − initial| around ``target`` [s].
+    """Return how long after ``t[0]`` y enters for good the band around ``target``, ``band`` times the move wide to either side [s].
 
     0.0 where y never leaves the band, NaN where it is outside of it at the end.
     """

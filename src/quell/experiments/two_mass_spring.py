@@ -107,7 +107,7 @@ class Result:
             "settings": asdict(self.settings) | about,
             "controllers": {name: dict(score) for name, score in self.scores.items()},
             "claims": [asdict(claim) for claim in self.claims],
-            "algorithm_1_stable_rate": {batch: gradient_range.stable_below(self.gradient_trials, batch) for batch in batches},
+            "algorithm_1_stable_up_to": {batch: gradient_range.stable_up_to(self.gradient_trials, batch) for batch in batches},
             "ended_early": {name: {"at": self.runs[name].ended, "message": text} for name, text in messages.items()},
         }
 
@@ -194,9 +194,9 @@ def score(run: Trajectory) -> dict[str, float | None]:
             "settling_time": None if math.isnan(settling) else settling,
             "control_variation": metrics.control_variation(run["u"][part]),
         }
-    if not run.status:
+    if run.ended >= END - 2 * run.dt:
         error = y - 1.0
-        forced, stepped = (slice(run.window(start, END).start, None) for start in (FORCE_WINDOW[0], STEP_AT))
+        forced, stepped = (run.window(start, END + 0.5 * run.dt) for start in (FORCE_WINDOW[0], STEP_AT))
         found |= {
             "disturbance_peak": metrics.peak(error[forced]),
             "disturbance_rms": metrics.rms(error[forced]),

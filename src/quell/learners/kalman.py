@@ -7,8 +7,9 @@ With the features φ (state, bias, u) and what the observer shows of them, φ^F 
 
 Q and R are continuous-time densities, so that the tuning does not change with dt.
 
-*Measurement noise.* ``R = τ E[ε²]``: the mean is an exponential one, and τ = N/omega_o, the observer's lag, is how long the noise of Δf̂
-is correlated. What the learner cannot explain it takes for noise, and then learns less from it.
+*Measurement noise.* ``R = τ E[ε² + (0.1 (Δf̂ + f_L^F))² + …]``: the mean is an exponential one, and τ = N/omega_o, the observer's lag, is how
+long the noise of Δf̂ is correlated. What the learner cannot explain it takes for noise, and then learns less from it; and it does not
+believe that a linear model explains more than nine tenths of what it sees, or the first instant of a motion would settle θ for good.
 
 *Random walk.* The walk of the bias is stated as a tracking bandwidth λ, with ``Q = λ² R``: the steady Kalman gain of a random walk
 in white noise is ``sqrt(Q/R)``, so a constant disturbance is learned with the time constant 1/λ, whatever its unit.
@@ -32,6 +33,8 @@ from quell.learners.lag import Lag, lag_of, lag_push
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
+# The share of f that a model is taken to leave unexplained, at least.
+_DOUBT = 0.1
 # No sensor resolves better than about 30 bits of what it measures.
 _RESOLUTION = 1e-9
 # In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
@@ -87,7 +90,8 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before: 
     theta, covariance, filtered, gain = memory.theta, memory.covariance, memory.filtered, memory.gain
     size = theta.size
     # Plain loops: at this size a call of BLAS costs more than the arithmetic.
-    innovation = seen[seen.size - 1] + filtered[size]
+    target = seen[seen.size - 1] + filtered[size]
+    innovation = target
     spread = 0.0
     for i in range(size):
         innovation -= theta[i] * filtered[i]
@@ -96,7 +100,7 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before: 
             total += covariance[i, j] * filtered[j]
         gain[i] = total
         spread += total * filtered[i]
-    noise = _noise_density(learner, memory.moment, innovation, learner.floor * seen[0])
+    noise = _noise_density(learner, memory.moment, innovation, _DOUBT * target, learner.floor * seen[0])
     memory.moment[2] += learner.dt
     spread += noise / learner.dt
     if memory.moment[2] > _WATCH * learner.noise_time and spread > 0.0:
@@ -112,9 +116,9 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before: 
 
 
 @kernel
-def _noise_density(learner: KalmanDesign, moment: Vector, innovation: float, least: float) -> float:
+def _noise_density(learner: KalmanDesign, moment: Vector, innovation: float, doubt: float, least: float) -> float:
     """Return R; the first values of the mean count fully, so that it starts where the data is."""
-    moment[0] += learner.forget * (innovation * innovation + least * least - moment[0])
+    moment[0] += learner.forget * (innovation * innovation + doubt * doubt + least * least - moment[0])
     moment[1] += learner.forget * (1.0 - moment[1])
     return moment[0] / moment[1] * learner.noise_time
 

@@ -1,0 +1,59 @@
+"""Why Algorithm 1 diverges: the same algorithm with and without the control signal among its features.
+
+    python benchmarks/algorithm_1.py
+
+The two-mass scenario at dt = 10 ms, drawn out to 1000 s, with a batch of one, in plain numpy: an implementation apart from quell's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import quell as ql
+from quell.experiments import two_mass_spring as study
+
+DT, HORIZON = 0.01, 1000.0
+
+
+def run(rate: float, with_u: bool) -> tuple[float, np.ndarray, float]:
+    """Return when the run ended, θ shortly before (at 99 % of it), and the effective gain (b0 + θ_u)/b0 then."""
+    settings = study.Settings(dt=DT)
+    observer, scenario = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT).model, study.scenario(settings)
+    plant, law = ql.plants.two_mass_spring().sampled(DT), study.controllers(settings)[study.MF].parameters.law
+    t = np.arange(round(HORIZON / DT)) * DT
+    r, w2, noise = scenario.reference(t), scenario.disturbances[1](t), scenario.noise(t)
+    x, z, theta, u, learned = np.zeros(4), np.zeros(5), np.zeros(6), 0.0, 0.0
+    mask = np.array([1.0, 1.0, 1.0, 1.0, float(with_u), 1.0])
+    history = []
+    for k in range(t.size):
+        if k == round(study.STEP_AT / DT):
+            x[:], z[:], u, learned = 0.0, 0.0, 0.0, 0.0
+        y = x[1]
+        if not abs(y) < 1e6:
+            break
+        predicted = observer.transition @ z + observer.input * u + observer.feed * learned
+        z = predicted + observer.gain * (y + noise[k] - predicted[0])
+        feature = np.array([*z[:4], u, 1.0]) * mask
+        theta = theta + rate * DT * z[4] * feature
+        learned = theta @ feature
+        u = law[0] * (r[k] - z[0]) - law[1:] @ z[1:4] - learned - z[4]
+        x = plant.transition @ x + plant.input * u + plant.disturbance[:, 1] * w2[k]
+        history.append(theta)
+    return t[k], history[int(0.99 * len(history)) - 1], 1.0 + history[int(0.99 * len(history)) - 1][4]
+
+
+def main() -> None:
+    """Print both cases for several rates."""
+    table = Table("rate · batch / dt [1/s]", "features", "lasts [s]", "θ at 99 % of that", "(b0 + θ_u)/b0")
+    for rate in (0.01, 0.03, 0.1, 0.3):
+        for with_u in (True, False):
+            ended, theta, gain = run(rate, with_u)
+            lasts = f"{ended:.0f}" if ended < HORIZON - 1.0 else f"all {HORIZON:.0f}"
+            table.add_row(f"{rate:g}", "x̂, u, 1" if with_u else "x̂, 1", lasts, np.array2string(theta, precision=2), f"{gain:.2f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
