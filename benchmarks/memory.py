@@ -1,6 +1,6 @@
 """Memory of a run of 10^8 samples, above that of the process before it began.
 
-    python benchmarks/memory.py [--samples N]
+python benchmarks/memory.py [--samples N]
 """
 
 from __future__ import annotations

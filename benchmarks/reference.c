@@ -19,13 +19,13 @@ typedef struct {
     double phi[N][N], gamma_u[N], gamma_f[N], gain[N];
     double law[NX], b0;
     double pole, rise, taps[N];
-    double walk_bias, forget, noise_time, prior, floor;
+    double scale[NX], threshold[P], walk_bias, forget, lag_time, prior, fastest;
 } design_t;
 
 typedef struct {
     double x[NX], z[N], u, f_learned;
     int started;
-    double theta[P], cov[P][P], chain[M][N], filtered[M], power, filled, since;
+    double theta[P], cov[P][P], chain[M][N], filtered[M], mean[NX], variance[NX], noise, unexplained, filled, since;
 } state_t;
 
 static inline double step(const design_t *restrict d, state_t *restrict s, double r, double y)
@@ -44,33 +44,45 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
         double error = y - pred[0];
         for (int i = 0; i < N; i++) s->z[i] = pred[i] + d->gain[i] * error;
 
-        double target = s->z[N - 1] + s->filtered[P], innovation = target, spread = 0.0, g[P];
-        for (int i = 0; i < P; i++) {
-            double sum = 0.0;
-            for (int j = 0; j < P; j++) sum += s->cov[i][j] * s->filtered[j];
-            g[i] = sum;
-            innovation -= s->theta[i] * s->filtered[i];
-            spread += sum * s->filtered[i];
-        }
-        double doubt = 0.1 * target, least = d->floor * s->z[0];
-        s->power += d->forget * (innovation * innovation + doubt * doubt + least * least - s->power);
+        double target = s->z[N - 1] + s->filtered[P], innovation = target, deviation = y - s->z[0], rounding = 1e-8 * y;
+        for (int i = 0; i < P; i++) innovation -= s->theta[i] * s->filtered[i];
+        double doubt = 0.1 * target;
+        s->noise += d->forget * (deviation * deviation + rounding * rounding - s->noise);
+        s->unexplained += d->forget * (innovation * innovation + doubt * doubt - s->unexplained);
         s->filled += d->forget * (1.0 - s->filled);
-        double noise = s->power / s->filled * d->noise_time;
         s->since += d->dt;
-        spread += noise / d->dt;
-        if (s->since > 2.0 * d->noise_time && spread > 0.0) {
-            double per = 1.0 / spread;
-            for (int i = 0; i < P; i++) {
-                double share = g[i] * per;
-                s->theta[i] += share * innovation;
-                for (int j = 0; j < P; j++) s->cov[i][j] -= share * g[j];
+        double noise = s->noise / s->filled, root = sqrt(d->lag_time * s->unexplained / s->filled);
+        if (root != 0.0) {
+            double weight = 1.0 / root, taught[P], g[P], spread = 0.0;
+            for (int i = 0; i < NX; i++) {
+                double away = s->filtered[i] - s->mean[i];
+                s->mean[i] += d->forget * away;
+                s->variance[i] += d->forget * (away * away - s->variance[i]);
+                taught[i] = s->variance[i] > d->threshold[i] * noise ? (s->filtered[i] - s->mean[i]) * weight : 0.0;
             }
-            s->cov[P - 1][P - 1] += d->walk_bias * noise * d->dt;
+            taught[P - 1] = s->filtered[P - 1];
+            if (s->since > 2.0 * d->lag_time) {
+                for (int i = 0; i < P; i++) {
+                    double sum = 0.0;
+                    for (int j = 0; j < P; j++) sum += s->cov[i][j] * taught[j];
+                    g[i] = sum;
+                    spread += sum * taught[i];
+                }
+                double per = 1.0 / fmax(spread + 1.0 / d->dt, spread / (d->fastest * d->dt));
+                for (int i = 0; i < P; i++) {
+                    double share = g[i] * per;
+                    double change = share * innovation * (i < NX ? weight : 1.0);
+                    s->theta[i] += change;
+                    if (i < NX) s->theta[P - 1] -= change * s->mean[i];
+                    for (int j = 0; j < P; j++) s->cov[i][j] -= share * g[j];
+                }
+                s->cov[P - 1][P - 1] += d->walk_bias * d->dt;
+            }
         }
     }
     double f = s->theta[P - 1], u0 = d->law[0] * r;
     for (int i = 0; i < NX; i++) {
-        f += s->theta[i] * s->z[i];
+        f += s->theta[i] * d->scale[i] * s->z[i];
         u0 -= d->law[i] * s->z[i];
     }
     double u = (u0 - f - s->z[N - 1]) / d->b0;
@@ -78,7 +90,7 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
     s->f_learned = f;
 
     for (int i = 0; i < M; i++) {
-        double input = i < NX ? s->z[i] : i < P ? 1.0 : f;
+        double input = i < NX ? d->scale[i] * s->z[i] : i < P ? 1.0 : f;
         double carry = d->rise * input, sum = 0.0;
         for (int j = 0; j < N; j++) {
             double old = s->chain[i][j];
@@ -126,7 +138,7 @@ double run(const design_t *design, size_t samples, double rest_at, const double 
             row[0] = r, row[1] = y, row[2] = measured, row[3] = u, row[4] = 0.0, row[5] = w2;
             for (int i = 0; i < NX; i++) row[6 + i] = s.x[i], row[10 + i] = s.z[i];
             row[14] = s.z[N - 1], row[15] = s.f_learned, row[16] = 0.0;
-            for (int i = 0; i < P; i++) row[17 + i] = s.theta[i];
+            for (int i = 0; i < P; i++) row[17 + i] = s.theta[i] * (i < NX ? d.scale[i] : 1.0);
         }
         double next[NX];
         for (int i = 0; i < NX; i++) {

@@ -60,7 +60,9 @@ def c_reference(folder: Path) -> Callable[[study.Settings, bool], np.ndarray]:
                 design.law,
                 [design.b0, kalman.lag.pole, kalman.lag.rise],
                 kalman.lag.taps,
-                [kalman.walk[-1], kalman.forget, kalman.noise_time, kalman.prior[0], kalman.floor],
+                kalman.scale[:4],
+                kalman.threshold,
+                [kalman.walk[-1], kalman.forget, kalman.lag_time, kalman.prior[0], kalman.fastest],
             ]
         )
         samples, hold = round(study.END / settings.dt) + 1, round(0.01 / settings.dt)
@@ -122,7 +124,11 @@ def learners(rows: list[dict[str, object]]) -> None:
     """Time each learner's loop against the loop without one."""
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
     scenario = study.scenario(settings)
-    kinds = {"Algorithm 1": ql.learners.BatchGradient(1e-6, 10), "Kalman": ql.learners.Kalman(), "Kalman with u": ql.learners.Kalman(u=True)}
+    kinds = {
+        "Algorithm 1": ql.learners.BatchGradient(1e-6, 10),
+        "Kalman": ql.learners.Kalman(),
+        "Kalman with u": ql.learners.Kalman(u=True),
+    }
     candidates = [study.controller(settings, learner=learner) for learner in (None, *kinds.values())]
     plain, *learned = best(*(lambda c=c: ql.simulate(plant, c, scenario) for c in candidates))
     for name, took in zip(kinds, learned, strict=True):
@@ -187,7 +193,8 @@ def against_python_control(rows: list[dict[str, object]]) -> None:
         return design.law[0] * inputs[0] - gains @ corrected
 
     eso = ct.nlsys(update, output, inputs=["r", "y"], outputs=["u"], states=5, dt=settings.dt, name="eso")
-    masses = ct.ss(sampled.transition, sampled.input[:, None], sampled.output[None, :], 0.0, settings.dt, inputs=["u"], outputs=["y"], name="m")
+    matrices = (sampled.transition, sampled.input[:, None], sampled.output[None, :], 0.0)
+    masses = ct.ss(*matrices, settings.dt, inputs=["u"], outputs=["y"], name="masses")
     loop = ct.interconnect([masses, eso], inputs=["r"], outputs=["y"])
     t = np.arange(samples) * settings.dt
     scenario = ql.Scenario(reference=1.0, duration=t[-1])

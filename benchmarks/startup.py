@@ -1,6 +1,6 @@
 """What it costs to begin: import, help, the second run of the study. Best of several processes.
 
-    python benchmarks/startup.py
+python benchmarks/startup.py
 """
 
 from __future__ import annotations

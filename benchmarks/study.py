@@ -1,6 +1,6 @@
 """The figures of the two-mass study over ten seeds and four sample times, as ranges.
 
-    python benchmarks/study.py
+python benchmarks/study.py
 """
 
 from __future__ import annotations

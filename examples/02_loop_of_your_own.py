@@ -12,7 +12,7 @@ DT = 1e-3
 controller = ql.ADRC(
     ql.ESO.model_free(order=2, b0=50.0, omega_o=80.0, dt=DT),
     omega_c=12.0,
-    learner=ql.learners.Kalman(frequency=12.0),
+    learner=ql.learners.Kalman(),
     u_min=-1.0,
     u_max=1.0,
     rate_limit=100.0,

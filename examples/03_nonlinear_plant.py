@@ -16,7 +16,7 @@ scenario = ql.Scenario(
     disturbances=(ql.signals.Sinusoid(amplitude=3.0, omega=1.5, start=25.0),),
     duration=60.0,
 )
-for learner in (None, ql.learners.Kalman(frequency=5.0)):
+for learner in (None, ql.learners.Kalman()):
     controller = ql.ADRC(ql.ESO.model_free(order=2, b0=8.0, omega_o=25.0, dt=2e-3), omega_c=8.0, learner=learner)
     run = ql.simulate(plant, controller, scenario)
     loaded = run.metrics(start=30.0)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -122,10 +124,34 @@ def test_a_bad_reference_is_held_too() -> None:
     assert one.estimate.status == ql.Status.REFERENCE_HELD
 
 
-def test_the_observer_waits_for_its_first_good_measurement() -> None:
-    """A sensor that wakes up late does not make a jump from zero."""
+def test_without_a_reference_the_plant_stays_where_it_is() -> None:
+    """Until the first good one comes."""
     controller = ql.ADRC(OBSERVER, omega_c=3.0)
-    assert controller.step(0.0, math.nan) == 0.0
+    assert controller.step(math.nan, 5.0) == 0.0
+    assert controller.estimate.status == ql.Status.REFERENCE_HELD
+    assert controller.step(6.0, 5.0) > 0.0
+
+
+@pytest.mark.parametrize("used", [False, True])
+def test_a_controller_can_be_copied_and_sent_to_another_process(used: bool) -> None:
+    """With its running state, which is then its own."""
+    controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman())
+    if used:
+        for k in range(50):
+            controller.step(1.0, 0.01 * k)
+    for other in (copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))):
+        mine = controller.state
+        assert other.step(1.0, 0.7) == ql.ADRC.step(copy.deepcopy(controller), 1.0, 0.7)
+        for name, array in controller.state.items():
+            np.testing.assert_array_equal(array, mine[name])
+        other.reset()
+        assert other.estimate.u == 0.0
+
+
+def test_the_observer_waits_for_its_first_good_measurement() -> None:
+    """A sensor that wakes up late does not make a jump from zero, whatever the reference."""
+    controller = ql.ADRC(OBSERVER, omega_c=3.0, u_min=-5.0, u_max=5.0)
+    assert controller.step(100.0, math.nan) == 0.0
     controller.step(7.0, 7.0)
     np.testing.assert_allclose(controller.estimate.x, [7.0, 0.0])
 
@@ -192,6 +218,12 @@ def test_the_estimate_says_what_is_known() -> None:
         (lambda: ql.ADRC(OBSERVER, omega_c=1.0, u_min=math.nan), "u_min = nan, u_max = inf: u_min must be less than u_max"),
         (lambda: ql.ADRC(OBSERVER, omega_c=1.0, rate_limit=0.0), "rate_limit = 0.0: must be finite and greater than zero"),
         (lambda: ql.ADRC("eso", omega_c=1.0), "observer = 'eso': must be an ESO"),
+        (lambda: ql.ADRC(OBSERVER, omega_c=1.0, learner=ql.learners.Kalman), "learner = .*: must be a learner, for example"),
+        (lambda: ql.ADRC(OBSERVER, omega_c=1e300), "omega_c = 1e[+]300 rad/s: its power 2 must be a number"),
+        (
+            lambda: setattr(ql.ADRC(OBSERVER, omega_c=1.0), "state", ql.ADRC(OBSERVER, omega_c=1.0).state | {"z": "x"}),
+            r"state\['z'\]: must be an array of numbers",
+        ),
         (lambda: setattr(ql.ADRC(OBSERVER, omega_c=1.0), "state", {}), r"state has \[\]: must have"),
         (
             lambda: setattr(ql.ADRC(OBSERVER, omega_c=1.0), "state", ql.ADRC(OBSERVER, omega_c=1.0).state | {"z": np.zeros(9)}),

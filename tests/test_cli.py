@@ -67,6 +67,16 @@ def test_a_mistake_gives_one_line_and_exit_code_two(arguments: tuple[str, ...], 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_old_result_outlives_a_run_that_fails(tmp_path: Path) -> None:
+    """What can't be written is said before the work is done, and nothing is overwritten until it is."""
+    (tmp_path / "keep.json").write_text("old")
+    (tmp_path / "file").write_text("")
+    shown = quell("reproduce", "two-mass", "--json", "keep.json", "--figures", "file", cwd=tmp_path)
+    assert shown.returncode == 2
+    assert "figures = 'file': must be a folder that can be made" in shown.stderr
+    assert (tmp_path / "keep.json").read_text() == "old"
+
+
 def test_importing_quell_imports_nothing_heavy() -> None:
     """Numba, scipy, xarray, matplotlib and python-control come when they are used."""
     code = "import sys, quell; print([m for m in ('numba', 'scipy', 'xarray', 'matplotlib', 'control', 'numpy') if m in sys.modules])"

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,6 +90,7 @@ def test_the_cache_lies_where_numba_is_told_and_is_named_after_the_sources(monke
     """``NUMBA_CACHE_DIR`` is respected; the name holds a hash, so that an edit starts a new cache."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     path = dispatch.cache_path.__wrapped__()
+    assert path is not None
     assert path.parent == tmp_path
     assert path.name == dispatch.cache_path().name
 
@@ -97,3 +102,52 @@ def test_only_the_newest_caches_of_other_versions_are_kept(tmp_path: Any) -> Non
     dispatch._forget_old_caches(tmp_path, tmp_path / "quell-0")
     assert (tmp_path / "quell-0").is_dir()
     assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_code_of_ones_own_is_not_taken_from_the_disk_cache(tmp_path: Path) -> None:
+    """A plant in the user's module is compiled anew in each process: the cache would not notice that it was edited."""
+    module = """
+from typing import NamedTuple
+import numpy as np
+import quell as ql
+from quell.plants.base import advance, measure
+
+class Decay(NamedTuple):
+    rate: float
+
+@measure.register(Decay)
+def _measure(plant, x):
+    return x[0]
+
+@advance.register(Decay)
+def _advance(plant, x, scratch, t, u, w):
+    x[0] += 0.01 * (u - RATE * x[0])
+
+class Mine:
+    name, order, disturbances, compiled = "mine", 1, 1, True
+    def sampled(self, dt, interpret=False):
+        return Decay(1.0)
+"""
+    script = """
+import quell as ql, mine
+controller = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=0.01), omega_c=1.0)
+runs = [ql.simulate(mine.Mine(), controller, ql.Scenario(1.0, 1.0), interpret=i) for i in (False, True)]
+print(abs(runs[0]["y"] - runs[1]["y"]).max() < 1e-9, runs[0]["y"][-1])
+"""
+    shown = []
+    for rate in ("1.0", "30.0"):
+        (tmp_path / "mine.py").write_text(module.replace("RATE", rate))
+        environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [sys.executable, "-c", script]
+        shown.append(subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout.split())
+    assert [agree for agree, _ in shown] == ["True", "True"]
+    assert shown[0][1] != shown[1][1]
+
+
+def test_without_a_place_for_a_cache_everything_works_all_the_same(tmp_path: Path) -> None:
+    """On a read-only machine the code is compiled in each process."""
+    (tmp_path / "file").write_text("")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "file" / "cache")}
+    script = "import quell as ql; c = ql.ADRC(ql.ESO.model_free(1, 1.0, 10.0, 0.01), 1.0); print(c.step(1.0, 0.0))"
+    shown = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == "1.0"

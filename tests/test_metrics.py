@@ -71,6 +71,7 @@ def test_variation_of_a_sinusoid_is_four_amplitudes_a_period() -> None:
 @pytest.mark.parametrize(
     ("measure", "message"),
     [
+        (lambda: metrics.settling_time(T[:3], np.array([0.0, 1.0, np.nan]), 1.0), "a value that is not finite at sample 2"),
         (lambda: metrics.rms(np.zeros(0)), "must be a vector of at least one sample"),
         (lambda: metrics.iae(T, T[1:]), "t has 400001 samples, the record 400000"),
         (lambda: metrics.overshoot(T, 1.0, initial=1.0), "there is no move to overshoot"),

@@ -216,6 +216,8 @@ def test_a_mistake_in_a_model_free_design_is_named(change: dict[str, object], me
         (control.ss([[-1.0]], [[1.0]], [[1.0]], [[1.0]]), "D = .*: must be zero"),
         (control.ss(np.eye(2), np.eye(2), np.eye(2), 0.0), r"B has shape \(2, 2\): must be a matrix of shape \(2, 1\)"),
         (([1.0], 0.0), "b = 0.0: must not be zero"),
+        (([-1e12], 1.0), "dt = 0.001 s: too long .* for the plant's fastest pole of 1e[+]12 rad/s"),
+        (([(math.pi / 1e-3) ** 2, 0.0], 1.0), "sampled, the model cannot be observed"),
         ("two-mass", "plant = 'two-mass': must be a linear plant"),
         ((np.zeros(9), 1.0), "order of the plant = 9: must be a whole number from 1 to 8"),
     ],

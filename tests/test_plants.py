@@ -117,6 +117,41 @@ def test_a_function_numba_cannot_compile_runs_as_python_and_says_so() -> None:
     assert run["y"][-1] == pytest.approx(1.0, abs=0.01)
 
 
+def test_a_division_by_zero_in_compiled_code_ends_the_run() -> None:
+    """It gives inf, as in numpy, and the run says that it diverged; nothing is swallowed."""
+    plant = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - 1.0 / (x[0] - 0.5)), order=2)
+    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=4.0)
+    run = ql.simulate(plant, controller, ql.Scenario(0.5, 5.0, x0=[0.5, 0.0]))
+    assert run.diverged
+    assert run.ended == 0.01
+
+
+def test_interpreting_runs_the_users_function_as_python() -> None:
+    """So that a debugger stops in it."""
+    seen = []
+
+    def rate(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
+        seen.append(type(x))
+        return x[1], u - x[0]
+
+    plant = ql.plants.NonlinearPlant(rate, order=2)
+    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=4.0)
+    seen.clear()
+    ql.simulate(plant, controller, ql.Scenario(1.0, 0.1), interpret=True)
+    assert len(seen) == 4 * 11
+
+
+def test_methods_and_callable_objects_are_served_too() -> None:
+    """As Python."""
+
+    class Spring:
+        def rate(self, t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
+            return x[1], u - 4.0 * x[0]
+
+    with pytest.warns(UserWarning, match="runs as Python"):
+        assert not ql.plants.NonlinearPlant(Spring().rate, order=2).compiled
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -131,6 +166,9 @@ def test_a_function_numba_cannot_compile_runs_as_python_and_says_so() -> None:
         (lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=[1.0]), r"output has shape \(1,\)"),
         (lambda: ql.plants.NonlinearPlant(pendulum, order=2, substeps=0), "substeps = 0: must be a whole number of at least 1"),
         (lambda: ql.plants.NonlinearPlant(3.0, order=2), r"f = 3.0: must be a function"),
+        (lambda: ql.plants.NonlinearPlant(lambda t, x: x, order=2), r"f\(0.0, zeros, 0.0, zeros\) fails with TypeError"),
+        (lambda: ql.plants.NonlinearPlant(lambda t, x, u, w: (x[5], u), order=2), "fails with IndexError"),
+        (lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=lambda x: x), r"output\(x\) must return one number"),
     ],
 )
 def test_a_mistake_is_named(make: object, message: str) -> None:

@@ -14,6 +14,14 @@ from quell import signals as s
 T = np.linspace(0.0, 12.0, 1201)
 
 
+class Short(s.Signal):
+    """A signal of the wrong shape."""
+
+    def evaluate(self, t: np.ndarray) -> np.ndarray:
+        """Return one value for all times."""
+        return np.zeros(1)
+
+
 def test_a_step_begins_at_its_sample() -> None:
     """An edge on a sample belongs to it, even where k·dt falls short of it by rounding."""
     t = np.arange(5) * 0.1
@@ -61,6 +69,7 @@ def test_signals_add_subtract_and_scale() -> None:
     both = 2.0 * s.Sinusoid() - s.Step(at=3.0) + 1.0
     np.testing.assert_allclose(both(T), 2.0 * np.sin(T) - (T >= 3.0 - 1e-9) + 1.0)
     np.testing.assert_allclose((-s.Sinusoid())(T), -np.sin(T))
+    np.testing.assert_allclose((1.0 - s.Sinusoid() / 2.0)(T), 1.0 - 0.5 * np.sin(T))
 
 
 def test_pieces_switch_at_their_times() -> None:
@@ -143,6 +152,10 @@ def test_every_kind_is_made_by_its_name() -> None:
         (lambda: s.BandLimitedNoise(seed=-1), "seed = -1: must be a whole number of at least 0"),
         (lambda: s.Sinusoid() * np.inf, "factor = inf: must be a finite number"),
         (lambda: s.Signal()(0.0), "must define evaluate"),
+        (lambda: s.make("samples"), "signal 'samples': missing 2 required"),
+        (lambda: s.Step().until(3.0, then="ramp"), "then = 'ramp': must be a number"),
+        (lambda: s.BandLimitedNoise(1e-12, 1e-13)(1000.0), "sample_time = 1e-13: too short"),
+        (lambda: Short()(T), r"Short.evaluate returned shape \(1,\) for times of shape \(1201,\)"),
     ],
 )
 def test_a_mistake_is_named_with_its_value_and_the_rule(make: object, message: str) -> None:

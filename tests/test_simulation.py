@@ -56,8 +56,9 @@ def test_a_run_that_diverges_ends_early_and_keeps_what_it_has() -> None:
     """The status says that it did, when, and what to do; nothing recorded is NaN."""
     wrong = ql.ADRC(ql.ESO.model_free(order=4, b0=-1.0, omega_o=10.0, dt=5e-3), omega_c=1.0)
     run = ql.simulate(PLANT, wrong, ql.Scenario(reference=1.0, duration=200.0))
-    assert run.status == ql.Status.DIVERGED
-    assert "b0" in run.status.message
+    assert run.diverged
+    assert "beyond limit = 1e+06" in run.message
+    assert "b0" in run.message
     assert 0.0 < run.ended < 200.0
     assert len(run) == round(run.ended / 5e-3)
     assert np.all(np.isfinite(run.log))
@@ -98,6 +99,31 @@ def test_a_run_of_ten_million_samples_needs_the_memory_of_its_record() -> None:
     assert run.log.base is None or run.log.base.nbytes < 50_000
 
 
+def test_the_limit_follows_the_size_of_what_is_asked_for() -> None:
+    """A loop in encoder counts is not taken for one that diverges."""
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
+    law = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=4.0)
+    run = ql.simulate(plant, law, ql.Scenario(reference=2e6, duration=10.0))
+    assert not run.diverged
+    assert run["y"][-1] == pytest.approx(2e6)
+    assert ql.simulate(plant, law, ql.Scenario(reference=2e6, duration=10.0), limit=1e6).diverged
+
+
+def test_the_status_of_a_run_has_what_any_step_reported() -> None:
+    """Also of samples that were not recorded."""
+    law = controller(u_min=-0.1, u_max=0.1)
+    run = ql.simulate(PLANT, law, ql.Scenario(reference=1.0, duration=2.0), record_every=399)
+    assert run.status == ql.Status.SATURATED
+
+
+def test_the_last_sample_is_there_whatever_the_sample_time() -> None:
+    """Rounding of duration / dt does not lose it."""
+    plant = ql.plants.LinearPlant([[0.0]], [1.0], [1.0])
+    for dt in (0.1, 0.3, 1e-3 / 3.0, 7e-4):
+        law = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=1.0, dt=dt), omega_c=1.0)
+        assert len(ql.simulate(plant, law, ql.Scenario(1.0, duration=3000 * dt), record_every=100)) == 31
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -109,7 +135,10 @@ def test_a_run_of_ten_million_samples_needs_the_memory_of_its_record() -> None:
         (lambda: ql.simulate(PLANT, controller(), ql.Scenario(disturbances=(0, 0, 0))), "disturbances has 3 signals: the plant has 2"),
         (lambda: ql.simulate(PLANT, controller(), ql.Scenario(), record_every=0), "record_every = 0: must be a whole number"),
         (lambda: ql.simulate(PLANT, controller(), ql.Scenario(), limit=-1.0), "limit = -1.0: must be finite and greater"),
-        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(reference="sine")), "signal = 'sine': must be a number"),
+        (lambda: ql.Scenario(reference="sine"), "reference = 'sine': must be a number"),
+        (lambda: ql.Scenario(disturbances=1.0), "disturbances = 1.0: must be a sequence of signals or numbers"),
+        (lambda: ql.Scenario(disturbances=(0.0, "wind")), r"disturbances\[1\] = 'wind': must be a number"),
+        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(duration=1e15)), "duration = 1000000000000000.0 s with dt = 0.005 s"),
     ],
 )
 def test_a_mistake_is_named(make: object, message: str) -> None:

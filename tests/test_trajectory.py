@@ -52,8 +52,13 @@ def test_metrics_judge_the_window_as_a_step(run: ql.Trajectory) -> None:
     assert found["peak_error"] == 1.0
     assert 2.0 < found["rise_time"] < 8.0
     assert run.metrics()["rms"] < 1.0
+    assert "overshoot" not in run.metrics(15.0)
+    assert "overshoot" in run.metrics(0.0, 10.0, target=1.0)
+    assert run.metrics(0.0, np.inf)["rms"] == run.metrics()["rms"]
     with pytest.raises(ValueError, match="start = 30.0, stop = None: the record ends at 20 s"):
         run.metrics(30.0)
+    with pytest.raises(ValueError, match="time = nan: must be a number"):
+        run.metrics(np.nan)
 
 
 def test_the_record_becomes_a_labelled_dataset(run: ql.Trajectory) -> None:
@@ -77,6 +82,18 @@ def test_a_saved_record_is_loaded_back_whole(run: ql.Trajectory, tmp_path: Path)
         np.testing.assert_array_equal(again[name], run[name])
     np.testing.assert_array_equal(again.t, run.t)
     assert (again.status, again.ended, again.plant, again.features) == (run.status, run.ended, run.plant, run.features)
+
+
+def test_an_empty_record_is_saved_too(tmp_path: Path) -> None:
+    """That of a run which diverged at once."""
+    controller = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=5e-3), omega_c=1.0)
+    nothing = ql.simulate(ql.plants.two_mass_spring(), controller, ql.Scenario(x0=[0.0, 9.0, 0.0, 0.0]), limit=1.0)
+    assert len(nothing) == 0
+    nothing.save(tmp_path / "nothing.nc")
+    again = ql.Trajectory.load(tmp_path / "nothing.nc")
+    assert len(again) == 0
+    assert again.diverged
+    assert again["x"].shape == (0, 4)
 
 
 def test_a_file_that_is_no_record_is_refused(tmp_path: Path) -> None:

@@ -53,6 +53,13 @@ def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
     return int(value)
 
 
+def flag(name: str, value: Any) -> bool:
+    """Return ``value`` if it is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} = {value!r}: must be True or False")
+    return bool(value)
+
+
 def interval(low_name: str, low: Any, high_name: str, high: Any) -> tuple[float, float]:
     """Return two limits in order; either may be infinite, neither NaN."""
     low_value, high_value = _number(low_name, low), _number(high_name, high)

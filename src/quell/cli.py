@@ -64,6 +64,12 @@ def main() -> None:
         message = " ".join(str(error).split())
         print(f"quell: {message}", file=sys.stderr)
         sys.exit(2)
+    except BrokenPipeError:  # whoever was reading has read enough
+        sys.stdout = None
+        sys.exit(0)
+    except (OSError, MemoryError) as error:
+        print(f"quell: {type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         print("quell: interrupted", file=sys.stderr)
         sys.exit(130)

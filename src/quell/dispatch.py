@@ -21,8 +21,8 @@ import functools
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
@@ -44,7 +44,7 @@ class Generic(Protocol[P, R_co]):
     implementations: dict[type, Callable[..., Any]]
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co:
-        """Call the implementation for the type of the first argument."""
+        """Call the implementation for the type of the first argument; all arguments by position."""
 
     def register(self, cls: type) -> Callable[[F], F]:
         """Return a decorator that makes a function the implementation for ``cls``."""
@@ -55,6 +55,8 @@ class Generic(Protocol[P, R_co]):
 OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy", "forceinline": True}
 
 _CACHES_KEPT = 4
+# Types with implementations from outside of this package.
+_FOREIGN: set[type] = set()
 
 
 def kernel(function: F) -> F:
@@ -90,6 +92,8 @@ def generic(declaration: Callable[P, R]) -> Generic[P, R]:
     def register(cls: type) -> Callable[[F], F]:
         def add(implementation: F) -> F:
             table[cls] = implementation
+            if not implementation.__module__.startswith("quell."):
+                _FOREIGN.add(cls)
             return implementation
 
         return add
@@ -106,14 +110,47 @@ def compiled(function: F) -> F:
     Reference counting is switched off: it would cost more than the arithmetic, and without it Numba refuses to compile whatever
     allocates memory, so that compiled kernels provably do not.
     """
-    with _cache_directory():
-        return numba.njit(function, cache=True, nogil=True, _nrt=False, **OPTIONS)
+    return _dispatcher(function, nogil=True, _nrt=False)
 
 
 def compiled_call(function: F) -> F:
     """Compile an entry point for calls one at a time from Python, on a handle (``structref``): counts references, keeps the interpreter."""
-    with _cache_directory():
-        return numba.njit(function, cache=True, **OPTIONS)
+    return _dispatcher(function)
+
+
+def for_types(entry: Any, *arguments: Any) -> Any:
+    """Return the dispatcher of an entry point to call with ``arguments``.
+
+    Where one of their types, at any depth, has implementations outside of this package, it is one without disk cache: the cache would not
+    notice that those have changed.
+    """
+    return entry.uncached if _FOREIGN and any(_is_foreign(argument) for argument in arguments) else entry
+
+
+def compilations(entry: Any) -> int:
+    """Return how many times an entry point was compiled in this process, rather than loaded from the disk cache."""
+    return int(sum(entry.stats.cache_misses.values()))
+
+
+def _is_foreign(value: Any) -> bool:
+    return type(value) in _FOREIGN or (isinstance(value, tuple) and any(map(_is_foreign, value)))
+
+
+def _dispatcher(function: Any, **options: Any) -> Any:
+    """Return a dispatcher with disk cache, where that can be had; ``uncached`` is its twin without."""
+    options |= OPTIONS
+    uncached = numba.njit(function, **options)
+    if cache_path() is None:
+        uncached.uncached = uncached
+        return uncached
+    before = numba_config.CACHE_DIR
+    numba_config.CACHE_DIR = str(cache_path())
+    try:
+        cached = numba.njit(function, cache=True, **options)
+    finally:
+        numba_config.CACHE_DIR = before
+    cached.uncached = uncached
+    return cached
 
 
 def interpreted(function: Any) -> Any:
@@ -122,8 +159,8 @@ def interpreted(function: Any) -> Any:
 
 
 @functools.cache
-def cache_path() -> Path:
-    """Return the directory of this version's compiled code, made if need be.
+def cache_path() -> Path | None:
+    """Return the directory of this version's compiled code, made if need be; None where there is no place to write to.
 
     It lies under ``NUMBA_CACHE_DIR`` when that is set, else under the user's cache directory.
     """
@@ -134,18 +171,16 @@ def cache_path() -> Path:
         digest.update(source.read_bytes())
     root = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(platformdirs.user_cache_dir("quell")) / "compiled")
     path = root / f"quell-{digest.hexdigest()[:16]}"
-    if not path.is_dir():
-        try:
-            path.mkdir(parents=True, exist_ok=True)
+    try:
+        fresh = not path.is_dir()
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+        if fresh:
             _forget_old_caches(root, path)
-        except OSError:  # a read-only home: Numba falls back to its own choice or to no cache at all
-            return root
+    except OSError:
+        return None
     return path
-
-
-def cache_is_cold() -> bool:
-    """Tell whether nothing has been compiled yet for this version, so that a first run can say that it compiles."""
-    return not any(cache_path().rglob("*.nbi"))
 
 
 def _forget_old_caches(root: Path, current: Path) -> None:
@@ -153,17 +188,6 @@ def _forget_old_caches(root: Path, current: Path) -> None:
     others = sorted((p for p in root.glob("quell-*") if p != current), key=lambda p: p.stat().st_mtime, reverse=True)
     for stale in others[_CACHES_KEPT - 1 :]:
         shutil.rmtree(stale, ignore_errors=True)
-
-
-@contextmanager
-def _cache_directory() -> Iterator[None]:
-    """Point Numba's cache at ours while a dispatcher is made (it fixes its directory then), and only so long."""
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = str(cache_path())
-    try:
-        yield
-    finally:
-        numba_config.CACHE_DIR = before
 
 
 def _no_implementation(name: str, type_name: str) -> str:

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Check that ``written_atomically`` will be able to write ``path``, and leave what is there alone.
+
+    Raises
+    ------
+    ValueError
+        where the folder of ``path`` does not exist or can't be written to, or ``path`` is a folder.
+    """
+    _part_of(Path(path)).unlink()
 
 
 @contextmanager
@@ -16,22 +27,25 @@ def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     ValueError
-        where the folder of ``path`` does not exist, or ``path`` is a folder.
+        as ``check_writable``.
     """
     target = Path(path)
+    part = _part_of(target)
+    try:
+        yield part
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _part_of(target: Path) -> Path:
     if not target.parent.is_dir():
         raise ValueError(f"path = {str(target)!r}: the folder {str(target.parent)!r} must exist")
     if target.is_dir():
         raise ValueError(f"path = {str(target)!r}: must be a file, is a folder")
-    handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    part = Path(name)
+    part = target.with_name(f".{target.stem}-{uuid.uuid4().hex[:12]}{target.suffix}")
     try:
-        yield part
-        # mkstemp makes files that only the owner can read; give the usual permissions.
-        mask = os.umask(0)
-        os.umask(mask)
-        part.chmod(0o666 & ~mask)
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
+        part.touch(exist_ok=False)
+    except OSError as error:
+        raise ValueError(f"path = {str(target)!r}: can't be written ({error.strerror})") from None
+    return part

@@ -1,7 +1,7 @@
 """What a response is judged by. Times in seconds, values in the unit of y; every function takes plain arrays.
 
-Sums over time take each sample to hold until the next, so a record must be whole: thinned by ``record_every`` the integrals stay close,
-the variation does not.
+Integrals are trapezoidal. A record must be whole for the control variation: thinned by ``record_every`` the integrals stay close, the
+variation does not. Records must be finite.
 """
 
 from __future__ import annotations
@@ -90,6 +90,10 @@ def _record(values: Any) -> Vector:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"record has shape {array.shape}: must be a vector of at least one sample; widen the window of time")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(
+            f"record has a value that is not finite at sample {int(np.argmin(np.isfinite(array)))}: judge what comes before it"
+        )
     return array
 
 

@@ -38,6 +38,8 @@ def plot_trajectory(run: Trajectory, axes: Any = None) -> Any:
         import matplotlib.pyplot as plt
 
         _, axes = plt.subplots(3, 1, sharex=True, figsize=(8.0, 7.0), layout="constrained")
+    if np.size(axes) != 3:
+        raise ValueError(f"axes: must be three matplotlib axes, got {np.size(axes)}")
     t = run.t
     draw(axes[0], t, run["y"], label="y", color="C0")
     draw(axes[0], t, run["r"], label="r", color="0.3", linestyle="--", linewidth=1.0)
@@ -50,6 +52,6 @@ def plot_trajectory(run: Trajectory, axes: Any = None) -> Any:
         ax.legend(loc="upper right", fontsize="small")
         ax.grid(alpha=0.3)
     axes[2].set_xlabel("time [s]")
-    if run.status:
+    if run.diverged:
         axes[0].set_title(f"ended at {run.ended:.3g} s: diverged", color="C3")
     return axes

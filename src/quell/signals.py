@@ -34,15 +34,19 @@ class Signal:
 
     def __call__(self, t: Any) -> Vector:
         """Return the values at the times ``t`` [s]; a number gives a 0-d array."""
-        return self.evaluate(np.asarray(t, dtype=np.float64))
+        times = np.asarray(t, dtype=np.float64)
+        values = np.asarray(self.evaluate(times), dtype=np.float64)
+        if values.shape != times.shape:
+            raise ValueError(f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape {times.shape}")
+        return values
 
     def seeded(self, seed: int) -> Signal:
         """Return this signal with its noise, if it has any, drawn from ``seed``."""
         return self
 
-    def until(self, time: float, then: Signal) -> Signal:
-        """Return this signal before ``time`` [s] and ``then`` from it on."""
-        return Switched((checks.finite("time", time),), (self, then))
+    def until(self, time: float, then: Signal | float) -> Signal:
+        """Return this signal before ``time`` [s] and ``then``, a signal or a number, from it on."""
+        return Switched((checks.finite("time", time),), (self, as_signal(then, "then")))
 
     def __add__(self, other: Signal | float) -> Signal:
         return Sum((self, as_signal(other)))
@@ -55,6 +59,12 @@ class Signal:
 
     def __neg__(self) -> Signal:
         return Scaled(-1.0, self)
+
+    def __rsub__(self, other: Signal | float) -> Signal:
+        return as_signal(other) - self
+
+    def __truediv__(self, factor: float) -> Signal:
+        return Scaled(1.0 / checks.nonzero("factor", factor, "a signal can't be divided by it"), self)
 
     __radd__ = __add__
     __rmul__ = __mul__
@@ -121,10 +131,11 @@ class Sinusoid(Signal):
     def evaluate(self, t: Vector) -> Vector:
         """Return the sinusoid."""
         since = t - self.start
-        if since.max(initial=-math.inf) < -_EDGE and self.start > 0.0:
+        started = since >= -_EDGE
+        if not started.any():
             return np.zeros(t.shape)
         wave = self.amplitude * np.sin(self.omega * since + self.phase)
-        return np.where(since >= -_EDGE, wave, 0.0) if self.start > 0.0 else wave
+        return wave if started.all() else np.where(started, wave, 0.0)
 
 
 @dataclass(frozen=True)
@@ -322,10 +333,12 @@ class BandLimitedNoise(Signal):
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the draws that hold at ``t``; none are drawn for negative times, which give zero."""
-        index = (t * (1.0 / self.sample_time) + (1.0 + 1e-6)).astype(np.int64) - 1  # floor, for times from 0 on
-        blocks = np.arange(index.min() // _BLOCK, index.max() // _BLOCK + 1) if t.size else np.arange(0)
-        if blocks.size > _BLOCKS_AT_ONCE:
-            blocks = np.unique(index // _BLOCK)
+        count = t * (1.0 / self.sample_time) + (1.0 + 1e-6)
+        if t.size and not float(np.max(np.abs(count))) < 2.0**52:
+            raise ValueError(f"sample_time = {self.sample_time!r}: too short to be counted in times of {float(np.max(np.abs(t))):g} s")
+        index = count.astype(np.int64) - 1  # floor, for times from 0 on
+        first, last = (int(index.min()) // _BLOCK, int(index.max()) // _BLOCK) if t.size else (0, -1)
+        blocks = np.arange(first, last + 1) if last - first < _BLOCKS_AT_ONCE else np.unique(index // _BLOCK)
         values = np.zeros(t.shape)
         sigma = math.sqrt(self.power / self.sample_time)
         for block in blocks[blocks >= 0].tolist():
@@ -361,9 +374,9 @@ def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:
     return tuple(signal.seeded(child) for signal, child in zip(signals, children, strict=True))
 
 
-def as_signal(value: Signal | float) -> Signal:
-    """Return a signal as it is and a number as a constant."""
-    return value if isinstance(value, Signal) else Constant(checks.finite("signal", value))
+def as_signal(value: Signal | float, name: str = "signal") -> Signal:
+    """Return a signal as it is and a number as a constant; ``name`` is what an error calls it."""
+    return value if isinstance(value, Signal) else Constant(checks.finite(name, value))
 
 
 KINDS: Mapping[str, type[Signal]] = {
@@ -391,7 +404,10 @@ def make(kind: str, **parameters: Any) -> Signal:
     known = tuple(f.name for f in fields(cls))
     for name in parameters:
         checks.one_of(f"parameter of signal {kind!r}", name, known)
-    return cls(**parameters)
+    try:
+        return cls(**parameters)
+    except TypeError as error:
+        raise ValueError(f"signal {kind!r}: {str(error).split('() ')[-1]}") from None
 
 
 def _check_finite(signal: Signal) -> None:

@@ -11,15 +11,17 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import Controller, control, report, rest
-from quell.dispatch import compiled, interpreted
+from quell.controllers.base import Controller, control, flags, report, rest
+from quell.dispatch import compiled, for_types, interpreted
 from quell.plants.base import Plant, advance, measure
 from quell.signals import Constant, Signal, as_signal, seeded_apart
-from quell.trajectory import Trajectory
+from quell.trajectory import Trajectory, first_sample_at
 from quell.types import Matrix, Status, Vector
 
 # Signals are evaluated so many samples at a time: enough to make Python's share small, few enough to stay in cache.
 _BLOCK = 8192
+# A counter of samples is exact up to here, and time in steps of dt nearly so.
+_MOST_SAMPLES = 10**12
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ class Scenario:
     Raises
     ------
     ValueError
-        for a duration that is not positive, a seed below zero, or ``rest_at`` times that do not increase within the duration.
+        for a duration that is not positive, a seed below zero, something that is no signal, or ``rest_at`` times that do not increase
+        within the duration.
     """
 
     reference: Signal | float = 0.0
@@ -60,7 +63,13 @@ class Scenario:
     def __post_init__(self) -> None:
         checks.positive("duration", self.duration, "s")
         checks.whole("seed", self.seed, 0)
-        times = checks.vector("rest_at", tuple(self.rest_at))
+        as_signal(self.reference, "reference")
+        as_signal(self.noise, "noise")
+        if not isinstance(self.disturbances, Sequence):
+            raise ValueError(f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers, one for each input")
+        for i, disturbance in enumerate(self.disturbances):
+            as_signal(disturbance, f"disturbances[{i}]")
+        times = checks.vector("rest_at", self.rest_at)
         if times.size and (np.any(np.diff(times) <= 0.0) or times[0] <= 0.0 or times[-1] >= self.duration):
             raise ValueError(f"rest_at = {self.rest_at!r}: must increase and lie within (0, duration = {self.duration!r})")
 
@@ -92,19 +101,21 @@ def run_block(
     every: int,
     until_next: int,
     limit: float,
-) -> tuple[int, int, int]:
+) -> tuple[int, int, int, int]:
     """Run ``r.size`` samples from the time ``t0``; write every ``every``-th into ``log`` from ``row`` on.
 
     Returns how many samples were run (fewer than asked where the loop diverged: ``|y|`` beyond ``limit``, or not finite), the next row,
-    and how many samples are left until it is written.
+    how many samples are left until it is written, and all status flags that were seen.
     """
     inputs = w.shape[1]
+    status = 0
     for k in range(r.size):
         y = measure(plant, x)
         measured = y + noise[k]
         if not abs(y) <= limit:
-            return k, row, until_next
+            return k, row, until_next, status
         u = control(design, state, r[k], measured)
+        status |= flags(design, state)
         if until_next == 0:
             log[row, 0] = r[k]
             log[row, 1] = y
@@ -119,7 +130,7 @@ def run_block(
             until_next = every
         until_next -= 1
         advance(plant, x, scratch, t0 + k * dt, u, w[k])
-    return r.size, row, until_next
+    return r.size, row, until_next, status
 
 
 @compiled
@@ -134,7 +145,7 @@ def simulate(
     scenario: Scenario,
     *,
     record_every: int = 1,
-    limit: float = 1e6,
+    limit: float | None = None,
     interpret: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory:
@@ -149,9 +160,10 @@ def simulate(
     record_every
         keep every so-many-th sample; the memory used is that of the record.
     limit
-        the run ends early, with ``Status.DIVERGED``, where ``|y|`` goes beyond it or is not finite [y-unit].
+        the run ends early, with ``Status.DIVERGED``, where ``|y|`` goes beyond it or is not finite [y-unit]; by default at a million
+        times the largest of 1, ``|x0|`` and the reference in the first samples.
     interpret
-        run the same functions as plain Python, to debug; about a thousand times slower.
+        run the same functions as plain Python, the plant's too, to debug; about a thousand times slower.
     progress
         called with the share done, 0 to 1, every few thousand samples.
 
@@ -166,25 +178,36 @@ def simulate(
         for arguments out of range, an x0 of the wrong size, or more disturbances than the plant has inputs.
     """
     every = checks.whole("record_every", record_every, 1)
-    limit = checks.positive("limit", limit)
     dt = controller.dt
-    samples = math.floor(scenario.duration / dt + 1e-9) + 1
+    if scenario.duration / dt > _MOST_SAMPLES:
+        raise ValueError(f"duration = {scenario.duration!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES:.0e} samples")
+    # The last sample is the last that is not after ``duration``, give or take rounding.
+    steps = scenario.duration / dt
+    samples = (round(steps) if math.isclose(steps, round(steps), rel_tol=1e-12, abs_tol=1e-9) else math.floor(steps)) + 1
     x0 = np.zeros(plant.order) if scenario.x0 is None else checks.vector("x0", scenario.x0, plant.order)
     reference, disturbances, noise = scenario.seeded_signals(plant.disturbances)
 
-    model, design, state = plant.sampled(dt), controller.parameters, controller.initial_state()
-    as_python = interpret or not getattr(plant, "compiled", True)
-    block, to_rest = (interpreted(run_block), interpreted(start_from_rest)) if as_python else (run_block, start_from_rest)
+    design, state = controller.parameters, controller.initial_state()
+    as_python = interpret or not plant.compiled
+    model = plant.sampled(dt, interpret)
+    block, to_rest = (
+        (interpreted(run_block), interpreted(start_from_rest))
+        if as_python
+        else (for_types(run_block, model, design), for_types(start_from_rest, design))
+    )
     channels = (
         *(("r", 1), ("y", 1), ("y_measured", 1), ("u", 1), ("w", plant.disturbances), ("x", plant.order)),
         *controller.channels,
     )
     log = np.empty(((samples - 1) // every + 1, sum(width for _, width in channels)))
     x, scratch = x0.copy(), np.zeros(6 * plant.order)
-    rests = {math.ceil(time / dt - 1e-9) for time in scenario.rest_at}
+    if limit is None:
+        early = reference(np.arange(min(samples, _BLOCK)) * dt)
+        limit = 1e6 * max(1.0, float(np.max(np.abs(x0), initial=0.0)), float(np.max(np.abs(early[np.isfinite(early)]), initial=0.0)))
+    limit = checks.positive("limit", limit)
+    rests = {first_sample_at(time, dt, samples) for time in scenario.rest_at}
     edges = sorted({*range(0, samples, _BLOCK), *(k for k in rests if k < samples), samples})
-    row = until_next = done = 0
-    status = Status.OK
+    row = until_next = done = status = 0
     # An interpreted loop that diverges would warn of every overflow; the status says it once.
     with np.errstate(over="ignore", invalid="ignore"):
         for first, last in pairwise(edges):
@@ -195,12 +218,13 @@ def simulate(
             w = np.empty((t.size, plant.disturbances))
             for j, signal in enumerate(disturbances):
                 w[:, j] = signal(t)
-            ran, row, until_next = block(
+            ran, row, until_next, seen = block(
                 *(model, x, scratch, design, state, first * dt, dt, reference(t), w, noise(t), log, row, every, until_next, limit)
             )
             done = first + ran
+            status |= seen
             if ran < t.size:
-                status = Status.DIVERGED
+                status |= Status.DIVERGED
                 break
             if progress is not None:
                 progress(done / samples)
@@ -209,9 +233,10 @@ def simulate(
         channels=channels,
         dt=dt,
         every=every,
-        status=status,
-        ended=(done if status else samples - 1) * dt,
+        status=Status(status),
+        ended=(done if status & Status.DIVERGED else samples - 1) * dt,
+        limit=limit,
         plant=plant.name,
-        features=tuple(getattr(controller, "features", ())),
+        features=controller.features,
         final_state=state,
     )

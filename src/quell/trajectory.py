@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,9 +50,11 @@ class Trajectory:
     dt : float
         sample time of the run [s]; recorded was every ``every``-th sample.
     status : Status
-        ``OK``, or ``DIVERGED``; ``status.message`` says what to do.
+        all flags that any step reported, and ``DIVERGED`` where the run ended early; ``message`` puts it in words.
     ended : float
         when the run ended [s].
+    limit : float
+        the ``|y|`` at which it would have been ended [y-unit].
     plant : str
         its name.
     features : tuple of str
@@ -66,9 +69,22 @@ class Trajectory:
     every: int = 1
     status: Status = Status.OK
     ended: float = 0.0
+    limit: float = math.inf
     plant: str = ""
     features: tuple[str, ...] = ()
     final_state: Any = None
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the run ended early."""
+        return Status.DIVERGED in self.status
+
+    @property
+    def message(self) -> str:
+        """What happened, when, and what to do."""
+        if not self.diverged:
+            return self.status.message
+        return f"|y| went beyond limit = {self.limit:.3g}, or was no number, at {self.ended:.6g} s. {self.status.message}"
 
     @property
     def t(self) -> Vector:
@@ -98,9 +114,8 @@ class Trajectory:
 
     def window(self, start: float, stop: float) -> slice:
         """Return the samples with ``start <= t < stop`` as a slice."""
-        step = self.every * self.dt
-        first, last = (max(int(np.ceil(time / step - 1e-9)), 0) for time in (start, stop))
-        return slice(first, min(last, len(self)))
+        first, last = (first_sample_at(time, self.every * self.dt, len(self)) for time in (start, stop))
+        return slice(first, last)
 
     def metrics(
         self, start: float = 0.0, stop: float | None = None, *, target: float | None = None, band: float = 0.002
@@ -119,20 +134,19 @@ class Trajectory:
         Returns
         -------
         dict
-            ``overshoot`` (fraction of the move), ``settling_time`` and ``rise_time`` [s] (all three only where y has to move; NaN
-            where it does not get there), ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y, and ``control_variation``.
+            ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y, and ``control_variation``; and, where the reference steps at the
+            start of the window or ``target`` is given: ``overshoot`` (fraction of the move), ``settling_time`` and ``rise_time`` [s]
+            (NaN where y does not get there).
 
         Raises
         ------
         ValueError
             where the window holds no sample: for instance because the run ended before it.
         """
-        part = (
-            self.window(start, np.inf if stop is None else stop) if stop is not None else slice(self.window(start, start).start, len(self))
-        )
+        part = self.window(start, np.inf if stop is None else stop)
         if part.start >= len(self) or part.stop <= part.start:
             raise ValueError(
-                f"start = {start!r}, stop = {stop!r}: the record ends at {self.ended:.6g} s ({self.status.message}); "
+                f"start = {start!r}, stop = {stop!r}: the record ends at {self.ended:.6g} s ({self.message}); "
                 "the window must hold at least one sample"
             )
         t, y, u = self.t[part], self["y"][part], self["u"][part]
@@ -140,7 +154,7 @@ class Trajectory:
         goal = float(self["r"][part][-1]) if target is None else checks.finite("target", target)
         initial = float(y[0])
         found: dict[str, float] = {}
-        if goal != initial:
+        if goal != initial and (target is not None or self._steps_at(part, goal)):
             found |= {
                 "overshoot": metrics.overshoot(y, goal, initial),
                 "settling_time": metrics.settling_time(t, y, goal, band, initial),
@@ -154,6 +168,12 @@ class Trajectory:
             "itae": metrics.itae(t, error),
             "control_variation": metrics.control_variation(u),
         }
+
+    def _steps_at(self, part: slice, goal: float) -> bool:
+        """Tell whether the reference goes to ``goal`` at the start of a window, give or take a sample, and stays; 0 s is such a start."""
+        r = self["r"]
+        stays = bool(np.all(r[part.start + 1 : part.stop] == goal))
+        return stays and (part.start == 0 or bool(np.any(r[max(part.start - 2, 0) : part.start + 1] != goal)))
 
     def plot(self, axes: Any = None) -> Any:
         """Draw output and reference, control signal and estimates of f, one below the other; return the three axes.
@@ -190,7 +210,8 @@ class Trajectory:
             "every": self.every,
             "status": int(self.status),
             "ended": self.ended,
-            "message": self.status.message,
+            "limit": self.limit,
+            "message": self.message,
         }
         return xarray.Dataset(variables, coordinates, attrs=about)
 
@@ -222,7 +243,9 @@ class Trajectory:
         if missing:
             raise ValueError(f"path = {os.fspath(path)!r}: has no {', '.join(sorted(missing))}: it was not written by Trajectory.save")
         names = [name for name in map(str, data.data_vars) if name != "f_hat"]
-        columns = [np.reshape(data[name].values, (data.sizes["time"], -1)) for name in names]
+        if "time" not in data.sizes or any(data[name].dims[:1] != ("time",) for name in names):
+            raise ValueError(f"path = {os.fspath(path)!r}: has channels that are not over time: it was not written by Trajectory.save")
+        columns = [data[name].values[:, None] if data[name].ndim == 1 else data[name].values for name in names]
         return cls(
             log=np.hstack(columns),
             channels=tuple((name, column.shape[1]) for name, column in zip(names, columns, strict=True)),
@@ -230,6 +253,18 @@ class Trajectory:
             every=int(data.attrs["every"]),
             status=Status(int(data.attrs["status"])),
             ended=float(data.attrs["ended"]),
+            limit=float(data.attrs.get("limit", math.inf)),
             plant=str(data.attrs["plant"]),
             features=tuple(map(str, data["theta_index"].values)) if "theta_index" in data.coords else (),
         )
+
+
+def first_sample_at(time: float, step: float, samples: int) -> int:
+    """Return the first of ``samples`` samples, ``step`` apart, that is not before ``time``; ``samples`` where none is.
+
+    A time that is a whole number of steps but for rounding belongs to that sample.
+    """
+    if math.isnan(time):
+        raise ValueError(f"time = {time!r}: must be a number")
+    count = min(max(time / step, 0.0), float(samples))
+    return min(round(count) if math.isclose(count, round(count), rel_tol=1e-12, abs_tol=1e-9) else math.ceil(count), samples)

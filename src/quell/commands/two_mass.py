@@ -13,11 +13,12 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from quell import plants
-from quell.dispatch import cache_is_cold
-from quell.experiments import two_mass_figures, two_mass_spring
-from quell.experiments.two_mass_spring import Result, Settings
-from quell.files import written_atomically
-from quell.simulation import Scenario, simulate
+from quell.dispatch import compilations
+from quell.experiments import two_mass_figures, two_mass_spring, two_mass_study
+from quell.experiments.two_mass_spring import Settings
+from quell.experiments.two_mass_study import Result
+from quell.files import check_writable, written_atomically
+from quell.simulation import Scenario, run_block, simulate
 
 _COLUMNS = (
     ("overshoot", "overshoot\n[‰]", 1e3, ".2f"),
@@ -37,10 +38,15 @@ def reproduce_two_mass(*, dt: float, seed: int, omega_o: float, reset: bool, jso
         for settings out of range, or a place that can't be written to.
     """
     settings = Settings(dt=dt, seed=seed, omega_o=omega_o, reset=reset)
-    two_mass_spring.controllers(settings)  # what can't be designed is said before anything is compiled
+    # What can't be designed or written is said before the work is done.
+    try:
+        two_mass_spring.controllers(settings)
+    except ValueError as error:
+        raise ValueError(f"{error} (the study goes up to 3 times omega_o)") from None
     if json_file is not None:
-        with written_atomically(json_file) as part:  # likewise what can't be written, before the work is done
-            part.write_text("{}\n")
+        check_writable(json_file)
+    if figures is not None:
+        two_mass_figures.made(figures)
     console = Console()
     _compile(console, settings)
     with Progress(TextColumn("{task.description:<15}"), BarColumn(), console=console, transient=True) as bar:
@@ -49,29 +55,30 @@ def reproduce_two_mass(*, dt: float, seed: int, omega_o: float, reset: bool, jso
         def tell(what: str, share: float) -> None:
             bar.update(task, description=what, completed=share)
 
-        result = two_mass_spring.run(settings, tell)
+        result = two_mass_study.run(settings, tell)
         paths = two_mass_figures.save(result, figures, tell) if figures is not None else []
     _print(console, result)
     if paths:
-        console.print(f"Figures: {', '.join(sorted({path.stem for path in paths}))} (PNG and SVG) in {figures}/")
+        names = ", ".join(sorted({path.stem for path in paths}))
+        console.print(f"Figures: {names} (PNG and SVG) in {escape(str(figures))}/", soft_wrap=True)
     if json_file is not None:
         with written_atomically(json_file) as part:
             part.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
-        console.print(f"Results: {json_file}")
+        console.print(f"Results: {escape(str(json_file))}", soft_wrap=True)
 
 
 def _compile(console: Console, settings: Settings) -> None:
-    """Compile what the study needs, or load it; where that takes long, say so beforehand and how long it took."""
-    cold = cache_is_cold()
-    if cold:
-        console.print("First run of this version: compiling, which takes about 15 seconds, once.")
+    """Compile what the study needs, or load it; where that takes long, say so and how long it took."""
     began = time.perf_counter()
     brief = Scenario(duration=10 * settings.dt, rest_at=(5 * settings.dt,))
-    for candidate in two_mass_spring.controllers(settings).values():
-        simulate(plants.two_mass_spring(), candidate, brief)
-    took = time.perf_counter() - began
-    if cold:
-        console.print(f"Compiled in {took:.1f} s; kept for later runs.")
+    with console.status("Compiling what is not in the cache: about 10 seconds, once for this version."):
+        for candidate in two_mass_spring.controllers(settings).values():
+            simulate(plants.two_mass_spring(), candidate, brief)
+    compiled = compilations(run_block)
+    if compiled:
+        console.print(
+            f"First run of this version: {compiled} loops compiled in {time.perf_counter() - began:.1f} s, and kept for later runs."
+        )
 
 
 def _print(console: Console, result: Result) -> None:
@@ -99,8 +106,8 @@ def _print(console: Console, result: Result) -> None:
     console.print(scores)
     console.print("Overshoot, settling (±0.2 %) and variation: step, 110–150 s. Peak and RMS of y − 1: force on m2, 170–250 s.\n")
     for name, run in result.runs.items():
-        if run.status:
-            console.print(f"{name} ended at {run.ended:.1f} s. {run.status.message}")
+        if run.diverged:
+            console.print(f"{name}: {run.message}")
 
 
 def _short(value: float) -> str:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.base import control, report, rest
+from quell.controllers.base import control, flags, report, rest
 from quell.controllers.handle import bind, bound_control, entry_point
 from quell.controllers.limits import Limits, apply_limits, limits
-from quell.dispatch import kernel
+from quell.dispatch import for_types, kernel
 from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart
 from quell.observers.eso import ESO, EsoModel, eso_start, eso_update
 from quell.types import Status, Vector
@@ -62,22 +62,28 @@ class AdrcState(NamedTuple):
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop, state.seen
     status = 0
-    if math.isfinite(r):
-        loop[_R] = r
-    else:
-        status |= _REFERENCE_HELD
     if math.isfinite(y):
         loop[_Y] = y
     else:
         status |= _MEASUREMENT_HELD
+    if math.isfinite(r):
+        loop[_R] = r
+    else:
+        status |= _REFERENCE_HELD
+        if loop[_STARTED] == 0.0:
+            loop[_R] = loop[_Y]  # no reference yet: stay
     if loop[_STARTED] == 0.0:
         eso_start(state.z, seen, loop[_Y])
-        # Nothing is known before a first good measurement: start again when it comes.
-        loop[_STARTED] = 1.0 if status & _MEASUREMENT_HELD == 0 else 0.0
+        if status & _MEASUREMENT_HELD != 0:
+            # Nothing is known before a first good measurement: u rests at zero, or as near as the limits let it.
+            loop[_U] = min(max(0.0, design.limits.low), design.limits.high)
+            loop[_STATUS] = status
+            return loop[_U]
+        loop[_STARTED] = 1.0
     else:
         eso_update(design.eso, state.z, seen, loop[_Y], loop[_U], loop[_F_LEARNED])
         if status & _MEASUREMENT_HELD == 0:
-            adapt(design.learner, state.learner, seen, loop[_U])
+            adapt(design.learner, state.learner, seen, loop[_Y], loop[_U])
     constant, slope = predict(design.learner, state.learner, seen, loop[_U])
     wished = _law(design, seen, loop[_R], constant, slope)
     if not math.isfinite(wished):
@@ -113,6 +119,11 @@ def _report(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
     row[order + 1] = state.loop[_F_LEARNED]
     row[order + 2] = state.loop[_STATUS]
     coefficients(design.learner, state.learner, row[order + 3 :])
+
+
+@flags.register(AdrcDesign)
+def _flags(design: AdrcDesign, state: AdrcState) -> int:
+    return int(state.loop[_STATUS])
 
 
 @rest.register(AdrcDesign)
@@ -189,6 +200,8 @@ class ADRC:
         self.observer = observer
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
         self.learner: Learner = NoLearner() if learner is None else learner
+        if isinstance(self.learner, type) or not all(hasattr(self.learner, name) for name in ("design", "memory", "feature_names")):
+            raise ValueError(f"learner = {learner!r}: must be a learner, for example quell.learners.Kalman(), or None")
         self.parameters = AdrcDesign(
             eso=observer.model,
             law=law_gains(observer.order, self.omega_c),
@@ -226,10 +239,11 @@ class ADRC:
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
+        dispatcher = for_types(bound_control, self.parameters)
         self._handle = bind(self.parameters, self._state)
         # The first call is made on a state of its own: it must not count as a sample.
-        bound_control(bind(self.parameters, self.initial_state()), 0.0, 0.0)
-        self._step = entry_point(bound_control, self._handle, 0.0, 0.0)
+        dispatcher(bind(self.parameters, self.initial_state()), 0.0, 0.0)
+        self._step = entry_point(dispatcher, self._handle, 0.0, 0.0)
 
     def step(self, r: float, y: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
@@ -242,6 +256,15 @@ class ADRC:
         if self._handle is None:
             self.prepare()
         return self._step(self._handle, r, y)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""
+        return {name: value for name, value in vars(self).items() if name not in ("_arrays", "_handle", "_step")}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        vars(self).update(kept)
+        self._arrays = _named_arrays(self._state)
+        self._handle = None
 
     def reset(self) -> None:
         """Go back to the state before the first sample; what was learned is forgotten."""
@@ -259,11 +282,14 @@ class ADRC:
     def state(self, saved: Mapping[str, Any]) -> None:
         if set(saved) != set(self._arrays):
             raise ValueError(f"state has {sorted(saved)}: must have {sorted(self._arrays)}")
-        # A learner that diverged may hold numbers that are not finite; its state is restored as it was.
-        checked = {name: np.asarray(value, dtype=np.float64) for name, value in saved.items()}
-        for name, value in checked.items():
-            if value.shape != self._arrays[name].shape:
-                raise ValueError(f"state[{name!r}] has shape {value.shape}: must have {self._arrays[name].shape}")
+        checked = {}
+        for name, array in self._arrays.items():
+            try:
+                checked[name] = np.asarray(saved[name], dtype=np.float64)
+            except (TypeError, ValueError):
+                raise ValueError(f"state[{name!r}]: must be an array of numbers") from None
+            if checked[name].shape != array.shape:
+                raise ValueError(f"state[{name!r}] has shape {checked[name].shape}: must have {array.shape}")
         for name, value in checked.items():
             self._arrays[name][...] = value
 
@@ -291,7 +317,11 @@ class ADRC:
 
 def law_gains(order: int, omega_c: float) -> Vector:
     """Return ``k_i = C(n, i−1) omega_c^(n−i+1)``, i = 1 … n: all poles of ``s^n + k_n s^(n−1) + … + k_1`` lie at −omega_c."""
-    return np.array([math.comb(order, i) * omega_c ** (order - i) for i in range(order)])
+    with np.errstate(over="ignore"):
+        gains = np.array([math.comb(order, i) * np.float64(omega_c) ** (order - i) for i in range(order)])
+    if not np.all(np.isfinite(gains)):
+        raise ValueError(f"omega_c = {omega_c!r} rad/s: its power {order} must be a number; lower omega_c")
+    return gains
 
 
 def _named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:

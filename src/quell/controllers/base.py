@@ -24,6 +24,10 @@ class Controller(Protocol):
         """What the compiled functions need, a NamedTuple."""
 
     @property
+    def features(self) -> tuple[str, ...]:
+        """What the entries of the channel ``theta`` multiply, where there is one."""
+
+    @property
     def channels(self) -> tuple[tuple[str, int], ...]:
         """Name and width of what ``report`` writes, in order."""
 
@@ -40,6 +44,12 @@ def control(controller: Any, state: Any, r: float, y: float) -> float:
 @generic
 def report(controller: Any, state: Any, row: Vector) -> None:
     """Write what the controller knows, as its ``channels`` say, into ``row``."""
+    raise TypeError
+
+
+@generic
+def flags(controller: Any, state: Any) -> int:
+    """Return the ``Status`` flags of the last sample."""
     raise TypeError
 
 

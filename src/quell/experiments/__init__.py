@@ -1,5 +1,5 @@
 """Published experiments, run again and judged: one module for each."""
 
-from quell.experiments import two_mass_spring
+from quell.experiments import gradient_range, two_mass_spring, two_mass_study
 
-__all__ = ["two_mass_spring"]
+__all__ = ["gradient_range", "two_mass_spring", "two_mass_study"]

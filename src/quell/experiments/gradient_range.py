@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from quell.experiments import two_mass_spring as setting
 from quell.learners import BatchGradient
-
-if TYPE_CHECKING:
-    from quell.experiments.two_mass_spring import Settings
+from quell.plants import two_mass_spring
+from quell.simulation import simulate
 
 BATCHES = (1, 10, 1000)
 RATES = tuple(float(rate) for rate in np.geomspace(1e-3, 1.0, 13))
@@ -31,31 +30,29 @@ class Trial:
     ended: float
     """When the run ended [s]: ``HORIZON``, or where it diverged."""
     stable: bool
-    """Whether it outlasted the study."""
+    """Whether it outlasted the setting."""
     disturbance_peak: float | None
 
 
-def trials(settings: Settings, tell: Callable[[str, float], None], rates: Sequence[float] = RATES) -> tuple[Trial, ...]:
+def trials(settings: setting.Settings, tell: Callable[[str, float], None], rates: Sequence[float] = RATES) -> tuple[Trial, ...]:
     """Run Algorithm 1 with every batch and rate.
 
     At a sample time of 10 ms, where the observer allows it: what happens depends on the rate a second, not a sample.
     """
-    from quell.experiments import two_mass_spring as study
-
     coarse = replace(settings, dt=max(settings.dt, min(0.01, 0.1 / settings.omega_o)))
-    plant, what = study.two_mass_spring(), replace(study.scenario(coarse), duration=HORIZON)
+    plant, what = two_mass_spring(), replace(setting.scenario(coarse), duration=HORIZON)
     every = max(round(0.1 / coarse.dt), 1)
 
     def trial(batch: int, rate: float) -> Trial:
-        candidate = study.controller(coarse, learner=BatchGradient(rate * coarse.dt / batch, batch))
-        run = study.simulate(plant, candidate, what, record_every=every)
-        return Trial(batch, rate, run.ended, run.ended > study.END, study.score(run)["disturbance_peak"])
+        candidate = setting.controller(coarse, learner=BatchGradient(rate * coarse.dt / batch, batch))
+        run = simulate(plant, candidate, what, record_every=every)
+        return Trial(batch, rate, run.ended, run.ended > setting.END, setting.score(run)["disturbance_peak"])
 
     cases = [(batch, rate) for batch in BATCHES for rate in rates]
     done = []
     for i in range(0, len(cases), len(rates)):
         tell("learning rates", i / len(cases))
-        done += study.in_parallel([partial(trial, *case) for case in cases[i : i + len(rates)]])
+        done += setting.in_parallel([partial(trial, *case) for case in cases[i : i + len(rates)]])
     tell("learning rates", 1.0)
     return tuple(done)
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from quell.experiments.gradient_range import HORIZON, Trial
-from quell.experiments.two_mass_spring import END, FORCE_AT, L1, MB, MF, STEP_AT, L, Result
+from quell.experiments.two_mass_spring import END, FORCE_AT, L1, MB, MF, STEP_AT, L
+from quell.experiments.two_mass_study import Result
 from quell.files import written_atomically
 from quell.plotting import draw
 from quell.trajectory import Trajectory
@@ -38,11 +39,7 @@ def save(result: Result, folder: str | os.PathLike[str], tell: Callable[[str, fl
     """
     import matplotlib
 
-    where = Path(folder)
-    try:
-        where.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"figures = {str(where)!r}: must be a folder that can be made ({error.strerror})") from None
+    where = made(folder)
     written = []
     # A fixed salt and no date: the same run gives the same files.
     with matplotlib.rc_context({"svg.hashsalt": "quell", "font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}):
@@ -55,6 +52,16 @@ def save(result: Result, folder: str | os.PathLike[str], tell: Callable[[str, fl
                 written.append(path)
     tell("figures", 1.0)
     return written
+
+
+def made(folder: str | os.PathLike[str]) -> Path:
+    """Return a folder for figures, made if need be; a ``ValueError`` says why it can't be."""
+    where = Path(folder)
+    try:
+        where.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"figures = {str(where)!r}: must be a folder that can be made ({error.strerror})") from None
+    return where
 
 
 def _figures(result: Result) -> Iterator[tuple[str, Any]]:
@@ -164,4 +171,4 @@ def _algorithm_1(result: Result) -> Any:
 
 
 def _label(name: str, run: Trajectory) -> str:
-    return f"{name} (diverged at {run.ended:.1f} s)" if run.status else name
+    return f"{name} (diverged at {run.ended:.3g} s)" if run.diverged else name

@@ -37,8 +37,8 @@ class Learner(Protocol):
 
 
 @generic
-def adapt(learner: Any, memory: Any, seen: Vector, u_before: float) -> None:
-    """Learn from ``seen = (x̂_1 … x̂_n, Δf̂)`` and the control signal applied during the sample that led to it."""
+def adapt(learner: Any, memory: Any, seen: Vector, y: float, u_before: float) -> None:
+    """Learn from ``seen = (x̂_1 … x̂_n, Δf̂)``, the measurement it follows from and the control signal applied before it."""
     raise TypeError
 
 
@@ -94,7 +94,7 @@ class NoLearnerMemory(NamedTuple):
 
 
 @adapt.register(NoLearnerDesign)
-def _adapt(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u_before: float) -> None:
+def _adapt(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, y: float, u_before: float) -> None:
     pass
 
 

@@ -57,8 +57,8 @@ class BatchGradientMemory(NamedTuple):
 
 
 @adapt.register(BatchGradientDesign)
-def _adapt(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, u_before: float) -> None:
-    at = int(memory.place[0])
+def _adapt(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, y: float, u_before: float) -> None:
+    at = min(max(int(memory.place[0]), 0), learner.batch - 1)
     size = learner.order + 2
     residual = seen[learner.order]
     oldest = memory.residuals[at]

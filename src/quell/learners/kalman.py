@@ -3,24 +3,33 @@
 With the features φ (state, bias, u) and what the observer shows of them, φ^F (``lag.py``), each sample::
 
     ε = Δf̂ + f_L^F − θ·φ^F
-    g = P φ^F / (φ^F·P φ^F + R/dt),    θ ← θ + g ε,    P ← P − g (P φ^F)ᵀ + Q dt
+    g = P φ̃ / max(φ̃·P φ̃ + 1/dt, φ̃·P φ̃ / (λ_m dt)),    θ ← θ + g ε,    P ← P − g (P φ̃)ᵀ + Q dt
 
-Q and R are continuous-time densities, so that the tuning does not change with dt.
+All are continuous-time densities, so the tuning does not change with dt. Coefficients of the state and of u are measured in noise of
+density ``R = τ E[ε² + (0.1 f̂)²]``: for them φ̃ = φ^F/√R and ε/√R take the place of φ^F and ε. The bias is measured in units of R itself.
 
-*Measurement noise.* ``R = τ E[ε² + (0.1 (Δf̂ + f_L^F))² + …]``: the mean is an exponential one, and τ = N/omega_o, the observer's lag, is how
-long the noise of Δf̂ is correlated. What the learner cannot explain it takes for noise, and then learns less from it; and it does not
-believe that a linear model explains more than nine tenths of what it sees, or the first instant of a motion would settle θ for good.
+*R follows the innovation.* What the learner can't explain it takes for noise, and learns less from it. Nor does it believe that a linear
+model explains more than nine tenths of f. The mean is an exponential one; τ = N/omega_o, the observer's lag, is how long the noise of Δf̂ is
+correlated. The bias does not follow R: a gain that follows the noise folds its high frequencies down to where the loop is
+sensitive.
 
-*Random walk.* The walk of the bias is stated as a tracking bandwidth λ, with ``Q = λ² R``: the steady Kalman gain of a random walk
-in white noise is ``sqrt(Q/R)``, so a constant disturbance is learned with the time constant 1/λ, whatever its unit.
+*Random walk.* A walk is given as a tracking bandwidth λ. For the bias ``Q = λ²``: the steady Kalman gain of a random walk in white noise is
+``sqrt(Q/R)``, so a constant disturbance is learned with the time constant 1/λ, whatever its unit. For a feature of variance φ² it is
+``λ² R/φ²``. All features together learn no faster than λ_m, the larger of omega_o and the bias's bandwidth: the observer can't check what
+is faster.
 
-*Start.* From rest the observer's own initial error is in Δf̂, and so is not f: the learner watches for 2 N/omega_o seconds before it learns.
-Rounding is not data either: no measurement of y counts as better than a billionth of its size.
+*What teaches.* The observer's estimates of higher derivatives are noisy. At rest they are nothing but noise, and regression on noise finds
+something, slowly and confidently. So a feature teaches only while its variance is ``_CLEAR²`` times what the measurement noise, seen in
+y − x̂_1, puts into it; else its place in φ̃ is zero. Rounding counts as noise too. What is constant in a feature is the bias's business,
+where there is one: φ̃ has the feature less its running mean, and the bias gives up at the mean what a coefficient gains.
+
+*Start.* From rest the observer's own initial error is in Δf̂, and so is not f: the learner watches for 2 τ before it learns.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,15 +39,22 @@ from quell import checks
 from quell.dispatch import kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import Lag, lag_of, lag_push
-from quell.observers.eso import ESO
+from quell.observers.eso import ESO, noise_gains
 from quell.types import Matrix, Vector
 
-# The share of f that a model is taken to leave unexplained, at least.
+# The share of f that a linear model is taken to leave unexplained, at least.
 _DOUBT = 0.1
-# No sensor resolves better than about 30 bits of what it measures.
-_RESOLUTION = 1e-9
+# How many times its noise a feature must be to teach. White noise of each sample makes 1, noise held for ten samples 3.
+_CLEAR = 6.0
+# No sensor resolves better than this share of what it measures.
+_RESOLUTION = 1e-8
 # In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
 _WATCH = 2.0
+# Mean squares are taken over so many lags of the observer.
+_AVERAGE = 10.0
+
+# Places in KalmanMemory.moment.
+_NOISE, _UNEXPLAINED, _FILLED, _SINCE = range(4)
 
 
 class KalmanDesign(NamedTuple):
@@ -46,11 +62,15 @@ class KalmanDesign(NamedTuple):
 
     lag: Lag
     scale: Vector
-    """(p,): a feature is its signal times this, O(1)."""
+    """(p,): a feature is its signal times this."""
     walk: Vector
     """(p,): λ² [1/s²]."""
+    threshold: Vector
+    """(p,): least variance with which a feature teaches, in units of that of y − x̂_1; 0 for the bias, which always does."""
     prior: Vector
-    """(p,): standard deviation of θ before anything is known, in scaled units."""
+    """(p,): standard deviation of θ before anything is known, in scaled units; 0 for the bias, whose walk opens P by itself."""
+    fastest: float
+    """λ_m [rad/s]."""
     states: int
     """n, or 0 without state features."""
     bias: bool
@@ -61,11 +81,9 @@ class KalmanDesign(NamedTuple):
     """Largest θ_u."""
     dt: float
     forget: float
-    """dt over the averaging time of E[ε²]."""
-    noise_time: float
+    """dt over the averaging time of mean squares."""
+    lag_time: float
     """τ [s]."""
-    floor: float
-    """What a measurement of y is at best good for, in units of Δf̂ per y."""
 
 
 class KalmanMemory(NamedTuple):
@@ -74,53 +92,83 @@ class KalmanMemory(NamedTuple):
     theta: Vector
     """(p,), scaled."""
     covariance: Matrix
-    """P (p, p)."""
+    """P (p, p); for the bias in units of R."""
     chain: Matrix
     """(p + 1, N): the lag filters of the features and, last, of f_L."""
     filtered: Vector
     """(p + 1,): what they show."""
+    mean: Vector
+    """(p,): running means of the features."""
+    variance: Vector
+    """(p,): their running variances."""
+    taught: Vector
+    """(p,): φ̃ of the newest sample."""
     gain: Vector
-    """(p,): room for P φ^F."""
+    """(p,): room for P φ̃."""
     moment: Vector
-    """(3,): E[ε²], how much of its average is filled, seconds since the start from rest."""
+    """(4,): mean squares of y − x̂_1 and of what is not explained, how much of them is filled, seconds since the start from rest."""
 
 
 @adapt.register(KalmanDesign)
-def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before: float) -> None:
-    theta, covariance, filtered, gain = memory.theta, memory.covariance, memory.filtered, memory.gain
+def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, u_before: float) -> None:
+    theta, covariance, filtered, mean, variance = memory.theta, memory.covariance, memory.filtered, memory.mean, memory.variance
+    taught, gain, moment = memory.taught, memory.gain, memory.moment
     size = theta.size
     # Plain loops: at this size a call of BLAS costs more than the arithmetic.
     target = seen[seen.size - 1] + filtered[size]
     innovation = target
-    spread = 0.0
     for i in range(size):
         innovation -= theta[i] * filtered[i]
+    noise, deviation = _watch(learner, moment, y, y - seen[0], innovation, target)
+    if deviation == 0.0:
+        return
+    weight = 1.0 / deviation
+    for i in range(size):
+        if learner.threshold[i] == 0.0:
+            taught[i] = filtered[i]
+        else:
+            away = filtered[i] - mean[i]
+            mean[i] += learner.forget * away
+            variance[i] += learner.forget * (away * away - variance[i])
+            centre = mean[i] if learner.bias else 0.0
+            taught[i] = weight * (filtered[i] - centre) if variance[i] > learner.threshold[i] * noise else 0.0
+    if moment[_SINCE] <= _WATCH * learner.lag_time:
+        return
+    spread = 0.0
+    for i in range(size):
         total = 0.0
         for j in range(size):
-            total += covariance[i, j] * filtered[j]
+            total += covariance[i, j] * taught[j]
         gain[i] = total
-        spread += total * filtered[i]
-    noise = _noise_density(learner, memory.moment, innovation, _DOUBT * target, learner.floor * seen[0])
-    memory.moment[2] += learner.dt
-    spread += noise / learner.dt
-    if memory.moment[2] > _WATCH * learner.noise_time and spread > 0.0:
-        inverse = 1.0 / spread
-        for i in range(size):
-            share = gain[i] * inverse
+        spread += total * taught[i]
+    inverse = 1.0 / max(spread + 1.0 / learner.dt, spread / (learner.fastest * learner.dt))
+    for i in range(size):
+        share = gain[i] * inverse
+        for j in range(size):
+            covariance[i, j] -= share * gain[j]
+        if learner.threshold[i] == 0.0:
             theta[i] += share * innovation
-            for j in range(size):
-                covariance[i, j] -= share * gain[j]
-            covariance[i, i] += learner.walk[i] * noise * learner.dt
-        if learner.with_u:
-            theta[size - 1] = min(max(theta[size - 1], learner.slope_low), learner.slope_high)
+            covariance[i, i] += learner.walk[i] * learner.dt
+        else:
+            change = share * innovation * weight
+            theta[i] += change
+            if learner.bias:
+                theta[learner.states] -= change * mean[i]
+            if taught[i] != 0.0:
+                covariance[i, i] += learner.walk[i] * learner.dt * deviation * deviation / variance[i]
+    if learner.with_u:
+        theta[size - 1] = min(max(theta[size - 1], learner.slope_low), learner.slope_high)
 
 
 @kernel
-def _noise_density(learner: KalmanDesign, moment: Vector, innovation: float, doubt: float, least: float) -> float:
-    """Return R; the first values of the mean count fully, so that it starts where the data is."""
-    moment[0] += learner.forget * (innovation * innovation + doubt * doubt + least * least - moment[0])
-    moment[1] += learner.forget * (1.0 - moment[1])
-    return moment[0] / moment[1] * learner.noise_time
+def _watch(learner: KalmanDesign, moment: Vector, y: float, error: float, innovation: float, target: float) -> tuple[float, float]:
+    """Take note of a sample; return the mean square of y − x̂_1, and √R. In the means the first values count fully."""
+    rounding, doubt = _RESOLUTION * y, _DOUBT * target
+    moment[_NOISE] += learner.forget * (error * error + rounding * rounding - moment[_NOISE])
+    moment[_UNEXPLAINED] += learner.forget * (innovation * innovation + doubt * doubt - moment[_UNEXPLAINED])
+    moment[_FILLED] += learner.forget * (1.0 - moment[_FILLED])
+    moment[_SINCE] += learner.dt
+    return moment[_NOISE] / moment[_FILLED], math.sqrt(learner.lag_time * moment[_UNEXPLAINED] / moment[_FILLED])
 
 
 @predict.register(KalmanDesign)
@@ -150,21 +198,23 @@ def _commit(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float,
 
 @restart.register(KalmanDesign)
 def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
-    finite = math.isfinite(memory.moment[0])
-    for i in range(memory.filtered.size):
+    size = memory.theta.size
+    finite = math.isfinite(memory.moment[_NOISE]) and math.isfinite(memory.moment[_UNEXPLAINED])
+    for i in range(size + 1):
         memory.filtered[i] = 0.0
         for j in range(learner.lag.taps.size):
             memory.chain[i, j] = 0.0
-    for i in range(memory.theta.size):
-        for j in range(memory.theta.size):
+    for i in range(size):
+        finite = finite and math.isfinite(memory.theta[i]) and math.isfinite(memory.mean[i]) and math.isfinite(memory.variance[i])
+        for j in range(size):
             finite = finite and math.isfinite(memory.covariance[i, j])
-        finite = finite and math.isfinite(memory.theta[i])
-    memory.moment[2] = 0.0
+    memory.moment[_SINCE] = 0.0
     if not finite:
-        memory.moment[0] = memory.moment[1] = 0.0
-        for i in range(memory.theta.size):
-            memory.theta[i] = 0.0
-            for j in range(memory.theta.size):
+        for k in range(memory.moment.size):
+            memory.moment[k] = 0.0
+        for i in range(size):
+            memory.theta[i] = memory.mean[i] = memory.variance[i] = memory.taught[i] = memory.gain[i] = 0.0
+            for j in range(size):
                 memory.covariance[i, j] = learner.prior[i] ** 2 if i == j else 0.0
 
 
@@ -178,21 +228,22 @@ def _coefficients(learner: KalmanDesign, memory: KalmanMemory, theta: Vector) ->
 class Kalman:
     """A linear learner that compensates the observer's lag: ``f_L = θ · (x̂_1 … x̂_n, 1, u)``.
 
+    Nothing in it depends on the unit of y or u.
+
     Parameters
     ----------
     state, bias, u
-        which features it has. With ``u`` it can learn that the plant's gain is not b0, which only the excitation of all states and u
-        together can tell; it is out by default.
+        which features it has. With ``u`` it can learn that the plant's gain is not b0; it is out by default, because a loop that
+        rejects a disturbance makes u a copy of it.
     bias_bandwidth
         how fast the bias follows, λ [rad/s]; ``omega_o`` of the observer by default. Smaller is smoother, larger rejects more.
     state_bandwidth
-        the same for the coefficients of the state, and of u [rad/s]; zero by default, as a plant's coefficients do not drift.
+        the same for the coefficients of the state [rad/s], one for all or one for each; zero by default, as a plant's coefficients do
+        not drift. The coefficient of u, where it is a feature, does not either.
     frequency
-        a frequency the plant has [rad/s]: feature i is ``x̂_i / frequency^(i−1)``, which should be O(1).
+        a frequency the plant has [rad/s]; ``omega_o / (2 N)`` by default. By it state i is scaled, to one size with the others.
     prior
-        how large the coefficients may be, as a multiple of ``frequency^(n−i+1)``.
-    innovation_time
-        over how long the innovation's power is averaged [s].
+        how large the coefficients may be: coefficient i is of the order of ``prior · frequency^(n−i+1)``.
     gain_interval
         where the effective gain ``(b0 + θ_u)/b0`` is kept when ``u`` is a feature.
 
@@ -203,67 +254,82 @@ class Kalman:
 
     References
     ----------
-    docs/theory: the paper's Algorithm 1, its three weaknesses, and what cures them.
+    docs/theory: the paper's Algorithm 1, its weaknesses, and what cures them.
     """
 
     state: bool = True
     bias: bool = True
     u: bool = False
     bias_bandwidth: float | None = None
-    state_bandwidth: float = 0.0
-    frequency: float = 1.0
+    state_bandwidth: float | Sequence[float] = 0.0
+    frequency: float | None = None
     prior: float = 10.0
-    innovation_time: float = 5.0
     gain_interval: tuple[float, float] = (0.5, 2.0)
 
     def __post_init__(self) -> None:
+        for name in ("state", "bias", "u"):
+            checks.flag(name, getattr(self, name))
         if not (self.state or self.bias or self.u):
             raise ValueError("state = False, bias = False, u = False: at least one feature must be left to learn")
         if self.bias_bandwidth is not None:
             checks.non_negative("bias_bandwidth", self.bias_bandwidth, "rad/s")
-        checks.non_negative("state_bandwidth", self.state_bandwidth, "rad/s")
-        checks.positive("frequency", self.frequency, "rad/s")
+        for value in checks.vector("state_bandwidth", self.state_bandwidth).tolist():
+            checks.non_negative("state_bandwidth", value, "rad/s")
+        if self.frequency is not None:
+            checks.positive("frequency", self.frequency, "rad/s")
         checks.positive("prior", self.prior)
-        checks.positive("innovation_time", self.innovation_time, "s")
         low, high = checks.vector("gain_interval", self.gain_interval, 2)
         if not 0.0 < low <= 1.0 <= high:
             raise ValueError(f"gain_interval = {self.gain_interval!r}: must be (low, high) with 0 < low <= 1 <= high")
 
     def design(self, observer: ESO) -> KalmanDesign:
-        """Return the parameters for ``observer``."""
-        n, w = observer.order, float(self.frequency)
-        orders = np.arange(n * self.state)
+        """Return the parameters for ``observer``.
+
+        Raises
+        ------
+        ValueError
+            where ``state_bandwidth`` is neither one number nor one for each state.
+        """
+        n = observer.order
+        slow = checks.vector("state_bandwidth", self.state_bandwidth)
+        slow = np.full(n, slow[0]) if slow.size == 1 else checks.vector("state_bandwidth", slow, n)
         follow = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
-        slow = self.state_bandwidth**2
-        slopes = sorted(share - 1.0 for share in self.gain_interval)
         lag_time = (n + 1) / observer.omega_o
+        frequency = 0.5 / lag_time if self.frequency is None else float(self.frequency)
+        scale = frequency ** -np.arange(n, dtype=np.float64)
+        # What noise in y leaves in x̂_i; what it leaves in f̂ is also in b0 u.
+        threshold = (_CLEAR * np.append(scale, 1.0)) ** 2 * noise_gains(observer)
+        size = self.prior * frequency**n
         return KalmanDesign(
             lag=lag_of(observer),
-            scale=np.array([*w ** -orders.astype(float), *[1.0] * self.bias, *[observer.b0] * self.u]),
-            walk=np.array([*[slow] * orders.size, *[follow**2] * self.bias, *[slow] * self.u]),
-            # The bias needs no prior: its walk opens P within 1/λ. For u the scale is b0, so that θ_u is a share of it.
-            prior=np.array([*[self.prior * w**n] * orders.size, *[0.0] * self.bias, *[1.0] * self.u]),
-            states=orders.size,
+            scale=np.array([*scale[: n * self.state], *[1.0] * self.bias, *[observer.b0] * self.u]),
+            walk=np.array([*slow[: n * self.state] ** 2, *[follow**2] * self.bias, *[0.0] * self.u]),
+            threshold=np.array([*threshold[: n * self.state], *[0.0] * self.bias, *[threshold[n]] * self.u]),
+            fastest=max(follow, observer.omega_o),
+            prior=np.array([*[size] * (n * self.state), *[0.0] * self.bias, *[1.0] * self.u]),
+            states=n * self.state,
             bias=self.bias,
             with_u=self.u,
-            slope_low=slopes[0],
-            slope_high=slopes[1],
+            slope_low=self.gain_interval[0] - 1.0,
+            slope_high=self.gain_interval[1] - 1.0,
             dt=observer.dt,
-            forget=-math.expm1(-observer.dt / self.innovation_time),
-            noise_time=lag_time,
-            floor=_RESOLUTION * observer.omega_o**n,
+            forget=-math.expm1(-observer.dt / (_AVERAGE * lag_time)),
+            lag_time=lag_time,
         )
 
     def memory(self, parameters: KalmanDesign) -> KalmanMemory:
-        """Return θ = 0 with the prior's covariance, and filters at rest."""
+        """Return a state with nothing learned."""
         p, size = parameters.scale.size, parameters.lag.taps.size
         return KalmanMemory(
             theta=np.zeros(p),
             covariance=np.diag(parameters.prior**2),
             chain=np.zeros((p + 1, size)),
             filtered=np.zeros(p + 1),
+            mean=np.zeros(p),
+            variance=np.zeros(p),
+            taught=np.zeros(p),
             gain=np.zeros(p),
-            moment=np.zeros(3),
+            moment=np.zeros(4),
         )
 
     def feature_names(self, order: int) -> tuple[str, ...]:

@@ -65,6 +65,8 @@ def _from_transfer_function(model: Any) -> Canonical:
         raise ValueError(f"plant has {np.shape(model.num)[:2]} outputs and inputs: an ESO needs one of each")
     numerator, denominator = np.trim_zeros(model.num[0][0], "f"), np.trim_zeros(model.den[0][0], "f")
     _check_continuous(model)
+    if numerator.size == 0:
+        raise ValueError("plant has a numerator of zero: the input must reach the output")
     if numerator.size != 1:
         raise ValueError(
             f"plant has a numerator of degree {numerator.size - 1}: its relative degree must equal its order, that is no zeros"

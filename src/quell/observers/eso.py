@@ -29,6 +29,8 @@ from quell.observers.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
 FORMS = ("current", "predictor")
+# In the coordinates of the design, where gains are O(1) and below: beyond this no pole is where it was put.
+_LARGEST_GAIN = 1e6
 
 
 class EsoModel(NamedTuple):
@@ -192,6 +194,22 @@ def continuous_gain(a: Vector, omega_o: float) -> Vector:
     return ell[1:]
 
 
+def noise_gains(observer: ESO) -> Vector:
+    """Return the variance of each estimate (N,) that white noise of unit variance in y leaves, as for a model-free observer.
+
+    In continuous time ``x̂_i = Σ_{k=i}^{N} C(N, k) ω_o^k s^(N−k+i−1) / (s + ω_o)^N · y``, and sampled white noise has the density dt; so
+    the variance is ``dt ω_o^(2i−1) ∫ |·|² dω / 2π`` of what is left at ω_o = 1. Good while ``omega_o dt`` is small.
+    """
+    size = observer.order + 1
+    omega = np.geomspace(1e-4, 1e4, 4001)
+    s = 1j * omega
+    gains = np.empty(size)
+    for i in range(1, size + 1):
+        response = sum(math.comb(size, k) * s ** (size - k + i - 1) for k in range(i, size + 1)) / (s + 1.0) ** size
+        gains[i - 1] = np.trapezoid(np.abs(response) ** 2, omega) / math.pi
+    return observer.dt * observer.omega_o ** (2.0 * np.arange(size) + 1.0) * gains
+
+
 def _sampled_design(a: Vector, b0: float, omega_o: float, dt: float, predictor: bool) -> EsoModel:
     """Sample the extended model and place the poles, in the coordinates ``x_i dt^(i−1)`` where all entries are O(1)."""
     size = a.size + 1
@@ -200,8 +218,15 @@ def _sampled_design(a: Vector, b0: float, omega_o: float, dt: float, predictor: 
     A[-2, :-1] -= a * dt ** (a.size - np.arange(a.size))
     B = np.zeros((size, 1))
     B[-2] = 1.0  # the effect of f_L; that of u is b0 times it
-    phi, (feed,) = zero_order_hold(A, [B], 1.0)
-    gain = _place(phi, -math.expm1(-omega_o * dt))
+    with np.errstate(over="ignore", invalid="ignore"):
+        phi, (feed,) = zero_order_hold(A, [B], 1.0)
+    gain = _place(phi, -math.expm1(-omega_o * dt)) if np.all(np.isfinite(phi)) else np.full(size, np.nan)
+    if not np.all(np.abs(gain) < _LARGEST_GAIN):
+        fastest = np.max(np.abs(np.roots([1.0, *a[::-1]])), initial=0.0)
+        raise ValueError(
+            f"dt = {dt!r} s: too long (or omega_o = {omega_o!r} rad/s too small) for the plant's fastest pole of {fastest:.3g} rad/s; "
+            "sampled, the model cannot be observed"
+        )
     # Back to the plant's coordinates: x = scaled / scale; an input enters with the n-th power of dt.
     feed = feed[:, 0] * dt**a.size / scale
     return EsoModel(
@@ -225,7 +250,10 @@ def _place(phi: Matrix, one_minus_pole: float) -> Vector:
     rows[0] = phi[0]
     for i in range(1, size):
         rows[i] = rows[i - 1] @ difference
-    vector = np.linalg.solve(rows, np.eye(size)[-1])
+    try:
+        vector = np.linalg.solve(rows, np.eye(size)[-1])
+    except np.linalg.LinAlgError:
+        return np.full(size, np.nan)
     shifted = difference + one_minus_pole * np.eye(size)
     for _ in range(size):
         vector = shifted @ vector

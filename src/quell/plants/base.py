@@ -1,7 +1,7 @@
 """What the driver asks of a plant.
 
 A plant is an object with ``order`` (number of states), ``disturbances`` (number of disturbance inputs), ``name``, and
-``sampled(dt)``, which returns a NamedTuple of parameters. For the type of that NamedTuple two functions are registered:
+``compiled`` and ``sampled(dt)``, which returns a NamedTuple of parameters. For the type of that NamedTuple two functions are registered:
 ``measure`` and ``advance``. See ``linear.py`` for a complete example.
 """
 
@@ -28,8 +28,12 @@ class Plant(Protocol):
     def disturbances(self) -> int:
         """Number of disturbance inputs."""
 
-    def sampled(self, dt: float) -> Any:
-        """Return the parameters for a sample time ``dt`` [s]."""
+    @property
+    def compiled(self) -> bool:
+        """Whether the driver can run it compiled."""
+
+    def sampled(self, dt: float, interpret: bool = False) -> Any:
+        """Return the parameters for a sample time ``dt`` [s]; with ``interpret``, such that Python can run and debug them."""
 
 
 @generic

@@ -98,7 +98,12 @@ class LinearPlant:
         """Number of disturbance inputs."""
         return int(self.E.shape[1])
 
-    def sampled(self, dt: float) -> LinearModel:
-        """Return the plant sampled with zero-order hold on u and w at ``dt`` [s], for the driver."""
+    @property
+    def compiled(self) -> bool:
+        """Whether the driver can run it compiled: always."""
+        return True
+
+    def sampled(self, dt: float, interpret: bool = False) -> LinearModel:
+        """Return the plant sampled with zero-order hold on u and w at ``dt`` [s], for the driver (interpreted or not, the same)."""
         phi, (gamma, gamma_w) = zero_order_hold(self.A, [self.B, self.E], checks.positive("dt", dt, "s"))
         return LinearModel(phi, gamma[:, 0].copy(), gamma_w, self.C[0].copy())

@@ -187,11 +187,13 @@ class NonlinearPlant:
         checks.whole("substeps", self.substeps, 1)
         if not callable(self.f):
             raise ValueError(f"f = {self.f!r}: must be a function f(t, x, u, w)")
-        returned = np.shape(self.f(0.0, np.zeros(n), 0.0, np.zeros(m)))
-        if returned != (n,):
-            raise ValueError(f"f returns shape {returned}: must return the {n} derivatives of the state")
+        returned = _tried("f(0.0, zeros, 0.0, zeros)", self.f, 0.0, np.zeros(n), 0.0, np.zeros(m))
+        if returned is not None and np.shape(returned) != (n,):
+            raise ValueError(f"f returns shape {np.shape(returned)}: must return the {n} derivatives of the state")
         if not callable(self.output):
             checks.vector("output", self._row, n)
+        elif np.shape(_tried("output(zeros)", self.output, np.zeros(n))) != ():
+            raise ValueError("output(x) must return one number")
 
     @property
     def _row(self) -> Any:
@@ -215,7 +217,12 @@ class NonlinearPlant:
     def _machine_code(self) -> tuple[Any, Any] | None:
         """The two functions compiled, or None where they can't be; they are kept as long as their addresses are."""
         n, m = self.order, self.disturbances
-        f, h = (function if hasattr(function, "py_func") else numba.njit(function) for function in (self.f, self._measured))
+        try:
+            # Division by zero gives inf, as in numpy: an exception could not leave compiled code from here.
+            f, h = (numba.njit(getattr(function, "py_func", function), error_model="numpy") for function in (self.f, self._measured))
+        except TypeError as error:  # not a plain function: a bound method, a callable object
+            self._warn(str(error))
+            return None
 
         def rate(t, px, u, pw, pdx):  # type: ignore[no-untyped-def]
             dx = numba.carray(pdx, (n,))
@@ -229,19 +236,35 @@ class NonlinearPlant:
         try:
             return numba.cfunc(_RATE_SIGNATURE)(rate), numba.cfunc(_OUTPUT_SIGNATURE)(output)
         except numba.core.errors.NumbaError as error:
-            reason = str(error).strip().splitlines()[-1]
-            warnings.warn(f"{self.name}: f or output can't be compiled and runs as Python, which is slow ({reason})", stacklevel=3)
+            lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+            self._warn(" ".join(lines[:2]))
             return None
+
+    def _warn(self, reason: str) -> None:
+        warnings.warn(f"{self.name}: f or output can't be compiled and runs as Python, which is slow ({reason})", stacklevel=4)
 
     @property
     def compiled(self) -> bool:
         """Whether Numba could compile the functions."""
         return self._machine_code is not None
 
-    def sampled(self, dt: float) -> CompiledNonlinear | PythonNonlinear:
-        """Return the plant for the driver, at the sample time ``dt`` [s]."""
+    def sampled(self, dt: float, interpret: bool = False) -> CompiledNonlinear | PythonNonlinear:
+        """Return the plant for the driver, at the sample time ``dt`` [s]; with ``interpret``, so that Python runs the functions."""
         step = checks.positive("dt", dt, "s") / self.substeps
-        if self._machine_code is None:
+        if interpret or self._machine_code is None:
             return PythonNonlinear(self.f, self._measured, step, self.substeps)
         rate, output = self._machine_code
         return CompiledNonlinear(rate.address, output.address, step, self.substeps)
+
+
+def _tried(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return what a user's function returns; None where the origin is no place for it."""
+    try:
+        return function(*arguments)
+    except ArithmeticError:
+        return None
+    except Exception as error:
+        text = f"{what} fails with {type(error).__name__}: {error}"
+        if isinstance(error, ValueError) and "math domain" in str(error):
+            return None
+        raise ValueError(f"{text}; f takes (t, x, u, w), output takes (x), with arrays x and w of the plant's sizes") from error
