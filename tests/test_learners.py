@@ -94,7 +94,7 @@ def literal_algorithm_1(seen: np.ndarray, u: np.ndarray, rate: float, batch: int
 def test_algorithm_1_by_sliding_sums_is_algorithm_1_as_printed(batch: int, rng: np.random.Generator) -> None:
     """The same θ at every sample, and the same third buffer at the end."""
     seen, u = rng.normal(size=(200, 4)), rng.normal(size=200)
-    learner = ql.learners.BatchGradient(rate=1e-3, batch=batch).design(ESO.model_free(order=3, b0=1.0, omega_o=10.0, dt=1e-2))
+    learner = ql.learners.BatchGradient(rate=1e-3, batch=batch).design(ESO.model_free(order=3, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
     memory = ql.learners.BatchGradient(rate=1e-3, batch=batch).memory(learner)
     expected = literal_algorithm_1(seen, u, 1e-3, batch)
     for row, before, theta in zip(seen, u, expected, strict=True):
@@ -107,7 +107,7 @@ def test_algorithm_1_by_sliding_sums_is_algorithm_1_as_printed(batch: int, rng: 
 def test_algorithm_1_is_silent_until_its_buffers_are_full(rng: np.random.Generator) -> None:
     """Warm-up as MF-ESO: no feedforward for the first n samples less one."""
     learner = ql.learners.BatchGradient(rate=1.0, batch=20)
-    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2))
+    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
     memory = learner.memory(design)
     for k in range(20):
         assert predict(design, memory, np.ones(3), 1.0) == (0.0, 0.0), k
@@ -118,7 +118,7 @@ def test_algorithm_1_is_silent_until_its_buffers_are_full(rng: np.random.Generat
 def test_the_sliding_sum_of_algorithm_1_does_not_drift(rng: np.random.Generator) -> None:
     """A datum 1e12 times larger than the rest leaves no trace once the ring has come round twice."""
     learner = ql.learners.BatchGradient(rate=0.0, batch=16)
-    design = learner.design(ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=1e-2))
+    design = learner.design(ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
     memory = learner.memory(design)
     adapt(design, memory, np.array([1e6, 1e6]), 0.0, 0.0)
     for _ in range(40):
@@ -128,7 +128,7 @@ def test_the_sliding_sum_of_algorithm_1_does_not_drift(rng: np.random.Generator)
 
 def kalman_memory(learner: ql.learners.Kalman, observer: ESO) -> tuple[object, object]:
     """Return a Kalman learner past its start, to which every feature teaches."""
-    design = learner.design(observer)
+    design = learner.design(observer, 1.0)
     design = design._replace(threshold=1e-9 * design.threshold)
     memory = learner.memory(design)
     memory.moment[:] = 1.0, 1.0, 1.0, 1e9
@@ -196,7 +196,7 @@ def test_the_effective_gain_stays_in_its_interval(rng: np.random.Generator) -> N
     for b0 in (2.0, -2.0):
         learner = ql.learners.Kalman(u=True, gain_interval=(0.4, 1.5))
         observer = ESO.model_free(order=2, b0=b0, omega_o=10.0, dt=1e-2)
-        design = learner.design(observer)
+        design = learner.design(observer, 1.0)
         memory = learner.memory(design)
         for _ in range(2000):
             seen, u = 10.0 * rng.normal(size=3), rng.normal()
@@ -289,7 +289,7 @@ def test_the_learner_watches_before_it_learns() -> None:
     """From rest it does not learn from the observer's own transient."""
     observer = ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2)
     learner = ql.learners.Kalman()
-    design = learner.design(observer)
+    design = learner.design(observer, 1.0)
     memory = learner.memory(design)
     for k in range(100):
         adapt(design, memory, np.array([1.0, 2.0, 3.0]), 1.0 + 1e-6, 0.0)
@@ -305,7 +305,7 @@ def test_the_learner_watches_before_it_learns() -> None:
 @pytest.mark.parametrize("learner", [ql.learners.Kalman(u=True), ql.learners.BatchGradient(batch=4)])
 def test_a_learner_that_left_the_range_of_numbers_begins_anew(learner: object) -> None:
     """Restarting keeps what was learned, but not where it is no number."""
-    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2))
+    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
     memory = learner.memory(design)
     memory.theta[:] = 0.25
     restart(design, memory)
@@ -323,7 +323,7 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew(learner: object) -
         (lambda: ql.learners.Kalman(bias_bandwidth=-1.0), "bias_bandwidth = -1.0: must be finite and not negative"),
         (lambda: ql.learners.Kalman(state=2), "state = 2: must be True or False"),
         (
-            lambda: ql.learners.Kalman(state_bandwidth=[0.1, 0.2]).design(ESO.model_free(3, 1.0, 10.0, 0.01)),
+            lambda: ql.learners.Kalman(state_bandwidth=[0.1, 0.2]).design(ESO.model_free(3, 1.0, 10.0, 0.01), 1.0),
             r"state_bandwidth has shape \(2,\): must be a vector of 3",
         ),
         (lambda: ql.learners.Kalman(frequency=0.0), "frequency = 0.0: must be finite and greater than zero"),

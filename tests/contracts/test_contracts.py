@@ -106,7 +106,7 @@ def test_a_learner_runs_the_same_again_and_interpreted(name: str) -> None:
 def test_a_learner_changes_only_its_memory(name: str, rng: np.random.Generator) -> None:
     """What it is shown stays as it was; predicting changes nothing at all."""
     learner = LEARNERS[name]
-    design = learner.design(OBSERVERS["model-free, order 2, current"])
+    design = learner.design(OBSERVERS["model-free, order 2, current"], 1.0)
     memory = learner.memory(design)
     for _ in range(200):
         seen = rng.normal(size=3)
@@ -127,7 +127,7 @@ def test_a_learner_names_its_coefficients(name: str) -> None:
     """As many names as θ has entries, each once."""
     learner = LEARNERS[name]
     for order in (1, 4):
-        memory = learner.memory(learner.design(OBSERVERS[f"model-free, order {order}, current"]))
+        memory = learner.memory(learner.design(OBSERVERS[f"model-free, order {order}, current"], 1.0))
         names = learner.feature_names(order)
         assert len(names) == len(set(names)) == memory.theta.size
 

@@ -208,7 +208,7 @@ class ADRC:
             cancel=observer.a,
             b0=observer.b0,
             limits=limits(u_min, u_max, rate_limit, observer.dt),
-            learner=self.learner.design(observer),
+            learner=self.learner.design(observer, self.omega_c),
         )
         self.features = self.learner.feature_names(observer.order)
         self._state = self.initial_state()

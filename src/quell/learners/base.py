@@ -1,6 +1,6 @@
 """What the controller asks of a learner.
 
-A learner is an immutable description (``Kalman(...)``). ``design(observer)`` turns it into a NamedTuple of parameters, and ``memory`` of
+A learner is an immutable description (``Kalman(...)``). ``design(observer, omega_c)`` turns it into a NamedTuple of parameters, and ``memory`` of
 those into a NamedTuple of arrays, its whole state. For the type of the parameters the functions below are registered; each sample
 the controller calls, in this order:
 
@@ -26,8 +26,8 @@ from quell.types import Vector
 class Learner(Protocol):
     """A description of a learner."""
 
-    def design(self, observer: ESO) -> Any:
-        """Return the parameters (a NamedTuple) for an observer."""
+    def design(self, observer: ESO, omega_c: float) -> Any:
+        """Return the parameters (a NamedTuple) for an observer and a controller's bandwidth [rad/s]."""
 
     def memory(self, parameters: Any) -> Any:
         """Return the state before anything was learned: a NamedTuple of arrays."""
@@ -69,7 +69,7 @@ def coefficients(learner: Any, memory: Any, theta: Vector) -> None:
 class NoLearner:
     """The learner that has nothing to say: it makes an L-ESO a plain ESO."""
 
-    def design(self, observer: ESO) -> NoLearnerDesign:
+    def design(self, observer: ESO, omega_c: float) -> NoLearnerDesign:
         """Return no parameters."""
         return NoLearnerDesign()
 

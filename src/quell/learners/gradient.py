@@ -146,8 +146,8 @@ class BatchGradient:
         checks.non_negative("rate", self.rate)
         checks.whole("batch", self.batch, 1)
 
-    def design(self, observer: ESO) -> BatchGradientDesign:
-        """Return the parameters for ``observer``."""
+    def design(self, observer: ESO, omega_c: float) -> BatchGradientDesign:
+        """Return the parameters for ``observer``; the controller's bandwidth does not matter."""
         return BatchGradientDesign(float(self.rate), self.batch, observer.order)
 
     def memory(self, parameters: BatchGradientDesign) -> BatchGradientMemory:

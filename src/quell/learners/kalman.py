@@ -241,7 +241,7 @@ class Kalman:
         the same for the coefficients of the state [rad/s], one for all or one for each; zero by default, as a plant's coefficients do
         not drift. The coefficient of u, where it is a feature, does not either.
     frequency
-        a frequency the plant has [rad/s]; ``omega_o / (2 N)`` by default. By it state i is scaled, to one size with the others.
+        a frequency the plant has [rad/s]; ``omega_c`` of the controller by default. By it state i is scaled, to one size with the others.
     prior
         how large the coefficients may be: coefficient i is of the order of ``prior · frequency^(n−i+1)``.
     gain_interval
@@ -282,8 +282,8 @@ class Kalman:
         if not 0.0 < low <= 1.0 <= high:
             raise ValueError(f"gain_interval = {self.gain_interval!r}: must be (low, high) with 0 < low <= 1 <= high")
 
-    def design(self, observer: ESO) -> KalmanDesign:
-        """Return the parameters for ``observer``.
+    def design(self, observer: ESO, omega_c: float) -> KalmanDesign:
+        """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s].
 
         Raises
         ------
@@ -295,7 +295,7 @@ class Kalman:
         slow = np.full(n, slow[0]) if slow.size == 1 else checks.vector("state_bandwidth", slow, n)
         follow = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
         lag_time = (n + 1) / observer.omega_o
-        frequency = 0.5 / lag_time if self.frequency is None else float(self.frequency)
+        frequency = omega_c if self.frequency is None else float(self.frequency)
         scale = frequency ** -np.arange(n, dtype=np.float64)
         # What noise in y leaves in x̂_i; what it leaves in f̂ is also in b0 u.
         threshold = (_CLEAR * np.append(scale, 1.0)) ** 2 * noise_gains(observer)
