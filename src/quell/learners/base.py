@@ -1,7 +1,7 @@
 """What the controller asks of a learner.
 
-A learner is an immutable description (``Kalman(...)``). ``design(observer, omega_c)`` turns it into a NamedTuple of parameters, and ``memory`` of
-those into a NamedTuple of arrays, its whole state. For the type of the parameters the functions below are registered; each sample
+A learner is an immutable description (``Kalman(...)``). ``design(observer, omega_c)`` turns it into a NamedTuple of parameters, and
+``memory`` of those into a NamedTuple of arrays, its whole state. For the type of the parameters the functions below are registered; each sample
 the controller calls, in this order:
 
 1. ``adapt`` with what the observer has just seen;
