@@ -1,8 +1,8 @@
 """What the controller asks of a learner.
 
 A learner is an immutable description (``Kalman(...)``). ``design(observer, omega_c)`` turns it into a NamedTuple of parameters, and
-``memory`` of those into a NamedTuple of arrays, its whole state. For the type of the parameters the functions below are registered; each sample
-the controller calls, in this order:
+``memory`` of those into a NamedTuple of arrays, its whole state. For the type of the parameters the functions below are registered;
+each sample the controller calls, in this order:
 
 1. ``adapt`` with what the observer has just seen;
 2. ``predict``, for the feedforward ``f_L = constant + slope · u``: affine in u, so that a learner with u among its features is cancelled
