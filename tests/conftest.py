@@ -6,8 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 import quell as ql
+
+# The same examples in every run, and no stop-watch: the machines that test are shared.
+settings.register_profile("quell", deadline=None, derandomize=True)
+settings.load_profile("quell")
 
 
 @pytest.fixture

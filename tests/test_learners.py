@@ -16,7 +16,7 @@ from quell.learners.lag import lag_of, lag_push
 from quell.observers.eso import ESO, eso_start, eso_update
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     order=st.integers(1, 8),
     dt=st.sampled_from([1e-3, 1e-2]),

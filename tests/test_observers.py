@@ -7,7 +7,7 @@ import math
 import control
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
@@ -28,7 +28,6 @@ def error_polynomial(observer: ESO) -> np.ndarray:
     return np.poly(error - np.eye(size))
 
 
-@settings(deadline=None)
 @given(order=st.integers(1, 8), dt=st.sampled_from([1e-4, 1e-3, 1e-2]), omega_o=st.floats(1.0, 100.0))
 def test_all_poles_lie_at_exp_minus_omega_o_dt(order: int, dt: float, omega_o: float) -> None:
     """For every order, sample time and bandwidth: the polynomial is (z − β)^N."""
@@ -38,7 +37,6 @@ def test_all_poles_lie_at_exp_minus_omega_o_dt(order: int, dt: float, omega_o: f
     np.testing.assert_allclose(error_polynomial(observer), wanted, rtol=1e-7, atol=1e-13 * wanted.max())
 
 
-@settings(deadline=None)
 @given(
     a=st.lists(st.floats(-50.0, 50.0), min_size=1, max_size=5),
     dt=st.sampled_from([1e-3, 5e-3]),
@@ -166,7 +164,6 @@ def test_a_state_space_model_and_a_transfer_function_give_the_same_coefficients(
         assert found.b == pytest.approx(wanted.b)
 
 
-@settings(deadline=None)
 @given(a=st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=6), seed=st.integers(0, 1000))
 def test_the_canonical_form_does_not_depend_on_the_coordinates(a: list[float], seed: int) -> None:
     """A companion form hidden by a change of coordinates is found again, and S maps the states."""

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from quell import signals as s
@@ -98,7 +98,6 @@ def test_noise_has_the_variance_power_over_sample_time_and_is_held() -> None:
     assert abs(np.corrcoef(draws[1:], draws[:-1])[0, 1]) < 0.02
 
 
-@settings(deadline=None)
 @given(cuts=st.lists(st.integers(1, 99_999), max_size=6), dt=st.sampled_from([1e-3, 7e-4, 1e-2, 0.033]))
 def test_noise_does_not_depend_on_how_time_is_cut(cuts: list[int], dt: float) -> None:
     """The same bits come out in pieces of any size, in any order."""

@@ -20,7 +20,7 @@ from quell.types import Matrix, Status, Vector
 
 # Signals are evaluated so many samples at a time: enough to make Python's share small, few enough to stay in cache.
 _BLOCK = 8192
-# A counter of samples is exact up to here, and time in steps of dt nearly so.
+# Time in steps of dt is exact to a part in a thousand of a step up to here.
 _MOST_SAMPLES = 10**12
 
 
@@ -177,53 +177,38 @@ def simulate(
     ValueError
         for arguments out of range, an x0 of the wrong size, or more disturbances than the plant has inputs.
     """
+    _check_kinds(plant, controller, scenario)
     every = checks.whole("record_every", record_every, 1)
     dt = controller.dt
-    if scenario.duration / dt > _MOST_SAMPLES:
-        raise ValueError(f"duration = {scenario.duration!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES:.0e} samples")
-    # The last sample is the last that is not after ``duration``, give or take rounding.
-    steps = scenario.duration / dt
-    samples = (round(steps) if math.isclose(steps, round(steps), rel_tol=1e-12, abs_tol=1e-9) else math.floor(steps)) + 1
+    samples = _sample_count(scenario.duration, dt)
     x0 = np.zeros(plant.order) if scenario.x0 is None else checks.vector("x0", scenario.x0, plant.order)
-    reference, disturbances, noise = scenario.seeded_signals(plant.disturbances)
-
-    design, state = controller.parameters, controller.initial_state()
-    as_python = interpret or not plant.compiled
-    model = plant.sampled(dt, interpret)
-    block, to_rest = (
-        (interpreted(run_block), interpreted(start_from_rest))
-        if as_python
-        else (for_types(run_block, model, design), for_types(start_from_rest, design))
-    )
+    signals = scenario.seeded_signals(plant.disturbances)
+    limit = _default_limit(signals[0], x0, samples, dt) if limit is None else checks.positive("limit", limit)
     channels = (
         *(("r", 1), ("y", 1), ("y_measured", 1), ("u", 1), ("w", plant.disturbances), ("x", plant.order)),
         *controller.channels,
     )
     log = np.empty(((samples - 1) // every + 1, sum(width for _, width in channels)))
+    design, state, model = controller.parameters, controller.initial_state(), plant.sampled(dt, interpret)
+    as_python = interpret or not plant.compiled
+    block, to_rest = (interpreted(f) if as_python else for_types(f, model, design) for f in (run_block, start_from_rest))
+
     x, scratch = x0.copy(), np.zeros(6 * plant.order)
-    if limit is None:
-        early = reference(np.arange(min(samples, _BLOCK)) * dt)
-        limit = 1e6 * max(1.0, float(np.max(np.abs(x0), initial=0.0)), float(np.max(np.abs(early[np.isfinite(early)]), initial=0.0)))
-    limit = checks.positive("limit", limit)
-    rests = {first_sample_at(time, dt, samples) for time in scenario.rest_at}
-    edges = sorted({*range(0, samples, _BLOCK), *(k for k in rests if k < samples), samples})
     row = until_next = done = status = 0
+    rests = {first_sample_at(time, dt, samples) for time in scenario.rest_at}
     # An interpreted loop that diverges would warn of every overflow; the status says it once.
     with np.errstate(over="ignore", invalid="ignore"):
-        for first, last in pairwise(edges):
+        for first, last in pairwise(sorted({*range(0, samples, _BLOCK), *rests, samples})):
             if first in rests:
                 x[:] = x0
                 to_rest(design, state)
-            t = np.arange(first, last) * dt
-            w = np.empty((t.size, plant.disturbances))
-            for j, signal in enumerate(disturbances):
-                w[:, j] = signal(t)
+            r, w, noise = _evaluated(signals, np.arange(first, last) * dt)
             ran, row, until_next, seen = block(
-                *(model, x, scratch, design, state, first * dt, dt, reference(t), w, noise(t), log, row, every, until_next, limit)
+                *(model, x, scratch, design, state, first * dt, dt, r, w, noise, log, row, every, until_next, limit)
             )
             done = first + ran
             status |= seen
-            if ran < t.size:
+            if done < last:
                 status |= Status.DIVERGED
                 break
             if progress is not None:
@@ -240,3 +225,37 @@ def simulate(
         features=controller.features,
         final_state=state,
     )
+
+
+def _check_kinds(plant: Any, controller: Any, scenario: Any) -> None:
+    for name, value, has, wanted in (
+        ("plant", plant, "sampled", "a plant, for example quell.plants.two_mass_spring()"),
+        ("controller", controller, "initial_state", "a controller, for example quell.ADRC(...)"),
+        ("scenario", scenario, "seeded_signals", "a quell.Scenario"),
+    ):
+        if isinstance(value, type) or not hasattr(value, has):
+            raise ValueError(f"{name} = {value!r}: must be {wanted}")
+
+
+def _sample_count(duration: float, dt: float) -> int:
+    """Return how many samples there are until ``duration``, both ends included, give or take rounding."""
+    steps = duration / dt
+    if steps > _MOST_SAMPLES:
+        raise ValueError(f"duration = {duration!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES:.0e} samples")
+    return (round(steps) if math.isclose(steps, round(steps), rel_tol=1e-12, abs_tol=1e-9) else math.floor(steps)) + 1
+
+
+def _default_limit(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
+    """Return a million times what is asked of the loop: a loop in encoder counts is not one that diverges."""
+    early = reference(np.arange(min(samples, _BLOCK)) * dt)
+    sizes = np.abs([1.0, *x0, *early[np.isfinite(early)]])
+    return 1e6 * float(np.max(sizes))
+
+
+def _evaluated(signals: tuple[Signal, tuple[Signal, ...], Signal], t: Vector) -> tuple[Vector, Matrix, Vector]:
+    """Return reference (k,), disturbances (k, m) and noise (k,) at the times ``t``."""
+    reference, disturbances, noise = signals
+    w = np.empty((t.size, len(disturbances)))
+    for j, disturbance in enumerate(disturbances):
+        w[:, j] = disturbance(t)
+    return np.ascontiguousarray(reference(t)), w, np.ascontiguousarray(noise(t))

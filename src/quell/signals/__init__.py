@@ -1,0 +1,68 @@
+"""References, disturbances and noise as functions of time.
+
+A signal is an immutable object called with an array of times [s]; it returns an array of values. It has no state, so it can be
+evaluated anywhere, in any order, in pieces of any size, always with the same bits. Signals add, subtract and scale::
+
+    reference   = Sinusoid(amplitude=1.0, omega=1.0).until(110.0, then=Step(at=110.0))
+    disturbance = 0.5 * Step(at=2.0) + BandLimitedNoise(power=1e-6, sample_time=0.01)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from quell import checks
+from quell.signals.base import Constant, Scaled, Signal, Sum, Switched, as_signal, seeded_apart
+from quell.signals.noise import BandLimitedNoise
+from quell.signals.shapes import Chirp, Ramp, Samples, Sinusoid, Step, Trapezoid
+
+__all__ = [
+    "KINDS",
+    "BandLimitedNoise",
+    "Chirp",
+    "Constant",
+    "Ramp",
+    "Samples",
+    "Scaled",
+    "Signal",
+    "Sinusoid",
+    "Step",
+    "Sum",
+    "Switched",
+    "Trapezoid",
+    "as_signal",
+    "make",
+    "seeded_apart",
+]
+
+KINDS: Mapping[str, type[Signal]] = {
+    "constant": Constant,
+    "step": Step,
+    "ramp": Ramp,
+    "sinusoid": Sinusoid,
+    "chirp": Chirp,
+    "trapezoid": Trapezoid,
+    "samples": Samples,
+    "noise": BandLimitedNoise,
+}
+"""The signals that a name and numbers describe, as scenario files use them."""
+
+
+def make(kind: str, **parameters: Any) -> Signal:
+    """Make a signal from the name of its kind and its parameters.
+
+    Raises
+    ------
+    ValueError
+        for an unknown kind or parameter; the message lists the known ones.
+    """
+    cls = KINDS[checks.one_of("signal", kind, tuple(KINDS))]
+    known = tuple(f.name for f in fields(cls))
+    for name in parameters:
+        checks.one_of(f"parameter of signal {kind!r}", name, known)
+    try:
+        return cls(**parameters)
+    except TypeError as error:
+        raise ValueError(f"signal {kind!r}: {str(error).split('() ')[-1]}") from None

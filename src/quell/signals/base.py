@@ -1,0 +1,161 @@
+"""What every signal can do, and how signals are put together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.types import Vector
+
+# Edges that fall on a sample belong to it even when k * dt is short of it by rounding.
+EDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class Signal:
+    """What every signal can do; ``evaluate`` is what a new kind has to give."""
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the values at the times ``t`` [s], an array of the same shape."""
+        raise TypeError(f"{type(self).__name__} must define evaluate(t)")
+
+    def __call__(self, t: Any) -> Vector:
+        """Return the values at the times ``t`` [s]; a number gives a 0-d array."""
+        times = np.asarray(t, dtype=np.float64)
+        values = np.asarray(self.evaluate(times), dtype=np.float64)
+        if values.shape != times.shape:
+            raise ValueError(f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape {times.shape}")
+        return values
+
+    def seeded(self, seed: int) -> Signal:
+        """Return this signal with its noise, if it has any, drawn from ``seed``."""
+        return self
+
+    def until(self, time: float, then: Signal | float) -> Signal:
+        """Return this signal before ``time`` [s] and ``then``, a signal or a number, from it on."""
+        return Switched((checks.finite("time", time),), (self, as_signal(then, "then")))
+
+    def __add__(self, other: Signal | float) -> Signal:
+        return Sum((self, as_signal(other)))
+
+    def __sub__(self, other: Signal | float) -> Signal:
+        return Sum((self, -1.0 * as_signal(other)))
+
+    def __mul__(self, factor: float) -> Signal:
+        return Scaled(checks.finite("factor", factor), self)
+
+    def __neg__(self) -> Signal:
+        return Scaled(-1.0, self)
+
+    def __rsub__(self, other: Signal | float) -> Signal:
+        return as_signal(other) - self
+
+    def __truediv__(self, factor: float) -> Signal:
+        return Scaled(1.0 / checks.nonzero("factor", factor, "a signal can't be divided by it"), self)
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+
+@dataclass(frozen=True)
+class Constant(Signal):
+    """The same ``value`` at all times."""
+
+    value: float = 0.0
+
+    def __post_init__(self) -> None:
+        checks.finite("value", self.value)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return ``value`` everywhere."""
+        return np.full(t.shape, float(self.value))
+
+
+@dataclass(frozen=True)
+class Scaled(Signal):
+    """``factor`` times another signal; written ``factor * signal``."""
+
+    factor: float
+    signal: Signal
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the scaled values."""
+        return self.factor * self.signal(t)
+
+    def seeded(self, seed: int) -> Signal:
+        """Seed the signal inside."""
+        return replace(self, signal=self.signal.seeded(seed))
+
+
+@dataclass(frozen=True)
+class Sum(Signal):
+    """The sum of several signals; written ``a + b``."""
+
+    terms: tuple[Signal, ...]
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the sum."""
+        total = np.zeros(t.shape)
+        for term in self.terms:
+            total = total + term(t)
+        return total
+
+    def seeded(self, seed: int) -> Signal:
+        """Seed every term, each with a stream of its own."""
+        return replace(self, terms=seeded_apart(self.terms, seed))
+
+
+@dataclass(frozen=True)
+class Switched(Signal):
+    """Pieces in time: ``pieces[i]`` holds from ``times[i − 1]`` to ``times[i]`` [s]; each is a function of absolute time."""
+
+    times: tuple[float, ...]
+    pieces: tuple[Signal, ...]
+
+    def __post_init__(self) -> None:
+        times = checks.vector("times", self.times)
+        if len(self.pieces) != times.size + 1:
+            raise ValueError(f"pieces has {len(self.pieces)} entries, times {times.size}: there must be one piece more than times")
+        if np.any(np.diff(times) <= 0.0):
+            raise ValueError(f"times = {self.times!r}: must increase")
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the values of whichever piece holds."""
+        edges = np.asarray(self.times) - EDGE
+        if t.size:
+            first, last = np.searchsorted(edges, (t.min(), t.max()), side="right")
+            if first == last:
+                return self.pieces[first](t)
+        which = np.searchsorted(edges, t, side="right")
+        values = np.empty(t.shape)
+        for i, piece in enumerate(self.pieces):
+            mine = which == i
+            values[mine] = piece(t[mine])
+        return values
+
+    def seeded(self, seed: int) -> Signal:
+        """Seed every piece, each with a stream of its own."""
+        return replace(self, pieces=seeded_apart(self.pieces, seed))
+
+
+def as_signal(value: Signal | float, name: str = "signal") -> Signal:
+    """Return a signal as it is and a number as a constant; ``name`` is what an error calls it."""
+    return value if isinstance(value, Signal) else Constant(checks.finite(name, value))
+
+
+def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:
+    """Seed several signals from one seed, so that no two of them share a stream."""
+    if not signals:
+        return ()
+    children = np.random.SeedSequence(seed).generate_state(len(signals), np.uint32).tolist()
+    return tuple(signal.seeded(child) for signal, child in zip(signals, children, strict=True))
+
+
+def check_fields(signal: Signal) -> None:
+    """Check that every parameter of a signal is a finite number."""
+    for f in fields(signal):
+        checks.finite(f.name, getattr(signal, f.name))

@@ -1,0 +1,170 @@
+"""Signals of a given shape."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.signals.base import EDGE, Signal, check_fields
+from quell.types import Vector
+
+
+@dataclass(frozen=True)
+class Step(Signal):
+    """Zero before ``at`` [s], ``height`` from it on."""
+
+    height: float = 1.0
+    at: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the step."""
+        return np.where(t >= self.at - EDGE, float(self.height), 0.0)
+
+
+@dataclass(frozen=True)
+class Ramp(Signal):
+    """Zero before ``start`` [s], then rising by ``slope`` a second until ``stop`` [s], then held."""
+
+    slope: float = 1.0
+    start: float = 0.0
+    stop: float = math.inf
+
+    def __post_init__(self) -> None:
+        checks.finite("slope", self.slope)
+        checks.interval("start", checks.finite("start", self.start), "stop", self.stop)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the ramp."""
+        return self.slope * (np.clip(t, self.start, self.stop) - self.start)
+
+
+@dataclass(frozen=True)
+class Sinusoid(Signal):
+    """``amplitude · sin(omega (t − start) + phase)`` from ``start`` [s] on, zero before; ``omega`` in rad/s, ``phase`` in rad."""
+
+    amplitude: float = 1.0
+    omega: float = 1.0
+    phase: float = 0.0
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the sinusoid."""
+        since = t - self.start
+        started = since >= -EDGE
+        if not started.any():
+            return np.zeros(t.shape)
+        wave = self.amplitude * np.sin(self.omega * since + self.phase)
+        return wave if started.all() else np.where(started, wave, 0.0)
+
+
+@dataclass(frozen=True)
+class Chirp(Signal):
+    """A sinusoid whose frequency moves linearly from ``omega_start`` to ``omega_end`` [rad/s] in ``duration`` [s], then stays.
+
+    The phase is the integral of the frequency, so it has no jump.
+    """
+
+    amplitude: float = 1.0
+    omega_start: float = 0.1
+    omega_end: float = 10.0
+    duration: float = 10.0
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        checks.positive("duration", self.duration, "s")
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the chirp."""
+        since = np.maximum(t - self.start, 0.0)
+        sweep = np.minimum(since, self.duration)
+        phase = self.omega_start * sweep + 0.5 * (self.omega_end - self.omega_start) * sweep**2 / self.duration
+        return self.amplitude * np.sin(phase + self.omega_end * (since - sweep))
+
+
+@dataclass(frozen=True)
+class Trapezoid(Signal):
+    """A move from 0 to ``distance`` with a trapezoidal velocity profile, then held.
+
+    Parameters
+    ----------
+    distance
+        where the move ends [y-unit], of either sign.
+    duration
+        how long it takes [s].
+    ramp_time
+        how long it accelerates, and decelerates [s]; at most half of ``duration`` (then the profile is a triangle). A third of
+        ``duration`` by default, the profile of least energy.
+    start
+        when it begins [s].
+    """
+
+    distance: float = 1.0
+    duration: float = 2.0
+    ramp_time: float | None = None
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        checks.finite("distance", self.distance)
+        checks.finite("start", self.start)
+        checks.positive("duration", self.duration, "s")
+        ramp = self._ramp
+        if not 0.0 < ramp <= self.duration / 2:
+            raise ValueError(f"ramp_time = {self.ramp_time!r}: must be in (0, duration / 2 = {self.duration / 2}]")
+
+    @property
+    def _ramp(self) -> float:
+        return self.duration / 3 if self.ramp_time is None else checks.finite("ramp_time", self.ramp_time)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the position along the move."""
+        ramp, since = self._ramp, np.clip(t - self.start, 0.0, self.duration)
+        cruise = self.distance / (self.duration - ramp)
+        left = self.duration - since
+        speeding = 0.5 * cruise / ramp * since**2
+        braking = self.distance - 0.5 * cruise / ramp * left**2
+        return np.where(since < ramp, speeding, np.where(left < ramp, braking, cruise * (since - 0.5 * ramp)))
+
+
+@dataclass(frozen=True, eq=False)
+class Samples(Signal):
+    """Recorded samples.
+
+    Parameters
+    ----------
+    times
+        when they were taken [s], increasing.
+    values
+        what they were.
+    hold
+        ``"linear"`` interpolates, ``"previous"`` holds each value until the next. Outside of the record the end values hold.
+    """
+
+    times: Any
+    values: Any
+    hold: str = "linear"
+
+    def __post_init__(self) -> None:
+        times = checks.vector("times", self.times)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "values", checks.vector("values", self.values, times.size))
+        checks.one_of("hold", self.hold, ("linear", "previous"))
+        if times.size == 0 or np.any(np.diff(times) <= 0.0):
+            raise ValueError("times: must hold at least one sample and increase")
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the samples at ``t``."""
+        if self.hold == "linear":
+            return np.asarray(np.interp(t, self.times, self.values))
+        index = np.searchsorted(self.times - EDGE, t, side="right") - 1
+        return np.asarray(self.values[np.maximum(index, 0)])
