@@ -6,11 +6,12 @@ project = "quell"
 author = "The quell developers"
 copyright = "2026, the quell developers"
 release = version = quell.__version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx-mathjax-offline"]
 html_theme = "pydata_sphinx_theme"
 html_title = "quell"
 html_theme_options = {"show_prev_next": False, "secondary_sidebar_items": ["page-toc"]}
 html_show_sourcelink = False
+html_sidebars = {"**": []}
 exclude_patterns = ["_build", "jupyter_execute"]
 
 # Every cell of the pages is run when they are built: an example that fails stops the build.

@@ -96,6 +96,16 @@ def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_an_observer_runs_the_same_again_and_interpreted(name: str) -> None:
+    """In a loop with the plant it was made for: same seed, same output; no second compilation; interpreted = compiled."""
+    observer = OBSERVERS[name]
+    companion = np.diag(np.ones(observer.order - 1), 1)
+    companion[-1] = -observer.a
+    ends = np.eye(observer.order)
+    check_run(ql.plants.LinearPlant(companion, 1.5 * ends[-1], ends[0]), ql.ADRC(observer, omega_c=1.0))
+
+
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_learner_runs_the_same_again_and_interpreted(name: str) -> None:
     """Same seed, same output; no second compilation; interpreted = compiled."""
