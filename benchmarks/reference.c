@@ -19,7 +19,7 @@ typedef struct {
     double phi[N][N], gamma_u[N], gamma_f[N], gain[N];
     double law[NX], b0;
     double pole, rise, taps[N];
-    double scale[NX], threshold[P], walk_bias, forget, lag_time, prior, fastest;
+    double scale[NX], threshold[P], walk_bias, forget, lag_time, prior, fastest, f_noise;
 } design_t;
 
 typedef struct {
@@ -51,7 +51,7 @@ static inline double step(const design_t *restrict d, state_t *restrict s, doubl
         s->unexplained += d->forget * (innovation * innovation + doubt * doubt - s->unexplained);
         s->filled += d->forget * (1.0 - s->filled);
         s->since += d->dt;
-        double noise = s->noise / s->filled, root = sqrt(d->lag_time * s->unexplained / s->filled);
+        double noise = s->noise / s->filled, root = sqrt(d->lag_time * (s->unexplained + d->f_noise * s->noise) / s->filled);
         if (root != 0.0) {
             double weight = 1.0 / root, taught[P], g[P], spread = 0.0;
             for (int i = 0; i < NX; i++) {

@@ -62,7 +62,7 @@ def c_reference(folder: Path) -> Callable[[study.Settings, bool], np.ndarray]:
                 kalman.lag.taps,
                 kalman.scale[:4],
                 kalman.threshold,
-                [kalman.walk[-1], kalman.forget, kalman.lag_time, kalman.prior[0], kalman.fastest],
+                [kalman.walk[-1], kalman.forget, kalman.lag_time, kalman.prior[0], kalman.fastest, kalman.f_noise],
             ]
         )
         samples, hold = round(study.END / settings.dt) + 1, round(0.01 / settings.dt)

@@ -130,6 +130,9 @@ def test_without_a_reference_the_plant_stays_where_it_is() -> None:
     assert controller.step(math.nan, 5.0) == 0.0
     assert controller.estimate.status == ql.Status.REFERENCE_HELD
     assert controller.step(6.0, 5.0) > 0.0
+    sleeping = ql.ADRC(OBSERVER, omega_c=3.0)
+    sleeping.step(1.0, math.nan)
+    assert sleeping.step(math.nan, 0.0) > 0.0
 
 
 @pytest.mark.parametrize("used", [False, True])
@@ -139,7 +142,7 @@ def test_a_controller_can_be_copied_and_sent_to_another_process(used: bool) -> N
     if used:
         for k in range(50):
             controller.step(1.0, 0.01 * k)
-    for other in (copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))):
+    for other in (copy.copy(controller), copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))):
         mine = controller.state
         assert other.step(1.0, 0.7) == ql.ADRC.step(copy.deepcopy(controller), 1.0, 0.7)
         for name, array in controller.state.items():

@@ -133,7 +133,7 @@ def kalman_memory(learner: ql.learners.Kalman, observer: ESO) -> tuple[object, o
     memory = learner.memory(design)
     memory.moment[:] = 1.0, 1.0, 1.0, 1e9
     memory.variance[:] = 1.0
-    return design._replace(forget=0.0, fastest=1e9), memory
+    return design._replace(forget=0.0, fastest=1e9, f_noise=0.0), memory
 
 
 def test_without_a_walk_the_kalman_learner_is_ridge_regression(rng: np.random.Generator) -> None:
@@ -240,6 +240,22 @@ def test_at_rest_a_learner_is_as_quiet_as_no_learner(order: int, power: float) -
     )
     late = plain.window(200.0, 300.0)
     assert np.std(learned["y"][late]) < 3.0 * np.std(plain["y"][late])
+
+
+@pytest.mark.parametrize("order", [2, 4, 6])
+@pytest.mark.parametrize("u", [False, True])
+def test_where_nothing_is_left_to_learn_nothing_is_learned(order: int, u: bool) -> None:
+    """A chain of integrators without noise: what is left is rounding, P stays positive, the loop goes on."""
+    A = np.diag(np.ones(order - 1), 1)
+    plant = ql.plants.LinearPlant(A, np.eye(order)[-1], np.eye(order)[0])
+    s = ql.signals
+    scenario = ql.Scenario(s.Sinusoid().until(60.0, then=s.Sinusoid(omega=0.5)).until(120.0, then=2.0), 160.0, (s.Step(at=140.0),))
+    controller = ql.ADRC(ESO.model_free(order, 1.0, 10.0, 5e-3), omega_c=1.0, learner=ql.learners.Kalman(u=u))
+    run = ql.simulate(plant, controller, scenario)
+    assert not run.diverged
+    assert np.max(np.abs(run["theta"][run.t < 140.0])) < 0.1
+    covariance = run.final_state.learner.covariance
+    assert np.min(np.linalg.eigvalsh(0.5 * (covariance + covariance.T))) > -1e-9 * np.max(np.abs(covariance))
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])

@@ -1,4 +1,4 @@
-"""quell: disturbance-rejection control that learns, and that its learning cannot break.
+"""quell: disturbance-rejection control that learns.
 
 The public names; each is imported when it is first used, so that ``import quell`` is quick::
 

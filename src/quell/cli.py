@@ -15,7 +15,7 @@ from quell import __version__
 
 app = App(
     name="quell",
-    help="Disturbance-rejection control that learns, and that its learning cannot break.",
+    help="Disturbance-rejection control that learns.",
     version=__version__,
     print_error=False,
     exit_on_error=False,

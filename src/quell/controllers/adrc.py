@@ -9,6 +9,7 @@ loop through u is solved instead of closed a sample late: ``u = sat( (u_0 − h 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -30,7 +31,7 @@ _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 
 # Places in AdrcState.loop.
-_U, _F_LEARNED, _R, _Y, _STARTED, _STATUS = range(6)
+_U, _F_LEARNED, _R, _Y, _STARTED, _REFERENCED, _STATUS = range(7)
 
 
 class AdrcDesign(NamedTuple):
@@ -54,7 +55,7 @@ class AdrcState(NamedTuple):
     seen: Vector
     """What the law may know of it (N,)."""
     loop: Vector
-    """(6,): u applied, f_L, last good r and y, whether started, status."""
+    """(7,): u applied, f_L, last good r and y, whether there was a good y, whether a good r, status."""
     learner: Any
 
 
@@ -68,9 +69,10 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         status |= _MEASUREMENT_HELD
     if math.isfinite(r):
         loop[_R] = r
+        loop[_REFERENCED] = 1.0
     else:
         status |= _REFERENCE_HELD
-        if loop[_STARTED] == 0.0:
+        if loop[_REFERENCED] == 0.0:
             loop[_R] = loop[_Y]  # no reference yet: stay
     if loop[_STARTED] == 0.0:
         eso_start(state.z, seen, loop[_Y])
@@ -235,7 +237,7 @@ class ADRC:
         """Return a state before the first sample, with nothing learned."""
         size = self.observer.order + 1
         memory = self.learner.memory(self.parameters.learner)
-        return AdrcState(np.zeros(size), np.zeros(size), np.zeros(6), memory)
+        return AdrcState(np.zeros(size), np.zeros(size), np.zeros(7), memory)
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
@@ -263,6 +265,7 @@ class ADRC:
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update(kept)
+        self._state = copy.deepcopy(self._state)
         self._arrays = _named_arrays(self._state)
         self._handle = None
 

@@ -6,12 +6,13 @@ With the features φ (state, bias, u) and what the observer shows of them, φ^F 
     g = P φ̃ / max(φ̃·P φ̃ + 1/dt, φ̃·P φ̃ / (λ_m dt)),    θ ← θ + g ε,    P ← P − g (P φ̃)ᵀ + Q dt
 
 All are continuous-time densities, so the tuning does not change with dt. Coefficients of the state and of u are measured in noise of
-density ``R = τ E[ε² + (0.1 f̂)²]``: for them φ̃ = φ^F/√R and ε/√R take the place of φ^F and ε. The bias is measured in units of R itself.
+density ``R = τ E[ε² + (0.1 f̂)² + σ²]``: for them φ̃ = φ^F/√R and ε/√R take the place of φ^F and ε. The bias is measured in units of R
+itself.
 
 *R follows the innovation.* What the learner can't explain it takes for noise, and learns less from it. Nor does it believe that a linear
-model explains more than nine tenths of f. The mean is an exponential one; τ = N/omega_o, the observer's lag, is how long the noise of Δf̂ is
-correlated. The bias does not follow R: a gain that follows the noise folds its high frequencies down to where the loop is
-sensitive.
+model explains more than nine tenths of f, or that f̂ is better than σ, what the measurement noise, or rounding, leaves in it. The mean is
+an exponential one; τ = N/omega_o, the observer's lag, is how long the noise of Δf̂ is correlated. The bias does not follow R: a gain that
+follows the noise folds its high frequencies down to where the loop is sensitive.
 
 *Random walk.* A walk is given as a tracking bandwidth λ. For the bias ``Q = λ²``: the steady Kalman gain of a random walk in white noise is
 ``sqrt(Q/R)``, so a constant disturbance is learned with the time constant 1/λ, whatever its unit. For a feature of variance φ² it is
@@ -71,6 +72,8 @@ class KalmanDesign(NamedTuple):
     """(p,): standard deviation of θ before anything is known, in scaled units; 0 for the bias, whose walk opens P by itself."""
     fastest: float
     """λ_m [rad/s]."""
+    f_noise: float
+    """Variance that white noise of unit variance in y leaves in f̂."""
     states: int
     """n, or 0 without state features."""
     bias: bool
@@ -141,6 +144,8 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
             total += covariance[i, j] * taught[j]
         gain[i] = total
         spread += total * taught[i]
+    if spread < 0.0:  # P is no covariance any more: rather learn nothing
+        return
     inverse = 1.0 / max(spread + 1.0 / learner.dt, spread / (learner.fastest * learner.dt))
     for i in range(size):
         share = gain[i] * inverse
@@ -150,14 +155,15 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
             theta[i] += share * innovation
             covariance[i, i] += learner.walk[i] * learner.dt
         else:
-            change = share * innovation * weight
-            theta[i] += change
+            wished = theta[i] + share * innovation * weight
+            if learner.with_u and i == size - 1:
+                wished = min(max(wished, learner.slope_low), learner.slope_high)
+            change = wished - theta[i]
+            theta[i] = wished
             if learner.bias:
                 theta[learner.states] -= change * mean[i]
             if taught[i] != 0.0:
                 covariance[i, i] += learner.walk[i] * learner.dt * deviation * deviation / variance[i]
-    if learner.with_u:
-        theta[size - 1] = min(max(theta[size - 1], learner.slope_low), learner.slope_high)
 
 
 @kernel
@@ -168,7 +174,8 @@ def _watch(learner: KalmanDesign, moment: Vector, y: float, error: float, innova
     moment[_UNEXPLAINED] += learner.forget * (innovation * innovation + doubt * doubt - moment[_UNEXPLAINED])
     moment[_FILLED] += learner.forget * (1.0 - moment[_FILLED])
     moment[_SINCE] += learner.dt
-    return moment[_NOISE] / moment[_FILLED], math.sqrt(learner.lag_time * moment[_UNEXPLAINED] / moment[_FILLED])
+    unexplained = moment[_UNEXPLAINED] + learner.f_noise * moment[_NOISE]
+    return moment[_NOISE] / moment[_FILLED], math.sqrt(learner.lag_time * unexplained / moment[_FILLED])
 
 
 @predict.register(KalmanDesign)
@@ -233,8 +240,8 @@ class Kalman:
     Parameters
     ----------
     state, bias, u
-        which features it has. With ``u`` it can learn that the plant's gain is not b0; it is out by default, because a loop that
-        rejects a disturbance makes u a copy of it.
+        which features it has. Without a bias a load that stays is taken for a property of the plant. With ``u`` the learner can learn
+        that the plant's gain is not b0; it is out by default, because a loop that rejects a disturbance makes u a copy of it.
     bias_bandwidth
         how fast the bias follows, λ [rad/s]; ``omega_o`` of the observer by default. Smaller is smoother, larger rejects more.
     state_bandwidth
@@ -298,7 +305,8 @@ class Kalman:
         frequency = omega_c if self.frequency is None else float(self.frequency)
         scale = frequency ** -np.arange(n, dtype=np.float64)
         # What noise in y leaves in x̂_i; what it leaves in f̂ is also in b0 u.
-        threshold = (_CLEAR * np.append(scale, 1.0)) ** 2 * noise_gains(observer)
+        noise = noise_gains(observer)
+        threshold = (_CLEAR * np.append(scale, 1.0)) ** 2 * noise
         size = self.prior * frequency**n
         return KalmanDesign(
             lag=lag_of(observer),
@@ -306,6 +314,7 @@ class Kalman:
             walk=np.array([*slow[: n * self.state] ** 2, *[follow**2] * self.bias, *[0.0] * self.u]),
             threshold=np.array([*threshold[: n * self.state], *[0.0] * self.bias, *[threshold[n]] * self.u]),
             fastest=max(follow, observer.omega_o),
+            f_noise=float(noise[n]),
             prior=np.array([*[size] * (n * self.state), *[0.0] * self.bias, *[1.0] * self.u]),
             states=n * self.state,
             bias=self.bias,
