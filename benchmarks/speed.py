@@ -27,6 +27,17 @@ from quell.experiments import two_mass_spring as study
 
 HERE = Path(__file__).parent
 TRIALS = 15
+SAMPLES = round(study.END / study.Settings().dt) + 1
+
+
+def row(what: str, ratio: float, bar: str, times: str) -> dict[str, object]:
+    """Return a line of the table."""
+    return {"what": what, "ratio": ratio, "bar": bar, "times": times}
+
+
+def each(*runs: float) -> str:
+    """Say how long a sample takes in runs of the study that took so long [s]."""
+    return " / ".join(f"{run / SAMPLES * 1e9:.0f}" for run in runs) + " ns a sample"
 
 
 def best(*candidates: Callable[[], object], trials: int = TRIALS) -> list[float]:
@@ -86,22 +97,14 @@ def against_c(rows: list[dict[str, object]]) -> None:
         log, run = reference(settings), ql.simulate(plant, controller, scenario)
         apart = max(np.max(np.abs(run["y"] - log[:, 1])), np.max(np.abs(run["u"] - log[:, 3])))
         assert apart < 1e-6, f"quell and C differ by {apart}"
-        samples = len(run)
         c_all, ours_all, c_bare, ours_bare = best(
             lambda: reference(settings),
             lambda: ql.simulate(plant, controller, scenario),
             lambda: reference(settings, False),
-            lambda: ql.simulate(plant, controller, scenario, record_every=samples),
+            lambda: ql.simulate(plant, controller, scenario, record_every=SAMPLES),
         )
     for label, c, ours in (("every sample recorded", c_all, ours_all), ("nothing recorded", c_bare, ours_bare)):
-        rows.append(
-            {
-                "what": f"closed loop, Kalman learner, {label}: quell / C",
-                "ratio": ours / c,
-                "bar": "≤ 2",
-                "times": f"{ours / samples * 1e9:.0f} / {c / samples * 1e9:.0f} ns a sample, apart by {apart:.0e}",
-            }
-        )
+        rows.append(row(f"closed loop, Kalman learner, {label}: quell / C", ours / c, "≤ 2", f"{each(ours, c)}, apart by {apart:.0e}"))
 
 
 def algorithm_1(rows: list[dict[str, object]]) -> None:
@@ -110,14 +113,7 @@ def algorithm_1(rows: list[dict[str, object]]) -> None:
     scenario = study.scenario(settings)
     small, large = (study.controller(settings, learner=ql.learners.BatchGradient(1e-5 / n, n)) for n in (10, 10_000))
     few, many = best(lambda: ql.simulate(plant, small, scenario), lambda: ql.simulate(plant, large, scenario))
-    rows.append(
-        {
-            "what": "Algorithm 1: batch of 10 000 / batch of 10",
-            "ratio": many / few,
-            "bar": "≤ 1.3",
-            "times": f"{many / 250_001 * 1e9:.0f} / {few / 250_001 * 1e9:.0f} ns a sample",
-        }
-    )
+    rows.append(row("Algorithm 1: batch of 10 000 / batch of 10", many / few, "≤ 1.3", each(many, few)))
 
 
 def learners(rows: list[dict[str, object]]) -> None:
@@ -132,8 +128,7 @@ def learners(rows: list[dict[str, object]]) -> None:
     candidates = [study.controller(settings, learner=learner) for learner in (None, *kinds.values())]
     plain, *learned = best(*(lambda c=c: ql.simulate(plant, c, scenario) for c in candidates))
     for name, took in zip(kinds, learned, strict=True):
-        times = f"{took / 250_001 * 1e9:.0f} / {plain / 250_001 * 1e9:.0f} ns a sample"
-        rows.append({"what": f"closed loop: {name} / no learner", "ratio": took / plain, "bar": "", "times": times})
+        rows.append(row(f"closed loop: {name} / no learner", took / plain, "", each(took, plain)))
 
 
 def one_call(rows: list[dict[str, object]]) -> None:
@@ -164,15 +159,9 @@ def one_call(rows: list[dict[str, object]]) -> None:
     peer = 10 * peer - empty
     plain, kalman = plain - empty, kalman - empty
     for label, took in (("order 2, no learner", plain), ("order 4, Kalman learner", kalman)):
-        rows.append({"what": f"step() from Python, {label}: µs", "ratio": took * 1e6, "bar": "≤ 1", "times": f"{took * 1e9:.0f} ns"})
-    rows.append(
-        {
-            "what": "one call, second order: pyadrc / quell",
-            "ratio": peer / plain,
-            "bar": "> 1",
-            "times": f"{peer * 1e9:.0f} / {plain * 1e9:.0f} ns, same outputs",
-        }
-    )
+        rows.append(row(f"step() from Python, {label}: µs", took * 1e6, "≤ 1", f"{took * 1e9:.0f} ns"))
+    times = f"{peer * 1e9:.0f} / {plain * 1e9:.0f} ns, same outputs"
+    rows.append(row("one call, second order: pyadrc / quell", peer / plain, "> 1", times))
 
 
 def against_python_control(rows: list[dict[str, object]]) -> None:
@@ -206,7 +195,7 @@ def against_python_control(rows: list[dict[str, object]]) -> None:
     ours /= 100_001
     theirs /= samples
     times = f"{theirs * 1e6:.0f} µs / {ours * 1e9:.0f} ns a sample, apart by {apart:.0e}"
-    rows.append({"what": "two-mass loop, MF-ESO: python-control / quell", "ratio": theirs / ours, "bar": "≥ 300", "times": times})
+    rows.append(row("two-mass loop, MF-ESO: python-control / quell", theirs / ours, "≥ 300", times))
 
 
 def main() -> None:
@@ -218,8 +207,8 @@ def main() -> None:
     for measure in (against_c, algorithm_1, learners, one_call, against_python_control):
         measure(rows)
     table = Table("what", "measured", "bar", "times")
-    for row in rows:
-        table.add_row(str(row["what"]), f"{row['ratio']:.2f}", str(row["bar"]), str(row["times"]))
+    for line in rows:
+        table.add_row(str(line["what"]), f"{line['ratio']:.2f}", str(line["bar"]), str(line["times"]))
     Console().print(table)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -15,7 +15,7 @@ from quell.controllers.base import Controller, control, flags, report, rest
 from quell.dispatch import compiled, for_types, interpreted
 from quell.plants.base import Plant, advance, measure
 from quell.signals import Constant, Signal, as_signal, seeded_apart
-from quell.trajectory import Trajectory, first_sample_at
+from quell.trajectory import Trajectory, first_sample_at, in_steps
 from quell.types import Matrix, Status, Vector
 
 # Signals are evaluated so many samples at a time: enough to make Python's share small, few enough to stay in cache.
@@ -239,10 +239,9 @@ def _check_kinds(plant: Any, controller: Any, scenario: Any) -> None:
 
 def _sample_count(duration: float, dt: float) -> int:
     """Return how many samples there are until ``duration``, both ends included, give or take rounding."""
-    steps = duration / dt
-    if steps > _MOST_SAMPLES:
+    if duration / dt > _MOST_SAMPLES:
         raise ValueError(f"duration = {duration!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES:.0e} samples")
-    return (round(steps) if math.isclose(steps, round(steps), rel_tol=1e-12, abs_tol=1e-9) else math.floor(steps)) + 1
+    return math.floor(in_steps(duration, dt)) + 1
 
 
 def _default_limit(reference: Signal, x0: Vector, samples: int, dt: float) -> float:

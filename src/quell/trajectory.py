@@ -18,6 +18,8 @@ from quell.types import Matrix, Status, Vector
 if TYPE_CHECKING:
     import xarray
 
+# Channels of several values a sample, be it only one.
+_VECTORS = ("w", "x", "x_hat", "theta")
 _MEANINGS = {
     "r": ("reference", "y-unit"),
     "y": ("output", "y-unit"),
@@ -106,7 +108,7 @@ class Trajectory:
             if channel == name:
                 break
             start += width
-        return self.log[:, start] if width == 1 and name not in ("w", "x", "x_hat", "theta") else self.log[:, start : start + width]
+        return self.log[:, start : start + width] if name in _VECTORS else self.log[:, start]
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -266,5 +268,11 @@ def first_sample_at(time: float, step: float, samples: int) -> int:
     """
     if math.isnan(time):
         raise ValueError(f"time = {time!r}: must be a number")
-    count = min(max(time / step, 0.0), float(samples))
-    return min(round(count) if math.isclose(count, round(count), rel_tol=1e-12, abs_tol=1e-9) else math.ceil(count), samples)
+    return math.ceil(in_steps(min(max(time, 0.0), samples * step), step))
+
+
+def in_steps(time: float, step: float) -> float:
+    """Return ``time / step``, to the nearest whole number where it is one but for rounding."""
+    count = time / step
+    nearest = float(round(count))
+    return nearest if math.isclose(count, nearest, rel_tol=1e-12, abs_tol=1e-9) else count

@@ -30,7 +30,7 @@ class Trial:
     ended: float
     """When the run ended [s]: ``HORIZON``, or where it diverged."""
     stable: bool
-    """Whether it outlasted the setting."""
+    """Whether it outlasted the study."""
     disturbance_peak: float | None
 
 

@@ -109,10 +109,10 @@ def _bandwidth_for(settings: Settings, model: bool, scores: Any, tell: Callable[
     found = map(score, in_parallel([partial(quick_run, settings, candidate) for candidate in candidates]))
     tell("bandwidths", 1.0 if model else 0.5)
     points = [(math.log(s["disturbance_peak"]), math.log(factor)) for s, factor in zip(found, grid, strict=True) if s["disturbance_peak"]]
+    peaks, factors = np.array(sorted(points)).T if points else (np.zeros(0), np.zeros(0))
     needed: dict[str, float | None] = {}
     for learner in (L, L1):
         peak = scores[learner]["disturbance_peak"]
-        peaks, factors = np.array(sorted(points)).T if points else (np.zeros(0), np.zeros(0))
         known = peak is not None and peaks.size > 1 and math.log(peak) <= peaks[-1]
         needed[learner] = float(np.exp(np.interp(math.log(peak), peaks, factors))) if known else None
     return needed

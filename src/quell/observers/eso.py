@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -201,13 +202,20 @@ def noise_gains(observer: ESO) -> Vector:
     the variance is ``dt ω_o^(2i−1) ∫ |·|² dω / 2π`` of what is left at ω_o = 1. Good while ``omega_o dt`` is small.
     """
     size = observer.order + 1
+    return observer.dt * observer.omega_o ** (2.0 * np.arange(size) + 1.0) * _unit_noise_gains(size)
+
+
+@cache
+def _unit_noise_gains(size: int) -> Vector:
+    """Return the integrals of ``noise_gains``, which depend on the number of states only."""
     omega = np.geomspace(1e-4, 1e4, 4001)
     s = 1j * omega
     gains = np.empty(size)
     for i in range(1, size + 1):
         response = sum(math.comb(size, k) * s ** (size - k + i - 1) for k in range(i, size + 1)) / (s + 1.0) ** size
         gains[i - 1] = np.trapezoid(np.abs(response) ** 2, omega) / math.pi
-    return observer.dt * observer.omega_o ** (2.0 * np.arange(size) + 1.0) * gains
+    gains.flags.writeable = False
+    return gains
 
 
 def _sampled_design(a: Vector, b0: float, omega_o: float, dt: float, predictor: bool) -> EsoModel:

@@ -261,10 +261,10 @@ def _tried(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Return what a user's function returns; None where the origin is no place for it."""
     try:
         return function(*arguments)
-    except ArithmeticError:
-        return None
     except Exception as error:
-        text = f"{what} fails with {type(error).__name__}: {error}"
-        if isinstance(error, ValueError) and "math domain" in str(error):
+        if isinstance(error, ArithmeticError) or "math domain" in str(error):
             return None
-        raise ValueError(f"{text}; f takes (t, x, u, w), output takes (x), with arrays x and w of the plant's sizes") from error
+        raise ValueError(
+            f"{what} fails with {type(error).__name__}: {error}; "
+            "f takes (t, x, u, w), output takes (x), with arrays x and w of the plant's sizes"
+        ) from error
