@@ -52,6 +52,7 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
         (("--dt", "nan"), "dt = nan: must be finite and greater than zero"),
         (("--omega-o", "400", "--dt", "0.01"), "omega_o * dt"),
         (("--seed", "-1"), "seed = -1: must be a whole number"),
+        (("--seed", "1.5"), "--seed = '1.5': must be a whole number"),
         (("--dt", "fast"), "dt"),
         (("--json", "nowhere/out.json"), "the folder 'nowhere' must exist"),
         (("--colour", "red"), "colour"),

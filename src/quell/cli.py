@@ -6,10 +6,11 @@ Heavy imports stand inside the commands, so that ``quell --help`` answers at onc
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Parameter, Token
 
 from quell import __version__
 
@@ -24,11 +25,20 @@ reproduce = App(name="reproduce", help="Run a published experiment again and jud
 app.command(reproduce)
 
 
+def _whole(kind: Any, tokens: Sequence[Token]) -> int:
+    """Read a whole number; the parser's own conversion would round 1.5 to 2 without a word."""
+    text = tokens[0].value
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"{tokens[0].keyword} = {text!r}: must be a whole number") from None
+
+
 @reproduce.command(name="two-mass")
 def two_mass(
     *,
     dt: float = 1e-3,
-    seed: int = 0,
+    seed: Annotated[int, Parameter(converter=_whole)] = 0,
     omega_o: float = 10.0,
     reset: bool = True,
     json: Annotated[Path | None, Parameter(name="--json")] = None,
