@@ -98,7 +98,7 @@ def test_algorithm_1_by_sliding_sums_is_algorithm_1_as_printed(batch: int, rng: 
     memory = ql.learners.BatchGradient(rate=1e-3, batch=batch).memory(learner)
     expected = literal_algorithm_1(seen, u, 1e-3, batch)
     for row, before, theta in zip(seen, u, expected, strict=True):
-        adapt(learner, memory, row, row[0], before)
+        adapt(learner, memory, row, row[0], before, row[-1])
         np.testing.assert_allclose(memory.theta, theta, atol=1e-12)
     newest = np.column_stack([seen[-batch:, :3], u[-batch:], np.ones(batch)]) @ memory.theta
     np.testing.assert_allclose(np.sort(outputs(memory)), np.sort(newest), atol=1e-12)
@@ -111,7 +111,7 @@ def test_algorithm_1_is_silent_until_its_buffers_are_full(rng: np.random.Generat
     memory = learner.memory(design)
     for k in range(20):
         assert predict(design, memory, np.ones(3), 1.0) == (0.0, 0.0), k
-        adapt(design, memory, rng.normal(size=3), 0.0, 0.1)
+        adapt(design, memory, rng.normal(size=3), 0.0, 0.1, 0.0)
     assert predict(design, memory, np.ones(3), 1.0) != (0.0, 0.0)
 
 
@@ -120,9 +120,9 @@ def test_the_sliding_sum_of_algorithm_1_does_not_drift(rng: np.random.Generator)
     learner = ql.learners.BatchGradient(rate=0.0, batch=16)
     design = learner.design(ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
     memory = learner.memory(design)
-    adapt(design, memory, np.array([1e6, 1e6]), 0.0, 0.0)
+    adapt(design, memory, np.array([1e6, 1e6]), 0.0, 0.0, 1e6)
     for _ in range(40):
-        adapt(design, memory, rng.normal(size=2), 0.0, 0.3)
+        adapt(design, memory, rng.normal(size=2), 0.0, 0.3, 0.0)
     np.testing.assert_allclose(memory.total, memory.residuals @ memory.features, rtol=1e-12)
 
 
@@ -143,8 +143,8 @@ def test_without_a_walk_the_kalman_learner_is_ridge_regression(rng: np.random.Ge
     memory.covariance[:] = 9.0 * np.eye(4)
     features, targets = rng.normal(size=(300, 4)), rng.normal(size=300)
     for row, target in zip(features, targets, strict=True):
-        memory.filtered[:] = [*row, 0.0]
-        adapt(design, memory, np.array([0.0, 0.0, 0.0, 0.0, target]), 1.0, 0.0)
+        memory.filtered[:] = row
+        adapt(design, memory, np.zeros(5), 1.0, 0.0, target)
     weight = observer.dt / design.lag_time  # R = τ E[ε²], with E[ε²] held at 1
     ridge = np.linalg.solve(np.eye(4) / 9.0 + weight * features.T @ features, weight * features.T @ targets)
     np.testing.assert_allclose(memory.theta, ridge, atol=1e-10)
@@ -158,9 +158,9 @@ def test_the_bias_follows_with_its_bandwidth_whatever_the_sample_time(dt: float)
     design, memory = kalman_memory(learner, ESO.model_free(order=1, b0=1.0, omega_o=50.0, dt=dt))
     memory.filtered[0] = 1.0
     for _ in range(round(10.0 / dt)):  # let P settle
-        adapt(design, memory, np.zeros(2), 1.0, 0.0)
+        adapt(design, memory, np.zeros(2), 1.0, 0.0, 0.0)
     for _ in range(round(1.0 / bandwidth / dt)):
-        adapt(design, memory, np.array([0.0, 1.0]), 1.0, 0.0)
+        adapt(design, memory, np.zeros(2), 1.0, 0.0, 1.0)
     assert memory.theta[0] == pytest.approx(1.0 - math.exp(-1.0), rel=0.02)
 
 
@@ -200,10 +200,10 @@ def test_the_effective_gain_stays_in_its_interval(rng: np.random.Generator) -> N
         memory = learner.memory(design)
         for _ in range(2000):
             seen, u = 10.0 * rng.normal(size=3), rng.normal()
-            adapt(design, memory, np.array([*seen[:2], -5.0 * b0 * u]), seen[0] + 1e-9, u)
+            adapt(design, memory, seen, seen[0] + 1e-9, u, -5.0 * b0 * u)
             slope = predict(design, memory, seen, u)[1]
             assert 0.4 - 1e-12 <= (b0 + slope) / b0 <= 1.5 + 1e-12
-            commit(design, memory, seen, u, rng.normal())
+            commit(design, memory, seen, u)
 
 
 def test_rounding_is_not_data() -> None:
@@ -308,13 +308,13 @@ def test_the_learner_watches_before_it_learns() -> None:
     design = learner.design(observer, 1.0)
     memory = learner.memory(design)
     for k in range(100):
-        adapt(design, memory, np.array([1.0, 2.0, 3.0]), 1.0 + 1e-6, 0.0)
-        commit(design, memory, np.array([1.0, 2.0, 3.0]), 0.0, 0.0)
+        adapt(design, memory, np.array([1.0, 2.0, 3.0]), 1.0 + 1e-6, 0.0, 3.0)
+        commit(design, memory, np.array([1.0, 2.0, 3.0]), 0.0)
         if abs(k - 2 * 3 / 10.0 / 1e-2) > 1:
             assert np.any(memory.theta != 0.0) == (k > 2 * 3 / 10.0 / 1e-2), k
     restart(design, memory)
     before = memory.theta.copy()
-    adapt(design, memory, np.array([1.0, 2.0, 3.0]), 1.0 + 1e-6, 0.0)
+    adapt(design, memory, np.array([1.0, 2.0, 3.0]), 1.0 + 1e-6, 0.0, 3.0)
     np.testing.assert_array_equal(memory.theta, before)
 
 

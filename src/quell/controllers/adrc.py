@@ -22,16 +22,18 @@ from quell.controllers.base import control, flags, report, rest
 from quell.controllers.handle import bind, bound_control, entry_point
 from quell.controllers.limits import Limits, apply_limits, limits
 from quell.dispatch import for_types, kernel
+from quell.guard import UnguardedDesign, UnguardedMemory, note, permit, watch
 from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart
+from quell.learners.lag import Lag, lag_of, lag_push
 from quell.observers.eso import ESO, EsoModel, eso_start, eso_update
-from quell.types import Status, Vector
+from quell.types import Matrix, Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 
 # Places in AdrcState.loop.
-_U, _F_LEARNED, _R, _Y, _STARTED, _REFERENCED, _STATUS = range(7)
+_U, _F_LEARNED, _F_SHOWN, _R, _Y, _STARTED, _REFERENCED, _STATUS = range(8)
 
 
 class AdrcDesign(NamedTuple):
@@ -45,6 +47,9 @@ class AdrcDesign(NamedTuple):
     b0: float
     limits: Limits
     learner: Any
+    lag: Lag
+    """How f_L shows in Δf̂; without taps where there is no learner."""
+    guard: Any
 
 
 class AdrcState(NamedTuple):
@@ -55,14 +60,18 @@ class AdrcState(NamedTuple):
     seen: Vector
     """What the law may know of it (N,)."""
     loop: Vector
-    """(7,): u applied, f_L, last good r and y, whether there was a good y, whether a good r, status."""
+    """(8,): u applied, f_L, what Δf̂ will show of it, last good r and y, whether there was a good y, whether a good r, status."""
     learner: Any
+    shadow: Matrix
+    """The lag filter of f_L (1, N)."""
+    guard: Any
 
 
 @control.register(AdrcDesign)
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop, state.seen
     status = 0
+    f_plain = 0.0
     if math.isfinite(y):
         loop[_Y] = y
     else:
@@ -84,13 +93,17 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         loop[_STARTED] = 1.0
     else:
         eso_update(design.eso, state.z, seen, loop[_Y], loop[_U], loop[_F_LEARNED])
+        f_plain = seen[seen.size - 1] + loop[_F_SHOWN]
+        watch(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
-            adapt(design.learner, state.learner, seen, loop[_Y], loop[_U])
+            adapt(design.learner, state.learner, seen, loop[_Y], loop[_U], f_plain)
     constant, slope = predict(design.learner, state.learner, seen, loop[_U])
+    constant, slope = permit(design.guard, state.guard, f_plain, constant, slope)
     wished = _law(design, seen, loop[_R], constant, slope)
     if not math.isfinite(wished):
         status |= _OVERFLOWED
         restart(design.learner, state.learner)
+        _forget_f_learned(state)
         eso_start(state.z, seen, loop[_Y])
         constant = slope = 0.0
         wished = loop[_U]
@@ -98,9 +111,18 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     f_learned = constant + slope * u
     loop[_U] = u
     loop[_F_LEARNED] = f_learned
+    loop[_F_SHOWN] = lag_push(design.lag, state.shadow, 0, f_learned)
     loop[_STATUS] = status | cut
-    commit(design.learner, state.learner, seen, u, f_learned)
+    commit(design.learner, state.learner, seen, u)
+    note(design.guard, state.guard, u, f_learned)
     return u
+
+
+@kernel
+def _forget_f_learned(state: AdrcState) -> None:
+    state.loop[_F_SHOWN] = 0.0
+    for i in range(state.shadow.shape[1]):
+        state.shadow[0, i] = 0.0
 
 
 @kernel
@@ -132,6 +154,7 @@ def _flags(design: AdrcDesign, state: AdrcState) -> int:
 def _rest(design: AdrcDesign, state: AdrcState) -> None:
     for i in range(state.loop.size):
         state.loop[i] = 0.0
+    _forget_f_learned(state)
     restart(design.learner, state.learner)
 
 
@@ -211,7 +234,11 @@ class ADRC:
             b0=observer.b0,
             limits=limits(u_min, u_max, rate_limit, observer.dt),
             learner=self.learner.design(observer, self.omega_c),
+            lag=lag_of(observer),
+            guard=UnguardedDesign(),
         )
+        if isinstance(self.learner, NoLearner):
+            self.parameters = self.parameters._replace(lag=self.parameters.lag._replace(taps=np.zeros(0)))
         self.features = self.learner.feature_names(observer.order)
         self._state = self.initial_state()
         self._arrays = _named_arrays(self._state)
@@ -237,7 +264,7 @@ class ADRC:
         """Return a state before the first sample, with nothing learned."""
         size = self.observer.order + 1
         memory = self.learner.memory(self.parameters.learner)
-        return AdrcState(np.zeros(size), np.zeros(size), np.zeros(7), memory)
+        return AdrcState(np.zeros(size), np.zeros(size), np.zeros(8), memory, np.zeros((1, size)), UnguardedMemory(np.zeros(0)))
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""

@@ -7,7 +7,7 @@ each sample the controller calls, in this order:
 1. ``adapt`` with what the observer has just seen;
 2. ``predict``, for the feedforward ``f_L = constant + slope · u``: affine in u, so that a learner with u among its features is cancelled
    exactly, not a sample late;
-3. ``commit`` with the u that was really applied and the f_L that follows from it.
+3. ``commit`` with the u that was really applied.
 
 ``restart`` is called where the loop starts anew from rest, ``coefficients`` where a run is recorded.
 """
@@ -37,8 +37,11 @@ class Learner(Protocol):
 
 
 @generic
-def adapt(learner: Any, memory: Any, seen: Vector, y: float, u_before: float) -> None:
-    """Learn from ``seen = (x̂_1 … x̂_n, Δf̂)``, the measurement it follows from and the control signal applied before it."""
+def adapt(learner: Any, memory: Any, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
+    """Learn from ``seen = (x̂_1 … x̂_n, Δf̂)``, the measurement it follows from and the control signal applied before it.
+
+    ``f_plain = Δf̂ + f_L^F`` is what an ESO without learner would have estimated: f, as the observer shows it (``lag.py``).
+    """
     raise TypeError
 
 
@@ -49,8 +52,8 @@ def predict(learner: Any, memory: Any, seen: Vector, u_before: float) -> tuple[f
 
 
 @generic
-def commit(learner: Any, memory: Any, seen: Vector, u: float, f_learned: float) -> None:
-    """Take note of the applied ``u`` and of the ``f_learned`` that the observer will be fed."""
+def commit(learner: Any, memory: Any, seen: Vector, u: float) -> None:
+    """Take note of the ``u`` that was applied."""
     raise TypeError
 
 
@@ -94,7 +97,7 @@ class NoLearnerMemory(NamedTuple):
 
 
 @adapt.register(NoLearnerDesign)
-def _adapt(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, y: float, u_before: float) -> None:
+def _adapt(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
     pass
 
 
@@ -104,7 +107,7 @@ def _predict(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u_
 
 
 @commit.register(NoLearnerDesign)
-def _commit(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u: float, f_learned: float) -> None:
+def _commit(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u: float) -> None:
     pass
 
 

@@ -57,7 +57,7 @@ class BatchGradientMemory(NamedTuple):
 
 
 @adapt.register(BatchGradientDesign)
-def _adapt(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, y: float, u_before: float) -> None:
+def _adapt(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
     at = min(max(int(memory.place[0]), 0), learner.batch - 1)
     size = learner.order + 2
     residual = seen[learner.order]
@@ -91,7 +91,7 @@ def _predict(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Ve
 
 
 @commit.register(BatchGradientDesign)
-def _commit(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, u: float, f_learned: float) -> None:
+def _commit(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, u: float) -> None:
     pass
 
 

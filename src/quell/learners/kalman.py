@@ -97,9 +97,9 @@ class KalmanMemory(NamedTuple):
     covariance: Matrix
     """P (p, p); for the bias in units of R."""
     chain: Matrix
-    """(p + 1, N): the lag filters of the features and, last, of f_L."""
+    """(p, N): the lag filters of the features."""
     filtered: Vector
-    """(p + 1,): what they show."""
+    """(p,): what they show."""
     mean: Vector
     """(p,): running means of the features."""
     variance: Vector
@@ -113,16 +113,15 @@ class KalmanMemory(NamedTuple):
 
 
 @adapt.register(KalmanDesign)
-def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, u_before: float) -> None:
+def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
     theta, covariance, filtered, mean, variance = memory.theta, memory.covariance, memory.filtered, memory.mean, memory.variance
     taught, gain, moment = memory.taught, memory.gain, memory.moment
     size = theta.size
     # Plain loops: at this size a call of BLAS costs more than the arithmetic.
-    target = seen[seen.size - 1] + filtered[size]
-    innovation = target
+    innovation = f_plain
     for i in range(size):
         innovation -= theta[i] * filtered[i]
-    noise, deviation = _watch(learner, moment, y, y - seen[0], innovation, target)
+    noise, deviation = _watch(learner, moment, y, y - seen[0], innovation, f_plain)
     if deviation == 0.0:
         return
     weight = 1.0 / deviation
@@ -191,7 +190,7 @@ def _predict(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before
 
 
 @commit.register(KalmanDesign)
-def _commit(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float, f_learned: float) -> None:
+def _commit(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float) -> None:
     chain, filtered = memory.chain, memory.filtered
     size = memory.theta.size
     for i in range(learner.states):
@@ -200,14 +199,13 @@ def _commit(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float,
         filtered[learner.states] = lag_push(learner.lag, chain, learner.states, 1.0)
     if learner.with_u:
         filtered[size - 1] = lag_push(learner.lag, chain, size - 1, learner.scale[size - 1] * u)
-    filtered[size] = lag_push(learner.lag, chain, size, f_learned)
 
 
 @restart.register(KalmanDesign)
 def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
     size = memory.theta.size
     finite = math.isfinite(memory.moment[_NOISE]) and math.isfinite(memory.moment[_UNEXPLAINED])
-    for i in range(size + 1):
+    for i in range(size):
         memory.filtered[i] = 0.0
         for j in range(learner.lag.taps.size):
             memory.chain[i, j] = 0.0
@@ -332,8 +330,8 @@ class Kalman:
         return KalmanMemory(
             theta=np.zeros(p),
             covariance=np.diag(parameters.prior**2),
-            chain=np.zeros((p + 1, size)),
-            filtered=np.zeros(p + 1),
+            chain=np.zeros((p, size)),
+            filtered=np.zeros(p),
             mean=np.zeros(p),
             variance=np.zeros(p),
             taught=np.zeros(p),
