@@ -17,7 +17,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quell import controllers, experiments, learners, metrics, observers, plants, signals
+    from quell import controllers, experiments, features, learners, metrics, observers, plants, signals
     from quell.controllers.adrc import ADRC, Estimate
     from quell.observers.canonical import canonical
     from quell.observers.eso import ESO
@@ -37,7 +37,7 @@ _HOME = {
     "canonical": "quell.observers.canonical",
     "simulate": "quell.simulation",
 }
-_ROOMS = ("controllers", "experiments", "learners", "metrics", "observers", "plants", "signals")
+_ROOMS = ("controllers", "experiments", "features", "learners", "metrics", "observers", "plants", "signals")
 
 __all__ = [
     "ADRC",
@@ -49,6 +49,7 @@ __all__ = [
     "canonical",
     "controllers",
     "experiments",
+    "features",
     "learners",
     "metrics",
     "observers",

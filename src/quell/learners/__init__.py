@@ -3,5 +3,7 @@
 from quell.learners.base import Learner, NoLearner
 from quell.learners.gradient import BatchGradient
 from quell.learners.kalman import Kalman
+from quell.learners.model import Model, infer, learn
+from quell.learners.online import Online
 
-__all__ = ["BatchGradient", "Kalman", "Learner", "NoLearner"]
+__all__ = ["BatchGradient", "Kalman", "Learner", "Model", "NoLearner", "Online", "infer", "learn"]

@@ -1,0 +1,111 @@
+"""What a learner is shown: features of the estimated state and the control signal.
+
+A block of features (``State()``, ``Bias()``, …) is an immutable description; blocks are joined by ``+``. ``design(order)`` turns it
+into a NamedTuple, for whose type ``write`` is registered. All blocks are given *scaled* inputs, which lie in about [−1, 1] whatever the
+plant's units (``scaling.py``), so that all features are O(1).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from quell.dispatch import generic
+from quell.types import Vector
+
+
+@generic
+def write(features: Any, x: Vector, u: float, out: Vector) -> None:
+    """Write the features of the scaled state ``x`` (n,) and the scaled control signal ``u`` into ``out`` (p,)."""
+    raise TypeError
+
+
+@generic
+def unit(features: Any, scale: Vector, out: Vector) -> None:
+    """Write by what a coefficient must be multiplied to stand for the plant's units; ``scale`` (n + 2,) is that of x_1 … x_n, u, f."""
+    raise TypeError
+
+
+class Features:
+    """A block of features; ``one + other`` has the features of both."""
+
+    def design(self, order: int) -> Any:
+        """Return the parameters (a NamedTuple) for a plant of order ``order``.
+
+        Raises
+        ------
+        ValueError
+            where the block does not fit a plant of this order.
+        """
+        raise NotImplementedError
+
+    def names(self, order: int) -> tuple[str, ...]:
+        """Return what each feature is called."""
+        raise NotImplementedError
+
+    @property
+    def has_input(self) -> bool:
+        """Whether the last feature is u itself."""
+        return False
+
+    def __add__(self, other: Features) -> Joined:
+        if not isinstance(other, Features):
+            return NotImplemented
+        return Joined(self, other)
+
+
+class Joined(Features):
+    """The features of two blocks, one after the other; made by ``first + second``.
+
+    Raises
+    ------
+    ValueError
+        where ``first`` has the control signal, which must come last, and once.
+    """
+
+    def __init__(self, first: Features, second: Features) -> None:
+        if first.has_input:
+            raise ValueError("features: Input() must be the last of the blocks, and be there once")
+        self.first, self.second = first, second
+
+    def design(self, order: int) -> JoinedDesign:
+        """Return both blocks' parameters."""
+        return JoinedDesign(self.first.design(order), self.second.design(order), len(self.first.names(order)))
+
+    def names(self, order: int) -> tuple[str, ...]:
+        """Return both blocks' names; a name that comes again is numbered."""
+        found: list[str] = []
+        for name in (*self.first.names(order), *self.second.names(order)):
+            again, number = name, 2
+            while again in found:
+                again, number = f"{name} ({number})", number + 1
+            found.append(again)
+        return tuple(found)
+
+    @property
+    def has_input(self) -> bool:
+        """Whether the last feature is u itself."""
+        return self.second.has_input
+
+    def __repr__(self) -> str:
+        return f"{self.first!r} + {self.second!r}"
+
+
+class JoinedDesign(NamedTuple):
+    """Parameters of two blocks."""
+
+    first: Any
+    second: Any
+    split: int
+    """Number of features of the first."""
+
+
+@write.register(JoinedDesign)
+def _write(features: JoinedDesign, x: Vector, u: float, out: Vector) -> None:
+    write(features.first, x, u, out[: features.split])
+    write(features.second, x, u, out[features.split :])
+
+
+@unit.register(JoinedDesign)
+def _unit(features: JoinedDesign, scale: Vector, out: Vector) -> None:
+    unit(features.first, scale, out[: features.split])
+    unit(features.second, scale, out[features.split :])

@@ -1,0 +1,117 @@
+"""Features that a linear model needs: the state, the control signal, a constant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from quell import checks
+from quell.features.base import Features, unit, write
+from quell.types import Vector
+
+
+class StateDesign(NamedTuple):
+    """Parameters of ``State``."""
+
+    count: int
+
+
+@dataclass(frozen=True)
+class State(Features):
+    """The estimated output and its derivatives, ``x̂_1 … x̂_count``.
+
+    Parameters
+    ----------
+    count
+        how many; all n by default.
+    """
+
+    count: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.count is not None:
+            checks.whole("count", self.count, 1)
+
+    def design(self, order: int) -> StateDesign:
+        """Return the number of states."""
+        if self.count is not None and self.count > order:
+            raise ValueError(f"count = {self.count}: a plant of order {order} has {order} states")
+        return StateDesign(order if self.count is None else self.count)
+
+    def names(self, order: int) -> tuple[str, ...]:
+        """Return ``("x1", …)``."""
+        return tuple(f"x{i + 1}" for i in range(self.design(order).count))
+
+
+@write.register(StateDesign)
+def _write_state(features: StateDesign, x: Vector, u: float, out: Vector) -> None:
+    for i in range(features.count):
+        out[i] = x[i]
+
+
+@unit.register(StateDesign)
+def _unit_state(features: StateDesign, scale: Vector, out: Vector) -> None:
+    for i in range(features.count):
+        out[i] = 1.0 / scale[i]
+
+
+class BiasDesign(NamedTuple):
+    """Parameters of ``Bias``: none."""
+
+
+@dataclass(frozen=True)
+class Bias(Features):
+    """The constant 1."""
+
+    def design(self, order: int) -> BiasDesign:
+        """Return no parameters."""
+        return BiasDesign()
+
+    def names(self, order: int) -> tuple[str, ...]:
+        """Return ``("bias",)``."""
+        return ("bias",)
+
+
+@write.register(BiasDesign)
+def _write_bias(features: BiasDesign, x: Vector, u: float, out: Vector) -> None:
+    out[0] = 1.0
+
+
+@unit.register(BiasDesign)
+def _unit_bias(features: BiasDesign, scale: Vector, out: Vector) -> None:
+    out[0] = 1.0
+
+
+class InputDesign(NamedTuple):
+    """Parameters of ``Input``: none."""
+
+
+@dataclass(frozen=True)
+class Input(Features):
+    """The control signal that is applied, u. It must be the last of the blocks.
+
+    A linear learner solves the loop through u exactly and keeps the effective gain in an interval; any other is shown the u before.
+    """
+
+    def design(self, order: int) -> InputDesign:
+        """Return no parameters."""
+        return InputDesign()
+
+    def names(self, order: int) -> tuple[str, ...]:
+        """Return ``("u",)``."""
+        return ("u",)
+
+    @property
+    def has_input(self) -> bool:
+        """It is."""
+        return True
+
+
+@write.register(InputDesign)
+def _write_input(features: InputDesign, x: Vector, u: float, out: Vector) -> None:
+    out[0] = u
+
+
+@unit.register(InputDesign)
+def _unit_input(features: InputDesign, scale: Vector, out: Vector) -> None:
+    out[0] = 1.0 / scale[scale.size - 2]

@@ -1,0 +1,199 @@
+"""A learner of any model: features, scaling, and the lag of the observer taken out of the pairs it learns from.
+
+What the observer shows of f, ``f^F = Δf̂ + f_L^F``, is f filtered (``lag.py``), about f as it was D samples ago, D being the filter's group
+delay. So a black box is given the pair
+
+    ( φ(k − D),  f^F(k) )
+
+and what it learns has no lag bias, up to second order in frequency over omega_o. (A model that is linear in its parameters can do without
+the approximation: ``linear.py``.)
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.features import Bias, Features, State
+from quell.features.base import write
+from quell.features.scaling import Scaling, grow, scaling
+from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.lag import lag_of
+from quell.learners.model import infer, learn
+from quell.observers.eso import ESO
+from quell.types import Matrix, Vector
+
+# In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
+_WATCH = 2.0
+
+# Places in OnlineMemory.place.
+_ROW, _SINCE = range(2)
+
+
+class OnlineDesign(NamedTuple):
+    """Parameters of a learner around a model with p features."""
+
+    features: Any
+    scaling: Scaling
+    model: Any
+    delay: int
+    """D [samples]."""
+    watch: int
+    """Samples after a start from rest in which nothing is learned."""
+
+
+class OnlineMemory(NamedTuple):
+    """State of a learner around a model."""
+
+    scale: Vector
+    """(n + 2,): what x_1 … x_n, u and f are divided by."""
+    scaled: Vector
+    """Room for the scaled state (n,)."""
+    now: Vector
+    """Room for the features of a prediction (p,)."""
+    ring: Matrix
+    """The last features (D + 1, p)."""
+    place: Vector
+    """(2,): where the next row goes; samples since the start from rest."""
+    model: Any
+    flat: Vector
+    """All arrays of ``model``, end to end: the same memory."""
+    fresh: Vector
+    """What ``flat`` was before anything was learned."""
+
+
+@adapt.register(OnlineDesign)
+def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
+    if memory.place[_SINCE] <= learner.watch:
+        return
+    scale = memory.scale
+    grow(learner.scaling, scale, seen, u_before, f_plain)
+    if memory.place[_SINCE] > learner.watch + learner.delay:
+        # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
+        learn(learner.model, memory.model, memory.ring[int(memory.place[_ROW])], f_plain / scale[scale.size - 1])
+
+
+@predict.register(OnlineDesign)
+def _predict(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u_before: float) -> tuple[float, float]:
+    if memory.place[_SINCE] <= learner.watch + learner.delay:
+        return 0.0, 0.0
+    scale, scaled = memory.scale, memory.scaled
+    for i in range(scaled.size):
+        scaled[i] = seen[i] / scale[i]
+    write(learner.features, scaled, u_before / scale[scaled.size], memory.now)
+    return scale[scale.size - 1] * infer(learner.model, memory.model, memory.now), 0.0
+
+
+@commit.register(OnlineDesign)
+def _commit(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float) -> None:
+    scale, scaled = memory.scale, memory.scaled
+    row = int(memory.place[_ROW])
+    for i in range(scaled.size):
+        scaled[i] = seen[i] / scale[i]
+    write(learner.features, scaled, u / scale[scaled.size], memory.ring[row])
+    row += 1
+    memory.place[_ROW] = 0.0 if row > learner.delay else row
+    memory.place[_SINCE] += 1.0
+
+
+@restart.register(OnlineDesign)
+def _restart(learner: OnlineDesign, memory: OnlineMemory) -> None:
+    memory.place[_ROW] = memory.place[_SINCE] = 0.0
+    finite = True
+    for i in range(memory.flat.size):
+        finite = finite and abs(memory.flat[i]) <= 1e100
+    if not finite:
+        for i in range(memory.flat.size):
+            memory.flat[i] = memory.fresh[i]
+
+
+@coefficients.register(OnlineDesign)
+def _coefficients(learner: OnlineDesign, memory: OnlineMemory, theta: Vector) -> None:
+    pass
+
+
+class Online:
+    """A learner made of a model and features.
+
+    Parameters
+    ----------
+    model
+        what learns: a description with ``design(features, dt)`` and ``memory(parameters)`` (``model.py``).
+    features
+        what it is shown; the state and a constant by default.
+    frequency
+        a frequency the plant has [rad/s], for the automatic scaling; ``omega_c`` of the controller by default.
+    scale
+        what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
+
+    Raises
+    ------
+    ValueError
+        for arguments that fit nothing.
+    """
+
+    def __init__(self, model: Any, features: Features | None = None, *, frequency: float | None = None, scale: Any = None) -> None:
+        if isinstance(model, type) or not (hasattr(model, "design") and hasattr(model, "memory")):
+            raise ValueError(f"model = {model!r}: must have design(features, dt) and memory(parameters); see docs/extend")
+        self.model = model
+        self.features = State() + Bias() if features is None else features
+        if not isinstance(self.features, Features):
+            raise ValueError(f"features = {features!r}: must be made of blocks from quell.features, for example State() + Bias()")
+        self.frequency = None if frequency is None else checks.positive("frequency", frequency, "rad/s")
+        self.scale = None if scale is None else checks.vector("scale", scale)
+        if self.scale is not None and not np.all(self.scale > 0.0):
+            raise ValueError(f"scale = {scale!r}: must be positive")
+
+    def design(self, observer: ESO, omega_c: float) -> OnlineDesign:
+        """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s]."""
+        n = observer.order
+        if self.scale is not None:
+            checks.vector("scale", self.scale, n + 2)
+        return OnlineDesign(
+            features=self.features.design(n),
+            scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
+            model=self.model.design(len(self.features.names(n)), observer.dt),
+            delay=round(group_delay(observer)),
+            watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
+        )
+
+    def memory(self, parameters: OnlineDesign) -> OnlineMemory:
+        """Return a state with nothing learned."""
+        n = parameters.scaling.ladder.size - 2
+        p = len(self.features.names(n))
+        model, flat = _packed(self.model.memory(parameters.model))
+        return OnlineMemory(
+            scale=np.full(n + 2, 1e-100) if self.scale is None else self.scale.copy(),
+            scaled=np.zeros(n),
+            now=np.zeros(p),
+            ring=np.zeros((parameters.delay + 1, p)),
+            place=np.zeros(2),
+            model=model,
+            flat=flat,
+            fresh=flat.copy(),
+        )
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return no names: what a black box has learned is not said by coefficients."""
+        return ()
+
+
+def group_delay(observer: ESO) -> float:
+    """Return by how many samples f^F, as the next estimate shows it, lags slow changes of f.
+
+    The j-th lag of the chain of ``lag.py`` delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
+    """
+    lag = lag_of(observer)
+    stage = np.arange(lag.taps.size)
+    return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (1.0 if lag.predictor else 0.0)
+
+
+def _packed(memory: Any) -> tuple[Any, Vector]:
+    """Return a copy of a NamedTuple of arrays whose arrays all lie in one, and that one."""
+    arrays = [np.asarray(array, dtype=np.float64) for array in memory]
+    flat = np.concatenate([array.ravel() for array in arrays]) if arrays else np.zeros(0)
+    places = np.cumsum([0, *(array.size for array in arrays)])
+    views = [flat[start : start + array.size].reshape(array.shape) for start, array in zip(places, arrays, strict=False)]
+    return type(memory)(*views), flat
