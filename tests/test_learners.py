@@ -203,7 +203,7 @@ def test_the_effective_gain_stays_in_its_interval(rng: np.random.Generator) -> N
             adapt(design, memory, seen, seen[0] + 1e-9, u, -5.0 * b0 * u)
             slope = predict(design, memory, seen, u)[1]
             assert 0.4 - 1e-12 <= (b0 + slope) / b0 <= 1.5 + 1e-12
-            commit(design, memory, seen, u)
+            commit(design, memory, seen, u, 0.0)
 
 
 def test_rounding_is_not_data() -> None:
@@ -309,7 +309,7 @@ def test_the_learner_watches_before_it_learns() -> None:
     memory = learner.memory(design)
     for k in range(100):
         adapt(design, memory, np.array([1.0, 2.0, 3.0]), 1.0 + 1e-6, 0.0, 3.0)
-        commit(design, memory, np.array([1.0, 2.0, 3.0]), 0.0)
+        commit(design, memory, np.array([1.0, 2.0, 3.0]), 0.0, 0.0)
         if abs(k - 2 * 3 / 10.0 / 1e-2) > 1:
             assert np.any(memory.theta != 0.0) == (k > 2 * 3 / 10.0 / 1e-2), k
     restart(design, memory)

@@ -21,6 +21,7 @@ import functools
 import hashlib
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -55,6 +56,7 @@ class Generic(Protocol[P, R_co]):
 OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy", "forceinline": True}
 
 _CACHES_KEPT = 4
+_LARGEST = sys.float_info.max
 # Types with implementations from outside of this package.
 _FOREIGN: set[type] = set()
 
@@ -102,6 +104,16 @@ def generic(declaration: Callable[P, R]) -> Generic[P, R]:
     call.register = register  # type: ignore[attr-defined]
     call.implementations = table  # type: ignore[attr-defined]
     return cast("Generic[P, R]", call)
+
+
+@kernel
+def is_finite(value: float) -> bool:
+    """Say whether ``value`` is a number.
+
+    ``math.isfinite`` will not do in compiled code: it asks whether ``x − x`` is a number, and where x is itself a sum, reordering sums
+    makes that zero before it is asked. A comparison stays.
+    """
+    return abs(value) <= _LARGEST
 
 
 def compiled(function: F) -> F:

@@ -28,6 +28,7 @@ class Status(IntFlag):
     RATE_LIMITED = 8
     OVERFLOWED = 16
     DIVERGED = 32
+    LEARNER_CUT = 64
 
     @property
     def message(self) -> str:
@@ -42,6 +43,7 @@ _MESSAGES = {
     Status.RATE_LIMITED: "The control signal moves as fast as rate_limit allows; the observer was told the applied value.",
     Status.OVERFLOWED: "The observer or the learner left the range of numbers and was started afresh: "
     "lower the learning rate, omega_o or omega_c, or check b0.",
+    Status.LEARNER_CUT: "The learner's output was not a number; the guard cut it off and it began anew: look at the learner.",
     Status.DIVERGED: "The loop diverged and the run ended early: check the sign and size of b0, lower omega_c or omega_o, "
     "or the learning rate.",
 }

@@ -21,8 +21,8 @@ from quell import checks
 from quell.controllers.base import control, flags, report, rest
 from quell.controllers.handle import bind, bound_control, entry_point
 from quell.controllers.limits import Limits, apply_limits, limits
-from quell.dispatch import for_types, kernel
-from quell.guard import UnguardedDesign, UnguardedMemory, note, permit, watch
+from quell.dispatch import for_types, is_finite, kernel
+from quell.guard import GUARD_CHANNELS, Guard, UnguardedDesign, UnguardedMemory, calm, explain, note, permit, watch
 from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart
 from quell.learners.lag import Lag, lag_of, lag_push
 from quell.observers.eso import ESO, EsoModel, eso_start, eso_update
@@ -31,6 +31,7 @@ from quell.types import Matrix, Status, Vector
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
+_LEARNER_CUT = int(Status.LEARNER_CUT)
 
 # Places in AdrcState.loop.
 _U, _F_LEARNED, _F_SHOWN, _R, _Y, _STARTED, _REFERENCED, _STATUS = range(8)
@@ -72,11 +73,11 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop, state.seen
     status = 0
     f_plain = 0.0
-    if math.isfinite(y):
+    if is_finite(y):
         loop[_Y] = y
     else:
         status |= _MEASUREMENT_HELD
-    if math.isfinite(r):
+    if is_finite(r):
         loop[_R] = r
         loop[_REFERENCED] = 1.0
     else:
@@ -98,12 +99,15 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         if status & _MEASUREMENT_HELD == 0:
             adapt(design.learner, state.learner, seen, loop[_Y], loop[_U], f_plain)
     constant, slope = predict(design.learner, state.learner, seen, loop[_U])
-    constant, slope = permit(design.guard, state.guard, f_plain, constant, slope)
+    constant, slope, cut_off = permit(design.guard, state.guard, f_plain, constant, slope, loop[_U])
+    if cut_off:
+        status |= _LEARNER_CUT
+        restart(design.learner, state.learner)
     wished = _law(design, seen, loop[_R], constant, slope)
-    if not math.isfinite(wished):
+    if not is_finite(wished):
         status |= _OVERFLOWED
         restart(design.learner, state.learner)
-        _forget_f_learned(state)
+        _forget_f_learned(design, state)
         eso_start(state.z, seen, loop[_Y])
         constant = slope = 0.0
         wished = loop[_U]
@@ -113,13 +117,14 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop[_F_LEARNED] = f_learned
     loop[_F_SHOWN] = lag_push(design.lag, state.shadow, 0, f_learned)
     loop[_STATUS] = status | cut
-    commit(design.learner, state.learner, seen, u)
+    commit(design.learner, state.learner, seen, u, f_learned)
     note(design.guard, state.guard, u, f_learned)
     return u
 
 
 @kernel
-def _forget_f_learned(state: AdrcState) -> None:
+def _forget_f_learned(design: AdrcDesign, state: AdrcState) -> None:
+    calm(design.guard, state.guard)
     state.loop[_F_SHOWN] = 0.0
     for i in range(state.shadow.shape[1]):
         state.shadow[0, i] = 0.0
@@ -142,7 +147,8 @@ def _report(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
         row[i] = state.seen[i]
     row[order + 1] = state.loop[_F_LEARNED]
     row[order + 2] = state.loop[_STATUS]
-    coefficients(design.learner, state.learner, row[order + 3 :])
+    told = explain(design.guard, state.guard, row[order + 3 :])
+    coefficients(design.learner, state.learner, row[order + 3 + told :])
 
 
 @flags.register(AdrcDesign)
@@ -154,7 +160,7 @@ def _flags(design: AdrcDesign, state: AdrcState) -> int:
 def _rest(design: AdrcDesign, state: AdrcState) -> None:
     for i in range(state.loop.size):
         state.loop[i] = 0.0
-    _forget_f_learned(state)
+    _forget_f_learned(design, state)
     restart(design.learner, state.learner)
 
 
@@ -216,6 +222,7 @@ class ADRC:
         omega_c: float,
         *,
         learner: Learner | None = None,
+        guard: Guard | None = None,
         u_min: float = -math.inf,
         u_max: float = math.inf,
         rate_limit: float = math.inf,
@@ -224,6 +231,7 @@ class ADRC:
             raise ValueError(f"observer = {observer!r}: must be an ESO, from ESO.model_free or ESO.model_based")
         self.observer = observer
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
+        self.guard = guard
         self.learner: Learner = NoLearner() if learner is None else learner
         if isinstance(self.learner, type) or not all(hasattr(self.learner, name) for name in ("design", "memory", "feature_names")):
             raise ValueError(f"learner = {learner!r}: must be a learner, for example quell.learners.Kalman(), or None")
@@ -235,7 +243,7 @@ class ADRC:
             limits=limits(u_min, u_max, rate_limit, observer.dt),
             learner=self.learner.design(observer, self.omega_c),
             lag=lag_of(observer),
-            guard=UnguardedDesign(),
+            guard=UnguardedDesign() if guard is None else guard.design(observer),
         )
         if isinstance(self.learner, NoLearner):
             self.parameters = self.parameters._replace(lag=self.parameters.lag._replace(taps=np.zeros(0)))
@@ -257,6 +265,7 @@ class ADRC:
             ("f_residual", 1),
             ("f_learned", 1),
             ("status", 1),
+            *(() if self.guard is None else GUARD_CHANNELS),
             ("theta", len(self.features)),
         )
 
@@ -264,7 +273,8 @@ class ADRC:
         """Return a state before the first sample, with nothing learned."""
         size = self.observer.order + 1
         memory = self.learner.memory(self.parameters.learner)
-        return AdrcState(np.zeros(size), np.zeros(size), np.zeros(8), memory, np.zeros((1, size)), UnguardedMemory(np.zeros(0)))
+        guard = UnguardedMemory(np.zeros(0)) if self.guard is None else self.guard.memory(self.parameters.guard)
+        return AdrcState(np.zeros(size), np.zeros(size), np.zeros(8), memory, np.zeros((1, size)), guard)
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.dispatch import kernel
+from quell.dispatch import is_finite, kernel
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -45,5 +45,5 @@ def grow(scaling: Scaling, scale: Vector, seen: Vector, u: float, f: float) -> N
     for i in range(scale.size):
         size = abs(seen[i]) if i < order else (abs(u) if i == order else abs(f))
         size = max(size, scaling.ladder[i] * scale[0], _LEAST)
-        if size > scale[i] and math.isfinite(size):
+        if size > scale[i] and is_finite(size):
             scale[i] = 2.0 ** math.ceil(math.log2(size))

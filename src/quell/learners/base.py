@@ -52,8 +52,8 @@ def predict(learner: Any, memory: Any, seen: Vector, u_before: float) -> tuple[f
 
 
 @generic
-def commit(learner: Any, memory: Any, seen: Vector, u: float) -> None:
-    """Take note of the ``u`` that was applied."""
+def commit(learner: Any, memory: Any, seen: Vector, u: float, f_learned: float) -> None:
+    """Take note of the ``u`` that was applied and of the ``f_learned`` that the observer is fed, which a guard may have reduced."""
     raise TypeError
 
 
@@ -107,7 +107,7 @@ def _predict(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u_
 
 
 @commit.register(NoLearnerDesign)
-def _commit(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u: float) -> None:
+def _commit(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u: float, f_learned: float) -> None:
     pass
 
 

@@ -16,13 +16,13 @@ each time the ring is through, so that no rounding error is older than 2n sample
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from quell import checks
+from quell.dispatch import is_finite
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -91,7 +91,7 @@ def _predict(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Ve
 
 
 @commit.register(BatchGradientDesign)
-def _commit(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, u: float) -> None:
+def _commit(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, u: float, f_learned: float) -> None:
     pass
 
 
@@ -99,7 +99,7 @@ def _commit(learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vec
 def _restart(learner: BatchGradientDesign, memory: BatchGradientMemory) -> None:
     finite = True
     for i in range(memory.theta.size):
-        finite = finite and math.isfinite(memory.theta[i]) and math.isfinite(memory.total[i])
+        finite = finite and is_finite(memory.theta[i]) and is_finite(memory.total[i])
     if not finite:
         for i in range(memory.theta.size):
             memory.theta[i] = memory.total[i] = memory.fresh[i] = 0.0

@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.dispatch import kernel
+from quell.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import Lag, lag_of, lag_push
 from quell.observers.eso import ESO, noise_gains
@@ -77,6 +77,13 @@ class KalmanDesign(NamedTuple):
     states: int
     """n, or 0 without state features."""
     bias: bool
+    pairs: int
+    first_pair: int
+    retune: float
+    doubt: float
+    omega_low: float
+    omega_high: float
+    omega_start: Vector
     with_u: bool
     slope_low: float
     """Least θ_u, in scaled units."""
@@ -108,6 +115,8 @@ class KalmanMemory(NamedTuple):
     """(p,): φ̃ of the newest sample."""
     gain: Vector
     """(p,): room for P φ̃."""
+    phase: Vector
+    omega: Vector
     moment: Vector
     """(4,): mean squares of y − x̂_1 and of what is not explained, how much of them is filled, seconds since the start from rest."""
 
@@ -145,6 +154,7 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
         spread += total * taught[i]
     if spread < 0.0:  # P is no covariance any more: rather learn nothing
         return
+    turning = learner.first_pair
     inverse = 1.0 / max(spread + 1.0 / learner.dt, spread / (learner.fastest * learner.dt))
     for i in range(size):
         share = gain[i] * inverse
@@ -152,6 +162,15 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
             covariance[i, j] -= share * gain[j]
         if learner.threshold[i] == 0.0:
             theta[i] += share * innovation
+            if turning + 1 == i:
+                j = (i - learner.first_pair) // 2
+                turning += 2
+                ds = gain[i - 1] * inverse * innovation
+                dc = share * innovation
+                a2 = theta[i] ** 2 + theta[i - 1] ** 2
+                if a2 > 0.0:
+                    dw = learner.retune * memory.omega[j] * (theta[i - 1] * dc - theta[i] * ds) / (a2 + learner.doubt * moment[_UNEXPLAINED])
+                    memory.omega[j] = min(max(memory.omega[j] + dw, learner.omega_low), learner.omega_high)
             covariance[i, i] += learner.walk[i] * learner.dt
         else:
             wished = theta[i] + share * innovation * weight
@@ -184,19 +203,29 @@ def _predict(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before
         constant += memory.theta[i] * learner.scale[i] * seen[i]
     if learner.bias:
         constant += memory.theta[learner.states]
+    at = learner.first_pair
+    for j in range(learner.pairs):
+        constant += memory.theta[at] * math.sin(memory.phase[j]) + memory.theta[at + 1] * math.cos(memory.phase[j])
+        at += 2
     last = memory.theta.size - 1
     slope = memory.theta[last] * learner.scale[last] if learner.with_u else 0.0
     return constant, slope
 
 
 @commit.register(KalmanDesign)
-def _commit(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float) -> None:
+def _commit(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float, f_learned: float) -> None:
     chain, filtered = memory.chain, memory.filtered
     size = memory.theta.size
     for i in range(learner.states):
         filtered[i] = lag_push(learner.lag, chain, i, learner.scale[i] * seen[i])
     if learner.bias:
         filtered[learner.states] = lag_push(learner.lag, chain, learner.states, 1.0)
+    at = learner.first_pair
+    for j in range(learner.pairs):
+        filtered[at] = lag_push(learner.lag, chain, at, math.sin(memory.phase[j]))
+        filtered[at + 1] = lag_push(learner.lag, chain, at + 1, math.cos(memory.phase[j]))
+        at += 2
+        memory.phase[j] = (memory.phase[j] + memory.omega[j] * learner.dt) % (2.0 * math.pi)
     if learner.with_u:
         filtered[size - 1] = lag_push(learner.lag, chain, size - 1, learner.scale[size - 1] * u)
 
@@ -204,15 +233,15 @@ def _commit(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float)
 @restart.register(KalmanDesign)
 def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
     size = memory.theta.size
-    finite = math.isfinite(memory.moment[_NOISE]) and math.isfinite(memory.moment[_UNEXPLAINED])
+    finite = is_finite(memory.moment[_NOISE]) and is_finite(memory.moment[_UNEXPLAINED])
     for i in range(size):
         memory.filtered[i] = 0.0
         for j in range(learner.lag.taps.size):
             memory.chain[i, j] = 0.0
     for i in range(size):
-        finite = finite and math.isfinite(memory.theta[i]) and math.isfinite(memory.mean[i]) and math.isfinite(memory.variance[i])
+        finite = finite and is_finite(memory.theta[i]) and is_finite(memory.mean[i]) and is_finite(memory.variance[i])
         for j in range(size):
-            finite = finite and math.isfinite(memory.covariance[i, j])
+            finite = finite and is_finite(memory.covariance[i, j])
     memory.moment[_SINCE] = 0.0
     if not finite:
         for k in range(memory.moment.size):
@@ -270,6 +299,10 @@ class Kalman:
     frequency: float | None = None
     prior: float = 10.0
     gain_interval: tuple[float, float] = (0.5, 2.0)
+    omegas: tuple[float, ...] = ()
+    retune: float = 0.4
+    doubt: float = 60.0
+    pair_bandwidth: float = 25.0
 
     def __post_init__(self) -> None:
         for name in ("state", "bias", "u"):
@@ -308,14 +341,20 @@ class Kalman:
         size = self.prior * frequency**n
         return KalmanDesign(
             lag=lag_of(observer),
-            scale=np.array([*scale[: n * self.state], *[1.0] * self.bias, *[observer.b0] * self.u]),
-            walk=np.array([*slow[: n * self.state] ** 2, *[follow**2] * self.bias, *[0.0] * self.u]),
-            threshold=np.array([*threshold[: n * self.state], *[0.0] * self.bias, *[threshold[n]] * self.u]),
+            scale=np.array([*scale[: n * self.state], *[1.0] * self.bias, *[1.0] * (2 * len(self.omegas)), *[observer.b0] * self.u]),
+            walk=np.array([*slow[: n * self.state] ** 2, *[follow**2] * self.bias, *[self.pair_bandwidth**2] * (2 * len(self.omegas)), *[0.0] * self.u]),
+            threshold=np.array([*threshold[: n * self.state], *[0.0] * self.bias, *[0.0] * (2 * len(self.omegas)), *[threshold[n]] * self.u]),
             fastest=max(follow, observer.omega_o),
             f_noise=float(noise[n]),
-            prior=np.array([*[size] * (n * self.state), *[0.0] * self.bias, *[1.0] * self.u]),
+            prior=np.array([*[size] * (n * self.state), *[0.0] * self.bias, *[0.0] * (2 * len(self.omegas)), *[1.0] * self.u]),
             states=n * self.state,
             bias=self.bias,
+            pairs=len(self.omegas),
+            first_pair=n * self.state + self.bias,
+            retune=self.retune, doubt=self.doubt,
+            omega_low=0.02 * omega_c,
+            omega_high=0.5 * observer.omega_o,
+            omega_start=np.array(self.omegas, dtype=float),
             with_u=self.u,
             slope_low=self.gain_interval[0] - 1.0,
             slope_high=self.gain_interval[1] - 1.0,
@@ -336,9 +375,11 @@ class Kalman:
             variance=np.zeros(p),
             taught=np.zeros(p),
             gain=np.zeros(p),
+            phase=np.zeros(parameters.pairs),
+            omega=parameters.omega_start.copy(),
             moment=np.zeros(4),
         )
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return ``("x1", …, "bias", "u")``, as far as they are features."""
-        return (*(f"x{i + 1}" for i in range(order * self.state)), *["bias"] * self.bias, *["u"] * self.u)
+        return (*(f"x{i + 1}" for i in range(order * self.state)), *["bias"] * self.bias, *[f"h{i}" for i in range(2 * len(self.omegas))], *["u"] * self.u)

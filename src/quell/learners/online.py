@@ -87,7 +87,7 @@ def _predict(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u_before
 
 
 @commit.register(OnlineDesign)
-def _commit(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float) -> None:
+def _commit(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, f_learned: float) -> None:
     scale, scaled = memory.scale, memory.scaled
     row = int(memory.place[_ROW])
     for i in range(scaled.size):
