@@ -2,8 +2,9 @@
 
 from quell.learners.base import Learner, NoLearner
 from quell.learners.gradient import BatchGradient
+from quell.learners.harmonic import Harmonic
 from quell.learners.kalman import Kalman
 from quell.learners.model import Model, infer, learn
 from quell.learners.online import Online
 
-__all__ = ["BatchGradient", "Kalman", "Learner", "Model", "NoLearner", "Online", "infer", "learn"]
+__all__ = ["BatchGradient", "Harmonic", "Kalman", "Learner", "Model", "NoLearner", "Online", "infer", "learn"]

@@ -40,6 +40,7 @@ from quell import checks
 from quell.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import Lag, lag_of, lag_push
+from quell.learners.oscillators import Oscillators, retune, turn_phases
 from quell.observers.eso import ESO, noise_gains
 from quell.types import Matrix, Vector
 
@@ -59,7 +60,7 @@ _NOISE, _UNEXPLAINED, _FILLED, _SINCE = range(4)
 
 
 class KalmanDesign(NamedTuple):
-    """Parameters for an observer of order n, with p features in the order state, bias, u."""
+    """Parameters for an observer of order n, with p features in the order state, bias, oscillators' pairs, u."""
 
     lag: Lag
     scale: Vector
@@ -77,13 +78,7 @@ class KalmanDesign(NamedTuple):
     states: int
     """n, or 0 without state features."""
     bias: bool
-    pairs: int
-    first_pair: int
-    retune: float
-    doubt: float
-    omega_low: float
-    omega_high: float
-    omega_start: Vector
+    oscillators: Oscillators
     with_u: bool
     slope_low: float
     """Least θ_u, in scaled units."""
@@ -116,7 +111,9 @@ class KalmanMemory(NamedTuple):
     gain: Vector
     """(p,): room for P φ̃."""
     phase: Vector
+    """ψ of each oscillator [rad] (m,)."""
     omega: Vector
+    """ω̂ of each [rad/s] (m,)."""
     moment: Vector
     """(4,): mean squares of y − x̂_1 and of what is not explained, how much of them is filled, seconds since the start from rest."""
 
@@ -154,7 +151,6 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
         spread += total * taught[i]
     if spread < 0.0:  # P is no covariance any more: rather learn nothing
         return
-    turning = learner.first_pair
     inverse = 1.0 / max(spread + 1.0 / learner.dt, spread / (learner.fastest * learner.dt))
     for i in range(size):
         share = gain[i] * inverse
@@ -162,15 +158,6 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
             covariance[i, j] -= share * gain[j]
         if learner.threshold[i] == 0.0:
             theta[i] += share * innovation
-            if turning + 1 == i:
-                j = (i - learner.first_pair) // 2
-                turning += 2
-                ds = gain[i - 1] * inverse * innovation
-                dc = share * innovation
-                a2 = theta[i] ** 2 + theta[i - 1] ** 2
-                if a2 > 0.0:
-                    dw = learner.retune * memory.omega[j] * (theta[i - 1] * dc - theta[i] * ds) / (a2 + learner.doubt * moment[_UNEXPLAINED])
-                    memory.omega[j] = min(max(memory.omega[j] + dw, learner.omega_low), learner.omega_high)
             covariance[i, i] += learner.walk[i] * learner.dt
         else:
             wished = theta[i] + share * innovation * weight
@@ -182,6 +169,10 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
                 theta[learner.states] -= change * mean[i]
             if taught[i] != 0.0:
                 covariance[i, i] += learner.walk[i] * learner.dt * deviation * deviation / variance[i]
+    step = inverse * innovation
+    for j in range(memory.omega.size):
+        at = learner.oscillators.first + 2 * j
+        retune(learner.oscillators, memory.omega, j, theta, step * gain[at], step * gain[at + 1], moment[_UNEXPLAINED])
 
 
 @kernel
@@ -203,10 +194,9 @@ def _predict(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before
         constant += memory.theta[i] * learner.scale[i] * seen[i]
     if learner.bias:
         constant += memory.theta[learner.states]
-    at = learner.first_pair
-    for j in range(learner.pairs):
+    for j in range(memory.phase.size):
+        at = learner.oscillators.first + 2 * j
         constant += memory.theta[at] * math.sin(memory.phase[j]) + memory.theta[at + 1] * math.cos(memory.phase[j])
-        at += 2
     last = memory.theta.size - 1
     slope = memory.theta[last] * learner.scale[last] if learner.with_u else 0.0
     return constant, slope
@@ -220,12 +210,11 @@ def _commit(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float,
         filtered[i] = lag_push(learner.lag, chain, i, learner.scale[i] * seen[i])
     if learner.bias:
         filtered[learner.states] = lag_push(learner.lag, chain, learner.states, 1.0)
-    at = learner.first_pair
-    for j in range(learner.pairs):
+    for j in range(memory.phase.size):
+        at = learner.oscillators.first + 2 * j
         filtered[at] = lag_push(learner.lag, chain, at, math.sin(memory.phase[j]))
         filtered[at + 1] = lag_push(learner.lag, chain, at + 1, math.cos(memory.phase[j]))
-        at += 2
-        memory.phase[j] = (memory.phase[j] + memory.omega[j] * learner.dt) % (2.0 * math.pi)
+    turn_phases(memory.phase, memory.omega, learner.dt)
     if learner.with_u:
         filtered[size - 1] = lag_push(learner.lag, chain, size - 1, learner.scale[size - 1] * u)
 
@@ -238,6 +227,8 @@ def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
         memory.filtered[i] = 0.0
         for j in range(learner.lag.taps.size):
             memory.chain[i, j] = 0.0
+    for j in range(memory.omega.size):
+        finite = finite and is_finite(memory.omega[j]) and is_finite(memory.phase[j])
     for i in range(size):
         finite = finite and is_finite(memory.theta[i]) and is_finite(memory.mean[i]) and is_finite(memory.variance[i])
         for j in range(size):
@@ -246,6 +237,9 @@ def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
     if not finite:
         for k in range(memory.moment.size):
             memory.moment[k] = 0.0
+        for j in range(memory.omega.size):
+            memory.phase[j] = 0.0
+            memory.omega[j] = learner.oscillators.omega[j]
         for i in range(size):
             memory.theta[i] = memory.mean[i] = memory.variance[i] = memory.taught[i] = memory.gain[i] = 0.0
             for j in range(size):
@@ -299,10 +293,6 @@ class Kalman:
     frequency: float | None = None
     prior: float = 10.0
     gain_interval: tuple[float, float] = (0.5, 2.0)
-    omegas: tuple[float, ...] = ()
-    retune: float = 0.4
-    doubt: float = 60.0
-    pair_bandwidth: float = 25.0
 
     def __post_init__(self) -> None:
         for name in ("state", "bias", "u"):
@@ -339,22 +329,19 @@ class Kalman:
         noise = noise_gains(observer)
         threshold = (_CLEAR * np.append(scale, 1.0)) ** 2 * noise
         size = self.prior * frequency**n
+        oscillators, pair_bandwidth = self.oscillators(observer, omega_c)
+        pairs = 2 * oscillators.omega.size
         return KalmanDesign(
             lag=lag_of(observer),
-            scale=np.array([*scale[: n * self.state], *[1.0] * self.bias, *[1.0] * (2 * len(self.omegas)), *[observer.b0] * self.u]),
-            walk=np.array([*slow[: n * self.state] ** 2, *[follow**2] * self.bias, *[self.pair_bandwidth**2] * (2 * len(self.omegas)), *[0.0] * self.u]),
-            threshold=np.array([*threshold[: n * self.state], *[0.0] * self.bias, *[0.0] * (2 * len(self.omegas)), *[threshold[n]] * self.u]),
+            scale=np.array([*scale[: n * self.state], *[1.0] * self.bias, *[1.0] * pairs, *[observer.b0] * self.u]),
+            walk=np.array([*slow[: n * self.state] ** 2, *[follow**2] * self.bias, *[pair_bandwidth**2] * pairs, *[0.0] * self.u]),
+            threshold=np.array([*threshold[: n * self.state], *[0.0] * self.bias, *[0.0] * pairs, *[threshold[n]] * self.u]),
             fastest=max(follow, observer.omega_o),
             f_noise=float(noise[n]),
-            prior=np.array([*[size] * (n * self.state), *[0.0] * self.bias, *[0.0] * (2 * len(self.omegas)), *[1.0] * self.u]),
+            prior=np.array([*[size] * (n * self.state), *[0.0] * self.bias, *[0.0] * pairs, *[1.0] * self.u]),
             states=n * self.state,
             bias=self.bias,
-            pairs=len(self.omegas),
-            first_pair=n * self.state + self.bias,
-            retune=self.retune, doubt=self.doubt,
-            omega_low=0.02 * omega_c,
-            omega_high=0.5 * observer.omega_o,
-            omega_start=np.array(self.omegas, dtype=float),
+            oscillators=oscillators,
             with_u=self.u,
             slope_low=self.gain_interval[0] - 1.0,
             slope_high=self.gain_interval[1] - 1.0,
@@ -362,6 +349,10 @@ class Kalman:
             forget=-math.expm1(-observer.dt / (_AVERAGE * lag_time)),
             lag_time=lag_time,
         )
+
+    def oscillators(self, observer: ESO, omega_c: float) -> tuple[Oscillators, float]:
+        """Return the parameters of no oscillators, and how fast their pairs would follow; ``Harmonic`` has some."""
+        return Oscillators(observer.order * self.state + self.bias, np.zeros(0), 0.0, 0.0), 0.0
 
     def memory(self, parameters: KalmanDesign) -> KalmanMemory:
         """Return a state with nothing learned."""
@@ -375,11 +366,11 @@ class Kalman:
             variance=np.zeros(p),
             taught=np.zeros(p),
             gain=np.zeros(p),
-            phase=np.zeros(parameters.pairs),
-            omega=parameters.omega_start.copy(),
+            phase=np.zeros(parameters.oscillators.omega.size),
+            omega=parameters.oscillators.omega.copy(),
             moment=np.zeros(4),
         )
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return ``("x1", …, "bias", "u")``, as far as they are features."""
-        return (*(f"x{i + 1}" for i in range(order * self.state)), *["bias"] * self.bias, *[f"h{i}" for i in range(2 * len(self.omegas))], *["u"] * self.u)
+        return (*(f"x{i + 1}" for i in range(order * self.state)), *["bias"] * self.bias, *["u"] * self.u)
