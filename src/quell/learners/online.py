@@ -142,9 +142,7 @@ class Online:
         if not isinstance(self.features, Features):
             raise ValueError(f"features = {features!r}: must be made of blocks from quell.features, for example State() + Bias()")
         self.frequency = None if frequency is None else checks.positive("frequency", frequency, "rad/s")
-        self.scale = None if scale is None else checks.vector("scale", scale)
-        if self.scale is not None and not np.all(self.scale > 0.0):
-            raise ValueError(f"scale = {scale!r}: must be positive")
+        self.scale = None if scale is None else checks.positive_vector("scale", scale)
 
     def design(self, observer: ESO, omega_c: float) -> OnlineDesign:
         """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s]."""

@@ -1,0 +1,296 @@
+"""Learners that are linear in what they learn: ``f_L = θ · φ(x̂, u)``, with the observer's lag taken out exactly.
+
+The features go through the observer's own lag filter (``lag.py``), so that
+
+    Δf̂ + f_L^F = θ · φ^F + noise
+
+is a regression without lag bias, whatever the features. How θ is found is the business of a *rule*: a NamedTuple for whose type
+``improve`` and ``renew`` are registered (``nlms.py``, ``rls.py``).
+
+*Scaling.* States, u and f are divided by powers of two (``scaling.py``), and all is learned in these units. When one of them grows, θ and
+the filters are converted: for features that are products of signals exactly, so that nothing jumps. A nonlinear feature means something
+else from then on; θ is kept as a first guess and learning waits until the filters hold the new features.
+
+*Rest.* What does not stand clear of noise is shown as its mean (``sight.py``). While nothing moves, only the bias learns, where there is
+one: a load that comes at rest says nothing about the other features.
+
+*Input.* With ``Input()`` the last feature is u itself. f_L is then affine in u and the controller solves for u exactly; the effective gain
+``(b0 + θ_u)/b0`` is kept in an interval, for where it goes to zero the loop's gain goes to infinity.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.dispatch import generic, kernel
+from quell.features import Bias, Features, State
+from quell.features.base import unit, write
+from quell.features.scaling import Scaling, grow, scaling
+from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.lag import Lag, lag_of, lag_push
+from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory
+from quell.observers.eso import ESO
+from quell.types import Matrix, Vector
+
+# In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
+_WATCH = 2.0
+
+# Places in LinearMemory.place.
+_SINCE, _SCALED = range(2)
+
+
+@generic
+def improve(rule: Any, memory: Any, theta: Vector, features: Vector, error: float, only: int) -> None:
+    """Move ``theta`` (p,) so that ``error = target − θ·features`` becomes smaller; where ``only`` ≥ 0, that entry and no other."""
+    raise TypeError
+
+
+@generic
+def renew(rule: Any, memory: Any) -> None:
+    """Take what is known for uncertain again: the features have changed their meaning."""
+    raise TypeError
+
+
+class LinearDesign(NamedTuple):
+    """Parameters of a linear learner with p features, for a plant of order n and an observer with N = n + 1 states."""
+
+    features: Any
+    scaling: Scaling
+    sight: Sight
+    lag: Lag
+    rule: Any
+    constant: int
+    """Which feature is the constant 1; −1 for none."""
+    with_u: bool
+    slope_low: float
+    """Least θ_u, in the plant's units."""
+    slope_high: float
+    products: bool
+    """Whether all features are products of signals."""
+    watch: int
+    """Samples after a start from rest in which nothing is learned."""
+
+
+class LinearMemory(NamedTuple):
+    """State of a linear learner."""
+
+    theta: Vector
+    """(p,), scaled."""
+    scale: Vector
+    """(n + 2,): what x_1 … x_n, u and f are divided by."""
+    shown: Vector
+    """Room for the scaled state (n,)."""
+    now: Vector
+    """Room for the features (p,)."""
+    units: Vector
+    """(p,): ``unit`` of the features for ``scale``."""
+    chain: Matrix
+    """(p, N): the lag filters of the features."""
+    filtered: Vector
+    """(p,): what they show."""
+    place: Vector
+    """(2,): samples since the start from rest; whether there is a scale."""
+    sight: SightMemory
+    rule: Any
+
+
+@adapt.register(LinearDesign)
+def _adapt(learner: LinearDesign, memory: LinearMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
+    place, theta = memory.place, memory.theta
+    moves = look(learner.sight, memory.sight, seen, y, u_before)
+    if place[_SINCE] <= learner.watch:
+        return
+    _rescale(learner, memory, seen, u_before, f_plain)
+    if place[_SINCE] <= learner.watch or not (moves or learner.constant >= 0):
+        return
+    scale = memory.scale
+    error = f_plain / scale[scale.size - 1]
+    for i in range(theta.size):
+        error -= theta[i] * memory.filtered[i]
+    if not math.isfinite(error):
+        return
+    improve(learner.rule, memory.rule, theta, memory.filtered, error, -1 if moves else learner.constant)
+    if learner.with_u:
+        last = theta.size - 1
+        in_plant = scale[scale.size - 1] / scale[scale.size - 2]
+        theta[last] = min(max(theta[last], learner.slope_low / in_plant), learner.slope_high / in_plant)
+
+
+@kernel
+def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float, f: float) -> None:
+    """Let the scales grow, and convert what is in their units."""
+    theta, scale, units, new, chain = memory.theta, memory.scale, memory.units, memory.now, memory.chain
+    f_before = scale[scale.size - 1]
+    before = 0.0
+    for i in range(scale.size - 1):
+        before += scale[i]
+    grow(learner.scaling, scale, seen, u, f)
+    after = 0.0
+    for i in range(scale.size - 1):
+        after += scale[i]
+    f_ratio = f_before / scale[scale.size - 1]
+    grown = after != before
+    if memory.place[_SCALED] == 0.0:
+        # From now on there are features; what the observer showed until now was without them, so watch once more.
+        memory.place[_SCALED] = 1.0
+        memory.place[_SINCE] = 0.0
+        unit(learner.features, scale, units)
+        return
+    if f_ratio != 1.0:
+        for i in range(theta.size):
+            theta[i] *= f_ratio
+    if not grown:
+        return
+    unit(learner.features, scale, new)
+    for i in range(theta.size):
+        ratio = new[i] / units[i]
+        if 0.0 < ratio < 1.0:
+            theta[i] /= ratio
+            memory.filtered[i] *= ratio
+            for j in range(chain.shape[1]):
+                chain[i, j] *= ratio
+        units[i] = new[i]
+    renew(learner.rule, memory.rule)
+    if not learner.products:
+        memory.place[_SINCE] = 0.0
+
+
+@kernel
+def _show(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float) -> None:
+    """Write the features of the state and u into ``memory.now``."""
+    scale, shown = memory.scale, memory.shown
+    for i in range(shown.size):
+        shown[i] = clear_of_noise(learner.sight, memory.sight, i, seen[i]) / scale[i]
+    write(learner.features, shown, clear_of_noise(learner.sight, memory.sight, shown.size, u) / scale[shown.size], memory.now)
+
+
+@predict.register(LinearDesign)
+def _predict(learner: LinearDesign, memory: LinearMemory, seen: Vector, u_before: float) -> tuple[float, float]:
+    if memory.place[_SCALED] == 0.0:
+        return 0.0, 0.0
+    theta, scale = memory.theta, memory.scale
+    _show(learner, memory, seen, u_before)
+    size = theta.size - 1 if learner.with_u else theta.size
+    constant = 0.0
+    for i in range(size):
+        constant += theta[i] * memory.now[i]
+    f_scale = scale[scale.size - 1]
+    return f_scale * constant, theta[size] * f_scale / scale[scale.size - 2] if learner.with_u else 0.0
+
+
+@commit.register(LinearDesign)
+def _commit(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float) -> None:
+    memory.place[_SINCE] += 1.0
+    if memory.place[_SCALED] == 0.0:
+        return
+    _show(learner, memory, seen, u)
+    for i in range(memory.filtered.size):
+        memory.filtered[i] = lag_push(learner.lag, memory.chain, i, memory.now[i])
+
+
+@restart.register(LinearDesign)
+def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
+    memory.place[_SINCE] = 0.0
+    for i in range(memory.filtered.size):
+        memory.filtered[i] = 0.0
+        for j in range(memory.chain.shape[1]):
+            memory.chain[i, j] = 0.0
+    look_anew(memory.sight)
+    finite = True
+    for i in range(memory.theta.size):
+        finite = finite and math.isfinite(memory.theta[i])
+    if not finite:
+        for i in range(memory.theta.size):
+            memory.theta[i] = 0.0
+        renew(learner.rule, memory.rule)
+
+
+@coefficients.register(LinearDesign)
+def _coefficients(learner: LinearDesign, memory: LinearMemory, theta: Vector) -> None:
+    f_scale = memory.scale[memory.scale.size - 1]
+    for i in range(theta.size):
+        theta[i] = memory.theta[i] * memory.units[i] * f_scale if memory.place[_SCALED] > 0.0 else 0.0
+
+
+class Linear:
+    """What the learners with a rule have in common; not one itself.
+
+    Parameters
+    ----------
+    features
+        what f is taken to be linear in.
+    frequency
+        a frequency the plant has [rad/s], for the automatic scaling; ``omega_c`` of the controller by default.
+    scale
+        what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
+    gain_interval
+        where the effective gain ``(b0 + θ_u)/b0`` is kept when ``Input()`` is a feature.
+
+    Raises
+    ------
+    ValueError
+        for arguments that fit nothing.
+    """
+
+    def __init__(self, features: Features | None, frequency: float | None, scale: Any, gain_interval: tuple[float, float]) -> None:
+        self.features = State() + Bias() if features is None else features
+        if not isinstance(self.features, Features):
+            raise ValueError(f"features = {features!r}: must be made of blocks from quell.features, for example State() + Bias()")
+        self.frequency = None if frequency is None else checks.positive("frequency", frequency, "rad/s")
+        self.scale = None if scale is None else checks.positive_vector("scale", scale)
+        self.gain_interval = checks.around_one("gain_interval", gain_interval)
+
+    def rule(self, observer: ESO, omega_c: float, features: int) -> Any:
+        """Return the rule's parameters."""
+        raise NotImplementedError
+
+    def rule_memory(self, rule: Any, features: int) -> Any:
+        """Return the rule's state before anything was learned."""
+        raise NotImplementedError
+
+    def design(self, observer: ESO, omega_c: float) -> LinearDesign:
+        """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s]."""
+        n = observer.order
+        if self.scale is not None:
+            checks.vector("scale", self.scale, n + 2)
+        features, p, constant = self.features.design(n), len(self.features.names(n)), self.features.constant(n)
+        doubled = np.zeros(p)
+        unit(features, np.full(n + 2, 2.0), doubled)
+        slopes = sorted(observer.b0 * (share - 1.0) for share in self.gain_interval)
+        return LinearDesign(
+            features=features,
+            scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
+            sight=sight(observer),
+            lag=lag_of(observer),
+            rule=self.rule(observer, omega_c, p),
+            constant=constant,
+            with_u=self.features.has_input,
+            slope_low=slopes[0],
+            slope_high=slopes[1],
+            products=bool(np.all((doubled < 1.0) | (np.arange(p) == constant))),
+            watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
+        )
+
+    def memory(self, parameters: LinearDesign) -> LinearMemory:
+        """Return a state with nothing learned."""
+        n, p = parameters.scaling.ladder.size - 2, len(self.features.names(parameters.scaling.ladder.size - 2))
+        return LinearMemory(
+            theta=np.zeros(p),
+            scale=np.full(n + 2, 1e-100) if self.scale is None else self.scale.copy(),
+            shown=np.zeros(n),
+            now=np.zeros(p),
+            units=np.ones(p),
+            chain=np.zeros((p, parameters.lag.taps.size)),
+            filtered=np.zeros(p),
+            place=np.zeros(2),
+            sight=sight_memory(n),
+            rule=self.rule_memory(parameters.rule, p),
+        )
+
+    def feature_names(self, order: int) -> tuple[str, ...]:
+        """Return the features' names."""
+        return self.features.names(order)
