@@ -151,7 +151,7 @@ def test_the_effective_gain_stays_in_its_interval(make: Any, rng: np.random.Gene
             slope = predict(design, memory, seen, u)[1]
             assert 0.4 - 1e-12 <= (b0 + slope) / b0 <= 1.5 + 1e-12
             commit(design, memory, seen, u)
-        assert (b0 + slope) / b0 == pytest.approx(0.4)
+        assert (b0 + slope) / b0 < 0.6
 
 
 def test_a_wrong_gain_is_found() -> None:

@@ -4,8 +4,10 @@ from quell.learners.base import Learner, NoLearner
 from quell.learners.gradient import BatchGradient
 from quell.learners.kalman import Kalman
 from quell.learners.model import Model, infer, learn
+from quell.learners.network import MLP
 from quell.learners.nlms import NLMS
 from quell.learners.online import Online
+from quell.learners.process import GaussianProcess
 from quell.learners.rls import RLS
 
-__all__ = ["NLMS", "RLS", "BatchGradient", "Kalman", "Learner", "Model", "NoLearner", "Online", "infer", "learn"]
+__all__ = ["MLP", "NLMS", "RLS", "BatchGradient", "GaussianProcess", "Kalman", "Learner", "Model", "NoLearner", "Online", "infer", "learn"]

@@ -7,6 +7,9 @@ delay. So a black box is given the pair
 
 and what it learns has no lag bias, up to second order in frequency over omega_o. (A model that is linear in its parameters can do without
 the approximation: ``linear.py``.)
+
+What does not stand clear of noise is shown as its mean, and nothing is learned while nothing moves (``sight.py``): at rest a black box
+would learn by heart what it sees, and forget the rest.
 """
 
 from __future__ import annotations
@@ -16,12 +19,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.dispatch import kernel
 from quell.features import Bias, Features, State
 from quell.features.base import write
 from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import lag_of
 from quell.learners.model import infer, learn
+from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -37,6 +42,7 @@ class OnlineDesign(NamedTuple):
 
     features: Any
     scaling: Scaling
+    sight: Sight
     model: Any
     delay: int
     """D [samples]."""
@@ -57,6 +63,7 @@ class OnlineMemory(NamedTuple):
     """The last features (D + 1, p)."""
     place: Vector
     """(2,): where the next row goes; samples since the start from rest."""
+    sight: SightMemory
     model: Any
     flat: Vector
     """All arrays of ``model``, end to end: the same memory."""
@@ -66,41 +73,47 @@ class OnlineMemory(NamedTuple):
 
 @adapt.register(OnlineDesign)
 def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
+    moves = look(learner.sight, memory.sight, seen, y, u_before)
     if memory.place[_SINCE] <= learner.watch:
         return
     scale = memory.scale
     grow(learner.scaling, scale, seen, u_before, f_plain)
-    if memory.place[_SINCE] > learner.watch + learner.delay:
+    if moves and memory.place[_SINCE] > learner.watch + learner.delay + 1:
         # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
         learn(learner.model, memory.model, memory.ring[int(memory.place[_ROW])], f_plain / scale[scale.size - 1])
 
 
 @predict.register(OnlineDesign)
 def _predict(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u_before: float) -> tuple[float, float]:
-    if memory.place[_SINCE] <= learner.watch + learner.delay:
+    if memory.place[_SINCE] <= learner.watch + learner.delay + 1:
         return 0.0, 0.0
-    scale, scaled = memory.scale, memory.scaled
-    for i in range(scaled.size):
-        scaled[i] = seen[i] / scale[i]
-    write(learner.features, scaled, u_before / scale[scaled.size], memory.now)
+    scale = memory.scale
+    _show(learner, memory, seen, u_before, memory.now)
     return scale[scale.size - 1] * infer(learner.model, memory.model, memory.now), 0.0
 
 
 @commit.register(OnlineDesign)
 def _commit(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float) -> None:
-    scale, scaled = memory.scale, memory.scaled
-    row = int(memory.place[_ROW])
-    for i in range(scaled.size):
-        scaled[i] = seen[i] / scale[i]
-    write(learner.features, scaled, u / scale[scaled.size], memory.ring[row])
+    row = min(max(int(memory.place[_ROW]), 0), learner.delay)
+    _show(learner, memory, seen, u, memory.ring[row])
     row += 1
     memory.place[_ROW] = 0.0 if row > learner.delay else row
     memory.place[_SINCE] += 1.0
 
 
+@kernel
+def _show(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, out: Vector) -> None:
+    """Write the features of the state and u."""
+    scale, scaled = memory.scale, memory.scaled
+    for i in range(scaled.size):
+        scaled[i] = clear_of_noise(learner.sight, memory.sight, i, seen[i]) / scale[i]
+    write(learner.features, scaled, clear_of_noise(learner.sight, memory.sight, scaled.size, u) / scale[scaled.size], out)
+
+
 @restart.register(OnlineDesign)
 def _restart(learner: OnlineDesign, memory: OnlineMemory) -> None:
     memory.place[_ROW] = memory.place[_SINCE] = 0.0
+    look_anew(memory.sight)
     finite = True
     for i in range(memory.flat.size):
         finite = finite and abs(memory.flat[i]) <= 1e100
@@ -144,6 +157,10 @@ class Online:
         self.frequency = None if frequency is None else checks.positive("frequency", frequency, "rad/s")
         self.scale = None if scale is None else checks.positive_vector("scale", scale)
 
+    def fitted_model(self, observer: ESO, omega_c: float) -> Any:
+        """Return the model; one that is fitted to observer and controller does that here."""
+        return self.model
+
     def design(self, observer: ESO, omega_c: float) -> OnlineDesign:
         """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s]."""
         n = observer.order
@@ -152,7 +169,8 @@ class Online:
         return OnlineDesign(
             features=self.features.design(n),
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
-            model=self.model.design(len(self.features.names(n)), observer.dt),
+            sight=sight(observer),
+            model=self.fitted_model(observer, omega_c).design(len(self.features.names(n)), observer.dt),
             delay=round(group_delay(observer)),
             watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
         )
@@ -168,6 +186,7 @@ class Online:
             now=np.zeros(p),
             ring=np.zeros((parameters.delay + 1, p)),
             place=np.zeros(2),
+            sight=sight_memory(n),
             model=model,
             flat=flat,
             fresh=flat.copy(),
