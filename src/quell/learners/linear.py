@@ -11,8 +11,11 @@ is a regression without lag bias, whatever the features. How θ is found is the 
 the filters are converted: for features that are products of signals exactly, so that nothing jumps. A nonlinear feature means something
 else from then on; θ is kept as a first guess and learning waits until the filters hold the new features.
 
-*Rest.* What does not stand clear of noise is shown as its mean (``sight.py``). While nothing moves, only the bias learns, where there is
-one: a load that comes at rest says nothing about the other features.
+*Rest.* What does not stand clear of noise is shown as its mean, and θ learns nothing while nothing moves (``sight.py``): a load that comes
+at rest says nothing about the features.
+
+*What is left.* A fast bias d follows what θ does not explain, ``d' = λ (Δf̂ + f_L^F − θ·φ^F − d)``, and is fed forward with it. θ does not
+know of d: two that learn from what both leave would share it at random.
 
 *Input.* With ``Input()`` the last feature is u itself. f_L is then affine in u and the controller solves for u exactly; the effective gain
 ``(b0 + θ_u)/b0`` is kept in an interval, for where it goes to zero the loop's gain goes to infinity.
@@ -40,12 +43,12 @@ from quell.types import Matrix, Vector
 _WATCH = 2.0
 
 # Places in LinearMemory.place.
-_SINCE, _SCALED = range(2)
+_SINCE, _SCALED, _LEFT = range(3)
 
 
 @generic
-def improve(rule: Any, memory: Any, theta: Vector, features: Vector, error: float, only: int) -> None:
-    """Move ``theta`` (p,) so that ``error = target − θ·features`` becomes smaller; where ``only`` ≥ 0, that entry and no other."""
+def improve(rule: Any, memory: Any, theta: Vector, features: Vector, error: float) -> None:
+    """Move ``theta`` (p,) so that ``error = target − θ·features`` becomes smaller."""
     raise TypeError
 
 
@@ -71,6 +74,8 @@ class LinearDesign(NamedTuple):
     slope_high: float
     products: bool
     """Whether all features are products of signals."""
+    follow: float
+    """λ dt, at most 1."""
     watch: int
     """Samples after a start from rest in which nothing is learned."""
 
@@ -93,7 +98,7 @@ class LinearMemory(NamedTuple):
     filtered: Vector
     """(p,): what they show."""
     place: Vector
-    """(2,): samples since the start from rest; whether there is a scale."""
+    """(3,): samples since the start from rest; whether there is a scale; d, in the plant's units."""
     sight: SightMemory
     rule: Any
 
@@ -105,7 +110,7 @@ def _adapt(learner: LinearDesign, memory: LinearMemory, seen: Vector, y: float, 
     if place[_SINCE] <= learner.watch:
         return
     _rescale(learner, memory, seen, u_before, f_plain)
-    if place[_SINCE] <= learner.watch or not (moves or learner.constant >= 0):
+    if place[_SINCE] <= learner.watch:
         return
     scale = memory.scale
     error = f_plain / scale[scale.size - 1]
@@ -113,7 +118,10 @@ def _adapt(learner: LinearDesign, memory: LinearMemory, seen: Vector, y: float, 
         error -= theta[i] * memory.filtered[i]
     if not math.isfinite(error):
         return
-    improve(learner.rule, memory.rule, theta, memory.filtered, error, -1 if moves else learner.constant)
+    place[_LEFT] += learner.follow * (error * scale[scale.size - 1] - place[_LEFT])
+    if not moves:
+        return
+    improve(learner.rule, memory.rule, theta, memory.filtered, error)
     if learner.with_u:
         last = theta.size - 1
         in_plant = scale[scale.size - 1] / scale[scale.size - 2]
@@ -179,7 +187,7 @@ def _predict(learner: LinearDesign, memory: LinearMemory, seen: Vector, u_before
     for i in range(size):
         constant += theta[i] * memory.now[i]
     f_scale = scale[scale.size - 1]
-    return f_scale * constant, theta[size] * f_scale / scale[scale.size - 2] if learner.with_u else 0.0
+    return f_scale * constant + memory.place[_LEFT], theta[size] * f_scale / scale[scale.size - 2] if learner.with_u else 0.0
 
 
 @commit.register(LinearDesign)
@@ -194,7 +202,7 @@ def _commit(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float)
 
 @restart.register(LinearDesign)
 def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
-    memory.place[_SINCE] = 0.0
+    memory.place[_SINCE] = memory.place[_LEFT] = 0.0
     for i in range(memory.filtered.size):
         memory.filtered[i] = 0.0
         for j in range(memory.chain.shape[1]):
@@ -214,6 +222,8 @@ def _coefficients(learner: LinearDesign, memory: LinearMemory, theta: Vector) ->
     f_scale = memory.scale[memory.scale.size - 1]
     for i in range(theta.size):
         theta[i] = memory.theta[i] * memory.units[i] * f_scale if memory.place[_SCALED] > 0.0 else 0.0
+    if learner.constant >= 0:
+        theta[learner.constant] += memory.place[_LEFT]
 
 
 class Linear:
@@ -229,6 +239,8 @@ class Linear:
         what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
     gain_interval
         where the effective gain ``(b0 + θ_u)/b0`` is kept when ``Input()`` is a feature.
+    bias_bandwidth
+        how fast a bias follows what the features leave, λ [rad/s]; ``omega_o`` of the observer by default, 0 for none.
 
     Raises
     ------
@@ -236,12 +248,20 @@ class Linear:
         for arguments that fit nothing.
     """
 
-    def __init__(self, features: Features | None, frequency: float | None, scale: Any, gain_interval: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        features: Features | None,
+        frequency: float | None,
+        scale: Any,
+        gain_interval: tuple[float, float],
+        bias_bandwidth: float | None,
+    ) -> None:
         self.features = State() + Bias() if features is None else features
         if not isinstance(self.features, Features):
             raise ValueError(f"features = {features!r}: must be made of blocks from quell.features, for example State() + Bias()")
         self.frequency = None if frequency is None else checks.positive("frequency", frequency, "rad/s")
         self.scale = None if scale is None else checks.positive_vector("scale", scale)
+        self.bias_bandwidth = None if bias_bandwidth is None else checks.non_negative("bias_bandwidth", bias_bandwidth, "rad/s")
         self.gain_interval = checks.around_one("gain_interval", gain_interval)
 
     def rule(self, observer: ESO, omega_c: float, features: int) -> Any:
@@ -272,6 +292,7 @@ class Linear:
             slope_low=slopes[0],
             slope_high=slopes[1],
             products=bool(np.all((doubled < 1.0) | (np.arange(p) == constant))),
+            follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
             watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
         )
 
@@ -286,7 +307,7 @@ class Linear:
             units=np.ones(p),
             chain=np.zeros((p, parameters.lag.taps.size)),
             filtered=np.zeros(p),
-            place=np.zeros(2),
+            place=np.zeros(3),
             sight=sight_memory(n),
             rule=self.rule_memory(parameters.rule, p),
         )

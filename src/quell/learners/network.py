@@ -25,6 +25,8 @@ from quell.types import Matrix, Vector
 
 # No weight of a network with inputs and outputs of O(1) needs to be larger.
 _LARGEST = 30.0
+# Standard deviation of weights before anything is known: steep enough for units that switch, as friction does, within a third of the range.
+_PRIOR = 3.0
 # Targets are O(1); an error beyond this is an outlier.
 _LARGEST_ERROR = 1.0
 
@@ -131,14 +133,17 @@ class Network:
     def design(self, features: int, dt: float) -> NetworkDesign:
         """Return the parameters for so many features and a sample time [s]."""
         step = self.every * dt
-        rule = RlsRule(self.noise**2 * max(self.noise_time / step, 1.0), -math.expm1(-step / self.memory_time), 1.0)
+        rule = RlsRule(self.noise**2 * max(self.noise_time / step, 1.0), -math.expm1(-step / self.memory_time), _PRIOR**2)
         return NetworkDesign(rule, features, self.hidden, self.every, self.seed)
 
     def memory(self, parameters: NetworkDesign) -> NetworkMemory:
         """Return a network that says nothing: its output weights are zero, the others random."""
         width = parameters.inputs + 2
-        weights = np.random.default_rng(parameters.seed).normal(size=(parameters.hidden, width))
+        rng = np.random.default_rng(parameters.seed)
+        weights = _PRIOR * rng.normal(size=(parameters.hidden, width))
         weights[:, 0] = 0.0
+        # Each unit switches somewhere in the range of the features.
+        weights[:, 1] = -np.sum(weights[:, 2:] * rng.uniform(-1.0, 1.0, (parameters.hidden, parameters.inputs)), axis=1)
         theta = np.append(weights.ravel(), 0.0)
         p = theta.size
         return NetworkMemory(theta, parameters.rule.prior * np.eye(p), np.zeros(p), np.zeros(p), np.zeros(1))
@@ -163,8 +168,8 @@ class MLP(Online):
         standard deviation of what it can't explain, in units of the largest f.
     seed
         of the first weights.
-    frequency, scale
-        for the scaling, as in ``Online``.
+    frequency, scale, bias_bandwidth
+        as for ``Online``.
 
     Raises
     ------
@@ -188,10 +193,11 @@ class MLP(Online):
         seed: int = 0,
         frequency: float | None = None,
         scale: Any = None,
+        bias_bandwidth: float | None = None,
     ) -> None:
         self.memory_time = None if memory_time is None else checks.time_constant("memory_time", memory_time)
         model = Network(hidden, seed, every, 1.0, noise, 1.0)
-        super().__init__(model, State() if features is None else features, frequency=frequency, scale=scale)
+        super().__init__(model, State() if features is None else features, frequency=frequency, scale=scale, bias_bandwidth=bias_bandwidth)
 
     def fitted_model(self, observer: ESO, omega_c: float) -> Network:
         """Return the network with memory and correlation of noise as observer and controller want them."""

@@ -35,10 +35,7 @@ class NlmsMemory(NamedTuple):
 
 
 @improve.register(NlmsRule)
-def _improve(rule: NlmsRule, memory: NlmsMemory, theta: Vector, features: Vector, error: float, only: int) -> None:
-    if only >= 0:
-        theta[only] += rule.gain * features[only] * error / (rule.floor + features[only] * features[only])
-        return
+def _improve(rule: NlmsRule, memory: NlmsMemory, theta: Vector, features: Vector, error: float) -> None:
     power = rule.floor
     for i in range(theta.size):
         power += features[i] * features[i]
@@ -72,6 +69,8 @@ class NLMS(Linear):
         what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
     gain_interval
         where the effective gain ``(b0 + θ_u)/b0`` is kept when ``Input()`` is a feature.
+    bias_bandwidth
+        how fast a bias follows what the features leave, λ [rad/s]; ``omega_o`` of the observer by default, 0 for none.
 
     Raises
     ------
@@ -93,8 +92,9 @@ class NLMS(Linear):
         frequency: float | None = None,
         scale: Any = None,
         gain_interval: tuple[float, float] = (0.5, 2.0),
+        bias_bandwidth: float | None = None,
     ) -> None:
-        super().__init__(features, frequency, scale, gain_interval)
+        super().__init__(features, frequency, scale, gain_interval, bias_bandwidth)
         self.rate = None if rate is None else checks.positive("rate", rate, "1/s")
         self.regularisation = checks.positive("regularisation", regularisation)
 

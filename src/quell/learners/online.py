@@ -9,11 +9,12 @@ and what it learns has no lag bias, up to second order in frequency over omega_o
 the approximation: ``linear.py``.)
 
 What does not stand clear of noise is shown as its mean, and nothing is learned while nothing moves (``sight.py``): at rest a black box
-would learn by heart what it sees, and forget the rest.
+would learn by heart what it sees, and forget the rest. A fast bias d follows what the model leaves, as in ``linear.py``.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ from quell.types import Matrix, Vector
 _WATCH = 2.0
 
 # Places in OnlineMemory.place.
-_ROW, _SINCE = range(2)
+_ROW, _SINCE, _LEFT = range(3)
 
 
 class OnlineDesign(NamedTuple):
@@ -44,6 +45,8 @@ class OnlineDesign(NamedTuple):
     scaling: Scaling
     sight: Sight
     model: Any
+    follow: float
+    """λ dt, at most 1."""
     delay: int
     """D [samples]."""
     watch: int
@@ -62,7 +65,7 @@ class OnlineMemory(NamedTuple):
     ring: Matrix
     """The last features (D + 1, p)."""
     place: Vector
-    """(2,): where the next row goes; samples since the start from rest."""
+    """(3,): where the next row goes; samples since the start from rest; d, in the plant's units."""
     sight: SightMemory
     model: Any
     flat: Vector
@@ -78,9 +81,16 @@ def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, 
         return
     scale = memory.scale
     grow(learner.scaling, scale, seen, u_before, f_plain)
-    if moves and memory.place[_SINCE] > learner.watch + learner.delay + 1:
-        # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
-        learn(learner.model, memory.model, memory.ring[int(memory.place[_ROW])], f_plain / scale[scale.size - 1])
+    if memory.place[_SINCE] <= learner.watch + learner.delay + 1:
+        return
+    # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
+    features, f_scale = memory.ring[min(max(int(memory.place[_ROW]), 0), learner.delay)], scale[scale.size - 1]
+    if learner.follow > 0.0:
+        left = f_plain - f_scale * infer(learner.model, memory.model, features) - memory.place[_LEFT]
+        if math.isfinite(left):
+            memory.place[_LEFT] += learner.follow * left
+    if moves:
+        learn(learner.model, memory.model, features, f_plain / f_scale)
 
 
 @predict.register(OnlineDesign)
@@ -89,7 +99,7 @@ def _predict(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u_before
         return 0.0, 0.0
     scale = memory.scale
     _show(learner, memory, seen, u_before, memory.now)
-    return scale[scale.size - 1] * infer(learner.model, memory.model, memory.now), 0.0
+    return scale[scale.size - 1] * infer(learner.model, memory.model, memory.now) + memory.place[_LEFT], 0.0
 
 
 @commit.register(OnlineDesign)
@@ -112,7 +122,7 @@ def _show(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, o
 
 @restart.register(OnlineDesign)
 def _restart(learner: OnlineDesign, memory: OnlineMemory) -> None:
-    memory.place[_ROW] = memory.place[_SINCE] = 0.0
+    memory.place[_ROW] = memory.place[_SINCE] = memory.place[_LEFT] = 0.0
     look_anew(memory.sight)
     finite = True
     for i in range(memory.flat.size):
@@ -140,6 +150,8 @@ class Online:
         a frequency the plant has [rad/s], for the automatic scaling; ``omega_c`` of the controller by default.
     scale
         what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
+    bias_bandwidth
+        how fast a bias follows what the model leaves, λ [rad/s]; ``omega_o`` of the observer by default, 0 for none.
 
     Raises
     ------
@@ -147,7 +159,15 @@ class Online:
         for arguments that fit nothing.
     """
 
-    def __init__(self, model: Any, features: Features | None = None, *, frequency: float | None = None, scale: Any = None) -> None:
+    def __init__(
+        self,
+        model: Any,
+        features: Features | None = None,
+        *,
+        frequency: float | None = None,
+        scale: Any = None,
+        bias_bandwidth: float | None = None,
+    ) -> None:
         if isinstance(model, type) or not (hasattr(model, "design") and hasattr(model, "memory")):
             raise ValueError(f"model = {model!r}: must have design(features, dt) and memory(parameters); see docs/extend")
         self.model = model
@@ -155,6 +175,7 @@ class Online:
         if not isinstance(self.features, Features):
             raise ValueError(f"features = {features!r}: must be made of blocks from quell.features, for example State() + Bias()")
         self.frequency = None if frequency is None else checks.positive("frequency", frequency, "rad/s")
+        self.bias_bandwidth = None if bias_bandwidth is None else checks.non_negative("bias_bandwidth", bias_bandwidth, "rad/s")
         self.scale = None if scale is None else checks.positive_vector("scale", scale)
 
     def fitted_model(self, observer: ESO, omega_c: float) -> Any:
@@ -171,6 +192,7 @@ class Online:
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
             sight=sight(observer),
             model=self.fitted_model(observer, omega_c).design(len(self.features.names(n)), observer.dt),
+            follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
             delay=round(group_delay(observer)),
             watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
         )
@@ -185,7 +207,7 @@ class Online:
             scaled=np.zeros(n),
             now=np.zeros(p),
             ring=np.zeros((parameters.delay + 1, p)),
-            place=np.zeros(2),
+            place=np.zeros(3),
             sight=sight_memory(n),
             model=model,
             flat=flat,

@@ -278,8 +278,8 @@ class GaussianProcess(Online):
         learn from every so-many-th sample only; it predicts at each.
     noise
         standard deviation of what it can't explain, in units of the largest f.
-    frequency, scale
-        for the scaling, as in ``Online``.
+    frequency, scale, bias_bandwidth
+        as for ``Online``.
 
     Raises
     ------
@@ -303,10 +303,11 @@ class GaussianProcess(Online):
         noise: float = 0.1,
         frequency: float | None = None,
         scale: Any = None,
+        bias_bandwidth: float | None = None,
     ) -> None:
         self.memory_time = None if memory_time is None else checks.time_constant("memory_time", memory_time)
         model = Process(budget, length, every, 1.0, noise, 1.0)
-        super().__init__(model, State() if features is None else features, frequency=frequency, scale=scale)
+        super().__init__(model, State() if features is None else features, frequency=frequency, scale=scale, bias_bandwidth=bias_bandwidth)
 
     def fitted_model(self, observer: ESO, omega_c: float) -> Process:
         """Return the process with memory and correlation of noise as observer and controller want them."""

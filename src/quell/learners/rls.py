@@ -83,25 +83,11 @@ def open_covariance(rule: RlsRule, covariance: Matrix) -> None:
 
 
 @improve.register(RlsRule)
-def _improve(rule: RlsRule, memory: RlsMemory, theta: Vector, features: Vector, error: float, only: int) -> None:
+def _improve(rule: RlsRule, memory: RlsMemory, theta: Vector, features: Vector, error: float) -> None:
     covariance, gain = memory.covariance, memory.gain
-    if only < 0:
-        inverse = least_squares_gain(rule, covariance, gain, features)
-        for i in range(theta.size):
-            theta[i] += gain[i] * inverse * error
-        return
-    # The others are uncertain but not asked (Schmidt's consider filter): their correlation with this one fades.
-    feature = features[only]
-    spread = covariance[only, only] * feature * feature
-    share = spread / (rule.noise + spread)
-    if not share > 0.0:
-        return
-    theta[only] += share * error / feature
-    for j in range(theta.size):
-        if j != only:
-            covariance[only, j] *= 1.0 - share
-            covariance[j, only] = covariance[only, j]
-    covariance[only, only] = min(covariance[only, only] * (1.0 - share) / (1.0 - rule.forget), rule.prior)
+    inverse = least_squares_gain(rule, covariance, gain, features)
+    for i in range(theta.size):
+        theta[i] += gain[i] * inverse * error
 
 
 @renew.register(RlsRule)
@@ -126,6 +112,8 @@ class RLS(Linear):
         what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
     gain_interval
         where the effective gain ``(b0 + θ_u)/b0`` is kept when ``Input()`` is a feature.
+    bias_bandwidth
+        how fast a bias follows what the features leave, λ [rad/s]; ``omega_o`` of the observer by default, 0 for none.
 
     Raises
     ------
@@ -147,8 +135,9 @@ class RLS(Linear):
         frequency: float | None = None,
         scale: Any = None,
         gain_interval: tuple[float, float] = (0.5, 2.0),
+        bias_bandwidth: float | None = None,
     ) -> None:
-        super().__init__(features, frequency, scale, gain_interval)
+        super().__init__(features, frequency, scale, gain_interval, bias_bandwidth)
         self.memory_time = None if memory_time is None else checks.time_constant("memory_time", memory_time)
         self.prior = checks.positive("prior", prior)
 
