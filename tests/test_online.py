@@ -66,7 +66,7 @@ def _learn(model: PlainRule, memory: PlainMemory, features: Vector, target: floa
 
 def learned(delay: int | None) -> np.ndarray:
     """θ in the plant's units, from f = −3 x_1 − 0.4 x_2 + 0.5 as the observer shows it; ``delay`` overrides that of the pairs."""
-    learner = ql.learners.Online(Plain(), State() + Bias())
+    learner = ql.learners.Online(Plain(), State() + Bias(), scale=[2.0, 2.0, 1.0, 8.0])
     design = learner.design(OBSERVER, 2.0)
     if delay is not None:
         design = design._replace(delay=delay)

@@ -10,6 +10,9 @@ the approximation: ``linear.py``.)
 
 What does not stand clear of noise is shown as its mean, and nothing is learned while nothing moves (``sight.py``): at rest a black box
 would learn by heart what it sees, and forget the rest. A fast bias d follows what the model leaves, as in ``linear.py``.
+
+A scale that grows, by a factor of two or more, makes the same motion look smaller to the model, which then has to learn anew what it
+knew. That is so in the first motions, and where a motion is larger than all before; ``scale`` avoids it.
 """
 
 from __future__ import annotations
