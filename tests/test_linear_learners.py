@@ -27,7 +27,7 @@ def taught(rule: Any, memory: Any, features: np.ndarray, targets: np.ndarray) ->
     """θ after all pairs."""
     theta = np.zeros(features.shape[1])
     for row, target in zip(features, targets, strict=True):
-        improve(rule, memory, theta, row, target - theta @ row)
+        improve(rule, memory, theta, row, target - theta @ row, 1.0)
     return theta
 
 
@@ -47,12 +47,12 @@ def test_rls_forgets_along_what_it_sees_and_nowhere_else() -> None:
     direction, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
     for _ in range(5):
         before = direction @ memory.covariance @ direction / rule.noise
-        improve(rule, memory, np.zeros(2), direction, 0.0)
+        improve(rule, memory, np.zeros(2), direction, 0.0, 1.0)
         after = direction @ memory.covariance @ direction / rule.noise
         assert after == pytest.approx(before / (0.99 * (1.0 + before)), rel=1e-12)
         assert across @ memory.covariance @ across == pytest.approx(9.0, rel=1e-12)
     for _ in range(5000):
-        improve(rule, memory, np.zeros(2), direction, 0.0)
+        improve(rule, memory, np.zeros(2), direction, 0.0, 1.0)
     assert direction @ memory.covariance @ direction / rule.noise == pytest.approx(0.01 / 0.99, rel=1e-6)
 
 
@@ -61,9 +61,9 @@ def test_rls_follows_what_drifts_in_its_memory_time(rng: np.random.Generator) ->
     rule, memory = rls(1, forget=0.01)
     theta = np.zeros(1)
     for _ in range(2000):
-        improve(rule, memory, theta, np.ones(1), -theta[0])
+        improve(rule, memory, theta, np.ones(1), -theta[0], 1.0)
     for _ in range(100):
-        improve(rule, memory, theta, np.ones(1), 1.0 - theta[0])
+        improve(rule, memory, theta, np.ones(1), 1.0 - theta[0], 1.0)
     assert theta[0] == pytest.approx(1.0 - math.exp(-1.0), abs=0.01)
 
 
@@ -73,7 +73,7 @@ def test_the_uncertainty_of_rls_is_bounded_without_excitation(rng: np.random.Gen
     theta = np.zeros(3)
     for k in range(20_000):
         features = np.ones(3) + (1e-3 if k % 2 else 1e-6) * rng.normal(size=3)
-        improve(rule, memory, theta, features * (1e-4 if k % 3 else 1.0), rng.normal())
+        improve(rule, memory, theta, features * (1e-4 if k % 3 else 1.0), rng.normal(), 1.0)
     assert np.trace(memory.covariance) <= 3 * rule.prior * (1.0 + 1e-9)
     assert np.min(np.linalg.eigvalsh(memory.covariance)) > 0.0
     assert np.all(np.abs(theta) < 1e3)
@@ -83,7 +83,7 @@ def test_nlms_projects_on_what_it_sees(rng: np.random.Generator) -> None:
     """With the step 1 and no regularisation the new θ explains the sample, and is the nearest that does (Haykin, section 7.1)."""
     features, theta = rng.normal(size=5), rng.normal(size=5)
     before = theta.copy()
-    improve(NlmsRule(1.0, 0.0), NlmsMemory(np.zeros(0)), theta, features, 2.0 - theta @ features)
+    improve(NlmsRule(1.0, 0.0), NlmsMemory(np.zeros(0)), theta, features, 2.0 - theta @ features, 1.0)
     assert theta @ features == pytest.approx(2.0, rel=1e-12)
     np.testing.assert_allclose(theta - before, features * ((theta - before) @ features) / (features @ features), atol=1e-12)
 

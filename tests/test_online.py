@@ -59,7 +59,7 @@ def _infer(model: PlainRule, memory: PlainMemory, features: Vector) -> float:
 
 @learn.register(PlainRule)
 def _learn(model: PlainRule, memory: PlainMemory, features: Vector, target: float) -> None:
-    step = (target - infer(model, memory, features)) * least_squares_gain(model.rule, memory.covariance, memory.gain, features)
+    step = (target - infer(model, memory, features)) * least_squares_gain(model.rule, memory.covariance, memory.gain, features, 1.0)
     for i in range(features.size):
         memory.theta[i] += step * memory.gain[i]
 

@@ -35,20 +35,23 @@ from quell.features.base import unit, write
 from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import Lag, lag_of, lag_push
-from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory
+from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory, trust
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
 # In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
 _WATCH = 2.0
 
+# Where less than this share of what is seen can be a motion, nothing is learned from it.
+_LEAST_SURE = 0.01
+
 # Places in LinearMemory.place.
 _SINCE, _SCALED, _LEFT = range(3)
 
 
 @generic
-def improve(rule: Any, memory: Any, theta: Vector, features: Vector, error: float) -> None:
-    """Move ``theta`` (p,) so that ``error = target − θ·features`` becomes smaller."""
+def improve(rule: Any, memory: Any, theta: Vector, features: Vector, error: float, sure: float) -> None:
+    """Move ``theta`` (p,) so that ``error = target − θ·features`` becomes smaller; ``sure``, in (0, 1], says how little noise is in it."""
     raise TypeError
 
 
@@ -119,9 +122,10 @@ def _adapt(learner: LinearDesign, memory: LinearMemory, seen: Vector, y: float, 
     if not math.isfinite(error):
         return
     place[_LEFT] += learner.follow * (error * scale[scale.size - 1] - place[_LEFT])
-    if not moves:
+    sure = trust(learner.sight, memory.sight, scale[0])
+    if not moves or sure < _LEAST_SURE:
         return
-    improve(learner.rule, memory.rule, theta, memory.filtered, error)
+    improve(learner.rule, memory.rule, theta, memory.filtered, error, sure)
     if learner.with_u:
         last = theta.size - 1
         in_plant = scale[scale.size - 1] / scale[scale.size - 2]
@@ -284,7 +288,7 @@ class Linear:
         return LinearDesign(
             features=features,
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
-            sight=sight(observer),
+            sight=sight(observer, self.frequency or omega_c),
             lag=lag_of(observer),
             rule=self.rule(observer, omega_c, p),
             constant=constant,

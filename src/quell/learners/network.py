@@ -104,7 +104,7 @@ def _learn(model: NetworkDesign, memory: NetworkMemory, features: Vector, target
     if not math.isfinite(error):
         return
     error = min(max(error, -_LARGEST_ERROR), _LARGEST_ERROR)
-    step = error * least_squares_gain(model.rule, memory.covariance, gain, memory.slope)
+    step = error * least_squares_gain(model.rule, memory.covariance, gain, memory.slope, model.rule.noise)
     for i in range(theta.size):
         theta[i] = min(max(theta[i] + step * gain[i], -_LARGEST), _LARGEST)
 

@@ -2,7 +2,8 @@
 
     θ ← θ + rate dt · φ ε / (ρ + φ·φ)
 
-where ε is the error and φ the filtered features. Along φ the error decays as ``exp(−rate t)``, whatever the features' size and dt.
+where ε is the error and φ the filtered features. Along φ the error decays as ``exp(−rate t)``, whatever the features' size and dt; slower
+where noise hides it (``sight.trust``).
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ class NlmsMemory(NamedTuple):
 
 
 @improve.register(NlmsRule)
-def _improve(rule: NlmsRule, memory: NlmsMemory, theta: Vector, features: Vector, error: float) -> None:
+def _improve(rule: NlmsRule, memory: NlmsMemory, theta: Vector, features: Vector, error: float, sure: float) -> None:
     power = rule.floor
     for i in range(theta.size):
         power += features[i] * features[i]
-    step = rule.gain * error / power
+    step = rule.gain * sure * error / power
     for i in range(theta.size):
         theta[i] += step * features[i]
 

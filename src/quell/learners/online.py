@@ -8,8 +8,9 @@ delay. So a black box is given the pair
 and what it learns has no lag bias, up to second order in frequency over omega_o. (A model that is linear in its parameters can do without
 the approximation: ``linear.py``.)
 
-What does not stand clear of noise is shown as its mean, and nothing is learned while nothing moves (``sight.py``): at rest a black box
-would learn by heart what it sees, and forget the rest. A fast bias d follows what the model leaves, as in ``linear.py``.
+What does not stand clear of noise is shown as its mean, and nothing is learned while nothing moves, or where noise hides f
+(``sight.py``): at rest a black box would learn by heart what it sees, and forget the rest. A fast bias d follows what the model leaves, as
+in ``linear.py``.
 
 A scale that grows, by a factor of two or more, makes the same motion look smaller to the model, which then has to learn anew what it
 knew. That is so in the first motions, and where a motion is larger than all before; ``scale`` avoids it.
@@ -30,7 +31,7 @@ from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import lag_of
 from quell.learners.model import infer, learn
-from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory
+from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory, trust
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -92,7 +93,7 @@ def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, 
         left = f_plain - f_scale * infer(learner.model, memory.model, features) - memory.place[_LEFT]
         if math.isfinite(left):
             memory.place[_LEFT] += learner.follow * left
-    if moves:
+    if moves and trust(learner.sight, memory.sight, scale[0]) > 0.5:
         learn(learner.model, memory.model, features, f_plain / f_scale)
 
 
@@ -193,7 +194,7 @@ class Online:
         return OnlineDesign(
             features=self.features.design(n),
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
-            sight=sight(observer),
+            sight=sight(observer, self.frequency or omega_c),
             model=self.fitted_model(observer, omega_c).design(len(self.features.names(n)), observer.dt),
             follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
             delay=round(group_delay(observer)),

@@ -9,7 +9,7 @@ as it is. Plain exponential forgetting lets P grow without bound where nothing i
 is left of the danger, a small φ that opens P by and by, is bounded: P grows no further once its trace is that of the prior.
 
 The variance of noise is ``R = τ/dt`` with the observer's lag τ = N/omega_o, for as long the noise in f̂ is correlated; so nothing depends
-on dt.
+on dt. Where measurement noise hides what is to be learned it is larger (``sight.trust``).
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class RlsMemory(NamedTuple):
 
 
 @kernel
-def least_squares_gain(rule: RlsRule, covariance: Matrix, gain: Vector, features: Vector) -> float:
-    """Update P for a sample; write Pφ into ``gain`` and return by what it must be multiplied to make the gain, ``1/(R (1 + ζ))``."""
+def least_squares_gain(rule: RlsRule, covariance: Matrix, gain: Vector, features: Vector, noise: float) -> float:
+    """Update P for a sample of the variance ``noise``; write Pφ into ``gain`` and return its factor, ``1/(R (1 + ζ))``."""
     size = gain.size
     spread = trace = length = 0.0
     for i in range(size):
@@ -62,8 +62,8 @@ def least_squares_gain(rule: RlsRule, covariance: Matrix, gain: Vector, features
         trace += covariance[i, i]
     if not (0.0 < spread < 1e100):  # nothing to learn from, or P is no covariance any more: rather learn nothing
         return 0.0
-    inverse = 1.0 / (rule.noise + spread)
-    share = (1.0 - rule.forget - rule.forget * rule.noise / spread) * inverse / (1.0 - rule.forget)
+    inverse = 1.0 / (noise + spread)
+    share = (1.0 - rule.forget - rule.forget * noise / spread) * inverse / (1.0 - rule.forget)
     if share < 0.0 and trace - share * length > rule.prior * size:
         share = 0.0
     for i in range(size):
@@ -83,9 +83,9 @@ def open_covariance(rule: RlsRule, covariance: Matrix) -> None:
 
 
 @improve.register(RlsRule)
-def _improve(rule: RlsRule, memory: RlsMemory, theta: Vector, features: Vector, error: float) -> None:
+def _improve(rule: RlsRule, memory: RlsMemory, theta: Vector, features: Vector, error: float, sure: float) -> None:
     covariance, gain = memory.covariance, memory.gain
-    inverse = least_squares_gain(rule, covariance, gain, features)
+    inverse = least_squares_gain(rule, covariance, gain, features, rule.noise / sure)
     for i in range(theta.size):
         theta[i] += gain[i] * inverse * error
 

@@ -4,6 +4,9 @@ The observer's estimates of higher derivatives are noisy, and at rest all of the
 something, slowly and confidently. So a signal counts as moving only while its variance is ``_CLEAR²`` times what the measurement noise,
 seen in y − x̂_1, puts into it; rounding counts as noise too. Of a signal that does not move its running mean is shown. Means are
 exponential ones, over ten lags of the observer.
+
+The same noise is in what is to be learned, f as the observer shows it, and there it grows with the power n + 1 of omega_o. ``trust`` weighs
+it with what a motion at a frequency of the plant would show, ``F = ω^n |x_1|``.
 """
 
 from __future__ import annotations
@@ -19,6 +22,8 @@ from quell.types import Vector
 
 # How many times its noise a signal must be. White noise of each sample makes 1, noise held for ten samples 3.
 _CLEAR = 6.0
+# So many standard deviations of noise count against what is to be learned.
+_SURE = 3.0
 # No sensor resolves better than this share of what it measures.
 _RESOLUTION = 1e-8
 # Means are taken over so many lags of the observer.
@@ -32,6 +37,10 @@ class Sight(NamedTuple):
     """Least variance of x_1 … x_n and u, in units of that of y − x̂_1 (n + 1,)."""
     forget: float
     """dt over the averaging time."""
+    f_noise: float
+    """Variance that white noise of unit variance in y leaves in f̂."""
+    power: float
+    """ω^n."""
 
 
 class SightMemory(NamedTuple):
@@ -45,12 +54,13 @@ class SightMemory(NamedTuple):
     """(2,): mean square of y − x̂_1; how much of the mean is filled."""
 
 
-def sight(observer: ESO) -> Sight:
-    """Return the thresholds for an observer."""
+def sight(observer: ESO, frequency: float) -> Sight:
+    """Return the thresholds for an observer and a frequency the plant has [rad/s]."""
     noise = noise_gains(observer)
+    f_noise = float(noise[-1])
     noise[-1] /= observer.b0**2  # what noise leaves in f̂ is also in b0 u
     lag_time = (observer.order + 1) / observer.omega_o
-    return Sight(_CLEAR**2 * noise, -math.expm1(-observer.dt / (_AVERAGE * lag_time)))
+    return Sight(_CLEAR**2 * noise, -math.expm1(-observer.dt / (_AVERAGE * lag_time)), f_noise, frequency**observer.order)
 
 
 def sight_memory(order: int) -> SightMemory:
@@ -85,6 +95,14 @@ def is_clear(sight: Sight, memory: SightMemory, i: int) -> bool:
 def clear_of_noise(sight: Sight, memory: SightMemory, i: int, value: float) -> float:
     """Return ``value`` of signal ``i``, or its mean where it does not move."""
     return value if is_clear(sight, memory, i) else memory.mean[i]
+
+
+@kernel
+def trust(sight: Sight, memory: SightMemory, size: float) -> float:
+    """Return the share of F² in ``F² + (3σ)²``, σ being the noise in f; ``size`` is that of x_1."""
+    motion = sight.power * size
+    noise = _SURE * _SURE * sight.f_noise * memory.noise[0]
+    return motion * motion * memory.noise[1] / (motion * motion * memory.noise[1] + noise)
 
 
 @kernel
