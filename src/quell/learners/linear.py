@@ -42,8 +42,8 @@ from quell.types import Matrix, Vector
 # In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
 _WATCH = 2.0
 
-# Where less than this share of what is seen can be a motion, nothing is learned from it.
-_LEAST_SURE = 0.01
+# Where less than this share of what is seen can be a motion, nothing is learned from it: noise that is held is stronger than it looks.
+_LEAST_SURE = 0.1
 
 # Places in LinearMemory.place.
 _SINCE, _SCALED, _LEFT = range(3)
