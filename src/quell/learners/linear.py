@@ -46,7 +46,7 @@ _WATCH = 2.0
 _LEAST_SURE = 0.1
 
 # Places in LinearMemory.place.
-_SINCE, _SCALED, _LEFT = range(3)
+_SINCE, _SCALED, _LEFT, _OPEN = range(4)
 
 
 @generic
@@ -101,7 +101,7 @@ class LinearMemory(NamedTuple):
     filtered: Vector
     """(p,): what they show."""
     place: Vector
-    """(3,): samples since the start from rest; whether there is a scale; d, in the plant's units."""
+    """(4,): samples since the start from rest; whether there is a scale; d, in the plant's units; after which sample θ learns."""
     sight: SightMemory
     rule: Any
 
@@ -123,7 +123,7 @@ def _adapt(learner: LinearDesign, memory: LinearMemory, seen: Vector, y: float, 
         return
     place[_LEFT] += learner.follow * (error * scale[scale.size - 1] - place[_LEFT])
     sure = trust(learner.sight, memory.sight, scale[0])
-    if not moves or sure < _LEAST_SURE:
+    if not moves or sure < _LEAST_SURE or place[_SINCE] <= place[_OPEN]:
         return
     improve(learner.rule, memory.rule, theta, memory.filtered, error, sure)
     if learner.with_u:
@@ -168,7 +168,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
         units[i] = new[i]
     renew(learner.rule, memory.rule)
     if not learner.products:
-        memory.place[_SINCE] = 0.0
+        memory.place[_OPEN] = memory.place[_SINCE] + learner.watch
 
 
 @kernel
@@ -206,7 +206,7 @@ def _commit(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float)
 
 @restart.register(LinearDesign)
 def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
-    memory.place[_SINCE] = memory.place[_LEFT] = 0.0
+    memory.place[_SINCE] = memory.place[_LEFT] = memory.place[_OPEN] = 0.0
     for i in range(memory.filtered.size):
         memory.filtered[i] = 0.0
         for j in range(memory.chain.shape[1]):
@@ -311,7 +311,7 @@ class Linear:
             units=np.ones(p),
             chain=np.zeros((p, parameters.lag.taps.size)),
             filtered=np.zeros(p),
-            place=np.zeros(3),
+            place=np.zeros(4),
             sight=sight_memory(n),
             rule=self.rule_memory(parameters.rule, p),
         )
