@@ -8,8 +8,8 @@ is a regression without lag bias, whatever the features. How θ is found is the 
 ``improve`` and ``renew`` are registered (``nlms.py``, ``rls.py``).
 
 *Scaling.* States, u and f are divided by powers of two (``scaling.py``), and all is learned in these units. When one of them grows, θ and
-the filters are converted: for features that are products of signals exactly, so that nothing jumps. A nonlinear feature means something
-else from then on; θ is kept as a first guess and learning waits until the filters hold the new features.
+the filters are converted: for features that are products of signals exactly, so that nothing jumps. A nonlinear feature of such a state is
+another function from then on, and is learned anew. It happens in the first motions, and where a motion is larger than all before.
 
 *Rest.* What does not stand clear of noise is shown as its mean, and θ learns nothing while nothing moves (``sight.py``): a load that comes
 at rest says nothing about the features.
@@ -75,8 +75,8 @@ class LinearDesign(NamedTuple):
     slope_low: float
     """Least θ_u, in the plant's units."""
     slope_high: float
-    products: bool
-    """Whether all features are products of signals."""
+    depends: Matrix
+    """(p, n + 1): 1 where a feature depends on a state, or on u."""
     follow: float
     """λ dt, at most 1."""
     watch: int
@@ -90,6 +90,8 @@ class LinearMemory(NamedTuple):
     """(p,), scaled."""
     scale: Vector
     """(n + 2,): what x_1 … x_n, u and f are divided by."""
+    former: Vector
+    """Room for ``scale`` as it was (n + 2,)."""
     shown: Vector
     """Room for the scaled state (n,)."""
     now: Vector
@@ -135,40 +137,47 @@ def _adapt(learner: LinearDesign, memory: LinearMemory, seen: Vector, y: float, 
 @kernel
 def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float, f: float) -> None:
     """Let the scales grow, and convert what is in their units."""
-    theta, scale, units, new, chain = memory.theta, memory.scale, memory.units, memory.now, memory.chain
-    f_before = scale[scale.size - 1]
-    before = 0.0
-    for i in range(scale.size - 1):
-        before += scale[i]
+    theta, scale, former, units, new, chain = memory.theta, memory.scale, memory.former, memory.units, memory.now, memory.chain
+    for i in range(scale.size):
+        former[i] = scale[i]
     grow(learner.scaling, scale, seen, u, f)
-    after = 0.0
-    for i in range(scale.size - 1):
-        after += scale[i]
-    f_ratio = f_before / scale[scale.size - 1]
-    grown = after != before
     if memory.place[_SCALED] == 0.0:
         # From now on there are features; what the observer showed until now was without them, so watch once more.
         memory.place[_SCALED] = 1.0
         memory.place[_SINCE] = 0.0
         unit(learner.features, scale, units)
         return
-    if f_ratio != 1.0:
+    last = scale.size - 1
+    if scale[last] != former[last]:
         for i in range(theta.size):
-            theta[i] *= f_ratio
+            theta[i] *= former[last] / scale[last]
+    grown = False
+    for j in range(last):
+        grown = grown or scale[j] != former[j]
     if not grown:
         return
     unit(learner.features, scale, new)
+    touched = False
     for i in range(theta.size):
+        moved = False
+        for j in range(last):
+            moved = moved or (scale[j] != former[j] and learner.depends[i, j] > 0.0)
+        if not moved:
+            continue
+        touched = True
         ratio = new[i] / units[i]
-        if 0.0 < ratio < 1.0:
-            theta[i] /= ratio
-            memory.filtered[i] *= ratio
-            for j in range(chain.shape[1]):
-                chain[i, j] *= ratio
         units[i] = new[i]
-    renew(learner.rule, memory.rule)
-    if not learner.products:
-        memory.place[_OPEN] = memory.place[_SINCE] + learner.watch
+        if ratio == 1.0 or not ratio > 0.0:
+            # Another function from now on: better silent than wrong, until the filter holds it and it has been learned anew.
+            ratio = theta[i] = 0.0
+            memory.place[_OPEN] = memory.place[_SINCE] + learner.watch
+        else:
+            theta[i] /= ratio
+        memory.filtered[i] *= ratio
+        for j in range(chain.shape[1]):
+            chain[i, j] *= ratio
+    if touched:
+        renew(learner.rule, memory.rule)
 
 
 @kernel
@@ -282,8 +291,6 @@ class Linear:
         if self.scale is not None:
             checks.vector("scale", self.scale, n + 2)
         features, p, constant = self.features.design(n), len(self.features.names(n)), self.features.constant(n)
-        doubled = np.zeros(p)
-        unit(features, np.full(n + 2, 2.0), doubled)
         slopes = sorted(observer.b0 * (share - 1.0) for share in self.gain_interval)
         return LinearDesign(
             features=features,
@@ -295,7 +302,7 @@ class Linear:
             with_u=self.features.has_input,
             slope_low=slopes[0],
             slope_high=slopes[1],
-            products=bool(np.all((doubled < 1.0) | (np.arange(p) == constant))),
+            depends=_dependence(features, n, p),
             follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
             watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
         )
@@ -306,6 +313,7 @@ class Linear:
         return LinearMemory(
             theta=np.zeros(p),
             scale=np.full(n + 2, 1e-100) if self.scale is None else self.scale.copy(),
+            former=np.zeros(n + 2),
             shown=np.zeros(n),
             now=np.zeros(p),
             units=np.ones(p),
@@ -319,3 +327,17 @@ class Linear:
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return the features' names."""
         return self.features.names(order)
+
+
+def _dependence(features: Any, n: int, p: int) -> Matrix:
+    """Return which feature depends on which state, and on u, as seen at random points (p, n + 1)."""
+    rng, depends = np.random.default_rng(0), np.zeros((p, n + 1))
+    one, other = np.zeros(p), np.zeros(p)
+    for point in rng.uniform(-1.0, 1.0, (10, n + 1)):
+        write(features, point[:n], float(point[n]), one)
+        for j in range(n + 1):
+            moved = point.copy()
+            moved[j] = rng.uniform(-1.0, 1.0)
+            write(features, moved[:n], float(moved[n]), other)
+            depends[:, j] = np.maximum(depends[:, j], one != other)
+    return depends
