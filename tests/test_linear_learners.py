@@ -11,8 +11,8 @@ import pytest
 import quell as ql
 from quell.features import RBF, Bias, Friction, Input, Polynomial, State
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.linear import improve, renew
 from quell.learners.nlms import NlmsMemory, NlmsRule
+from quell.learners.regression import improve, renew
 from quell.learners.rls import RlsMemory, RlsRule
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)

@@ -1,7 +1,7 @@
 """Algorithm 1 on features of one's own choice, scaled.
 
 The same sliding sum as in ``gradient.py``, with ``I = φ(x̂, u)``; the state, u and Δf̂ are divided by powers of two (``scaling.py``). When
-one of these grows, θ is converted as in ``linear.py`` and the buffers are filled anew. Until the observer has forgotten its start
+one of these grows, θ is converted as in ``regression.py`` and the buffers are filled anew. Until the observer has forgotten its start
 nothing is pushed: there is no scale to be had from its transient.
 """
 

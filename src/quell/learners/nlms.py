@@ -14,7 +14,8 @@ import numpy as np
 
 from quell import checks
 from quell.features import Features
-from quell.learners.linear import Linear, improve, renew
+from quell.learners.linear import Linear
+from quell.learners.regression import improve, renew
 from quell.observers.eso import ESO
 from quell.types import Vector
 

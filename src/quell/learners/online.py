@@ -6,11 +6,11 @@ delay. So a black box is given the pair
     ( φ(k − D),  f^F(k) )
 
 and what it learns has no lag bias, up to second order in frequency over omega_o. (A model that is linear in its parameters can do without
-the approximation: ``linear.py``.)
+the approximation: ``regression.py``.)
 
 What does not stand clear of noise is shown as its mean, and nothing is learned while nothing moves, or where noise hides f
 (``sight.py``): at rest a black box would learn by heart what it sees, and forget the rest. A fast bias d follows what the model leaves, as
-in ``linear.py``.
+in ``regression.py``.
 
 A scale that grows, by a factor of two or more, makes the same motion look smaller to the model, which then has to learn anew what it
 knew. That is so in the first motions, and where a motion is larger than all before; ``scale`` avoids it.
