@@ -27,6 +27,14 @@ def positive(name: str, value: Any, unit: str = "") -> float:
     return number
 
 
+def time_constant(name: str, value: Any) -> float:
+    """Return ``value`` [s] as a float above zero; it may be infinite."""
+    number = _number(name, value)
+    if not number > 0.0:
+        raise ValueError(f"{name} = {value!r}: must be greater than zero [s]")
+    return number
+
+
 def non_negative(name: str, value: Any, unit: str = "") -> float:
     """Return ``value`` as a float of at least zero."""
     number = _number(name, value)
@@ -77,6 +85,22 @@ def vector(name: str, value: Any, size: int | None = None) -> Vector:
         wanted = "a vector" if size is None else f"a vector of {size}"
         raise ValueError(f"{name} has shape {array.shape}: must be {wanted}")
     return array
+
+
+def positive_vector(name: str, value: Any) -> Vector:
+    """Return ``value`` as a vector whose entries are greater than zero."""
+    array = vector(name, value)
+    if not np.all(array > 0.0):
+        raise ValueError(f"{name} = {value!r}: must be positive")
+    return array
+
+
+def around_one(name: str, value: Any) -> tuple[float, float]:
+    """Return ``value = (low, high)``, an interval of positive numbers around 1."""
+    low, high = vector(name, value, 2).tolist()
+    if not 0.0 < low <= 1.0 <= high:
+        raise ValueError(f"{name} = {value!r}: must be (low, high) with 0 < low <= 1 <= high")
+    return low, high
 
 
 def matrix(name: str, value: Any, rows: int | None = None, columns: int | None = None) -> Matrix:

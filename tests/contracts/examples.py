@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import inspect
 import math
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 import quell as ql
 from quell import learners as learner_room
+from quell.features import RBF, Bias, Input, Polynomial, RandomFourier, State
+from quell.learners.model import infer, learn
 from quell.observers.eso import ESO, FORMS
 
 PLANTS: dict[str, Any] = {
@@ -21,11 +25,65 @@ PLANTS: dict[str, Any] = {
 }
 CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
 
+
+class OwnDesign(NamedTuple):
+    """Parameters of a model from outside of the package."""
+
+    size: int
+    gain: float
+
+
+class OwnMemory(NamedTuple):
+    """Its state."""
+
+    weights: Any
+    last: Any
+
+
+class OwnModel:
+    """A model as a user would write it: a leaky normalised gradient step."""
+
+    def design(self, features: int, dt: float) -> OwnDesign:
+        """Return the parameters."""
+        return OwnDesign(features, dt)
+
+    def memory(self, parameters: OwnDesign) -> OwnMemory:
+        """Return the state."""
+        return OwnMemory(np.zeros(parameters.size), np.zeros((1, 2)))
+
+
+@infer.register(OwnDesign)
+def _infer(model: OwnDesign, memory: OwnMemory, features: Any) -> float:
+    total = 0.0
+    for i in range(model.size):
+        total += memory.weights[i] * features[i]
+    return total
+
+
+@learn.register(OwnDesign)
+def _learn(model: OwnDesign, memory: OwnMemory, features: Any, target: float) -> None:
+    error, power = target - infer(model, memory, features), 1.0
+    for i in range(model.size):
+        power += features[i] * features[i]
+    for i in range(model.size):
+        memory.weights[i] += model.gain * (error * features[i] / power - 1e-3 * memory.weights[i])
+    memory.last[0, 0] = error
+
+
 LEARNERS: dict[str, Any] = {
     name: getattr(learner_room, name)()
     for name in learner_room.__all__
-    if inspect.isclass(getattr(learner_room, name)) and not getattr(getattr(learner_room, name), "_is_protocol", False)
-} | {"Kalman with u": ql.learners.Kalman(u=True)}
+    if inspect.isclass(getattr(learner_room, name))
+    and not getattr(getattr(learner_room, name), "_is_protocol", False)
+    and name != "Online"  # it needs a model
+} | {
+    "Kalman with u": ql.learners.Kalman(u=True),
+    "a model of one's own": ql.learners.Online(OwnModel(), State() + Input()),
+    "RLS with u": ql.learners.RLS(State() + Polynomial() + Bias() + Input()),
+    "RLS on radial features": ql.learners.RLS(State() + RBF(16) + Bias()),
+    "NLMS on random features": ql.learners.NLMS(features=RandomFourier(20)),
+    "gradient on radial features": ql.learners.BatchGradient(features=RBF(16, states=(1,)) + Bias()),
+}
 
 OBSERVERS: dict[str, ESO] = {
     f"{kind}, order {order}, {form}": (

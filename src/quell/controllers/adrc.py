@@ -9,7 +9,6 @@ loop through u is solved instead of closed a sample late: ``u = sat( (u_0 − h 
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -235,12 +234,20 @@ class ADRC:
         self.learner: Learner = NoLearner() if learner is None else learner
         if isinstance(self.learner, type) or not all(hasattr(self.learner, name) for name in ("design", "memory", "feature_names")):
             raise ValueError(f"learner = {learner!r}: must be a learner, for example quell.learners.Kalman(), or None")
+        self._limits = limits(u_min, u_max, rate_limit, observer.dt)
+        self._prepare_design()
+        self._state = self.initial_state()
+        self._arrays = _named_arrays(self._state)
+        self._handle: Any = None
+
+    def _prepare_design(self) -> None:
+        observer = self.observer
         self.parameters = AdrcDesign(
             eso=observer.model,
             law=law_gains(observer.order, self.omega_c),
             cancel=observer.a,
             b0=observer.b0,
-            limits=limits(u_min, u_max, rate_limit, observer.dt),
+            limits=self._limits,
             learner=self.learner.design(observer, self.omega_c),
             lag=lag_of(observer),
             guard=UnguardedDesign() if guard is None else guard.design(observer),
@@ -248,9 +255,6 @@ class ADRC:
         if isinstance(self.learner, NoLearner):
             self.parameters = self.parameters._replace(lag=self.parameters.lag._replace(taps=np.zeros(0)))
         self.features = self.learner.feature_names(observer.order)
-        self._state = self.initial_state()
-        self._arrays = _named_arrays(self._state)
-        self._handle: Any = None
 
     @property
     def dt(self) -> float:
@@ -298,13 +302,18 @@ class ADRC:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""
-        return {name: value for name, value in vars(self).items() if name not in ("_arrays", "_handle", "_step")}
+        kept = {name: value for name, value in vars(self).items() if name not in ("parameters", "_state", "_arrays", "_handle", "_step")}
+        return kept | {"state": self.state}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        vars(self).update(kept)
-        self._state = copy.deepcopy(self._state)
+        saved = kept["state"]
+        vars(self).update({name: value for name, value in kept.items() if name != "state"})
+        # Parameters may hold addresses of compiled functions, and arrays of a state may share memory: both are made anew, not copied.
+        self._prepare_design()
+        self._state = self.initial_state()
         self._arrays = _named_arrays(self._state)
         self._handle = None
+        self.state = saved
 
     def reset(self) -> None:
         """Go back to the state before the first sample; what was learned is forgotten."""

@@ -47,6 +47,10 @@ class Features:
         """Whether the last feature is u itself."""
         return False
 
+    def constant(self, order: int) -> int:
+        """Return which feature is the constant 1; −1 where there is none."""
+        return -1
+
     def __add__(self, other: Features) -> Joined:
         if not isinstance(other, Features):
             return NotImplemented
@@ -85,6 +89,11 @@ class Joined(Features):
     def has_input(self) -> bool:
         """Whether the last feature is u itself."""
         return self.second.has_input
+
+    def constant(self, order: int) -> int:
+        """Return which feature is the constant 1; −1 where there is none."""
+        first, second = self.first.constant(order), self.second.constant(order)
+        return first if first >= 0 or second < 0 else len(self.first.names(order)) + second
 
     def __repr__(self) -> str:
         return f"{self.first!r} + {self.second!r}"

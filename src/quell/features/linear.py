@@ -13,7 +13,7 @@ from quell.types import Vector
 class StateDesign(NamedTuple):
     """Parameters of ``State``."""
 
-    count: int
+    width: int
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,18 @@ class State(Features):
 
     def names(self, order: int) -> tuple[str, ...]:
         """Return ``("x1", …)``."""
-        return tuple(f"x{i + 1}" for i in range(self.design(order).count))
+        return tuple(f"x{i + 1}" for i in range(self.design(order).width))
 
 
 @write.register(StateDesign)
 def _write_state(features: StateDesign, x: Vector, u: float, out: Vector) -> None:
-    for i in range(features.count):
+    for i in range(features.width):
         out[i] = x[i]
 
 
 @unit.register(StateDesign)
 def _unit_state(features: StateDesign, scale: Vector, out: Vector) -> None:
-    for i in range(features.count):
+    for i in range(features.width):
         out[i] = 1.0 / scale[i]
 
 
@@ -70,6 +70,10 @@ class Bias(Features):
     def names(self, order: int) -> tuple[str, ...]:
         """Return ``("bias",)``."""
         return ("bias",)
+
+    def constant(self, order: int) -> int:
+        """Return 0: it is."""
+        return 0
 
 
 @write.register(BiasDesign)

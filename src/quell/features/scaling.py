@@ -1,9 +1,9 @@
 """Automatic scaling: inputs and targets of O(1) whatever the plant's units.
 
-x̂_i is divided by a power of two that is no smaller than what x̂_i has reached, so that a scale changes seldom, and by a whole factor when it
-does. It is never smaller than what the scale of x̂_1 lets expect of a motion at the frequency ω: ``ω^(i−1)/8`` of it. At rest, where
-the higher derivatives are noise, noise is not blown up to O(1). The control signal and the total disturbance, which is what a learner has to
-predict, have scales of their own.
+x̂_i is divided by a power of two that is no smaller than what x̂_i has reached, so that a scale changes seldom, and by a whole factor when
+it does. It is never smaller than what the scale of x̂_1 lets expect of a motion at the frequency ω: ``ω^(i−1)/8`` of it. At rest, where
+the higher derivatives are noise, noise is not blown up to O(1). The control signal and the total disturbance, which is what a learner has
+to predict, have scales of their own.
 """
 
 from __future__ import annotations

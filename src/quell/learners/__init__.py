@@ -5,6 +5,24 @@ from quell.learners.gradient import BatchGradient
 from quell.learners.harmonic import Harmonic
 from quell.learners.kalman import Kalman
 from quell.learners.model import Model, infer, learn
+from quell.learners.network import MLP
+from quell.learners.nlms import NLMS
 from quell.learners.online import Online
+from quell.learners.process import GaussianProcess
+from quell.learners.rls import RLS
 
-__all__ = ["BatchGradient", "Harmonic", "Kalman", "Learner", "Model", "NoLearner", "Online", "infer", "learn"]
+__all__ = [
+    "MLP",
+    "NLMS",
+    "RLS",
+    "BatchGradient",
+    "GaussianProcess",
+    "Harmonic",
+    "Kalman",
+    "Learner",
+    "Model",
+    "NoLearner",
+    "Online",
+    "infer",
+    "learn",
+]

@@ -17,13 +17,15 @@ each time the ring is through, so that no rounding error is older than 2n sample
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
 from quell.dispatch import is_finite
+from quell.features import Features
 from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.gradient_features import FeatureGradientDesign, feature_gradient_design, feature_gradient_memory
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -132,29 +134,38 @@ class BatchGradient:
         learning rate α, a sample. The cost is a sum over the batch, so the step grows with ``batch`` and, in time, with 1/dt.
     batch
         size n of the three buffers, in samples.
+    features
+        other features, which are then scaled to O(1), as is Δf̂ (``gradient_features.py``); the paper's, unscaled, by default.
 
     Raises
     ------
     ValueError
-        for a negative rate or a batch below 1.
+        for a negative rate, a batch below 1, or features that are none.
     """
 
     rate: float = 1e-6
     batch: int = 10
+    features: Features | None = None
 
     def __post_init__(self) -> None:
         checks.non_negative("rate", self.rate)
         checks.whole("batch", self.batch, 1)
+        if not isinstance(self.features, Features | None):
+            raise ValueError(f"features = {self.features!r}: must be made of blocks from quell.features, or None")
 
-    def design(self, observer: ESO, omega_c: float) -> BatchGradientDesign:
-        """Return the parameters for ``observer``; the controller's bandwidth does not matter."""
+    def design(self, observer: ESO, omega_c: float) -> BatchGradientDesign | FeatureGradientDesign:
+        """Return the parameters for ``observer``; the bandwidth ``omega_c`` [rad/s] matters only for the scaling of other features."""
+        if self.features is not None:
+            return feature_gradient_design(float(self.rate), self.batch, self.features, observer, omega_c)
         return BatchGradientDesign(float(self.rate), self.batch, observer.order)
 
-    def memory(self, parameters: BatchGradientDesign) -> BatchGradientMemory:
+    def memory(self, parameters: Any) -> Any:
         """Return empty buffers and θ = 0."""
+        if isinstance(parameters, FeatureGradientDesign):
+            return feature_gradient_memory(parameters, len(self.feature_names(parameters.scaling.ladder.size - 2)))
         n, p = parameters.batch, parameters.order + 2
         return BatchGradientMemory(np.zeros(p), np.zeros((n, p)), np.zeros(n), np.zeros(p), np.zeros(p), np.zeros(2))
 
     def feature_names(self, order: int) -> tuple[str, ...]:
-        """Return ``("x1", …, "u", "bias")``."""
-        return (*(f"x{i + 1}" for i in range(order)), "u", "bias")
+        """Return ``("x1", …, "u", "bias")``, or the names of other features."""
+        return (*(f"x{i + 1}" for i in range(order)), "u", "bias") if self.features is None else self.features.names(order)

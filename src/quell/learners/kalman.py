@@ -306,9 +306,7 @@ class Kalman:
         if self.frequency is not None:
             checks.positive("frequency", self.frequency, "rad/s")
         checks.positive("prior", self.prior)
-        low, high = checks.vector("gain_interval", self.gain_interval, 2)
-        if not 0.0 < low <= 1.0 <= high:
-            raise ValueError(f"gain_interval = {self.gain_interval!r}: must be (low, high) with 0 < low <= 1 <= high")
+        checks.around_one("gain_interval", self.gain_interval)
 
     def design(self, observer: ESO, omega_c: float) -> KalmanDesign:
         """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s].

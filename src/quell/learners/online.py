@@ -6,7 +6,14 @@ delay. So a black box is given the pair
     ( φ(k − D),  f^F(k) )
 
 and what it learns has no lag bias, up to second order in frequency over omega_o. (A model that is linear in its parameters can do without
-the approximation: ``linear.py``.)
+the approximation: ``regression.py``.)
+
+What does not stand clear of noise is shown as its mean, and nothing is learned while nothing moves, or where noise hides f
+(``sight.py``): at rest a black box would learn by heart what it sees, and forget the rest. A fast bias d follows what the model leaves, as
+in ``regression.py``.
+
+A scale that grows, by a factor of two or more, makes the same motion look smaller to the model, which then has to learn anew what it
+knew. That is so in the first motions, and where a motion is larger than all before; ``scale`` avoids it.
 """
 
 from __future__ import annotations
@@ -16,12 +23,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.dispatch import is_finite, kernel
 from quell.features import Bias, Features, State
 from quell.features.base import write
 from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import lag_of
 from quell.learners.model import infer, learn
+from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory, trust
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -29,7 +38,7 @@ from quell.types import Matrix, Vector
 _WATCH = 2.0
 
 # Places in OnlineMemory.place.
-_ROW, _SINCE = range(2)
+_ROW, _SINCE, _LEFT = range(3)
 
 
 class OnlineDesign(NamedTuple):
@@ -37,7 +46,10 @@ class OnlineDesign(NamedTuple):
 
     features: Any
     scaling: Scaling
+    sight: Sight
     model: Any
+    follow: float
+    """λ dt, at most 1."""
     delay: int
     """D [samples]."""
     watch: int
@@ -56,7 +68,8 @@ class OnlineMemory(NamedTuple):
     ring: Matrix
     """The last features (D + 1, p)."""
     place: Vector
-    """(2,): where the next row goes; samples since the start from rest."""
+    """(3,): where the next row goes; samples since the start from rest; d, in the plant's units."""
+    sight: SightMemory
     model: Any
     flat: Vector
     """All arrays of ``model``, end to end: the same memory."""
@@ -66,41 +79,54 @@ class OnlineMemory(NamedTuple):
 
 @adapt.register(OnlineDesign)
 def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
+    moves = look(learner.sight, memory.sight, seen, y, u_before)
     if memory.place[_SINCE] <= learner.watch:
         return
     scale = memory.scale
     grow(learner.scaling, scale, seen, u_before, f_plain)
-    if memory.place[_SINCE] > learner.watch + learner.delay:
-        # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
-        learn(learner.model, memory.model, memory.ring[int(memory.place[_ROW])], f_plain / scale[scale.size - 1])
+    if memory.place[_SINCE] <= learner.watch + learner.delay + 1:
+        return
+    # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
+    features, f_scale = memory.ring[min(max(int(memory.place[_ROW]), 0), learner.delay)], scale[scale.size - 1]
+    if learner.follow > 0.0:
+        left = f_plain - f_scale * infer(learner.model, memory.model, features) - memory.place[_LEFT]
+        if is_finite(left):
+            memory.place[_LEFT] += learner.follow * left
+    if moves and trust(learner.sight, memory.sight, scale[0]) > 0.5:
+        learn(learner.model, memory.model, features, f_plain / f_scale)
 
 
 @predict.register(OnlineDesign)
 def _predict(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u_before: float) -> tuple[float, float]:
-    if memory.place[_SINCE] <= learner.watch + learner.delay:
+    if memory.place[_SINCE] <= learner.watch + learner.delay + 1:
         return 0.0, 0.0
-    scale, scaled = memory.scale, memory.scaled
-    for i in range(scaled.size):
-        scaled[i] = seen[i] / scale[i]
-    write(learner.features, scaled, u_before / scale[scaled.size], memory.now)
-    return scale[scale.size - 1] * infer(learner.model, memory.model, memory.now), 0.0
+    scale = memory.scale
+    _show(learner, memory, seen, u_before, memory.now)
+    return scale[scale.size - 1] * infer(learner.model, memory.model, memory.now) + memory.place[_LEFT], 0.0
 
 
 @commit.register(OnlineDesign)
 def _commit(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, f_learned: float) -> None:
-    scale, scaled = memory.scale, memory.scaled
-    row = int(memory.place[_ROW])
-    for i in range(scaled.size):
-        scaled[i] = seen[i] / scale[i]
-    write(learner.features, scaled, u / scale[scaled.size], memory.ring[row])
+    row = min(max(int(memory.place[_ROW]), 0), learner.delay)
+    _show(learner, memory, seen, u, memory.ring[row])
     row += 1
     memory.place[_ROW] = 0.0 if row > learner.delay else row
     memory.place[_SINCE] += 1.0
 
 
+@kernel
+def _show(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, out: Vector) -> None:
+    """Write the features of the state and u."""
+    scale, scaled = memory.scale, memory.scaled
+    for i in range(scaled.size):
+        scaled[i] = clear_of_noise(learner.sight, memory.sight, i, seen[i]) / scale[i]
+    write(learner.features, scaled, clear_of_noise(learner.sight, memory.sight, scaled.size, u) / scale[scaled.size], out)
+
+
 @restart.register(OnlineDesign)
 def _restart(learner: OnlineDesign, memory: OnlineMemory) -> None:
-    memory.place[_ROW] = memory.place[_SINCE] = 0.0
+    memory.place[_ROW] = memory.place[_SINCE] = memory.place[_LEFT] = 0.0
+    look_anew(memory.sight)
     finite = True
     for i in range(memory.flat.size):
         finite = finite and abs(memory.flat[i]) <= 1e100
@@ -127,6 +153,8 @@ class Online:
         a frequency the plant has [rad/s], for the automatic scaling; ``omega_c`` of the controller by default.
     scale
         what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
+    bias_bandwidth
+        how fast a bias follows what the model leaves, λ [rad/s]; ``omega_o`` of the observer by default, 0 for none.
 
     Raises
     ------
@@ -134,7 +162,15 @@ class Online:
         for arguments that fit nothing.
     """
 
-    def __init__(self, model: Any, features: Features | None = None, *, frequency: float | None = None, scale: Any = None) -> None:
+    def __init__(
+        self,
+        model: Any,
+        features: Features | None = None,
+        *,
+        frequency: float | None = None,
+        scale: Any = None,
+        bias_bandwidth: float | None = None,
+    ) -> None:
         if isinstance(model, type) or not (hasattr(model, "design") and hasattr(model, "memory")):
             raise ValueError(f"model = {model!r}: must have design(features, dt) and memory(parameters); see docs/extend")
         self.model = model
@@ -142,9 +178,12 @@ class Online:
         if not isinstance(self.features, Features):
             raise ValueError(f"features = {features!r}: must be made of blocks from quell.features, for example State() + Bias()")
         self.frequency = None if frequency is None else checks.positive("frequency", frequency, "rad/s")
-        self.scale = None if scale is None else checks.vector("scale", scale)
-        if self.scale is not None and not np.all(self.scale > 0.0):
-            raise ValueError(f"scale = {scale!r}: must be positive")
+        self.bias_bandwidth = None if bias_bandwidth is None else checks.non_negative("bias_bandwidth", bias_bandwidth, "rad/s")
+        self.scale = None if scale is None else checks.positive_vector("scale", scale)
+
+    def fitted_model(self, observer: ESO, omega_c: float) -> Any:
+        """Return the model; one that is fitted to observer and controller does that here."""
+        return self.model
 
     def design(self, observer: ESO, omega_c: float) -> OnlineDesign:
         """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s]."""
@@ -154,7 +193,9 @@ class Online:
         return OnlineDesign(
             features=self.features.design(n),
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
-            model=self.model.design(len(self.features.names(n)), observer.dt),
+            sight=sight(observer, self.frequency or omega_c),
+            model=self.fitted_model(observer, omega_c).design(len(self.features.names(n)), observer.dt),
+            follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
             delay=round(group_delay(observer)),
             watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
         )
@@ -169,7 +210,8 @@ class Online:
             scaled=np.zeros(n),
             now=np.zeros(p),
             ring=np.zeros((parameters.delay + 1, p)),
-            place=np.zeros(2),
+            place=np.zeros(3),
+            sight=sight_memory(n),
             model=model,
             flat=flat,
             fresh=flat.copy(),

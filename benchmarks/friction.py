@@ -1,0 +1,90 @@
+"""What a nonlinear learner gains where friction and a stiffening spring are what disturbs.
+
+    y'' = 2 u − y − 2 y³ − tanh(y'/0.05),     model-free ESO of 30 rad/s,     omega_c = 5 rad/s,     dt = 2 ms
+
+The error is against the ideal closed loop, ``omega_c²/(s + omega_c)²`` of the reference: what is left of it is what was not rejected. It
+is taken over the second minute. All learners have their defaults, but for the features named.
+
+Why it works: at each reversal friction jumps by 2. The observer sees that about N/omega_o = 0.1 s late, and so does the bias of a linear
+learner, which can only add damping that is too strong at high speed and too weak at low. A nonlinear learner knows from the last
+reversals what the next will be, and cancels it as the velocity changes sign. Best is who is told what to look for (``Friction``). In
+the moves to and fro the stage stands still in between. What friction does then depends on the force, which no function of the state
+can know, and black boxes gain nothing over the linear learner, whose bias is as quick as theirs.
+
+python benchmarks/friction.py
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy import signal
+
+import quell as ql
+from quell.features import RBF, Bias, Friction, Polynomial, RandomFourier, State
+
+OMEGA_C, DT, TRAINED = 5.0, 2e-3, 60.0
+
+s = ql.signals
+MOVE = s.Trapezoid(distance=1.0, duration=1.5, start=0.5)
+REFERENCES = {
+    "two sinusoids": 0.5 * s.Sinusoid(omega=1.0) + 0.3 * s.Sinusoid(omega=2.3),
+    "moves to and fro": sum(
+        ((-1.0) ** k * s.Trapezoid(distance=1.0, duration=1.5, start=0.5 + 3.0 * k) for k in range(1, 40)),
+        start=MOVE,
+    ),
+}
+LEARNERS: dict[str, Any] = {
+    "none": None,
+    "Kalman (linear)": ql.learners.Kalman(),
+    "RLS (linear)": ql.learners.RLS(),
+    "NLMS (linear)": ql.learners.NLMS(),
+    "RLS, RBF(40)": ql.learners.RLS(State() + RBF(40) + Bias()),
+    "NLMS, RBF(40)": ql.learners.NLMS(features=State() + RBF(40) + Bias()),
+    "RLS, RandomFourier(40, 0.3)": ql.learners.RLS(State() + RandomFourier(40, length=0.3) + Bias()),
+    "RLS, Polynomial + Friction": ql.learners.RLS(State() + Polynomial() + Friction() + Bias()),
+    "NLMS, Polynomial + Friction": ql.learners.NLMS(features=State() + Polynomial() + Friction() + Bias()),
+    "MLP": ql.learners.MLP(),
+    "GaussianProcess": ql.learners.GaussianProcess(),
+    "GaussianProcess(length=0.3)": ql.learners.GaussianProcess(length=0.3),
+}
+
+
+def stage(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
+    """Return the derivatives: a mass with friction on a spring that stiffens."""
+    return x[1], 2.0 * u - x[0] - 2.0 * x[0] ** 3 - math.tanh(x[1] / 0.05) + w[0]
+
+
+def rms_error(run: ql.Trajectory, since: float) -> float:
+    """Return the RMS of y less the ideal response to r, from ``since`` [s] on."""
+    ideal = signal.lsim(([OMEGA_C**2], [1.0, 2.0 * OMEGA_C, OMEGA_C**2]), run["r"], run.t)[1]
+    return float(np.sqrt(np.mean((run["y"] - ideal)[run.t >= since] ** 2)))
+
+
+def main() -> None:
+    """Print a table for each reference."""
+    plant = ql.plants.NonlinearPlant(stage, order=2, substeps=4)
+    observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=30.0, dt=DT)
+    for name, reference in REFERENCES.items():
+        table = Table("learner", "RMS error", "to Kalman", "ns, with plant", title=name)
+        scenario = ql.Scenario(reference, 2.0 * TRAINED, noise=s.BandLimitedNoise(1e-12, 0.01))
+        errors = {}
+        for label, learner in LEARNERS.items():
+            controller = ql.ADRC(observer, omega_c=OMEGA_C, learner=learner)
+            ql.simulate(plant, controller, ql.Scenario(0.0, 1.0))
+            start = time.perf_counter()
+            run = ql.simulate(plant, controller, scenario)
+            took = (time.perf_counter() - start) / run.t.size * 1e9
+            errors[label] = (rms_error(run, TRAINED), took)
+        for label, (error, took) in errors.items():
+            table.add_row(label, f"{error:.6f}", f"{error / errors['Kalman (linear)'][0]:.2f}", f"{took:.0f}")
+        Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

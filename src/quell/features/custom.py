@@ -1,0 +1,103 @@
+"""Features given by the user's own function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba.core import types as nb_types
+
+from quell.features.base import Features, unit, write
+from quell.foreign import POINTER, NotCompilableError, call, inner, machine_code
+from quell.types import Vector
+
+_SIGNATURE = nb_types.void(POINTER, nb_types.float64, POINTER)
+
+
+class CustomDesign(NamedTuple):
+    """Parameters of ``Custom``."""
+
+    address: int
+    """Of the compiled function, which the ``Custom`` object keeps."""
+    width: int
+
+
+class Custom(Features):
+    """What ``function(x, u)`` returns, of the scaled state x (n,) and the scaled control signal u.
+
+    Parameters
+    ----------
+    function
+        a plain function that returns a tuple of numbers; it is compiled by Numba, and called by address.
+    names
+        what each of the numbers is called.
+
+    Raises
+    ------
+    ValueError
+        where there are no names, or, by ``design``, where the function returns another number of them or can't be compiled.
+
+    Examples
+    --------
+    >>> import math
+    >>> gravity = Custom(lambda x, u: (math.sin(3.0 * x[0]), math.cos(3.0 * x[0])), names=("sin", "cos"))
+    """
+
+    def __init__(self, function: Callable[..., Any], names: Sequence[str]) -> None:
+        if not callable(function):
+            raise ValueError(f"function = {function!r}: must be a function f(x, u)")
+        if isinstance(names, str) or not isinstance(names, Sequence) or not names or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"names = {names!r}: must be a tuple with a name for each feature")
+        if len(set(names)) < len(names):
+            raise ValueError(f"names = {names!r}: each must be there once")
+        self.function = function
+        self.labels = tuple(names)
+
+    def __repr__(self) -> str:
+        return f"Custom({getattr(self.function, '__name__', self.function)!s}, names={self.labels!r})"
+
+    def design(self, order: int) -> CustomDesign:
+        """Compile the function, for a plant of order ``order``."""
+        count = len(self.labels)
+        try:
+            returned = np.shape(self.function(np.zeros(order), 0.0))
+        except ArithmeticError:  # the origin is no place for it
+            returned = (count,)
+        except Exception as error:
+            raise ValueError(f"function(zeros({order}), 0.0) fails with {type(error).__name__}: {error}") from error
+        if returned != (count,):
+            raise ValueError(f"function returns shape {returned}: must return a tuple of {count} numbers, one for each of names")
+        return CustomDesign(_machine_code(self.function, order, count).address, count)
+
+    def names(self, order: int) -> tuple[str, ...]:
+        """Return the names given."""
+        return self.labels
+
+
+@cache  # never given up: designs hold addresses
+def _machine_code(function: Callable[..., Any], order: int, count: int) -> Any:
+    def features(px, u, pout):  # type: ignore[no-untyped-def]
+        out = numba.carray(pout, (count,))
+        found = compiled(numba.carray(px, (order,)), u)
+        for j in range(count):
+            out[j] = found[j]
+
+    try:
+        compiled = inner(function)
+        return machine_code(_SIGNATURE, features)
+    except NotCompilableError as error:
+        raise ValueError(f"function can't be compiled by Numba: {error}; it must be a plain function of numbers") from error
+
+
+@write.register(CustomDesign)
+def _write(features: CustomDesign, x: Vector, u: float, out: Vector) -> None:
+    call(features.address, x, u, out)
+
+
+@unit.register(CustomDesign)
+def _unit(features: CustomDesign, scale: Vector, out: Vector) -> None:
+    for j in range(features.width):
+        out[j] = 1.0

@@ -1,0 +1,91 @@
+"""Monomials of the state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+from quell.features.base import Features, unit, write
+from quell.features.states import check_states, places
+from quell.types import Vector
+
+
+class PolynomialDesign(NamedTuple):
+    """Parameters of ``Polynomial``."""
+
+    factors: NDArray[np.int64]
+    """(p, degree): the states that are multiplied; −1 for none."""
+
+
+@dataclass(frozen=True)
+class Polynomial(Features):
+    """All monomials of the state of total degree 2 to ``degree``: a spring that stiffens, a drag that grows with speed squared.
+
+    Degree 1 is ``State()``, degree 0 ``Bias()``.
+
+    Parameters
+    ----------
+    degree
+        the largest.
+    states
+        which states, counted from 1; all by default.
+
+    Raises
+    ------
+    ValueError
+        for a degree below 2, or states that are none.
+    """
+
+    degree: int = 3
+    states: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        checks.whole("degree", self.degree, 2)
+        check_states(self.states)
+
+    def design(self, order: int) -> PolynomialDesign:
+        """Return the table of factors."""
+        chosen = places(self.states, order).tolist()
+        rows = [
+            [*factors, *[-1] * (self.degree - degree)]
+            for degree in range(2, self.degree + 1)
+            for factors in combinations_with_replacement(chosen, degree)
+        ]
+        return PolynomialDesign(np.array(rows, dtype=np.int64))
+
+    def names(self, order: int) -> tuple[str, ...]:
+        """Return ``("x1^2", "x1 x2", …)``."""
+        return tuple(_name([int(i) for i in row if i >= 0]) for row in self.design(order).factors)
+
+
+def _name(factors: list[int]) -> str:
+    powers = {i: factors.count(i) for i in factors}
+    return " ".join(f"x{i + 1}^{power}" if power > 1 else f"x{i + 1}" for i, power in powers.items())
+
+
+@write.register(PolynomialDesign)
+def _write(features: PolynomialDesign, x: Vector, u: float, out: Vector) -> None:
+    factors = features.factors
+    for j in range(factors.shape[0]):
+        product = 1.0
+        for k in range(factors.shape[1]):
+            if factors[j, k] >= 0:
+                product *= x[factors[j, k]]
+        out[j] = product
+
+
+@unit.register(PolynomialDesign)
+def _unit(features: PolynomialDesign, scale: Vector, out: Vector) -> None:
+    factors = features.factors
+    for j in range(factors.shape[0]):
+        product = 1.0
+        for k in range(factors.shape[1]):
+            if factors[j, k] >= 0:
+                product /= scale[factors[j, k]]
+        out[j] = product

@@ -1,0 +1,110 @@
+"""Radial basis functions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.features.base import Features, unit, write
+from quell.features.states import Places, check_states, places
+from quell.types import Matrix, Vector
+
+_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
+
+
+class RadialDesign(NamedTuple):
+    """Parameters of ``RBF``."""
+
+    states: Places
+    centers: Matrix
+    """(p, k)."""
+    weight: float
+    """``1/(2 width²)``."""
+
+
+class RBF(Features):
+    """Gaussians ``exp(−|x − c|²/(2 width²))`` around centres c that fill the scaled states' range [−1, 1].
+
+    Each is felt near its centre only: what is learned in one place does not disturb what was learned in another.
+
+    Parameters
+    ----------
+    count
+        number p of centres, which then come from a Halton sequence.
+    width
+        of a Gaussian; ``2 p^(−1/k)`` for k states by default, about the distance between centres.
+    states
+        which states, counted from 1; the first two by default.
+    centers
+        the centres themselves (p, k), instead of ``count``.
+
+    Raises
+    ------
+    ValueError
+        for arguments out of range, or centres that do not fit the states.
+
+    References
+    ----------
+    Broomhead & Lowe, *Multivariable functional interpolation and adaptive networks*, Complex Systems 2 (1988), eq. (2.2); Halton, *On the
+    efficiency of certain quasi-random sequences of points*, Numerische Mathematik 2 (1960).
+    """
+
+    def __init__(
+        self, count: int | None = None, width: float | None = None, *, states: Sequence[int] | None = None, centers: Any = None
+    ) -> None:
+        if count is not None and centers is not None:
+            raise ValueError("count and centers: give one of them")
+        self.centers = None if centers is None else checks.matrix("centers", centers)
+        self.count = checks.whole("count", 25 if count is None else count, 1) if self.centers is None else len(self.centers)
+        self.width = None if width is None else checks.positive("width", width)
+        check_states(states)
+        self.states = None if states is None else tuple(states)
+
+    def __repr__(self) -> str:
+        return f"RBF(count={self.count}, width={self.width}, states={self.states})"
+
+    def design(self, order: int) -> RadialDesign:
+        """Return centres and width."""
+        chosen = places(self.states, order, 2)
+        if self.centers is None:
+            if chosen.size > len(_PRIMES):
+                raise ValueError(f"states = {self.states!r}: must be at most {len(_PRIMES)}, or centers must be given")
+            centers = 2.0 * np.array([[_radical_inverse(i + 1, _PRIMES[k]) for k in range(chosen.size)] for i in range(self.count)]) - 1.0
+        else:
+            centers = checks.matrix("centers", self.centers, columns=chosen.size)
+        width = 2.0 * self.count ** (-1.0 / chosen.size) if self.width is None else self.width
+        return RadialDesign(chosen, centers, 0.5 / width**2)
+
+    def names(self, order: int) -> tuple[str, ...]:
+        """Return ``("rbf1", …)``."""
+        return tuple(f"rbf{j + 1}" for j in range(self.count))
+
+
+def _radical_inverse(index: int, base: int) -> float:
+    """Return ``index`` mirrored at the point in ``base``: a coordinate of a Halton sequence, in (0, 1)."""
+    inverse, digit = 0.0, 1.0 / base
+    while index:
+        index, rest = divmod(index, base)
+        inverse += rest * digit
+        digit /= base
+    return inverse
+
+
+@write.register(RadialDesign)
+def _write(features: RadialDesign, x: Vector, u: float, out: Vector) -> None:
+    for j in range(features.centers.shape[0]):
+        distance = 0.0
+        for k in range(features.states.size):
+            away = x[features.states[k]] - features.centers[j, k]
+            distance += away * away
+        out[j] = math.exp(-features.weight * distance)
+
+
+@unit.register(RadialDesign)
+def _unit(features: RadialDesign, scale: Vector, out: Vector) -> None:
+    for j in range(features.centers.shape[0]):
+        out[j] = 1.0

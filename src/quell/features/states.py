@@ -1,0 +1,39 @@
+"""Which states a block of features looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+
+Places = NDArray[np.int64]
+
+
+def check_states(states: Sequence[int] | None) -> None:
+    """Check the argument ``states``: numbers from 1 on, each once; None for a default that depends on the order."""
+    if states is None:
+        return
+    if not isinstance(states, tuple | list) or len(states) == 0:
+        raise ValueError(f"states = {states!r}: must be a tuple of the numbers of states, for example (1, 2)")
+    for i, state in enumerate(states):
+        checks.whole(f"states[{i}]", state, 1)
+    if len(set(states)) < len(states):
+        raise ValueError(f"states = {states!r}: a state may be named once")
+
+
+def places(states: Sequence[int] | None, order: int, default: int | None = None) -> Places:
+    """Return the places (k,) of ``states`` in x, counted from 0; without ``states`` the first ``default``, or all.
+
+    Raises
+    ------
+    ValueError
+        where a plant of order ``order`` has no such state.
+    """
+    if states is None:
+        return np.arange(order if default is None else min(order, default))
+    if max(states) > order:
+        raise ValueError(f"states = {states!r}: a plant of order {order} has no state {max(states)}")
+    return np.array(states, dtype=np.int64) - 1

@@ -1,0 +1,46 @@
+"""A nonlinear learner against friction and a stiffening spring, where a linear one can do little (benchmarks/friction.py)."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import quell as ql
+from quell.features import RBF, Bias, Friction, Polynomial, State
+
+OMEGA_C = 5.0
+LEARNERS: dict[str, Any] = {
+    "none": None,
+    "linear": ql.learners.Kalman(),
+    "MLP": ql.learners.MLP(),
+    "RBF": ql.learners.RLS(State() + RBF(40) + Bias()),
+    "friction": ql.learners.RLS(State() + Polynomial() + Friction() + Bias()),
+}
+
+
+@cache
+def error(name: str) -> float:
+    """RMS of y less the ideal closed loop's response, from 20 s on."""
+
+    def stage(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
+        return x[1], 2.0 * u - x[0] - 2.0 * x[0] ** 3 - math.tanh(x[1] / 0.05)
+
+    s = ql.signals
+    plant = ql.plants.NonlinearPlant(stage, order=2, substeps=4)
+    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=30.0, dt=2e-3), omega_c=OMEGA_C, learner=LEARNERS[name])
+    reference = 0.5 * s.Sinusoid(omega=1.0) + 0.3 * s.Sinusoid(omega=2.3)
+    run = ql.simulate(plant, controller, ql.Scenario(reference, 60.0, noise=s.BandLimitedNoise(1e-12, 0.01)))
+    ideal = signal.lsim(([OMEGA_C**2], [1.0, 2.0 * OMEGA_C, OMEGA_C**2]), run["r"], run.t)[1]
+    return float(np.sqrt(np.mean((run["y"] - ideal)[run.t >= 20.0] ** 2)))
+
+
+@pytest.mark.parametrize(("name", "at_most"), [("MLP", 0.7), ("RBF", 0.7), ("friction", 0.25)])
+def test_a_nonlinear_learner_rejects_friction_better_than_a_linear_one(name: str, at_most: float) -> None:
+    """And a linear one better than none."""
+    assert error("linear") < error("none")
+    assert error(name) <= at_most * error("linear")

@@ -1,0 +1,209 @@
+"""Learners that are linear in θ: their rules against closed forms, their scales, their gain."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.features import RBF, Bias, Friction, Input, Polynomial, State
+from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.nlms import NlmsMemory, NlmsRule
+from quell.learners.regression import improve, renew
+from quell.learners.rls import RlsMemory, RlsRule
+
+OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)
+
+
+def rls(size: int, noise: float = 2.0, forget: float = 0.0, prior: float = 9.0) -> tuple[RlsRule, RlsMemory]:
+    """A rule and its state."""
+    return RlsRule(noise, forget, prior), RlsMemory(prior * np.eye(size), np.zeros(size))
+
+
+def taught(rule: Any, memory: Any, features: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """θ after all pairs."""
+    theta = np.zeros(features.shape[1])
+    for row, target in zip(features, targets, strict=True):
+        improve(rule, memory, theta, row, target - theta @ row, 1.0)
+    return theta
+
+
+def test_rls_without_forgetting_is_ridge_regression(rng: np.random.Generator) -> None:
+    """θ = (I/prior + ΦᵀΦ/R)⁻¹ Φᵀy/R, and P is the inverse."""
+    features, targets = rng.normal(size=(200, 4)), rng.normal(size=200)
+    rule, memory = rls(4)
+    theta = taught(rule, memory, features, targets)
+    information = np.eye(4) / rule.prior + features.T @ features / rule.noise
+    np.testing.assert_allclose(theta, np.linalg.solve(information, features.T @ targets / rule.noise), atol=1e-11)
+    np.testing.assert_allclose(memory.covariance, np.linalg.inv(information), atol=1e-11)
+
+
+def test_rls_forgets_along_what_it_sees_and_nowhere_else() -> None:
+    """After a sample the uncertainty along φ is ζ/(λ(1+ζ)); across, nothing has changed."""
+    rule, memory = rls(2, forget=0.01)
+    direction, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
+    for _ in range(5):
+        before = direction @ memory.covariance @ direction / rule.noise
+        improve(rule, memory, np.zeros(2), direction, 0.0, 1.0)
+        after = direction @ memory.covariance @ direction / rule.noise
+        assert after == pytest.approx(before / (0.99 * (1.0 + before)), rel=1e-12)
+        assert across @ memory.covariance @ across == pytest.approx(9.0, rel=1e-12)
+    for _ in range(5000):
+        improve(rule, memory, np.zeros(2), direction, 0.0, 1.0)
+    assert direction @ memory.covariance @ direction / rule.noise == pytest.approx(0.01 / 0.99, rel=1e-6)
+
+
+def test_rls_follows_what_drifts_in_its_memory_time(rng: np.random.Generator) -> None:
+    """A step of a coefficient is learned with the time constant 1/forget samples."""
+    rule, memory = rls(1, forget=0.01)
+    theta = np.zeros(1)
+    for _ in range(2000):
+        improve(rule, memory, theta, np.ones(1), -theta[0], 1.0)
+    for _ in range(100):
+        improve(rule, memory, theta, np.ones(1), 1.0 - theta[0], 1.0)
+    assert theta[0] == pytest.approx(1.0 - math.exp(-1.0), abs=0.01)
+
+
+def test_the_uncertainty_of_rls_is_bounded_without_excitation(rng: np.random.Generator) -> None:
+    """However small or alike the features are, P stays a covariance, no larger than the prior in all."""
+    rule, memory = rls(3, forget=0.01)
+    theta = np.zeros(3)
+    for k in range(20_000):
+        features = np.ones(3) + (1e-3 if k % 2 else 1e-6) * rng.normal(size=3)
+        improve(rule, memory, theta, features * (1e-4 if k % 3 else 1.0), rng.normal(), 1.0)
+    assert np.trace(memory.covariance) <= 3 * rule.prior * (1.0 + 1e-9)
+    assert np.min(np.linalg.eigvalsh(memory.covariance)) > 0.0
+    assert np.all(np.abs(theta) < 1e3)
+
+
+def test_nlms_projects_on_what_it_sees(rng: np.random.Generator) -> None:
+    """With the step 1 and no regularisation the new θ explains the sample, and is the nearest that does (Haykin, section 7.1)."""
+    features, theta = rng.normal(size=5), rng.normal(size=5)
+    before = theta.copy()
+    improve(NlmsRule(1.0, 0.0), NlmsMemory(np.zeros(0)), theta, features, 2.0 - theta @ features, 1.0)
+    assert theta @ features == pytest.approx(2.0, rel=1e-12)
+    np.testing.assert_allclose(theta - before, features * ((theta - before) @ features) / (features @ features), atol=1e-12)
+
+
+def test_nlms_learns_at_its_rate_whatever_the_sample_time() -> None:
+    """Where the features stay, an error decays as exp(−rate t), and their size does not matter."""
+    for dt, size in ((1e-3, 1.0), (1e-2, 30.0)):
+        observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=dt)
+        rule = ql.learners.NLMS(rate=2.0, regularisation=1e-6).rule(observer, 1.0, 2)
+        count = round(0.5 / dt)
+        theta = taught(rule, NlmsMemory(np.zeros(0)), np.full((count, 2), size), np.ones(count))
+        assert 1.0 - theta @ [size, size] == pytest.approx(math.exp(-1.0), rel=0.02)
+
+
+def loop(learner: Any, duration: float = 40.0, unit: float = 1.0) -> tuple[ql.Trajectory, dict[str, float]]:
+    """A run with a mass on a spring that stiffens, with friction and a weight: f = −2 y − 0.5 y³ − tanh(y'/0.3) + 0.7, b = 1.5."""
+
+    def mass(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
+        y, v = x[0] / unit, x[1] / unit
+        return x[1], 1.5 * u + unit * (-2.0 * y - 0.5 * y**3 - np.tanh(v / 0.3) + 0.7)
+
+    s = ql.signals
+    plant = ql.plants.NonlinearPlant(mass, order=2)
+    reference = unit * (s.Sinusoid(0.8) + s.Sinusoid(0.5, omega=2.3))
+    controller = ql.ADRC(OBSERVER, omega_c=4.0, learner=learner)
+    run = ql.simulate(plant, controller, ql.Scenario(reference, duration, noise=s.BandLimitedNoise(1e-12 * unit**2, 0.01)), limit=1e12)
+    return run, controller.read(run.final_state).theta
+
+
+@pytest.mark.parametrize("unit", [2.0**-17, 1.0, 2.0**17])  # scales are powers of two
+def test_coefficients_are_in_the_plants_units(unit: float) -> None:
+    """What is learned is the plant, whatever the unit of y."""
+    _, theta = loop(ql.learners.RLS(State() + Polynomial(3, states=(1,)) + Friction(width=0.15) + Bias(), frequency=1.0), unit=unit)
+    assert theta["x1"] == pytest.approx(-2.0, abs=0.15)
+    assert theta["x1^3"] * unit**2 == pytest.approx(-0.5, abs=0.1)
+    assert theta["tanh(x2/0.15)"] / unit == pytest.approx(-1.0, abs=0.15)
+    assert theta["bias"] / unit == pytest.approx(0.7, abs=0.05)
+
+
+@pytest.mark.parametrize("make", [ql.learners.RLS, ql.learners.NLMS])
+def test_the_effective_gain_stays_in_its_interval(make: Any, rng: np.random.Generator) -> None:
+    """Whatever the data say, for either sign of b0."""
+    for b0 in (2.0, -2.0):
+        learner = make(features=State() + Bias() + Input(), gain_interval=(0.4, 1.5))
+        design = learner.design(ql.ESO.model_free(order=2, b0=b0, omega_o=10.0, dt=1e-2), 1.0)
+        memory = learner.memory(design)
+        for k in range(4000):
+            seen, u = 10.0 * rng.normal(size=3), math.sin(0.01 * k)
+            adapt(design, memory, seen, seen[0] + 1e-9, u, -5.0 * b0 * u)
+            slope = predict(design, memory, seen, u)[1]
+            assert 0.4 - 1e-12 <= (b0 + slope) / b0 <= 1.5 + 1e-12
+            commit(design, memory, seen, u, 0.0)
+        assert (b0 + slope) / b0 < 0.6
+
+
+def test_a_wrong_gain_is_found() -> None:
+    """With u among the features and enough excitation, b0 + θ_u is the plant's gain."""
+    s = ql.signals
+    excitation = s.Chirp(omega_start=0.2, omega_end=3.0, duration=60.0) + 0.5 * s.Sinusoid(omega=1.7)
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.5]], [0.0, 2.0], [1.0, 0.0])
+    learner = ql.learners.RLS(State() + Bias() + Input(), gain_interval=(0.3, 3.0))
+    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=1.2, omega_o=20.0, dt=5e-3), omega_c=4.0, learner=learner)
+    run = ql.simulate(plant, controller, ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-12, 0.01)))
+    assert 1.2 + controller.read(run.final_state).theta["u"] == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_scale_that_grows_changes_no_prediction(rng: np.random.Generator) -> None:
+    """For features that are products, θ and filters are converted exactly."""
+    learner = ql.learners.NLMS(features=State() + Polynomial(3) + Bias() + Input())
+    design = learner.design(OBSERVER, 1.0)
+    memory = learner.memory(design)
+    for _ in range(400):
+        seen, u = rng.uniform(-1.0, 1.0, 3), rng.uniform(-1.0, 1.0)
+        adapt(design, memory, seen, seen[0] + 1e-9, u, seen[0] + seen[1] ** 2 + 0.3)
+        commit(design, memory, seen, u, 0.0)
+    before, theta = predict(design, memory, np.array([0.3, -0.4, 0.0]), 0.2), np.zeros(10)
+    coefficients(design, memory, theta)
+    shown, scale = memory.filtered / memory.units, memory.scale.copy()
+    design = design._replace(rule=NlmsRule(0.0, 1.0), follow=0.0)
+    adapt(design, memory, np.array([50.0, 900.0, 0.0]), 50.0, 70.0, 300.0)
+    assert np.all(memory.scale > 8.0 * scale)
+    again = np.zeros(10)
+    coefficients(design, memory, again)
+    np.testing.assert_allclose(again, theta, rtol=1e-12)
+    np.testing.assert_allclose(memory.filtered / memory.units, shown, rtol=1e-12)
+    np.testing.assert_allclose(predict(design, memory, np.array([0.3, -0.4, 0.0]), 0.2), before, rtol=1e-12)
+
+
+def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
+    """Restarting keeps what was learned, but not where it is no number."""
+    learner = ql.learners.RLS()
+    design = learner.design(OBSERVER, 1.0)
+    memory = learner.memory(design)
+    memory.theta[:], memory.filtered[:], memory.rule.covariance[0, 0] = 0.25, 1.0, 3.0
+    restart(design, memory)
+    assert np.all(memory.theta == 0.25)
+    assert np.all(memory.filtered == 0.0)
+    assert memory.rule.covariance[0, 0] == 3.0
+    memory.theta[1] = math.nan
+    restart(design, memory)
+    np.testing.assert_array_equal(memory.theta, np.zeros(3))
+    np.testing.assert_array_equal(memory.rule.covariance, learner.memory(design).rule.covariance)
+    renew(NlmsRule(1.0, 1.0), NlmsMemory(np.zeros(0)))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ql.learners.NLMS(rate=0.0), "rate = 0.0: must be finite and greater than zero"),
+        (lambda: ql.learners.NLMS(regularisation=0.0), "regularisation = 0.0: must be finite and greater than zero"),
+        (lambda: ql.learners.NLMS(features="x1"), "features = 'x1': must be made of blocks from quell.features"),
+        (lambda: ql.learners.RLS(memory_time=-1.0), "memory_time = -1.0: must be greater than zero"),
+        (lambda: ql.learners.RLS(prior=math.inf), "prior = inf: must be finite and greater than zero"),
+        (lambda: ql.learners.RLS(scale=[1.0, 0.0]), r"scale = \[1.0, 0.0\]: must be positive"),
+        (lambda: ql.learners.RLS(scale=[1.0, 2.0]).design(OBSERVER, 1.0), r"scale has shape \(2,\): must be a vector of 4"),
+        (lambda: ql.learners.RLS(gain_interval=(1.2, 2.0)), r"gain_interval = \(1.2, 2.0\): must be \(low, high\) with 0 < low <= 1"),
+        (lambda: ql.learners.RLS(RBF(states=(4,))).design(OBSERVER, 1.0), r"states = \(4,\): a plant of order 2 has no state 4"),
+    ],
+)
+def test_a_mistake_is_named(make: Any, message: str) -> None:
+    """With the argument, its value and the rule."""
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,226 @@
+"""Learners made of models: pairs without lag bias, scaling, and the two black boxes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.features import Bias, State
+from quell.learners.base import adapt, commit, predict, restart
+from quell.learners.lag import lag_of, lag_push
+from quell.learners.model import infer, learn
+from quell.learners.network import Network
+from quell.learners.online import group_delay
+from quell.learners.process import Process
+from quell.learners.rls import RlsRule, least_squares_gain
+from quell.types import Matrix, Vector
+
+OBSERVER = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=2e-3)
+
+
+class PlainRule(NamedTuple):
+    """Least squares without forgetting."""
+
+    rule: RlsRule
+    features: int
+
+
+class PlainMemory(NamedTuple):
+    """State of it."""
+
+    theta: Vector
+    covariance: Matrix
+    gain: Vector
+
+
+class Plain:
+    """A model of one's own: least squares."""
+
+    def design(self, features: int, dt: float) -> PlainRule:
+        """Return the parameters."""
+        return PlainRule(RlsRule(1.0, 0.0, 1e6), features)
+
+    def memory(self, parameters: PlainRule) -> PlainMemory:
+        """Return the state."""
+        return PlainMemory(np.zeros(parameters.features), 1e6 * np.eye(parameters.features), np.zeros(parameters.features))
+
+
+@infer.register(PlainRule)
+def _infer(model: PlainRule, memory: PlainMemory, features: Vector) -> float:
+    output = 0.0
+    for i in range(features.size):
+        output += memory.theta[i] * features[i]
+    return output
+
+
+@learn.register(PlainRule)
+def _learn(model: PlainRule, memory: PlainMemory, features: Vector, target: float) -> None:
+    step = (target - infer(model, memory, features)) * least_squares_gain(model.rule, memory.covariance, memory.gain, features, 1.0)
+    for i in range(features.size):
+        memory.theta[i] += step * memory.gain[i]
+
+
+def learned(delay: int | None) -> np.ndarray:
+    """θ in the plant's units, from f = −3 x_1 − 0.4 x_2 + 0.5 as the observer shows it; ``delay`` overrides that of the pairs."""
+    learner = ql.learners.Online(Plain(), State() + Bias(), scale=[2.0, 2.0, 1.0, 8.0])
+    design = learner.design(OBSERVER, 2.0)
+    if delay is not None:
+        design = design._replace(delay=delay)
+    memory = learner.memory(design)
+    lag, chain, shown = lag_of(OBSERVER), np.zeros((1, 3)), 0.0
+    for k in range(20_000):
+        t = k * OBSERVER.dt
+        seen = np.array([math.sin(0.8 * t) + 0.5 * math.sin(1.5 * t), 0.8 * math.cos(0.8 * t) + 0.75 * math.cos(1.5 * t), 0.0])
+        adapt(design, memory, seen, seen[0] + 1e-9, 0.0, shown)
+        commit(design, memory, seen, 0.0, 0.0)
+        shown = lag_push(lag, chain, 0, -3.0 * seen[0] - 0.4 * seen[1] + 0.5)
+    return memory.model.theta * memory.scale[-1] / np.array([memory.scale[0], memory.scale[1], 1.0])
+
+
+def test_pairs_without_lag_teach_without_bias() -> None:
+    """Delayed by the observer's group delay the features give the plant; paired with the newest features they do not."""
+    np.testing.assert_allclose(learned(None), [-3.0, -0.4, 0.5], atol=0.1)
+    assert np.max(np.abs(learned(0) - [-3.0, -0.4, 0.5])) > 0.3
+
+
+@pytest.mark.parametrize("form", ["current", "predictor"])
+def test_the_group_delay_is_that_of_the_filter(form: str) -> None:
+    """A ramp comes through the lag filter so many samples late."""
+    observer = ql.ESO.model_free(order=3, b0=1.0, omega_o=20.0, dt=2e-3, form=form)
+    lag, chain = lag_of(observer), np.zeros((1, 4))
+    shown = [lag_push(lag, chain, 0, float(k)) for k in range(4000)]
+    assert 3999.0 - shown[-1] == pytest.approx(group_delay(observer), abs=1e-6)
+
+
+def surface(x: np.ndarray) -> float:
+    """A function with a fold, of O(1)."""
+    return 0.5 * math.tanh(4.0 * x[1]) + 0.4 * x[0] ** 3 - 0.2
+
+
+def fitted(model: Any, samples: int, rng: np.random.Generator) -> tuple[Any, Any, float]:
+    """A model after so many noisy pairs, and the RMS error it is left with."""
+    design = model.design(2, 1.0)
+    memory = model.memory(design)
+    for _ in range(samples):
+        x = rng.uniform(-1.0, 1.0, 2)
+        learn(design, memory, x, surface(x) + 0.02 * rng.normal())
+    return design, memory, math.sqrt(np.mean([(infer(design, memory, x) - surface(x)) ** 2 for x in rng.uniform(-0.9, 0.9, (500, 2))]))
+
+
+def test_a_network_fits_a_nonlinear_function(rng: np.random.Generator) -> None:
+    """From a thousand pairs; its gradient is the derivative of what it infers."""
+    design, memory, left = fitted(Network(8, 0, 1, math.inf, 0.05, 1e-3), 1000, rng)
+    assert left < 0.04
+    x = np.array([0.3, -0.2])
+    learn(design._replace(rule=RlsRule(1e30, 0.0, 1.0)), memory, x, 0.0)
+    for i in range(memory.theta.size):
+        at, step = memory.theta[i], 1e-6
+        memory.theta[i] = at + step
+        above = infer(design, memory, x)
+        memory.theta[i] = at - step
+        below = infer(design, memory, x)
+        memory.theta[i] = at
+        assert memory.slope[i] == pytest.approx((above - below) / (2.0 * step), abs=1e-7)
+
+
+def test_a_network_says_nothing_before_it_has_learned() -> None:
+    """And the seed decides about its first weights."""
+    design = Network(8, 3, 1, 1.0, 0.1, 1.0).design(2, 1.0)
+    one, other = (Network(8, seed, 1, 1.0, 0.1, 1.0) for seed in (3, 4))
+    assert infer(design, one.memory(design), np.ones(2)) == 0.0
+    assert np.any(one.memory(design).theta != other.memory(other.design(2, 1.0)).theta)
+
+
+def test_a_process_fits_a_nonlinear_function_on_its_budget(rng: np.random.Generator) -> None:
+    """Far from its points it says nothing."""
+    design, memory, left = fitted(Process(40, 0.5, 1, math.inf, 0.05, 1e-3), 2000, rng)
+    assert left < 0.05
+    assert memory.place[0] <= 40
+    assert abs(infer(design, memory, np.array([50.0, 50.0]))) < 1e-12
+    count = int(memory.place[0])
+    identity = memory.inverse[:count, :count] @ memory.kernel[:count, :count]
+    np.testing.assert_allclose(identity, np.eye(count), atol=1e-6)
+    assert np.min(np.linalg.eigvalsh(memory.covariance[:count, :count])) > -1e-9
+
+
+def test_a_process_is_a_gaussian_process_while_its_budget_lasts(rng: np.random.Generator) -> None:
+    """Against the closed form: k(x)ᵀ (K + σ² I)⁻¹ y."""
+    model = Process(30, 0.2, 1, math.inf, 0.1, 1.0)
+    design = model.design(2, 1.0)
+    memory = model.memory(design)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2), -1).reshape(-1, 2)
+    targets = rng.normal(size=25)
+    for x, target in zip(grid, targets, strict=True):
+        learn(design, memory, x, target)
+
+    def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.exp(-np.sum((a[:, None] - b[None]) ** 2, axis=2) / (2.0 * 0.2**2))
+
+    points = rng.uniform(-1.0, 1.0, (20, 2))
+    expected = kernel(points, grid) @ np.linalg.solve(kernel(grid, grid) + design.noise * np.eye(25), targets)
+    np.testing.assert_allclose([infer(design, memory, x) for x in points], expected, atol=1e-9)
+
+
+def test_a_process_with_a_budget_of_one_still_works(rng: np.random.Generator) -> None:
+    """The smallest there is."""
+    _, memory, _ = fitted(Process(1, 0.5, 1, 100.0, 0.1, 1.0), 200, rng)
+    assert memory.place[0] == 1
+    assert all(np.all(np.isfinite(array)) for array in memory)
+
+
+@pytest.mark.parametrize("learner", [ql.learners.MLP(every=5), ql.learners.GaussianProcess(every=5)])
+def test_a_model_can_learn_from_every_so_many_th_sample(learner: Any, rng: np.random.Generator) -> None:
+    """And stays as it is in between."""
+    design = learner.design(OBSERVER, 1.0)
+    memory = learner.memory(design)
+    for k in range(600 + 200):
+        if k == 795:
+            before = memory.model[0].copy()
+        seen = rng.normal(size=3)
+        adapt(design, memory, seen, seen[0] + 1e-6, 0.3, seen[0])
+        commit(design, memory, seen, 0.3, 0.0)
+    assert design.model.every == 5
+    assert before.shape == memory.model[0].shape
+
+
+def test_what_a_model_learned_is_kept_unless_it_is_no_number(rng: np.random.Generator) -> None:
+    """By ``restart``."""
+    learner = ql.learners.MLP()
+    design = learner.design(OBSERVER, 1.0)
+    memory = learner.memory(design)
+    memory.model.theta[0] = 0.25
+    restart(design, memory)
+    assert memory.model.theta[0] == 0.25
+    assert predict(design, memory, np.ones(3), 0.0) == (0.0, 0.0)
+    memory.model.theta[1] = math.nan
+    restart(design, memory)
+    np.testing.assert_array_equal(memory.flat, memory.fresh)
+    assert np.shares_memory(memory.model.theta, memory.flat)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ql.learners.Online(Plain), "model = .*: must have design"),
+        (lambda: ql.learners.Online(3), "model = 3: must have design"),
+        (lambda: ql.learners.Online(Plain(), "x1"), "features = 'x1': must be made of blocks"),
+        (lambda: ql.learners.Online(Plain(), scale=[-1.0]), r"scale = \[-1.0\]: must be positive"),
+        (lambda: ql.learners.Online(Plain(), bias_bandwidth=-1.0), "bias_bandwidth = -1.0: must be finite and not negative"),
+        (lambda: ql.learners.MLP(0), "hidden = 0: must be a whole number of at least 1"),
+        (lambda: ql.learners.MLP(memory_time=0.0), "memory_time = 0.0: must be greater than zero"),
+        (lambda: ql.learners.MLP(noise=0.0), "noise = 0.0: must be finite and greater than zero"),
+        (lambda: ql.learners.MLP(every=0), "every = 0: must be a whole number of at least 1"),
+        (lambda: ql.learners.MLP(seed=-1), "seed = -1: must be a whole number of at least 0"),
+        (lambda: ql.learners.GaussianProcess(0), "budget = 0: must be a whole number of at least 1"),
+        (lambda: ql.learners.GaussianProcess(length=0.0), "length = 0.0: must be finite and greater than zero"),
+        (lambda: ql.learners.BatchGradient(features=3), "features = 3: must be made of blocks"),
+    ],
+)
+def test_a_mistake_is_named(make: Any, message: str) -> None:
+    """With the argument, its value and the rule."""
+    with pytest.raises(ValueError, match=message):
+        make()
