@@ -9,7 +9,6 @@ loop through u is solved instead of closed a sample late: ``u = sat( (u_0 − h 
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from quell.controllers.handle import bind, bound_control, entry_point
 from quell.controllers.limits import Limits, apply_limits, limits
 from quell.dispatch import for_types, kernel
 from quell.guard import UnguardedDesign, UnguardedMemory, note, permit, watch
-from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart
+from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart, trouble
 from quell.learners.lag import Lag, lag_of, lag_push
 from quell.observers.eso import ESO, EsoModel, eso_start, eso_update
 from quell.types import Matrix, Status, Vector
@@ -97,6 +96,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         watch(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
             adapt(design.learner, state.learner, seen, loop[_Y], loop[_U], f_plain)
+            status |= trouble(design.learner, state.learner)
     constant, slope = predict(design.learner, state.learner, seen, loop[_U])
     constant, slope = permit(design.guard, state.guard, f_plain, constant, slope)
     wished = _law(design, seen, loop[_R], constant, slope)
@@ -288,40 +288,66 @@ class ADRC:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""
-        return {name: value for name, value in vars(self).items() if name not in ("_arrays", "_handle", "_step")}
+        kept = {name: value for name, value in vars(self).items() if name not in ("_state", "_arrays", "_handle", "_step")}
+        return kept | {"_saved": self.state}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update(kept)
-        self._state = copy.deepcopy(self._state)
+        saved = vars(self).pop("_saved")
+        # Addresses in a learner's parameters are those of a process, and its arrays may share memory, which copies of them would not.
+        self.parameters = self.parameters._replace(learner=self.learner.design(self.observer, self.omega_c))
+        self._state = self.initial_state()
         self._arrays = _named_arrays(self._state)
         self._handle = None
+        self.state = saved
 
     def reset(self) -> None:
         """Go back to the state before the first sample; what was learned is forgotten."""
-        self.state = _named_arrays(self.initial_state())
+        self.state = self._saved(self.initial_state())
 
     @property
-    def state(self) -> dict[str, NDArray[np.float64]]:
+    def state(self) -> dict[str, NDArray[Any]]:
         """The whole running state as named arrays, copied: ``numpy.savez(file, **controller.state)`` keeps it.
 
-        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then.
+        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then. A learner that is
+        a Python object is in it as an array () of objects, which is good in this process; quell does not pickle or unpickle it.
         """
-        return {name: array.copy() for name, array in self._arrays.items()}
+        return self._saved(self._state)
 
     @state.setter
     def state(self, saved: Mapping[str, Any]) -> None:
         if set(saved) != set(self._arrays):
             raise ValueError(f"state has {sorted(saved)}: must have {sorted(self._arrays)}")
         checked = {}
+        snapshots = {}
         for name, array in self._arrays.items():
+            if name in self._outside:
+                snapshots[name.removeprefix("learner.")] = np.asarray(saved[name])[()]
+                continue
             try:
                 checked[name] = np.asarray(saved[name], dtype=np.float64)
             except (TypeError, ValueError):
                 raise ValueError(f"state[{name!r}]: must be an array of numbers") from None
             if checked[name].shape != array.shape:
                 raise ValueError(f"state[{name!r}] has shape {checked[name].shape}: must have {array.shape}")
+        if snapshots:
+            self.learner.recall(self._state.learner, snapshots)  # type: ignore[attr-defined]
         for name, value in checked.items():
             self._arrays[name][...] = value
+
+    @property
+    def _outside(self) -> tuple[str, ...]:
+        """Names of what stands for something outside of the state's arrays."""
+        return tuple(f"learner.{name}" for name in getattr(self.learner, "outside", ()))
+
+    def _saved(self, state: AdrcState) -> dict[str, NDArray[Any]]:
+        saved: dict[str, NDArray[Any]] = {name: array.copy() for name, array in _named_arrays(state).items()}
+        if self._outside:
+            for name, snapshot in self.learner.snapshot(state.learner).items():  # type: ignore[attr-defined]
+                box = np.empty((), dtype=object)
+                box[()] = snapshot
+                saved[f"learner.{name}"] = box
+        return saved
 
     @property
     def estimate(self) -> Estimate:

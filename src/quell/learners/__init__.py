@@ -1,9 +1,24 @@
 """Learners: what feeds forward the disturbance that has been seen before."""
 
+from quell.learners.adapters import JaxModel, PythonModel, RiverModel, SklearnModel, TorchModel
 from quell.learners.base import Learner, NoLearner
 from quell.learners.gradient import BatchGradient
 from quell.learners.kalman import Kalman
 from quell.learners.model import Model, infer, learn
 from quell.learners.online import Online
 
-__all__ = ["BatchGradient", "Kalman", "Learner", "Model", "NoLearner", "Online", "infer", "learn"]
+__all__ = [
+    "BatchGradient",
+    "JaxModel",
+    "Kalman",
+    "Learner",
+    "Model",
+    "NoLearner",
+    "Online",
+    "PythonModel",
+    "RiverModel",
+    "SklearnModel",
+    "TorchModel",
+    "infer",
+    "learn",
+]

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.dispatch import kernel
 from quell.features import Bias, Features, State
 from quell.features.base import write
 from quell.features.scaling import Scaling, grow, scaling
@@ -64,35 +65,44 @@ class OnlineMemory(NamedTuple):
     """What ``flat`` was before anything was learned."""
 
 
+@kernel
+def show(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, out: Vector) -> None:
+    """Write the features of the estimates ``seen`` and of ``u`` into ``out`` (p,), scaled."""
+    scale, scaled = memory.scale, memory.scaled
+    for i in range(scaled.size):
+        scaled[i] = seen[i] / scale[i]
+    write(learner.features, scaled, u / scale[scaled.size], out)
+
+
+@kernel
+def ready(learner: OnlineDesign, memory: OnlineMemory) -> bool:
+    """Return whether there are pairs to learn from yet, and something to predict."""
+    return bool(memory.place[_SINCE] > learner.watch + learner.delay)
+
+
 @adapt.register(OnlineDesign)
 def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
-    if memory.place[_SINCE] <= learner.watch:
+    if memory.place[_SINCE] < learner.watch:  # the first row that is learned from is written with the scale found here
         return
     scale = memory.scale
     grow(learner.scaling, scale, seen, u_before, f_plain)
-    if memory.place[_SINCE] > learner.watch + learner.delay:
+    if ready(learner, memory):
         # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
         learn(learner.model, memory.model, memory.ring[int(memory.place[_ROW])], f_plain / scale[scale.size - 1])
 
 
 @predict.register(OnlineDesign)
 def _predict(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u_before: float) -> tuple[float, float]:
-    if memory.place[_SINCE] <= learner.watch + learner.delay:
+    if not ready(learner, memory):
         return 0.0, 0.0
-    scale, scaled = memory.scale, memory.scaled
-    for i in range(scaled.size):
-        scaled[i] = seen[i] / scale[i]
-    write(learner.features, scaled, u_before / scale[scaled.size], memory.now)
-    return scale[scale.size - 1] * infer(learner.model, memory.model, memory.now), 0.0
+    show(learner, memory, seen, u_before, memory.now)
+    return memory.scale[memory.scale.size - 1] * infer(learner.model, memory.model, memory.now), 0.0
 
 
 @commit.register(OnlineDesign)
 def _commit(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float) -> None:
-    scale, scaled = memory.scale, memory.scaled
     row = int(memory.place[_ROW])
-    for i in range(scaled.size):
-        scaled[i] = seen[i] / scale[i]
-    write(learner.features, scaled, u / scale[scaled.size], memory.ring[row])
+    show(learner, memory, seen, u, memory.ring[row])
     row += 1
     memory.place[_ROW] = 0.0 if row > learner.delay else row
     memory.place[_SINCE] += 1.0

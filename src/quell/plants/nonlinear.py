@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,17 +10,14 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba.core import types as nb_types
-from numba.extending import intrinsic, overload
 
 from quell import checks
 from quell.dispatch import generic, kernel
+from quell.foreign import call_address, number_from_address
 from quell.plants.base import advance, measure
 from quell.types import Vector
 
-_RATE = ctypes.CFUNCTYPE(None, ctypes.c_double, ctypes.c_void_p, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
-_OUTPUT = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p)
 _POINTER = nb_types.CPointer(nb_types.float64)
 _RATE_SIGNATURE = nb_types.void(nb_types.float64, _POINTER, nb_types.float64, _POINTER, _POINTER)
 _OUTPUT_SIGNATURE = nb_types.float64(_POINTER)
@@ -75,48 +71,9 @@ def _runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: 
             x[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
 
 
-def _call_rate(address: int, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
-    """Call the compiled rate function at an address; from compiled code this is a plain jump."""
-    _RATE(address)(t, x.ctypes.data, u, w.ctypes.data, dx.ctypes.data)
-
-
-def _call_output(address: int, x: Vector) -> float:
-    """Call the compiled output function at an address."""
-    return float(_OUTPUT(address)(x.ctypes.data))
-
-
-@intrinsic
-def _jump(typing_context: Any, address: Any, arguments: Any) -> Any:
-    """Call the function at an address with a tuple of numbers and arrays (by pointer); with one argument it returns a number."""
-    returns = nb_types.float64 if len(arguments) == 1 else nb_types.none
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        target, packed = values
-        passed = []
-        for i, kind in enumerate(arguments):
-            value = builder.extract_value(packed, i)
-            passed.append(context.make_array(kind)(context, builder, value).data if isinstance(kind, nb_types.Array) else value)
-        result = ir.DoubleType() if returns is nb_types.float64 else ir.VoidType()
-        function = builder.inttoptr(target, ir.FunctionType(result, [value.type for value in passed]).as_pointer())
-        called = builder.call(function, passed)
-        return called if returns is nb_types.float64 else context.get_dummy_value()
-
-    return returns(address, arguments), generate
-
-
-@overload(_call_rate, strict=False)
-def _compiled_call_rate(address: Any, t: Any, x: Any, u: Any, w: Any, dx: Any) -> Any:
-    return lambda address, t, x, u, w, dx: _jump(address, (t, x, u, w, dx))
-
-
-@overload(_call_output, strict=False)
-def _compiled_call_output(address: Any, x: Any) -> Any:
-    return lambda address, x: _jump(address, (x,))
-
-
 @measure.register(CompiledNonlinear)
 def _measure(plant: CompiledNonlinear, x: Vector) -> float:
-    return _call_output(plant.output, x)
+    return number_from_address(plant.output, (x,))
 
 
 @advance.register(CompiledNonlinear)
@@ -126,7 +83,7 @@ def _advance(plant: CompiledNonlinear, x: Vector, scratch: Vector, t: float, u: 
 
 @derivatives.register(CompiledNonlinear)
 def _derivatives(plant: CompiledNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
-    _call_rate(plant.rate, t, x, u, w, dx)
+    call_address(plant.rate, (t, x, u, w, dx))
 
 
 @measure.register(PythonNonlinear)
