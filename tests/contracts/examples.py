@@ -14,6 +14,8 @@ import quell as ql
 from quell import learners as learner_room
 from quell.observers.eso import ESO, FORMS
 
+from .python_models import python_learners
+
 PLANTS: dict[str, Any] = {
     "two_mass_spring": ql.plants.two_mass_spring(),
     "LinearPlant": ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]]),
@@ -21,11 +23,19 @@ PLANTS: dict[str, Any] = {
 }
 CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
 
-LEARNERS: dict[str, Any] = {
-    name: getattr(learner_room, name)()
-    for name in learner_room.__all__
-    if inspect.isclass(getattr(learner_room, name)) and not getattr(getattr(learner_room, name), "_is_protocol", False)
-} | {"Kalman with u": ql.learners.Kalman(u=True)}
+PYTHON_LEARNERS = python_learners()
+_NEED_A_MODEL = ("JaxModel", "Online", "PythonModel", "RiverModel", "SklearnModel", "TorchModel")
+LEARNERS: dict[str, Any] = (
+    {
+        name: getattr(learner_room, name)()
+        for name in learner_room.__all__
+        if name not in _NEED_A_MODEL
+        and inspect.isclass(getattr(learner_room, name))
+        and not getattr(getattr(learner_room, name), "_is_protocol", False)
+    }
+    | {"Kalman with u": ql.learners.Kalman(u=True)}
+    | PYTHON_LEARNERS
+)
 
 OBSERVERS: dict[str, ESO] = {
     f"{kind}, order {order}, {form}": (

@@ -17,7 +17,7 @@ from quell.observers.eso import eso_start, eso_update
 from quell.plants.base import advance, measure
 from quell.simulation import run_block
 
-from .examples import CHAIN, LEARNERS, OBSERVERS, PLANTS
+from .examples import CHAIN, LEARNERS, OBSERVERS, PLANTS, PYTHON_LEARNERS
 
 SCENARIO = ql.Scenario(
     reference=ql.signals.Sinusoid(omega=1.5),
@@ -128,25 +128,26 @@ def test_a_learner_changes_only_its_memory(name: str, rng: np.random.Generator) 
     first, again = (predict(design, memory, np.ones(3), 0.2) for _ in range(2))
     assert first == again
     assert np.all(np.isfinite(first))
-    for one, other in zip(memory, frozen, strict=True):
-        np.testing.assert_array_equal(one, other)
+    for label, array in _named_arrays(memory).items():
+        np.testing.assert_array_equal(array, _named_arrays(frozen)[label])
 
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_learner_names_its_coefficients(name: str) -> None:
     """As many names as θ has entries, each once."""
     learner = LEARNERS[name]
-    for order in (1, 4):
+    for order in (2,) if name in PYTHON_LEARNERS else (1, 4):  # a network has inputs of its own, here two
         memory = learner.memory(learner.design(OBSERVERS[f"model-free, order {order}, current"], 1.0))
         names = learner.feature_names(order)
-        assert len(names) == len(set(names)) == memory.theta.size
+        assert len(names) == len(set(names)) == getattr(memory, "theta", np.zeros(0)).size
 
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_learner_stays_bounded_without_excitation(name: str) -> None:
-    """A constant reference for 1e5 samples: nothing winds up, drifts or leaves the numbers."""
+    """A constant reference for 1e5 samples (3e4 where Python learns): nothing winds up, drifts or leaves the numbers."""
     controller = law_for(CHAIN, learner=LEARNERS[name])
-    scenario = ql.Scenario(reference=0.5, duration=1000.0, noise=ql.signals.BandLimitedNoise(1e-10, 0.01))
+    duration = 300.0 if name in PYTHON_LEARNERS else 1000.0
+    scenario = ql.Scenario(reference=0.5, duration=duration, noise=ql.signals.BandLimitedNoise(1e-10, 0.01))
     run = ql.simulate(CHAIN, controller, scenario, record_every=100)
     assert not run.diverged
     assert np.max(np.abs(run["y"][run.t > 100.0] - 0.5)) < 1e-2

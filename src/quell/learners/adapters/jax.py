@@ -23,7 +23,7 @@ class JaxModel(PythonModel):
         takes an array (p,) and returns a number, or an array (1,), for example
         ``equinox.nn.MLP(2, "scalar", 16, 1, key=jax.random.key(0))``.
     optimizer
-        an optax optimiser; ``optax.adam(0.01)`` by default.
+        an optax optimiser; ``optax.sgd(0.1)`` by default (``TorchModel`` says why not Adam).
     steps
         gradient steps on each batch.
     **options
@@ -42,9 +42,9 @@ class JaxModel(PythonModel):
         equinox, optax = needed("equinox", "jax"), needed("optax", "jax")
         if not (isinstance(module, equinox.Module) and callable(module)):
             raise ValueError(f"module = {module!r}: must be an equinox.Module that can be called with an array (p,)")
-        optimizer = optax.adam(0.01) if optimizer is None else optimizer
+        optimizer = optax.sgd(0.1) if optimizer is None else optimizer
         if not all(callable(getattr(optimizer, name, None)) for name in ("init", "update")):
-            raise ValueError(f"optimizer = {optimizer!r}: must be an optax optimiser, for example optax.adam(0.01)")
+            raise ValueError(f"optimizer = {optimizer!r}: must be an optax optimiser, for example optax.sgd(0.1)")
         self.name = type(module).__name__
         self._set_up(_Module(module, optimizer, checks.whole("steps", steps, 1)), **options)
 

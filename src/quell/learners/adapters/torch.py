@@ -19,7 +19,8 @@ class TorchModel(PythonModel):
         takes a tensor (m, p) and returns one of shape (m, 1) or (m,), on the CPU.
     optimizer
         an optimiser on the module's own parameters, or a function that makes one of parameters, for example
-        ``functools.partial(torch.optim.SGD, lr=0.05)``; Adam with a learning rate of 0.01 by default.
+        ``functools.partial(torch.optim.SGD, lr=0.05)``; that with a learning rate of 0.1 by default. Pairs that follow each other
+        resemble each other, and an optimiser that takes long steps on small gradients (Adam at its usual rates) unlearns the rest.
     steps
         gradient steps on each batch.
     **options
@@ -41,7 +42,7 @@ class TorchModel(PythonModel):
         if not parameters:
             raise ValueError(f"module = {module!r}: must have parameters to train")
         if optimizer is None:
-            optimizer = torch.optim.Adam(parameters, lr=0.01)
+            optimizer = torch.optim.SGD(parameters, lr=0.1)
         elif not isinstance(optimizer, torch.optim.Optimizer) and callable(optimizer):
             optimizer = optimizer(parameters)
         if not isinstance(optimizer, torch.optim.Optimizer):
