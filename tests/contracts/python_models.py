@@ -5,11 +5,19 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
+import time
 from typing import Any
 
 import numpy as np
 
 import quell as ql
+
+HARD_SPRING = ql.plants.NonlinearPlant(
+    lambda t, x, u, w: (x[1], u + w[0] - 6.0 * x[0] - 8.0 * x[0] ** 3 - 1.5 * x[1] * abs(x[1])), order=2, name="hard spring"
+)
+CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
+OBSERVER = ql.ESO.model_free(order=2, b0=1.0, omega_o=15.0, dt=5e-3)
+SHORT = ql.Scenario(reference=ql.signals.Sinusoid(omega=1.5), duration=4.0, rest_at=(2.0,))
 
 
 class LeastMeanSquares:
@@ -29,6 +37,49 @@ class LeastMeanSquares:
     def predict(self, features: np.ndarray) -> float:
         """Return θ·φ."""
         return float(self.theta @ features)
+
+
+class Sleeper(LeastMeanSquares):
+    """A model that takes its time."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self.seconds = seconds
+
+    def predict(self, features: np.ndarray) -> float:
+        """Sleep, then return θ·φ."""
+        time.sleep(self.seconds)
+        return super().predict(features)
+
+
+class Broken(LeastMeanSquares):
+    """A model that does well for some calls, and then what it is told."""
+
+    def __init__(self, well: int, then: Any) -> None:
+        super().__init__()
+        self.well, self.then, self.calls = well, then, 0
+
+    def predict(self, features: np.ndarray) -> Any:
+        """Return θ·φ, or do what it was told."""
+        self.calls += 1
+        if self.calls <= self.well:
+            return super().predict(features)
+        if isinstance(self.then, BaseException):
+            raise self.then
+        return self.then
+
+
+class Counter(LeastMeanSquares):
+    """A model that writes down what it is called with."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.batches: list[int] = []
+
+    def learn(self, features: np.ndarray, targets: np.ndarray) -> None:
+        """Learn, and take note of the batch."""
+        self.batches.append(len(targets))
+        super().learn(features, targets)
 
 
 def has(*modules: str) -> bool:
@@ -75,3 +126,8 @@ def python_learners() -> dict[str, Any]:
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
         found["Equinox MLP"] = ql.learners.JaxModel(jax_mlp())
     return found
+
+
+def law(learner: Any, **options: Any) -> ql.ADRC:
+    """A controller for a plant of order two."""
+    return ql.ADRC(OBSERVER, omega_c=4.0, learner=learner, **options)
