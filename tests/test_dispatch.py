@@ -72,6 +72,33 @@ def test_a_type_without_implementation_is_named_in_the_error() -> None:
         area(1.0, 1.0)
 
 
+@dispatch.generic
+def corners(shape: Any) -> int:
+    """Return the number of corners."""
+    raise TypeError
+
+
+@corners.register(Square)
+def _square_corners(shape: Square) -> int:
+    return 4
+
+
+@corners.register(object)
+def _no_corners(shape: Any) -> int:
+    return 0
+
+
+@dispatch.compiled
+def count_corners(one: Any, other: Any) -> int:
+    """Add corners of any shapes."""
+    return corners(one) + corners(other)
+
+
+def test_what_is_registered_for_object_serves_all_types_without_their_own() -> None:
+    """Compiled and interpreted alike."""
+    assert count_corners(Circle(1.0), Square(1.0)) == dispatch.interpreted(count_corners)(Circle(1.0), Square(1.0)) == 4
+
+
 def test_a_second_call_with_the_same_types_does_not_compile_again() -> None:
     """One compilation serves all values of the same types."""
     total(Circle(1.0), Circle(2.0))

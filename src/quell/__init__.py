@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from quell import controllers, experiments, features, learners, metrics, observers, plants, signals
     from quell.controllers.adrc import ADRC, Estimate
+    from quell.guard import Guard, Reason
     from quell.observers.canonical import canonical
     from quell.observers.eso import ESO
     from quell.simulation import Scenario, simulate
@@ -31,6 +32,8 @@ _HOME = {
     "ADRC": "quell.controllers.adrc",
     "ESO": "quell.observers.eso",
     "Estimate": "quell.controllers.adrc",
+    "Guard": "quell.guard",
+    "Reason": "quell.guard",
     "Scenario": "quell.simulation",
     "Status": "quell.types",
     "Trajectory": "quell.trajectory",
@@ -43,6 +46,8 @@ __all__ = [
     "ADRC",
     "ESO",
     "Estimate",
+    "Guard",
+    "Reason",
     "Scenario",
     "Status",
     "Trajectory",

@@ -70,7 +70,7 @@ def generic(declaration: Callable[P, R]) -> Generic[P, R]:
     """Make a generic function out of its declaration, whose docstring is the contract.
 
     ``declaration.register(Type)`` decorates the implementation for the NamedTuple ``Type`` of the first argument;
-    ``declaration.implementations`` is the table of them.
+    ``declaration.implementations`` is the table of them. What is registered for ``object`` serves all types without one of their own.
 
     Raises
     ------
@@ -81,15 +81,14 @@ def generic(declaration: Callable[P, R]) -> Generic[P, R]:
 
     @functools.wraps(declaration)
     def call(head: Any, *rest: Any) -> Any:
-        try:
-            implementation = table[type(head)]
-        except KeyError:
-            raise TypeError(_no_implementation(declaration.__name__, type(head).__name__)) from None
+        implementation = table.get(type(head)) or table.get(object)
+        if implementation is None:
+            raise TypeError(_no_implementation(declaration.__name__, type(head).__name__))
         return implementation(head, *rest)
 
     def resolve(head: Any, *rest: Any) -> Any:
         cls = getattr(head, "instance_class", None) if isinstance(head, nb_types.BaseNamedTuple) else None
-        return table.get(cls)  # type: ignore[arg-type]
+        return table.get(cls) or table.get(object)  # type: ignore[arg-type]
 
     def register(cls: type) -> Callable[[F], F]:
         def add(implementation: F) -> F:

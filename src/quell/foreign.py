@@ -21,7 +21,10 @@ POINTER = nb_types.CPointer(nb_types.float64)
 
 
 def call(address: int, *arguments: Any) -> None:
-    """Call the function at ``address`` with numbers, and arrays by pointer; from compiled code this is a plain jump."""
+    """Call the function at ``address`` with whole numbers (int64), numbers (float64), and arrays by pointer.
+
+    From compiled code this is a plain jump.
+    """
     _through_ctypes(None, address, arguments)
 
 
@@ -31,9 +34,15 @@ def evaluate(address: int, *arguments: Any) -> float:
 
 
 def _through_ctypes(returns: Any, address: int, arguments: tuple[Any, ...]) -> Any:
-    kinds = [ctypes.c_void_p if isinstance(argument, np.ndarray) else ctypes.c_double for argument in arguments]
+    kinds = [_kind(argument) for argument in arguments]
     passed = [argument.ctypes.data if isinstance(argument, np.ndarray) else argument for argument in arguments]
     return ctypes.CFUNCTYPE(returns, *kinds)(address)(*passed)
+
+
+def _kind(argument: Any) -> Any:
+    if isinstance(argument, np.ndarray):
+        return ctypes.c_void_p
+    return ctypes.c_int64 if isinstance(argument, int | np.integer) else ctypes.c_double
 
 
 def _jump(address: Any, arguments: Any, returns: Any) -> Any:

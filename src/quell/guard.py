@@ -1,7 +1,8 @@
 """The guard: how much a learner may say.
 
 *What is known exactly.* ``f_plain = Δf̂ + f_L^F = f^F`` is what an ESO without learner would have estimated from the same y and u
-(``lag.py``). So, one lag of the observer later, it is known what that ESO has missed, and which part of it the learner's output g meant to make up for:
+(``lag.py``). So, one lag of the observer later, it is known what that ESO has missed, and which part of it the learner's output g
+meant to make up for:
 
     q = F (f − f^F) = f_plain − f_plain^F,        p = (1 − F) F g = g^F − g^FF
 
@@ -12,19 +13,20 @@ averaged over T seconds in which something happens:
 
     m_xy ← m_xy + (dt/T) a (x y / s − m_xy),        s = q² + p²,        a = min(1, s / (0.4 e)²)
 
-with e the usual size of q. The share of the plain ESO's error that the learner would have removed, ``η = (2 m_qp − m_pp) / m_qq``, decides:
+with e the usual size of q. The share of the plain ESO's error that the learner would have removed,
+``η = (2 m_qp − m_pp) / m_qq``, decides:
 
     β = min( clip((η − 0.1) / 0.2, 0, 1),  1.2 m_qq / m_pp )
 
-The second term is for learners that say the right thing too loud, which makes the loop's gain exceed one and is dangerous though η is positive.
-A learner starts, and starts again after it was cut off, with the record of one that is always wrong: it has to be right for about 0.8 T, unheard, before it
-is heard.
+The second term is for learners that say the right thing too loud, which makes a loop's gain exceed one and is dangerous though η
+is positive. A learner starts, and starts again after it was cut off, with the record of one that has nothing to do with f: it has to be
+right for about 0.8 T, unheard, before it is heard in full.
 
 *No sample is trusted.* ``f − f^F`` has the size e, so whatever is further from f_plain than that is not f:
 
     held = g clipped to f_plain ± κe, and faded to zero between κe and 3κe from it,        f_L = β held
 
-It moves by 2 omega_o e a second at most. What is not finite, or a hundred times larger than f, is cut off within the sample.
+and f_L moves by 2 omega_o e a second at most. What is not finite, or a hundred times larger than f, is cut off within the sample.
 """
 
 from __future__ import annotations

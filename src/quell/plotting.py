@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quell.guard import Reason
 from quell.types import Vector
 
 if TYPE_CHECKING:
@@ -33,13 +34,15 @@ def draw(ax: Any, t: Vector, values: Vector, **style: Any) -> None:
 
 
 def plot_trajectory(run: Trajectory, axes: Any = None) -> Any:
-    """Draw output and reference, control signal and estimates of f into three axes; return them."""
+    """Draw output and reference, control signal, estimates of f and, where there is a guard, its authority; return the axes."""
+    guarded = "authority" in run.names
+    count = 4 if guarded and axes is None else 3
     if axes is None:
         import matplotlib.pyplot as plt
 
-        _, axes = plt.subplots(3, 1, sharex=True, figsize=(8.0, 7.0), layout="constrained")
-    if np.size(axes) != 3:
-        raise ValueError(f"axes: must be three matplotlib axes, got {np.size(axes)}")
+        _, axes = plt.subplots(count, 1, sharex=True, figsize=(8.0, 2.3 * count), layout="constrained")
+    if np.size(axes) not in (3, 4) or (np.size(axes) == 4 and not guarded):
+        raise ValueError(f"axes: must be three matplotlib axes, or four for a run with a guard, got {np.size(axes)}")
     t = run.t
     draw(axes[0], t, run["y"], label="y", color="C0")
     draw(axes[0], t, run["r"], label="r", color="0.3", linestyle="--", linewidth=1.0)
@@ -47,11 +50,29 @@ def plot_trajectory(run: Trajectory, axes: Any = None) -> Any:
     for name, label in (("f_hat", "estimate of f"), ("f_learned", "learned share"), ("f_residual", "residual")):
         if name in run.names:
             draw(axes[2], t, run[name], label=label, linewidth=1.0)
-    for ax, label in zip(axes, ("output", "control signal", "total disturbance"), strict=True):
+    if len(axes) == 4:
+        _draw_guard(run, axes[3])
+    for ax, label in zip(axes, ("output", "control signal", "total disturbance", "guard"), strict=False):
         ax.set_ylabel(label)
         ax.legend(loc="upper right", fontsize="small")
         ax.grid(alpha=0.3)
-    axes[2].set_xlabel("time [s]")
+    axes[len(axes) - 1].set_xlabel("time [s]")
     if run.diverged:
         axes[0].set_title(f"ended at {run.ended:.3g} s: diverged", color="C3")
     return axes
+
+
+def _draw_guard(run: Trajectory, ax: Any) -> None:
+    """Draw the authority, the share of the plain observer's error that is left with the learner, and where it was held back and why."""
+    t, authority, plain = run.t, run["authority"], run["error_plain"]
+    left = np.minimum(np.divide(run["error_learned"], plain, out=np.ones_like(plain), where=plain > 0.0), 1.5)
+    draw(ax, t, authority, label="authority", color="C2")
+    draw(ax, t, left, label="error left at full authority", color="C4", linewidth=1.0)
+    shown = [Reason.TOO_LOUD, Reason.OUT_OF_BOUNDS, Reason.TOO_FAST, Reason.EXPLODED, Reason.NOT_FINITE]
+    for i, reason in enumerate(shown):
+        at = t[run["reason"] == reason]
+        if at.size:
+            at = at[:: max(at.size // 500, 1)]
+            label = reason.name.lower().replace("_", " ")
+            ax.plot(at, np.full(at.size, -0.08 - 0.06 * i), "|", markersize=4.0, color=f"C{5 + i}", label=label)
+    ax.set_ylim(-0.45, 1.6)

@@ -31,6 +31,10 @@ _MEANINGS = {
     "f_residual": ("residual total disturbance estimated by the observer", "y-unit/s^n"),
     "f_learned": ("total disturbance fed forward by the learner", "y-unit/s^n"),
     "f_hat": ("estimated total disturbance", "y-unit/s^n"),
+    "authority": ("share of its output that the guard lets the learner have", "1"),
+    "error_plain": ("RMS of what an ESO without learner would have missed of f", "y-unit/s^n"),
+    "error_learned": ("RMS of what would be missed with the learner at full authority", "y-unit/s^n"),
+    "reason": ("why the authority is what it is (quell.guard.Reason)", "1"),
     "status": ("status flags of the step", "1"),
     "theta": ("coefficients of the learner", "y-unit/s^n per feature-unit"),
 }
@@ -178,12 +182,12 @@ class Trajectory:
         return stays and (part.start == 0 or bool(np.any(r[max(part.start - 2, 0) : part.start + 1] != goal)))
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw output and reference, control signal and estimates of f, one below the other; return the three axes.
+        """Draw output and reference, control signal, estimates of f and, where there is a guard, what it did; return the axes.
 
         Parameters
         ----------
         axes
-            three matplotlib axes to draw into; a new figure by default.
+            three matplotlib axes to draw into, or four for a run with a guard; a new figure by default.
         """
         from quell.plotting import plot_trajectory
 

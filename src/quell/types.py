@@ -29,6 +29,8 @@ class Status(IntFlag):
     OVERFLOWED = 16
     DIVERGED = 32
     LEARNER_CUT = 64
+    LEARNER_LATE = 128
+    LEARNER_FAILED = 256
 
     @property
     def message(self) -> str:
@@ -46,4 +48,8 @@ _MESSAGES = {
     Status.LEARNER_CUT: "The learner's output was not a number; the guard cut it off and it began anew: look at the learner.",
     Status.DIVERGED: "The loop diverged and the run ended early: check the sign and size of b0, lower omega_c or omega_o, "
     "or the learning rate.",
+    Status.LEARNER_LATE: "The learner took longer than its budget and the loop went on with its last prediction: "
+    "raise budget or period, or take a smaller model.",
+    Status.LEARNER_FAILED: "The learner raised an error or returned no finite number and was not listened to; a warning said why, "
+    "and last_problem of the learner keeps it: mend the model or lower its learning rate.",
 }

@@ -18,6 +18,8 @@ from quell.features import RBF, Bias, Input, Polynomial, RandomFourier, State
 from quell.learners.model import infer, learn
 from quell.observers.eso import ESO, FORMS
 
+from .python_models import python_learners
+
 PLANTS: dict[str, Any] = {
     "two_mass_spring": ql.plants.two_mass_spring(),
     "LinearPlant": ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]]),
@@ -70,20 +72,26 @@ def _learn(model: OwnDesign, memory: OwnMemory, features: Any, target: float) ->
     memory.last[0, 0] = error
 
 
-LEARNERS: dict[str, Any] = {
-    name: getattr(learner_room, name)()
-    for name in learner_room.__all__
-    if inspect.isclass(getattr(learner_room, name))
-    and not getattr(getattr(learner_room, name), "_is_protocol", False)
-    and name != "Online"  # it needs a model
-} | {
-    "Kalman with u": ql.learners.Kalman(u=True),
-    "a model of one's own": ql.learners.Online(OwnModel(), State() + Input()),
-    "RLS with u": ql.learners.RLS(State() + Polynomial() + Bias() + Input()),
-    "RLS on radial features": ql.learners.RLS(State() + RBF(16) + Bias()),
-    "NLMS on random features": ql.learners.NLMS(features=RandomFourier(20)),
-    "gradient on radial features": ql.learners.BatchGradient(features=RBF(16, states=(1,)) + Bias()),
-}
+PYTHON_LEARNERS = python_learners()
+_NEED_A_MODEL = ("JaxModel", "Online", "PythonModel", "RiverModel", "SklearnModel", "TorchModel")
+LEARNERS: dict[str, Any] = (
+    {
+        name: getattr(learner_room, name)()
+        for name in learner_room.__all__
+        if inspect.isclass(getattr(learner_room, name))
+        and not getattr(getattr(learner_room, name), "_is_protocol", False)
+        and name not in _NEED_A_MODEL
+    }
+    | {
+        "Kalman with u": ql.learners.Kalman(u=True),
+        "a model of one's own": ql.learners.Online(OwnModel(), State() + Input()),
+        "RLS with u": ql.learners.RLS(State() + Polynomial() + Bias() + Input()),
+        "RLS on radial features": ql.learners.RLS(State() + RBF(16) + Bias()),
+        "NLMS on random features": ql.learners.NLMS(features=RandomFourier(20)),
+        "gradient on radial features": ql.learners.BatchGradient(features=RBF(16, states=(1,)) + Bias()),
+    }
+    | PYTHON_LEARNERS
+)
 
 OBSERVERS: dict[str, ESO] = {
     f"{kind}, order {order}, {form}": (

@@ -18,7 +18,7 @@ from quell.observers.eso import eso_start, eso_update
 from quell.plants.base import advance, measure
 from quell.simulation import run_block
 
-from .examples import CHAIN, LEARNERS, OBSERVERS, PLANTS
+from .examples import CHAIN, LEARNERS, OBSERVERS, PLANTS, PYTHON_LEARNERS
 
 SCENARIO = ql.Scenario(
     reference=ql.signals.Sinusoid(omega=1.5),
@@ -138,7 +138,7 @@ def test_a_learner_changes_only_its_memory(name: str, rng: np.random.Generator) 
 def test_a_learner_names_its_coefficients(name: str) -> None:
     """Each once, and as many as it writes."""
     learner = LEARNERS[name]
-    for order in (1, 4):
+    for order in (2,) if name in PYTHON_LEARNERS else (1, 4):  # a network has inputs of its own, here two
         design = learner.design(OBSERVERS[f"model-free, order {order}, current"], 1.0)
         names = learner.feature_names(order)
         theta = np.full(len(names) + 1, np.nan)
@@ -149,9 +149,10 @@ def test_a_learner_names_its_coefficients(name: str) -> None:
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_learner_stays_bounded_without_excitation(name: str) -> None:
-    """A constant reference for 1e5 samples: nothing winds up, drifts or leaves the numbers."""
+    """A constant reference for 1e5 samples (3e4 where Python learns): nothing winds up, drifts or leaves the numbers."""
     controller = law_for(CHAIN, learner=LEARNERS[name])
-    scenario = ql.Scenario(reference=0.5, duration=1000.0, noise=ql.signals.BandLimitedNoise(1e-10, 0.01))
+    duration = 300.0 if name in PYTHON_LEARNERS else 1000.0
+    scenario = ql.Scenario(reference=0.5, duration=duration, noise=ql.signals.BandLimitedNoise(1e-10, 0.01))
     run = ql.simulate(CHAIN, controller, scenario, record_every=100)
     assert not run.diverged
     assert np.max(np.abs(run["y"][run.t > 100.0] - 0.5)) < 1e-2

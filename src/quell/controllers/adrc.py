@@ -21,8 +21,8 @@ from quell.controllers.base import control, flags, report, rest
 from quell.controllers.handle import bind, bound_control, entry_point
 from quell.controllers.limits import Limits, apply_limits, limits
 from quell.dispatch import for_types, is_finite, kernel
-from quell.guard import GUARD_CHANNELS, Guard, UnguardedDesign, UnguardedMemory, calm, explain, note, permit, watch
-from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart
+from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, calm, explain, note, permit, watch
+from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart, trouble
 from quell.learners.lag import Lag, lag_of, lag_push
 from quell.observers.eso import ESO, EsoModel, eso_start, eso_update
 from quell.types import Matrix, Status, Vector
@@ -97,6 +97,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         watch(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
             adapt(design.learner, state.learner, seen, loop[_Y], loop[_U], f_plain)
+            status |= trouble(design.learner, state.learner)
     constant, slope = predict(design.learner, state.learner, seen, loop[_U])
     constant, slope, cut_off = permit(design.guard, state.guard, f_plain, constant, slope, loop[_U])
     if cut_off:
@@ -180,6 +181,14 @@ class Estimate(NamedTuple):
     """The control signal applied."""
     status: Status
     """What the step had to report."""
+    authority: float = 1.0
+    """Share of its output that the guard lets a learner have."""
+    error_plain: float = math.nan
+    """RMS of what an ESO without learner would have missed of f, as the guard has it [y-unit/s^n]."""
+    error_learned: float = math.nan
+    """The same had the learner had full authority."""
+    reason: Reason = Reason.TRUSTED
+    """Why the authority is what it is."""
 
 
 class ADRC:
@@ -195,6 +204,8 @@ class ADRC:
         controller bandwidth [rad/s]: all poles of the ideal loop lie at −omega_c.
     learner
         what feeds f forward; none by default.
+    guard
+        what gives a learner the authority it has earned; none by default: then a learner has all of it.
     u_min, u_max
         limits of the control signal [u-unit].
     rate_limit
@@ -234,6 +245,8 @@ class ADRC:
         self.learner: Learner = NoLearner() if learner is None else learner
         if isinstance(self.learner, type) or not all(hasattr(self.learner, name) for name in ("design", "memory", "feature_names")):
             raise ValueError(f"learner = {learner!r}: must be a learner, for example quell.learners.Kalman(), or None")
+        if guard is not None and not isinstance(guard, Guard):
+            raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
         self._limits = limits(u_min, u_max, rate_limit, observer.dt)
         self._prepare_design()
         self._state = self.initial_state()
@@ -241,7 +254,7 @@ class ADRC:
         self._handle: Any = None
 
     def _prepare_design(self) -> None:
-        observer = self.observer
+        observer, lag = self.observer, lag_of(self.observer)
         self.parameters = AdrcDesign(
             eso=observer.model,
             law=law_gains(observer.order, self.omega_c),
@@ -249,11 +262,9 @@ class ADRC:
             b0=observer.b0,
             limits=self._limits,
             learner=self.learner.design(observer, self.omega_c),
-            lag=lag_of(observer),
-            guard=UnguardedDesign() if guard is None else guard.design(observer),
+            lag=lag._replace(taps=np.zeros(0)) if isinstance(self.learner, NoLearner) else lag,
+            guard=UnguardedDesign() if self.guard is None else self.guard.design(observer),
         )
-        if isinstance(self.learner, NoLearner):
-            self.parameters = self.parameters._replace(lag=self.parameters.lag._replace(taps=np.zeros(0)))
         self.features = self.learner.feature_names(observer.order)
 
     @property
@@ -317,30 +328,51 @@ class ADRC:
 
     def reset(self) -> None:
         """Go back to the state before the first sample; what was learned is forgotten."""
-        self.state = _named_arrays(self.initial_state())
+        self.state = self._saved(self.initial_state())
 
     @property
-    def state(self) -> dict[str, NDArray[np.float64]]:
+    def state(self) -> dict[str, NDArray[Any]]:
         """The whole running state as named arrays, copied: ``numpy.savez(file, **controller.state)`` keeps it.
 
-        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then.
+        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then. A learner that is
+        a Python object is in it as an array () of objects, which is good in this process; quell does not pickle or unpickle it.
         """
-        return {name: array.copy() for name, array in self._arrays.items()}
+        return self._saved(self._state)
 
     @state.setter
     def state(self, saved: Mapping[str, Any]) -> None:
         if set(saved) != set(self._arrays):
             raise ValueError(f"state has {sorted(saved)}: must have {sorted(self._arrays)}")
         checked = {}
+        snapshots = {}
         for name, array in self._arrays.items():
+            if name in self._outside:
+                snapshots[name.removeprefix("learner.")] = np.asarray(saved[name])[()]
+                continue
             try:
                 checked[name] = np.asarray(saved[name], dtype=np.float64)
             except (TypeError, ValueError):
                 raise ValueError(f"state[{name!r}]: must be an array of numbers") from None
             if checked[name].shape != array.shape:
                 raise ValueError(f"state[{name!r}] has shape {checked[name].shape}: must have {array.shape}")
+        if snapshots:
+            self.learner.recall(self._state.learner, snapshots)  # type: ignore[attr-defined]
         for name, value in checked.items():
             self._arrays[name][...] = value
+
+    @property
+    def _outside(self) -> tuple[str, ...]:
+        """Names of what stands for something outside of the state's arrays."""
+        return tuple(f"learner.{name}" for name in getattr(self.learner, "outside", ()))
+
+    def _saved(self, state: AdrcState) -> dict[str, NDArray[Any]]:
+        saved: dict[str, NDArray[Any]] = {name: array.copy() for name, array in _named_arrays(state).items()}
+        if self._outside:
+            for name, snapshot in self.learner.snapshot(state.learner).items():  # type: ignore[attr-defined]
+                box = np.empty((), dtype=object)
+                box[()] = snapshot
+                saved[f"learner.{name}"] = box
+        return saved
 
     @property
     def estimate(self) -> Estimate:
@@ -361,7 +393,15 @@ class ADRC:
             theta=dict(zip(self.features, theta.tolist(), strict=True)),
             u=float(state.loop[_U]),
             status=Status(int(state.loop[_STATUS])),
+            **self._guard_report(state),
         )
+
+    def _guard_report(self, state: AdrcState) -> dict[str, Any]:
+        told = np.zeros(len(GUARD_CHANNELS))
+        if explain(self.parameters.guard, state.guard, told) == 0:
+            return {}
+        named = dict(zip([name for name, _ in GUARD_CHANNELS], told.tolist(), strict=True))
+        return named | {"reason": Reason(int(named["reason"]))}
 
 
 def law_gains(order: int, omega_c: float) -> Vector:

@@ -178,20 +178,20 @@ class TurncoatMemory(NamedTuple):
     """State of ``Turncoat``."""
 
     honest: Any
-    count: Vector
+    so_far: Vector
     """(1,)."""
 
 
 @adapt.register(TurncoatDesign)
 def _adapt_turncoat(learner: TurncoatDesign, memory: TurncoatMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
-    memory.count[0] += 1.0
+    memory.so_far[0] += 1.0
     adapt(learner.honest, memory.honest, seen, y, u_before, f_plain)
 
 
 @predict.register(TurncoatDesign)
 def _predict_turncoat(learner: TurncoatDesign, memory: TurncoatMemory, seen: Vector, u_before: float) -> tuple[float, float]:
     constant, slope = predict(learner.honest, memory.honest, seen, u_before)
-    return (constant if memory.count[0] < learner.turns else learner.size * constant), slope
+    return (constant if memory.so_far[0] < learner.turns else learner.size * constant), slope
 
 
 @commit.register(TurncoatDesign)

@@ -1,5 +1,6 @@
 """Learners: what feeds forward the disturbance that has been seen before."""
 
+from quell.learners.adapters import JaxModel, PythonModel, RiverModel, SklearnModel, TorchModel
 from quell.learners.base import Learner, NoLearner
 from quell.learners.gradient import BatchGradient
 from quell.learners.harmonic import Harmonic
@@ -18,11 +19,16 @@ __all__ = [
     "BatchGradient",
     "GaussianProcess",
     "Harmonic",
+    "JaxModel",
     "Kalman",
     "Learner",
     "Model",
     "NoLearner",
     "Online",
+    "PythonModel",
+    "RiverModel",
+    "SklearnModel",
+    "TorchModel",
     "infer",
     "learn",
 ]

@@ -9,7 +9,11 @@ each sample the controller calls, in this order:
    exactly, not a sample late;
 3. ``commit`` with the u that was really applied.
 
-``restart`` is called where the loop starts anew from rest, ``coefficients`` where a run is recorded.
+``restart`` is called where the loop starts anew from rest, ``coefficients`` where a run is recorded, ``trouble`` after ``adapt``.
+
+A learner whose memory stands for something outside of it, a Python object say, also has ``outside``, the names of the fields that do so,
+``snapshot(memory)``, which returns copies of what they stand for by name, and ``recall(memory, snapshots)``, which puts copies of those in
+its place or says that they do not fit. The state that a controller shows has the snapshots instead of those fields.
 """
 
 from __future__ import annotations
@@ -67,6 +71,17 @@ def restart(learner: Any, memory: Any) -> None:
 def coefficients(learner: Any, memory: Any, theta: Vector) -> None:
     """Write θ into ``theta`` (p,), in the plant's units: ``f_L = θ · features``."""
     raise TypeError
+
+
+@generic
+def trouble(learner: Any, memory: Any) -> int:
+    """Return the ``Status`` flags that the learner has to add to the step's: none, unless it says otherwise."""
+    raise TypeError
+
+
+@trouble.register(object)
+def _no_trouble(learner: Any, memory: Any) -> int:
+    return 0
 
 
 class NoLearner:

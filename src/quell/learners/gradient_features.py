@@ -155,7 +155,7 @@ def _empty(memory: FeatureGradientMemory) -> None:
 
 
 @kernel
-def _show(learner: FeatureGradientDesign, memory: FeatureGradientMemory, seen: Vector, u: float, f_learned: float) -> None:
+def _show(learner: FeatureGradientDesign, memory: FeatureGradientMemory, seen: Vector, u: float) -> None:
     scale, shown = memory.scale, memory.shown
     for i in range(shown.size):
         shown[i] = seen[i] / scale[i]

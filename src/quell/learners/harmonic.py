@@ -11,6 +11,7 @@ from quell import checks
 from quell.learners.kalman import Kalman
 from quell.learners.oscillators import Oscillators
 from quell.observers.eso import ESO
+from quell.types import Vector
 
 # Where frequencies start by default, in omega_c: the next oscillator at this share of the one before.
 _SPREAD = 0.3
@@ -72,10 +73,11 @@ class Harmonic(Kalman):
             where a frequency starts outside of the limits.
         """
         low, high = (_LOWEST * omega_c, _HIGHEST * observer.omega_o) if self.limits is None else self.limits
-        start = omega_c * _SPREAD ** np.arange(self.count) if self.omegas is None else checks.vector("omegas", self.omegas)
         if self.omegas is None:
-            start = np.clip(start, low, high)
-        elif not np.all((low <= start) & (start <= high)):
+            start: Vector = np.asarray(np.clip(omega_c * _SPREAD ** np.arange(self.count), low, high), dtype=np.float64)
+        else:
+            start = checks.vector("omegas", self.omegas)
+        if not np.all((low <= start) & (start <= high)):
             raise ValueError(f"omegas = {self.omegas!r} rad/s: must lie within limits = ({low:g}, {high:g}) rad/s")
         follow = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
         return Oscillators(observer.order * self.state + self.bias, start, float(low), float(high)), (

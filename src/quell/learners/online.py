@@ -77,6 +77,21 @@ class OnlineMemory(NamedTuple):
     """What ``flat`` was before anything was learned."""
 
 
+@kernel
+def show(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, out: Vector) -> None:
+    """Write the features of the estimates ``seen`` and of ``u`` into ``out`` (p,), scaled."""
+    scale, scaled = memory.scale, memory.scaled
+    for i in range(scaled.size):
+        scaled[i] = clear_of_noise(learner.sight, memory.sight, i, seen[i]) / scale[i]
+    write(learner.features, scaled, clear_of_noise(learner.sight, memory.sight, scaled.size, u) / scale[scaled.size], out)
+
+
+@kernel
+def ready(learner: OnlineDesign, memory: OnlineMemory) -> bool:
+    """Return whether there are pairs to learn from yet, and something to predict."""
+    return bool(memory.place[_SINCE] > learner.watch + learner.delay + 1)
+
+
 @adapt.register(OnlineDesign)
 def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
     moves = look(learner.sight, memory.sight, seen, y, u_before)
@@ -84,7 +99,7 @@ def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, 
         return
     scale = memory.scale
     grow(learner.scaling, scale, seen, u_before, f_plain)
-    if memory.place[_SINCE] <= learner.watch + learner.delay + 1:
+    if not ready(learner, memory):
         return
     # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
     features, f_scale = memory.ring[min(max(int(memory.place[_ROW]), 0), learner.delay)], scale[scale.size - 1]
@@ -98,29 +113,20 @@ def _adapt(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, y: float, 
 
 @predict.register(OnlineDesign)
 def _predict(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u_before: float) -> tuple[float, float]:
-    if memory.place[_SINCE] <= learner.watch + learner.delay + 1:
+    if not ready(learner, memory):
         return 0.0, 0.0
     scale = memory.scale
-    _show(learner, memory, seen, u_before, memory.now)
+    show(learner, memory, seen, u_before, memory.now)
     return scale[scale.size - 1] * infer(learner.model, memory.model, memory.now) + memory.place[_LEFT], 0.0
 
 
 @commit.register(OnlineDesign)
 def _commit(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, f_learned: float) -> None:
     row = min(max(int(memory.place[_ROW]), 0), learner.delay)
-    _show(learner, memory, seen, u, memory.ring[row])
+    show(learner, memory, seen, u, memory.ring[row])
     row += 1
     memory.place[_ROW] = 0.0 if row > learner.delay else row
     memory.place[_SINCE] += 1.0
-
-
-@kernel
-def _show(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, out: Vector) -> None:
-    """Write the features of the state and u."""
-    scale, scaled = memory.scale, memory.scaled
-    for i in range(scaled.size):
-        scaled[i] = clear_of_noise(learner.sight, memory.sight, i, seen[i]) / scale[i]
-    write(learner.features, scaled, clear_of_noise(learner.sight, memory.sight, scaled.size, u) / scale[scaled.size], out)
 
 
 @restart.register(OnlineDesign)

@@ -1,14 +1,15 @@
 """Sinusoids whose frequency is not known: oscillators that are retuned while they learn.
 
-An oscillator turns its own phase, ``ψ' = ω̂``, and gives a learner the pair of features (sin ψ, cos ψ). A load ``A sin(ωt + φ)`` makes the learned
-pair θ = (θ_s, θ_c) a vector of length A; where ω̂ is wrong, it turns at ω − ω̂. So each update δθ of the pair retunes the oscillator by
-how much it turns:
+An oscillator turns its own phase, ``ψ' = ω̂``, and gives a learner the pair of features (sin ψ, cos ψ). A load ``A sin(ωt + φ)`` makes
+the learned pair θ = (θ_s, θ_c) a vector of length A; where ω̂ is wrong, it turns at ω − ω̂. So each update δθ of the pair retunes the
+oscillator by how much it turns:
 
     ω̂ ← ω̂ + κ ω̂ (θ_s δθ_c − θ_c δθ_s) / (|θ|² + c E[ε² + (0.1 f̂)²])
 
 Two things make it lock quickly and stay. The gain is relative to ω̂, as an oscillator learns at a rate in proportion to its frequency
-(its share of the bias's bandwidth, see ``kalman.py``): so the loop of phase and frequency is damped alike at all frequencies. And what is not yet
-explained, ε, counts against the turn: when a load comes on, θ swings round from wherever noise had left it, which says nothing about the frequency.
+(its share of the bias's bandwidth, see ``kalman.py``): so the loop of phase and frequency is damped alike at all frequencies. And what
+is not yet explained, ε, counts against the turn: when a load comes on, θ swings round from wherever noise had left it, which says
+nothing about the frequency.
 """
 
 from __future__ import annotations

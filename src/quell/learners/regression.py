@@ -175,7 +175,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
 
 
 @kernel
-def _show(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float, f_learned: float) -> None:
+def _show(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float) -> None:
     """Write the features of the state and u into ``memory.now``."""
     scale, shown = memory.scale, memory.shown
     for i in range(shown.size):

@@ -1,0 +1,9 @@
+"""Learners whose model is a Python object, of any library or of none."""
+
+from quell.learners.adapters.jax import JaxModel
+from quell.learners.adapters.python import PythonModel
+from quell.learners.adapters.river import RiverModel
+from quell.learners.adapters.sklearn import SklearnModel
+from quell.learners.adapters.torch import TorchModel
+
+__all__ = ["JaxModel", "PythonModel", "RiverModel", "SklearnModel", "TorchModel"]

@@ -1,0 +1,96 @@
+"""Equinox modules, trained by an optax optimiser, as learners."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Unpack
+
+import numpy as np
+
+from quell import checks
+from quell.learners.adapters.python import Options, PythonModel, needed
+from quell.types import Matrix, Vector
+
+
+class JaxModel(PythonModel):
+    """A learner whose model is an Equinox module, trained by gradient steps on the mean squared error of each batch.
+
+    The steps are compiled by JAX on the trial, before the loop runs.
+
+    Parameters
+    ----------
+    module
+        takes an array (p,) and returns a number, or an array (1,), for example
+        ``equinox.nn.MLP(2, "scalar", 16, 1, key=jax.random.key(0))``.
+    optimizer
+        an optax optimiser; ``optax.sgd(0.1)`` by default (``TorchModel`` says why not Adam).
+    steps
+        gradient steps on each batch.
+    **options
+        ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
+
+    Raises
+    ------
+    ImportError
+        where JAX, Equinox or optax is missing.
+    ValueError
+        for something that is no module or optimiser, and as ``PythonModel``.
+    """
+
+    def __init__(self, module: Any, optimizer: Any = None, *, steps: int = 1, **options: Unpack[Options]) -> None:
+        needed("jax", "jax")
+        equinox, optax = needed("equinox", "jax"), needed("optax", "jax")
+        if not (isinstance(module, equinox.Module) and callable(module)):
+            raise ValueError(f"module = {module!r}: must be an equinox.Module that can be called with an array (p,)")
+        optimizer = optax.sgd(0.1) if optimizer is None else optimizer
+        if not all(callable(getattr(optimizer, name, None)) for name in ("init", "update")):
+            raise ValueError(f"optimizer = {optimizer!r}: must be an optax optimiser, for example optax.sgd(0.1)")
+        self.name = type(module).__name__
+        self._set_up(_Module(module, optimizer, checks.whole("steps", steps, 1)), **options)
+
+    def _unwrapped(self, model: Any) -> Any:
+        return model.module
+
+
+class _Module:
+    def __init__(self, module: Any, optimizer: Any, steps: int) -> None:
+        equinox = needed("equinox", "jax")
+        self.module, self.optimizer, self.steps = module, optimizer, steps
+        self.moments = optimizer.init(equinox.filter(module, equinox.is_inexact_array))
+
+    def __deepcopy__(self, memo: Any) -> _Module:
+        # Arrays of JAX never change, so that a shallow copy is as good as a deep one.
+        other = object.__new__(_Module)
+        vars(other).update(vars(self))
+        return other
+
+    def learn(self, features: Matrix, targets: Vector) -> None:
+        step, _ = _compiled()
+        # JAX compiles for each shape: batches are filled up to a power of two with rows that do not count.
+        size = 1 << (len(targets) - 1).bit_length()
+        rows, wanted, weights = np.zeros((size, features.shape[1])), np.zeros(size), np.zeros(size)
+        rows[: len(targets)], wanted[: len(targets)], weights[: len(targets)] = features, targets, 1.0
+        for _ in range(self.steps):
+            self.module, self.moments = step(self.module, self.moments, self.optimizer, rows, wanted, weights)
+
+    def predict(self, features: Vector) -> Any:
+        return np.asarray(_compiled()[1](self.module, features))
+
+
+@functools.cache
+def _compiled() -> tuple[Any, Any]:
+    """Return a gradient step and a prediction; made when first used, as JAX takes a while to import."""
+    jax, equinox = needed("jax", "jax"), needed("equinox", "jax")
+
+    def loss(module: Any, rows: Any, wanted: Any, weights: Any) -> Any:
+        output = jax.vmap(module)(rows)
+        if output.shape not in (wanted.shape, (*wanted.shape, 1)):
+            raise ValueError(f"returned shape {output.shape[1:]} for a row: must be one number")
+        return (weights * (output.reshape(wanted.shape) - wanted) ** 2).sum() / weights.sum()
+
+    def step(module: Any, moments: Any, optimizer: Any, rows: Any, wanted: Any, weights: Any) -> Any:
+        gradient = equinox.filter_grad(loss)(module, rows, wanted, weights)
+        updates, moments = optimizer.update(gradient, moments, equinox.filter(module, equinox.is_inexact_array))
+        return equinox.apply_updates(module, updates), moments
+
+    return equinox.filter_jit(step), equinox.filter_jit(lambda module, features: module(features))

@@ -1,0 +1,48 @@
+"""River's regressors as learners."""
+
+from __future__ import annotations
+
+from typing import Any, Unpack
+
+from quell.learners.adapters.python import Options, PythonModel
+from quell.types import Matrix, Vector
+
+
+class RiverModel(PythonModel):
+    """A learner whose model is a river regressor or pipeline, or anything with ``learn_one`` and ``predict_one``.
+
+    Features are shown as a dictionary, by the numbers 0, 1, … of the features.
+
+    Parameters
+    ----------
+    regressor
+        for example ``river.preprocessing.StandardScaler() | river.linear_model.LinearRegression()``.
+    **options
+        ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
+
+    Raises
+    ------
+    ValueError
+        for a regressor without these methods, and as ``PythonModel``.
+    """
+
+    def __init__(self, regressor: Any, **options: Unpack[Options]) -> None:
+        if isinstance(regressor, type) or not all(callable(getattr(regressor, name, None)) for name in ("learn_one", "predict_one")):
+            raise ValueError(f"regressor = {regressor!r}: must have learn_one and predict_one, as river's regressors have")
+        self.name = type(regressor).__name__
+        self._set_up(_Regressor(regressor), **options)
+
+    def _unwrapped(self, model: Any) -> Any:
+        return model.regressor
+
+
+class _Regressor:
+    def __init__(self, regressor: Any) -> None:
+        self.regressor = regressor
+
+    def learn(self, features: Matrix, targets: Vector) -> None:
+        for row, target in zip(features.tolist(), targets.tolist(), strict=True):
+            self.regressor.learn_one(dict(enumerate(row)), target)
+
+    def predict(self, features: Vector) -> Any:
+        return self.regressor.predict_one(dict(enumerate(features.tolist())))

@@ -1,0 +1,55 @@
+"""Scikit-learn's incremental regressors as learners."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, Unpack
+
+from quell.learners.adapters.python import Options, PythonModel
+from quell.types import Matrix, Vector
+
+
+class SklearnModel(PythonModel):
+    """A learner whose model is a scikit-learn estimator, or anything with ``partial_fit`` and ``predict``.
+
+    Features and target come scaled, so that no scaler is needed. A ``random_state`` of None is set to 0 in the copy that learns: the same
+    seed shall give the same run.
+
+    Parameters
+    ----------
+    estimator
+        for example ``sklearn.linear_model.SGDRegressor()`` or ``sklearn.neural_network.MLPRegressor()``.
+    **options
+        ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
+
+    Raises
+    ------
+    ValueError
+        for an estimator that can't learn piece by piece, and as ``PythonModel``.
+    """
+
+    def __init__(self, estimator: Any, **options: Unpack[Options]) -> None:
+        if isinstance(estimator, type) or not all(callable(getattr(estimator, name, None)) for name in ("partial_fit", "predict")):
+            raise ValueError(
+                f"estimator = {estimator!r}: must have partial_fit and predict, as SGDRegressor and MLPRegressor have; "
+                "of a pipeline, give its last step: features come scaled"
+            )
+        self.name = type(estimator).__name__
+        self._set_up(_Estimator(estimator), **options)
+
+    def _unwrapped(self, model: Any) -> Any:
+        return model.estimator
+
+
+class _Estimator:
+    def __init__(self, estimator: Any) -> None:
+        self.estimator = copy.deepcopy(estimator)
+        parameters = estimator.get_params(deep=False) if hasattr(estimator, "get_params") else {}
+        if "random_state" in parameters and parameters["random_state"] is None:
+            self.estimator.set_params(random_state=0)
+
+    def learn(self, features: Matrix, targets: Vector) -> None:
+        self.estimator.partial_fit(features, targets)
+
+    def predict(self, features: Vector) -> Any:
+        return self.estimator.predict(features.reshape(1, -1))

@@ -1,0 +1,82 @@
+"""PyTorch modules as learners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Unpack
+
+from quell import checks
+from quell.learners.adapters.python import Options, PythonModel, needed
+from quell.types import Matrix, Vector
+
+
+class TorchModel(PythonModel):
+    """A learner whose model is a PyTorch module, trained by gradient steps on the mean squared error of each batch.
+
+    Parameters
+    ----------
+    module
+        takes a tensor (m, p) and returns one of shape (m, 1) or (m,), on the CPU.
+    optimizer
+        an optimiser on the module's own parameters, or a function that makes one of parameters, for example
+        ``functools.partial(torch.optim.SGD, lr=0.05)``; that with a learning rate of 0.1 by default. Pairs that follow each other
+        resemble each other, and an optimiser that takes long steps on small gradients (Adam at its usual rates) unlearns the rest.
+    steps
+        gradient steps on each batch.
+    **options
+        ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
+
+    Raises
+    ------
+    ImportError
+        where PyTorch is missing.
+    ValueError
+        for something that is no module or optimiser, and as ``PythonModel``.
+    """
+
+    def __init__(self, module: Any, optimizer: Callable[[Any], Any] | Any = None, *, steps: int = 1, **options: Unpack[Options]) -> None:
+        torch = needed("torch", "torch")
+        if not isinstance(module, torch.nn.Module):
+            raise ValueError(f"module = {module!r}: must be a torch.nn.Module")
+        parameters = list(module.parameters())
+        if not parameters:
+            raise ValueError(f"module = {module!r}: must have parameters to train")
+        if optimizer is None:
+            optimizer = torch.optim.SGD(parameters, lr=0.1)
+        elif not isinstance(optimizer, torch.optim.Optimizer) and callable(optimizer):
+            optimizer = optimizer(parameters)
+        if not isinstance(optimizer, torch.optim.Optimizer):
+            raise ValueError(f"optimizer = {optimizer!r}: must be a torch optimiser, or a function that makes one of parameters")
+        own = {id(parameter) for parameter in parameters}
+        if any(id(parameter) not in own for group in optimizer.param_groups for parameter in group["params"]):
+            raise ValueError("optimizer: must be on the parameters of the module; make it of module.parameters()")
+        self.name = type(module).__name__
+        self._set_up(_Module(module, optimizer, checks.whole("steps", steps, 1)), **options)
+
+    def _unwrapped(self, model: Any) -> Any:
+        return model.module.eval()
+
+
+class _Module:
+    # Module and optimiser are copied together, so that the copy of one has the parameters of the copy of the other.
+    def __init__(self, module: Any, optimizer: Any, steps: int) -> None:
+        self.module, self.optimizer, self.steps = module, optimizer, steps
+        self.kind = next(module.parameters()).dtype
+
+    def learn(self, features: Matrix, targets: Vector) -> None:
+        torch = needed("torch", "torch")
+        rows, wanted = (torch.from_numpy(array).to(self.kind) for array in (features, targets))
+        self.module.train()
+        for _ in range(self.steps):
+            self.optimizer.zero_grad()
+            output = self.module(rows)
+            if tuple(output.shape) not in ((len(wanted), 1), (len(wanted),)):
+                raise ValueError(f"returned shape {tuple(output.shape)} for {len(wanted)} rows: must be one number for each")
+            torch.nn.functional.mse_loss(output.reshape(-1), wanted).backward()
+            self.optimizer.step()
+
+    def predict(self, features: Vector) -> Any:
+        torch = needed("torch", "torch")
+        self.module.eval()
+        with torch.no_grad():
+            return self.module(torch.from_numpy(features.reshape(1, -1)).to(self.kind)).numpy()
