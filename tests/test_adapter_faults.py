@@ -72,17 +72,17 @@ def test_a_model_starts_anew_after_a_failure_and_is_left_alone_after_three_in_a_
     """One that fails at its sixth call each time goes on for ever; one that always fails is asked three times."""
     again, never = PythonModel(Broken(5, math.nan)), PythonModel(Broken(2, math.nan))
     with pytest.warns(RuntimeWarning):
-        run = ql.simulate(CHAIN, law(again), ql.Scenario(duration=10.0))
+        run = ql.simulate(CHAIN, law(again), ql.Scenario(ql.signals.Sinusoid(), duration=10.0))
     assert "left alone" not in again.last_problem
     assert run["status"][-1] in (0, Status.LEARNER_FAILED, Status.LEARNER_FAILED | Status.OVERFLOWED)
 
     controller = law(never)  # tried, and found good
     never._source.well = 0
     with pytest.warns(RuntimeWarning) as told:
-        run = ql.simulate(CHAIN, controller, ql.Scenario(reference=1.0, duration=20.0))
+        run = ql.simulate(CHAIN, controller, ql.Scenario(ql.signals.Sinusoid(), duration=20.0))
     assert ["left alone" in str(warning.message) for warning in told] == [False, True]
     assert Status(int(run["status"][-1])) == Status.LEARNER_FAILED
-    assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
+    assert np.max(np.abs(run["y"])) < 2.0
     np.testing.assert_array_equal(run["f_learned"][-1000:], 0.0)
 
 
@@ -113,7 +113,7 @@ class Model:
 warnings.simplefilter("ignore")
 controller = ql.ADRC(ql.ESO.model_free(2, 1.0, 15.0, 5e-3), 4.0, learner=ql.learners.PythonModel(Model()))
 try:
-    ql.simulate(ql.plants.LinearPlant([[0, 1], [0, 0]], [0, 1], [1, 0]), controller, ql.Scenario(1.0, 1e5), record_every=1000)
+    ql.simulate(ql.plants.LinearPlant([[0, 1], [0, 0]], [0, 1], [1, 0]), controller, ql.Scenario(ql.signals.Sinusoid(), 1e5), record_every=1000)
     time.sleep(60.0)
 except KeyboardInterrupt:
     print("interrupted")

@@ -75,12 +75,12 @@ def test_the_model_is_called_once_a_period_with_all_pairs_since() -> None:
     """The first call has one pair, each other a period's."""
     for period in (1, 7):
         learner = PythonModel(Counter(), period=period)
-        run = ql.simulate(CHAIN, law(learner), ql.Scenario(reference=1.0, duration=3.0))
+        run = ql.simulate(CHAIN, law(learner), ql.Scenario(reference=ql.signals.Sinusoid(), duration=3.0))
         batches = learner.trained(run.final_state.learner).batches
         assert set(batches[1:]) == {period}
         assert batches[0] == 1
         design = learner.design(OBSERVER, 4.0)
-        assert len(batches) == math.ceil((len(run) - 1 - design.online.watch - design.online.delay) / period)
+        assert len(batches) == math.ceil((len(run) - 2 - design.online.watch - design.online.delay) / period)
         assert len(np.unique(run["f_learned"])) <= len(batches) + 1
 
 

@@ -66,6 +66,38 @@ def two_mass(
     reproduce_two_mass(dt=dt, seed=seed, omega_o=omega_o, reset=reset, json_file=json, figures=figures)
 
 
+@app.command(name="stress")
+def stress(
+    *,
+    runs: Annotated[int, Parameter(converter=_whole)] = 600,
+    honest: Annotated[int, Parameter(converter=_whole)] = 100,
+    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    guard: bool = True,
+    json: Annotated[Path | None, Parameter(name="--json")] = None,
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+) -> None:
+    """Put the guard on trial: hostile learners and an honest one in random loops, each beside plain MF-ESO.
+
+    Parameters
+    ----------
+    runs
+        How many runs with hostile learners, all kinds in turn.
+    honest
+        How many runs with the honest learner.
+    seed
+        Seed of all that is random.
+    guard
+        With the guard, or without, to see what it is good for.
+    json
+        Write all results to this file, for programs.
+    figures
+        Put the figure into this folder, as PNG and SVG.
+    """
+    from quell.commands.stress import run_stress
+
+    run_stress(runs=runs, honest=honest, seed=seed, guarded=guard, json_file=json, figures=figures)
+
+
 def main() -> None:
     """Run the command line; a mistake in what was asked gives one line and exit code 2."""
     try:

@@ -16,11 +16,11 @@ averaged over T seconds in which something happens:
 with e the usual size of q. The share of the plain ESO's error that the learner would have removed,
 ``η = (2 m_qp − m_pp) / m_qq``, decides:
 
-    β = min( clip((η − 0.1) / 0.2, 0, 1),  1.2 m_qq / m_pp )
+    β = min( clip(η / 0.2, 0, 1),  1.2 m_qq / m_pp )
 
 The second term is for learners that say the right thing too loud, which makes a loop's gain exceed one and is dangerous though η
 is positive. A learner starts, and starts again after it was cut off, with the record of one that has nothing to do with f: it has to be
-right for about 0.8 T, unheard, before it is heard in full.
+right for 0.7 T, unheard, before it is heard at all, and for 0.8 T to be heard in full.
 
 *No sample is trusted.* ``f − f^F`` has the size e, so whatever is further from f_plain than that is not f:
 
@@ -44,14 +44,14 @@ from quell.learners.lag import Lag, lag_of, lag_push
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
-# Averages are taken over so many lags N/omega_o of the observer: 10 s in the two-mass study.
-_AVERAGE = 20.0
+# Averages are taken over so many lags N/omega_o of the observer: 15 s in the two-mass study.
+_AVERAGE = 30.0
 # The usual size of q follows within two lags where it grows, and is remembered for 200.
 _ATTACK, _MEMORY = 2.0, 200.0
 # Samples below this share of the usual size count less: they are noise.
 _QUIET = 0.4
-# A learner is heard from this explained share on, and fully from that on.
-_HEARD, _TRUSTED = 0.1, 0.3
+# A learner is fully heard from this explained share on.
+_TRUSTED = 0.2
 # It may have so much more energy than what it should explain.
 _LOUD = 1.2
 # Outside of the bound it fades to nothing at so many times the bound.
@@ -264,7 +264,7 @@ def _authority(record: Vector) -> tuple[float, int]:
     if not record[_QQ] > _TINY:
         return 0.0, _UNPROVEN
     explained = (2.0 * record[_QP] - record[_PP]) / record[_QQ]
-    heard = (explained - _HEARD) / (_TRUSTED - _HEARD)
+    heard = explained / _TRUSTED
     if heard <= 0.0:
         return 0.0, _UNPROVEN
     quiet = _LOUD * record[_QQ] / record[_PP]  # what explains something has m_pp > 0
@@ -314,7 +314,7 @@ class Guard:
     bound
         how far from the plain observer's estimate a learner's output may be, in units of the usual error of that estimate: κ.
     time
-        over how long a learner's record is averaged, T [s]; by default 20 lags ``(n + 1)/omega_o`` of the observer.
+        over how long a learner's record is averaged, T [s]; by default 30 lags ``(n + 1)/omega_o`` of the observer.
 
     Raises
     ------
@@ -322,7 +322,7 @@ class Guard:
         for a parameter that is not positive.
     """
 
-    bound: float = 1.25
+    bound: float = 1.0
     time: float | None = None
 
     def __post_init__(self) -> None:

@@ -1,5 +1,5 @@
-"""Published experiments, run again and judged: one module for each."""
+"""Published experiments, run again and judged, and trials of our own: one module for each."""
 
-from quell.experiments import gradient_range, two_mass_spring, two_mass_study
+from quell.experiments import adversaries, gradient_range, random_loops, stress, two_mass_spring, two_mass_study
 
-__all__ = ["gradient_range", "two_mass_spring", "two_mass_study"]
+__all__ = ["adversaries", "gradient_range", "random_loops", "stress", "two_mass_spring", "two_mass_study"]

@@ -7,36 +7,28 @@ One type for all, so that a trial compiles once; ``kind`` says which. Algorithm 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell import checks
 from quell.dispatch import kernel
+from quell.learners import BatchGradient, Harmonic, Kalman, Learner
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.observers.eso import ESO
 from quell.types import Vector
 
-KINDS = (
-    "multiple of the estimate",
-    "white noise",
-    "constant",
-    "exponential",
-    "delayed estimate",
-    "minus u",
-    "flipping sign",
-    "bursts of NaN",
-    "bursts of Inf",
-    "random features",
-    "multiple of the plain estimate",
-)
-_MULTIPLE, _WHITE, _CONSTANT, _EXPONENTIAL, _DELAYED, _MINUS_U, _FLIPPING, _NAN, _INF, _FEATURES, _PLAIN = range(11)
+# What an ``Adversary`` does.
+MULTIPLE, WHITE, CONSTANT, EXPONENTIAL, DELAYED, MINUS_U, FLIPPING, NAN, INF, FEATURES, PLAIN = range(11)
 
 
 class AdversaryDesign(NamedTuple):
     """Parameters of an adversary."""
 
     kind: int
+    """What it does."""
     size: float
     """A factor, a standard deviation or an amplitude."""
     time: float
@@ -89,25 +81,25 @@ def _predict(learner: AdversaryDesign, memory: AdversaryMemory, seen: Vector, u_
     n = seen.size - 1
     f_hat = seen[n] + moment[_F_L]
     out = 0.0
-    if kind == _MULTIPLE:
+    if kind == MULTIPLE:
         out = size * f_hat
-    elif kind == _PLAIN:
+    elif kind == PLAIN:
         out = size * moment[_F_PLAIN]
-    elif kind == _WHITE:
+    elif kind == WHITE:
         out = size * normal(memory.dice)
-    elif kind == _CONSTANT:
+    elif kind == CONSTANT:
         out = size
-    elif kind == _EXPONENTIAL:
+    elif kind == EXPONENTIAL:
         out = size * math.exp(min(moment[_COUNT] / learner.time, 600.0))
-    elif kind == _DELAYED:
+    elif kind == DELAYED:
         out = size * memory.ring[int(moment[_AT])]
-    elif kind == _MINUS_U:
+    elif kind == MINUS_U:
         out = -size * u_before
-    elif kind == _FLIPPING:
+    elif kind == FLIPPING:
         out = size * moment[_SIGN] * f_hat
-    elif kind == _NAN:
+    elif kind == NAN:
         out = size * f_hat if moment[_SIGN] > 0.0 else math.nan
-    elif kind == _INF:
+    elif kind == INF:
         out = size * f_hat if moment[_SIGN] > 0.0 else math.inf
     else:
         out = learner.weights[n] * u_before + learner.weights[n + 1]
@@ -136,7 +128,27 @@ def _coefficients(learner: AdversaryDesign, memory: AdversaryMemory, theta: Vect
 
 @dataclass(frozen=True)
 class Adversary:
-    """One adversary; sizes of f are in [y-unit/s^n], times in seconds."""
+    """A learner that returns what its kind says, f̂ = Δf̂ + f_L being the total estimate.
+
+    ``MULTIPLE``
+        ``size · f̂``; ``PLAIN`` the same multiple of what an ESO without learner would have estimated.
+    ``WHITE``
+        white noise of standard deviation ``size``.
+    ``CONSTANT``
+        ``size``.
+    ``EXPONENTIAL``
+        ``size · exp(t/time)``.
+    ``DELAYED``
+        ``size · f̂``, ``delay`` samples late.
+    ``MINUS_U``
+        ``−size · b0 u``.
+    ``FLIPPING``
+        ``± size · f̂``, the sign changing at random times, ``time`` seconds apart on average.
+    ``NAN``, ``INF``
+        ``size · f̂``, and NaN or Inf in bursts that begin and end at random times.
+    ``FEATURES``
+        ``weights · (x̂_1 … x̂_n, u, 1)``.
+    """
 
     kind: int
     size: float = 1.0
@@ -150,7 +162,7 @@ class Adversary:
         n = observer.order
         weights = np.zeros(n + 2)
         weights[: len(self.weights)] = self.weights
-        size = self.size * (observer.b0 if self.kind == _MINUS_U else 1.0)
+        size = self.size * (observer.b0 if self.kind == MINUS_U else 1.0)
         return AdversaryDesign(self.kind, size, self.time / observer.dt, weights, self.delay)
 
     def memory(self, parameters: AdversaryDesign) -> AdversaryMemory:
@@ -228,3 +240,42 @@ class Turncoat:
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return no names."""
         return ()
+
+
+# Kinds of adversaries for a trial, and how to draw one.
+_DRAWS: dict[str, Callable[[np.random.Generator], Learner]] = {
+    "opposite sign": lambda rng: Adversary(MULTIPLE, -_log_uniform(rng, 0.1, 10.0)),
+    "over-prediction": lambda rng: Adversary(int(rng.choice([MULTIPLE, PLAIN])), float(rng.uniform(1.5, 10.0))),
+    "white noise": lambda rng: Adversary(WHITE, _log_uniform(rng, 1e-2, 1e3), seed=_seed(rng)),
+    "constant": lambda rng: Adversary(CONSTANT, _sign(rng) * _log_uniform(rng, 0.1, 1e3)),
+    "exponential": lambda rng: Adversary(EXPONENTIAL, _sign(rng) * _log_uniform(rng, 1e-3, 1.0), float(rng.uniform(1.0, 30.0))),
+    "delay": lambda rng: Adversary(DELAYED, float(rng.uniform(0.5, 1.5)), delay=round(_log_uniform(rng, 1.0, 5000.0))),
+    "minus u": lambda rng: Adversary(MINUS_U, float(rng.uniform(0.3, 2.0))),
+    "sign flips": lambda rng: Adversary(FLIPPING, float(rng.uniform(0.5, 2.0)), _log_uniform(rng, 0.1, 20.0), seed=_seed(rng)),
+    "NaN and Inf": lambda rng: Adversary(
+        int(rng.choice([NAN, INF])), float(rng.uniform(0.5, 1.2)), _log_uniform(rng, 0.05, 30.0), seed=_seed(rng)
+    ),
+    "Algorithm 1": lambda rng: BatchGradient(_log_uniform(rng, 1e-7, 1.0)),
+    "turncoat": lambda rng: Turncoat(
+        Kalman() if rng.random() < 0.5 else Harmonic(), float(rng.uniform(20.0, 130.0)), float(rng.choice([-3.0, -1.0, 1.5, 3.0, 10.0]))
+    ),
+    "random features": lambda rng: Adversary(FEATURES, weights=tuple((rng.normal(size=6) * _log_uniform(rng, 0.1, 10.0)).tolist())),
+}
+KINDS = tuple(_DRAWS)
+
+
+def draw(kind: str, rng: np.random.Generator) -> Learner:
+    """Return a random adversary of a kind."""
+    return _DRAWS[checks.one_of("kind", kind, KINDS)](rng)
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _sign(rng: np.random.Generator) -> float:
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(1, 2**31 - 1))

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from quell.experiments import two_mass_spring as setting
+from quell.experiments.parallel import in_parallel
 from quell.learners import BatchGradient
 from quell.plants import two_mass_spring
 from quell.simulation import simulate
@@ -52,7 +53,7 @@ def trials(settings: setting.Settings, tell: Callable[[str, float], None], rates
     done = []
     for i in range(0, len(cases), len(rates)):
         tell("learning rates", i / len(cases))
-        done += setting.in_parallel([partial(trial, *case) for case in cases[i : i + len(rates)]])
+        done += in_parallel([partial(trial, *case) for case in cases[i : i + len(rates)]])
     tell("learning rates", 1.0)
     return tuple(done)
 

@@ -20,6 +20,7 @@ from quell.signals import BandLimitedNoise, Sinusoid, Step
 from quell.simulation import Scenario
 
 STEP_AT, LOAD_AT, END = 60.0, 90.0, 150.0
+REFERENCE = Sinusoid().until(STEP_AT, then=Step(at=STEP_AT))
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Loop:
     def scenario(self) -> Scenario:
         """What happens to it."""
         return Scenario(
-            reference=Sinusoid().until(STEP_AT, then=Step(at=STEP_AT)),
+            reference=REFERENCE,
             disturbances=(0.0, Sinusoid(self.amplitude, self.omega, start=LOAD_AT)),
             noise=BandLimitedNoise(power=1e-12, sample_time=0.01),
             duration=END,
@@ -61,9 +62,8 @@ class Loop:
         return ADRC(ESO.model_free(order=4, b0=b0, omega_o=10.0, dt=self.dt), omega_c=1.0, learner=learner, guard=guard)
 
 
-def draw(count: int, seed: int) -> list[Loop]:
+def draw(count: int, rng: np.random.Generator) -> list[Loop]:
     """Return ``count`` random loops."""
-    rng = np.random.default_rng(seed)
     return [
         Loop(
             m1=rng.uniform(0.5, 2.0),

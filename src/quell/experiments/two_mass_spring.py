@@ -9,11 +9,7 @@ says how that was found.
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 from quell import checks, metrics
 from quell.controllers import ADRC
@@ -144,12 +140,6 @@ def score(run: Trajectory) -> dict[str, float | None]:
             "rms_from_step": metrics.rms(error[stepped]),
         }
     return found
-
-
-def in_parallel(jobs: Iterable[Callable[[], Any]]) -> list[Any]:
-    """Run independent simulations on all cores; compiled loops release the interpreter."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return [future.result() for future in [pool.submit(job) for job in jobs]]
 
 
 def quick_run(settings: Settings, candidate: ADRC) -> Trajectory:

@@ -14,6 +14,7 @@ from quell import metrics
 from quell.experiments import gradient_range
 from quell.experiments.claims import Claim
 from quell.experiments.gradient_range import Trial
+from quell.experiments.parallel import in_parallel
 from quell.experiments.two_mass_spring import (
     BAND,
     FORCE_WINDOW,
@@ -28,7 +29,6 @@ from quell.experiments.two_mass_spring import (
     controller,
     controllers,
     gradient_rate,
-    in_parallel,
     quick_run,
     scenario,
     score,
