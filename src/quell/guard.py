@@ -20,7 +20,7 @@ with e the usual size of q. The share of the plain ESO's error that the learner 
 
 The second term is for learners that say the right thing too loud, which makes a loop's gain exceed one and is dangerous though η
 is positive. A learner starts, and starts again after it was cut off, with the record of one that has nothing to do with f: it has to be
-right for 0.7 T, unheard, before it is heard at all, and for 0.8 T to be heard in full.
+right for 0.7 T, unheard, before it is heard at all, and for 0.9 T to be heard in full.
 
 *No sample is trusted.* ``f − f^F`` has the size e, so whatever is further from f_plain than that is not f:
 
