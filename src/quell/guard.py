@@ -322,7 +322,7 @@ class Guard:
         for a parameter that is not positive.
     """
 
-    bound: float = 1.0
+    bound: float = 1.2
     time: float | None = None
 
     def __post_init__(self) -> None:
