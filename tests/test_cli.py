@@ -45,6 +45,21 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
 
 
+def test_the_guards_trial_is_printed_written_and_drawn(tmp_path: Path) -> None:
+    """A table a line a kind, JSON, and a figure as PNG and SVG; without a terminal."""
+    shown = quell("stress", "--runs", "12", "--honest", "2", "--seed", "4", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    assert all(kind in shown.stdout for kind in ("opposite sign", "turncoat", "all adversaries", "honest"))
+    assert "…" not in shown.stdout, "a column is cut"
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["settings"]["seed"] == 4
+    assert result["adversarial"]["unstable_where_plain_is_stable"] == 0
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {"stress.png", "stress.svg"}
+    wrong = quell("stress", "--runs", "-3", cwd=tmp_path)
+    assert wrong.returncode == 2
+    assert wrong.stderr.strip() == "quell: runs = -3: must be a whole number from 0 to 1000000"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -26,7 +26,8 @@ right for 0.7 T, unheard, before it is heard at all, and for 0.9 T to be heard i
 
     held = g clipped to f_plain ± κe, and faded to zero between κe and 3κe from it,        f_L = β held
 
-and f_L moves by 2 omega_o e a second at most. What is not finite, or a hundred times larger than f, is cut off within the sample.
+and f_L moves by 2 omega_o e a second at most, unless the bound itself moves it. What is not finite, or a hundred times larger than
+f, is cut off within the sample.
 """
 
 from __future__ import annotations
@@ -192,7 +193,7 @@ class GuardMemory(NamedTuple):
     record: Vector
     """(5,): m_qq, m_qp, m_pp; mean squares of q and of q − p [(y-unit/s^n)²]."""
     moment: Vector
-    """(5,): authority, usual size of q, g of the sample, f_L permitted last, reason."""
+    """(5,): authority, usual size of q, g of the sample, the last f_L, reason."""
 
 
 # Places in GuardMemory.
@@ -233,7 +234,7 @@ def _permit(
     if not (abs(output) <= most and is_finite(slope)):
         finite = is_finite(output) and is_finite(slope)
         moment[_OUTPUT] = min(max(output, -most), most) if finite else 0.0
-        moment[_AUTHORITY] = moment[_LAST] = 0.0
+        moment[_AUTHORITY] = 0.0
         moment[_REASON] = _EXPLODED if finite else _NOT_FINITE
         _distrust(record)
         return 0.0, 0.0, not finite
@@ -248,10 +249,10 @@ def _permit(
         held = min(max(output, f_plain - bound), f_plain + bound) * max(_FADE - away / max(bound, _TINY), 0.0) / (_FADE - 1.0)
     wished, change = authority * held, guard.fastest * moment[_USUAL]
     permitted = min(max(wished, moment[_LAST] - change), moment[_LAST] + change)
+    permitted = min(max(permitted, min(f_plain - bound, 0.0)), max(f_plain + bound, 0.0))
     steady = permitted == wished
     if not steady:
         reason = _TOO_FAST
-    moment[_LAST] = permitted
     moment[_REASON] = reason
     if inside and steady and guard.least_slope <= authority * slope <= guard.largest_slope:
         return authority * constant, authority * slope, False
@@ -283,6 +284,7 @@ def _distrust(record: Vector) -> None:
 @note.register(GuardDesign)
 def _note(guard: GuardDesign, memory: GuardMemory, u: float, f_learned: float) -> None:
     memory.shown[_G] = lag_push(guard.lag, memory.chain, _G, memory.moment[_OUTPUT])
+    memory.moment[_LAST] = f_learned
 
 
 @explain.register(GuardDesign)

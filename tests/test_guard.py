@@ -1,0 +1,227 @@
+"""The guard: what it knows is exact, what it permits is bounded, and who is heard has earned it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.experiments.adversaries import (
+    CONSTANT,
+    DELAYED,
+    EXPONENTIAL,
+    FEATURES,
+    INF,
+    MINUS_U,
+    MULTIPLE,
+    NAN,
+    PLAIN,
+    WHITE,
+    Adversary,
+    Turncoat,
+)
+from quell.experiments.random_loops import Loop
+from quell.guard import note, permit, watch
+from quell.learners.lag import lag_of, lag_push
+from quell.types import Status
+
+LOOP = Loop(m1=0.8, m2=1.3, k=1.4, gain_error=1.2, dt=5e-3, omega=0.5, amplitude=1.0, seed=4)
+PLANT = ql.plants.two_mass_spring()
+OBSERVER = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=5e-3)
+HOSTILE = {
+    "opposite sign": Adversary(MULTIPLE, -3.0),
+    "over-prediction": Adversary(MULTIPLE, 1.5),
+    "gross over-prediction": Adversary(PLAIN, 10.0),
+    "white noise": Adversary(WHITE, 100.0),
+    "a constant": Adversary(CONSTANT, 50.0),
+    "an exponential": Adversary(EXPONENTIAL, 0.01, time=3.0),
+    "a delay": Adversary(DELAYED, 1.0, delay=100),
+    "minus u": Adversary(MINUS_U, 1.0),
+    "a feature of its own": Adversary(FEATURES, weights=(-5.0, 0.0, 0.0, 10.0)),
+    "NaN": Adversary(NAN, 1.0, time=5.0),
+    "Inf": Adversary(INF, 1.0, time=5.0),
+    "Algorithm 1, fast": ql.learners.BatchGradient(1e-2),
+    "a turncoat": Turncoat(ql.learners.Kalman(), 95.0, -3.0),
+}
+
+
+def law(learner: object, guard: ql.Guard | None = None) -> ql.ADRC:
+    """The two-mass loop with a learner."""
+    return ql.ADRC(OBSERVER, omega_c=1.0, learner=learner, guard=guard)
+
+
+def error(run: ql.Trajectory) -> float:
+    """RMS of y − 1 under load."""
+    part = run.window(90.0, 150.1)
+    return float(np.sqrt(np.mean((run["y"][part] - 1.0) ** 2)))
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_learner_does_no_harm(name: str) -> None:
+    """The loop is about as good as MF-ESO under load, whatever the learner says."""
+    every = round(0.02 / LOOP.dt)
+    plain = ql.simulate(LOOP.plant, LOOP.controller(), LOOP.scenario, record_every=every)
+    run = ql.simulate(LOOP.plant, LOOP.controller(HOSTILE[name], ql.Guard()), LOOP.scenario, record_every=every)
+    assert not run.diverged
+    assert error(run) <= 1.1 * error(plain)
+
+
+def test_an_honest_learner_is_heard() -> None:
+    """It has full authority once it has proved itself, and nothing is lost to having no guard."""
+    every = round(0.02 / LOOP.dt)
+    plain, free, guarded = (
+        ql.simulate(LOOP.plant, LOOP.controller(learner, guard), LOOP.scenario, record_every=every)
+        for learner, guard in ((None, None), (ql.learners.Harmonic(), None), (ql.learners.Harmonic(), ql.Guard()))
+    )
+    assert guarded["authority"][0] == 0.0
+    assert guarded["authority"][guarded.window(140.0, 150.0)].min() > 0.99
+    assert error(guarded) < 0.3 * error(plain)
+    assert error(guarded) < 2.0 * error(free) + 0.01 * error(plain)
+
+
+def test_a_learner_without_authority_leaves_the_loop_as_it_is_without() -> None:
+    """Not about: to the bit."""
+    scenario = dataclasses.replace(LOOP.scenario, duration=20.0)
+    silenced = ql.simulate(LOOP.plant, LOOP.controller(Adversary(MULTIPLE, -1.0), ql.Guard()), scenario)
+    plain = ql.simulate(LOOP.plant, LOOP.controller(), scenario)
+    assert np.all(silenced["authority"] == 0.0)
+    np.testing.assert_array_equal(silenced["u"], plain["u"])
+
+
+def test_what_is_permitted_lies_within_its_bounds(rng: np.random.Generator) -> None:
+    """Within κe of the plain estimate or nearer to zero, and no faster than 2 ω_o e a second inside, whatever comes."""
+    design = ql.Guard(bound=0.8).design(OBSERVER)
+    memory = ql.Guard(bound=0.8).memory(design)
+    f_plain = last = 0.0
+    heard = 0
+    for k in range(20_000):
+        f_plain += 0.05 * rng.normal() - 0.01 * f_plain
+        watch(design, memory, f_plain)
+        wild = rng.random() < 0.3
+        constant = f_plain + rng.normal() * (10.0 ** rng.uniform(-3.0, 6.0) if wild else 0.05)
+        memory.record[:3] = 0.5  # the record of one that is always right
+        permitted, slope, cut_off = permit(design, memory, f_plain, constant, 0.0, 0.0)
+        e, exploded = memory.moment[1], memory.moment[4] == ql.Reason.EXPLODED
+        low, high = min(f_plain - 0.8 * e, 0.0), max(f_plain + 0.8 * e, 0.0)
+        assert slope == 0.0
+        assert not cut_off
+        assert low <= permitted <= high, k
+        fast = abs(permitted - last) > 2.0 * OBSERVER.omega_o * OBSERVER.dt * e * (1.0 + 1e-9)
+        assert not fast or exploded or permitted in (low, high), k
+        note(design, memory, 0.0, permitted)
+        last = permitted
+        heard += permitted != 0.0
+    assert heard > 5000, "hardly anything was permitted: the test says nothing"
+
+
+def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
+    """The guard's q is (1 − F) of the plain estimate, and for a perfect learner p = q: all is explained."""
+    guard = ql.Guard(time=2.0)
+    design = guard.design(OBSERVER)
+    memory = guard.memory(design)
+    lag = lag_of(OBSERVER)
+    chain, shown = np.zeros((1, 5)), 0.0
+    for k in range(12_000):
+        f = math.sin(0.7 * k * OBSERVER.dt)
+        watch(design, memory, shown)
+        permit(design, memory, shown, f, 0.0, 0.0)
+        note(design, memory, 0.0, f)
+        shown = lag_push(lag, chain, 0, f)
+    qq, qp, pp = memory.record[:3]
+    assert qp == pytest.approx(qq, rel=1e-6)
+    assert pp == pytest.approx(qq, rel=1e-6)
+    assert memory.moment[0] == 1.0
+    assert memory.record[4] == pytest.approx(0.0, abs=1e-9)
+    # |q| of a sinusoid: |F (1 − F)| at 0.7 rad/s, with F = (1 + s/10)^-5.
+    response = (1.0 + 0.07j) ** -5
+    assert memory.moment[1] == pytest.approx(abs(response * (1.0 - response)), rel=0.1)
+
+
+def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() -> None:
+    """After a NaN it is unheard for as long as at the start, though it is right all the time."""
+    design = ql.Guard(time=2.0).design(OBSERVER)
+    memory = ql.Guard(time=2.0).memory(design)
+    chain, shown, heard = np.zeros((1, 5)), 0.0, []
+    for k in range(6000):
+        f = math.sin(0.7 * k * OBSERVER.dt)
+        watch(design, memory, shown)
+        said = math.nan if k == 3000 else f
+        kept, slope, cut_off = permit(design, memory, shown, said, 0.0, 0.0)
+        assert cut_off == (k == 3000)
+        if k == 3000:
+            assert (kept, slope) == (0.0, 0.0)
+            assert ql.Reason(int(memory.moment[4])) == ql.Reason.NOT_FINITE
+        note(design, memory, 0.0, kept)
+        heard.append(memory.moment[0] > 0.0)
+        shown = lag_push(design.lag, chain, 0, f)
+    again = 3000 + heard[3001:].index(True)
+    assert heard[2999]
+    assert 0.5 < (again - 3000) * OBSERVER.dt / (2.0 * math.log(2.0)) < 2.0
+
+
+def test_status_and_reason_say_what_happened() -> None:
+    """On the estimate, in the record and in its picture."""
+    controller = law(Adversary(NAN, 1.0, time=2.0), ql.Guard())
+    flags, reasons = Status.OK, set()
+    for k in range(3000):
+        controller.step(math.sin(0.005 * k), 0.5 * math.sin(0.005 * k - 0.4))
+        flags |= controller.estimate.status
+        reasons.add(controller.estimate.reason)
+    assert Status.LEARNER_CUT in flags
+    assert "began anew" in flags.message
+    assert {ql.Reason.NOT_FINITE, ql.Reason.UNPROVEN} <= reasons
+    assert all(reason.message.endswith(".") for reason in ql.Reason)
+    assert controller.estimate.error_plain > 0.0
+    assert math.isfinite(controller.estimate.error_learned)
+    run = ql.simulate(PLANT, controller, ql.Scenario(ql.signals.Sinusoid(), 20.0))
+    assert Status.LEARNER_CUT in run.status
+    assert {"authority", "error_plain", "error_learned", "reason"} <= set(run.names)
+    assert run.to_xarray()["error_plain"].attrs["units"] == "y-unit/s^n"
+    axes = run.plot()
+    assert len(axes) == 4
+    assert "not finite" in axes[3].get_legend_handles_labels()[1]
+
+
+def test_without_a_guard_nothing_is_said_of_it() -> None:
+    """A learner has all authority then."""
+    run = ql.simulate(PLANT, law(ql.learners.Kalman()), ql.Scenario(1.0, 1.0))
+    assert "authority" not in run.names
+    assert law(ql.learners.Kalman()).estimate.authority == 1.0
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_the_unit_of_y_does_not_matter_to_the_guard(unit: float) -> None:
+    """In micrometres or megametres the same authority is given."""
+    found = []
+    for size in (1.0, unit):
+        plant = ql.plants.two_mass_spring(c2=size)
+        observer = ql.ESO.model_free(order=4, b0=size, omega_o=10.0, dt=5e-3)
+        controller = ql.ADRC(observer, 1.0, learner=ql.learners.Kalman(), guard=ql.Guard())
+        scenario = ql.Scenario(size * ql.signals.Sinusoid(), 40.0, noise=ql.signals.BandLimitedNoise(1e-12 * size**2, 0.01))
+        found.append(ql.simulate(plant, controller, scenario, limit=1e9)["authority"])
+    np.testing.assert_allclose(found[0], found[1], atol=1e-3)
+    assert found[0][-1] == 1.0
+
+
+def test_a_guard_counts_for_nothing_where_there_is_no_learner() -> None:
+    """It has nothing to guard: the same loop."""
+    scenario = ql.Scenario(1.0, 5.0)
+    plain, guarded = (ql.simulate(PLANT, law(None, guard), scenario) for guard in (None, ql.Guard()))
+    np.testing.assert_array_equal(plain["u"], guarded["u"])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ql.Guard(bound=0.0), "bound = 0.0: must be finite and greater than zero"),
+        (lambda: ql.Guard(time=-1.0), "time = -1.0"),
+        (lambda: law(ql.learners.Kalman(), guard=True), "guard = True: must be a quell.Guard"),
+    ],
+)
+def test_mistakes_are_named(make: object, message: str) -> None:
+    """Argument, value, rule."""
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,89 @@
+"""Sinusoids of unknown frequency."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.learners.oscillators import Oscillators, retune, turn_phases
+
+
+def test_a_turning_pair_retunes_its_oscillator_by_how_much_it_turns() -> None:
+    """In the closed form: with nothing unexplained, ω̂ grows by κ ω̂ times the angle; with much unexplained, by little."""
+    oscillators = Oscillators(1, np.array([2.0]), 0.1, 10.0)
+    theta, angle = np.array([0.3, 3.0, 4.0]), 1e-3
+    change = angle * np.array([-theta[2], theta[1]])
+    omega = oscillators.omega.copy()
+    retune(oscillators, omega, 0, theta, change[0], change[1], 0.0)
+    assert omega[0] == pytest.approx(2.0 * (1.0 + 0.4 * angle), rel=1e-9)
+    omega = oscillators.omega.copy()
+    retune(oscillators, omega, 0, theta, change[0], change[1], 25.0 / 60.0)
+    assert omega[0] == pytest.approx(2.0 * (1.0 + 0.2 * angle), rel=1e-9)
+    retune(oscillators, omega, 0, theta, *(1e9 * change), 0.0)
+    assert omega[0] == 10.0
+    retune(oscillators, omega, 0, 0.0 * theta, *change, 0.0)
+    assert omega[0] == 10.0
+
+
+def test_phases_turn_at_their_frequency() -> None:
+    """And stay within a turn."""
+    phase, omega = np.array([0.0, 1.0]), np.array([2.0, 0.5])
+    for _ in range(10_000):
+        turn_phases(phase, omega, 1e-2)
+    np.testing.assert_allclose(np.exp(1j * phase), np.exp(1j * np.array([200.0, 51.0])), atol=1e-9)
+    assert np.all((phase >= 0.0) & (phase < 2.0 * math.pi))
+
+
+@pytest.mark.parametrize("start", [0.2, 2.5])
+@pytest.mark.parametrize("truth", [0.4, 1.2])
+def test_an_unknown_frequency_is_found_and_the_load_rejected(start: float, truth: float) -> None:
+    """From far below or above, within a minute."""
+    controller = ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, 5e-3), omega_c=1.0, learner=ql.learners.Harmonic(omegas=(start,)))
+    scenario = ql.Scenario(
+        reference=ql.signals.Sinusoid().until(40.0, then=ql.signals.Step(at=40.0)),
+        disturbances=(0.0, ql.signals.Sinusoid(omega=truth, start=60.0)),
+        noise=ql.signals.BandLimitedNoise(1e-12, 0.01),
+        duration=140.0,
+    )
+    run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=4)
+    plain = ql.simulate(ql.plants.two_mass_spring(), ql.ADRC(controller.observer, omega_c=1.0), scenario, record_every=4)
+    assert run.final_state.learner.omega[0] == pytest.approx(truth, rel=0.01)
+    late = run.window(130.0, 140.0)
+    assert np.max(np.abs(run["y"][late] - 1.0)) < 0.02 * np.max(np.abs(plain["y"][late] - 1.0))
+
+
+def test_frequencies_start_apart_and_stay_within_their_limits() -> None:
+    """By default ω_c, 0.3 ω_c, …; names and θ fit."""
+    observer = ql.ESO.model_free(2, 1.0, 20.0, 1e-2)
+    learner = ql.learners.Harmonic(count=3, u=True)
+    design = learner.design(observer, 2.0)
+    np.testing.assert_allclose(design.oscillators.omega, [2.0, 0.6, 0.18])
+    assert learner.feature_names(2) == ("x1", "x2", "bias", "sin1", "cos1", "sin2", "cos2", "sin3", "cos3", "u")
+    assert design.scale.size == 10
+    assert (design.oscillators.low, design.oscillators.high) == (0.04, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"count": 0}, "count = 0"),
+        ({"count": 2, "omegas": (1.0,)}, "omegas"),
+        ({"omegas": (-1.0,)}, "omegas = -1.0"),
+        ({"limits": (2.0, 1.0)}, "0 < low < high"),
+        ({"pair_bandwidth": 0.0}, "pair_bandwidth = 0.0"),
+        ({"bias_bandwidth": -1.0}, "bias_bandwidth"),
+    ],
+)
+def test_mistakes_are_named(options: dict[str, object], message: str) -> None:
+    """Argument, value, rule."""
+    with pytest.raises(ValueError, match=message):
+        ql.learners.Harmonic(**options)
+
+
+def test_a_start_outside_of_the_limits_is_refused() -> None:
+    """Not clipped without a word."""
+    with pytest.raises(ValueError, match=r"omegas = \(50.0,\) rad/s: must lie within limits"):
+        ql.ADRC(ql.ESO.model_free(2, 1.0, 20.0, 1e-2), 1.0, learner=ql.learners.Harmonic(omegas=(50.0,)))

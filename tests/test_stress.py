@@ -1,0 +1,76 @@
+"""The guard's trial as an instrument: it can fail, it repeats, it says what it did."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.experiments import adversaries, random_loops, stress
+
+
+def test_without_a_guard_the_trial_is_lost() -> None:
+    """What does harm is in it: most kinds wreck some loop."""
+    found = stress.run(36, 0, seed=0, guard=None)
+    assert stress.summary(found.outcomes)["unstable_where_plain_is_stable"] >= 8
+    assert all(math.isnan(outcome.ratio) == outcome.unstable for outcome in found.outcomes)
+
+
+def test_the_same_seed_gives_the_same_trial() -> None:
+    """All that is random is drawn from it."""
+    one, again, other = (stress.run(12, 2, seed, guard=ql.Guard()) for seed in (1, 1, 2))
+    assert [o.ratio for o in one.outcomes] == [o.ratio for o in again.outcomes]
+    assert [o.ratio for o in one.outcomes] != [o.ratio for o in other.outcomes]
+    assert one.kinds == [*adversaries.KINDS, stress.HONEST]
+
+
+def test_results_are_plain_data() -> None:
+    """For ``json.dump``, with counts for each kind and quantiles of the ratios."""
+    told: list[float] = []
+    found = stress.run(12, 1, seed=5, guard=ql.Guard(), tell=told.append).to_json()
+    assert json.loads(json.dumps(found)) == found
+    assert set(found) == {"settings", "adversarial", "honest", "kinds", "worst"}
+    assert found["adversarial"]["runs"] == 12
+    assert list(found["kinds"]) == list(adversaries.KINDS)
+    assert set(found["honest"]["load_ratio"]) == {"median", "p90", "p99", "max"}
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_loops_are_drawn_within_their_ranges(rng: np.random.Generator) -> None:
+    """And b0 is off by as much as it says."""
+    for loop in random_loops.draw(50, rng):
+        assert 0.5 <= loop.m1 <= 2.0
+        assert 0.3 <= loop.k <= 3.0
+        assert loop.dt in (1e-3, 2e-3, 5e-3)
+        _, b, _ = ql.canonical(loop.plant)
+        assert loop.controller().parameters.b0 == pytest.approx(loop.gain_error * b)
+
+
+@pytest.mark.parametrize("kind", adversaries.KINDS)
+def test_every_kind_of_adversary_runs_as_it_was_drawn(kind: str, rng: np.random.Generator) -> None:
+    """Each draw is another learner, with a short run to show."""
+    loop = random_loops.draw(1, rng)[0]
+    one, other = (adversaries.draw(kind, rng) for _ in range(2))
+    assert repr(one) != repr(other)
+    run = ql.simulate(loop.plant, loop.controller(one, ql.Guard()), ql.Scenario(ql.signals.Sinusoid(), 2.0))
+    assert not run.diverged
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [((-1, 0, 0), "runs = -1"), ((0, 0, 0), "at least one must be positive"), ((1, 0, -1), "seed = -1"), ((1, 0.5, 0), "honest = 0.5")],
+)
+def test_mistakes_are_named(arguments: tuple[int, int, int], message: str) -> None:
+    """Argument, value, rule."""
+    with pytest.raises(ValueError, match=message):
+        stress.run(*arguments, guard=None)
+
+
+def test_an_unknown_kind_is_refused(rng: np.random.Generator) -> None:
+    """With the list of those there are."""
+    with pytest.raises(ValueError, match="kind"):
+        adversaries.draw("bad mood", rng)
