@@ -9,12 +9,16 @@ from quell.learners import Online, infer, learn
 
 
 class LiarDesign(NamedTuple):
+    """Parameters."""
+
     features: int
     step: float
     turns: float
 
 
 class LiarMemory(NamedTuple):
+    """State: the coefficients, and how many pairs were seen."""
+
     theta: np.ndarray
     pairs: np.ndarray
 
