@@ -15,7 +15,7 @@ from rich.table import Table
 import quell as ql
 from quell.experiments import two_mass_spring as study
 from quell.learners import Harmonic
-from quell.signals import Sinusoid, Sum
+from quell.signals import Signal, Sinusoid
 
 LOAD_AT, JUDGED_AT, END = 150.0, 210.0, 250.0
 
@@ -27,7 +27,7 @@ def peaks(learner: ql.learners.Learner | None, omegas: Sequence[float]) -> tuple
     """
     settings = study.Settings()
     paper = study.scenario(settings)
-    load: Sinusoid | Sum = Sinusoid(omega=omegas[0], start=LOAD_AT)
+    load: Signal = Sinusoid(omega=omegas[0], start=LOAD_AT)
     for omega in omegas[1:]:
         load = load + Sinusoid(omega=omega, start=LOAD_AT)
     scenario = ql.Scenario(
