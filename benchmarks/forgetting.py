@@ -1,4 +1,4 @@
-"""What L-ESO still knows of the plant after a sinusoidal load that went on for a while.
+"""What L-ESO still knows of the plant after a sinusoidal load that went on for a while, without and with a feature for the load.
 
 python benchmarks/forgetting.py
 """
@@ -17,22 +17,24 @@ TRAINED = 90.0
 
 def main() -> None:
     """Train on sin t, load m2 for a while, then step from rest without the load."""
-    table = Table("load lasts [s]", "θ1", "θ3", "overshoot", "settling [s]")
+    table = Table("learner", "load lasts [s]", "θ1", "θ3", "overshoot", "settling [s]")
     settings = study.Settings()
-    controller = study.controllers(settings)[study.L]
-    for lasts in (0.0, 300.0, 900.0, 3000.0):
-        step_at = TRAINED + lasts + 110.0
-        load = signals.Constant(0.0).until(TRAINED, then=signals.Sinusoid(omega=0.3, start=TRAINED))
-        scenario = ql.Scenario(
-            reference=signals.Sinusoid().until(step_at, then=signals.Step(at=step_at)),
-            disturbances=(0.0, load.until(TRAINED + lasts, then=0.0) if lasts else 0.0),
-            noise=signals.BandLimitedNoise(power=1e-12, sample_time=0.01),
-            duration=step_at + 40.0,
-            rest_at=(step_at,),
-        )
-        run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario)
-        found, theta = run.metrics(step_at), run["theta"][run.window(step_at, step_at + 1.0)][0]
-        table.add_row(f"{lasts:g}", f"{theta[0]:.2f}", f"{theta[2]:.2f}", f"{found['overshoot']:.5f}", f"{found['settling_time']:.1f}")
+    for name, learner in (("Kalman", ql.learners.Kalman()), ("Harmonic", ql.learners.Harmonic())):
+        controller = study.controller(settings, learner=learner)
+        for lasts in (0.0, 300.0, 900.0, 3000.0):
+            step_at = TRAINED + lasts + 110.0
+            load = signals.Constant(0.0).until(TRAINED, then=signals.Sinusoid(omega=0.3, start=TRAINED))
+            scenario = ql.Scenario(
+                reference=signals.Sinusoid().until(step_at, then=signals.Step(at=step_at)),
+                disturbances=(0.0, load.until(TRAINED + lasts, then=0.0) if lasts else 0.0),
+                noise=signals.BandLimitedNoise(power=1e-12, sample_time=0.01),
+                duration=step_at + 40.0,
+                rest_at=(step_at,),
+            )
+            run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=10)
+            found, theta = run.metrics(step_at), run["theta"][run.window(step_at, step_at + 1.0)][0]
+            cells = (f"{theta[0]:.2f}", f"{theta[2]:.2f}", f"{found['overshoot']:.5f}", f"{found['settling_time']:.1f}")
+            table.add_row(name, f"{lasts:g}", *cells)
     Console().print(table)
 
 
