@@ -54,7 +54,7 @@ def plot_trajectory(run: Trajectory, axes: Any = None) -> Any:
         _draw_guard(run, axes[3])
     for ax, label in zip(axes, ("output", "control signal", "total disturbance", "guard"), strict=False):
         ax.set_ylabel(label)
-        ax.legend(loc="upper right", fontsize="small")
+        ax.legend(loc="upper right", fontsize="small", ncols=3 if label == "guard" else 1)
         ax.grid(alpha=0.3)
     axes[len(axes) - 1].set_xlabel("time [s]")
     if run.diverged:
@@ -75,4 +75,4 @@ def _draw_guard(run: Trajectory, ax: Any) -> None:
             at = at[:: max(at.size // 500, 1)]
             label = reason.name.lower().replace("_", " ")
             ax.plot(at, np.full(at.size, -0.08 - 0.06 * i), "|", markersize=4.0, color=f"C{5 + i}", label=label)
-    ax.set_ylim(-0.45, 1.6)
+    ax.set_ylim(-0.45, 2.1)  # room for the legend
