@@ -73,8 +73,8 @@ def _print(console: Console, result: stress.Result, guarded: bool) -> None:
     console.print(table)
     found = stress.summary(result.outcomes)
     console.print(
-        f"Lost: unstable where MF-ESO is stable. Unstable loops: {found['unstable']}, of which MF-ESO keeps {found['unstable_where_plain_is_stable']} stable; "
-        f"MF-ESO itself: {found['plain_unstable']}."
+        f"Lost: unstable where MF-ESO is stable. Unstable loops: {found['unstable']}, "
+        f"of which MF-ESO keeps {found['unstable_where_plain_is_stable']} stable; MF-ESO itself: {found['plain_unstable']}."
     )
     console.print("Whole run: 150 s. Load: from 90 s on. Late: from 140 s on. Errors are against the response the design asks for.\n")
 

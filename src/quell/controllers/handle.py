@@ -49,7 +49,7 @@ def _one_sample(design: Any, state: Any, r: float, y: float) -> float:
 def _borrowed_control(typing_context: Any, handle: Any, r: Any, y: Any) -> Any:
     """Call ``_one_sample`` with what the handle holds; the caller's handle keeps it alive."""
     fields = handle.field_dict
-    callee = nb_types.Dispatcher(_one_sample.uncached)
+    callee = nb_types.Dispatcher(_one_sample.uncached)  # type: ignore[attr-defined]
     inner = callee.get_call_type(typing_context, (fields["design"], fields["state"], r, y), {})
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
