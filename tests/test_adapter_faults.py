@@ -113,7 +113,8 @@ class Model:
 warnings.simplefilter("ignore")
 controller = ql.ADRC(ql.ESO.model_free(2, 1.0, 15.0, 5e-3), 4.0, learner=ql.learners.PythonModel(Model()))
 try:
-    ql.simulate(ql.plants.LinearPlant([[0, 1], [0, 0]], [0, 1], [1, 0]), controller, ql.Scenario(ql.signals.Sinusoid(), 1e5), record_every=1000)
+    masses = ql.plants.LinearPlant([[0, 1], [0, 0]], [0, 1], [1, 0])
+    ql.simulate(masses, controller, ql.Scenario(ql.signals.Sinusoid(), 1e5), record_every=1000)
     time.sleep(60.0)
 except KeyboardInterrupt:
     print("interrupted")
