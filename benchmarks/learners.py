@@ -4,7 +4,7 @@
 
 All in the study's two-mass loop, the first 60 s of it at 1 ms with nothing recorded, as ratios of the best of several interleaved trials;
 the reference is the same loop with the Kalman learner in C (``reference.c``), timed among them. A *loop sample* is plant and controller;
-a *step* is the controller alone, called from compiled code with r and y from a table.
+a *step* is the controller alone, called from compiled code with r and y from a table; ``controller.step`` is called from Python.
 """
 
 from __future__ import annotations
@@ -184,6 +184,26 @@ def guard(rows: list[dict[str, object]]) -> None:
                 rows.append(row(f"{what}, {name}: {label}", one / other, bar, nanoseconds(one, other, of=what)))
 
 
+def from_python(rows: list[dict[str, object]]) -> None:
+    """Time ``controller.step`` with and without guard."""
+    run = ql.simulate(PLANT, law(LEARNERS["Kalman"]), SCENARIO)
+    r, y = run["r"].tolist(), run["y_measured"].tolist()
+
+    def stepping_from_python(controller: ql.ADRC) -> Any:
+        def call() -> None:
+            controller.reset()
+            for now, measured in zip(r, y, strict=True):
+                controller.step(now, measured)
+
+        controller.prepare()
+        return call
+
+    for name in GUARDED:
+        both, learner = best(*(stepping_from_python(law(LEARNERS[name], guard)) for guard in (ql.Guard(), None)), trials=TRIALS)
+        times = nanoseconds(both, learner, of="controller.step")
+        rows.append(row(f"controller.step, {name}: with guard / without", both / learner, "≤ 1.4", times))
+
+
 def main() -> None:
     """Run all and print one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -192,6 +212,7 @@ def main() -> None:
     rows: list[dict[str, object]] = []
     learners(rows)
     guard(rows)
+    from_python(rows)
     show(rows, arguments.json)
 
 
