@@ -4,35 +4,24 @@
 
 Times on a shared machine mean little; ratios of the best of several interleaved trials mean more. The references: the same loop in C
 (``reference.c``, which must give the same trajectory), pyadrc on the same second-order loop, python-control on the same two-mass loop.
+``learners.py`` has the learners.
 """
 
 from __future__ import annotations
 
 import argparse
-import ctypes
-import json
-import subprocess
 import tempfile
-import time
 import timeit
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from c_reference import best, c_reference, row, show
 
 import quell as ql
 from quell.experiments import two_mass_spring as study
 
-HERE = Path(__file__).parent
 TRIALS = 15
 SAMPLES = round(study.END / study.Settings().dt) + 1
-
-
-def row(what: str, ratio: float, bar: str, times: str) -> dict[str, object]:
-    """Return a line of the table."""
-    return {"what": what, "ratio": ratio, "bar": bar, "times": times}
 
 
 def each(*runs: float) -> str:
@@ -40,68 +29,21 @@ def each(*runs: float) -> str:
     return " / ".join(f"{run / SAMPLES * 1e9:.0f}" for run in runs) + " ns a sample"
 
 
-def best(*candidates: Callable[[], object], trials: int = TRIALS) -> list[float]:
-    """Time candidates in turn, several times; return the best time of each [s]."""
-    found = [float("inf")] * len(candidates)
-    for _ in range(trials):
-        for i, candidate in enumerate(candidates):
-            began = time.perf_counter()
-            candidate()
-            found[i] = min(found[i], time.perf_counter() - began)
-    return found
-
-
-def c_reference(folder: Path) -> Callable[[study.Settings, bool], np.ndarray]:
-    """Build ``reference.c``; return a function that runs the study's L-ESO in it and returns the log."""
-    library = folder / "reference.so"
-    command = ["gcc", "-O3", "-march=native", "-std=gnu11", "-shared", "-fPIC", "-o", str(library), str(HERE / "reference.c"), "-lm"]
-    subprocess.run(command, check=True)
-    run = ctypes.CDLL(str(library)).run
-    run.restype = ctypes.c_double
-    pointer = ctypes.c_void_p
-
-    def reference(settings: study.Settings, record: bool = True) -> np.ndarray:
-        design = study.controllers(settings)[study.L].parameters
-        kalman, plant = design.learner, ql.plants.two_mass_spring().sampled(settings.dt)
-        numbers = np.concatenate(
-            [
-                [settings.dt],
-                *(field.ravel() for field in plant),
-                *(field.ravel() for field in design.eso[:4]),
-                design.law,
-                [design.b0, kalman.lag.pole, kalman.lag.rise],
-                kalman.lag.taps,
-                kalman.scale[:4],
-                kalman.threshold,
-                [kalman.walk[-1], kalman.forget, kalman.lag_time, kalman.prior[0], kalman.fastest, kalman.f_noise],
-            ]
-        )
-        samples, hold = round(study.END / settings.dt) + 1, round(0.01 / settings.dt)
-        noise = study.scenario(settings).noise.seeded(settings.seed)(np.arange(samples // hold + 1) * 0.01)
-        log = np.empty((samples, 22) if record else 0)
-        run(
-            *(numbers.ctypes.data_as(pointer), ctypes.c_size_t(samples), ctypes.c_double(study.STEP_AT)),
-            *(noise.ctypes.data_as(pointer), ctypes.c_size_t(hold), log.ctypes.data_as(pointer) if record else None),
-        )
-        return log
-
-    return reference
-
-
 def against_c(rows: list[dict[str, object]]) -> None:
     """Time the whole closed loop with the Kalman learner."""
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
     controller, scenario = study.controllers(settings)[study.L], study.scenario(settings)
     with tempfile.TemporaryDirectory() as folder:
-        reference = c_reference(Path(folder))
-        log, run = reference(settings), ql.simulate(plant, controller, scenario)
+        reference = c_reference(Path(folder), settings)
+        log, run = reference(True), ql.simulate(plant, controller, scenario)
         apart = max(np.max(np.abs(run["y"] - log[:, 1])), np.max(np.abs(run["u"] - log[:, 3])))
         assert apart < 1e-6, f"quell and C differ by {apart}"
         c_all, ours_all, c_bare, ours_bare = best(
-            lambda: reference(settings),
+            lambda: reference(True),
             lambda: ql.simulate(plant, controller, scenario),
-            lambda: reference(settings, False),
+            lambda: reference(False),
             lambda: ql.simulate(plant, controller, scenario, record_every=SAMPLES),
+            trials=TRIALS,
         )
     for label, c, ours in (("every sample recorded", c_all, ours_all), ("nothing recorded", c_bare, ours_bare)):
         rows.append(row(f"closed loop, Kalman learner, {label}: quell / C", ours / c, "≤ 2", f"{each(ours, c)}, apart by {apart:.0e}"))
@@ -112,23 +54,8 @@ def algorithm_1(rows: list[dict[str, object]]) -> None:
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
     scenario = study.scenario(settings)
     small, large = (study.controller(settings, learner=ql.learners.BatchGradient(1e-5 / n, n)) for n in (10, 10_000))
-    few, many = best(lambda: ql.simulate(plant, small, scenario), lambda: ql.simulate(plant, large, scenario))
+    few, many = best(lambda: ql.simulate(plant, small, scenario), lambda: ql.simulate(plant, large, scenario), trials=TRIALS)
     rows.append(row("Algorithm 1: batch of 10 000 / batch of 10", many / few, "≤ 1.3", each(many, few)))
-
-
-def learners(rows: list[dict[str, object]]) -> None:
-    """Time each learner's loop against the loop without one."""
-    settings, plant = study.Settings(), ql.plants.two_mass_spring()
-    scenario = study.scenario(settings)
-    kinds = {
-        "Algorithm 1": ql.learners.BatchGradient(1e-6, 10),
-        "Kalman": ql.learners.Kalman(),
-        "Kalman with u": ql.learners.Kalman(u=True),
-    }
-    candidates = [study.controller(settings, learner=learner) for learner in (None, *kinds.values())]
-    plain, *learned = best(*(lambda c=c: ql.simulate(plant, c, scenario) for c in candidates))
-    for name, took in zip(kinds, learned, strict=True):
-        rows.append(row(f"closed loop: {name} / no learner", took / plain, "", each(took, plain)))
 
 
 def one_call(rows: list[dict[str, object]]) -> None:
@@ -191,7 +118,7 @@ def against_python_control(rows: list[dict[str, object]]) -> None:
     assert apart < 1e-9, f"quell and python-control differ by {apart}"
     (theirs,) = best(lambda: ct.input_output_response(loop, t, np.ones(samples)), trials=3)
     longer = ql.Scenario(reference=1.0, duration=100.0)
-    (ours,) = best(lambda: ql.simulate(plant, law, longer))
+    (ours,) = best(lambda: ql.simulate(plant, law, longer), trials=TRIALS)
     ours /= 100_001
     theirs /= samples
     times = f"{theirs * 1e6:.0f} µs / {ours * 1e9:.0f} ns a sample, apart by {apart:.0e}"
@@ -204,14 +131,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []
-    for measure in (against_c, algorithm_1, learners, one_call, against_python_control):
+    for measure in (against_c, algorithm_1, one_call, against_python_control):
         measure(rows)
-    table = Table("what", "measured", "bar", "times")
-    for line in rows:
-        table.add_row(str(line["what"]), f"{line['ratio']:.2f}", str(line["bar"]), str(line["times"]))
-    Console().print(table)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    show(rows, arguments.json)
 
 
 if __name__ == "__main__":

@@ -20,10 +20,12 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
@@ -31,6 +33,7 @@ import numba
 import platformdirs
 from numba.core import config as numba_config
 from numba.core import types as nb_types
+from numba.core.errors import NumbaError
 from numba.extending import overload, register_jitable
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -42,6 +45,7 @@ R_co = TypeVar("R_co", covariant=True)
 class Generic(Protocol[P, R_co]):
     """A generic function: called as its declaration says, with one implementation for each type of its first argument."""
 
+    __name__: str
     implementations: dict[type, Callable[..., Any]]
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co:
@@ -57,8 +61,8 @@ OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_mo
 
 _CACHES_KEPT = 4
 _LARGEST = sys.float_info.max
-# Types with implementations from outside of this package.
-_FOREIGN: set[type] = set()
+# Types with implementations from outside of this package, and what they are called in messages.
+_FOREIGN: dict[type, str] = {}
 
 
 def kernel(function: F) -> F:
@@ -94,7 +98,7 @@ def generic(declaration: Callable[P, R]) -> Generic[P, R]:
         def add(implementation: F) -> F:
             table[cls] = implementation
             if not implementation.__module__.startswith("quell."):
-                _FOREIGN.add(cls)
+                _FOREIGN.setdefault(cls, cls.__name__)
             return implementation
 
         return add
@@ -136,6 +140,51 @@ def for_types(entry: Any, *arguments: Any) -> Any:
     notice that those have changed.
     """
     return entry.uncached if _FOREIGN and any(_is_foreign(argument) for argument in arguments) else entry
+
+
+def call_it(cls: type, name: str) -> None:
+    """Call a type from outside of this package ``name`` in messages: its user knows the class that makes it better."""
+    if cls in _FOREIGN:
+        _FOREIGN[cls] = name
+
+
+@contextmanager
+def compiling(*arguments: Any) -> Iterator[None]:
+    """Around the first call of an entry point with ``arguments``: what Numba says of code from outside of this package, in a line.
+
+    Raises
+    ------
+    ValueError
+        where such code can't be compiled, or allocates memory.
+    """
+    try:
+        yield
+    except NumbaError as error:
+        told = _blame(str(error)) if any(map(_is_foreign, arguments)) else ""
+        if not told:
+            raise
+        raise ValueError(told) from None
+
+
+# What Numba says before it comes to the point.
+_PREAMBLE = re.compile(r"\W*$|There are \d|- Of which|Overload in|With argument|Rejected as|- Resolution|(\w+Error: )?Failed in nopython")
+
+
+def _blame(text: str) -> str:
+    """Return what is wrong with the innermost function from outside of this package that Numba was at; nothing where there is none."""
+    names = {cls.__name__: name for cls, name in _FOREIGN.items()}
+    calls = [found for found in re.finditer(r">>> (\w+)\((\w+)\(", text) if found[2] in names]
+    if not calls:
+        return ""
+    rest = text[calls[-1].end() :]
+    lines = [line.strip() for line in rest.splitlines()[1:]]
+    reason = next((line for line in lines if not _PREAMBLE.match(line)), "no reason given").removesuffix(" found for signature:")
+    fault = "allocates memory" if "NRT required" in rest or "Only accept returning of array" in rest else "can not be compiled"
+    return (
+        f"{names[calls[-1][2]]}.{calls[-1][1]} (for {calls[-1][2]}) {fault} ({reason}): use loops over numbers and arrays that are there "
+        "from the start, as fields of the memory; no new arrays, no lists, no slices that are assigned to. "
+        "simulate(..., interpret=True) runs it as Python"
+    )
 
 
 def compilations(entry: Any) -> int:

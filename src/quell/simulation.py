@@ -12,7 +12,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import Controller, control, flags, report, rest
-from quell.dispatch import compiled, for_types, interpreted
+from quell.dispatch import compiled, compiling, for_types, interpreted
 from quell.plants.base import Plant, advance, measure
 from quell.signals import Constant, Signal, as_signal, seeded_apart
 from quell.trajectory import Trajectory, first_sample_at, in_steps
@@ -197,7 +197,7 @@ def simulate(
     row = until_next = done = status = 0
     rests = {first_sample_at(time, dt, samples) for time in scenario.rest_at}
     # An interpreted loop that diverges would warn of every overflow; the status says it once.
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"), compiling(model, design):
         for first, last in pairwise(sorted({*range(0, samples, _BLOCK), *rests, samples})):
             if first in rests:
                 x[:] = x0

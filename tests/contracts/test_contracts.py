@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 from typing import Any
 
@@ -29,20 +30,23 @@ SCENARIO = ql.Scenario(
 )
 
 
+SHORT = dataclasses.replace(SCENARIO, duration=1.5, rest_at=(1.2,))
+
+
 def law_for(plant: Any, **options: Any) -> ql.ADRC:
     """A controller for a plant of its order."""
     return ql.ADRC(ql.ESO.model_free(order=plant.order, b0=1.5, omega_o=12.0, dt=0.01), omega_c=1.5, **options)
 
 
-def check_run(plant: Any, controller: ql.ADRC) -> None:
+def check_run(plant: Any, controller: ql.ADRC, scenario: ql.Scenario = SCENARIO) -> None:
     """A run is repeatable, compiled once, and the same interpreted."""
-    first = ql.simulate(plant, controller, SCENARIO)
+    first = ql.simulate(plant, controller, scenario)
     compiled_before = len(run_block.signatures)
-    again = ql.simulate(plant, controller, SCENARIO)
+    again = ql.simulate(plant, controller, scenario)
     assert len(run_block.signatures) == compiled_before, "the second run compiled again"
     np.testing.assert_array_equal(first.log, again.log)
     assert np.all(np.isfinite(first.log))
-    plainly = ql.simulate(plant, controller, SCENARIO, interpret=True)
+    plainly = ql.simulate(plant, controller, scenario, interpret=True)
     # Fused multiply-add rounds otherwise, and a learner remembers it.
     np.testing.assert_allclose(plainly["y"], first["y"], rtol=1e-6, atol=1e-8)
 
@@ -111,6 +115,12 @@ def test_an_observer_runs_the_same_again_and_interpreted(name: str) -> None:
 def test_a_learner_runs_the_same_again_and_interpreted(name: str) -> None:
     """Same seed, same output; no second compilation; interpreted = compiled."""
     check_run(CHAIN, law_for(CHAIN, learner=LEARNERS[name]))
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_guarded_learner_runs_the_same_again_and_interpreted(name: str) -> None:
+    """The guard changes nothing of that."""
+    check_run(CHAIN, law_for(CHAIN, learner=LEARNERS[name], guard=ql.Guard(time=0.5)), SHORT)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
@@ -189,10 +199,11 @@ def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.
     np.testing.assert_array_equal(said[0], said[1])
 
 
+@pytest.mark.parametrize("guard", [None, ql.Guard(time=0.5)], ids=["unguarded", "guarded"])
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_learner_goes_on_without_a_trace(name: str) -> None:
+def test_a_learner_goes_on_without_a_trace(name: str, guard: ql.Guard | None) -> None:
     """Saved and restored by named arrays, copied, or sent: the same bits from there on."""
-    one, other = (law_for(CHAIN, learner=LEARNERS[name]) for _ in range(2))
+    one, other = (law_for(CHAIN, learner=LEARNERS[name], guard=guard) for _ in range(2))
     y = np.sin(0.02 * np.arange(600)) + 0.1 * np.sin(0.31 * np.arange(600))
     for k in range(400):
         one.step(0.5, y[k])

@@ -20,9 +20,9 @@ from quell import checks
 from quell.controllers.base import control, flags, report, rest
 from quell.controllers.handle import bind, bound_control, entry_point
 from quell.controllers.limits import Limits, apply_limits, limits
-from quell.dispatch import for_types, is_finite, kernel
+from quell.dispatch import compiling, for_types, is_finite, kernel
 from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, calm, explain, note, permit, watch
-from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart, trouble
+from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart, tried, trouble
 from quell.learners.lag import Lag, lag_of, lag_push
 from quell.observers.eso import ESO, EsoModel, eso_start, eso_update
 from quell.types import Matrix, Status, Vector
@@ -261,7 +261,7 @@ class ADRC:
             cancel=observer.a,
             b0=observer.b0,
             limits=self._limits,
-            learner=self.learner.design(observer, self.omega_c),
+            learner=tried(self.learner, observer, self.omega_c),
             lag=lag._replace(taps=np.zeros(0)) if isinstance(self.learner, NoLearner) else lag,
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer),
         )
@@ -296,7 +296,8 @@ class ADRC:
         dispatcher = for_types(bound_control, self.parameters)
         self._handle = bind(self.parameters, self._state)
         # The first call is made on a state of its own: it must not count as a sample.
-        dispatcher(bind(self.parameters, self.initial_state()), 0.0, 0.0)
+        with compiling(self.parameters):
+            dispatcher(bind(self.parameters, self.initial_state()), 0.0, 0.0)
         self._step = entry_point(dispatcher, self._handle, 0.0, 0.0)
 
     def step(self, r: float, y: float) -> float:

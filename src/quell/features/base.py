@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from quell import trial
 from quell.dispatch import generic
 from quell.types import Vector
 
@@ -118,3 +121,42 @@ def _write(features: JoinedDesign, x: Vector, u: float, out: Vector) -> None:
 def _unit(features: JoinedDesign, scale: Vector, out: Vector) -> None:
     unit(features.first, scale, out[: features.split])
     unit(features.second, scale, out[features.split :])
+
+
+def tried(features: Features, order: int) -> Any:
+    """Return ``features.design(order)``; blocks of the user's own have to write their features once, interpreted.
+
+    Raises
+    ------
+    ValueError
+        that names the block's class and the rule, for whatever is wrong.
+    """
+    if isinstance(features, Joined):
+        tried(features.first, order)
+        tried(features.second, order)
+    elif trial.of_users(features):
+        _try_block(features, order)
+    return features.design(order)
+
+
+def _try_block(block: Features, order: int) -> None:
+    name = type(block).__name__
+    what = f"{name}.design({order})"
+    parameters = trial.attempt(what, "design takes the plant's order", block.design, order)
+    trial.named_tuple(what, parameters, "numbers and arrays")
+    names = trial.attempt(f"{name}.names({order})", "names takes the plant's order", block.names, order)
+    if not isinstance(names, tuple) or not names or not all(isinstance(label, str) for label in names):
+        raise ValueError(f"{name}.names({order}) returns {names!r}: must return a tuple with a name for each feature")
+    trial.registered(name, parameters, write, unit)
+    rule = f"it is given x ({order},), u, and room for {len(names)} features, as many as it has names"
+    ones, marks = np.ones(order + 2), (7e77, -7e77)
+    for function, arguments in ((write, (trial.wave(order), 0.5)), (unit, (ones,))):
+        written = []
+        for mark in marks:
+            out = np.full(len(names), mark)
+            trial.attempt_kernel(f"{name}: {function.__name__}", rule, function, parameters, *arguments, out)
+            written.append(out != mark)
+        if not np.all(written):
+            raise ValueError(
+                f"{name}: {function.__name__} leaves features {np.flatnonzero(~np.all(written, axis=0)).tolist()} unwritten; {rule}"
+            )

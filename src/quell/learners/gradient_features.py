@@ -13,7 +13,7 @@ import numpy as np
 
 from quell.dispatch import is_finite, kernel
 from quell.features import Features
-from quell.features.base import unit, write
+from quell.features.base import tried, unit, write
 from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.observers.eso import ESO
@@ -69,7 +69,7 @@ def feature_gradient_design(rate: float, batch: int, features: Features, observe
     return FeatureGradientDesign(
         rate=rate,
         batch=batch,
-        features=features.design(observer.order),
+        features=tried(features, observer.order),
         scaling=scaling(observer, frequency, False),
         watch=round(_WATCH * (observer.order + 1) / observer.omega_o / observer.dt),
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from quell import checks
 from quell.features import Bias, Features, State
-from quell.features.base import write
+from quell.features.base import tried, write
 from quell.features.scaling import scaling
 from quell.learners.lag import lag_of
 from quell.learners.regression import WATCH, LinearDesign, LinearMemory
@@ -68,7 +68,7 @@ class Linear:
         n = observer.order
         if self.scale is not None:
             checks.vector("scale", self.scale, n + 2)
-        features, p, constant = self.features.design(n), len(self.features.names(n)), self.features.constant(n)
+        features, p, constant = tried(self.features, n), len(self.features.names(n)), self.features.constant(n)
         slopes = sorted(observer.b0 * (share - 1.0) for share in self.gain_interval)
         return LinearDesign(
             features=features,

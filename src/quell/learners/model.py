@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import numpy as np
+
+from quell import trial
 from quell.dispatch import generic
 from quell.types import Vector
 
@@ -33,3 +36,41 @@ def infer(model: Any, memory: Any, features: Vector) -> float:
 def learn(model: Any, memory: Any, features: Vector, target: float) -> None:
     """Learn from a pair of ``features`` (p,) and ``target``; the state must stay bounded whatever they are."""
     raise TypeError
+
+
+def tried(model: Any, features: int, dt: float) -> Any:
+    """Return ``model.design(features, dt)``; a model of the user's own has to infer and learn once, interpreted, on a memory of its own.
+
+    Raises
+    ------
+    ValueError
+        that names the model's class and the rule, for whatever is wrong.
+    """
+    if not trial.of_users(model):
+        return model.design(features, dt)
+    name, rule = type(model).__name__, f"it is shown {features} features, of shape ({features},), and learns and predicts one number"
+    what = f"{name}.design({features}, {dt:g})"
+    parameters = trial.named_tuple(
+        what, trial.attempt(what, "design takes (features, dt)", model.design, features, dt), "numbers and arrays"
+    )
+    trial.registered(name, parameters, infer, learn)
+    trial.arrays(
+        f"{name}.memory", trial.attempt(f"{name}.memory(...)", "memory takes (parameters)", model.memory, parameters), nested=False
+    )
+    memory = packed(model.memory(parameters))[0]
+    for i in range(3):
+        shown = trial.wave(features, 1.0 + i)
+        predicted = trial.attempt_kernel(f"{name}: infer", rule, infer, parameters, memory, shown)
+        if predicted is not trial.UNKNOWN:
+            trial.number(f"{name}: infer", predicted)
+        trial.attempt_kernel(f"{name}: learn", rule, learn, parameters, memory, shown, 0.5)
+    return parameters
+
+
+def packed(memory: Any) -> tuple[Any, Vector]:
+    """Return a copy of a NamedTuple of arrays whose arrays all lie in one, and that one."""
+    arrays = [np.asarray(array, dtype=np.float64) for array in memory]
+    flat = np.concatenate([array.ravel() for array in arrays]) if arrays else np.zeros(0)
+    places = np.cumsum([0, *(array.size for array in arrays)])
+    views = [flat[start : start + array.size].reshape(array.shape) for start, array in zip(places, arrays, strict=False)]
+    return type(memory)(*views), flat

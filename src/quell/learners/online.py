@@ -25,11 +25,12 @@ import numpy as np
 from quell import checks
 from quell.dispatch import is_finite, kernel
 from quell.features import Bias, Features, State
+from quell.features.base import tried as tried_features
 from quell.features.base import write
 from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import lag_of
-from quell.learners.model import infer, learn
+from quell.learners.model import infer, learn, packed, tried
 from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory, trust
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -197,10 +198,10 @@ class Online:
         if self.scale is not None:
             checks.vector("scale", self.scale, n + 2)
         return OnlineDesign(
-            features=self.features.design(n),
+            features=tried_features(self.features, n),
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
             sight=sight(observer, self.frequency or omega_c),
-            model=self.fitted_model(observer, omega_c).design(len(self.features.names(n)), observer.dt),
+            model=tried(self.fitted_model(observer, omega_c), len(self.features.names(n)), observer.dt),
             follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
             delay=round(group_delay(observer)),
             watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
@@ -210,7 +211,7 @@ class Online:
         """Return a state with nothing learned."""
         n = parameters.scaling.ladder.size - 2
         p = len(self.features.names(n))
-        model, flat = _packed(self.model.memory(parameters.model))
+        model, flat = packed(self.model.memory(parameters.model))
         return OnlineMemory(
             scale=np.full(n + 2, 1e-100) if self.scale is None else self.scale.copy(),
             scaled=np.zeros(n),
@@ -236,12 +237,3 @@ def group_delay(observer: ESO) -> float:
     lag = lag_of(observer)
     stage = np.arange(lag.taps.size)
     return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (1.0 if lag.predictor else 0.0)
-
-
-def _packed(memory: Any) -> tuple[Any, Vector]:
-    """Return a copy of a NamedTuple of arrays whose arrays all lie in one, and that one."""
-    arrays = [np.asarray(array, dtype=np.float64) for array in memory]
-    flat = np.concatenate([array.ravel() for array in arrays]) if arrays else np.zeros(0)
-    places = np.cumsum([0, *(array.size for array in arrays)])
-    views = [flat[start : start + array.size].reshape(array.shape) for start, array in zip(places, arrays, strict=False)]
-    return type(memory)(*views), flat

@@ -1,0 +1,85 @@
+"""The two-mass loop in C (``reference.c``) and the stop-watch: what the benchmarks of speed share."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import quell as ql
+from quell.experiments import two_mass_spring as study
+
+SOURCE = Path(__file__).with_name("reference.c")
+
+
+def c_reference(folder: Path, settings: study.Settings, duration: float = study.END) -> Callable[[bool], np.ndarray]:
+    """Build ``reference.c``; return a function that runs the study's L-ESO in it, and returns the log where it is to be recorded.
+
+    Design and noise are made here, so that running takes no longer than the loop does.
+    """
+    library = folder / "reference.so"
+    command = ["gcc", "-O3", "-march=native", "-std=gnu11", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-lm"]
+    subprocess.run(command, check=True)
+    run = ctypes.CDLL(str(library)).run
+    run.restype = ctypes.c_double
+    pointer = ctypes.c_void_p
+    design = study.controllers(settings)[study.L].parameters
+    kalman, plant = design.learner, ql.plants.two_mass_spring().sampled(settings.dt)
+    numbers = np.concatenate(
+        [
+            [settings.dt],
+            *(field.ravel() for field in plant),
+            *(field.ravel() for field in design.eso[:4]),
+            design.law,
+            [design.b0, kalman.lag.pole, kalman.lag.rise],
+            kalman.lag.taps,
+            kalman.scale[:4],
+            kalman.threshold,
+            [kalman.walk[-1], kalman.forget, kalman.lag_time, kalman.prior[0], kalman.fastest, kalman.f_noise],
+        ]
+    )
+    samples, hold = round(duration / settings.dt) + 1, round(0.01 / settings.dt)
+    noise = study.scenario(settings).noise.seeded(settings.seed)(np.arange(samples // hold + 1) * 0.01)
+
+    def reference(record: bool) -> np.ndarray:
+        log = np.empty((samples, 22) if record else 0)
+        run(
+            *(numbers.ctypes.data_as(pointer), ctypes.c_size_t(samples), ctypes.c_double(study.STEP_AT)),
+            *(noise.ctypes.data_as(pointer), ctypes.c_size_t(hold), log.ctypes.data_as(pointer) if record else None),
+        )
+        return log
+
+    return reference
+
+
+def best(*candidates: Callable[[], object], trials: int) -> list[float]:
+    """Time candidates in turn, several times; return the best time of each [s], that of this thread: others on the machine don't count."""
+    found = [float("inf")] * len(candidates)
+    for _ in range(trials):
+        for i, candidate in enumerate(candidates):
+            began = time.thread_time()
+            candidate()
+            found[i] = min(found[i], time.thread_time() - began)
+    return found
+
+
+def row(what: str, ratio: float, bar: str, times: str) -> dict[str, object]:
+    """Return a line of the table."""
+    return {"what": what, "ratio": ratio, "bar": bar, "times": times}
+
+
+def show(rows: Sequence[dict[str, object]], file: Path | None, title: str | None = None) -> None:
+    """Print a table, and write its rows to ``file`` where there is one."""
+    table = Table("what", "measured", "bar", "times", title=title)
+    for line in rows:
+        table.add_row(str(line["what"]), f"{line['ratio']:.2f}", str(line["bar"]), str(line["times"]))
+    Console().print(table)
+    if file:
+        file.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
