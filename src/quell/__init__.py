@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quell import controllers, experiments, features, learners, metrics, observers, plants, signals
-    from quell.controllers.adrc import ADRC, Estimate
+    from quell.controllers.adrc import ADRC
+    from quell.controllers.estimate import Estimate
     from quell.guard import Guard, Reason
     from quell.observers.canonical import canonical
     from quell.observers.eso import ESO
@@ -31,7 +32,7 @@ __version__ = "0.1.0"
 _HOME = {
     "ADRC": "quell.controllers.adrc",
     "ESO": "quell.observers.eso",
-    "Estimate": "quell.controllers.adrc",
+    "Estimate": "quell.controllers.estimate",
     "Guard": "quell.guard",
     "Reason": "quell.guard",
     "Scenario": "quell.simulation",

@@ -1,6 +1,7 @@
 """Controllers: what makes a control signal of a reference and a measurement."""
 
-from quell.controllers.adrc import ADRC, Estimate
+from quell.controllers.adrc import ADRC
 from quell.controllers.base import Controller
+from quell.controllers.estimate import Estimate
 
 __all__ = ["ADRC", "Controller", "Estimate"]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import control, flags, report, rest
+from quell.controllers.estimate import Estimate
 from quell.controllers.handle import bind, bound_control, entry_point
 from quell.controllers.limits import Limits, apply_limits, limits
 from quell.dispatch import compiling, for_types, is_finite, kernel
@@ -162,33 +163,6 @@ def _rest(design: AdrcDesign, state: AdrcState) -> None:
         state.loop[i] = 0.0
     _forget_f_learned(design, state)
     restart(design.learner, state.learner)
-
-
-class Estimate(NamedTuple):
-    """What the controller knows after a step."""
-
-    x: Vector
-    """(n,): y and its derivatives."""
-    f: float
-    """Total disturbance [y-unit/s^n]: ``f_learned + f_residual``."""
-    f_learned: float
-    """The learner's share, f_L."""
-    f_residual: float
-    """The observer's share, Δf̂."""
-    theta: dict[str, float]
-    """The learner's coefficients by feature."""
-    u: float
-    """The control signal applied."""
-    status: Status
-    """What the step had to report."""
-    authority: float = 1.0
-    """Share of its output that the guard lets a learner have."""
-    error_plain: float = math.nan
-    """RMS of what an ESO without learner would have missed of f, as the guard has it [y-unit/s^n]."""
-    error_learned: float = math.nan
-    """The same had the learner had full authority."""
-    reason: Reason = Reason.TRUSTED
-    """Why the authority is what it is."""
 
 
 class ADRC:

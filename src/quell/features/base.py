@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell import trial
+from quell import tryout
 from quell.dispatch import generic
 from quell.types import Vector
 
@@ -134,7 +134,7 @@ def tried(features: Features, order: int) -> Any:
     if isinstance(features, Joined):
         tried(features.first, order)
         tried(features.second, order)
-    elif trial.of_users(features):
+    elif tryout.of_users(features):
         _try_block(features, order)
     return features.design(order)
 
@@ -142,19 +142,19 @@ def tried(features: Features, order: int) -> Any:
 def _try_block(block: Features, order: int) -> None:
     name = type(block).__name__
     what = f"{name}.design({order})"
-    parameters = trial.attempt(what, "design takes the plant's order", block.design, order)
-    trial.named_tuple(what, parameters, "numbers and arrays")
-    names = trial.attempt(f"{name}.names({order})", "names takes the plant's order", block.names, order)
+    parameters = tryout.attempt(what, "design takes the plant's order", block.design, order)
+    tryout.named_tuple(what, parameters, "numbers and arrays")
+    names = tryout.attempt(f"{name}.names({order})", "names takes the plant's order", block.names, order)
     if not isinstance(names, tuple) or not names or not all(isinstance(label, str) for label in names):
         raise ValueError(f"{name}.names({order}) returns {names!r}: must return a tuple with a name for each feature")
-    trial.registered(name, parameters, write, unit)
+    tryout.registered(name, parameters, write, unit)
     rule = f"it is given x ({order},), u, and room for {len(names)} features, as many as it has names"
     ones, marks = np.ones(order + 2), (7e77, -7e77)
-    for function, arguments in ((write, (trial.wave(order), 0.5)), (unit, (ones,))):
+    for function, arguments in ((write, (tryout.wave(order), 0.5)), (unit, (ones,))):
         written = []
         for mark in marks:
             out = np.full(len(names), mark)
-            trial.attempt_kernel(f"{name}: {function.__name__}", rule, function, parameters, *arguments, out)
+            tryout.attempt_kernel(f"{name}: {function.__name__}", rule, function, parameters, *arguments, out)
             written.append(out != mark)
         if not np.all(written):
             raise ValueError(

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from quell import trial
+from quell import tryout
 from quell.dispatch import generic
 from quell.observers.eso import ESO
 from quell.types import Vector
@@ -93,29 +93,29 @@ def tried(learner: Any, observer: ESO, omega_c: float) -> Any:
     ValueError
         that names the learner's class and the rule, for whatever is wrong.
     """
-    if not trial.of_users(learner):
+    if not tryout.of_users(learner):
         return learner.design(observer, omega_c)
     name, order = type(learner).__name__, observer.order
     what = f"{name}.design(observer, {omega_c:g})"
-    parameters = trial.attempt(what, "design takes (observer, omega_c)", learner.design, observer, omega_c)
-    trial.named_tuple(what, parameters, "numbers and arrays")
-    trial.registered(name, parameters, adapt, predict, commit, restart, coefficients)
-    memory = trial.attempt(f"{name}.memory(...)", "memory takes (parameters)", learner.memory, parameters)
-    trial.arrays(f"{name}.memory", memory, nested=True)
-    names = trial.attempt(f"{name}.feature_names({order})", "feature_names takes the plant's order", learner.feature_names, order)
+    parameters = tryout.attempt(what, "design takes (observer, omega_c)", learner.design, observer, omega_c)
+    tryout.named_tuple(what, parameters, "numbers and arrays")
+    tryout.registered(name, parameters, adapt, predict, commit, restart, coefficients)
+    memory = tryout.attempt(f"{name}.memory(...)", "memory takes (parameters)", learner.memory, parameters)
+    tryout.arrays(f"{name}.memory", memory, nested=True)
+    names = tryout.attempt(f"{name}.feature_names({order})", "feature_names takes the plant's order", learner.feature_names, order)
     if not isinstance(names, tuple) or not all(isinstance(label, str) for label in names):
         raise ValueError(f"{name}.feature_names({order}) returns {names!r}: must return a tuple with a name for each coefficient")
-    seen, rule = trial.wave(order + 1), "docs/extend says what it is given"
-    trial.attempt_kernel(f"{name}: adapt", rule, adapt, parameters, memory, seen, 0.9, 0.5, 0.1)
-    predicted = trial.attempt_kernel(f"{name}: predict", rule, predict, parameters, memory, seen, 0.5)
-    if predicted is not trial.UNKNOWN:
+    seen, rule = tryout.wave(order + 1), "docs/extend says what it is given"
+    tryout.attempt_kernel(f"{name}: adapt", rule, adapt, parameters, memory, seen, 0.9, 0.5, 0.1)
+    predicted = tryout.attempt_kernel(f"{name}: predict", rule, predict, parameters, memory, seen, 0.5)
+    if predicted is not tryout.UNKNOWN:
         if not (isinstance(predicted, tuple) and len(predicted) == 2):
             raise ValueError(f"{name}: predict returns {predicted!r}: must return (constant, slope), two numbers")
         for label, value in zip(("constant", "slope"), predicted, strict=True):
-            trial.number(f"{name}: predict, {label},", value)
-    trial.attempt_kernel(f"{name}: commit", rule, commit, parameters, memory, seen, 0.5, 0.1)
-    trial.attempt_kernel(f"{name}: coefficients", f"it has {len(names)} names", coefficients, parameters, memory, np.zeros(len(names)))
-    trial.attempt_kernel(f"{name}: restart", rule, restart, parameters, memory)
+            tryout.number(f"{name}: predict, {label},", value)
+    tryout.attempt_kernel(f"{name}: commit", rule, commit, parameters, memory, seen, 0.5, 0.1)
+    tryout.attempt_kernel(f"{name}: coefficients", f"it has {len(names)} names", coefficients, parameters, memory, np.zeros(len(names)))
+    tryout.attempt_kernel(f"{name}: restart", rule, restart, parameters, memory)
     return parameters
 
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from quell import trial
+from quell import tryout
 from quell.dispatch import generic
 from quell.types import Vector
 
@@ -46,24 +46,24 @@ def tried(model: Any, features: int, dt: float) -> Any:
     ValueError
         that names the model's class and the rule, for whatever is wrong.
     """
-    if not trial.of_users(model):
+    if not tryout.of_users(model):
         return model.design(features, dt)
     name, rule = type(model).__name__, f"it is shown {features} features, of shape ({features},), and learns and predicts one number"
     what = f"{name}.design({features}, {dt:g})"
-    parameters = trial.named_tuple(
-        what, trial.attempt(what, "design takes (features, dt)", model.design, features, dt), "numbers and arrays"
+    parameters = tryout.named_tuple(
+        what, tryout.attempt(what, "design takes (features, dt)", model.design, features, dt), "numbers and arrays"
     )
-    trial.registered(name, parameters, infer, learn)
-    trial.arrays(
-        f"{name}.memory", trial.attempt(f"{name}.memory(...)", "memory takes (parameters)", model.memory, parameters), nested=False
+    tryout.registered(name, parameters, infer, learn)
+    tryout.arrays(
+        f"{name}.memory", tryout.attempt(f"{name}.memory(...)", "memory takes (parameters)", model.memory, parameters), nested=False
     )
     memory = packed(model.memory(parameters))[0]
     for i in range(3):
-        shown = trial.wave(features, 1.0 + i)
-        predicted = trial.attempt_kernel(f"{name}: infer", rule, infer, parameters, memory, shown)
-        if predicted is not trial.UNKNOWN:
-            trial.number(f"{name}: infer", predicted)
-        trial.attempt_kernel(f"{name}: learn", rule, learn, parameters, memory, shown, 0.5)
+        shown = tryout.wave(features, 1.0 + i)
+        predicted = tryout.attempt_kernel(f"{name}: infer", rule, infer, parameters, memory, shown)
+        if predicted is not tryout.UNKNOWN:
+            tryout.number(f"{name}: infer", predicted)
+        tryout.attempt_kernel(f"{name}: learn", rule, learn, parameters, memory, shown, 0.5)
     return parameters
 
 
