@@ -225,3 +225,32 @@ def test_mistakes_are_named(make: object, message: str) -> None:
     """Argument, value, rule."""
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("bad", [1.7e308, 1e306, 1e160])
+@pytest.mark.parametrize("learner", [None, ql.learners.Kalman(), ql.learners.Harmonic(state=False)])
+def test_a_measurement_beyond_all_numbers_is_got_over(bad: float, learner: object) -> None:
+    """After it the guarded loop goes on as the one without a guard does."""
+    controllers = [ql.ADRC(OBSERVER, 1.0, learner=learner, guard=guard, u_min=-20.0, u_max=20.0) for guard in (None, ql.Guard())]
+    for k in range(4000):
+        y = bad if k == 1000 else 0.3 * math.sin(0.004 * k)
+        for controller in controllers:
+            assert math.isfinite(controller.step(0.0, y))
+            if k > 3000:
+                assert Status.OVERFLOWED not in controller.estimate.status, k
+    guarded = controllers[1].estimate
+    assert math.isfinite(guarded.error_plain)
+    assert math.isfinite(guarded.error_learned)
+    for array in controllers[1].state.values():
+        assert np.all(np.isfinite(array))
+
+
+def test_a_bad_measurement_does_not_open_the_bounds() -> None:
+    """A learner that turns after one sample that was off by a kilometre does little more harm than MF-ESO suffers itself."""
+    errors = []
+    for learner in (None, Turncoat(ql.learners.Kalman(), 50.0, 10.0)):
+        controller = ql.ADRC(OBSERVER, 1.0, learner=learner, guard=ql.Guard() if learner else None, u_min=-20.0, u_max=20.0)
+        glitch = ql.signals.Step(1000.0, at=45.0) - ql.signals.Step(1000.0, at=45.005)
+        run = ql.simulate(PLANT, controller, ql.Scenario(ql.signals.Sinusoid(), 120.0, noise=glitch), record_every=4)
+        errors.append(np.max(np.abs(run["y"][run.window(60.0, 120.0)])))
+    assert errors[1] < 3.0 * errors[0] + 1.0, errors

@@ -13,7 +13,8 @@ averaged over T seconds in which something happens:
 
     m_xy ← m_xy + (dt/T) a (x y / s − m_xy),        s = q² + p²,        a = min(1, s / (0.4 e)²)
 
-with e the usual size of q. The share of the plain ESO's error that the learner would have removed,
+with e the usual size of q, in which an outlier counts for no more than three times what is usual. The share of the plain ESO's error
+that the learner would have removed,
 ``η = (2 m_qp − m_pp) / m_qq``, decides:
 
     β = min( clip(η / 0.2, 0, 1),  1.2 m_qq / m_pp )
@@ -49,6 +50,7 @@ from quell.types import Matrix, Vector
 _AVERAGE = 30.0
 # The usual size of q follows within two lags where it grows, and is remembered for 200.
 _ATTACK, _MEMORY = 2.0, 200.0
+_OUTLIER = 3.0
 # Samples below this share of the usual size count less: they are noise.
 _QUIET = 0.4
 # A learner is fully heard from this explained share on.
@@ -193,25 +195,32 @@ class GuardMemory(NamedTuple):
     record: Vector
     """(5,): m_qq, m_qp, m_pp; mean squares of q and of q − p [(y-unit/s^n)²]."""
     moment: Vector
-    """(5,): authority, usual size of q, g of the sample, the last f_L, reason."""
+    """(6,): authority, usual size of q, g of the sample, the last f_L, reason, samples so far."""
 
 
 # Places in GuardMemory.
 _F_PLAIN, _G, _GG = range(3)
 _QQ, _QP, _PP, _PLAIN, _LEARNED = range(5)
-_AUTHORITY, _USUAL, _OUTPUT, _LAST, _REASON = range(5)
+_AUTHORITY, _USUAL, _OUTPUT, _LAST, _REASON, _SINCE = range(6)
 
 
 @watch.register(GuardDesign)
 def _watch(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     shown, record, moment = memory.shown, memory.record, memory.moment
     q, p = f_plain - shown[_F_PLAIN], shown[_G] - shown[_GG]
+    qq, pp = q * q, p * p
+    if not is_finite(qq + pp):
+        # A measurement beyond all numbers, perhaps: what it left here is worth nothing.
+        calm(guard, memory)
+        return
     shown[_F_PLAIN] = lag_push(guard.lag, memory.chain, _F_PLAIN, f_plain)
     shown[_GG] = lag_push(guard.lag, memory.chain, _GG, shown[_G])
     usual = moment[_USUAL]
-    usual += guard.attack * (abs(q) - usual) if abs(q) > usual else -guard.decay * usual
-    moment[_USUAL] = usual
-    qq, pp = q * q, p * p
+    # Once there is a usual size, an outlier counts for no more than three times that: one bad measurement must not open all bounds.
+    moment[_SINCE] += 1.0
+    large = abs(q) if moment[_SINCE] * guard.forget < 1.0 else min(abs(q), _OUTLIER * usual)
+    usual += guard.attack * (large - usual) if large > usual else -guard.decay * usual
+    moment[_USUAL] = max(usual, _TINY)
     size, quiet = qq + pp, (_QUIET * usual) ** 2
     if size < _TINY:
         return
@@ -352,4 +361,4 @@ class Guard:
         """Return the state before the first sample: nothing proved."""
         record = np.zeros(5)
         _distrust(record)
-        return GuardMemory(np.zeros((3, parameters.lag.taps.size)), np.zeros(3), record, np.zeros(5))
+        return GuardMemory(np.zeros((3, parameters.lag.taps.size)), np.zeros(3), record, np.zeros(6))

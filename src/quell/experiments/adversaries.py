@@ -139,7 +139,7 @@ class Adversary:
     ``EXPONENTIAL``
         ``size · exp(t/time)``.
     ``DELAYED``
-        ``size · f̂``, ``delay`` samples late.
+        ``size · f̂``, ``delay`` samples later than it is known.
     ``MINUS_U``
         ``−size · b0 u``.
     ``FLIPPING``

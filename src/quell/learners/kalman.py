@@ -128,6 +128,9 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
     for i in range(size):
         innovation -= theta[i] * filtered[i]
     noise, deviation = _watch(learner, moment, y, y - seen[0], innovation, f_plain)
+    if not is_finite(deviation):  # a measurement beyond all numbers, perhaps
+        restart(learner, memory)
+        return
     if deviation == 0.0:
         return
     weight = 1.0 / deviation
