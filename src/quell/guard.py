@@ -13,7 +13,7 @@ averaged over T seconds in which something happens:
 
     m_xy ← m_xy + (dt/T) a (x y / s − m_xy),        s = q² + p²,        a = min(1, s / (0.4 e)²)
 
-with e the usual size of q, in which an outlier counts for no more than three times what is usual. The share of the plain ESO's error
+with e the usual size of q, in which an outlier counts for no more than five times what is usual. The share of the plain ESO's error
 that the learner would have removed,
 ``η = (2 m_qp − m_pp) / m_qq``, decides:
 
@@ -50,7 +50,7 @@ from quell.types import Matrix, Vector
 _AVERAGE = 30.0
 # The usual size of q follows within two lags where it grows, and is remembered for 200.
 _ATTACK, _MEMORY = 2.0, 200.0
-_OUTLIER = 3.0
+_OUTLIER = 5.0
 # Samples below this share of the usual size count less: they are noise.
 _QUIET = 0.4
 # A learner is fully heard from this explained share on.
@@ -216,7 +216,7 @@ def _watch(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     shown[_F_PLAIN] = lag_push(guard.lag, memory.chain, _F_PLAIN, f_plain)
     shown[_GG] = lag_push(guard.lag, memory.chain, _GG, shown[_G])
     usual = moment[_USUAL]
-    # Once there is a usual size, an outlier counts for no more than three times that: one bad measurement must not open all bounds.
+    # Once there is a usual size, an outlier counts for no more than five times that: one bad measurement must not open all bounds.
     moment[_SINCE] += 1.0
     large = abs(q) if moment[_SINCE] * guard.forget < 1.0 else min(abs(q), _OUTLIER * usual)
     usual += guard.attack * (large - usual) if large > usual else -guard.decay * usual
