@@ -111,7 +111,7 @@ def test_what_is_permitted_lies_within_its_bounds(rng: np.random.Generator) -> N
         assert low <= permitted <= high, k
         fast = abs(permitted - last) > 2.0 * OBSERVER.omega_o * OBSERVER.dt * e * (1.0 + 1e-9)
         assert not fast or exploded or permitted in (low, high), k
-        note(design, memory, 0.0, permitted)
+        note(design, memory, permitted)
         last = permitted
         heard += permitted != 0.0
     assert heard > 5000, "hardly anything was permitted: the test says nothing"
@@ -128,7 +128,7 @@ def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
         f = math.sin(0.7 * k * OBSERVER.dt)
         watch(design, memory, shown)
         permit(design, memory, shown, f, 0.0, 0.0)
-        note(design, memory, 0.0, f)
+        note(design, memory, f)
         shown = lag_push(lag, chain, 0, f)
     qq, qp, pp = memory.record[:3]
     assert qp == pytest.approx(qq, rel=1e-6)
@@ -154,7 +154,7 @@ def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() 
         if k == 3000:
             assert (kept, slope) == (0.0, 0.0)
             assert ql.Reason(int(memory.moment[4])) == ql.Reason.NOT_FINITE
-        note(design, memory, 0.0, kept)
+        note(design, memory, kept)
         heard.append(memory.moment[0] > 0.0)
         shown = lag_push(design.lag, chain, 0, f)
     again = 3000 + heard[3001:].index(True)

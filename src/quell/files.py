@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
@@ -36,6 +38,18 @@ def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Write dictionaries, lists, strings and finite numbers to a JSON file, whole or not at all.
+
+    Raises
+    ------
+    ValueError
+        as ``check_writable``, and for a number that is not finite.
+    """
+    with written_atomically(path) as part:
+        part.write_text(json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _part_of(target: Path) -> Path:

@@ -109,8 +109,8 @@ def permit(guard: Any, memory: Any, f_plain: float, constant: float, slope: floa
 
 
 @generic
-def note(guard: Any, memory: Any, u: float, f_learned: float) -> None:
-    """Take note of the ``u`` that was applied and of the ``f_learned`` that the observer is fed."""
+def note(guard: Any, memory: Any, f_learned: float) -> None:
+    """Take note of the ``f_learned`` that the observer is fed."""
     raise TypeError
 
 
@@ -153,7 +153,7 @@ def _permit_all(
 
 
 @note.register(UnguardedDesign)
-def _note_nothing(guard: UnguardedDesign, memory: UnguardedMemory, u: float, f_learned: float) -> None:
+def _note_nothing(guard: UnguardedDesign, memory: UnguardedMemory, f_learned: float) -> None:
     pass
 
 
@@ -291,7 +291,7 @@ def _distrust(record: Vector) -> None:
 
 
 @note.register(GuardDesign)
-def _note(guard: GuardDesign, memory: GuardMemory, u: float, f_learned: float) -> None:
+def _note(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> None:
     memory.shown[_G] = lag_push(guard.lag, memory.chain, _G, memory.moment[_OUTPUT])
     memory.moment[_LAST] = f_learned
 
@@ -343,7 +343,7 @@ class Guard:
 
     def design(self, observer: ESO) -> GuardDesign:
         """Return the parameters for an observer."""
-        lag_time = (observer.order + 1) / observer.omega_o
+        lag_time = observer.lag_time
         dt, time = observer.dt, _AVERAGE * lag_time if self.time is None else self.time
         slopes = sorted([-0.5 * observer.b0, observer.b0])
         return GuardDesign(

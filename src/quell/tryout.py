@@ -33,14 +33,11 @@ def attempt(what: str, rule: str, function: Callable[..., Any], *arguments: Any)
 def attempt_kernel(what: str, rule: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Do what ``attempt`` does; ``UNKNOWN`` where there is a division by zero and the like, which gives inf or NaN once it is compiled."""
     try:
-        with np.errstate(all="ignore"):
-            return function(*arguments)
-    except ArithmeticError:
-        return UNKNOWN
-    except Exception as error:
-        if "math domain" in str(error):
+        return attempt(what, rule, function, *arguments)
+    except ValueError as error:
+        if isinstance(error.__cause__, ArithmeticError) or "math domain" in str(error.__cause__):
             return UNKNOWN
-        raise ValueError(f"{what} fails with {type(error).__name__}: {error}; {rule}") from error
+        raise
 
 
 def registered(name: str, parameters: Any, *functions: Generic[Any, Any]) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -13,9 +11,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from quell.experiments import stress, stress_figure
+from quell.experiments.figures import made
 from quell.experiments.stress import HONEST, Outcome
-from quell.experiments.two_mass_figures import made
-from quell.files import check_writable, written_atomically
+from quell.files import check_writable, write_json
 from quell.guard import Guard
 
 
@@ -45,8 +43,7 @@ def run_stress(*, runs: int, honest: int, seed: int, guarded: bool, json_file: P
         stress_figure.save(result, figures)
         console.print(f"Figure: stress (PNG and SVG) in {escape(str(figures))}/", soft_wrap=True)
     if json_file is not None:
-        with written_atomically(json_file) as part:
-            part.write_text(json.dumps(_plain(result.to_json()), indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+        write_json(json_file, result.to_json())
         console.print(f"Results: {escape(str(json_file))}", soft_wrap=True)
 
 
@@ -87,12 +84,3 @@ def _row(table: Table, label: str, outcomes: list[Outcome]) -> None:
         *(escape(label), str(found["runs"]), f"[red]{lost}[/]" if lost else "0"),
         *("–" if cell is None else f"{cell:.3f}" for cell in cells),
     )
-
-
-def _plain(value: Any) -> Any:
-    """Return ``value`` with None where a number is none."""
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return None if isinstance(value, float) and value != value else value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 
@@ -15,9 +14,10 @@ from rich.table import Table
 from quell import plants
 from quell.dispatch import compilations
 from quell.experiments import two_mass_figures, two_mass_spring, two_mass_study
+from quell.experiments.figures import made
 from quell.experiments.two_mass_spring import Settings
 from quell.experiments.two_mass_study import Result
-from quell.files import check_writable, written_atomically
+from quell.files import check_writable, write_json
 from quell.simulation import Scenario, run_block, simulate
 
 _COLUMNS = (
@@ -46,7 +46,7 @@ def reproduce_two_mass(*, dt: float, seed: int, omega_o: float, reset: bool, jso
     if json_file is not None:
         check_writable(json_file)
     if figures is not None:
-        two_mass_figures.made(figures)
+        made(figures)
     console = Console()
     _compile(console, settings)
     with Progress(TextColumn("{task.description:<15}"), BarColumn(), console=console, transient=True) as bar:
@@ -62,8 +62,7 @@ def reproduce_two_mass(*, dt: float, seed: int, omega_o: float, reset: bool, jso
         names = ", ".join(sorted({path.stem for path in paths}))
         console.print(f"Figures: {names} (PNG and SVG) in {escape(str(figures))}/", soft_wrap=True)
     if json_file is not None:
-        with written_atomically(json_file) as part:
-            part.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+        write_json(json_file, result.to_json())
         console.print(f"Results: {escape(str(json_file))}", soft_wrap=True)
 
 

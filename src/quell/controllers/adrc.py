@@ -119,7 +119,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop[_F_SHOWN] = lag_push(design.lag, state.shadow, 0, f_learned)
     loop[_STATUS] = status | cut
     commit(design.learner, state.learner, seen, u, f_learned)
-    note(design.guard, state.guard, u, f_learned)
+    note(design.guard, state.guard, f_learned)
     return u
 
 

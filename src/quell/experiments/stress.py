@@ -78,8 +78,13 @@ class Result:
             "adversarial": summary(self.hostile),
             "honest": summary(self.of(HONEST)),
             "kinds": {kind: summary(self.of(kind)) for kind in self.kinds if kind != HONEST},
-            "worst": [asdict(outcome) for outcome in worst],
+            "worst": [_plain(asdict(outcome)) for outcome in worst],
         }
+
+
+def _plain(outcome: dict[str, Any]) -> dict[str, Any]:
+    """Return an outcome with None where a ratio is none."""
+    return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in outcome.items()}
 
 
 def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from quell.experiments.figures import made, save_figure
 from quell.experiments.stress import HONEST, Result
-from quell.files import written_atomically
 
 
 def draw(result: Result) -> Any:
@@ -36,11 +36,5 @@ def draw(result: Result) -> Any:
 
 
 def save(result: Result, folder: Path) -> list[Path]:
-    """Write the figure as PNG and SVG; return the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    figure = draw(result)
-    paths = [folder / f"stress.{suffix}" for suffix in ("png", "svg")]
-    for path in paths:
-        with written_atomically(path) as part:
-            figure.savefig(part, format=path.suffix[1:], dpi=150)
-    return paths
+    """Write the figure into ``folder``, made if need be; return the paths."""
+    return save_figure(draw(result), made(folder), "stress")

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from quell.experiments.figures import made, save_figure
 from quell.experiments.gradient_range import HORIZON, Trial
 from quell.experiments.two_mass_spring import END, FORCE_AT, L1, MB, MF, STEP_AT, L
 from quell.experiments.two_mass_study import Result
-from quell.files import written_atomically
 from quell.plotting import draw
 from quell.trajectory import Trajectory
 
@@ -41,27 +41,12 @@ def save(result: Result, folder: str | os.PathLike[str], tell: Callable[[str, fl
 
     where = made(folder)
     written = []
-    # A fixed salt and no date: the same run gives the same files.
-    with matplotlib.rc_context({"svg.hashsalt": "quell", "font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}):
+    with matplotlib.rc_context({"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}):
         for i, (name, figure) in enumerate(_figures(result)):
             tell("figures", i / 4)
-            for suffix in ("png", "svg"):
-                path = where / f"{name}.{suffix}"
-                with written_atomically(path) as part:
-                    figure.savefig(part, dpi=130, metadata={"Date": None} if suffix == "svg" else None)
-                written.append(path)
+            written += save_figure(figure, where, name)
     tell("figures", 1.0)
     return written
-
-
-def made(folder: str | os.PathLike[str]) -> Path:
-    """Return a folder for figures, made if need be; a ``ValueError`` says why it can't be."""
-    where = Path(folder)
-    try:
-        where.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"figures = {str(where)!r}: must be a folder that can be made ({error.strerror})") from None
-    return where
 
 
 def _figures(result: Result) -> Iterator[tuple[str, Any]]:

@@ -16,11 +16,9 @@ from quell.features import Features
 from quell.features.base import tried, unit, write
 from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.lag import watch_samples
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
-
-# In units of the observer's lag.
-_WATCH = 2.0
 
 # Places in FeatureGradientMemory.place.
 _AT, _FULL, _SINCE, _SCALED = range(4)
@@ -71,7 +69,7 @@ def feature_gradient_design(rate: float, batch: int, features: Features, observe
         batch=batch,
         features=tried(features, observer.order),
         scaling=scaling(observer, frequency, False),
-        watch=round(_WATCH * (observer.order + 1) / observer.omega_o / observer.dt),
+        watch=watch_samples(observer),
     )
 
 

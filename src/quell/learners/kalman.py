@@ -20,7 +20,7 @@ follows the noise folds its high frequencies down to where the loop is sensitive
 is faster.
 
 *What teaches.* The observer's estimates of higher derivatives are noisy. At rest they are nothing but noise, and regression on noise finds
-something, slowly and confidently. So a feature teaches only while its variance is ``_CLEAR²`` times what the measurement noise, seen in
+something, slowly and confidently. So a feature teaches only while its variance is ``CLEAR²`` times what the measurement noise, seen in
 y − x̂_1, puts into it; else its place in φ̃ is zero. Rounding counts as noise too. What is constant in a feature is the bias's business,
 where there is one: φ̃ has the feature less its running mean, and the bias gives up at the mean what a coefficient gains.
 
@@ -39,21 +39,14 @@ import numpy as np
 from quell import checks
 from quell.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.lag import Lag, lag_of, lag_push
+from quell.learners.lag import WATCH, Lag, lag_of, lag_push
 from quell.learners.oscillators import Oscillators, retune, turn_phases
+from quell.learners.sight import AVERAGE, CLEAR, RESOLUTION
 from quell.observers.eso import ESO, noise_gains
 from quell.types import Matrix, Vector
 
 # The share of f that a linear model is taken to leave unexplained, at least.
 _DOUBT = 0.1
-# How many times its noise a feature must be to teach. White noise of each sample makes 1, noise held for ten samples 3.
-_CLEAR = 6.0
-# No sensor resolves better than this share of what it measures.
-_RESOLUTION = 1e-8
-# In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
-_WATCH = 2.0
-# Mean squares are taken over so many lags of the observer.
-_AVERAGE = 10.0
 
 # Places in KalmanMemory.moment.
 _NOISE, _UNEXPLAINED, _FILLED, _SINCE = range(4)
@@ -143,7 +136,7 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
             variance[i] += learner.forget * (away * away - variance[i])
             centre = mean[i] if learner.bias else 0.0
             taught[i] = weight * (filtered[i] - centre) if variance[i] > learner.threshold[i] * noise else 0.0
-    if moment[_SINCE] <= _WATCH * learner.lag_time:
+    if moment[_SINCE] <= WATCH * learner.lag_time:
         return
     spread = 0.0
     for i in range(size):
@@ -181,7 +174,7 @@ def _adapt(learner: KalmanDesign, memory: KalmanMemory, seen: Vector, y: float, 
 @kernel
 def _watch(learner: KalmanDesign, moment: Vector, y: float, error: float, innovation: float, target: float) -> tuple[float, float]:
     """Take note of a sample; return the mean square of y − x̂_1, and √R. In the means the first values count fully."""
-    rounding, doubt = _RESOLUTION * y, _DOUBT * target
+    rounding, doubt = RESOLUTION * y, _DOUBT * target
     moment[_NOISE] += learner.forget * (error * error + rounding * rounding - moment[_NOISE])
     moment[_UNEXPLAINED] += learner.forget * (innovation * innovation + doubt * doubt - moment[_UNEXPLAINED])
     moment[_FILLED] += learner.forget * (1.0 - moment[_FILLED])
@@ -323,12 +316,12 @@ class Kalman:
         slow = checks.vector("state_bandwidth", self.state_bandwidth)
         slow = np.full(n, slow[0]) if slow.size == 1 else checks.vector("state_bandwidth", slow, n)
         follow = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
-        lag_time = (n + 1) / observer.omega_o
+        lag_time = observer.lag_time
         frequency = omega_c if self.frequency is None else float(self.frequency)
         scale = frequency ** -np.arange(n, dtype=np.float64)
         # What noise in y leaves in x̂_i; what it leaves in f̂ is also in b0 u.
         noise = noise_gains(observer)
-        threshold = (_CLEAR * np.append(scale, 1.0)) ** 2 * noise
+        threshold = (CLEAR * np.append(scale, 1.0)) ** 2 * noise
         size = self.prior * frequency**n
         oscillators, pair_bandwidth = self.oscillators(observer, omega_c)
         pairs = 2 * oscillators.omega.size
@@ -347,7 +340,7 @@ class Kalman:
             slope_low=self.gain_interval[0] - 1.0,
             slope_high=self.gain_interval[1] - 1.0,
             dt=observer.dt,
-            forget=-math.expm1(-observer.dt / (_AVERAGE * lag_time)),
+            forget=-math.expm1(-observer.dt / (AVERAGE * lag_time)),
             lag_time=lag_time,
         )
 

@@ -22,6 +22,9 @@ from quell.dispatch import kernel
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
+# In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
+WATCH = 2.0
+
 
 class Lag(NamedTuple):
     """The lag filter of one observer, with N = n + 1 states for each input."""
@@ -34,6 +37,11 @@ class Lag(NamedTuple):
     """c (N,)."""
     predictor: bool
     """One sample later, for an observer in predictor form."""
+
+
+def watch_samples(observer: ESO) -> int:
+    """Return how many samples after a start from rest nothing is learned: the observer's own initial error is in Δf̂ then."""
+    return round(WATCH * (observer.order + 1) / observer.omega_o / observer.dt)
 
 
 def lag_of(observer: ESO) -> Lag:

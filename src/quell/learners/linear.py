@@ -10,8 +10,8 @@ from quell import checks
 from quell.features import Bias, Features, State
 from quell.features.base import tried, write
 from quell.features.scaling import scaling
-from quell.learners.lag import lag_of
-from quell.learners.regression import WATCH, LinearDesign, LinearMemory
+from quell.learners.lag import lag_of, watch_samples
+from quell.learners.regression import LinearDesign, LinearMemory
 from quell.learners.sight import sight, sight_memory
 from quell.observers.eso import ESO
 from quell.types import Matrix
@@ -82,7 +82,7 @@ class Linear:
             slope_high=slopes[1],
             depends=_dependence(features, n, p),
             follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
-            watch=round(WATCH * (n + 1) / observer.omega_o / observer.dt),
+            watch=watch_samples(observer),
         )
 
     def memory(self, parameters: LinearDesign) -> LinearMemory:

@@ -202,5 +202,4 @@ class MLP(Online):
     def fitted_model(self, observer: ESO, omega_c: float) -> Network:
         """Return the network with memory and correlation of noise as observer and controller want them."""
         model: Network = self.model
-        lag_time = (observer.order + 1) / observer.omega_o
-        return Network(model.hidden, model.seed, model.every, self.memory_time or 100.0 / omega_c, model.noise, lag_time)
+        return Network(model.hidden, model.seed, model.every, self.memory_time or 100.0 / omega_c, model.noise, observer.lag_time)

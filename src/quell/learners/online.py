@@ -29,14 +29,11 @@ from quell.features.base import tried as tried_features
 from quell.features.base import write
 from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.lag import lag_of
+from quell.learners.lag import lag_of, watch_samples
 from quell.learners.model import infer, learn, packed, tried
 from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory, trust
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
-
-# In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
-_WATCH = 2.0
 
 # Places in OnlineMemory.place.
 _ROW, _SINCE, _LEFT = range(3)
@@ -204,7 +201,7 @@ class Online:
             model=tried(self.fitted_model(observer, omega_c), len(self.features.names(n)), observer.dt),
             follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
             delay=round(group_delay(observer)),
-            watch=round(_WATCH * (n + 1) / observer.omega_o / observer.dt),
+            watch=watch_samples(observer),
         )
 
     def memory(self, parameters: OnlineDesign) -> OnlineMemory:

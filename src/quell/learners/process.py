@@ -312,5 +312,4 @@ class GaussianProcess(Online):
     def fitted_model(self, observer: ESO, omega_c: float) -> Process:
         """Return the process with memory and correlation of noise as observer and controller want them."""
         model: Process = self.model
-        lag_time = (observer.order + 1) / observer.omega_o
-        return Process(model.budget, model.length, model.every, self.memory_time or 1000.0 / omega_c, model.noise, lag_time)
+        return Process(model.budget, model.length, model.every, self.memory_time or 1000.0 / omega_c, model.noise, observer.lag_time)

@@ -33,9 +33,6 @@ from quell.learners.lag import Lag, lag_push
 from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, trust
 from quell.types import Matrix, Vector
 
-# In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
-WATCH = 2.0
-
 # Where less than this share of what is seen can be a motion, nothing is learned from it: noise that is held is stronger than it looks.
 _LEAST_SURE = 0.1
 

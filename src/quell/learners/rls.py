@@ -153,4 +153,4 @@ class RLS(Linear):
 
 def rls_rule(observer: ESO, memory_time: float, prior: float) -> RlsRule:
     """Return the rule for an observer, a memory time [s] and a standard deviation of θ."""
-    return RlsRule((observer.order + 1) / observer.omega_o / observer.dt, -math.expm1(-observer.dt / memory_time), prior**2)
+    return RlsRule(observer.lag_time / observer.dt, -math.expm1(-observer.dt / memory_time), prior**2)

@@ -1,7 +1,7 @@
 """What of the state and the control signal stands clear of noise.
 
 The observer's estimates of higher derivatives are noisy, and at rest all of them are nothing but noise. A regression on noise finds
-something, slowly and confidently. So a signal counts as moving only while its variance is ``_CLEAR²`` times what the measurement noise,
+something, slowly and confidently. So a signal counts as moving only while its variance is ``CLEAR²`` times what the measurement noise,
 seen in y − x̂_1, puts into it; rounding counts as noise too. Of a signal that does not move its running mean is shown. Means are
 exponential ones, over ten lags of the observer.
 
@@ -21,13 +21,13 @@ from quell.observers.eso import ESO, noise_gains
 from quell.types import Vector
 
 # How many times its noise a signal must be. White noise of each sample makes 1, noise held for ten samples 3.
-_CLEAR = 6.0
+CLEAR = 6.0
 # So many standard deviations of noise count against what is to be learned.
 _SURE = 3.0
 # No sensor resolves better than this share of what it measures.
-_RESOLUTION = 1e-8
+RESOLUTION = 1e-8
 # Means are taken over so many lags of the observer.
-_AVERAGE = 10.0
+AVERAGE = 10.0
 
 
 class Sight(NamedTuple):
@@ -59,8 +59,7 @@ def sight(observer: ESO, frequency: float) -> Sight:
     noise = noise_gains(observer)
     f_noise = float(noise[-1])
     noise[-1] /= observer.b0**2  # what noise leaves in f̂ is also in b0 u
-    lag_time = (observer.order + 1) / observer.omega_o
-    return Sight(_CLEAR**2 * noise, -math.expm1(-observer.dt / (_AVERAGE * lag_time)), f_noise, frequency**observer.order)
+    return Sight(CLEAR**2 * noise, -math.expm1(-observer.dt / (AVERAGE * observer.lag_time)), f_noise, frequency**observer.order)
 
 
 def sight_memory(order: int) -> SightMemory:
@@ -71,7 +70,7 @@ def sight_memory(order: int) -> SightMemory:
 @kernel
 def look(sight: Sight, memory: SightMemory, seen: Vector, y: float, u: float) -> bool:
     """Take note of a sample; return whether anything moves."""
-    rounding, error = _RESOLUTION * y, y - seen[0]
+    rounding, error = RESOLUTION * y, y - seen[0]
     memory.noise[0] += sight.forget * (error * error + rounding * rounding - memory.noise[0])
     memory.noise[1] += sight.forget * (1.0 - memory.noise[1])
     order = memory.mean.size - 1

@@ -171,6 +171,11 @@ class ESO:
         return int(self.a.size)
 
     @property
+    def lag_time(self) -> float:
+        """By how much the estimate of f trails f, ``N/omega_o`` [s]; at high sampling rates, and for what is slow."""
+        return (self.order + 1) / self.omega_o
+
+    @property
     def pole(self) -> float:
         """Where all poles of the observer lie in the z-plane, ``exp(−omega_o dt)``."""
         return math.exp(-self.omega_o * self.dt)
