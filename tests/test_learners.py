@@ -13,7 +13,8 @@ import quell as ql
 from quell.learners.base import adapt, commit, predict, restart
 from quell.learners.gradient import outputs
 from quell.learners.lag import lag_of, lag_push
-from quell.observers.eso import ESO, eso_start, eso_update
+from quell.observers.base import begin, observe
+from quell.observers.eso import ESO
 
 
 @settings(max_examples=40)
@@ -37,7 +38,7 @@ def test_the_lag_filter_is_the_observers_own_shadow(order: int, dt: float, form:
     z, seen, chain = np.zeros(size), np.zeros(size), np.zeros((1, size))
     shadow, quick = np.zeros(1000), np.zeros(1000)
     for k in range(1, 1000):
-        eso_update(observer.model, z, seen, 0.0, 0.0, inputs[k - 1])
+        observe(observer.model, z, seen, 0.0, 0.0, inputs[k - 1])
         shadow[k] = -seen[-1]
         quick[k] = lag_push(lag, chain, 0, inputs[k - 1])
     np.testing.assert_allclose(quick, shadow, atol=1e-7 * max(np.max(np.abs(shadow)), 1e-3))
@@ -56,11 +57,11 @@ def test_what_a_plain_eso_would_have_estimated_is_known_exactly(rng: np.random.G
     lag, chain = lag_of(observer), np.zeros((1, 4))
     y, u, f_learned = (np.cumsum(rng.normal(size=2000)) * 1e-2 for _ in range(3))
     z, seen, plain, plainly = (np.zeros(4) for _ in range(4))
-    eso_start(z, seen, y[0])
-    eso_start(plain, plainly, y[0])
+    begin(observer.model, z, seen, y[0])
+    begin(observer.model, plain, plainly, y[0])
     for k in range(1, y.size):
-        eso_update(observer.model, z, seen, y[k], u[k - 1], f_learned[k - 1])
-        eso_update(observer.model, plain, plainly, y[k], u[k - 1], 0.0)
+        observe(observer.model, z, seen, y[k], u[k - 1], f_learned[k - 1])
+        observe(observer.model, plain, plainly, y[k], u[k - 1], 0.0)
         shown = lag_push(lag, chain, 0, f_learned[k - 1])
         assert seen[-1] + shown == pytest.approx(plainly[-1], rel=1e-9, abs=1e-6)
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.observers import canonical, continuous_gain
-from quell.observers.eso import ESO, eso_start, eso_update
+from quell.observers.base import begin, observe
+from quell.observers.eso import ESO
 
 
 def error_polynomial(observer: ESO) -> np.ndarray:
@@ -105,10 +106,10 @@ def test_a_model_without_coefficients_is_model_free() -> None:
 def run_observer(observer: ESO, y: np.ndarray, u: np.ndarray, f_learned: np.ndarray) -> np.ndarray:
     """Feed records through an observer; return what it hands out, (samples, N)."""
     z, seen = np.zeros(observer.order + 1), np.zeros(observer.order + 1)
-    eso_start(z, seen, y[0])
+    begin(observer.model, z, seen, y[0])
     out = [seen.copy()]
     for k in range(1, y.size):
-        eso_update(observer.model, z, seen, y[k], u[k - 1], f_learned[k - 1])
+        observe(observer.model, z, seen, y[k], u[k - 1], f_learned[k - 1])
         out.append(seen.copy())
     return np.array(out)
 

@@ -15,7 +15,7 @@ from quell import plants as plant_room
 from quell.controllers.adrc import _named_arrays
 from quell.dispatch import compiled, for_types, interpreted
 from quell.learners.base import adapt, coefficients, commit, predict
-from quell.observers.eso import eso_start, eso_update
+from quell.observers.base import begin, observe
 from quell.plants.base import advance, measure
 from quell.simulation import run_block
 
@@ -91,10 +91,10 @@ def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state
     truth = np.zeros(size)
     truth[-1] = f
     z, seen = np.zeros(size), np.zeros(size)
-    eso_start(z, seen, 0.0)
+    begin(model, z, seen, 0.0)
     for _ in range(1500):
         truth = model.transition @ truth + model.input * u
-        eso_update(model, z, seen, truth[0], u, 0.0)
+        observe(model, z, seen, truth[0], u, 0.0)
     scale = 12.0 ** -np.arange(size)
     np.testing.assert_allclose(seen * scale, truth * scale, rtol=1e-5, atol=1e-5 * np.max(np.abs(truth * scale)))
     for one, other in zip(model, before, strict=True):

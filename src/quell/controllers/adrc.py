@@ -1,168 +1,25 @@
-"""Active disturbance rejection control: the law around an ESO and, where there is one, a learner.
-
-    u_0 = k_1 (r − x̂_1) − k_2 x̂_2 − … − k_n x̂_n,      k_i = C(n, i−1) omega_c^(n−i+1)
-    u   = sat( (u_0 − f_L − Δf̂ + a·x̂) / b0 )
-
-(Gao, ACC 2003; paper eq. (control), with the term ``a·x̂`` that the paper forgets.) With ``f_L = h + s u`` affine in u the
-loop through u is solved instead of closed a sample late: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``.
-"""
+"""Active disturbance rejection control: an ESO, the law around it (``law.py``) and, where there is one, a learner."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.base import control, flags, report, rest
 from quell.controllers.estimate import Estimate
 from quell.controllers.handle import bind, bound_control, entry_point
-from quell.controllers.limits import Limits, apply_limits, limits
-from quell.dispatch import compiling, for_types, is_finite, kernel
-from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, calm, explain, note, permit, watch
-from quell.learners.base import Learner, NoLearner, adapt, coefficients, commit, predict, restart, tried, trouble
-from quell.learners.lag import Lag, lag_of, lag_push
-from quell.observers.eso import ESO, EsoModel, eso_start, eso_update
-from quell.types import Matrix, Status, Vector
-
-_MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
-_REFERENCE_HELD = int(Status.REFERENCE_HELD)
-_OVERFLOWED = int(Status.OVERFLOWED)
-_LEARNER_CUT = int(Status.LEARNER_CUT)
-
-# Places in AdrcState.loop.
-_U, _F_LEARNED, _F_SHOWN, _R, _Y, _STARTED, _REFERENCED, _STATUS = range(8)
-
-
-class AdrcDesign(NamedTuple):
-    """Parameters of the controller, for a plant of order n; N = n + 1."""
-
-    eso: EsoModel
-    law: Vector
-    """k (n,)."""
-    cancel: Vector
-    """a (n,)."""
-    b0: float
-    limits: Limits
-    learner: Any
-    lag: Lag
-    """How f_L shows in Δf̂; without taps where there is no learner."""
-    guard: Any
-
-
-class AdrcState(NamedTuple):
-    """State of the controller."""
-
-    z: Vector
-    """The observer's state (N,)."""
-    seen: Vector
-    """What the law may know of it (N,)."""
-    loop: Vector
-    """(8,): u applied, f_L, what Δf̂ will show of it, last good r and y, whether there was a good y, whether a good r, status."""
-    learner: Any
-    shadow: Matrix
-    """The lag filter of f_L (1, N)."""
-    guard: Any
-
-
-@control.register(AdrcDesign)
-def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
-    loop, seen = state.loop, state.seen
-    status = 0
-    f_plain = 0.0
-    if is_finite(y):
-        loop[_Y] = y
-    else:
-        status |= _MEASUREMENT_HELD
-    if is_finite(r):
-        loop[_R] = r
-        loop[_REFERENCED] = 1.0
-    else:
-        status |= _REFERENCE_HELD
-        if loop[_REFERENCED] == 0.0:
-            loop[_R] = loop[_Y]  # no reference yet: stay
-    if loop[_STARTED] == 0.0:
-        eso_start(state.z, seen, loop[_Y])
-        if status & _MEASUREMENT_HELD != 0:
-            # Nothing is known before a first good measurement: u rests at zero, or as near as the limits let it.
-            loop[_U] = min(max(0.0, design.limits.low), design.limits.high)
-            loop[_STATUS] = status
-            return loop[_U]
-        loop[_STARTED] = 1.0
-    else:
-        eso_update(design.eso, state.z, seen, loop[_Y], loop[_U], loop[_F_LEARNED])
-        f_plain = seen[seen.size - 1] + loop[_F_SHOWN]
-        watch(design.guard, state.guard, f_plain)
-        if status & _MEASUREMENT_HELD == 0:
-            adapt(design.learner, state.learner, seen, loop[_Y], loop[_U], f_plain)
-            status |= trouble(design.learner, state.learner)
-    constant, slope = predict(design.learner, state.learner, seen, loop[_U])
-    constant, slope, cut_off = permit(design.guard, state.guard, f_plain, constant, slope, loop[_U])
-    if cut_off:
-        status |= _LEARNER_CUT
-        restart(design.learner, state.learner)
-    wished = _law(design, seen, loop[_R], constant, slope)
-    if not is_finite(wished):
-        status |= _OVERFLOWED
-        restart(design.learner, state.learner)
-        _forget_f_learned(design, state)
-        eso_start(state.z, seen, loop[_Y])
-        constant = slope = 0.0
-        wished = loop[_U]
-    u, cut = apply_limits(design.limits, wished, loop[_U])
-    f_learned = constant + slope * u
-    loop[_U] = u
-    loop[_F_LEARNED] = f_learned
-    loop[_F_SHOWN] = lag_push(design.lag, state.shadow, 0, f_learned)
-    loop[_STATUS] = status | cut
-    commit(design.learner, state.learner, seen, u, f_learned)
-    note(design.guard, state.guard, f_learned)
-    return u
-
-
-@kernel
-def _forget_f_learned(design: AdrcDesign, state: AdrcState) -> None:
-    calm(design.guard, state.guard)
-    state.loop[_F_SHOWN] = 0.0
-    for i in range(state.shadow.shape[1]):
-        state.shadow[0, i] = 0.0
-
-
-@kernel
-def _law(design: AdrcDesign, seen: Vector, r: float, constant: float, slope: float) -> float:
-    inverse_gain = 1.0 / (design.b0 + slope)
-    order = design.law.size
-    wished = design.law[0] * r - seen[order]
-    for i in range(order):
-        wished += (design.cancel[i] - design.law[i]) * seen[i]
-    return (wished - constant) * inverse_gain
-
-
-@report.register(AdrcDesign)
-def _report(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
-    order = design.law.size
-    for i in range(order + 1):
-        row[i] = state.seen[i]
-    row[order + 1] = state.loop[_F_LEARNED]
-    row[order + 2] = state.loop[_STATUS]
-    told = explain(design.guard, state.guard, row[order + 3 :])
-    coefficients(design.learner, state.learner, row[order + 3 + told :])
-
-
-@flags.register(AdrcDesign)
-def _flags(design: AdrcDesign, state: AdrcState) -> int:
-    return int(state.loop[_STATUS])
-
-
-@rest.register(AdrcDesign)
-def _rest(design: AdrcDesign, state: AdrcState) -> None:
-    for i in range(state.loop.size):
-        state.loop[i] = 0.0
-    _forget_f_learned(design, state)
-    restart(design.learner, state.learner)
+from quell.controllers.law import F_LEARNED, LOOP, STATUS, AdrcDesign, AdrcState, U, law_gains
+from quell.controllers.limits import limits
+from quell.dispatch import compiling, for_types
+from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, explain
+from quell.learners.base import Learner, NoLearner, coefficients, tried
+from quell.learners.lag import lag_of
+from quell.observers.eso import ESO
+from quell.types import Status
 
 
 class ADRC:
@@ -231,8 +88,10 @@ class ADRC:
         observer, lag = self.observer, lag_of(self.observer)
         self.parameters = AdrcDesign(
             eso=observer.model,
-            law=law_gains(observer.order, self.omega_c),
-            cancel=observer.a,
+            law=np.append(law_gains(observer.degree, self.omega_c), np.zeros(observer.order - observer.degree)),
+            cancel=observer.cancel,
+            cancel_f=observer.cancel_f,
+            degree=observer.degree,
             b0=observer.b0,
             limits=self._limits,
             learner=tried(self.learner, observer, self.omega_c),
@@ -260,10 +119,16 @@ class ADRC:
 
     def initial_state(self) -> AdrcState:
         """Return a state before the first sample, with nothing learned."""
-        size = self.observer.order + 1
-        memory = self.learner.memory(self.parameters.learner)
-        guard = UnguardedMemory(np.zeros(0)) if self.guard is None else self.guard.memory(self.parameters.guard)
-        return AdrcState(np.zeros(size), np.zeros(size), np.zeros(8), memory, np.zeros((1, size)), guard)
+        order = self.observer.order
+        return AdrcState(
+            z=np.zeros(self.observer.states),
+            seen=np.zeros(order + 1),
+            reference=np.zeros(order),
+            loop=np.zeros(LOOP),
+            learner=self.learner.memory(self.parameters.learner),
+            shadow=np.zeros((1, order + 1)),
+            guard=UnguardedMemory(np.zeros(0)) if self.guard is None else self.guard.memory(self.parameters.guard),
+        )
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
@@ -359,15 +224,15 @@ class ADRC:
         order = self.observer.order
         theta = np.zeros(len(self.features))
         coefficients(self.parameters.learner, state.learner, theta)
-        learned, residual = float(state.loop[_F_LEARNED]), float(state.seen[order])
+        learned, residual = float(state.loop[F_LEARNED]), float(state.seen[order])
         return Estimate(
             x=state.seen[:order].copy(),
             f=learned + residual,
             f_learned=learned,
             f_residual=residual,
             theta=dict(zip(self.features, theta.tolist(), strict=True)),
-            u=float(state.loop[_U]),
-            status=Status(int(state.loop[_STATUS])),
+            u=float(state.loop[U]),
+            status=Status(int(state.loop[STATUS])),
             **self._guard_report(state),
         )
 
@@ -377,15 +242,6 @@ class ADRC:
             return {}
         named = dict(zip([name for name, _ in GUARD_CHANNELS], told.tolist(), strict=True))
         return named | {"reason": Reason(int(named["reason"]))}
-
-
-def law_gains(order: int, omega_c: float) -> Vector:
-    """Return ``k_i = C(n, i−1) omega_c^(n−i+1)``, i = 1 … n: all poles of ``s^n + k_n s^(n−1) + … + k_1`` lie at −omega_c."""
-    with np.errstate(over="ignore"):
-        gains = np.array([math.comb(order, i) * np.float64(omega_c) ** (order - i) for i in range(order)])
-    if not np.all(np.isfinite(gains)):
-        raise ValueError(f"omega_c = {omega_c!r} rad/s: its power {order} must be a number; lower omega_c")
-    return gains
 
 
 def _named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:

@@ -42,6 +42,17 @@ def control(controller: Any, state: Any, r: float, y: float) -> float:
 
 
 @generic
+def heed(controller: Any, state: Any, derivatives: Vector) -> None:
+    """Take note of the reference's derivatives r', r'', … for the next sample; a controller without use for them does nothing."""
+    raise TypeError
+
+
+@heed.register(object)
+def _heed_nothing(controller: Any, state: Any, derivatives: Vector) -> None:
+    pass
+
+
+@generic
 def report(controller: Any, state: Any, row: Vector) -> None:
     """Write what the controller knows, as its ``channels`` say, into ``row``."""
     raise TypeError

@@ -8,7 +8,9 @@ from quell.types import Matrix, Vector
 
 
 class LinearLaw(NamedTuple):
-    """A sampled linear law of m states that is told what was really applied::
+    """A sampled linear law of m states that is told what was really applied.
+
+    ::
 
         u_wished = C x + D_r r + D_y y          u = limited(u_wished)
         x⁺       = A x + B_r r + B_y y + B_u u

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.dispatch import kernel
+from quell.observers.base import begin, observe
 from quell.observers.canonical import canonical
 from quell.observers.discretize import zero_order_hold
 from quell.types import Matrix, Vector
@@ -49,9 +49,8 @@ class EsoModel(NamedTuple):
     """Whether the controller sees z⁻ rather than z."""
 
 
-@kernel
-def eso_update(model: EsoModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
-    """Advance ``z`` (N,) by a sample, and put into ``seen`` (N,) what the controller may know of it."""
+@observe.register(EsoModel)
+def _observe(model: EsoModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
     size = z.size
     for i in range(size):
         total = model.input[i] * u + model.feed[i] * f_learned
@@ -66,9 +65,8 @@ def eso_update(model: EsoModel, z: Vector, seen: Vector, y: float, u: float, f_l
             seen[i] = z[i]
 
 
-@kernel
-def eso_start(z: Vector, seen: Vector, y: float) -> None:
-    """Start at rest at the first measurement: ``x̂_1 = y``, all else zero."""
+@begin.register(EsoModel)
+def _begin(model: EsoModel, z: Vector, seen: Vector, y: float) -> None:
     for i in range(z.size):
         z[i] = seen[i] = 0.0
     z[0] = seen[0] = y
@@ -169,6 +167,26 @@ class ESO:
     def order(self) -> int:
         """Order n of the plant; the observer has n + 1 states."""
         return int(self.a.size)
+
+    @property
+    def degree(self) -> int:
+        """Relative degree from u to y: so many derivatives of y the controller shapes."""
+        return self.order
+
+    @property
+    def cancel(self) -> Vector:
+        """What the controller adds to cancel the modelled dynamics: ``cancel · x̂`` [y-unit/s^n]."""
+        return self.a
+
+    @property
+    def cancel_f(self) -> float:
+        """1.0 where the total disturbance enters as u does, else 0.0: then u has nothing to cancel but its effect on the state."""
+        return 1.0
+
+    @property
+    def states(self) -> int:
+        """Length of the observer's running state."""
+        return self.order + 1
 
     @property
     def lag_time(self) -> float:
