@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import Controller, control, flags, report, rest
+from quell.controllers.base import Controller, control, flags, heed, report, rest
 from quell.dispatch import compiled, compiling, for_types, interpreted
 from quell.plants.base import Plant, advance, measure
 from quell.signals import Constant, Signal, as_signal, seeded_apart
@@ -94,6 +94,7 @@ def run_block(
     t0: float,
     dt: float,
     r: Vector,
+    derivatives: Matrix,
     w: Matrix,
     noise: Vector,
     log: Matrix,
@@ -114,6 +115,8 @@ def run_block(
         measured = y + noise[k]
         if not abs(y) <= limit:
             return k, row, until_next, status
+        if derivatives.shape[1] > 0:
+            heed(design, state, derivatives[k])
         u = control(design, state, r[k], measured)
         status |= flags(design, state)
         if until_next == 0:
@@ -183,6 +186,7 @@ def simulate(
     samples = _sample_count(scenario.duration, dt)
     x0 = np.zeros(plant.order) if scenario.x0 is None else checks.vector("x0", scenario.x0, plant.order)
     signals = scenario.seeded_signals(plant.disturbances)
+    derivatives = _derivatives(signals[0], getattr(controller, "derivatives", 0))
     limit = _default_limit(signals[0], x0, samples, dt) if limit is None else checks.positive("limit", limit)
     channels = (
         *(("r", 1), ("y", 1), ("y_measured", 1), ("u", 1), ("w", plant.disturbances), ("x", plant.order)),
@@ -202,9 +206,11 @@ def simulate(
             if first in rests:
                 x[:] = x0
                 to_rest(design, state)
-            r, w, noise = _evaluated(signals, np.arange(first, last) * dt)
+            times = np.arange(first, last) * dt
+            r, w, noise = _evaluated(signals, times)
+            rates = np.array([rate(times) for rate in derivatives]).reshape(len(derivatives), times.size).T.copy()
             ran, row, until_next, seen = block(
-                *(model, x, scratch, design, state, first * dt, dt, r, w, noise, log, row, every, until_next, limit)
+                *(model, x, scratch, design, state, first * dt, dt, r, rates, w, noise, log, row, every, until_next, limit)
             )
             done = first + ran
             status |= seen
@@ -249,6 +255,14 @@ def _default_limit(reference: Signal, x0: Vector, samples: int, dt: float) -> fl
     early = reference(np.arange(min(samples, _BLOCK)) * dt)
     sizes = np.abs([1.0, *x0, *early[np.isfinite(early)]])
     return 1e6 * float(np.max(sizes))
+
+
+def _derivatives(reference: Signal, count: int) -> list[Signal]:
+    """Return the first ``count`` derivatives of the reference."""
+    found: list[Signal] = []
+    for _ in range(count):
+        found.append((found[-1] if found else reference).derivative())
+    return found
 
 
 def _evaluated(signals: tuple[Signal, tuple[Signal, ...], Signal], t: Vector) -> tuple[Vector, Matrix, Vector]:
