@@ -48,8 +48,8 @@ _ROOMS = ("analysis", "controllers", "experiments", "features", "learners", "met
 
 __all__ = [
     "ADRC",
-    "DesignWarning",
     "ESO",
+    "DesignWarning",
     "Estimate",
     "Guard",
     "Reason",

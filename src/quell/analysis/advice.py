@@ -35,8 +35,8 @@ def advise(
     plant
         what it is to control, linear (see ``analyse``); by default the plant that an ADRC's observer assumes, which is kind to it.
     noise
-        standard deviation of the measurement noise, taken for white [y-unit]. It is judged by what it does to u as a share of ``u_max − u_min``; so
-        a controller without limits is not judged.
+        standard deviation of the measurement noise, taken for white [y-unit]. It is judged by what it does to u as a share of ``u_max −
+        u_min``; so a controller without limits is not judged.
     actuator_lag
         time constant of the actuator [s], where the plant does not have it.
     delay
@@ -94,8 +94,8 @@ def _judge_margin(loop: LoopAnalysis, observer: Any) -> list[Finding]:
 
 
 def _judge_lag(loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, delay: float) -> list[Finding]:
-    parts = [f"an actuator lag of {1e3 * actuator_lag:.3g} ms"] * (actuator_lag > 0.0) + [f"a delay of {1e3 * delay:.3g} ms"] * (delay > 0.0)
-    cause = " and ".join(parts)
+    parts = (("an actuator lag", actuator_lag), ("a delay", delay))
+    cause = " and ".join(f"{what} of {1e3 * time:.3g} ms" for what, time in parts if time > 0.0)
     if not late.stable:
         return [_unstable(late, f"with {cause}", f"its delay margin is {1e3 * loop.margins.delay:.3g} ms; lower omega_o and omega_c")]
     before, after = loop.margins, late.margins
@@ -104,7 +104,7 @@ def _judge_lag(loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, dela
     # An infinite phase margin, of a loop whose gain never is 1, has no angle to lose.
     at = before.phase_omega
     cost = math.degrees(math.atan(at * actuator_lag) + at * delay)
-    angle = "" if math.isnan(at) else f" costs {cost:.1f}° at the crossover of {at:.3g} rad/s and"
+    angle = "" if math.isnan(at) else f", {cost:.1f}° at the crossover of {at:.3g} rad/s,"
     return [
         Finding(
             *("lag", after.modulus, _LEFT * before.modulus),
@@ -133,5 +133,3 @@ def _judge_noise(loop: LoopAnalysis, controller: Any, noise: float) -> list[Find
             f"{100.0 * _NOISE:g} % is about what an actuator stands: {what_to_do}",
         )
     ]
-
-

@@ -4,9 +4,9 @@ Around what it sees at that instant, a learner that learns no more is
 
     f_L = const + g · (x̂_1 … x̂_n, Δf̂) + h u_before + s u
 
-For features that are the state, u and a constant that is exact everywhere, with g = θ. For any other learner (a network, a Gaussian process,
-polynomials) it holds for small motions: g and h are central differences of its own ``predict``. The constant, and whatever turns by itself
-(oscillators), is a feedforward: it moves the loop but does not close it, so no margin depends on it.
+For features that are the state, u and a constant that is exact everywhere, with g = θ. For any other learner (a network, a Gaussian
+process, polynomials) it holds for small motions: g and h are central differences of its own ``predict``. The constant, and whatever turns
+by itself (oscillators), is a feedforward: it moves the loop but does not close it, so no margin depends on it.
 
 A guard multiplies all of it with the learner's authority β. Where it clips the output (``Reason.OUT_OF_BOUNDS``, ``TOO_FAST``), less is fed
 back than is taken here.
@@ -113,7 +113,7 @@ def frozen(controller: Any, run: Any = None, t: float | None = None) -> Frozen:
 
 def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
     row = first_sample_at(t, run.every * run.dt, len(run))
-    if not (0.0 <= t and row < len(run)):
+    if not (t >= 0.0 and row < len(run)):
         raise ValueError(f"t = {t!r}: must be a time of the record, from 0 to {run.t[-1]:g} s")
     order = controller.observer.order
     if tuple(run.features) != tuple(controller.features):

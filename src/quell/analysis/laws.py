@@ -1,9 +1,9 @@
 """The linear law that a controller is while no limit holds, in discrete time and exact.
 
-It is not derived but asked for: a controller without limits is a linear map from its state, r and y to its next state and u, so unit vectors
-through its own ``control`` give the matrices, whatever the form of its observer. The unit is 2⁻⁶⁰, which is the same to the last bit for what
-is linear, and small enough for what is linear for small errors only. Entries of the state
-that never reach u, or that nothing reaches (records, filters for learning), are left out.
+It is not derived but asked for: a controller without limits is a linear map from its state, r and y to its next state and u, so unit
+vectors through its own ``control`` give the matrices, whatever the form of its observer. The unit is 2⁻⁶⁰, which is the same to the last
+bit for what is linear, and small enough for what is linear for small errors only. Entries of the state that never reach u, or that
+nothing reaches (records, filters for learning), are left out.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.analysis.frozen import Frozen, FrozenMemory, copied, frozen
 from quell.controllers.base import control
 from quell.controllers.limits import Limits
 from quell.controllers.linear import LinearLaw
 from quell.guard import UnguardedDesign, UnguardedMemory
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 _UNIT = 2.0**-60
 _FREE = Limits(-math.inf, math.inf, math.inf)
@@ -57,7 +58,8 @@ def linear_law(controller: Any, at: Any = None) -> LinearLaw:
     control(design, state, 0.0, 0.0)
     law = _asked(design, state)
     control(design, state, 0.0, 0.0)
-    if not all(np.array_equal(one, other) for one, other in zip(law, _asked(design, state), strict=True)):
+    again = _asked(design, state)
+    if not all(np.array_equal(np.asarray(one), np.asarray(other)) for one, other in zip(law, again, strict=True)):
         raise ValueError(f"controller = {controller!r}: its law changes from sample to sample, so there is no linear one")
     if not all(np.all(np.isfinite(part)) for part in law):
         raise ValueError(f"controller = {controller!r}: the gain b0 + ∂f_L/∂u is zero with this learner, so its law is not finite")
@@ -88,9 +90,9 @@ def _asked(design: Any, origin: Any) -> LinearLaw:
     return LinearLaw(np.ascontiguousarray(A[np.ix_(keep, keep)]), B_r[keep], B_y[keep], B_u[keep], C[keep], D_r, D_y)
 
 
-def _reached(A: Vector, start: Vector) -> Vector:
+def _reached(A: Matrix, start: Vector) -> NDArray[np.bool_]:
     """Return which states are ever reached along A from those that ``start`` drives; with A transposed, which ever reach them."""
-    found = start != 0.0
+    found: NDArray[np.bool_] = start != 0.0
     while True:
         more = found | np.any(A[:, found] != 0.0, axis=1)
         if np.array_equal(more, found):

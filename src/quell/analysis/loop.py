@@ -1,6 +1,7 @@
 """A loop of a linear plant and a controller at one instant: poles, margins, what noise does to u, sensitivity functions.
 
-In discrete time, at the controller's samples, with d a load at the plant's input, n the noise of the measurement and w the plant's disturbances::
+In discrete time, at the controller's samples, with d a load at the plant's input, n the noise of the measurement and w the plant's
+disturbances::
 
     u = C_r r − C_y (y + n)        y = P (u + d) + P_w w        L = P C_y        S = 1/(1 + L),  T = 1 − S
 
@@ -92,11 +93,12 @@ class LoopAnalysis:
             return f"unstable: a pole at |z| = {np.max(np.abs(self.poles)):.6g}"
         m, (noise, peak) = self.margins, (self.noise_to_control, self.noise_to_control_peak)
         low, high = self.b_range
+        what, unit = ("b/b0", "") if self._nominal else ("a gain", " times what it is")
         return "\n".join(
             [
                 f"gain margin {m.gain[0]:.3g} … {m.gain[1]:.3g}, phase margin {m.phase:.1f}° at {m.phase_omega:.3g} rad/s",
                 f"modulus margin {m.modulus:.3f}, disk margin {m.disk:.3f}, delay margin {1e3 * m.delay:.3g} ms",
-                f"stable for b/b0 from {low:.3g} to {high:.3g}" if self._nominal else f"stable for a gain from {low:.3g} to {high:.3g} times",
+                f"stable for {what} from {low:.3g} to {high:.3g}{unit}",
                 f"white noise of 1 in y makes u move by {noise:.3g} RMS, at most by a factor of {peak:.3g} at one frequency",
             ]
         )
@@ -154,7 +156,8 @@ class LoopAnalysis:
         Parameters
         ----------
         name
-            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"`` (load to y), ``"CS"`` (noise to −u) or ``"closed_loop"`` (r to y).
+            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"`` (load to y), ``"CS"`` (noise to −u) or ``"closed_loop"`` (r
+            to y).
         omega
             frequencies [rad/s] (k,).
 
@@ -173,11 +176,14 @@ class LoopAnalysis:
             return S
         if name == "T":
             return L * S
-        return S * {
-            "PS": lambda: self.response("P", omega),
-            "CS": lambda: self.response("C_y", omega),
-            "closed_loop": lambda: self.response("P", omega) * self.response("C_r", omega),
-        }[name]()
+        return (
+            S
+            * {
+                "PS": lambda: self.response("P", omega),
+                "CS": lambda: self.response("C_y", omega),
+                "closed_loop": lambda: self.response("P", omega) * self.response("C_r", omega),
+            }[name]()
+        )
 
     def _loop(self, omega: Any) -> Complex:
         return response(self._P, omega, self.dt) * response(self._C_y, omega, self.dt)
@@ -255,8 +261,8 @@ class LoopAnalysis:
         Parameters
         ----------
         name
-            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"``, ``"CS"``, ``"closed_loop"`` (r to y), or ``"source → target"`` as
-            for ``closed_loop``, for example ``"w2 → y"``.
+            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"``, ``"CS"``, ``"closed_loop"`` (r to y), or ``"source →
+            target"`` as for ``closed_loop``, for example ``"w2 → y"``.
 
         Raises
         ------
@@ -270,7 +276,9 @@ class LoopAnalysis:
     def transfer_function(self, name: str) -> Any:
         """Return the same as a ``control.TransferFunction``: polynomials in z.
 
-        Good to read, and for orders up to about 2; poles that lie together near z = 1 are not to be had from coefficients in double precision.
+        Good to read. Poles that lie together near z = 1 are not to be had from coefficients in double precision: with omega_o dt = 0.12 the
+        step response of P, C_r and C_y, closed by python-control in state space, is right to 1e-9 up to order 3 and to 3e-8 for order 4;
+        that of the closed loop as one fraction to 1e-9, 1e-6 and 3e-3 for orders 2, 3 and 4. ``system`` is right for all.
         """
         from quell.analysis.systems import transfer_function
 

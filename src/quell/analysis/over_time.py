@@ -16,16 +16,16 @@ from quell.trajectory import Trajectory
 def loops_over_time(plant: Any, controller: Any, run: Any, times: Any, **lags: float) -> list[LoopAnalysis]:
     """Analyse the loop with its learner frozen at several instants.
 
-    Each is the loop that there would be if nothing more were learned from then on. That all of them are stable does not prove the stability of
-    the loop that learns (docs/analysis).
+    Each is the loop that there would be if nothing more were learned from then on. That all of them are stable does not prove the
+    stability of the loop that learns (docs/analysis).
 
     Parameters
     ----------
     plant, controller
         as for ``analyse``; ``plant`` has to be one that can be simulated where a scenario is given.
     run
-        a ``Trajectory``, whose record says what the learner had found; or the ``Scenario`` of a run, which is simulated up to each time, and does
-        for every learner.
+        a ``Trajectory``, whose record says what the learner had found; or the ``Scenario`` of a run, which is simulated up to each time,
+        and does for every learner.
     times
         instants [s].
     lags

@@ -15,6 +15,8 @@ from quell.analysis.over_time import loops_over_omega_o
 def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     """Draw gain and phase of the loop ``L = P C_y`` with its margins; return the axes.
 
+    The margins' numbers are written into a figure of its own only: beside a second loop they would lie on top of each other.
+
     Parameters
     ----------
     loop
@@ -24,6 +26,7 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     style
         of the lines, for example ``label``.
     """
+    alone = axes is None
     top, low = axes = _axes(axes, 2, 1)
     omega, L = loop.omega, loop.response("L", loop.omega)
     phase = np.degrees(np.unwrap(np.angle(L)))
@@ -37,11 +40,13 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     if np.isfinite(margins.phase_omega):
         at = float(np.interp(margins.phase_omega, omega, phase))
         low.vlines(margins.phase_omega, -180.0, at, color=line.get_color(), linewidth=2.5, alpha=0.6)
-        low.annotate(f"{margins.phase:.0f}°", (margins.phase_omega, 0.5 * (at - 180.0)), xytext=(5, -3), textcoords="offset points")
+        if alone:
+            low.annotate(f"{margins.phase:.0f}°", (margins.phase_omega, 0.5 * (at - 180.0)), xytext=(5, -3), textcoords="offset points")
     for factor, at in zip(margins.gain, margins.gain_omega, strict=True):
         if np.isfinite(at):
             top.vlines(at, *sorted((1.0, 1.0 / factor)), color=line.get_color(), linewidth=2.5, alpha=0.6)
-            top.annotate(f"{factor:.2g}", (at, factor**-0.5), xytext=(5, -3), textcoords="offset points")
+            if alone:
+                top.annotate(f"{factor:.2g}", (at, factor**-0.5), xytext=(5, -3), textcoords="offset points")
     _limit_ratio(top, np.abs(L))
     low.set_ylim(max(float(np.min(phase)), -720.0) - 20.0, min(float(np.max(phase)), 180.0) + 20.0)
     for ax, label in zip(axes, ("|L|", "phase of L [°]"), strict=True):

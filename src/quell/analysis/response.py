@@ -1,8 +1,8 @@
 """Frequency responses of sampled systems, and the frequencies at which to look.
 
-No polynomial is ever formed: poles of an observer lie on top of each other close to z = 1, where the roots of a polynomial of degree 5 move by
-the fifth root of its rounding. A response is a linear solve, ``C (ζI − N)⁻¹ B + D`` with ``ζ = e^(jω dt) − 1`` and ``N = A − I``, so that
-what is slow is not the difference of two numbers near one.
+No polynomial is ever formed: poles of an observer lie on top of each other close to z = 1, where the roots of a polynomial of degree 5
+move by the fifth root of its rounding. A response is a linear solve, ``C (ζI − N)⁻¹ B + D`` with ``ζ = e^(jω dt) − 1`` and ``N = A − I``,
+so that what is slow is not the difference of two numbers near one.
 """
 
 from __future__ import annotations
@@ -49,8 +49,7 @@ def response(system: System, omega: Any, dt: float) -> Complex:
         return np.full(zeta.shape, complex(system.D))
     resolvent = zeta[:, None, None] * np.eye(system.N.shape[0]) - system.N
     solved = np.linalg.solve(resolvent, np.broadcast_to(system.B[:, None], (zeta.size, system.B.size, 1)))
-    answer: Complex = solved[:, :, 0] @ system.C + system.D
-    return answer
+    return np.asarray(solved[:, :, 0] @ system.C + system.D, dtype=np.complex128)
 
 
 def in_s_plane(shifted: Complex, dt: float) -> Complex:
@@ -74,6 +73,5 @@ def frequencies(poles: Complex, dt: float) -> Vector:
         away = damping * _BESIDE if damping > 1e-6 * center else center * _UNDAMPED
         grid += [center - away, center + away]
     omega = np.unique(np.concatenate(grid))
-    # The response at half the rate itself is real but for rounding; it is looked at apart.
-    kept: Vector = omega[(omega >= bottom) & (omega < top * (1.0 - 1e-9))]
+    kept: Vector = omega[(omega >= bottom) & (omega <= top)]
     return kept

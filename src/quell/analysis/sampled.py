@@ -1,7 +1,7 @@
 """A plant as the controller sees it: sampled with zero-order hold, with dead time and actuator lag if there are any.
 
-Matrices are kept as ``A − I``: a double integrator sampled at 1 ms differs from the unit matrix in the sixth digit, and all that is slow is in
-that difference.
+Matrices are kept as ``A − I``: a double integrator sampled at 1 ms differs from the unit matrix in the sixth digit, and all that is slow
+is in that difference.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def sampled_plant(plant: Any, dt: float, delay: float = 0.0, actuator_lag: float
     Parameters
     ----------
     plant
-        a ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction``, or ``(num, den)`` in powers of s; one of python-control may be sampled
-        already, with the same dt.
+        a ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction``, or ``(num, den)`` in powers of s; one of python-control
+        may be sampled already, with the same dt.
     dt
         sample time [s].
     delay
@@ -127,7 +127,9 @@ def _state_space(plant: Any, dt: float) -> tuple[Matrix, Matrix, Vector, Matrix,
         return *_companion(checks.vector("num", plant[0]), checks.vector("den", plant[1])), False
     is_sampled = bool(getattr(plant, "dt", None))
     if is_sampled and (plant.dt is True or not math.isclose(plant.dt, dt, rel_tol=1e-9)):
-        raise ValueError(f"plant has a sample time of {plant.dt!r}: must be in continuous time, or sampled at the controller's dt = {dt!r} s")
+        raise ValueError(
+            f"plant has a sample time of {plant.dt!r}: must be in continuous time, or sampled at the controller's dt = {dt!r} s"
+        )
     if hasattr(plant, "num") and hasattr(plant, "den"):
         if np.shape(plant.num)[:2] != (1, 1):
             raise ValueError(f"plant has {np.shape(plant.num)[:2]} outputs and inputs: must have one of each")

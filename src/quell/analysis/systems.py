@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from quell.analysis.loop import LoopAnalysis
 
 _CLOSED = {"closed_loop": ("r", "y"), "PS": ("d", "y"), "CS": ("n", "u"), "S": ("n", "y"), "T": ("n", "y")}
+# Least coefficient of a polynomial, of its largest.
+_ROUNDING = 1e-13
 _PARTS = ("P", "C_r", "C_y", "L")
 
 
@@ -27,15 +29,20 @@ def state_space(loop: LoopAnalysis, name: str) -> Any:
 def transfer_function(loop: LoopAnalysis, name: str) -> Any:
     """Return a part of the loop as a ``control.TransferFunction``; see ``LoopAnalysis.transfer_function``.
 
-    Denominator and numerator are characteristic polynomials: ``det(zI − A)`` and, as B Cᵀ has rank one,
-    ``det(zI − A + B Cᵀ) − (1 − D) det(zI − A)``.
+    The denominator is ``det(zI − A)``; the numerator is its product with the impulse response D, CB, CAB, …, which has the numerator's
+    own size: the difference of two characteristic polynomials would lose it to their rounding.
     """
     N, B, C, D = System.balanced(*_named(loop, name))
-    denominator = _characteristic(N)
-    numerator = _characteristic(N - np.outer(B, C)) - (1.0 - D) * denominator
-    if D == 0.0:
-        numerator = numerator[1:]
-    return _control().tf(numerator, denominator, loop.dt)
+    denominator = np.real(np.poly(1.0 + np.linalg.eigvals(N)))
+    pulse, x = [D], B
+    for _ in range(N.shape[0]):
+        pulse.append(float(C @ x))
+        x = x + N @ x
+    numerator = np.convolve(denominator, pulse)[: denominator.size]
+    # What is a pole at z = 0 in both is u of the sample before, counted twice.
+    while denominator.size > 1 and all(abs(part[-1]) < _ROUNDING * np.max(np.abs(part)) for part in (numerator, denominator)):
+        numerator, denominator = numerator[:-1], denominator[:-1]
+    return _control().tf(np.trim_zeros(numerator, "f") if np.any(numerator) else [0.0], denominator, loop.dt)
 
 
 def _named(loop: LoopAnalysis, name: str) -> System:
@@ -66,11 +73,6 @@ def _part(loop: LoopAnalysis, name: str) -> System:
     big: Matrix = np.block([[P.N, np.zeros((n, m))], [np.outer(C_y.B, P.C), N]])
     into: Vector = np.concatenate([P.B, np.zeros(m)])
     return System(big, into, np.concatenate([C_y.D * P.C, C_y.C]), 0.0)
-
-
-def _characteristic(N: Matrix) -> Vector:
-    """Return the coefficients of ``det(zI − I − N)``, highest power first."""
-    return np.real(np.poly(1.0 + np.linalg.eigvals(N)))
 
 
 def _control() -> Any:

@@ -8,10 +8,10 @@ from quell import checks
 def omega_c_for(settling_time: float, order: int, band: float = 0.02) -> float:
     """Return the controller bandwidth with which the ideal loop settles in a given time.
 
-    The ideal loop ``omega_c^n / (s + omega_c)^n`` answers to a unit step with the regularised incomplete gamma function
-    ``P(n, omega_c t)``, which rises without overshoot, so it is in the band for good where ``P(n, omega_c t) = 1 − band``. For 2 % and n = 1, 2
-    that is 3.91/t and 5.83/t; Herbst (*Electronics* 2, 2013, eqs. (10) and (22)) rounds to 4/t and 6/t. A real loop is slower, by the lag of its observer, about
-    ``(n + 1)/omega_o``.
+    The ideal loop ``omega_c^n / (s + omega_c)^n`` answers to a unit step with the regularised incomplete gamma function ``P(n, omega_c
+    t)``, which rises without overshoot, so it is in the band for good where ``P(n, omega_c t) = 1 − band``. For 2 % and n = 1, 2 that is
+    3.91/t and 5.83/t, which Herbst (*Electronics* 2, 2013) rounds to 4/t and 6/t. A real loop, with an observer and a plant other than
+    its model, differs.
 
     Parameters
     ----------

@@ -1,10 +1,11 @@
 """What makes a design unwise though it is possible, as far as the design alone tells.
 
-An observer places its poles in the z-plane, so it is stable at any sample time; what slow sampling takes is margin. Measured on the loop with
-the plant that the design assumes, a chain of n = 1 … 4 integrators, with omega_o 3 and 10 times omega_c (docs/analysis): the modulus margin is
-12 to 16 % smaller than with fast sampling at ``omega_o dt = 1`` for the current form where omega_o is 3 omega_c (6 to 14 % where it is 10 omega_c),
-and at 0.3 for the predictor form, which has a sample of delay more. The law's gains are those of continuous time: beyond ``omega_c dt = 0.5`` loops of
-orders 3 and 4 are lost suddenly (all were at 0.7, none at 0.5).
+An observer places its poles in the z-plane, so it is stable at any sample time; what slow sampling takes is margin. Measured on the loop
+with the plant that the design assumes, a chain of n = 1 … 4 integrators, with omega_o 3 and 10 times omega_c (docs/analysis): the modulus
+margin is 12 to 16 % smaller than with fast sampling at ``omega_o dt = 1`` for the current form where omega_o is 3 omega_c (6 to 14 %
+where it is 10 omega_c), and at 0.3 for the predictor form, which has a sample of delay more. The law's gains are those of continuous
+time: beyond ``omega_c dt = 0.5`` loops of orders 3 and 4 are lost suddenly (with omega_o = omega_c
+all are at 0.7, none at 0.5).
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def sampling_findings(observer: Any, omega_c: float) -> list[Finding]:
         found.append(
             Finding(
                 *("sampling", value, limit),
-                f"omega_o * dt = {value:.3g} is above {limit:g}: sampling costs the loop more than about 15 % of its modulus margin; "
+                f"omega_o * dt = {value:.3g} is above {limit:g}: there sampling costs up to a sixth of the modulus margin, beyond it more; "
                 f"sample every {limit / observer.omega_o:.3g} s or faster, lower omega_o to {limit / dt:.3g} rad/s{other}",
             )
         )
@@ -52,7 +53,7 @@ def sampling_findings(observer: Any, omega_c: float) -> list[Finding]:
         found.append(
             Finding(
                 *("sampling", value, _LAW_LIMIT),
-                f"omega_c * dt = {value:.3g} is above {_LAW_LIMIT:g}: the law's gains are made for faster sampling, and the loop may be lost; "
+                f"omega_c * dt = {value:.3g} is above {_LAW_LIMIT:g}: the law's gains are made for faster sampling, the loop may be lost; "
                 f"sample every {_LAW_LIMIT / omega_c:.3g} s or faster, or lower omega_c to {_LAW_LIMIT / dt:.3g} rad/s",
             )
         )
