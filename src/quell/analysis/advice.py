@@ -97,7 +97,13 @@ def _judge_lag(loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, dela
     parts = (("an actuator lag", actuator_lag), ("a delay", delay))
     cause = " and ".join(f"{what} of {1e3 * time:.3g} ms" for what, time in parts if time > 0.0)
     if not late.stable:
-        return [_unstable(late, f"with {cause}", f"its delay margin is {1e3 * loop.margins.delay:.3g} ms; lower omega_o and omega_c")]
+        return [
+            _unstable(
+                late,
+                f"with {cause}",
+                f"its delay margin is {1e3 * loop.margins.delay:.3g} ms; shorten it, or lower omega_o and omega_c together",
+            )
+        ]
     before, after = loop.margins, late.margins
     if after.modulus >= _LEFT * before.modulus:
         return []
@@ -109,7 +115,7 @@ def _judge_lag(loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, dela
         Finding(
             *("lag", after.modulus, _LEFT * before.modulus),
             f"{cause}{angle} leaves a phase margin of {after.phase:.1f}° of {before.phase:.1f}°, a modulus margin of "
-            f"{after.modulus:.3g} of {before.modulus:.3g}: lower omega_o and omega_c, or let the controller know of it",
+            f"{after.modulus:.3g} of {before.modulus:.3g}: shorten it, let the controller know of it, or lower omega_o and omega_c together",
         )
     ]
 

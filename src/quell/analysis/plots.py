@@ -28,7 +28,9 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     """
     alone = axes is None
     top, low = axes = _axes(axes, 2, 1)
-    omega, L = loop.omega, loop.response("L", loop.omega)
+    # At half the sampling rate itself a sampled plant may have a zero, and no phase.
+    omega = loop.omega[:-1]
+    L = loop.response("L", omega)
     phase = np.degrees(np.unwrap(np.angle(L)))
     margins = loop.margins
     crossing = margins.phase_omega if np.isfinite(margins.phase_omega) else omega[-1]
