@@ -115,7 +115,8 @@ def _judge_lag(loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, dela
         Finding(
             *("lag", after.modulus, _LEFT * before.modulus),
             f"{cause}{angle} leaves a phase margin of {after.phase:.1f}° of {before.phase:.1f}°, a modulus margin of "
-            f"{after.modulus:.3g} of {before.modulus:.3g}: shorten it, let the controller know of it, or lower omega_o and omega_c together",
+            f"{after.modulus:.3g} of {before.modulus:.3g}: shorten it, let the controller know of it, "
+            "or lower omega_o and omega_c together",
         )
     ]
 
