@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quell import controllers, experiments, features, learners, metrics, observers, plants, signals
+    from quell.batch_record import BatchTrajectory
     from quell.controllers.adrc import ADRC
     from quell.controllers.estimate import Estimate
     from quell.guard import Guard, Reason
@@ -31,6 +32,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "ADRC": "quell.controllers.adrc",
+    "BatchTrajectory": "quell.batch_record",
     "ESO": "quell.observers.eso",
     "Estimate": "quell.controllers.estimate",
     "Guard": "quell.guard",
@@ -46,6 +48,7 @@ _ROOMS = ("controllers", "experiments", "features", "learners", "metrics", "obse
 __all__ = [
     "ADRC",
     "ESO",
+    "BatchTrajectory",
     "Estimate",
     "Guard",
     "Reason",
