@@ -136,6 +136,16 @@ def test_any_part_of_the_loop_may_differ_from_run_to_run() -> None:
     np.testing.assert_array_equal(other.run(2).log, alone.log)
 
 
+def test_a_controller_that_feeds_derivatives_forward_may_be_one_of_a_batch() -> None:
+    """Each run is given the derivatives that its controller wants, of the one reference."""
+    laws = [controller(feedforward=on) for on in (True, False, True)]
+    moving = ql.Scenario(ql.signals.Sinusoid(omega=0.5), duration=5.0)
+    runs = ql.simulate(PLANTS, laws, moving)
+    for i, law in enumerate(laws):
+        np.testing.assert_array_equal(runs["u"][i], ql.simulate(PLANTS[i], law, moving)["u"])
+    assert np.any(runs["u"][0] != ql.simulate(PLANTS[0], laws[1], moving)["u"])
+
+
 def test_scenarios_of_a_batch_may_rest_at_different_times() -> None:
     """Each run is still the run alone."""
     scenarios = [replace(SHORT, rest_at=times, x0=[0.0, 0.1, 0.0, 0.0]) for times in ((), (0.3,), (0.5, 0.7))]
