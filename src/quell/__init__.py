@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quell import analysis, controllers, experiments, features, learners, metrics, observers, plants, signals
+    from quell.batch_record import BatchTrajectory
     from quell.controllers.adrc import ADRC
     from quell.controllers.bandwidth import omega_c_for
     from quell.controllers.estimate import Estimate
@@ -33,6 +34,7 @@ __version__ = "0.1.0"
 _HOME = {
     "ADRC": "quell.controllers.adrc",
     "DesignWarning": "quell.types",
+    "BatchTrajectory": "quell.batch_record",
     "ESO": "quell.observers.eso",
     "Estimate": "quell.controllers.estimate",
     "Guard": "quell.guard",
@@ -49,6 +51,7 @@ _ROOMS = ("analysis", "controllers", "experiments", "features", "learners", "met
 __all__ = [
     "ADRC",
     "ESO",
+    "BatchTrajectory",
     "DesignWarning",
     "Estimate",
     "Guard",
