@@ -185,5 +185,9 @@ def _zeros(a: Vector, column: Vector) -> Vector:
 
 
 def spell(zeros: Vector) -> str:
-    """Return zeros as text."""
-    return ", ".join(f"{z.real:.4g}" if z.imag == 0.0 else f"{z.real:.4g}{z.imag:+.4g}j" for z in zeros.tolist())
+    """Return zeros as text, conjugate pairs as one."""
+    told = []
+    for z in zeros[zeros.imag >= 0.0].tolist():
+        real = f"{z.real:.4g}" if abs(z.real) > 1e-9 * abs(z) or z == 0.0 else ""
+        told.append(real + (f"±{z.imag:.4g}j" if z.imag > 0.0 else ""))
+    return ", ".join(told)

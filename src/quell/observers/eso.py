@@ -270,8 +270,8 @@ def noise_gains(observer: ESO) -> Vector:
     """Return the variance of each estimate (N,) that white noise of unit variance in y leaves, as for a model-free observer.
 
     In continuous time ``x̂_i = Σ_{k=i}^{N} C(N, k) ω_o^k s^(N−k+i−1) / (s + ω_o)^N · y``, and sampled white noise has the density dt; so
-    the variance is ``dt ω_o^(2i−1) ∫ |·|² dω / 2π`` of what is left at ω_o = 1. Good while ``omega_o dt`` is small. Where f enters before the
-    last integrator, with zeros of the plant in its way, that says nothing of it, and its variance is summed up sample by sample.
+    the variance is ``dt ω_o^(2i−1) ∫ |·|² dω / 2π`` of what is left at ω_o = 1. Good while ``omega_o dt`` is small. Where f enters before
+    the last integrator, with zeros of the plant in its way, that says nothing of it, and its variance is summed up sample by sample.
     """
     size = observer.order + 1
     if observer.f_degree < observer.order:
