@@ -171,7 +171,7 @@ def test_the_loop_of_a_plant_with_zeros_steps_as_if_it_had_none(num: Any, den: A
     plant, omega_c, dt = hidden(num, den), 2.0, 1e-3
     controller = ql.ADRC(ESO.model_based(plant, omega_o=20.0, dt=dt), omega_c=omega_c)
     run = ql.simulate(plant, controller, ql.Scenario(1.0, 20.0, (ql.signals.Step(at=10.0),)))
-    y, t = run["y"].ravel(), run["t"].ravel() if "t" in run.names else dt * np.arange(run["y"].size)
+    y, t = run["y"].ravel(), run.t
     rest = sum((omega_c * t) ** k / math.factorial(k) for k in range(controller.observer.degree)) * np.exp(-omega_c * t)
     before = t < 10.0
     assert np.max(np.abs(y - 1.0 + rest)[before]) < 2e-3

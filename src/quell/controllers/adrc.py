@@ -253,8 +253,8 @@ def _check_zeros(observer: ESO) -> None:
     if unstable.size:
         raise ValueError(
             f"observer: the plant has zeros from u at {spell(unstable)} rad/s, not in the left half plane; ADRC inverts the plant, "
-            "so that u would grow, or swing, without end while y looks well; control another output, or take a controller that does not invert the "
-            "plant (linear-quadratic, for instance)"
+            "so that u would grow, or swing, without end while y looks well; control another output, or take a controller that does not "
+            "invert the plant (linear-quadratic, for instance)"
         )
 
 
