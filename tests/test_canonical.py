@@ -13,9 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
+from quell.learners.lag import lag_of
 from quell.observers import canonical
 from quell.observers.base import begin, observe
-from quell.observers.eso import ESO, noise_gains, place
+from quell.observers.eso import ESO, noise_gains
+from quell.observers.placement import place
 
 
 def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:
@@ -167,7 +169,7 @@ def test_a_record_is_mapped_like_a_sample() -> None:
     ],
 )
 def test_the_loop_of_a_plant_with_zeros_steps_as_if_it_had_none(num: Any, den: Any) -> None:
-    """y follows ``(omega_c/(s + omega_c))^r``, r being the relative degree, and a constant load is rejected without error."""
+    """The output follows ``(omega_c/(s + omega_c))^r``, r being the relative degree, and a constant load is rejected without error."""
     plant, omega_c, dt = hidden(num, den), 2.0, 1e-3
     controller = ql.ADRC(ESO.model_based(plant, omega_o=20.0, dt=dt), omega_c=omega_c)
     run = ql.simulate(plant, controller, ql.Scenario(1.0, 20.0, (ql.signals.Step(at=10.0),)))
@@ -204,7 +206,7 @@ def test_noise_in_f_is_as_much_as_its_gain_says(rng: np.random.Generator) -> Non
 
 
 def test_a_learner_learns_on_a_plant_with_zeros() -> None:
-    """f as the observer shows it is what lag compensation says it is, zeros or not: a coefficient that is off is found."""
+    """What the observer shows of f is what lag compensation says it is, zeros or not: a coefficient that is off is found."""
     observer = ESO.model_based(([1.0, 4.0], [1.0, 0.5, 2.0, 1.0]), omega_o=20.0, dt=2e-3)
     # The real plant has f = −1.5 y on top, entering as u does.
     plant = hidden([1.0, 4.0], np.polyadd([1.0, 0.5, 2.0, 1.0], 1.5 * np.array([1.0, 4.0])))
@@ -265,3 +267,39 @@ def test_the_condition_says_how_near_a_plant_is_to_unobservable() -> None:
     """Two states that are seen with almost the same dynamics."""
     near, far = (canonical((np.diag([-1.0, -1.0 - gap]), [1.0, 2.0], [1.0, 1.0])).condition for gap in (1e-6, 1.0))
     assert far < 10.0 < 1e5 < near
+
+
+@pytest.mark.parametrize("zeros", [[-0.1], [-0.5 + 1.0j, -0.5 - 1.0j], [-0.3, -4.0], [-300.0, -1.0]])
+def test_with_its_poles_at_the_zeros_the_observer_shows_f_as_if_there_were_none(zeros: list[complex]) -> None:
+    """What it shows of f needs as many lags as it has poles at β, of gain one together; a zero faster than omega_o is not kept."""
+    plant = (np.poly(zeros).real, np.poly([-1.0, -0.3, 0.5, 0.0]))
+    observer = ESO.model_based(plant, omega_o=20.0, dt=2e-3, keep_zeros=True)
+    kept = sum(zero.real > -20.0 for zero in np.array(zeros))
+    taps = lag_of(observer).taps
+    np.testing.assert_allclose(taps[5 - kept :], 0.0, atol=1e-8)
+    assert np.sum(taps) == pytest.approx(1.0, abs=1e-8)
+    if kept == len(zeros):
+        assert np.all(taps[: 5 - kept] > 0.0)
+
+
+def test_poles_at_slow_zeros_spare_noise_and_learn_where_the_other_observer_cannot() -> None:
+    """A zero at −0.1 rad/s under omega_o = 20: f̂ a hundred times quieter, and a learner reduces the error instead of adding to it."""
+    plant = hidden(3.0 * np.poly([-0.1]), np.poly([-1.0, -0.3, 0.5]))
+    scenario = ql.Scenario(0.0, 40.0, (ql.signals.Sinusoid(omega=1.3),))
+    errors, noise = {}, {}
+    for keep in (False, True):
+        observer = ESO.model_based(plant, omega_o=20.0, dt=2e-3, keep_zeros=keep)
+        noise[keep] = noise_gains(observer)[-1] ** 0.5
+        for learner in (None, ql.learners.Kalman()):
+            run = ql.simulate(plant, ql.ADRC(observer, omega_c=2.0, learner=learner), scenario)
+            errors[keep, learner is None] = run.metrics(20.0)["rms"]
+    assert noise[False] > 100.0 * noise[True]
+    assert errors[False, False] > 3.0 * errors[False, True]
+    assert errors[True, False] < 0.4 * errors[True, True]
+
+
+def test_a_gain_of_ones_own_scales_the_whole_input() -> None:
+    """b0 replaces the model's b, zeros and all."""
+    given, own = (ESO.model_based((NUM, DEN), 20.0, 1e-3, b0=b0) for b0 in (6.0, None))
+    np.testing.assert_allclose(given.model.input, 2.0 * own.model.input, rtol=1e-12)
+    np.testing.assert_array_equal(given.model.feed, own.model.feed)

@@ -28,6 +28,7 @@ from quell import checks
 from quell.observers.base import begin, observe
 from quell.observers.canonical import Canonical, canonical, spell
 from quell.observers.discretize import zero_order_hold
+from quell.observers.placement import place, sampled_zeros
 from quell.types import Matrix, Vector
 
 FORMS = ("current", "predictor")
@@ -131,11 +132,21 @@ class ESO:
         return cls._design(canonical((np.zeros(checks.whole("order", order, 1, 8)), 1.0)), b0, omega_o, dt, form)
 
     @classmethod
-    def model_based(cls, plant: Any, omega_o: float, dt: float, *, b0: float | None = None, E: Any = None, form: str = "current") -> ESO:
+    def model_based(
+        cls,
+        plant: Any,
+        omega_o: float,
+        dt: float,
+        *,
+        b0: float | None = None,
+        E: Any = None,
+        form: str = "current",
+        keep_zeros: bool = False,
+    ) -> ESO:
         """Design an ESO that knows a model of the plant (paper eq. (mbplant)), which may have zeros.
 
-        f enters where u does, zeros included, or through a channel E of its own, which must have none. In both cases all N poles lie at
-        ``exp(−omega_o dt)``, and a constant f is estimated without error; see docs/design for what slow zeros do.
+        f enters where u does, zeros included, or through a channel E of its own, which must have none. In both cases a constant f is
+        estimated without error.
 
         Parameters
         ----------
@@ -145,6 +156,11 @@ class ESO:
             as for ``model_free``.
         b0
             nominal control gain, from u to y^(relative degree); the model's own by default.
+        keep_zeros
+            leave poles of the observer at the zeros from f that are stable and slower than omega_o. Then f̂ follows f as if there
+            were none, ``(omega_o/(s + omega_o))^(N − zeros)``, which is what a learner needs; the state is found no faster than the
+            zeros are. By default all N poles lie at ``exp(−omega_o dt)``: state and constant f are found fast, but f̂ exaggerates what
+            changes (docs/design).
 
         Raises
         ------
@@ -158,10 +174,10 @@ class ESO:
                 f"plant has a zero at s = 0 (zeros from u: {spell(found.zeros)} rad/s): a constant f leaves no trace in y and can not be "
                 "estimated; measure another output"
             )
-        return cls._design(found, found.b if b0 is None else b0, omega_o, dt, form)
+        return cls._design(found, found.b if b0 is None else b0, omega_o, dt, form, keep_zeros)
 
     @classmethod
-    def _design(cls, plant: Canonical, b0: float, omega_o: float, dt: float, form: str) -> ESO:
+    def _design(cls, plant: Canonical, b0: float, omega_o: float, dt: float, form: str, keep_zeros: bool = False) -> ESO:
         b0 = checks.nonzero("b0", b0, "it is the gain from u to the plant's highest derivative")
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         checks.one_of("form", form, FORMS)
@@ -170,7 +186,14 @@ class ESO:
                 f"omega_o = {omega_o!r} rad/s with dt = {dt!r} s: omega_o * dt = {omega_o * dt:.3g} must be below pi, "
                 "no sampling can follow a bandwidth above half its rate; lower omega_o or dt"
             )
-        return cls(plant, b0, omega_o, dt, form, _sampled_design(plant, b0, omega_o, dt, form == "predictor"))
+        return cls(
+            plant,
+            b0,
+            omega_o,
+            dt,
+            form,
+            _sampled_design(plant, b0, omega_o, dt, form == "predictor", checks.flag("keep_zeros", keep_zeros)),
+        )
 
     @property
     def a(self) -> Vector:
@@ -217,7 +240,7 @@ class ESO:
 
     @property
     def pole(self) -> float:
-        """Where all poles of the observer lie in the z-plane, ``exp(−omega_o dt)``."""
+        """Where the poles of the observer lie in the z-plane, ``exp(−omega_o dt)``, but for those kept at zeros."""
         return math.exp(-self.omega_o * self.dt)
 
     def states_of(self, x_hat: Any) -> Vector:
@@ -308,7 +331,7 @@ def _summed_noise_gains(observer: ESO) -> Vector:
     return np.diag(total).reshape(size) * scale**2
 
 
-def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, predictor: bool) -> EsoModel:
+def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, predictor: bool, keep_zeros: bool) -> EsoModel:
     """Sample the extended model, in the coordinates ``x_i dt^(i−1)`` and ``f dt^q`` where all entries are O(1), and place the poles.
 
     That is done in the coordinates ``x_i/omega_o^(i−1)``, ``f/omega_o^q``: over a sample hardly anything happens there, but it is known
@@ -329,7 +352,11 @@ def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, pred
         slow = step ** (power[None, :] - power[:, None])
         gain = np.full(size, np.nan)
         if np.all(np.isfinite(phi)):
-            gain = place(difference * slow, np.full(size, -math.expm1(-step))) * step**power
+            difference *= slow
+            rises = np.full(size, -math.expm1(-step), dtype=complex)
+            kept = plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)] if keep_zeros and plant.matched else np.zeros(0)
+            rises[: kept.size] = sampled_zeros(difference, kept, dt)
+            gain = place(difference, rises) * step**power
     if not np.all(np.abs(gain) < _LARGEST_GAIN):
         fastest = np.max(np.abs(np.roots([1.0, *plant.a[::-1]])), initial=0.0)
         zeros = f" or its zeros at {spell(plant.zeros)} rad/s" if plant.zeros.size else ""
@@ -346,40 +373,3 @@ def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, pred
         gain=gain / scale,
         predictor=predictor,
     )
-
-
-def place(difference: Matrix, rises: Vector) -> Vector:
-    """Return L that puts the eigenvalues of ``(I − L C) Φ``, with C = (1, 0, …), at ``1 − rises`` (Ackermann's formula).
-
-    ``L = Π (Φ − β_i I) O⁻¹ e_N`` with the rows ``C Φ (Φ − I)^i`` for O: differences instead of powers leave ``O⁻¹ e_N`` as it is
-    and make O triangular for a chain of integrators, where powers would be nearly parallel. They are taken over the largest rise, which
-    makes them O(1) too.
-
-    Parameters
-    ----------
-    difference
-        ``Φ − I`` (N, N), in coordinates of the observer's own time, so that divided by the largest rise it is O(1).
-    rises
-        ``1 − β_i`` (N,), complex ones in conjugate pairs.
-
-    Returns
-    -------
-    array
-        L (N,); NaN where Φ can't be observed through C.
-    """
-    size = difference.shape[0]
-    unit = np.max(np.abs(rises))
-    rate = difference / unit
-    rows = np.empty((size, size))
-    rows[0] = difference[0]
-    rows[0, 0] += 1.0
-    for i in range(1, size):
-        rows[i] = rows[i - 1] @ rate
-    try:
-        vector = np.linalg.solve(rows, np.eye(size)[-1])
-    except np.linalg.LinAlgError:
-        return np.full(size, np.nan)
-    for rise in rises / unit:
-        vector = rate @ vector + rise * vector
-    gain: Vector = unit * np.real(vector)
-    return gain
