@@ -102,4 +102,4 @@ OBSERVERS: dict[str, ESO] = {
     for kind in ("model-free", "model-based")
     for order in (1, 2, 4, 8)
     for form in FORMS
-}
+} | {"model-based, order 3, with a zero": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), omega_o=12.0, dt=0.01)}

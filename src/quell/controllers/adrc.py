@@ -20,6 +20,7 @@ from quell.dispatch import compiling, for_types
 from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, explain
 from quell.learners.base import Learner, NoLearner, coefficients, tried
 from quell.learners.lag import lag_of
+from quell.observers.canonical import spell
 from quell.observers.eso import ESO
 from quell.types import Status
 
@@ -50,7 +51,8 @@ class ADRC(HandOver):
     Raises
     ------
     ValueError
-        for a bandwidth that is not positive, limits in the wrong order, a rate limit that is not positive.
+        for a bandwidth that is not positive, limits in the wrong order, a rate limit that is not positive; for an observer of a plant with
+        zeros that are not in the left half plane.
 
     Examples
     --------
@@ -77,6 +79,7 @@ class ADRC(HandOver):
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO, from ESO.model_free or ESO.model_based")
         self.observer = observer
+        _check_zeros(observer)
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
         self.guard = guard
         self.learner: Learner = NoLearner() if learner is None else learner
@@ -269,6 +272,17 @@ class ADRC(HandOver):
             return {}
         named = dict(zip([name for name, _ in GUARD_CHANNELS], told.tolist(), strict=True))
         return named | {"reason": Reason(int(named["reason"]))}
+
+
+def _check_zeros(observer: ESO) -> None:
+    """Refuse a plant whose zeros the law must not cancel: u makes y^(r) what it should be, and the zeros from u are poles of u."""
+    unstable = observer.plant.unstable_zeros
+    if unstable.size:
+        raise ValueError(
+            f"observer: the plant has zeros from u at {spell(unstable)} rad/s, not in the left half plane; ADRC inverts the plant, "
+            "so that u would grow, or swing, without end while y looks well; control another output, or take a controller that does not "
+            "invert the plant (linear-quadratic, for instance)"
+        )
 
 
 def _named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:

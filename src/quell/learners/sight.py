@@ -59,7 +59,7 @@ def sight(observer: ESO, frequency: float) -> Sight:
     noise = noise_gains(observer)
     f_noise = float(noise[-1])
     noise[-1] /= observer.b0**2  # what noise leaves in f̂ is also in b0 u
-    return Sight(CLEAR**2 * noise, -math.expm1(-observer.dt / (AVERAGE * observer.lag_time)), f_noise, frequency**observer.order)
+    return Sight(CLEAR**2 * noise, -math.expm1(-observer.dt / (AVERAGE * observer.lag_time)), f_noise, frequency**observer.f_degree)
 
 
 def sight_memory(order: int) -> SightMemory:

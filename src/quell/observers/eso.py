@@ -4,7 +4,8 @@ Extended model (paper eqs. (eq_2) and (eq.leso)), states ``z = (x̂_1 … x̂_n,
 
     x_i' = x_{i+1},    x_n' = −a·x + b0 u + f_L + Δf,    Δf' = 0
 
-sampled exactly with zero-order hold to ``Φ, Γ_u, Γ_f``. Each sample::
+and for any other plant, zeros and all, its observable canonical form ``z' = Ā z + B̄ u + Ē (f_L + Δf)`` (``canonical.py``), in place of the
+first two. It is sampled exactly with zero-order hold to ``Φ, Γ_u, Γ_f``. Each sample::
 
     predict   z⁻ = Φ z + Γ_u u + Γ_f f_L          u: the control signal that was really applied
     correct   z  = z⁻ + L (y − z⁻_1)
@@ -25,8 +26,9 @@ import numpy as np
 
 from quell import checks
 from quell.observers.base import begin, observe
-from quell.observers.canonical import canonical
+from quell.observers.canonical import Canonical, canonical, spell
 from quell.observers.discretize import zero_order_hold
+from quell.observers.placement import place, sampled_zeros
 from quell.types import Matrix, Vector
 
 FORMS = ("current", "predictor")
@@ -78,8 +80,8 @@ class ESO:
 
     Attributes
     ----------
-    a : (n,) array
-        the plant's coefficients known to it, in ``y^(n) = −a·(y … y^(n−1)) + b0 u + f``; zero for a model-free one [1/s^(n−i)].
+    plant : Canonical
+        the plant as it is known to it; a chain of integrators for a model-free one.
     b0 : float
         nominal control gain [y-unit / u-unit / s^n].
     omega_o : float
@@ -98,7 +100,7 @@ class ESO:
     (4, 0.0488)
     """
 
-    a: Vector
+    plant: Canonical
     b0: float
     omega_o: float
     dt: float
@@ -127,32 +129,55 @@ class ESO:
         ValueError
             naming the argument, its value and the rule.
         """
-        return cls._design(np.zeros(checks.whole("order", order, 1, 8)), b0, omega_o, dt, form)
+        return cls._design(canonical((np.zeros(checks.whole("order", order, 1, 8)), 1.0)), b0, omega_o, dt, form)
 
     @classmethod
-    def model_based(cls, plant: Any, omega_o: float, dt: float, *, b0: float | None = None, form: str = "current") -> ESO:
-        """Design an ESO that knows a model of the plant (paper eq. (mbplant)).
+    def model_based(
+        cls,
+        plant: Any,
+        omega_o: float,
+        dt: float,
+        *,
+        b0: float | None = None,
+        E: Any = None,
+        form: str = "current",
+        keep_zeros: bool = False,
+    ) -> ESO:
+        """Design an ESO that knows a model of the plant (paper eq. (mbplant)), which may have zeros.
+
+        f enters where u does, zeros included, or through a channel E of its own, which must have none. In both cases a constant f is
+        estimated without error.
 
         Parameters
         ----------
-        plant
-            a linear plant, ``control.StateSpace``, ``control.TransferFunction`` or ``(a, b)``; see ``canonical``.
+        plant, E
+            a linear plant, ``control.StateSpace``, ``control.TransferFunction``, matrices, coefficients; see ``canonical``.
         omega_o, dt, form
             as for ``model_free``.
         b0
-            nominal control gain; the model's own by default.
+            nominal control gain, from u to y^(relative degree); the model's own by default.
+        keep_zeros
+            leave poles of the observer at the zeros from f that are stable and slower than omega_o. Then f̂ follows f as if there
+            were none, ``(omega_o/(s + omega_o))^(N − zeros)``, which is what a learner needs; the state is found no faster than the
+            zeros are. By default all N poles lie at ``exp(−omega_o dt)``: state and constant f are found fast, but f̂ exaggerates what
+            changes (docs/design).
 
         Raises
         ------
         ValueError
-            as for ``model_free``, and where the plant is not observable from y or has zeros from u.
+            as for ``model_free`` and ``canonical``, for a plant of more than 8 states, and where a zero at s = 0 hides a constant f.
         """
-        a, b, _ = canonical(plant)
-        checks.whole("order of the plant", a.size, 1, 8)
-        return cls._design(a, b if b0 is None else b0, omega_o, dt, form)
+        found = canonical(plant, E)
+        checks.whole("order of the plant", found.a.size, 1, 8)
+        if found.matched and np.any(found.zeros == 0.0):
+            raise ValueError(
+                f"plant has a zero at s = 0 (zeros from u: {spell(found.zeros)} rad/s): a constant f leaves no trace in y and can not be "
+                "estimated; measure another output"
+            )
+        return cls._design(found, found.b if b0 is None else b0, omega_o, dt, form, keep_zeros)
 
     @classmethod
-    def _design(cls, a: Vector, b0: float, omega_o: float, dt: float, form: str) -> ESO:
+    def _design(cls, plant: Canonical, b0: float, omega_o: float, dt: float, form: str, keep_zeros: bool = False) -> ESO:
         b0 = checks.nonzero("b0", b0, "it is the gain from u to the plant's highest derivative")
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         checks.one_of("form", form, FORMS)
@@ -161,27 +186,47 @@ class ESO:
                 f"omega_o = {omega_o!r} rad/s with dt = {dt!r} s: omega_o * dt = {omega_o * dt:.3g} must be below pi, "
                 "no sampling can follow a bandwidth above half its rate; lower omega_o or dt"
             )
-        return cls(a, b0, omega_o, dt, form, _sampled_design(a, b0, omega_o, dt, form == "predictor"))
+        return cls(
+            plant,
+            b0,
+            omega_o,
+            dt,
+            form,
+            _sampled_design(plant, b0, omega_o, dt, form == "predictor", checks.flag("keep_zeros", keep_zeros)),
+        )
+
+    @property
+    def a(self) -> Vector:
+        """The plant's coefficients (n,), in ``y^(n) = −a·(y … y^(n−1)) + b0 u + f`` where there are no zeros [1/s^(n−i)]."""
+        return self.plant.a
 
     @property
     def order(self) -> int:
         """Order n of the plant; the observer has n + 1 states."""
-        return int(self.a.size)
+        return int(self.plant.a.size)
 
     @property
     def degree(self) -> int:
-        """Relative degree from u to y: so many derivatives of y the controller shapes."""
-        return self.order
+        """Relative degree r from u to y: so many derivatives of y the controller shapes; n unless the plant has zeros."""
+        return self.plant.degree
+
+    @property
+    def f_degree(self) -> int:
+        """Relative degree from f to y: f is in y-unit/s^f_degree."""
+        return self.plant.f_degree
 
     @property
     def cancel(self) -> Vector:
-        """What the controller adds to cancel the modelled dynamics: ``cancel · x̂`` [y-unit/s^n]."""
-        return self.a
+        """What the controller adds to cancel the modelled dynamics: ``cancel · x̂`` [y-unit/s^r].
+
+        From ``y^(n) = −a·z + b u + f``, or from ``y^(r) = z_{r+1} + b u``, plus f where that enters as u does.
+        """
+        return self.plant.a if self.degree == self.order else -np.eye(self.order)[self.degree]
 
     @property
     def cancel_f(self) -> float:
         """1.0 where the total disturbance enters as u does, else 0.0: then u has nothing to cancel but its effect on the state."""
-        return 1.0
+        return 1.0 if self.plant.matched else 0.0
 
     @property
     def states(self) -> int:
@@ -195,8 +240,34 @@ class ESO:
 
     @property
     def pole(self) -> float:
-        """Where all poles of the observer lie in the z-plane, ``exp(−omega_o dt)``."""
+        """Where the poles of the observer lie in the z-plane, ``exp(−omega_o dt)``, but for those kept at zeros."""
         return math.exp(-self.omega_o * self.dt)
+
+    def states_of(self, x_hat: Any) -> Vector:
+        """Return estimates in the states of the plant that the observer was designed for: ``S⁻¹ x̂``.
+
+        Parameters
+        ----------
+        x_hat
+            (n,), as ``controller.estimate.x``, or (samples, n), as ``run["x_hat"]``.
+
+        Returns
+        -------
+        array
+            of the same shape. For a plant given without states it is x̂ itself: y and its derivatives, less what u and f feed through.
+
+        Raises
+        ------
+        ValueError
+            where the last axis is not n long.
+        """
+        x = np.asarray(x_hat, dtype=np.float64)
+        if x.ndim == 0 or x.shape[-1] != self.order:
+            raise ValueError(f"x_hat has shape {x.shape}: the last axis must have the {self.order} states")
+        S = self.plant.S
+        size = np.linalg.norm(S, axis=1)
+        mapped: Vector = np.linalg.solve(S / size[:, None], (x / size).reshape(-1, self.order).T).T.reshape(x.shape)
+        return mapped
 
 
 def continuous_gain(a: Vector, omega_o: float) -> Vector:
@@ -222,9 +293,12 @@ def noise_gains(observer: ESO) -> Vector:
     """Return the variance of each estimate (N,) that white noise of unit variance in y leaves, as for a model-free observer.
 
     In continuous time ``x̂_i = Σ_{k=i}^{N} C(N, k) ω_o^k s^(N−k+i−1) / (s + ω_o)^N · y``, and sampled white noise has the density dt; so
-    the variance is ``dt ω_o^(2i−1) ∫ |·|² dω / 2π`` of what is left at ω_o = 1. Good while ``omega_o dt`` is small.
+    the variance is ``dt ω_o^(2i−1) ∫ |·|² dω / 2π`` of what is left at ω_o = 1. Good while ``omega_o dt`` is small. Where f enters before
+    the last integrator, with zeros of the plant in its way, that says nothing of it, and its variance is summed up sample by sample.
     """
     size = observer.order + 1
+    if observer.f_degree < observer.order:
+        return _summed_noise_gains(observer)
     return observer.dt * observer.omega_o ** (2.0 * np.arange(size) + 1.0) * _unit_noise_gains(size)
 
 
@@ -241,51 +315,61 @@ def _unit_noise_gains(size: int) -> Vector:
     return gains
 
 
-def _sampled_design(a: Vector, b0: float, omega_o: float, dt: float, predictor: bool) -> EsoModel:
-    """Sample the extended model and place the poles, in the coordinates ``x_i dt^(i−1)`` where all entries are O(1)."""
-    size = a.size + 1
-    scale = dt ** np.arange(size)
-    A = np.diag(np.ones(size - 1), 1)  # f is the last state: it drives x_n through the same superdiagonal
-    A[-2, :-1] -= a * dt ** (a.size - np.arange(a.size))
-    B = np.zeros((size, 1))
-    B[-2] = 1.0  # the effect of f_L; that of u is b0 times it
-    with np.errstate(over="ignore", invalid="ignore"):
-        phi, (feed,) = zero_order_hold(A, [B], 1.0)
-    gain = _place(phi, -math.expm1(-omega_o * dt)) if np.all(np.isfinite(phi)) else np.full(size, np.nan)
+def _summed_noise_gains(observer: ESO) -> Vector:
+    """Return the diagonal of ``Σ M^k L Lᵀ M^kᵀ``, M = (I − L C) Φ, by doubling, in the observer's own time."""
+    model, size = observer.model, observer.order + 1
+    scale = observer.omega_o ** np.append(np.arange(observer.order), observer.f_degree)
+    gain = model.gain / scale
+    transition = model.transition * scale[None, :] / scale[:, None]
+    transition -= np.outer(gain, transition[0])
+    total = np.outer(gain, gain)
+    for _ in range(64):
+        total += transition @ total @ transition.T
+        transition = transition @ transition
+        if np.max(np.abs(transition)) < 1e-12:
+            break
+    return np.diag(total).reshape(size) * scale**2
+
+
+def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, predictor: bool, keep_zeros: bool) -> EsoModel:
+    """Sample the extended model, in the coordinates ``x_i dt^(i−1)`` and ``f dt^q`` where all entries are O(1), and place the poles.
+
+    That is done in the coordinates ``x_i/omega_o^(i−1)``, ``f/omega_o^q``: over a sample hardly anything happens there, but it is known
+    to full precision, because ``Φ − I`` is taken as the integral ``∫ e^(A t) A dt``, not as a difference.
+    """
+    n, q = plant.a.size, plant.f_degree
+    size = n + 1
+    power = np.append(np.arange(n), q)
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+        A = np.diag(np.ones(size - 1), 1)
+        A[-2, :-1] -= plant.a * dt ** (n - np.arange(n))
+        A[:-1, -1] = plant.E * dt ** (np.arange(n) + 1.0 - q)
+        inputs = np.zeros((size, 2))
+        inputs[:-1, 0] = plant.B / plant.b * dt ** (np.arange(n) + 1.0 - plant.degree)
+        inputs[:, 1] = A[:, -1]
+        phi, (difference, gammas) = zero_order_hold(A, [A, inputs], 1.0)
+        step = omega_o * dt
+        slow = step ** (power[None, :] - power[:, None])
+        gain = np.full(size, np.nan)
+        if np.all(np.isfinite(phi)):
+            difference *= slow
+            rises = np.full(size, -math.expm1(-step), dtype=complex)
+            kept = plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)] if keep_zeros and plant.matched else np.zeros(0)
+            rises[: kept.size] = sampled_zeros(difference, kept, dt)
+            gain = place(difference, rises) * step**power
     if not np.all(np.abs(gain) < _LARGEST_GAIN):
-        fastest = np.max(np.abs(np.roots([1.0, *a[::-1]])), initial=0.0)
+        fastest = np.max(np.abs(np.roots([1.0, *plant.a[::-1]])), initial=0.0)
+        zeros = f" or its zeros at {spell(plant.zeros)} rad/s" if plant.zeros.size else ""
         raise ValueError(
-            f"dt = {dt!r} s: too long (or omega_o = {omega_o!r} rad/s too small) for the plant's fastest pole of {fastest:.3g} rad/s; "
-            "sampled, the model cannot be observed"
+            f"dt = {dt!r} s: too long (or omega_o = {omega_o!r} rad/s too small) for the plant's fastest pole of {fastest:.3g} rad/s"
+            f"{zeros}; sampled, the model cannot be observed"
         )
-    # Back to the plant's coordinates: x = scaled / scale; an input enters with the n-th power of dt.
-    feed = feed[:, 0] * dt**a.size / scale
+    # Back to the plant's coordinates; an input enters with the power of dt of its relative degree.
+    scale = dt**power
     return EsoModel(
         transition=np.ascontiguousarray(phi * scale[None, :] / scale[:, None]),
-        input=b0 * feed,
-        feed=feed,
+        input=b0 * (gammas[:, 0] * dt**plant.degree / scale),
+        feed=gammas[:, 1] * dt**q / scale,
         gain=gain / scale,
         predictor=predictor,
     )
-
-
-def _place(phi: Matrix, one_minus_pole: float) -> Vector:
-    """Return L that puts all eigenvalues of ``(I − L C) Φ`` at ``1 − one_minus_pole`` (Ackermann's formula for repeated poles).
-
-    ``L = (Φ − βI)^N O⁻¹ e_N`` with the rows ``C Φ (Φ − I)^i`` for O: differences instead of powers leave ``O⁻¹ e_N`` as it is
-    and make O triangular for a chain of integrators, where powers would be nearly parallel.
-    """
-    size = phi.shape[0]
-    difference = phi - np.eye(size)
-    rows = np.empty((size, size))
-    rows[0] = phi[0]
-    for i in range(1, size):
-        rows[i] = rows[i - 1] @ difference
-    try:
-        vector = np.linalg.solve(rows, np.eye(size)[-1])
-    except np.linalg.LinAlgError:
-        return np.full(size, np.nan)
-    shifted = difference + one_minus_pole * np.eye(size)
-    for _ in range(size):
-        vector = shifted @ vector
-    return vector
