@@ -22,7 +22,8 @@ import numpy as np
 from quell import checks
 from quell.guard import UnguardedDesign
 from quell.learners.base import NoLearner, adapt, coefficients, commit, predict, restart
-from quell.trajectory import Trajectory, first_sample_at
+from quell.record import first_sample_at
+from quell.trajectory import Trajectory
 from quell.types import Vector
 
 # Central differences over so much of the size of a signal: they err by its square.
