@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from quell import checks
 from quell.controllers.base import rest
 from quell.controllers.handle import bind
@@ -202,6 +204,10 @@ class HandOver:
                 )
         if type(observer.model) is not type(old.model):
             raise ValueError("observer is of another kind than the present one: make a new controller, and start(y, u) it")
+        if old.degree < old.order and not (observer.b0 == old.b0 and np.array_equal(observer.plant.a, old.plant.a)):
+            raise ValueError(
+                "observer has another model or b0, and the plant has zeros: its states are other ones then; retune omega_o only"
+            )
         if not isinstance(self.learner, NoLearner) and (observer.b0 != old.b0 or (observer.cancel != old.cancel).any()):
             raise ValueError(
                 f"observer has b0 = {observer.b0!r} and a = {observer.cancel.tolist()}, other than the present one: "
