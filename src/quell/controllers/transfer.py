@@ -122,9 +122,9 @@ def tustin(system: System, dt: float, prewarp: float | None = None) -> System:
         h = math.tan(0.5 * prewarp * dt) / prewarp
     A, B, C, D = system
     one = np.eye(A.shape[0])
-    inner = one - h * A
-    B_d: Matrix = 2.0 * h * np.linalg.solve(inner, B)
-    return np.linalg.solve(inner, one + h * A), B_d, np.linalg.solve(inner.T, C.T).T, np.asarray(D + 0.5 * C @ B_d, dtype=np.float64)
+    inverse = np.asarray(np.linalg.inv(one - h * A), dtype=np.float64)
+    B_d, C_d = 2.0 * h * inverse @ B, C @ inverse
+    return inverse @ (one + h * A), B_d, C_d, D + 0.5 * C @ B_d
 
 
 def sampled_law(

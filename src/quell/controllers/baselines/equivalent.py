@@ -75,9 +75,6 @@ def equivalent_pid(controller: Any, **options: Any) -> PID:
     ki, kp, kd = (value / (alpha[0] * b0) for value in beta)
     setpoint = k1 / (alpha[0] * b0) * np.poly([-w] * (observer.order + 1))
     limits = controller.parameters.limits
-    settings: dict[str, Any] = {
-        "u_min": limits.low,
-        "u_max": limits.high,
-        "name": f"PID equivalent to ADRC of order {observer.order}",
-    } | options
+    name = f"PID equivalent to ADRC of order {observer.order}"
+    settings: dict[str, Any] = {"u_min": limits.low, "u_max": limits.high, "name": name} | options
     return PID(kp, ki, kd, tf=tf, setpoint=setpoint.tolist(), dt=controller.dt, **settings)
