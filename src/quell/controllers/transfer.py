@@ -99,7 +99,7 @@ def balanced(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> System:
         return A, B, C, D
     A, (scale, _) = matrix_balance(A, permute=False, separate=True)
     B, C = B / scale[:, None], C * scale
-    into, out = np.linalg.norm(B), np.linalg.norm(C)
+    into, out = float(np.max(np.abs(B))), float(np.max(np.abs(C)))
     share = math.sqrt(out / into) if into > 0.0 and out > 0.0 else 1.0
     return A, B * share, C / share, D
 

@@ -12,8 +12,7 @@ choice. With motor position control ``v = k_p (r_1 − x_1) − k_v x_1'`` the l
 which for ``H = √5, k_v = 4 ω_a, k_p = ω_a²`` is ``(s + ω_a)⁴`` (Yuki, Murakami & Ohnishi, *IECON* 1993; Hori, Sawada & Chun, *IEEE
 Trans. Industrial Electronics* 46, 1999, with a disturbance observer slow enough for the whole of both masses).
 
-They measure the motor and get T from a disturbance observer there. Here is one measurement, ``y = c_1 x_1 + c_2 x_2``, of either mass:
-so x_1, x_1' and T come from a Kalman filter of both masses with a slow force d on the load (observer_law.py). What d asks for at rest
+They measure the motor and get T from a disturbance observer there. Here is one measurement, y, the place of either mass: so x_1, x_1' and T come from a Kalman filter of both masses with a slow force d on the load (observer_law.py). What d asks for at rest
 is fed forward::
 
     r_1 = r − d̂/k − κ d̂/(m_1 k_p)
@@ -49,8 +48,8 @@ class ResonanceRatio(LinearController):
         how fast the filter follows the force on the load [rad/s]; by default half the anti-resonance.
     ratio
         H, above 1; √5 by default.
-    c1, c2
-        what is measured, ``y = c1 x1 + c2 x2`` with c1 + c2 = 1; the load by default.
+    measured
+        ``"load"``: y = x2, or ``"motor"``: y = x1.
     u_min, u_max, rate_limit, name
         as for ``LinearController``.
 
@@ -66,7 +65,7 @@ class ResonanceRatio(LinearController):
     Raises
     ------
     ValueError
-        for a number out of range, or a combination c1, c2 that does not show the load's place.
+        for a number out of range.
 
     Examples
     --------
@@ -85,31 +84,29 @@ class ResonanceRatio(LinearController):
         dt: float,
         omega_d: float | None = None,
         ratio: float = math.sqrt(5.0),
-        c1: float = 0.0,
-        c2: float = 1.0,
+        measured: str = "load",
         **options: Any,
     ) -> None:
-        plant = two_mass_spring(m1, m2, k, c1, c2)
+        c1 = float(checks.one_of("measured", measured, ("load", "motor")) == "motor")
+        plant = two_mass_spring(m1, m2, k, c1, 1.0 - c1)
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         if not checks.positive("ratio", ratio) > 1.0:
             raise ValueError(f"ratio = {ratio!r}: must be above 1, the resonance lies above the anti-resonance")
-        if not math.isclose(c1 + c2, 1.0) or min(c1, c2) < 0.0:
-            raise ValueError(f"c1 = {c1!r}, c2 = {c2!r}: must not be negative and add up to 1, so that y is a place between the masses")
-        antiresonance = math.sqrt(k / m2)
-        self.kappa = round((ratio**2 - 1.0) * m1 / m2, 12)
         omega_d = 0.5 * antiresonance if omega_d is None else checks.positive("omega_d", omega_d, "rad/s")
         kp, kv = antiresonance**2, 4.0 * antiresonance
         torque = (1.0 - self.kappa) * k
         self.K = np.array([m1 * kp - torque, torque, m1 * kv, 0.0])
-        # At rest under d the spring carries it: x1 − x2 = −d/k, u = −d, and y = c1 x1 + c2 x2 = r.
+        # At rest under d the spring carries it: x1 − x2 = −d/k, u = −d, and y = x2 + c1 (x1 − x2) = r.
         self.K_d = float(1.0 + (self.K[0] * (1.0 - c1) - self.K[1] * c1) / k)
         model = with_disturbance(plant.A, plant.B, plant.C, plant.E[:, 1:], dt)
-        # White noise in u and a walk in d that crosses it at omega_d, of such a size that the filter's fastest poles have the radius
-        # omega_o. The walk alone would not do: from d to the load the motor on the spring is an anti-resonance, and would keep poles.
-        (b1, degree1), (b2, degree2) = (leading_gain(plant.A, plant.E[:, i : i + 1], plant.C) for i in (0, 1))
-        density = min(omega_o ** (2 * degree1) / b1**2, omega_o ** (2 * degree2 + 2) / (b2 * omega_d) ** 2)
+        # White noise in the force on the mass that is not measured, and a walk in d that crosses it at omega_d, of such a size that the
+        # filter's fastest poles have the radius omega_o. From the force on the measured mass to y there is an anti-resonance, where that
+        # force does not show: a filter that knew of no other would have undamped poles there.
+        far = plant.E[:, :1] if measured == "load" else plant.E[:, 1:]
+        (b_far, degree_far), (b_d, degree_d) = (leading_gain(plant.A, column, plant.C) for column in (far, plant.E[:, 1:]))
+        density = min(omega_o ** (2 * degree_far) / b_far**2, omega_o ** (2 * degree_d + 2) / (b_d * omega_d) ** 2)
         W = np.zeros((5, 5))
-        W[:4, :4] = sampled_noise(plant.A, plant.B @ plant.B.T * density, dt)
+        W[:4, :4] = sampled_noise(plant.A, far @ far.T * density, dt)
         W[4, 4] = dt * density * omega_d**2
         self.L = kalman_gain(model, W, 1.0 / dt)
         law = feedback_law(model, self.L, np.append(self.K, self.K_d), m1 * kp)
