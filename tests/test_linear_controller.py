@@ -176,7 +176,7 @@ def test_a_prefilter_starts_at_the_first_measurement() -> None:
 
 def test_a_prefilter_serves_adrc_with_a_learner() -> None:
     """Channels, coefficients and the estimate are ADRC's; a constant prefilter changes nothing."""
-    adrc = ql.ADRC(ql.ESO.model_free(2, 2.0, 20.0, 0.01), 3.0, learner=ql.learners.Kalman())
+    adrc = ql.ADRC(ql.ESO.model_free(2, 2.0, 20.0, 0.01), 3.0, learner=ql.learners.NLMS())
     scenario = ql.Scenario(reference=ql.signals.Sinusoid(), duration=3.0)
     plain, shaped = (ql.simulate(LAG, c, scenario) for c in (adrc, Prefiltered(adrc, ql.baselines.Shaper((0.0,), (1.0,)))))
     np.testing.assert_array_equal(plain["u"], shaped["u"])

@@ -12,8 +12,8 @@ choice. With motor position control ``v = k_p (r_1 − x_1) − k_v x_1'`` the l
 which for ``H = √5, k_v = 4 ω_a, k_p = ω_a²`` is ``(s + ω_a)⁴`` (Yuki, Murakami & Ohnishi, *IECON* 1993; Hori, Sawada & Chun, *IEEE
 Trans. Industrial Electronics* 46, 1999, with a disturbance observer slow enough for the whole of both masses).
 
-They measure the motor and get T from a disturbance observer there. Here is one measurement, y, the place of either mass: so x_1, x_1' and T come from a Kalman filter of both masses with a slow force d on the load (observer_law.py). What d asks for at rest
-is fed forward::
+They measure the motor and get T from a disturbance observer there. Here is one measurement, y, the place of either mass: so x_1, x_1'
+and T come from a Kalman filter of both masses with a slow force d on the load (observer_law.py). What d asks for at rest is fed forward::
 
     r_1 = r − d̂/k − κ d̂/(m_1 k_p)
 
@@ -92,6 +92,8 @@ class ResonanceRatio(LinearController):
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         if not checks.positive("ratio", ratio) > 1.0:
             raise ValueError(f"ratio = {ratio!r}: must be above 1, the resonance lies above the anti-resonance")
+        antiresonance = math.sqrt(k / m2)
+        self.kappa = round((ratio**2 - 1.0) * m1 / m2, 12)
         omega_d = 0.5 * antiresonance if omega_d is None else checks.positive("omega_d", omega_d, "rad/s")
         kp, kv = antiresonance**2, 4.0 * antiresonance
         torque = (1.0 - self.kappa) * k
