@@ -254,7 +254,11 @@ WASHED_OUT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [0.0,
         (lambda: PID.simc(1.0, 1.0, 0.0, dt=0.1), "theta, or tau_c, = 0.0: must be finite and greater than zero"),
         (lambda: equivalent_pid("adrc"), "controller = 'adrc': must be an ADRC"),
         (lambda: equivalent_pid(ql.ADRC(ql.ESO.model_free(3, 1.0, 10.0, 0.01), 1.0)), "controller is of order 3: must be of order 1"),
-        (lambda: equivalent_pid(ql.ADRC(ql.ESO.model_based(LAG, 10.0, 0.01), 1.0)), "controller knows a model"),
+        (lambda: equivalent_pid(ql.ADRC(ql.ESO.model_based(LAG, 10.0, 0.01), 1.0)), "controller has an observer that knows a model"),
+        (
+            lambda: equivalent_pid(ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, feedforward=True)),
+            "controller has feedforward: a PID controller has no derivatives",
+        ),
         (
             lambda: equivalent_pid(ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, learner=ql.learners.Kalman())),
             "controller has a learner, Kalman",

@@ -114,7 +114,8 @@ class Prefiltered(Running):
     Raises
     ------
     ValueError
-        for something that is no controller or no prefilter.
+        for something that is no controller or no prefilter, and for a controller with feedforward: the derivatives of the reference are
+        not those of what the prefilter makes of it.
 
     Examples
     --------
@@ -129,6 +130,8 @@ class Prefiltered(Running):
             raise ValueError(f"controller = {controller!r}: must be a controller, for example quell.ADRC(...)")
         if isinstance(prefilter, type) or not all(hasattr(prefilter, name) for name in ("design", "memory")):
             raise ValueError(f"prefilter = {prefilter!r}: must be a prefilter, for example quell.baselines.ZV(omega=1.4)")
+        if getattr(controller, "derivatives", 0):
+            raise ValueError("controller has feedforward: a prefilter leaves no derivatives to feed forward; use feedforward=False")
         self.controller = controller
         self.prefilter = prefilter
         self._begin()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,12 +24,15 @@ class Running:
 
     parameters: Any
     """What the compiled functions need, a NamedTuple."""
+    _state: Any
+    _handle: Any
+    _step: Callable[[Any, float, float], float]
 
     def _begin(self) -> None:
         self._prepare_design()
         self._state = self.initial_state()
         self._arrays = named_arrays(self._state)
-        self._handle: Any = None
+        self._handle = None
 
     def _prepare_design(self) -> None:
         raise NotImplementedError
@@ -57,7 +60,7 @@ class Running:
         """
         if self._handle is None:
             self.prepare()
-        return float(self._step(self._handle, r, y))
+        return self._step(self._handle, r, y)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""
@@ -70,14 +73,15 @@ class Running:
         self.state = kept["state"]
 
     def reset(self) -> None:
-        """Go back to the state before the first sample."""
+        """Go back to the state before the first sample; what was learned is forgotten."""
         self.state = self._saved(self.initial_state())
 
     @property
     def state(self) -> dict[str, NDArray[Any]]:
         """The whole running state as named arrays, copied: ``numpy.savez(file, **controller.state)`` keeps it.
 
-        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then.
+        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then. A learner that is
+        a Python object is in it as an array () of objects, which is good in this process; quell does not pickle or unpickle it.
         """
         return self._saved(self._state)
 

@@ -26,6 +26,7 @@ import numpy as np
 from quell.controllers.adrc import ADRC
 from quell.controllers.baselines.pid import PID
 from quell.learners.base import NoLearner
+from quell.observers.eso import ESO
 
 
 def equivalent_pid(controller: Any, **options: Any) -> PID:
@@ -46,7 +47,7 @@ def equivalent_pid(controller: Any, **options: Any) -> PID:
     Raises
     ------
     ValueError
-        for an ADRC of another order, with a learner, or with a model of the plant, and for what is no ADRC.
+        for an ADRC of another order, with a learner, feedforward or another observer, and for what is no ADRC.
     """
     if not isinstance(controller, ADRC):
         raise ValueError(f"controller = {controller!r}: must be an ADRC")
@@ -60,8 +61,11 @@ def equivalent_pid(controller: Any, **options: Any) -> PID:
             f"controller is of order {observer.order}: must be of order 1 (PI) or 2 (PID); an ADRC of order n has n zeros from y, a PID "
             "controller two at most"
         )
-    if np.any(observer.a != 0.0):
-        raise ValueError(f"controller knows a model, a = {observer.a.tolist()}: must be around ESO.model_free")
+    usual = ESO.model_free(observer.order, observer.b0, observer.omega_o, observer.dt, form=observer.form).model
+    if type(observer.model) is not type(usual) or not all(np.array_equal(a, b) for a, b in zip(observer.model, usual, strict=True)):
+        raise ValueError("controller has an observer that knows a model, or is of another kind: must be around ESO.model_free")
+    if controller.derivatives:
+        raise ValueError("controller has feedforward: a PID controller has no derivatives of the reference; use feedforward=False")
     w, b0 = observer.omega_o, observer.b0
     if observer.order == 1:
         (k1,) = controller.parameters.law.tolist()
