@@ -20,9 +20,9 @@ from typing import Any
 from quell import checks, metrics
 from quell.controllers import ADRC, Controller, Prefiltered
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio
-from quell.experiments.parallel import in_parallel
 from quell.learners import Kalman
 from quell.observers import ESO
+from quell.parallel import in_parallel
 from quell.plants import Plant, two_mass_spring
 from quell.signals import BandLimitedNoise, Step
 from quell.simulation import Scenario, simulate
