@@ -12,6 +12,8 @@ import quell as ql
 from quell.controllers import LinearController, LinearLaw, Prefiltered
 from quell.controllers.transfer import anti_windup, as_state_space, realised, tustin
 
+from .contracts.python_models import LeastMeanSquares
+
 LAG = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -1.5]], [0.0, 2.0], [1.0, 0.0])
 
 
@@ -177,13 +179,26 @@ def test_a_prefilter_starts_at_the_first_measurement() -> None:
 def test_a_prefilter_serves_adrc_with_a_learner() -> None:
     """Channels, coefficients and the estimate are ADRC's; a constant prefilter changes nothing."""
     adrc = ql.ADRC(ql.ESO.model_free(2, 2.0, 20.0, 0.01), 3.0, learner=ql.learners.NLMS())
-    scenario = ql.Scenario(reference=ql.signals.Sinusoid(), duration=3.0)
-    plain, shaped = (ql.simulate(LAG, c, scenario) for c in (adrc, Prefiltered(adrc, ql.baselines.Shaper((0.0,), (1.0,)))))
+    scenario = ql.Scenario(reference=ql.signals.Sinusoid(), duration=0.6)
+    plain, shaped = (ql.simulate(LAG, c, scenario, interpret=True) for c in (adrc, Prefiltered(adrc, ql.baselines.Shaper((0.0,), (1.0,)))))
     np.testing.assert_array_equal(plain["u"], shaped["u"])
     np.testing.assert_array_equal(shaped["r_shaped"], shaped["r"])
     np.testing.assert_array_equal(plain["theta"], shaped["theta"])
     assert shaped.features == plain.features
     assert Prefiltered(adrc, ql.baselines.ZV(1.0)).read(shaped.final_state).u == plain["u"][-1]
+
+
+def test_a_prefilter_keeps_what_a_python_learner_keeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What lies outside of the arrays is in the state, by name, and comes back."""
+    learner = ql.learners.PythonModel(LeastMeanSquares())
+    shaped = Prefiltered(ql.ADRC(ql.ESO.model_free(2, 2.0, 20.0, 0.01), 3.0, learner=learner), ql.baselines.ZV(3.0))
+    outside = [name for name, value in shaped.state.items() if value.dtype == object]
+    assert outside
+    assert all(name.startswith("controller.learner.") for name in outside)
+    recalled: list[object] = []
+    monkeypatch.setattr(learner, "recall", lambda memory, snapshots: recalled.append(set(snapshots)))
+    shaped.state = shaped.state
+    assert recalled == [{name.removeprefix("controller.learner.") for name in outside}]
 
 
 LAW = LinearLaw(np.eye(2), np.zeros(2), np.zeros(2), np.zeros(2), np.ones(2), 0.0, 0.0)

@@ -1,5 +1,7 @@
 """LQG with a disturbance state: state feedback with a Kalman filter that also estimates a disturbance at the input.
 
+::
+
     minimise ∫ y² + ρ u² dt,      u = −K x̂ − d̂ + N r,      N = 1 / ( C (I − Φ + Γ K)⁻¹ Γ )
 
 (Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, sections 8.5 and 9; observer_law.py has the filter.) The cost

@@ -1,5 +1,7 @@
 """PI or PID with a notch filter on a resonance.
 
+::
+
     N(s) = (s² + 2 ζ_z ω s + ω²) / (s² + 2 ζ_p ω s + ω²),      |N(jω)| = ζ_z/ζ_p = depth,      −3 dB over about  2 ζ_p ω = width · ω
 
 (Ellis, *Control System Design Guide*, 4th ed. 2012, chapter 9; Vukosavić & Stojić, *IEEE Trans. Industrial Electronics* 45, 1998, for

@@ -1,5 +1,7 @@
 """The filtered PID controller of two degrees of freedom.
 
+::
+
     U = 1/F(s) · ( k_p (b R − Y) + k_i/s (R − Y) + k_d s (c R − Y) ),        F(s) = 1 + T_f s + (T_f s)²/2
 
 (Åström & Hägglund, *Advanced PID Control*, ISA 2006, sections 3.2 to 3.4: set-point weights b and c, and a filter of second order on
@@ -79,6 +81,8 @@ class PID(LinearController):
             raise ValueError(f"kd = {kd!r}, tf = {tf!r}: a derivative needs a filter, tf greater than zero; a tenth of kd/kp is usual")
         self.tt = self._tracking_time() if tt is None else checks.positive("tt", tt, "s")
         self.setpoint = (self.kd * self.c, self.kp * self.b, self.ki) if setpoint is None else tuple(checks.vector("setpoint", setpoint))
+        if not self.setpoint:
+            raise ValueError(f"setpoint = {setpoint!r}: must be a polynomial in s, highest power first")
         system = realised(*self.polynomials())
         law = sampled_law(system, checks.positive("dt", dt, "s"), prewarp=self._prewarp, tracking_time=self.tt)
         super().__init__(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
