@@ -48,10 +48,13 @@ def test_a_pid_controller_is_its_equation() -> None:
 
 
 def test_simc_makes_the_loop_that_skogestad_says() -> None:
-    """A lag with PI: the loop's time constant is τ_c where no delay is; his example E1's settings in series form."""
+    """A lag with PI: the loop's time constant is τ_c where no delay is; his example E1 (K_c = 5.5, τ_I = 0.8); the series form."""
     lag = ql.plants.LinearPlant([[-0.5]], [1.0], [1.0])  # gain 2, time constant 2 s
     run = ql.simulate(lag, PID.simc(2.0, 2.0, 0.0, tau_c=0.8, dt=1e-3), ql.Scenario(reference=1.0, duration=4.0))
     np.testing.assert_allclose(run["y"], 1.0 - np.exp(-run.t / 0.8), atol=2e-3)
+    # 1/((s + 1)(0.2 s + 1)), by the half rule τ1 = 1.1 and θ = 0.1.
+    first = PID.simc(1.0, 1.1, 0.1, dt=1e-3)
+    assert (first.kp, first.kp / first.ki) == pytest.approx((5.5, 0.8))
     # e^(−0.18 s) / ((1.22 s + 1)(0.22 s + 1)) with τ_c = θ: K_c = 1.22/0.36, τ_I = min(1.22, 1.44), τ_D = 0.22.
     tuned = PID.simc(1.0, 1.22, 0.18, 0.22, dt=1e-3)
     series = 1.22 / 0.36
@@ -59,7 +62,7 @@ def test_simc_makes_the_loop_that_skogestad_says() -> None:
 
 
 def test_simc_for_a_double_integrator_is_stable_with_its_delay() -> None:
-    """At three quarters of the sampled loop's own lag and more it settles; K_c = 1/(16 k θ²) at τ_c = θ."""
+    """The filter is the delay that the rule is told; K_c = 1/(16 k θ²) at τ_c = θ."""
     tuned = PID.simc_double_integrator(2.0, 0.5, dt=0.01, tf=0.5)
     assert tuned.kd == pytest.approx(1.0 / (16.0 * 2.0 * 0.5**2) * 8.0 * 0.5)
     double = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 2.0], [1.0, 0.0])
