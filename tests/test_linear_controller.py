@@ -226,7 +226,7 @@ make = LinearController.from_transfer_function
         (lambda: Prefiltered("pid", ql.baselines.ZV(1.0)), "controller = 'pid': must be a controller"),
         (
             lambda: Prefiltered(ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, feedforward=True), ql.baselines.ZV(1.0)),
-            "controller has feedforward: a prefilter leaves no derivatives",
+            "controller has feedforward, and Shaper knows no derivatives",
         ),
         (lambda: Prefiltered(ql.baselines.PID(1.0, dt=0.1), 3), "prefilter = 3: must be a prefilter"),
     ],

@@ -7,6 +7,7 @@ from quell.controllers.base import Controller
 from quell.controllers.estimate import Estimate
 from quell.controllers.linear import LinearController, LinearLaw
 from quell.controllers.prefilter import Prefilter, Prefiltered
+from quell.controllers.reference_model import ReferenceModel
 from quell.controllers.unwise import warn_if_unwise
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "LinearLaw",
     "Prefilter",
     "Prefiltered",
+    "ReferenceModel",
     "baselines",
     "omega_c_for",
     "warn_if_unwise",

@@ -15,6 +15,7 @@ from quell.controllers.handover import HandOver
 from quell.controllers.law import F_LEARNED, LOOP, STATUS, AdrcDesign, AdrcState, U, law_gains
 from quell.controllers.limits import limits
 from quell.controllers.running import Running
+from quell.controllers.unwise import warn_if_unwise
 from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, explain
 from quell.learners.base import Learner, NoLearner, coefficients, tried
 from quell.learners.lag import lag_of
@@ -89,6 +90,7 @@ class ADRC(HandOver, Running):
         self._learned_at = self.omega_c
         self._limits = limits(u_min, u_max, rate_limit, observer.dt)
         self._begin()
+        warn_if_unwise(observer, self.omega_c)
 
     def _prepare_design(self) -> None:
         observer, lag = self.observer, lag_of(self.observer)

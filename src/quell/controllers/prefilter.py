@@ -1,7 +1,8 @@
 """A prefilter of the reference before any controller.
 
 A prefilter is an object with ``design(dt)``, which returns a NamedTuple of parameters, and ``memory(design)``, which returns its state, a
-NamedTuple of arrays. For the type of the parameters two functions are registered: ``prefilter`` and ``settle``.
+NamedTuple of arrays. For the type of the parameters two functions are registered: ``prefilter`` and ``settle``. One that knows derivatives
+of what it makes of the reference says how many with ``derivatives``, and registers ``slopes``.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from quell.controllers.base import control, flags, report, rest
+from quell.controllers.base import control, flags, heed, report, rest
 from quell.controllers.running import Running
 from quell.dispatch import generic, is_finite
 from quell.types import Status, Vector
@@ -44,6 +45,17 @@ def settle(design: Any, memory: Any, value: float) -> None:
     raise TypeError
 
 
+@generic
+def slopes(design: Any, memory: Any, derivatives: Vector) -> None:
+    """Write the derivatives of the last shaped reference, from the first on, into ``derivatives``."""
+    raise TypeError
+
+
+@slopes.register(object)
+def _no_slopes(design: Any, memory: Any, derivatives: Vector) -> None:
+    pass
+
+
 class PrefilteredDesign(NamedTuple):
     """Parameters of a controller behind a prefilter."""
 
@@ -56,6 +68,8 @@ class PrefilteredState(NamedTuple):
 
     controller: Any
     prefilter: Any
+    derivatives: Vector
+    """Of the shaped reference, as many as the prefilter knows."""
     loop: Vector
     """(5,): shaped reference, last good r, whether there was a good y, whether a good r, status of the prefilter."""
 
@@ -75,6 +89,9 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
     shaped = r
     if loop[_STARTED] != 0.0 and loop[_REFERENCED] != 0.0:
         shaped = prefilter(design.prefilter, state.prefilter, loop[_R])
+        if state.derivatives.size > 0:
+            slopes(design.prefilter, state.prefilter, state.derivatives)
+            heed(design.controller, state.controller, state.derivatives)
     loop[_SHAPED] = shaped if is_finite(shaped) else y
     return control(design.controller, state.controller, shaped, y)
 
@@ -114,8 +131,8 @@ class Prefiltered(Running):
     Raises
     ------
     ValueError
-        for something that is no controller or no prefilter, and for a controller with feedforward: the derivatives of the reference are
-        not those of what the prefilter makes of it.
+        for something that is no controller or no prefilter, and for a controller with feedforward behind a prefilter that knows no
+        derivatives of what it makes of the reference.
 
     Examples
     --------
@@ -130,8 +147,11 @@ class Prefiltered(Running):
             raise ValueError(f"controller = {controller!r}: must be a controller, for example quell.ADRC(...)")
         if isinstance(prefilter, type) or not all(hasattr(prefilter, name) for name in ("design", "memory")):
             raise ValueError(f"prefilter = {prefilter!r}: must be a prefilter, for example quell.baselines.ZV(omega=1.4)")
-        if getattr(controller, "derivatives", 0):
-            raise ValueError("controller has feedforward: a prefilter leaves no derivatives to feed forward; use feedforward=False")
+        if getattr(controller, "derivatives", 0) and not getattr(prefilter, "derivatives", 0):
+            raise ValueError(
+                f"controller has feedforward, and {type(prefilter).__name__} knows no derivatives of what it makes of the reference: "
+                "use feedforward=False, or a prefilter such as ReferenceModel"
+            )
         self.controller = controller
         self.prefilter = prefilter
         self._begin()
@@ -156,7 +176,10 @@ class Prefiltered(Running):
 
     def initial_state(self) -> PrefilteredState:
         """Return a state before the first sample, with nothing learned."""
-        return PrefilteredState(self.controller.initial_state(), self.prefilter.memory(self.parameters.prefilter), np.zeros(5))
+        known = getattr(self.prefilter, "derivatives", 0) if getattr(self.controller, "derivatives", 0) else 0
+        return PrefilteredState(
+            self.controller.initial_state(), self.prefilter.memory(self.parameters.prefilter), np.zeros(known), np.zeros(5)
+        )
 
     @property
     def status(self) -> Status:
