@@ -59,7 +59,9 @@ def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
     """
     checks.whole("count", count, 1)
     if checks.positive("spread", spread) > _MOST_SPREAD:
-        raise ValueError(f"spread = {spread!r}: must be at most {_MOST_SPREAD:g}, the published samples tell nothing of what lies so far out")
+        raise ValueError(
+            f"spread = {spread!r}: must be at most {_MOST_SPREAD:g}, the published samples tell nothing of what lies so far out"
+        )
     from scipy.stats import norm
 
     random = np.random.default_rng(checks.whole("seed", seed, 0))

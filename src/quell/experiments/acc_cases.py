@@ -1,0 +1,126 @@
+"""The three design cases of Wie & Bernstein (*Benchmark Problems for Robust Control Design*, ACC 1990–92; AIAA J. Guidance 15, 1992).
+
+Masses 1 kg, no actuator lag, u on m1, y = x2:
+
+1. a unit impulse on m2; stable for all 0.5 < k < 2, and settled by 15 s at k = 1;
+2. the same, and stable for m1, m2 and k as far from 1 as can be, all at once;
+3. a sinusoid of 0.5 rad/s on m2, of unknown amplitude and phase, rejected with 20 s to settle, for all 0.5 < k < 2.
+
+The first two with the controllers of ``acc_designs`` as they are; in the third u has no limit, as a load of 1 N at m2 asks more than 0.5 N.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from quell.controllers import ADRC
+from quell.experiments.acc_criteria import MOST_Y
+from quell.experiments.acc_designs import DT, designs
+from quell.experiments.acc_loops import Margins, margins, stable
+from quell.experiments.parallel import in_parallel
+from quell.plants import LinearPlant, two_mass_spring
+from quell.signals import Sinusoid
+from quell.simulation import Scenario, simulate
+from quell.trajectory import Trajectory
+
+STIFFNESSES = np.linspace(0.5, 2.0, 13)
+LOAD = 0.5
+"""[rad/s]."""
+_PHASES = (0.0, 0.5 * np.pi)
+_LOAD_TIME = 80.0
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """What a controller makes of the three cases."""
+
+    margins: Margins
+    """Of the nominal loop."""
+    settled_at: float
+    """When |y| has come below 0.1 m for good after an impulse on m2, at k = 1 [s]; infinite where it does not within 60 s."""
+    settled_at_worst: float
+    """The same for the worst k."""
+    stable_from: float
+    """Least and largest k between which the loop is stable around k = 1 [N/m]."""
+    stable_to: float
+    parameter_bound: float
+    """Largest p such that the loop is stable for every m1, m2, k in [1 − p, 1 + p]."""
+    load_peak: float
+    """Largest |y| from 20 s on under a sinusoid of 1 N on m2, for the worst k and phase [m]."""
+    load_remains: float
+    """The same over the last period of 80 s."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return numbers for ``json.dump``; what is infinite is None."""
+        plain = asdict(self) | {"margins": dict(zip(Margins._fields, self.margins, strict=True))}
+        return {key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in plain.items()}
+
+
+def study_cases() -> dict[str, CaseResult]:
+    """Return what each of our controllers makes of the cases."""
+    loaded = designs(DT, most_u=np.inf, load=LOAD)
+    return {name: _study(controller, loaded[name]) for name, controller in designs(DT).items()}
+
+
+def _study(controller: ADRC, loaded: ADRC) -> CaseResult:
+    nominal = two_mass_spring()
+    impulses = in_parallel([partial(_impulse, controller, k) for k in (1.0, *STIFFNESSES)])
+    settled = [_settled_at(run) for run in impulses]
+    loads = in_parallel([partial(_load, loaded, k, phase) for k, phase in product(STIFFNESSES, _PHASES)])
+    period = 2.0 * np.pi / LOAD
+    return CaseResult(
+        margins=margins(nominal, controller),
+        settled_at=settled[0],
+        settled_at_worst=max(settled[1:]),
+        stable_from=_edge(controller, 1.0 / 1.01),
+        stable_to=_edge(controller, 1.01),
+        parameter_bound=_parameter_bound(controller),
+        load_peak=max(_peak(run, 20.0) for run in loads),
+        load_remains=max(_peak(run, _LOAD_TIME - period) for run in loads),
+    )
+
+
+def _impulse(controller: ADRC, k: float) -> Trajectory:
+    return simulate(two_mass_spring(k=k), controller, Scenario(duration=60.0, x0=[0.0, 0.0, 0.0, 1.0]))
+
+
+def _load(controller: ADRC, k: float, phase: float) -> Trajectory:
+    return simulate(two_mass_spring(k=k), controller, Scenario(duration=_LOAD_TIME, disturbances=(0.0, Sinusoid(1.0, LOAD, phase))))
+
+
+def _settled_at(run: Trajectory) -> float:
+    outside = np.flatnonzero(np.abs(run["y"]) > MOST_Y)
+    if run.diverged or outside[-1] == len(run) - 1:
+        return np.inf
+    return float(run.t[outside[-1] + 1])
+
+
+def _peak(run: Trajectory, start: float) -> float:
+    return np.inf if run.diverged else float(np.max(np.abs(run["y"][run.t >= start])))
+
+
+def _edge(controller: ADRC, factor: float) -> float:
+    """Return the last k, going from 1 in steps of ``factor``, at which the loop is stable; not beyond 0.01 and 100 N/m."""
+    k = 1.0
+    while 0.01 < k < 100.0 and stable(two_mass_spring(k=k * factor), controller):
+        k *= factor
+    return k
+
+
+def _parameter_bound(controller: ADRC) -> float:
+    """Return p to 0.005, looked for on corners and middles of the box of m1, m2 and k."""
+    for step in range(1, 199):
+        p = 0.005 * step
+        box = (1.0 - p, 1.0, 1.0 + p)
+        if not all(stable(_plant(*corner), controller) for corner in product(box, box, box)):
+            return 0.005 * (step - 1)
+    return 0.99
+
+
+def _plant(m1: float, m2: float, k: float) -> LinearPlant:
+    return two_mass_spring(m1, m2, k)
