@@ -79,27 +79,24 @@ def _print_rates(console: Console, result: acc.Result) -> None:
 
 def _print_cases(console: Console, result: acc.Result) -> None:
     table = Table(title="The original problem's design cases (m1 = m2 = 1 kg, no lag)", title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("controller", no_wrap=True)
-    headings = ("gain\nmargin", "phase\n[°]", "modulus\n", "settled\n[s]", "worst k\n[s]", "stable for k\n[N/m]")
-    for heading in (*headings, "m1, m2, k\n[±%]", "load\n20 s [m]", "late\n[m]"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for name, case in result.cases.items():
-        low, high = case.margins.gain
-        table.add_row(
-            name,
-            f"{low:.2f}–{high:.2f}",
-            f"{case.margins.phase:.0f}",
-            f"{case.margins.modulus:.2f}",
-            *(_number(value, ".1f") for value in (case.settled_at, case.settled_at_worst)),
-            f"{case.stable_from:.2f}–{case.stable_to:.2f}",
-            f"{100.0 * case.parameter_bound:.1f}",
-            *(_number(value, ".4f") for value in (case.load_peak, case.load_remains)),
-        )
-    console.print(table)
-    console.print(
-        "Settled: |y| ≤ 0.1 m for good after a unit impulse on m2, at k = 1 and at the worst k of 0.5 to 2. Load: sin(0.5 t) N on m2, any phase,\n"
-        "|u| not limited, worst k: largest |y| from 20 s on, and in the last period of 80 s."
+    table.add_column("")
+    for name in result.cases:
+        table.add_column(name, justify="right", no_wrap=True)
+    rows = (
+        ("gain margin", lambda case: "{:.2f}–{:.2f}".format(*case.margins.gain)),
+        ("phase margin [°]", lambda case: f"{case.margins.phase:.0f}"),
+        ("modulus margin", lambda case: f"{case.margins.modulus:.2f}"),
+        ("1: stable for k [N/m]", lambda case: f"{case.stable_from:.2f}–{case.stable_to:.2f}"),
+        ("1: settled after impulse, k = 1 [s]", lambda case: _number(case.settled_at, ".1f")),
+        ("1: the same, worst k from 0.5 to 2 [s]", lambda case: _number(case.settled_at_worst, ".1f")),
+        ("2: stable for m1, m2, k, all within [%]", lambda case: f"±{100.0 * case.parameter_bound:.1f}"),
+        ("3: |y| under the load, from 20 s on [m]", lambda case: _number(case.load_peak, ".4f")),
+        ("3: the same, last period of 80 s [m]", lambda case: _number(case.load_remains, ".5f")),
     )
+    for label, cell in rows:
+        table.add_row(label, *map(cell, result.cases.values()))
+    console.print(table)
+    console.print("Settled: |y| ≤ 0.1 m for good. Load: sin(0.5 t) N on m2, two phases, u not limited; worst k and phase.")
 
 
 def _number(value: float, form: str) -> str:

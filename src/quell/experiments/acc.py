@@ -1,8 +1,8 @@
 """The ACC benchmark as an outside test: fixed controllers against a thousand uncertain plants.
 
 Two masses on a spring, pushed through an actuator with lag; all of it uncertain. From a unit impulse on m2 the output must be within
-0.1 m from 15 s on, with |u| ≤ 0.5 N always (Rocchetta, Crespo & Kenny, DSCC 2019). Every plant is simulated twice, without and with the cubic
-part of its spring, for 30 s at dt = 10 ms.
+0.1 m from 15 s on, with |u| ≤ 0.5 N always (Rocchetta, Crespo & Kenny, DSCC 2019). Every plant is simulated twice, without and with
+the cubic part of its spring, for 30 s at dt = 10 ms.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def records(
 ) -> tuple[Vector, Matrix, Matrix]:
     """Return times (samples,), y and u (count, samples) after m2 was hit to the ``speeds`` [m/s]; no numbers after a run's early end."""
     samples = round(DURATION / controller.dt) + 1
-    y, u = (np.full((len(plants), samples), np.nan) for _ in "yu")
+    y, u = np.full((2, len(plants), samples), np.nan)
 
     def some(first: int) -> None:
         for i in range(first, min(first + _TOGETHER, len(plants))):
@@ -97,4 +97,4 @@ def records(
             y[i, : len(run)], u[i, : len(run)] = run["y"], run["u"]
 
     in_parallel([partial(some, first) for first in range(0, len(plants), _TOGETHER)], tell)
-    return np.arange(samples) * controller.dt, y, u
+    return np.arange(samples, dtype=np.float64) * controller.dt, y, u

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ class Judged(NamedTuple):
         held = (self.late_peak <= MOST_Y) & (self.most_u <= MOST_U + _ROUNDING)
         return ~held  # what is no number fails
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, Any]:
         """Return the failure rate, its interval and why plants fail, for ``json.dump``."""
         failures, count = int(np.sum(self.fails)), self.fails.size
         return {

@@ -115,5 +115,5 @@ def _spread(rates: Rates) -> Any:
         ax.set_xlabel("spread of the plants (1: as published)")
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("plants that fail [%]")
-    axes[0].legend(fontsize="small")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize="small")
     return figure

@@ -16,15 +16,23 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.linear import LinearModel, LinearPlant
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 
 class CubicSpringModel(NamedTuple):
-    """The plant sampled: its linear part exactly, and half a sample's push of the cubic spring."""
+    """The plant sampled: its linear part exactly, as a ``LinearModel``, and half a sample's push of the cubic spring."""
 
-    linear: LinearModel
+    transition: Matrix
+    """Φ (5, 5)."""
+    input: Vector
+    """Γ (5,)."""
+    disturbance: Matrix
+    """Γ_w (5, 2)."""
+    output: Vector
+    """C (5,)."""
     push1: float
     """What a stretch of 1 m adds to the velocity of m1 in half a sample, ``−k_cubic dt / 2 m1``."""
     push2: float
@@ -38,21 +46,24 @@ def _measure(plant: CubicSpringModel, x: Vector) -> float:
 
 @advance.register(CubicSpringModel)
 def _advance(plant: CubicSpringModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
-    stretch = x[0] - x[1]
-    x[2] += plant.push1 * stretch**3
-    x[3] += plant.push2 * stretch**3
-    advance(plant.linear, x, scratch, t, u, w)
-    stretch = x[0] - x[1]
-    x[2] += plant.push1 * stretch**3
-    x[3] += plant.push2 * stretch**3
+    _push(plant, x)
+    advance(LinearModel(plant.transition, plant.input, plant.disturbance, plant.output), x, scratch, t, u, w)
+    _push(plant, x)
+
+
+@kernel
+def _push(plant: CubicSpringModel, x: Vector) -> None:
+    cube = (x[0] - x[1]) ** 3
+    x[2] += plant.push1 * cube
+    x[3] += plant.push2 * cube
 
 
 @dataclass(frozen=True, eq=False)
 class CubicSpringPlant:
     """Two masses with a cubic spring; ``lagged_two_mass_spring`` makes it.
 
-    It is advanced by Strang's splitting (Hairer, Lubich & Wanner, *Geometric Numerical Integration*, II.5): half the cubic force's push, the
-    linear plant exactly for a whole sample, the other half. The error is of order dt²; the linear part, however stiff, has none.
+    It is advanced by Strang's splitting (Hairer, Lubich & Wanner, *Geometric Numerical Integration*, II.5): half the cubic force's push,
+    the linear plant exactly for a whole sample, the other half. The error is of order dt²; the linear part, however stiff, has none.
     """
 
     linear: LinearPlant
@@ -79,7 +90,7 @@ class CubicSpringPlant:
     def sampled(self, dt: float, interpret: bool = False) -> CubicSpringModel:
         """Return the plant sampled at ``dt`` [s], for the driver (interpreted or not, the same)."""
         half = 0.5 * self.k_cubic * checks.positive("dt", dt, "s")
-        return CubicSpringModel(self.linear.sampled(dt), -half / self.m1, half / self.m2)
+        return CubicSpringModel(*self.linear.sampled(dt), -half / self.m1, half / self.m2)
 
 
 def lagged_two_mass_spring(
