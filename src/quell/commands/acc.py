@@ -94,7 +94,7 @@ def _print_cases(console: Console, result: acc.Result) -> None:
         ("3: the same, last period of 80 s [m]", lambda case: _number(case.load_remains, ".5f")),
     )
     for label, cell in rows:
-        table.add_row(label, *map(cell, result.cases.values()))
+        table.add_row(escape(label), *map(cell, result.cases.values()))
     console.print(table)
     console.print("Settled: |y| ≤ 0.1 m for good. Load: sin(0.5 t) N on m2, two phases, u not limited; worst k and phase.")
 
