@@ -10,12 +10,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import quell as ql
+from quell.analysis import analyse, linear_law
 from quell.cli import app
 from quell.experiments import acc, acc_samples
 from quell.experiments.acc_cases import study_cases
 from quell.experiments.acc_criteria import interval, judge
 from quell.experiments.acc_designs import DT, MB, MF, PUBLISHED, L, designs
-from quell.experiments.acc_loops import closed_loop, law_of, margins
+from quell.experiments.acc_loops import closed_loop, stable
 from quell.experiments.acc_published import judge_published
 from quell.plants import lagged_two_mass_spring
 from quell.plants.base import advance
@@ -131,19 +132,25 @@ def test_the_law_of_a_controller_is_the_one_it_runs() -> None:
     """As long as no limit holds, the linear loop and the driver agree to rounding."""
     plant, controller = lagged_two_mass_spring(lag=0.02), designs(most_u=1e3)[MF]
     run = ql.simulate(plant, controller, ql.Scenario(duration=5.0, x0=[0.0, 0.0, 0.0, 1e-3, 0.0]))
-    loop = closed_loop(plant, controller)
+    loop = closed_loop(plant, linear_law(controller), DT)
     x = np.zeros(loop.shape[0])
     x[3] = 1e-3
     for y in run["y"]:
         assert x[1] == pytest.approx(y, abs=1e-12)
         x = loop @ x
-    assert law_of(controller).A.shape == (5, 5)
 
 
-def test_margins_of_an_unstable_loop_are_zero() -> None:
-    """A spring five times as stiff as the designs are for."""
-    found = margins(lagged_two_mass_spring(k=5.0), designs()[MF])
-    assert (found.gain, found.phase, found.modulus) == ((1.0, 1.0), 0.0, 0.0)
+def test_a_spring_five_times_as_stiff_makes_the_loop_unstable() -> None:
+    """And the nominal one does not."""
+    assert stable(lagged_two_mass_spring(), designs()[MF])
+    assert not stable(lagged_two_mass_spring(k=5.0), designs()[MF])
+
+
+def test_every_controller_of_the_benchmark_has_margins() -> None:
+    """A PID on the nominal plant has a response at half the sampling rate whose imaginary part is rounding: no reason to fail."""
+    for controller in designs().values():
+        low, high = analyse(ql.plants.two_mass_spring(), controller).margins.gain
+        assert 0.1 < low < 1.0 < high
 
 
 def test_ours_fail_less_than_the_published_on_drawn_plants_without_and_with_the_cubic_spring() -> None:
@@ -152,14 +159,15 @@ def test_ours_fail_less_than_the_published_on_drawn_plants_without_and_with_the_
     for cubic in (False, True):
         published = min(np.mean(judge_published(design, samples, cubic).fails) for design in PUBLISHED.values())
         assert published > 0.4
-        for controller in designs().values():
-            assert np.mean(acc.judge_sampled(controller, samples, cubic).fails) < 0.5 * published
+        for name in (MF, MB, L):
+            assert np.mean(acc.judge_sampled(designs()[name], samples, cubic).fails) < 0.5 * published
 
 
 def test_the_original_design_cases_are_met() -> None:
     """Stable for all 0.5 < k < 2 (MB-ESO from 0.59 only), settled by 15 s at k = 1; the sinusoid fades under the learner."""
     cases = study_cases()
-    for name, case in cases.items():
+    for name in (MF, MB, L):
+        case = cases[name]
         assert case.stable_from < (0.6 if name == MB else 0.5)
         assert case.stable_to > 2.0
         assert case.settled_at < 15.0

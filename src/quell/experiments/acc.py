@@ -13,23 +13,17 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-
-from quell.controllers import ADRC
 from quell.experiments import acc_samples
 from quell.experiments.acc_cases import CaseResult, study_cases
 from quell.experiments.acc_criteria import DURATION, Judged, judge
 from quell.experiments.acc_designs import DT, PUBLISHED, designs
 from quell.experiments.acc_loops import unstable
 from quell.experiments.acc_published import judge_published
-from quell.experiments.parallel import in_parallel
-from quell.plants import CubicSpringPlant, LinearPlant
+from quell.plants import CubicSpringPlant, LinearPlant, PlantBatch
 from quell.simulation import Scenario, simulate
 from quell.types import Matrix, Vector
 
 SPRINGS = {"linear": False, "cubic": True}
-# Runs in a job.
-_TOGETHER = 50
 # Where a plant has flown apart; a spring that softens can break.
 _LOST = 1e3
 
@@ -77,24 +71,16 @@ def run(samples: Matrix, source: str = "given", tell: Tell | None = None) -> Res
     return Result(samples, source, judged, study_cases(), count / spent)
 
 
-def judge_sampled(controller: ADRC, samples: Matrix, cubic: bool, tell: Callable[[float], None] | None = None) -> Judged:
+def judge_sampled(controller: Any, samples: Matrix, cubic: bool, tell: Callable[[float], None] | None = None) -> Judged:
     """Simulate one controller on every plant and judge it; on all cores."""
     plants = [acc_samples.plant(sample, cubic) for sample in samples]
     return judge(*records(controller, plants, 1.0 / samples[:, 1], tell), unstable(plants, controller))
 
 
 def records(
-    controller: ADRC, plants: Sequence[LinearPlant | CubicSpringPlant], speeds: Vector, tell: Callable[[float], None] | None = None
+    controller: Any, plants: Sequence[LinearPlant | CubicSpringPlant], speeds: Vector, tell: Callable[[float], None] | None = None
 ) -> tuple[Vector, Matrix, Matrix]:
     """Return times (samples,), y and u (count, samples) after m2 was hit to the ``speeds`` [m/s]; no numbers after a run's early end."""
-    samples = round(DURATION / controller.dt) + 1
-    y, u = np.full((2, len(plants), samples), np.nan)
-
-    def some(first: int) -> None:
-        for i in range(first, min(first + _TOGETHER, len(plants))):
-            impulse = Scenario(duration=DURATION, x0=[0.0, 0.0, 0.0, speeds[i], *[0.0] * (plants[i].order - 4)])
-            run = simulate(plants[i], controller, impulse, limit=_LOST)
-            y[i, : len(run)], u[i, : len(run)] = run["y"], run["u"]
-
-    in_parallel([partial(some, first) for first in range(0, len(plants), _TOGETHER)], tell)
-    return np.arange(samples, dtype=np.float64) * controller.dt, y, u
+    impulses = [Scenario(duration=DURATION, x0=[0.0, 0.0, 0.0, speed, 0.0]) for speed in speeds.tolist()]
+    runs = simulate(PlantBatch(plants), controller, impulses, limit=_LOST, record=("y", "u"), progress=tell)
+    return runs.t, runs["y"], runs["u"]

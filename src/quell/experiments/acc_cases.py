@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from quell.controllers import ADRC
+from quell.analysis import analyse
+from quell.analysis.margins import Margins
 from quell.experiments.acc_criteria import MOST_Y
 from quell.experiments.acc_designs import DT, designs
-from quell.experiments.acc_loops import Margins, margins, stable
-from quell.experiments.parallel import in_parallel
+from quell.experiments.acc_loops import stable
+from quell.parallel import in_parallel
 from quell.plants import LinearPlant, two_mass_spring
 from quell.signals import Sinusoid
 from quell.simulation import Scenario, simulate
@@ -57,8 +58,16 @@ class CaseResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return numbers for ``json.dump``; what is infinite is None."""
-        plain = asdict(self) | {"margins": dict(zip(Margins._fields, self.margins, strict=True))}
-        return {key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in plain.items()}
+        plain = asdict(self) | {"margins": self.margins._asdict()}
+        return {key: _plain(value) for key, value in plain.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    return value if np.isfinite(value) else None
 
 
 def study_cases() -> dict[str, CaseResult]:
@@ -67,14 +76,13 @@ def study_cases() -> dict[str, CaseResult]:
     return {name: _study(controller, loaded[name]) for name, controller in designs(DT).items()}
 
 
-def _study(controller: ADRC, loaded: ADRC) -> CaseResult:
-    nominal = two_mass_spring()
+def _study(controller: Any, loaded: Any) -> CaseResult:
     impulses = in_parallel([partial(_impulse, controller, k) for k in (1.0, *STIFFNESSES)])
     settled = [_settled_at(run) for run in impulses]
     loads = in_parallel([partial(_load, loaded, k, phase) for k, phase in product(STIFFNESSES, _PHASES)])
     period = 2.0 * np.pi / LOAD
     return CaseResult(
-        margins=margins(nominal, controller),
+        margins=analyse(two_mass_spring(), controller).margins,
         settled_at=settled[0],
         settled_at_worst=max(settled[1:]),
         stable_from=_edge(controller, 1.0 / 1.01),
@@ -85,11 +93,11 @@ def _study(controller: ADRC, loaded: ADRC) -> CaseResult:
     )
 
 
-def _impulse(controller: ADRC, k: float) -> Trajectory:
+def _impulse(controller: Any, k: float) -> Trajectory:
     return simulate(two_mass_spring(k=k), controller, Scenario(duration=60.0, x0=[0.0, 0.0, 0.0, 1.0]))
 
 
-def _load(controller: ADRC, k: float, phase: float) -> Trajectory:
+def _load(controller: Any, k: float, phase: float) -> Trajectory:
     return simulate(two_mass_spring(k=k), controller, Scenario(duration=_LOAD_TIME, disturbances=(0.0, Sinusoid(1.0, LOAD, phase))))
 
 
@@ -104,7 +112,7 @@ def _peak(run: Trajectory, start: float) -> float:
     return np.inf if run.diverged else float(np.max(np.abs(run["y"][run.t >= start])))
 
 
-def _edge(controller: ADRC, factor: float) -> float:
+def _edge(controller: Any, factor: float) -> float:
     """Return the last k, going from 1 in steps of ``factor``, at which the loop is stable; not beyond 0.01 and 100 N/m."""
     k = 1.0
     while 0.01 < k < 100.0 and stable(two_mass_spring(k=k * factor), controller):
@@ -112,7 +120,7 @@ def _edge(controller: ADRC, factor: float) -> float:
     return k
 
 
-def _parameter_bound(controller: ADRC) -> float:
+def _parameter_bound(controller: Any) -> float:
     """Return p to 0.005, looked for on corners and middles of the box of m1, m2 and k."""
     for step in range(1, 199):
         p = 0.005 * step

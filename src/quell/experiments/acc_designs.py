@@ -10,18 +10,23 @@ values, and on which plants they were chosen: drawn ones, up to three times as u
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from quell.controllers import ADRC
+from quell.experiments import compare
 from quell.guard import Guard
 from quell.learners import Harmonic, Kalman
 from quell.observers import ESO
 from quell.plants import two_mass_spring
 
-MF, MB, L = "MF-ESO", "MB-ESO", "L-ESO"
+MF, MB, L = OURS = "MF-ESO", "MB-ESO", "L-ESO"
 OMEGA_C, OMEGA_O, B0 = 1.0, 10.0, 1.5
 MOST_U = 0.5
 DT = 0.01
+
+
+BASELINES = {"PID": "pid", "PI with notch": "pi-notch", "LQG": "lqg", "resonance ratio": "resonance-ratio"}
+"""As ``quell compare`` designs them for the nominal plant; none was tuned for this benchmark."""
 
 
 class TransferFunction(NamedTuple):
@@ -51,8 +56,8 @@ def designs(
     *,
     most_u: float = MOST_U,
     load: float | None = None,
-) -> dict[str, ADRC]:
-    """Return our controllers by name, sampled at ``dt`` [s], with ``|u| <= most_u`` [N].
+) -> dict[str, Any]:
+    """Return baselines and our controllers by name, sampled at ``dt`` [s], with ``|u| <= most_u`` [N].
 
     MF-ESO knows of the plant its order and gain; MB-ESO the nominal masses and spring; L-ESO learns from nothing while it controls,
     under guard. None knows of the actuator's lag. Where a sinusoidal ``load`` of known frequency [rad/s] is to be rejected, L-ESO learns
@@ -62,7 +67,8 @@ def designs(
     model_based = ESO.model_based(two_mass_spring(), omega_o=omega_o, dt=dt, b0=b0)
     learner = Kalman() if load is None else Harmonic(omegas=(load,), bias_bandwidth=2.0)
     guard = Guard() if load is None else None
-    return {
+    baselines = {name: compare.controller(key, dt, most_u) for name, key in BASELINES.items()}
+    return baselines | {
         MF: ADRC(model_free, omega_c, u_min=-most_u, u_max=most_u),
         MB: ADRC(model_based, omega_c, u_min=-most_u, u_max=most_u),
         L: ADRC(model_free, omega_c, learner=learner, guard=guard, u_min=-most_u, u_max=most_u),

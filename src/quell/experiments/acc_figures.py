@@ -12,7 +12,7 @@ import numpy as np
 from quell.experiments import acc_samples
 from quell.experiments.acc import SPRINGS, Result, judge_sampled, records
 from quell.experiments.acc_criteria import DURATION, MOST_Y, SETTLED_AT, interval
-from quell.experiments.acc_designs import DT, MOST_U, PUBLISHED, designs
+from quell.experiments.acc_designs import DT, MOST_U, OURS, PUBLISHED, designs
 from quell.experiments.acc_published import judge_published
 from quell.experiments.figures import made, save_figure
 
@@ -55,7 +55,7 @@ def _figure(height: float) -> Any:
 
 def _failures(result: Result) -> Any:
     """Draw the failure rates with their intervals."""
-    figure = _figure(3.6)
+    figure = _figure(5.2)
     ax = figure.subplots()
     for k, (spring, judged) in enumerate(result.judged.items()):
         rows = [one.to_json() for one in judged.values()]
@@ -77,7 +77,7 @@ def _failures(result: Result) -> Any:
 
 def _responses(samples: Any) -> Any:
     """Draw y and u of our controllers on plants with cubic springs: median, 90 % of all, and all."""
-    ours = designs(DT)
+    ours = {name: controller for name, controller in designs(DT).items() if name in OURS}
     figure = _figure(5.2)
     axes = figure.subplots(2, len(ours), sharex=True, sharey="row")
     plants = [acc_samples.plant(sample, cubic=True) for sample in samples]
@@ -108,12 +108,12 @@ def _spread(rates: Rates) -> Any:
     for ax, (spring, found) in zip(axes, rates.items(), strict=True):
         for i, (name, points) in enumerate(found.items()):
             rate, low, high = 100.0 * np.array(points).T
-            style = "--" if name in PUBLISHED else "-"
+            style = "--" if name in PUBLISHED else "-" if name in OURS else ":"
             ax.plot(SPREADS, rate, color=f"C{i}", linestyle=style, marker="o", markersize=3.0, label=name)
             ax.fill_between(SPREADS, low, high, color=f"C{i}", alpha=0.1, linewidth=0.0)
         ax.set_title(f"{spring} spring", fontsize="medium")
         ax.set_xlabel("spread of the plants (1: as published)")
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("plants that fail [%]")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize="small")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize="small")
     return figure
