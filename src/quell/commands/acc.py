@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from quell.experiments import acc, acc_figures, acc_samples
-from quell.experiments.acc_designs import DT, OURS, designs
+from quell.experiments.acc_cases import CaseResult
+from quell.experiments.acc_designs import DT, designs
 from quell.experiments.figures import made
 from quell.files import check_writable, write_json
 
@@ -80,9 +82,9 @@ def _print_rates(console: Console, result: acc.Result) -> None:
 def _print_cases(console: Console, result: acc.Result) -> None:
     table = Table(title="The original problem's design cases (m1 = m2 = 1 kg, no lag)", title_justify="left", box=SIMPLE_HEAD)
     table.add_column("")
-    for name in OURS:
+    for name in result.cases:
         table.add_column(name, justify="right", no_wrap=True)
-    rows = (
+    rows: tuple[tuple[str, Callable[[CaseResult], str]], ...] = (
         ("gain margin", lambda case: "{:.2f}–{:.2f}".format(*case.margins.gain)),
         ("phase margin [°]", lambda case: f"{case.margins.phase:.0f}"),
         ("modulus margin", lambda case: f"{case.margins.modulus:.2f}"),
@@ -94,11 +96,9 @@ def _print_cases(console: Console, result: acc.Result) -> None:
         ("3: the same, last period of 80 s [m]", lambda case: _number(case.load_remains, ".5f")),
     )
     for label, cell in rows:
-        table.add_row(escape(label), *(cell(result.cases[name]) for name in OURS))
+        table.add_row(escape(label), *map(cell, result.cases.values()))
     console.print(table)
-    console.print(
-        "Settled: |y| ≤ 0.1 m for good. Load: sin(0.5 t) N on m2, two phases, u not limited; worst k and phase.\nThose of the baselines are in the JSON file."
-    )
+    console.print("Settled: |y| ≤ 0.1 m for good. Load: sin(0.5 t) N on m2, two phases, u not limited; worst k and phase.")
 
 
 def _number(value: float, form: str) -> str:

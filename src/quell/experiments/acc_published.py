@@ -10,6 +10,7 @@ import numpy as np
 
 from quell.experiments.acc_criteria import DURATION, SETTLED_AT, Judged
 from quell.experiments.acc_designs import TransferFunction
+from quell.parallel import one_blas_thread
 from quell.types import Matrix, Vector
 
 # |y| and |u| are looked at so often [s].
@@ -18,6 +19,11 @@ STEP = 0.01
 
 def judge_published(design: TransferFunction, samples: Matrix, cubic: bool, duration: float = DURATION) -> Judged:
     """Judge a continuous-time design on samples (count, 6); a loop with a pole that is not in the left half-plane is unstable."""
+    with one_blas_thread():
+        return _judged(design, samples, cubic, duration)
+
+
+def _judged(design: TransferFunction, samples: Matrix, cubic: bool, duration: float) -> Judged:
     from scipy.linalg import expm
 
     loops, output = _closed_loops(design, samples)
