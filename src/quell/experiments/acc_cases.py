@@ -11,6 +11,7 @@ The first two with the controllers of ``acc_designs`` as they are; in the third 
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
@@ -22,9 +23,9 @@ from quell.analysis import analyse
 from quell.analysis.margins import Margins
 from quell.experiments.acc_criteria import MOST_Y
 from quell.experiments.acc_designs import DT, OURS, designs
-from quell.experiments.acc_loops import stable
+from quell.experiments.acc_loops import unstable
 from quell.parallel import in_parallel
-from quell.plants import LinearPlant, two_mass_spring
+from quell.plants import two_mass_spring
 from quell.signals import Sinusoid
 from quell.simulation import Scenario, simulate
 from quell.trajectory import Trajectory
@@ -114,10 +115,9 @@ def _peak(run: Trajectory, start: float) -> float:
 
 def _edge(controller: Any, factor: float) -> float:
     """Return the last k, going from 1 in steps of ``factor``, at which the loop is stable; not beyond 0.01 and 100 N/m."""
-    k = 1.0
-    while 0.01 < k < 100.0 and stable(two_mass_spring(k=k * factor), controller):
-        k *= factor
-    return k
+    stiffnesses = factor ** np.arange(math.ceil(math.log(100.0) / abs(math.log(factor))))
+    lost = unstable([two_mass_spring(k=k) for k in stiffnesses], controller)
+    return float(stiffnesses[max(np.argmax(lost) - 1, 0) if np.any(lost) else -1])
 
 
 def _parameter_bound(controller: Any) -> float:
@@ -125,10 +125,6 @@ def _parameter_bound(controller: Any) -> float:
     for step in range(1, 199):
         p = 0.005 * step
         box = (1.0 - p, 1.0, 1.0 + p)
-        if not all(stable(_plant(*corner), controller) for corner in product(box, box, box)):
+        if np.any(unstable([two_mass_spring(*corner) for corner in product(box, box, box)], controller)):
             return 0.005 * (step - 1)
     return 0.99
-
-
-def _plant(m1: float, m2: float, k: float) -> LinearPlant:
-    return two_mass_spring(m1, m2, k)

@@ -15,11 +15,6 @@ from quell.plants import CubicSpringPlant, LinearPlant
 from quell.types import Matrix
 
 
-def stable(plant: LinearPlant, controller: Any) -> bool:
-    """Tell whether all poles of the sampled loop lie inside of the unit circle."""
-    return not bool(unstable([plant], controller)[0])
-
-
 def unstable(plants: Sequence[LinearPlant | CubicSpringPlant], controller: Any) -> NDArray[np.bool_]:
     """Tell for each plant whether its loop, with nothing learned, is unstable at rest, where a cubic spring does not show."""
     law = linear_law(controller)
