@@ -117,7 +117,7 @@ def _edge(controller: Any, factor: float) -> float:
     """Return the last k, going from 1 in steps of ``factor``, at which the loop is stable; not beyond 0.01 and 100 N/m."""
     stiffnesses = factor ** np.arange(math.ceil(math.log(100.0) / abs(math.log(factor))))
     lost = unstable([two_mass_spring(k=k) for k in stiffnesses], controller)
-    return float(stiffnesses[max(np.argmax(lost) - 1, 0) if np.any(lost) else -1])
+    return float(stiffnesses[max(int(np.argmax(lost)) - 1, 0) if np.any(lost) else -1])
 
 
 def _parameter_bound(controller: Any) -> float:
