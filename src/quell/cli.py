@@ -66,6 +66,38 @@ def two_mass(
     reproduce_two_mass(dt=dt, seed=seed, omega_o=omega_o, reset=reset, json_file=json, figures=figures)
 
 
+@reproduce.command(name="acc")
+def acc(
+    *,
+    samples: Path | None = None,
+    count: Annotated[int, Parameter(converter=_whole)] = 1000,
+    spread: float = 1.0,
+    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    json: Annotated[Path | None, Parameter(name="--json")] = None,
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+) -> None:
+    """Run the ACC robust-control benchmark: published designs and ours, each one fixed controller for a thousand uncertain plants.
+
+    Parameters
+    ----------
+    samples
+        Read the plants from this CSV file (columns m1, m2, k_lin, k_nonlin, lambda, tau) instead of drawing them.
+    count
+        How many plants are drawn.
+    spread
+        How uncertain those are: 1 is the published small uncertainty, 3 about where the best published design fails half of them.
+    seed
+        Seed of the plants.
+    json
+        Write all results to this file, for programs.
+    figures
+        Put the figures into this folder, as PNG and SVG.
+    """
+    from quell.commands.acc import reproduce_acc
+
+    reproduce_acc(samples=samples, count=count, spread=spread, seed=seed, json_file=json, figures=figures)
+
+
 @app.command(name="stress")
 def stress(
     *,

@@ -22,6 +22,8 @@ from .python_models import python_learners
 
 PLANTS: dict[str, Any] = {
     "two_mass_spring": ql.plants.two_mass_spring(),
+    "CubicSpringPlant": ql.plants.lagged_two_mass_spring(k_cubic=0.3),
+    "lagged_two_mass_spring": ql.plants.lagged_two_mass_spring(),
     "LinearPlant": ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]]),
     "NonlinearPlant": ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u + w[0] - math.sin(x[0]) - 0.1 * x[1]), order=2),
 }

@@ -152,8 +152,10 @@ def _zeros(function: Callable[[Vector], Vector], omega: Vector, values: Vector) 
     def at(x: float) -> float:
         return float(function(np.exp(np.array([x])))[0])
 
-    return [
-        math.exp(brentq(at, math.log(omega[i]), math.log(omega[i + 1]), xtol=1e-13, rtol=1e-13))
-        for i in np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
-        if np.isfinite(values[i]) and np.isfinite(values[i + 1])
-    ]
+    found = []
+    for i in np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:])):
+        low, high = math.log(omega[i]), math.log(omega[i + 1])
+        # At half the sampling rate a response is real; the sign of its imaginary part is that of a rounding error, which nothing repeats.
+        if np.isfinite(values[i]) and np.isfinite(values[i + 1]) and at(low) * at(high) < 0.0:
+            found.append(math.exp(brentq(at, low, high, xtol=1e-13, rtol=1e-13)))
+    return found

@@ -1,0 +1,134 @@
+"""Two masses, a spring that may harden or soften, and an actuator with lag.
+
+The benchmark of Wie & Bernstein (1992) in the extended form of Rocchetta, Crespo & Kenny (*Solution of the Benchmark Control Problem by
+Scenario Optimization*, DSCC 2019, doi 10.1115/DSCC2019-8949)::
+
+    m1 x1'' = −p + λ F + w1          p = k (x1 − x2) + k_cubic (x1 − x2)³
+    m2 x2'' =  p + w2                y = x2
+    τ F'    = −F + u
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.dispatch import kernel
+from quell.plants.base import advance, measure
+from quell.plants.linear import LinearModel, LinearPlant
+from quell.types import Matrix, Vector
+
+
+class CubicSpringModel(NamedTuple):
+    """The plant sampled: its linear part exactly, as a ``LinearModel``, and half a sample's push of the cubic spring."""
+
+    transition: Matrix
+    """Φ (5, 5)."""
+    input: Vector
+    """Γ (5,)."""
+    disturbance: Matrix
+    """Γ_w (5, 2)."""
+    output: Vector
+    """C (5,)."""
+    push1: float
+    """What a stretch of 1 m adds to the velocity of m1 in half a sample, ``−k_cubic dt / 2 m1``."""
+    push2: float
+    """The same for m2, ``k_cubic dt / 2 m2``."""
+
+
+@measure.register(CubicSpringModel)
+def _measure(plant: CubicSpringModel, x: Vector) -> float:
+    return x[1]
+
+
+@advance.register(CubicSpringModel)
+def _advance(plant: CubicSpringModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+    _push(plant, x)
+    advance(LinearModel(plant.transition, plant.input, plant.disturbance, plant.output), x, scratch, t, u, w)
+    _push(plant, x)
+
+
+@kernel
+def _push(plant: CubicSpringModel, x: Vector) -> None:
+    cube = (x[0] - x[1]) ** 3
+    x[2] += plant.push1 * cube
+    x[3] += plant.push2 * cube
+
+
+@dataclass(frozen=True, eq=False)
+class CubicSpringPlant:
+    """Two masses with a cubic spring; ``lagged_two_mass_spring`` makes it.
+
+    It is advanced by Strang's splitting (Hairer, Lubich & Wanner, *Geometric Numerical Integration*, II.5): half the cubic force's push,
+    the linear plant exactly for a whole sample, the other half. The error is of order dt²; the linear part, however stiff, has none.
+    """
+
+    linear: LinearPlant
+    m1: float
+    m2: float
+    k_cubic: float
+    name: str = "two-mass-spring with cubic spring"
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return self.linear.order
+
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbance inputs."""
+        return self.linear.disturbances
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the driver can run it compiled: always."""
+        return True
+
+    def sampled(self, dt: float, interpret: bool = False) -> CubicSpringModel:
+        """Return the plant sampled at ``dt`` [s], for the driver (interpreted or not, the same)."""
+        half = 0.5 * self.k_cubic * checks.positive("dt", dt, "s")
+        return CubicSpringModel(*self.linear.sampled(dt), -half / self.m1, half / self.m2)
+
+
+def lagged_two_mass_spring(
+    m1: float = 1.0, m2: float = 1.0, k: float = 1.0, k_cubic: float = 0.0, effectiveness: float = 1.0, lag: float = 0.01
+) -> LinearPlant | CubicSpringPlant:
+    """Return two masses on a spring, pushed through an actuator with lag.
+
+    States: positions of m1 and m2 [m], their velocities [m/s], the actuator's force before its effectiveness [N]. The control signal u [N]
+    drives the actuator; the disturbance forces w1 and w2 act on m1 and m2 [N]. Output ``y = x2`` [m]. A unit impulse on m2 at t = 0 is the
+    start from ``x0 = (0, 0, 0, 1/m2, 0)``.
+
+    Parameters
+    ----------
+    m1, m2
+        masses [kg].
+    k
+        stiffness of the spring [N/m].
+    k_cubic
+        its cubic part [N/m³]: hardening above zero, softening below; a linear plant is returned where it is zero.
+    effectiveness
+        share λ of the actuator's force that reaches m1.
+    lag
+        its time constant τ [s].
+
+    Raises
+    ------
+    ValueError
+        for a mass, stiffness, effectiveness or lag that is not positive, or a ``k_cubic`` that is not finite.
+    """
+    m1, m2, k = checks.positive("m1", m1, "kg"), checks.positive("m2", m2, "kg"), checks.positive("k", k, "N/m")
+    effectiveness, lag = checks.positive("effectiveness", effectiveness), checks.positive("lag", lag, "s")
+    k_cubic = checks.finite("k_cubic", k_cubic)
+    A = np.zeros((5, 5))
+    A[0, 2] = A[1, 3] = 1.0
+    A[2, :2] = -k / m1, k / m1
+    A[3, :2] = k / m2, -k / m2
+    A[2, 4], A[4, 4] = effectiveness / m1, -1.0 / lag
+    E = np.zeros((5, 2))
+    E[2, 0], E[3, 1] = 1.0 / m1, 1.0 / m2
+    linear = LinearPlant(A, B=[0.0, 0.0, 0.0, 0.0, 1.0 / lag], C=[0.0, 1.0, 0.0, 0.0, 0.0], E=E, name="two-mass-spring with lag")
+    return linear if k_cubic == 0.0 else CubicSpringPlant(linear, m1, m2, k_cubic)
