@@ -53,7 +53,7 @@ class CaseResult:
     parameter_bound: float
     """Largest p such that the loop is stable for every m1, m2, k in [1 − p, 1 + p]."""
     load_peak: float
-    """Largest |y| from 20 s on under a sinusoid of 1 N on m2, for the worst k and phase [m]."""
+    """Largest |y| from 20 s on under a sinusoid of 1 N on m2, for the worst k and phase [m]; infinite where a loop is unstable."""
     load_remains: float
     """The same over the last period of 80 s."""
 
@@ -81,6 +81,7 @@ def _study(controller: Any, loaded: Any) -> CaseResult:
     impulses = in_parallel([partial(_impulse, controller, k) for k in (1.0, *STIFFNESSES)])
     settled = [_settled_at(run) for run in impulses]
     loads = in_parallel([partial(_load, loaded, k, phase) for k, phase in product(STIFFNESSES, _PHASES)])
+    lost = bool(np.any(unstable([two_mass_spring(k=k) for k in STIFFNESSES], loaded)))
     period = 2.0 * np.pi / LOAD
     return CaseResult(
         margins=analyse(two_mass_spring(), controller).margins,
@@ -89,8 +90,8 @@ def _study(controller: Any, loaded: Any) -> CaseResult:
         stable_from=_edge(controller, 1.0 / 1.01),
         stable_to=_edge(controller, 1.01),
         parameter_bound=_parameter_bound(controller),
-        load_peak=max(_peak(run, 20.0) for run in loads),
-        load_remains=max(_peak(run, _LOAD_TIME - period) for run in loads),
+        load_peak=math.inf if lost else max(_peak(run, 20.0) for run in loads),
+        load_remains=math.inf if lost else max(_peak(run, _LOAD_TIME - period) for run in loads),
     )
 
 

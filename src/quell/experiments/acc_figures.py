@@ -68,7 +68,7 @@ def _failures(result: Result) -> Any:
             ax.text(100.0 * high + 1.0, y, f"{100.0 * rate:.1f} %", va="center", fontsize="small")
     ax.set_yticks(range(len(judged)), list(judged))
     ax.invert_yaxis()
-    ax.set_xlim(0.0, 105.0)
+    ax.set_xlim(0.0, 112.0)
     ax.set_xlabel("plants that fail [%], with 95 % confidence interval")
     ax.set_title(f"ACC benchmark, {len(result.samples)} plants ({result.source})", fontsize="medium")
     ax.legend(loc="lower right", fontsize="small")
