@@ -11,10 +11,9 @@ import pytest
 import quell as ql
 from quell.features import Bias, State
 from quell.learners.base import adapt, commit, predict, restart
-from quell.learners.lag import lag_of, lag_push
+from quell.learners.lag import group_delay, lag_of, lag_push
 from quell.learners.model import infer, learn
 from quell.learners.network import Network
-from quell.learners.online import group_delay
 from quell.learners.process import Process
 from quell.learners.rls import RlsRule, least_squares_gain
 from quell.types import Matrix, Vector

@@ -54,9 +54,22 @@ class SightMemory(NamedTuple):
     """(2,): mean square of y − x̂_1; how much of the mean is filled."""
 
 
+def noise_shown(observer: ESO) -> Vector:
+    """Return ``noise_gains``, as multiples of what ``y − x̂_1`` shows of the noise in y.
+
+    Raises
+    ------
+    ValueError
+        for an observer of reduced form, whose x̂_1 is y: what is noise can not be told there.
+    """
+    if observer.form == "reduced":
+        raise ValueError("form = 'reduced': x̂_1 = y shows this learner no noise to tell motion from; use form='current'")
+    return noise_gains(observer)
+
+
 def sight(observer: ESO, frequency: float) -> Sight:
     """Return the thresholds for an observer and a frequency the plant has [rad/s]."""
-    noise = noise_gains(observer)
+    noise = noise_shown(observer)
     f_noise = float(noise[-1])
     noise[-1] /= observer.b0**2  # what noise leaves in f̂ is also in b0 u
     return Sight(CLEAR**2 * noise, -math.expm1(-observer.dt / (AVERAGE * observer.lag_time)), f_noise, frequency**observer.order)
