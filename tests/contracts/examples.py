@@ -21,6 +21,7 @@ from quell.observers.eso import ESO, FORMS
 from .python_models import python_learners
 
 PLANTS: dict[str, Any] = {
+    "delayed": ql.plants.delayed(ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), delay=0.02, dt=0.01),
     "two_mass_spring": ql.plants.two_mass_spring(),
     "LinearPlant": ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]]),
     "NonlinearPlant": ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u + w[0] - math.sin(x[0]) - 0.1 * x[1]), order=2),
@@ -102,4 +103,10 @@ OBSERVERS: dict[str, ESO] = {
     for kind in ("model-free", "model-based")
     for order in (1, 2, 4, 8)
     for form in FORMS
+} | {
+    "half gain": ESO.model_free(2, 1.5, 12.0, 0.01, half_gain=True),
+    "Kalman": ESO.kalman(2, 1.5, 0.01, noise=1e-6, drift=3e-2),
+    "cascade": ESO.cascade(2, 1.5, 12.0, 0.01),
+    "nonlinear": ESO.nonlinear(2, 1.5, 12.0, 0.01, delta=0.05),
+    "delay": ESO.model_free(2, 1.5, 12.0, 0.01, delay=0.02),
 }

