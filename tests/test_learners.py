@@ -20,6 +20,8 @@ LINEAR = {
     "current": ESO.model_free(3, 2.0, 15.0, 2e-3),
     "predictor": ESO.model_free(3, 2.0, 15.0, 2e-3, form="predictor"),
     "model-based": ESO.model_based(([3.0, -1.0, 0.5], 2.0), 15.0, 2e-3),
+    "zeros": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), 15.0, 2e-3),
+    "zeros kept": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), 15.0, 2e-3, keep_zeros=True),
     "reduced": ESO.model_free(3, 2.0, 15.0, 2e-3, form="reduced"),
     "half gain": ESO.model_free(3, 2.0, 15.0, 2e-3, half_gain=True),
     "half gain, predictor": ESO.model_free(3, 2.0, 15.0, 2e-3, half_gain=True, form="predictor"),

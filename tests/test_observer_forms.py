@@ -13,7 +13,8 @@ from scipy.linalg import solve_discrete_lyapunov
 import quell as ql
 from quell.observers.base import acting, begin, observe
 from quell.observers.discretize import zero_order_hold
-from quell.observers.eso import ESO, noise_gains
+from quell.observers.eso import ESO
+from quell.observers.noise import noise_gains
 from quell.observers.nonlinear import fal
 from quell.observers.response import response
 
@@ -317,6 +318,20 @@ def test_time_scales_are_those_of_the_poles() -> None:
     assert FORMS["half gain"].lag_time == pytest.approx(3 / 20.0, rel=0.05)
     assert FORMS["reduced"].lag_time == pytest.approx(2 / 20.0, rel=0.05)
     assert FORMS["cascade"].lag_time == pytest.approx(3 / 20.0 + 3 / 10.0, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["half gain", "cascade", "Kalman", "delay", "nonlinear"])
+def test_a_hand_over_is_bumpless_in_every_form(name: str) -> None:
+    """From somebody else's u at rest, with a load: u goes on from there, and y stays."""
+    observer = ESO.nonlinear(2, 1.5, 20.0, DT, delta=0.05) if name == "nonlinear" else FORMS[name]
+    controller = ql.ADRC(observer, omega_c=2.0)
+    # y = 1 is held against the spring by u = 2/1.5.
+    controller.start(y=1.0, u=2.0 / 1.5)
+    x, model = np.array([1.0, 0.0]), PLANT.sampled(DT)
+    for _ in range(200):
+        u = controller.step(1.0, float(x[0]))
+        assert u == pytest.approx(2.0 / 1.5, abs=1e-6)
+        x = model.transition @ x + model.input * u
 
 
 @pytest.mark.parametrize("extra", [{"learner": ql.learners.Kalman()}, {"learner": ql.learners.BatchGradient()}, {"guard": ql.Guard()}])

@@ -161,3 +161,48 @@ def test_a_mistake_is_named_with_its_value_and_the_rule(make: object, message: s
     """Nothing wrong gets as far as a run."""
     with pytest.raises((ValueError, TypeError), match=message):
         make()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        s.Constant(3.0),
+        s.Ramp(slope=2.0, start=1.0, stop=3.0),
+        s.Ramp(slope=2.0),
+        s.Sinusoid(amplitude=2.0, omega=1.7, phase=0.3),
+        s.Trapezoid(distance=-2.0, duration=5.0, start=1.0),
+        s.SmoothMove(distance=2.0, duration=6.0, smoothness=3, start=1.0),
+        s.SmoothMove(distance=2.0, duration=6.0, smoothness=4).derivative(),
+        s.Samples([0.0, 2.0, 3.0], [1.0, -1.0, 4.0]),
+        2.0 * s.Sinusoid(omega=0.8).until(4.0, then=s.Ramp(slope=0.3)) - s.Trapezoid(start=6.0),
+    ],
+    ids=lambda signal: type(signal).__name__,
+)
+def test_a_derivative_is_the_slope_of_the_signal(signal: s.Signal) -> None:
+    """Its integral gives the signal back, but for jumps, which are no part of it."""
+    t = np.linspace(-1.0, 12.0, 260_001)
+    smooth = signal(t)
+    slope = np.diff(smooth) / np.diff(t)
+    known = signal.derivative()(t[:-1] + 0.5 * (t[1] - t[0]))
+    jumps = np.abs(np.diff(smooth)) > 0.1
+    kinks = np.abs(slope - known) > 2e-3 * (1.0 + np.abs(known))
+    assert np.sum(jumps) <= 1
+    assert np.sum(kinks & ~jumps) <= 8, "more than the corners differ"
+
+
+def test_a_smooth_move_has_the_derivatives_it_promises() -> None:
+    """M of them are continuous, zero at both ends; the move of m = 2 is the minimum-jerk polynomial 10σ³ − 15σ⁴ + 6σ⁵."""
+    sigma = np.linspace(0.0, 1.0, 101)
+    np.testing.assert_allclose(s.SmoothMove(1.0, 1.0, smoothness=2)(sigma), 10 * sigma**3 - 15 * sigma**4 + 6 * sigma**5, atol=1e-14)
+    move = s.SmoothMove(distance=-3.0, duration=2.0, smoothness=4, start=1.0)
+    assert move([0.0, 1.0, 2.0, 3.0, 9.0]).tolist() == pytest.approx([0.0, 0.0, -1.5, -3.0, -3.0])
+    for _ in range(4):
+        move = move.derivative()
+        near = move([1.0 - 1e-9, 1.0 + 1e-9, 3.0 - 1e-9, 3.0 + 1e-9])
+        np.testing.assert_allclose(near, 0.0, atol=1e-4)
+
+
+def test_a_signal_without_a_known_derivative_says_so() -> None:
+    """And what to do."""
+    with pytest.raises(ValueError, match="Chirp has none: take another signal"):
+        s.Chirp().derivative()

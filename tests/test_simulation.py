@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell import simulation
+from quell import driver
 
 PLANT = ql.plants.two_mass_spring()
 
@@ -27,7 +27,7 @@ def test_the_same_seed_gives_the_same_bits(two_mass_scenario: ql.Scenario) -> No
 def test_the_block_size_leaves_no_trace(two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
     """Signals are made in pieces, the record is one."""
     whole = ql.simulate(PLANT, controller(), two_mass_scenario)
-    monkeypatch.setattr(simulation, "_BLOCK", 77)
+    monkeypatch.setattr(driver, "_BLOCK", 77)
     np.testing.assert_array_equal(ql.simulate(PLANT, controller(), two_mass_scenario).log, whole.log)
 
 

@@ -46,7 +46,7 @@ def test_loops_are_drawn_within_their_ranges(rng: np.random.Generator) -> None:
         assert 0.5 <= loop.m1 <= 2.0
         assert 0.3 <= loop.k <= 3.0
         assert loop.dt in (1e-3, 2e-3, 5e-3)
-        _, b, _ = ql.canonical(loop.plant)
+        b = ql.canonical(loop.plant).b
         assert loop.controller().parameters.b0 == pytest.approx(loop.gain_error * b)
 
 

@@ -17,20 +17,24 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quell import controllers, experiments, features, learners, metrics, observers, plants, signals
+    from quell import analysis, controllers, experiments, features, learners, metrics, observers, plants, signals
+    from quell.batch_record import BatchTrajectory
     from quell.controllers.adrc import ADRC
+    from quell.controllers.bandwidth import omega_c_for
     from quell.controllers.estimate import Estimate
     from quell.guard import Guard, Reason
     from quell.observers.canonical import canonical
     from quell.observers.eso import ESO
     from quell.simulation import Scenario, simulate
     from quell.trajectory import Trajectory
-    from quell.types import Status
+    from quell.types import DesignWarning, Status
 
 __version__ = "0.1.0"
 
 _HOME = {
     "ADRC": "quell.controllers.adrc",
+    "DesignWarning": "quell.types",
+    "BatchTrajectory": "quell.batch_record",
     "ESO": "quell.observers.eso",
     "Estimate": "quell.controllers.estimate",
     "Guard": "quell.guard",
@@ -39,19 +43,23 @@ _HOME = {
     "Status": "quell.types",
     "Trajectory": "quell.trajectory",
     "canonical": "quell.observers.canonical",
+    "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation",
 }
-_ROOMS = ("controllers", "experiments", "features", "learners", "metrics", "observers", "plants", "signals")
+_ROOMS = ("analysis", "controllers", "experiments", "features", "learners", "metrics", "observers", "plants", "signals")
 
 __all__ = [
     "ADRC",
     "ESO",
+    "BatchTrajectory",
+    "DesignWarning",
     "Estimate",
     "Guard",
     "Reason",
     "Scenario",
     "Status",
     "Trajectory",
+    "analysis",
     "canonical",
     "controllers",
     "experiments",
@@ -59,6 +67,7 @@ __all__ = [
     "learners",
     "metrics",
     "observers",
+    "omega_c_for",
     "plants",
     "signals",
     "simulate",

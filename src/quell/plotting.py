@@ -10,8 +10,11 @@ from quell.guard import Reason
 from quell.types import Vector
 
 if TYPE_CHECKING:
+    from quell.batch_record import BatchTrajectory
     from quell.trajectory import Trajectory
 
+# Shares of the runs that a band holds, and how dark it is.
+_BANDS = ((100.0, "all", 0.15), (90.0, "90 %", 0.25), (50.0, "50 %", 0.4))
 # About two points for each pixel of a wide figure.
 _POINTS = 2000
 
@@ -59,6 +62,42 @@ def plot_trajectory(run: Trajectory, axes: Any = None) -> Any:
     axes[len(axes) - 1].set_xlabel("time [s]")
     if run.diverged:
         axes[0].set_title(f"ended at {run.ended:.3g} s: diverged", color="C3")
+    return axes
+
+
+def plot_batch(runs: BatchTrajectory, axes: Any = None) -> Any:
+    """Draw output and control signal of a batch: median and bands of the runs that went through, and where others diverged."""
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        _, axes = plt.subplots(2, 1, sharex=True, figsize=(8.0, 5.0), layout="constrained")
+    if np.size(axes) != 2:
+        raise ValueError(f"axes: must be two matplotlib axes, got {np.size(axes)}")
+    whole, lost = np.flatnonzero(~runs.diverged), np.flatnonzero(runs.diverged)
+    some = slice(None, None, max(runs.t.size // _POINTS, 1))
+    t = runs.t[some]
+    for ax, name, label, color in ((axes[0], "y", "output", "C0"), (axes[1], "u", "control signal", "C1")):
+        if whole.size:
+            values = runs[name][whole, some]
+            shares = sorted({50.0, *(50.0 + side * share / 2.0 for share, _, _ in _BANDS for side in (-1.0, 1.0))})
+            at = dict(zip(shares, np.percentile(values, shares, axis=0), strict=True))
+            for share, held, dark in _BANDS:
+                ax.fill_between(t, at[50.0 - share / 2.0], at[50.0 + share / 2.0], color=color, alpha=dark, linewidth=0.0, label=held)
+            ax.plot(t, at[50.0], color=color, label="median")
+            # A run on its way to infinity would hide all others.
+            low, high = float(at[5.0].min()), float(at[95.0].max())
+            margin = 0.5 * (high - low) or 1.0
+            ax.set_ylim(low - margin, high + margin)
+        ax.set_ylabel(label)
+        ax.grid(alpha=0.3)
+    if "r" in runs.names:
+        axes[0].plot(t, runs["r"][0, some], color="0.3", linestyle="--", linewidth=1.0, label="r")
+    # The lines of runs that diverged would cover all others; where each of them ended is marked below.
+    if lost.size:
+        axes[0].plot(runs.ended[lost], np.full(lost.size, 0.02), "|", color="C3", transform=axes[0].get_xaxis_transform(), label="diverged")
+    axes[0].legend(loc="upper right", fontsize="small", ncols=3)
+    axes[1].set_xlabel("time [s]")
+    axes[0].set_title(f"{len(runs)} runs, {lost.size} diverged", color="C3" if lost.size else "0.2", fontsize="medium")
     return axes
 
 

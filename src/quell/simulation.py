@@ -1,27 +1,22 @@
-"""The one driver: a plant and a controller, sample by sample, through a scenario."""
+"""Plants and controllers through scenarios: one run, or many."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import Controller, control, flags, report, rest
-from quell.dispatch import compiled, compiling, for_types, interpreted
-from quell.plants.base import Plant, advance, measure
+from quell.batch import simulate_batch
+from quell.batch_record import BatchTrajectory
+from quell.controllers.base import Controller
+from quell.driver import Course, Loop, channels_of, check_part, pieces
+from quell.plants.base import Plant
 from quell.signals import Constant, Signal, as_signal, seeded_apart
-from quell.trajectory import Trajectory, first_sample_at, in_steps
-from quell.types import Matrix, Status, Vector
-
-# Signals are evaluated so many samples at a time: enough to make Python's share small, few enough to stay in cache.
-_BLOCK = 8192
-# Time in steps of dt is exact to a part in a thousand of a step up to here.
-_MOST_SAMPLES = 10**12
+from quell.trajectory import Trajectory
+from quell.types import Status
 
 
 @dataclass(frozen=True)
@@ -84,62 +79,8 @@ class Scenario:
         return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise
 
 
-@compiled
-def run_block(
-    plant: Any,
-    x: Vector,
-    scratch: Vector,
-    design: Any,
-    state: Any,
-    t0: float,
-    dt: float,
-    r: Vector,
-    w: Matrix,
-    noise: Vector,
-    log: Matrix,
-    row: int,
-    every: int,
-    until_next: int,
-    limit: float,
-) -> tuple[int, int, int, int]:
-    """Run ``r.size`` samples from the time ``t0``; write every ``every``-th into ``log`` from ``row`` on.
-
-    Returns how many samples were run (fewer than asked where the loop diverged: ``|y|`` beyond ``limit``, or not finite), the next row,
-    how many samples are left until it is written, and all status flags that were seen.
-    """
-    inputs = w.shape[1]
-    status = 0
-    for k in range(r.size):
-        y = measure(plant, x)
-        measured = y + noise[k]
-        if not abs(y) <= limit:
-            return k, row, until_next, status
-        u = control(design, state, r[k], measured)
-        status |= flags(design, state)
-        if until_next == 0:
-            log[row, 0] = r[k]
-            log[row, 1] = y
-            log[row, 2] = measured
-            log[row, 3] = u
-            for j in range(inputs):
-                log[row, 4 + j] = w[k, j]
-            for j in range(x.size):
-                log[row, 4 + inputs + j] = x[j]
-            report(design, state, log[row, 4 + inputs + x.size :])
-            row += 1
-            until_next = every
-        until_next -= 1
-        advance(plant, x, scratch, t0 + k * dt, u, w[k])
-    return r.size, row, until_next, status
-
-
-@compiled
-def start_from_rest(design: Any, state: Any) -> None:
-    """Start the controller from rest, with what it has learned."""
-    rest(design, state)
-
-
-def simulate(
+@overload
+def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
     plant: Plant,
     controller: Controller,
     scenario: Scenario,
@@ -148,15 +89,43 @@ def simulate(
     limit: float | None = None,
     interpret: bool = False,
     progress: Callable[[float], None] | None = None,
-) -> Trajectory:
-    """Run a controller on a plant through a scenario.
+) -> Trajectory: ...
+@overload
+def simulate(
+    plant: Plant | Sequence[Plant],
+    controller: Controller | Sequence[Controller],
+    scenario: Scenario | Sequence[Scenario],
+    *,
+    record_every: int = 1,
+    limit: float | None = None,
+    interpret: bool = False,
+    progress: Callable[[float], None] | None = None,
+    record: Sequence[str] | None = None,
+    workers: int | None = None,
+) -> BatchTrajectory: ...
+def simulate(
+    plant: Any,
+    controller: Any,
+    scenario: Any,
+    *,
+    record_every: int = 1,
+    limit: float | None = None,
+    interpret: bool = False,
+    progress: Callable[[float], None] | None = None,
+    record: Sequence[str] | None = None,
+    workers: int | None = None,
+) -> Trajectory | BatchTrajectory:
+    """Run a controller on a plant through a scenario; or many of them, each on its own, on all cores.
 
     The controller starts with nothing learned, on a state of its own: neither it nor the plant is changed.
 
     Parameters
     ----------
     plant, controller, scenario
-        what to run; the sample time is the controller's.
+        what to run; the sample time is the controller's. Where one of them is a sequence (for plants ``quell.plants.batch``), it is a
+        batch: a run for each of its entries, the others the same in all runs or a sequence of the same length. Run i is, bit for bit, what
+        ``simulate`` gives for the i-th plant, controller and scenario alone. So all runs of one scenario have the same noise; for other
+        noise give a sequence of scenarios with other seeds. All runs of a batch have the same sample time and duration.
     record_every
         keep every so-many-th sample; the memory used is that of the record.
     limit
@@ -165,96 +134,52 @@ def simulate(
     interpret
         run the same functions as plain Python, the plant's too, to debug; about a thousand times slower.
     progress
-        called with the share done, 0 to 1, every few thousand samples.
+        called with the share done, 0 to 1, every few thousand samples, or every few runs.
+    record
+        for a batch: the channels to keep; ``("r", "y", "u")`` by default. A single run keeps all.
+    workers
+        for a batch: how many threads share it; as many as there are cores by default.
 
     Returns
     -------
-    Trajectory
+    Trajectory or BatchTrajectory
         what was recorded, as far as the run went.
 
     Raises
     ------
     ValueError
-        for arguments out of range, an x0 of the wrong size, or more disturbances than the plant has inputs.
+        for arguments out of range, an x0 of the wrong size, more disturbances than the plant has inputs, or runs that do not fit into one
+        batch.
     """
-    _check_kinds(plant, controller, scenario)
+    if any(isinstance(value, Sequence) for value in (plant, controller, scenario)):
+        return simulate_batch(plant, controller, scenario, record_every, limit, interpret, progress, record, workers)
+    for name, value in (("record", record), ("workers", workers)):
+        if value is not None:
+            raise ValueError(f"{name} = {value!r}: is for a batch; a single run records all channels, in this thread")
+    check_part("plant", plant)
+    check_part("controller", controller)
+    check_part("scenario", scenario)
     every = checks.whole("record_every", record_every, 1)
-    dt = controller.dt
-    samples = _sample_count(scenario.duration, dt)
-    x0 = np.zeros(plant.order) if scenario.x0 is None else checks.vector("x0", scenario.x0, plant.order)
-    signals = scenario.seeded_signals(plant.disturbances)
-    limit = _default_limit(signals[0], x0, samples, dt) if limit is None else checks.positive("limit", limit)
-    channels = (
-        *(("r", 1), ("y", 1), ("y_measured", 1), ("u", 1), ("w", plant.disturbances), ("x", plant.order)),
-        *controller.channels,
-    )
-    log = np.empty(((samples - 1) // every + 1, sum(width for _, width in channels)))
-    design, state, model = controller.parameters, controller.initial_state(), plant.sampled(dt, interpret)
-    as_python = interpret or not plant.compiled
-    block, to_rest = (interpreted(f) if as_python else for_types(f, model, design) for f in (run_block, start_from_rest))
-
-    x, scratch = x0.copy(), np.zeros(6 * plant.order)
-    row = until_next = done = status = 0
-    rests = {first_sample_at(time, dt, samples) for time in scenario.rest_at}
-    # An interpreted loop that diverges would warn of every overflow; the status says it once.
-    with np.errstate(over="ignore", invalid="ignore"), compiling(model, design):
-        for first, last in pairwise(sorted({*range(0, samples, _BLOCK), *rests, samples})):
-            if first in rests:
-                x[:] = x0
-                to_rest(design, state)
-            r, w, noise = _evaluated(signals, np.arange(first, last) * dt)
-            ran, row, until_next, seen = block(
-                *(model, x, scratch, design, state, first * dt, dt, r, w, noise, log, row, every, until_next, limit)
-            )
-            done = first + ran
-            status |= seen
-            if done < last:
-                status |= Status.DIVERGED
-                break
-            if progress is not None:
-                progress(done / samples)
+    course = Course.of(scenario, plant, controller, limit)
+    loop = Loop(plant, plant.sampled(course.dt, interpret), controller, course, interpret)
+    channels = channels_of(plant, controller)
+    log = np.empty(((course.samples - 1) // every + 1, sum(width for _, width in channels)))
+    row = 0
+    for first, last in pieces(course.samples, course.rests):
+        row = loop.run(course.stretch(first, last), log, row, every)
+        if loop.diverged:
+            break
+        if progress is not None:
+            progress(last / course.samples)
     return Trajectory(
         log=log[:row],
         channels=channels,
-        dt=dt,
+        dt=course.dt,
         every=every,
-        status=Status(status),
-        ended=(done if status & Status.DIVERGED else samples - 1) * dt,
-        limit=limit,
+        status=Status(loop.status),
+        ended=loop.ended * course.dt,
+        limit=course.limit,
         plant=plant.name,
         features=controller.features,
-        final_state=state,
+        final_state=loop.state,
     )
-
-
-def _check_kinds(plant: Any, controller: Any, scenario: Any) -> None:
-    for name, value, has, wanted in (
-        ("plant", plant, "sampled", "a plant, for example quell.plants.two_mass_spring()"),
-        ("controller", controller, "initial_state", "a controller, for example quell.ADRC(...)"),
-        ("scenario", scenario, "seeded_signals", "a quell.Scenario"),
-    ):
-        if isinstance(value, type) or not hasattr(value, has):
-            raise ValueError(f"{name} = {value!r}: must be {wanted}")
-
-
-def _sample_count(duration: float, dt: float) -> int:
-    """Return how many samples there are until ``duration``, both ends included, give or take rounding."""
-    if duration / dt > _MOST_SAMPLES:
-        raise ValueError(f"duration = {duration!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES:.0e} samples")
-    return math.floor(in_steps(duration, dt)) + 1
-
-
-def _default_limit(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
-    """Return a million times what is asked of the loop: a loop in encoder counts is not one that diverges."""
-    early = reference(np.arange(min(samples, _BLOCK)) * dt)
-    sizes = np.abs([1.0, *x0, *early[np.isfinite(early)]])
-    return 1e6 * float(np.max(sizes))
-
-
-def _evaluated(signals: tuple[Signal, tuple[Signal, ...], Signal], t: Vector) -> tuple[Vector, Matrix, Vector]:
-    """Return reference (k,), disturbances (k, m) and noise (k,) at the times ``t``."""
-    reference, disturbances, noise = signals
-    w = np.empty((t.size, len(disturbances)))
-    for j, disturbance in enumerate(disturbances):
-        w[:, j] = disturbance(t)
-    return np.ascontiguousarray(reference(t)), w, np.ascontiguousarray(noise(t))

@@ -1,4 +1,4 @@
-"""Array aliases, and the status that a step or a run reports."""
+"""Array aliases, the status that a step or a run reports, and the warning for unwise designs."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ Vector: TypeAlias = NDArray[np.float64]
 
 Matrix: TypeAlias = NDArray[np.float64]
 """Two-dimensional, C-contiguous, float64."""
+
+
+class DesignWarning(UserWarning):
+    """A design is possible but unwise; the text has the number, its limit and what to do."""
 
 
 class Status(IntFlag):

@@ -104,6 +104,7 @@ OBSERVERS: dict[str, ESO] = {
     for order in (1, 2, 4, 8)
     for form in FORMS
 } | {
+    "model-based, order 3, with a zero": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), omega_o=12.0, dt=0.01),
     "half gain": ESO.model_free(2, 1.5, 12.0, 0.01, half_gain=True),
     "Kalman": ESO.kalman(2, 1.5, 0.01, noise=1e-6, drift=3e-2),
     "cascade": ESO.cascade(2, 1.5, 12.0, 0.01),

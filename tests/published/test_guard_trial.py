@@ -11,7 +11,7 @@ import pytest
 import quell as ql
 from quell.experiments import stress
 from quell.experiments import two_mass_spring as study
-from quell.experiments.parallel import in_parallel
+from quell.parallel import in_parallel
 
 SETTINGS = study.Settings()
 SINE = ql.signals.Sinusoid

@@ -13,12 +13,13 @@ from rich.table import Table
 
 from quell import plants
 from quell.dispatch import compilations
+from quell.driver import run_block
 from quell.experiments import two_mass_figures, two_mass_spring, two_mass_study
 from quell.experiments.figures import made
 from quell.experiments.two_mass_spring import Settings
 from quell.experiments.two_mass_study import Result
 from quell.files import check_writable, write_json
-from quell.simulation import Scenario, run_block, simulate
+from quell.simulation import Scenario, simulate
 
 _COLUMNS = (
     ("overshoot", "overshoot\n[‰]", 1e3, ".2f"),

@@ -10,19 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.controllers.base import heed
 from quell.controllers.estimate import Estimate
 from quell.controllers.handle import bind, bound_control, entry_point
+from quell.controllers.handover import HandOver
 from quell.controllers.law import F_LEARNED, LOOP, STATUS, AdrcDesign, AdrcState, U, law_gains
 from quell.controllers.limits import limits
 from quell.dispatch import compiling, for_types
 from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, explain
 from quell.learners.base import Learner, NoLearner, coefficients, tried
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
+from quell.observers.canonical import spell
 from quell.observers.eso import ESO
 from quell.types import Status
 
 
-class ADRC:
+class ADRC(HandOver):
     """Active disturbance rejection control around an ESO, with or without a learner.
 
     The object is immutable in all but its running state: ``step`` moves that on, ``simulate`` leaves it alone and uses a state of its own.
@@ -37,6 +40,9 @@ class ADRC:
         what feeds f forward; none by default.
     guard
         what gives a learner the authority it has earned; none by default: then a learner has all of it.
+    feedforward
+        whether the reference's derivatives are fed forward: ``simulate`` takes them from the signal, ``step`` from its caller. The ideal
+        loop then follows the reference without lag.
     u_min, u_max
         limits of the control signal [u-unit].
     rate_limit
@@ -48,7 +54,8 @@ class ADRC:
     Raises
     ------
     ValueError
-        for a bandwidth that is not positive, limits in the wrong order, a rate limit that is not positive.
+        for a bandwidth that is not positive, limits in the wrong order, a rate limit that is not positive; for an observer of a plant with
+        zeros that are not in the left half plane.
 
     Examples
     --------
@@ -67,6 +74,7 @@ class ADRC:
         *,
         learner: Learner | None = None,
         guard: Guard | None = None,
+        feedforward: bool = False,
         u_min: float = -math.inf,
         u_max: float = math.inf,
         rate_limit: float = math.inf,
@@ -75,6 +83,7 @@ class ADRC:
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO, from ESO.model_free or ESO.model_based")
         self.observer = observer
+        _check_zeros(observer)
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
         self.guard = guard
         self.learner: Learner = NoLearner() if learner is None else learner
@@ -82,7 +91,9 @@ class ADRC:
             raise ValueError(f"learner = {learner!r}: must be a learner, for example quell.learners.Kalman(), or None")
         if guard is not None and not isinstance(guard, Guard):
             raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
+        self.feedforward = checks.flag("feedforward", feedforward)
         self.half_gain = checks.flag("half_gain", half_gain)
+        self._learned_at = self.omega_c
         self._limits = limits(u_min, u_max, rate_limit, observer.dt)
         self._prepare_design()
         self._state = self.initial_state()
@@ -98,9 +109,10 @@ class ADRC:
             cancel=observer.cancel,
             cancel_f=observer.cancel_f,
             degree=observer.degree,
+            fade=math.exp(-self.omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,
-            learner=tried(self.learner, observer, self.omega_c),
+            learner=tried(self.learner, observer, self._learned_at),  # its scales stay, whatever the loop is retuned to
             lag=NO_LAG if isinstance(self.learner, NoLearner) else lag_of(observer),
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer),
         )
@@ -110,6 +122,11 @@ class ADRC:
     def dt(self) -> float:
         """Sample time [s]."""
         return self.observer.dt
+
+    @property
+    def derivatives(self) -> int:
+        """How many derivatives of the reference are fed forward."""
+        return self.observer.degree if self.feedforward else 0
 
     @property
     def channels(self) -> tuple[tuple[str, int], ...]:
@@ -145,17 +162,30 @@ class ADRC:
             dispatcher(bind(self.parameters, self.initial_state()), 0.0, 0.0)
         self._step = entry_point(dispatcher, self._handle, 0.0, 0.0)
 
-    def step(self, r: float, y: float) -> float:
+    def step(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
 
+        With ``feedforward``, r', r'', … may follow [y-unit/s^i]; those not given, or not finite, are zero.
+
         A value that is not finite is replaced by the last good one, and said in ``estimate.status``. The observer takes the returned
-        value for applied; limits belong in ``u_min``, ``u_max`` and ``rate_limit``, not behind the controller.
+        value for applied; limits belong in ``u_min``, ``u_max`` and ``rate_limit``, not behind the controller; else see ``applied``.
 
         The first call compiles, or loads; ``prepare`` does that beforehand.
         """
         if self._handle is None:
             self.prepare()
+        if self.feedforward:
+            self._feed(derivatives)
+        elif derivatives:
+            raise ValueError(f"step was given {len(derivatives)} derivatives of the reference: make the controller with feedforward=True")
         return self._step(self._handle, r, y)
+
+    def _feed(self, derivatives: tuple[float, ...]) -> None:
+        if len(derivatives) > self.observer.degree:
+            raise ValueError(
+                f"step was given {len(derivatives)} derivatives of the reference: there is use for {self.observer.degree} at most"
+            )
+        heed(self.parameters, self._state, np.array(derivatives, dtype=np.float64))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""
@@ -248,6 +278,17 @@ class ADRC:
             return {}
         named = dict(zip([name for name, _ in GUARD_CHANNELS], told.tolist(), strict=True))
         return named | {"reason": Reason(int(named["reason"]))}
+
+
+def _check_zeros(observer: ESO) -> None:
+    """Refuse a plant whose zeros the law must not cancel: u makes y^(r) what it should be, and the zeros from u are poles of u."""
+    unstable = observer.plant.unstable_zeros
+    if unstable.size:
+        raise ValueError(
+            f"observer: the plant has zeros from u at {spell(unstable)} rad/s, not in the left half plane; ADRC inverts the plant, "
+            "so that u would grow, or swing, without end while y looks well; control another output, or take a controller that does not "
+            "invert the plant (linear-quadratic, for instance)"
+        )
 
 
 def _named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:

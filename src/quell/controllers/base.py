@@ -1,7 +1,8 @@
 """What the driver asks of a controller.
 
 A controller is an object with ``dt``, ``parameters`` (a NamedTuple), ``initial_state()`` (a NamedTuple of arrays) and ``channels`` (the
-names of what it reports). For the type of its parameters three functions are registered.
+names of what it reports). For the type of its parameters the functions below are registered. A controller that wants derivatives of the
+reference says how many with ``derivatives``.
 """
 
 from __future__ import annotations

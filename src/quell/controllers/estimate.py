@@ -13,9 +13,9 @@ class Estimate(NamedTuple):
     """What the controller knows after a step."""
 
     x: Vector
-    """(n,): y and its derivatives."""
+    """(n,): y and its derivatives, less what u and f feed through where the plant has zeros; ``observer.states_of`` maps them back."""
     f: float
-    """Total disturbance [y-unit/s^n]: ``f_learned + f_residual``."""
+    """Total disturbance [y-unit/s^n; with zeros in its way y-unit/s^f_degree]: ``f_learned + f_residual``."""
     f_learned: float
     """The learner's share, f_L."""
     f_residual: float

@@ -3,11 +3,11 @@
     u_0 = k_1 (r − x̂_1) + k_2 (r' − x̂_2) + … + k_m (r^(m−1) − x̂_m) + r^(m),      k_i = C(m, i−1) omega_c^(m−i+1)
     u   = sat( (u_0 − f_L − Δf̂ + a·x̂) / b0 )
 
-(Gao, ACC 2003; paper eq. (control), with the term ``a·x̂`` that the paper forgets.) The derivatives of r are zero where none are given;
-m is the relative degree from u to y, the plant's order unless it has zeros. With ``f_L = h + s u`` affine in u the loop through u is
-solved instead of closed a sample late: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``. Where u reaches the plant with a delay, learner,
-guard and observer are told of the u that *acts* (``observers.base.acting``): ``f_L = h + s u_acting``. The law is the same then, for when
-the u it finds acts, f will have ``s u`` in it.
+(Gao, ACC 2003; paper eq. (control), with the term ``a·x̂`` that the paper forgets.) The derivatives of r are zero where none are given; m
+is the relative degree from u to y, the plant's order unless it has zeros. With ``f_L = h + s u`` affine in u the loop through u is solved
+instead of closed a sample late: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``. Where u reaches the plant with a delay, learner, guard
+and observer are told of the u that *acts* (``observers.base.acting``): ``f_L = h + s u_acting``. The law is the same then, for when the u
+it finds acts, f will have ``s u`` in it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 _LEARNER_CUT = int(Status.LEARNER_CUT)
 
-LOOP = 13
+LOOP = 15
 """Length of ``AdrcState.loop``, whose places are:"""
 (
     U,  # applied
@@ -40,13 +40,15 @@ LOOP = 13
     R,  # last good reference
     Y,  # last good measurement
     STARTED,  # whether there was one
-    _REFERENCED,  # whether there was a reference
+    REFERENCED,  # whether there was a reference
     STATUS,  # of the last sample
     CONSTANT,  # h of f_L = h + s u
     SLOPE,  # s
     WISHED,  # what the law would apply, limits included
     MANUAL,  # whether somebody else applies u, and it is
     MANUAL_U,
+    BUMPLESS,  # whether the next u is to go on from this one
+    OFFSET,  # what is still added for that
 ) = range(LOOP)
 
 
@@ -61,6 +63,8 @@ class AdrcDesign(NamedTuple):
     """a (n,)."""
     cancel_f: float
     """1 where f enters as u does, else 0."""
+    fade: float
+    """What is left a sample later of an offset that avoids a bump."""
     degree: int
     """Relative degree m from u to y."""
     b0: float
@@ -100,10 +104,10 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         status |= _MEASUREMENT_HELD
     if is_finite(r):
         loop[R] = r
-        loop[_REFERENCED] = 1.0
+        loop[REFERENCED] = 1.0
     else:
         status |= _REFERENCE_HELD
-        if loop[_REFERENCED] == 0.0:
+        if loop[REFERENCED] == 0.0:
             loop[R] = loop[Y]  # no reference yet: stay
     if loop[STARTED] == 0.0:
         begin(design.eso, state.z, seen, loop[Y])
@@ -131,10 +135,15 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     if not is_finite(wished):
         status |= _OVERFLOWED
         restart(design.learner, state.learner)
-        _forget_f_learned(design, state)
+        forget_f_learned(design, state)
         begin(design.eso, state.z, seen, loop[Y])
-        constant = slope = 0.0
+        constant = slope = loop[OFFSET] = 0.0
         wished = loop[U]
+    if loop[BUMPLESS] != 0.0:
+        loop[OFFSET] = loop[U] - wished
+        loop[BUMPLESS] = 0.0
+    wished += loop[OFFSET]
+    loop[OFFSET] *= design.fade
     u, cut = apply_limits(design.limits, wished, loop[U])
     loop[WISHED] = u
     if loop[MANUAL] == 0.0:
@@ -160,7 +169,8 @@ def _conclude(design: AdrcDesign, state: AdrcState, acted: float) -> None:
 
 
 @kernel
-def _forget_f_learned(design: AdrcDesign, state: AdrcState) -> None:
+def forget_f_learned(design: AdrcDesign, state: AdrcState) -> None:
+    """Empty the filter of f_L, and the guard's."""
     calm(design.guard, state.guard)
     state.loop[_F_SHOWN] = 0.0
     for i in range(state.shadow.shape[1]):
@@ -208,7 +218,7 @@ def _rest(design: AdrcDesign, state: AdrcState) -> None:
         state.loop[i] = 0.0
     for i in range(state.reference.size):
         state.reference[i] = 0.0
-    _forget_f_learned(design, state)
+    forget_f_learned(design, state)
     restart(design.learner, state.learner)
 
 

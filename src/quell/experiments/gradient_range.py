@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 
 from quell.experiments import two_mass_spring as setting
-from quell.experiments.parallel import in_parallel
 from quell.learners import BatchGradient
+from quell.parallel import in_parallel
 from quell.plants import two_mass_spring
 from quell.simulation import simulate
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from quell import checks
 from quell.experiments import adversaries, random_loops
-from quell.experiments.parallel import in_parallel
 from quell.experiments.random_loops import END, LOAD_AT, Loop
 from quell.guard import Guard
 from quell.learners import Harmonic, Learner
+from quell.parallel import in_parallel
 from quell.simulation import simulate
 from quell.types import Vector
 

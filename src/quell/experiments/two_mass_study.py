@@ -14,7 +14,6 @@ from quell import metrics
 from quell.experiments import gradient_range
 from quell.experiments.claims import Claim
 from quell.experiments.gradient_range import Trial
-from quell.experiments.parallel import in_parallel
 from quell.experiments.two_mass_spring import (
     BAND,
     FORCE_WINDOW,
@@ -34,6 +33,7 @@ from quell.experiments.two_mass_spring import (
     score,
 )
 from quell.learners import BatchGradient
+from quell.parallel import in_parallel
 from quell.plants import two_mass_spring
 from quell.simulation import simulate
 from quell.trajectory import Trajectory

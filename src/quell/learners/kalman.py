@@ -267,7 +267,8 @@ class Kalman:
     frequency
         a frequency the plant has [rad/s]; ``omega_c`` of the controller by default. By it state i is scaled, to one size with the others.
     prior
-        how large the coefficients may be: coefficient i is of the order of ``prior · frequency^(n−i+1)``.
+        how large the coefficients may be: coefficient i is of the order of ``prior · frequency^(n−i+1)``, for a plant
+        with zeros in f's way with the relative degree from f in the place of n.
     gain_interval
         where the effective gain ``(b0 + θ_u)/b0`` is kept when ``u`` is a feature.
 
@@ -322,7 +323,7 @@ class Kalman:
         # What noise in y leaves in x̂_i; what it leaves in f̂ is also in b0 u.
         noise = noise_shown(observer)
         threshold = (CLEAR * np.append(scale, 1.0)) ** 2 * noise
-        size = self.prior * frequency**n
+        size = self.prior * frequency**observer.f_degree
         oscillators, pair_bandwidth = self.oscillators(observer, omega_c)
         pairs = 2 * oscillators.omega.size
         return KalmanDesign(

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.dispatch import generic
+from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
-from quell.observers.response import f_lag, f_shadow, response, scaled, without_delay
+from quell.observers.response import f_lag, f_shadow, own_response, response
 from quell.types import Matrix, Vector
 
 # In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
@@ -100,7 +101,7 @@ def group_delay(observer: ESO) -> float:
     The j-th lag of the chain delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
     """
     if not observer.has_one_pole:
-        return f_lag(scaled(response(without_delay(observer.model), observer.order + 1), observer.dt))
+        return f_lag(own_response(observer))
     lag = _chain(observer)
     stage = np.arange(lag.taps.size)
     return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (1.0 if lag.predictor else 0.0)

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.dispatch import kernel
-from quell.observers.eso import ESO, noise_gains
+from quell.observers.eso import ESO
+from quell.observers.noise import noise_gains
 from quell.types import Vector
 
 # How many times its noise a signal must be. White noise of each sample makes 1, noise held for ten samples 3.
@@ -72,7 +73,7 @@ def sight(observer: ESO, frequency: float) -> Sight:
     noise = noise_shown(observer)
     f_noise = float(noise[-1])
     noise[-1] /= observer.b0**2  # what noise leaves in f̂ is also in b0 u
-    return Sight(CLEAR**2 * noise, -math.expm1(-observer.dt / (AVERAGE * observer.lag_time)), f_noise, frequency**observer.order)
+    return Sight(CLEAR**2 * noise, -math.expm1(-observer.dt / (AVERAGE * observer.lag_time)), f_noise, frequency**observer.f_degree)
 
 
 def sight_memory(order: int) -> SightMemory:

@@ -1,4 +1,17 @@
-"""From a state-space model to the chain of integrators that an ESO is built on."""
+"""From a model of any kind to the observable canonical form that an ESO is built on.
+
+    S = [C; C A; …; C A^(n−1)]        z = S x,    z' = Ā z + B̄ u + Ē f,    y = z_1
+
+with ``Ā = S A S⁻¹`` a companion matrix (last row −a), and ``B̄ = S B``, ``Ē = S E`` the Markov parameters ``C A^(i−1) B`` and
+``C A^(i−1) E`` (paper, eq. (transform), which has the case where both are zero but for their last entries). What u and f feed through on
+the way is not in z, so nothing has to be differentiated:
+
+    z_i = y^(i−1) − Σ_{j<i} (B̄_j u^(i−1−j) + Ē_j f^(i−1−j))
+
+The first entry of B̄ that is not zero is the r-th, r being the relative degree from u to y: ``y^(r) = z_{r+1} + B̄_r u + Ē_r f``, or
+``−a·z + …`` for r = n. The n − r zeros from u are the eigenvalues of what is left of the plant while u holds y at zero: of the last n − r
+rows and columns of ``Ā − B̄ e_{r+1}ᵀ/B̄_r``. The same with Ē gives the zeros from f.
+"""
 
 from __future__ import annotations
 
@@ -6,85 +19,102 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell import checks
+from quell.observers.models import Fraction, StateSpace, read
 from quell.types import Matrix, Vector
 
 # Below this ratio of singular values the balanced observability matrix counts as rank deficient.
 _RANK_TOLERANCE = 1e-10
 # Markov parameters below this share of their own bound count as zero.
 _ZERO_TOLERANCE = 1e-9
+# A zero this much slower than the plant's fastest pole or zero counts as one at s = 0.
+_AT_REST = 1e-9
 
 
 class Canonical(NamedTuple):
-    """``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u``, and the map ``S`` from the model's own state to (y, y', …)."""
+    """A plant in observable canonical form, ``z = S x``; without zeros it is ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u + f``."""
 
     a: Vector
+    """(n,) [1/s^(n−i)]."""
     b: float
+    """Gain from u to y^(degree) [y-unit / u-unit / s^degree]."""
     S: Matrix
+    """(n, n): from the user's states to z; the identity for a plant given without states."""
+    B: Vector
+    """S B (n,): zero before entry ``degree``, which is b."""
+    E: Vector
+    """S E / f_gain (n,): zero before entry ``f_degree``, which is 1."""
+    degree: int
+    """Relative degree r from u to y."""
+    f_degree: int
+    """Relative degree from f to y; f is measured in y-unit/s^f_degree."""
+    f_gain: float
+    """f is this times the disturbance that enters through E (through B, in units of u, where there is no E)."""
+    zeros: Vector
+    """The n − degree zeros from u to y [rad/s], complex."""
+    condition: float
+    """Largest over smallest singular value of S with rows of length 1: from 1e10 on the plant counts as unobservable."""
+
+    @property
+    def matched(self) -> bool:
+        """Whether f enters as u does."""
+        return self.f_degree == self.degree
+
+    @property
+    def unstable_zeros(self) -> Vector:
+        """Those of the zeros that are not in the left half plane, or damped by less than a millionth."""
+        return self.zeros[self.zeros.real >= -1e-6 * np.abs(self.zeros)]
 
 
-def canonical(model: Any) -> Canonical:
-    """Bring a model to observable canonical form (paper, eq. (transform): ``S = [C; C A; …; C A^(n−1)]``).
+def canonical(plant: Any, E: Any = None) -> Canonical:
+    """Bring a plant with one input and one output to observable canonical form, and check what an ESO needs of it.
 
     Parameters
     ----------
-    model
-        a plant with ``A`` (n, n), ``B`` (n, 1), ``C`` (1, n) (so also ``control.StateSpace``), a ``control.TransferFunction``, or
-        the pair ``(a, b)`` itself with ``a = (a_0 … a_{n−1})``.
+    plant
+        one of
+
+        * a plant with ``A`` (n, n), ``B`` (n, 1), ``C`` (1, n): ``LinearPlant``, ``control.StateSpace``; D must be zero,
+        * matrices ``(A, B, C)``, or ``(A, B, E, C)`` as in the paper's eq. (1); B, E and C may be vectors,
+        * ``control.TransferFunction``, or the pair ``(numerator, denominator)`` of sequences in descending powers of s,
+        * the pair ``(a, b)`` with a number b: ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u``.
+    E
+        where the disturbance enters: a column (n,) or (n, 1), or the index of one of the plant's own disturbance inputs. By default it
+        enters where u does.
 
     Returns
     -------
     Canonical
-        the coefficients ``a`` (n,) [1/s^(n−i)], the gain ``b`` [y-unit / u-unit / s^n] and ``S`` (n, n).
 
     Raises
     ------
     ValueError
-        where the model is not of one input and one output, is not observable from y (assumption 1 of the paper), or has a relative
-        degree other than its order (the input then enters before the last integrator and the model has zeros).
+        each with its own message: the plant is not observable from y (assumption 1 of the paper), u or the disturbance does not reach y,
+        a disturbance with a channel of its own has invariant zeros to y (assumption 3), a transfer function is improper or biproper, the
+        model is of discrete time, shapes do not fit.
+
+    Examples
+    --------
+    >>> found = canonical(([1.0, 3.0], [1.0, 0.4, 1.0]))
+    >>> found.degree, found.zeros.real.round(6).tolist(), found.B.round(6).tolist()
+    (1, [-3.0], [1.0, 2.6])
     """
-    if isinstance(model, tuple) and len(model) == 2:
-        return _from_pair(*model)
-    if hasattr(model, "num") and hasattr(model, "den"):
-        return _from_transfer_function(model)
-    if all(hasattr(model, name) for name in "ABC"):
-        return _from_state_space(model)
-    raise ValueError(
-        f"plant = {model!r}: must be a linear plant or control.StateSpace (with A, B, C), a control.TransferFunction, or a pair (a, b)"
-    )
+    model = read(plant, E)
+    return _from_fraction(model) if isinstance(model, Fraction) else _from_state_space(model)
 
 
-def _from_pair(a: Any, b: Any) -> Canonical:
-    coefficients = checks.vector("a", a)
-    gain = checks.nonzero("b", b, "or the input does not reach the plant")
-    return Canonical(coefficients, gain, np.eye(coefficients.size))
+def _from_fraction(model: Fraction) -> Canonical:
+    """Divide the numerator by the denominator: the quotient's powers of 1/s are the Markov parameters."""
+    n = model.a.size
+    B = np.empty(n)
+    for k in range(n):
+        B[k] = model.c[n - 1 - k] - sum(model.a[n - j] * B[k - j] for j in range(1, k + 1))
+    return _assemble(model.a, B, None, np.eye(n), 1.0)
 
 
-def _from_transfer_function(model: Any) -> Canonical:
-    if np.shape(model.num)[:2] != (1, 1):
-        raise ValueError(f"plant has {np.shape(model.num)[:2]} outputs and inputs: an ESO needs one of each")
-    numerator, denominator = np.trim_zeros(model.num[0][0], "f"), np.trim_zeros(model.den[0][0], "f")
-    _check_continuous(model)
-    if numerator.size == 0:
-        raise ValueError("plant has a numerator of zero: the input must reach the output")
-    if numerator.size != 1:
-        raise ValueError(
-            f"plant has a numerator of degree {numerator.size - 1}: its relative degree must equal its order, that is no zeros"
-        )
-    a = denominator[:0:-1] / denominator[0]
-    return _from_pair(np.array(a, dtype=float), float(numerator[0] / denominator[0]))
-
-
-def _from_state_space(model: Any) -> Canonical:
-    A = checks.matrix("A", model.A)
-    n = A.shape[0]
-    checks.matrix("A", A, n, n)
-    B, C = checks.matrix("B", model.B, n, 1), checks.matrix("C", model.C, 1, n)
-    _check_continuous(model)
-    if hasattr(model, "D") and np.any(np.asarray(model.D) != 0.0):
-        raise ValueError(f"D = {np.asarray(model.D).tolist()}: must be zero, the output may not follow the input at once")
+def _from_state_space(model: StateSpace) -> Canonical:
+    A, n = model.A, model.B.size
     S = np.empty((n, n))
-    S[0] = C[0]
+    S[0] = model.C
     for i in range(1, n):
         S[i] = S[i - 1] @ A
     # Rows of one size, whatever the unit of time.
@@ -98,24 +128,66 @@ def _from_state_space(model: Any) -> Canonical:
             f"(smallest over largest singular value {singular[-1] / max(singular[0], 1e-300):.1e}); "
             "measure another output or reduce the model"
         )
-    markov = S @ B[:, 0]
-    bound = size * np.linalg.norm(B)
-    early = np.flatnonzero(np.abs(markov[:-1]) > _ZERO_TOLERANCE * bound[:-1])
-    if early.size:
-        raise ValueError(
-            f"plant has relative degree {early[0] + 1} but order {n}: the input must reach y through all {n} integrators; "
-            "this model has zeros, use ESO.model_free(order=relative degree)"
-        )
-    b = checks.nonzero("b = C A^(n-1) B", float(markov[-1]), "or the input does not reach the output")
-    if abs(b) <= _ZERO_TOLERANCE * bound[-1]:
-        raise ValueError(f"b = C A^(n-1) B = {b!r}: must not be zero, or the input does not reach the output")
     # Row n of the companion matrix: C A^n = −a S. What is no more than its rounding is zero.
+    condition = float(singular[0] / singular[-1])
     a = -np.linalg.solve(balanced.T, S[-1] @ A) / size
-    rounding = 1e-13 * np.linalg.cond(balanced) * size[-1] * np.linalg.norm(A, 2)
-    a[np.abs(a) * size <= rounding] = 0.0
-    return Canonical(a, b, S)
+    a[np.abs(a) * size <= 1e-13 * condition * size[-1] * np.linalg.norm(A, 2)] = 0.0
+    return _assemble(a, _markov(S, model.B), None if model.E is None else _markov(S, model.E), S, condition)
 
 
-def _check_continuous(model: Any) -> None:
-    if getattr(model, "dt", None):
-        raise ValueError(f"plant has a sample time, dt = {model.dt!r}: must be a continuous-time model (the ESO is sampled by its own dt)")
+def _markov(S: Matrix, column: Vector) -> Vector:
+    """Return ``S column``, without what is only the rounding of sums that cancel."""
+    markov = S @ column
+    markov[np.abs(markov) <= _ZERO_TOLERANCE * (np.abs(S) @ np.abs(column))] = 0.0
+    return markov
+
+
+def _assemble(a: Vector, B: Vector, E: Vector | None, S: Matrix, condition: float) -> Canonical:
+    n = a.size
+    if not np.any(B):
+        raise ValueError(f"b = 0: u does not reach y through any of the {n} states (B or the output is wrong)")
+    degree = int(np.flatnonzero(B)[0]) + 1
+    b = float(B[degree - 1])
+    # The same channel, up to a factor.
+    E = B if E is None or _parallel(E, B) else E
+    if not np.any(E):
+        raise ValueError(
+            f"E: the disturbance does not reach y through any of the {n} states; it can be neither estimated nor does it matter"
+        )
+    f_degree = int(np.flatnonzero(E)[0]) + 1
+    if E is not B and f_degree < n:
+        raise ValueError(
+            f"E: the disturbance has invariant zeros to y (assumption 3), {spell(_zeros(a, E))} rad/s, its relative degree is {f_degree} "
+            f"and not {n}; leave E out (f then enters where u does), or measure another output"
+        )
+    return Canonical(a, b, S, B, E / E[f_degree - 1], degree, f_degree, float(E[f_degree - 1]), _zeros(a, B), condition)
+
+
+def _parallel(one: Vector, other: Vector) -> bool:
+    at = np.flatnonzero(other)[0]
+    return bool(one[at] != 0.0 and np.allclose(one, other * (one[at] / other[at]), rtol=_ZERO_TOLERANCE, atol=0.0))
+
+
+def _zeros(a: Vector, column: Vector) -> Vector:
+    """Return the zeros from an input with the Markov parameters ``column`` (module docstring)."""
+    n = a.size
+    r = int(np.flatnonzero(column)[0]) + 1
+    companion = np.diag(np.ones(n - 1), 1)
+    companion[-1] = -a
+    if r == n:
+        return np.zeros(0, dtype=complex)
+    rest = companion[r:, r:].copy()
+    rest[:, 0] -= column[r:] / column[r - 1]
+    zeros = np.linalg.eigvals(rest).astype(complex)
+    fastest = max(np.max(np.abs(zeros)), np.max(np.abs(np.linalg.eigvals(companion))))
+    zeros[np.abs(zeros) <= _AT_REST * fastest] = 0.0
+    return zeros[np.argsort(zeros.real, kind="stable")]
+
+
+def spell(zeros: Vector) -> str:
+    """Return zeros as text, conjugate pairs as one."""
+    told = []
+    for z in zeros[zeros.imag >= 0.0].tolist():
+        real = f"{z.real:.4g}" if abs(z.real) > 1e-9 * abs(z) or z == 0.0 else ""
+        told.append(real + (f"±{z.imag:.4g}j" if z.imag > 0.0 else ""))
+    return ", ".join(told)

@@ -64,3 +64,8 @@ def delayed_model(model: Any, delay: float, dt: float) -> Any:
     """
     samples = checks.samples("delay", delay, dt)
     return model if samples == 0 else DelayedModel(model, model.states, samples)
+
+
+def without_delay(model: Any) -> Any:
+    """Return an observer's model as it is without a delay of u, to which neither y nor f_L is subject."""
+    return model.inner if isinstance(model, DelayedModel) else model

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.observers.base import observe
+from quell.observers.delay import without_delay
 from quell.observers.nonlinear import NonlinearModel
 from quell.types import Matrix, Vector
 
@@ -47,24 +48,20 @@ def response(model: Any, estimates: int) -> Response:
     return Response(after[:, :m].copy(), after[:, m:].copy(), seen[:, :m].copy(), seen[:, m:].copy())
 
 
-def without_delay(model: Any) -> Any:
-    """Return an observer's model as it is without a delay of u, to which neither y nor f_L is subject."""
-    return getattr(model, "inner", model)
-
-
 def f_shadow(found: Response) -> tuple[Matrix, Vector, Vector, float]:
     """Return ``(M, g, c, d)`` of ``−Δf̂ = c·s + d φ``, ``s⁺ = M s + g φ``: what the estimate of f shows of f_L = φ, for y = u = 0."""
     return found.transition, found.inputs[:, 2], -found.seen[-1], -float(found.through[-1, 2])
 
 
-def scaled(found: Response, unit: float) -> Response:
-    """Return the same in the coordinates ``z_i unit^i``, i from 0 to n and over again for each level; ``seen`` stays as it is."""
-    estimates, m = found.seen.shape
-    units = unit ** (np.arange(m) % estimates).astype(np.float64)
+def own_response(observer: Any) -> Response:
+    """Return that of an ``ESO`` without its delay of u, in its own time: z as ``x_i/omega_o^(i−1)``, ``f/omega_o^q``; ``seen`` as it is."""
+    n = observer.order
+    found = response(without_delay(observer.model), n + 1)
+    units = np.resize(observer.omega_o ** np.append(np.arange(n, dtype=np.float64), observer.f_degree), found.transition.shape[0])
     return found._replace(
-        transition=found.transition * units[:, None] / units[None, :],
-        inputs=found.inputs * units[:, None],
-        seen=found.seen / units[None, :],
+        transition=found.transition * units[None, :] / units[:, None],
+        inputs=found.inputs / units[:, None],
+        seen=found.seen * units[None, :],
     )
 
 

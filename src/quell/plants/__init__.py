@@ -1,9 +1,10 @@
 """Plants: what is to be controlled."""
 
 from quell.plants.base import Plant
+from quell.plants.batch import PlantBatch, batch
 from quell.plants.delayed import delayed
 from quell.plants.linear import LinearPlant
 from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.two_mass_spring import two_mass_spring
 
-__all__ = ["LinearPlant", "NonlinearPlant", "Plant", "delayed", "two_mass_spring"]
+__all__ = ["LinearPlant", "NonlinearPlant", "Plant", "PlantBatch", "batch", "delayed", "two_mass_spring"]

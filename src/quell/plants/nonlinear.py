@@ -87,7 +87,12 @@ def _derivatives(plant: CompiledNonlinear, t: float, x: Vector, u: float, w: Vec
 
 @measure.register(PythonNonlinear)
 def _measure_python(plant: PythonNonlinear, x: Vector) -> float:
-    return float(plant.output(x))
+    try:
+        return float(plant.output(x))
+    except Exception as error:
+        if not _out_of_range(error):
+            raise
+        return float("nan")
 
 
 @advance.register(PythonNonlinear)
@@ -97,7 +102,12 @@ def _advance_python(plant: PythonNonlinear, x: Vector, scratch: Vector, t: float
 
 @derivatives.register(PythonNonlinear)
 def _derivatives_python(plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
-    dx[:] = plant.rate(t, x, u, w)
+    try:
+        dx[:] = plant.rate(t, x, u, w)
+    except Exception as error:
+        if not _out_of_range(error):
+            raise
+        dx[:] = np.nan  # as the compiled function has it; the run ends as diverged
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,9 +222,14 @@ def _tried(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return function(*arguments)
     except Exception as error:
-        if isinstance(error, ArithmeticError) or "math domain" in str(error):
+        if _out_of_range(error):
             return None
         raise ValueError(
             f"{what} fails with {type(error).__name__}: {error}; "
             "f takes (t, x, u, w), output takes (x), with arrays x and w of the plant's sizes"
         ) from error
+
+
+def _out_of_range(error: Exception) -> bool:
+    """Tell whether a function was asked for something that is no number there, such as exp(1000.0)."""
+    return isinstance(error, ArithmeticError) or "math domain" in str(error)

@@ -16,7 +16,7 @@ from typing import Any
 from quell import checks
 from quell.signals.base import Constant, Scaled, Signal, Sum, Switched, as_signal, seeded_apart
 from quell.signals.noise import BandLimitedNoise
-from quell.signals.shapes import Chirp, Ramp, Samples, Sinusoid, Step, Trapezoid
+from quell.signals.shapes import Chirp, Ramp, Samples, Sinusoid, SmoothMove, Step, Trapezoid
 
 __all__ = [
     "KINDS",
@@ -28,6 +28,7 @@ __all__ = [
     "Scaled",
     "Signal",
     "Sinusoid",
+    "SmoothMove",
     "Step",
     "Sum",
     "Switched",
@@ -44,6 +45,7 @@ KINDS: Mapping[str, type[Signal]] = {
     "sinusoid": Sinusoid,
     "chirp": Chirp,
     "trapezoid": Trapezoid,
+    "move": SmoothMove,
     "samples": Samples,
     "noise": BandLimitedNoise,
 }

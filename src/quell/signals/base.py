@@ -35,6 +35,19 @@ class Signal:
         """Return this signal with its noise, if it has any, drawn from ``seed``."""
         return self
 
+    def derivative(self) -> Signal:
+        """Return the signal's derivative in time, of which jumps are no part; a kind that has none says so.
+
+        Raises
+        ------
+        ValueError
+            for a signal whose derivative is not known in closed form.
+        """
+        raise ValueError(
+            f"reference has no derivative known in closed form, {type(self).__name__} has none: "
+            "take another signal, define derivative(), or put a prefilter before the controller"
+        )
+
     def until(self, time: float, then: Signal | float) -> Signal:
         """Return this signal before ``time`` [s] and ``then``, a signal or a number, from it on."""
         return Switched((checks.finite("time", time),), (self, as_signal(then, "then")))
@@ -74,6 +87,10 @@ class Constant(Signal):
         """Return ``value`` everywhere."""
         return np.full(t.shape, float(self.value))
 
+    def derivative(self) -> Signal:
+        """Return zero."""
+        return Constant(0.0)
+
 
 @dataclass(frozen=True)
 class Scaled(Signal):
@@ -85,6 +102,10 @@ class Scaled(Signal):
     def evaluate(self, t: Vector) -> Vector:
         """Return the scaled values."""
         return self.factor * self.signal(t)
+
+    def derivative(self) -> Signal:
+        """Scale the derivative."""
+        return replace(self, signal=self.signal.derivative())
 
     def seeded(self, seed: int) -> Signal:
         """Seed the signal inside."""
@@ -103,6 +124,10 @@ class Sum(Signal):
         for term in self.terms:
             total = total + term(t)
         return total
+
+    def derivative(self) -> Signal:
+        """Sum the derivatives."""
+        return replace(self, terms=tuple(term.derivative() for term in self.terms))
 
     def seeded(self, seed: int) -> Signal:
         """Seed every term, each with a stream of its own."""
@@ -136,6 +161,10 @@ class Switched(Signal):
             mine = which == i
             values[mine] = piece(t[mine])
         return values
+
+    def derivative(self) -> Signal:
+        """Take the derivative of each piece."""
+        return replace(self, pieces=tuple(piece.derivative() for piece in self.pieces))
 
     def seeded(self, seed: int) -> Signal:
         """Seed every piece, each with a stream of its own."""

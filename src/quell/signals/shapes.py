@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from quell import checks
-from quell.signals.base import EDGE, Signal, check_fields
+from quell.signals.base import EDGE, Constant, Signal, check_fields
 from quell.types import Vector
 
 
@@ -27,6 +27,10 @@ class Step(Signal):
         """Return the step."""
         return np.where(t >= self.at - EDGE, float(self.height), 0.0)
 
+    def derivative(self) -> Signal:
+        """Return zero."""
+        return Constant(0.0)
+
 
 @dataclass(frozen=True)
 class Ramp(Signal):
@@ -43,6 +47,11 @@ class Ramp(Signal):
     def evaluate(self, t: Vector) -> Vector:
         """Return the ramp."""
         return self.slope * (np.clip(t, self.start, self.stop) - self.start)
+
+    def derivative(self) -> Signal:
+        """Return the slope while it rises."""
+        rising = Step(self.slope, self.start)
+        return rising if math.isinf(self.stop) else rising - Step(self.slope, self.stop)
 
 
 @dataclass(frozen=True)
@@ -65,6 +74,10 @@ class Sinusoid(Signal):
             return np.zeros(t.shape)
         wave = self.amplitude * np.sin(self.omega * since + self.phase)
         return wave if started.all() else np.where(started, wave, 0.0)
+
+    def derivative(self) -> Signal:
+        """Return the sinusoid a quarter of a period ahead."""
+        return replace(self, amplitude=self.amplitude * self.omega, phase=self.phase + 0.5 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -135,6 +148,65 @@ class Trapezoid(Signal):
         braking = self.distance - 0.5 * cruise / ramp * left**2
         return np.where(since < ramp, speeding, np.where(left < ramp, braking, cruise * (since - 0.5 * ramp)))
 
+    def derivative(self) -> Signal:
+        """Return the speed: a trapezoid of two ramps."""
+        ramp, end = self._ramp, self.start + self.duration
+        acceleration = self.distance / (self.duration - ramp) / ramp
+        return Ramp(acceleration, self.start, self.start + ramp) - Ramp(acceleration, end - ramp, end)
+
+
+@dataclass(frozen=True)
+class SmoothMove(Signal):
+    """A move from 0 to ``distance`` along the polynomial whose first derivatives vanish at both ends, then held.
+
+    With σ = (t − start)/duration the position is ``distance · I_σ(m + 1, m + 1)``, the regularised incomplete beta function: its speed is
+    proportional to ``σ^m (1 − σ)^m``. For m = 2 that is the move of least jerk (Flash & Hogan, *J. Neuroscience* 5, 1985).
+
+    Parameters
+    ----------
+    distance
+        where the move ends [y-unit], of either sign.
+    duration
+        how long it takes [s].
+    smoothness
+        how many derivatives m are continuous, 1 to 12: feedforward for a plant of order n wants n.
+    start
+        when it begins [s].
+    order
+        which derivative of it this is; 0 is the move itself.
+    """
+
+    distance: float = 1.0
+    duration: float = 2.0
+    smoothness: int = 4
+    start: float = 0.0
+    order: int = 0
+
+    def __post_init__(self) -> None:
+        checks.finite("distance", self.distance)
+        checks.finite("start", self.start)
+        checks.positive("duration", self.duration, "s")
+        checks.whole("smoothness", self.smoothness, 1, 12)
+        checks.whole("order", self.order, 0)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the position along the move, or its derivative."""
+        m, sigma = self.smoothness, np.clip((t - self.start) / self.duration, 0.0, 1.0)
+        # The second half is the first one mirrored: the polynomial itself cancels badly near σ = 1.
+        back = sigma > 0.5
+        near = np.where(back, 1.0 - sigma, sigma)
+        speed = np.polynomial.Polynomial([math.comb(m, i) * (-1.0) ** i for i in range(m + 1)]) * np.polynomial.Polynomial.basis(m)
+        position = speed.integ()
+        value = position.deriv(self.order)(near) if self.order else position(near)
+        value = value / (position(0.5) * 2.0) * self.distance / self.duration**self.order
+        mirrored = self.distance - value if self.order == 0 else (-1.0) ** (self.order + 1) * value
+        inside = np.where(back, mirrored, value)
+        return inside if self.order == 0 else np.where((t >= self.start - EDGE) & (t < self.start + self.duration - EDGE), inside, 0.0)
+
+    def derivative(self) -> Signal:
+        """Return the next derivative."""
+        return replace(self, order=self.order + 1)
+
 
 @dataclass(frozen=True, eq=False)
 class Samples(Signal):
@@ -168,3 +240,10 @@ class Samples(Signal):
             return np.asarray(np.interp(t, self.times, self.values))
         index = np.searchsorted(self.times - EDGE, t, side="right") - 1
         return np.asarray(self.values[np.maximum(index, 0)])
+
+    def derivative(self) -> Signal:
+        """Return the slope between samples."""
+        if self.hold == "previous" or self.times.size < 2:
+            return Constant(0.0)
+        slopes = np.diff(self.values) / np.diff(self.times)
+        return Constant(0.0).until(self.times[0], then=Samples(self.times, np.append(slopes, 0.0), hold="previous"))

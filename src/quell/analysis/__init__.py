@@ -1,0 +1,27 @@
+"""Analysis of loops: poles, margins, sensitivity functions, what noise does; as systems of python-control, and as pictures."""
+
+from quell.analysis.advice import advise
+from quell.analysis.frozen import Frozen, frozen
+from quell.analysis.laws import linear_law
+from quell.analysis.loop import LoopAnalysis, analyse
+from quell.analysis.margins import Margins
+from quell.analysis.over_time import loops_over_omega_o, loops_over_time
+from quell.analysis.plots import plot_bode, plot_gang_of_four, plot_margins_against_omega_o, plot_margins_over_time
+from quell.controllers.unwise import Finding
+
+__all__ = [
+    "Finding",
+    "Frozen",
+    "LoopAnalysis",
+    "Margins",
+    "advise",
+    "analyse",
+    "frozen",
+    "linear_law",
+    "loops_over_omega_o",
+    "loops_over_time",
+    "plot_bode",
+    "plot_gang_of_four",
+    "plot_margins_against_omega_o",
+    "plot_margins_over_time",
+]

@@ -1,0 +1,142 @@
+"""What makes a loop unwise, with numbers: sampling, noise, lags, and too little margin."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from quell import checks
+from quell.analysis.loop import LoopAnalysis, analyse
+from quell.controllers.unwise import Finding, sampling_findings
+
+# RMS of u, as a share of its range: six standard deviations are then 30 % of it.
+_NOISE = 0.05
+# A chain of four integrators with omega_o = 10 omega_c has 0.41, with 3 omega_c 0.24.
+_LEAST_MODULUS = 0.3
+# What a lag may leave of the modulus margin.
+_LEFT = 0.8
+
+
+def advise(
+    controller: Any,
+    plant: Any = None,
+    *,
+    noise: float | None = None,
+    actuator_lag: float = 0.0,
+    delay: float = 0.0,
+    at: Any = None,
+) -> list[Finding]:
+    """Say what makes a design unwise, with the number, its limit, and what to do.
+
+    Parameters
+    ----------
+    controller
+        an ``ADRC``, or a linear controller.
+    plant
+        what it is to control, linear (see ``analyse``); by default the plant that an ADRC's observer assumes, which is kind to it.
+    noise
+        standard deviation of the measurement noise, taken for white [y-unit]. It is judged by what it does to u as a share of ``u_max −
+        u_min``; so a controller without limits is not judged.
+    actuator_lag
+        time constant of the actuator [s], where the plant does not have it.
+    delay
+        dead time of actuator, transport, calculation [s].
+    at
+        when the learner is frozen; see ``analyse``.
+
+    Returns
+    -------
+    list of Finding
+        in the order sampling, margin, lag, noise; empty where nothing was found.
+
+    Raises
+    ------
+    ValueError
+        as ``analyse``; without a plant for a controller that assumes none.
+    """
+    observer = getattr(controller, "observer", None)
+    if plant is None:
+        if observer is None:
+            raise ValueError("plant = None: this controller does not say which plant it is made for; give one")
+        plant = [observer.b0], [1.0, *observer.a[::-1]]
+    actuator_lag, delay = checks.non_negative("actuator_lag", actuator_lag, "s"), checks.non_negative("delay", delay, "s")
+    found = [] if observer is None else sampling_findings(observer, controller.omega_c)
+    loop = analyse(plant, controller, at=at)
+    if not loop.stable:
+        return [*found, _unstable(loop, "with this plant", "check b0, raise omega_o or lower omega_c")]
+    found += _judge_margin(loop, observer)
+    if actuator_lag > 0.0 or delay > 0.0:
+        late = analyse(plant, controller, at=at, delay=delay, actuator_lag=actuator_lag)
+        found += _judge_lag(loop, late, actuator_lag, delay)
+        loop = late
+    if noise is not None and loop.stable:
+        found += _judge_noise(loop, controller, checks.non_negative("noise", noise))
+    return found
+
+
+def _unstable(loop: LoopAnalysis, when: str, what_to_do: str) -> Finding:
+    size = float(max(abs(loop.poles)))
+    return Finding("stability", size, 1.0, f"the loop is unstable {when}, with a pole at |z| = {size:.6g}: {what_to_do}")
+
+
+def _judge_margin(loop: LoopAnalysis, observer: Any) -> list[Finding]:
+    margins = loop.margins
+    if margins.modulus >= _LEAST_MODULUS:
+        return []
+    what_to_do = "detune it" if observer is None else "raise omega_o (noise permitting) or lower omega_c"
+    return [
+        Finding(
+            *("margin", margins.modulus, _LEAST_MODULUS),
+            f"modulus margin {margins.modulus:.3g} is below {_LEAST_MODULUS:g} (phase margin {margins.phase:.1f}°, "
+            f"worst at {margins.modulus_omega:.3g} rad/s): {what_to_do}",
+        )
+    ]
+
+
+def _judge_lag(loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, delay: float) -> list[Finding]:
+    parts = (("an actuator lag", actuator_lag), ("a delay", delay))
+    cause = " and ".join(f"{what} of {1e3 * time:.3g} ms" for what, time in parts if time > 0.0)
+    if not late.stable:
+        return [
+            _unstable(
+                late,
+                f"with {cause}",
+                f"its delay margin is {1e3 * loop.margins.delay:.3g} ms; shorten it, or lower omega_o and omega_c together",
+            )
+        ]
+    before, after = loop.margins, late.margins
+    if after.modulus >= _LEFT * before.modulus:
+        return []
+    # An infinite phase margin, of a loop whose gain never is 1, has no angle to lose.
+    at = before.phase_omega
+    cost = math.degrees(math.atan(at * actuator_lag) + at * delay)
+    angle = "" if math.isnan(at) else f", {cost:.1f}° at the crossover of {at:.3g} rad/s,"
+    return [
+        Finding(
+            *("lag", after.modulus, _LEFT * before.modulus),
+            f"{cause}{angle} leaves a phase margin of {after.phase:.1f}° of {before.phase:.1f}°, a modulus margin of "
+            f"{after.modulus:.3g} of {before.modulus:.3g}: shorten it, let the controller know of it, "
+            "or lower omega_o and omega_c together",
+        )
+    ]
+
+
+def _judge_noise(loop: LoopAnalysis, controller: Any, noise: float) -> list[Finding]:
+    limits = getattr(controller.parameters, "limits", None)
+    u_range = math.inf if limits is None else limits.high - limits.low
+    rms = noise * loop.noise_to_control
+    share = rms / u_range
+    if share <= _NOISE:
+        return []
+    what_to_do = "lower the gains"
+    if hasattr(controller, "omega_c"):
+        # Noise in f̂ grows with the power n + 1/2 of omega_o.
+        lower = controller.observer.omega_o * (_NOISE / share) ** (1.0 / (controller.observer.order + 0.5))
+        what_to_do = f"lower omega_o to about {lower:.2g} rad/s, and omega_c with it, or measure better"
+    return [
+        Finding(
+            *("noise", share, _NOISE),
+            f"noise of {noise:.3g} RMS in y makes u move by {rms:.3g} RMS, {100.0 * share:.3g} % of its range of {u_range:.3g}; "
+            f"{100.0 * _NOISE:g} % is about what an actuator stands: {what_to_do}",
+        )
+    ]

@@ -1,0 +1,80 @@
+"""A loop at several instants of a run, and a design at several bandwidths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from quell import checks
+from quell.analysis.frozen import frozen
+from quell.analysis.loop import LoopAnalysis, analyse
+from quell.simulation import Scenario, simulate
+from quell.trajectory import Trajectory
+
+
+def loops_over_time(plant: Any, controller: Any, run: Any, times: Any, **lags: float) -> list[LoopAnalysis]:
+    """Analyse the loop with its learner frozen at several instants.
+
+    Each is the loop that there would be if nothing more were learned from then on. That all of them are stable does not prove the
+    stability of the loop that learns (docs/analysis).
+
+    Parameters
+    ----------
+    plant, controller
+        as for ``analyse``; ``plant`` has to be one that can be simulated where a scenario is given.
+    run
+        a ``Trajectory``, whose record says what the learner had found; or the ``Scenario`` of a run, which is simulated up to each time,
+        and does for every learner.
+    times
+        instants [s].
+    lags
+        ``delay`` and ``actuator_lag``, as for ``analyse``.
+
+    Returns
+    -------
+    list of LoopAnalysis
+        one for each instant.
+
+    Raises
+    ------
+    ValueError
+        as ``frozen`` and ``analyse``; for a time outside of the run, or a scenario in which the loop diverges before it.
+    """
+    instants = checks.vector("times", times)
+    if isinstance(run, Trajectory):
+        return [analyse(plant, controller, at=frozen(controller, run, t), **lags) for t in instants.tolist()]
+    if not isinstance(run, Scenario):
+        raise ValueError(f"run = {run!r}: must be a Trajectory or a Scenario")
+    loops = []
+    for t in instants.tolist():
+        if not 0.0 < t <= run.duration:
+            raise ValueError(f"times has {t!r}: must lie within (0, duration = {run.duration!r}] s")
+        until = replace(run, duration=t, rest_at=tuple(at for at in run.rest_at if at < t))
+        record = simulate(plant, controller, until, record_every=10**9)
+        if record.diverged:
+            raise ValueError(f"times has {t!r}: the loop diverged at {record.ended:.6g} s")
+        loops.append(analyse(plant, controller, at=record, **lags))
+    return loops
+
+
+def loops_over_omega_o(plant: Any, make_controller: Callable[[float], Any], omegas: Any, **lags: float) -> list[LoopAnalysis]:
+    """Analyse designs with several observer bandwidths.
+
+    Parameters
+    ----------
+    plant
+        as for ``analyse``.
+    make_controller
+        returns the controller for an omega_o [rad/s].
+    omegas
+        the bandwidths [rad/s].
+    lags
+        ``delay`` and ``actuator_lag``, as for ``analyse``.
+
+    Returns
+    -------
+    list of LoopAnalysis
+        one for each bandwidth.
+    """
+    return [analyse(plant, make_controller(omega_o), **lags) for omega_o in checks.positive_vector("omegas", omegas).tolist()]

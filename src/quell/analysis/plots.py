@@ -1,0 +1,174 @@
+"""Pictures of loops: Bode plot, gang of four, margins over time or bandwidth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.analysis.loop import LoopAnalysis
+from quell.analysis.over_time import loops_over_omega_o
+
+
+def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
+    """Draw gain and phase of the loop ``L = P C_y`` with its margins; return the axes.
+
+    The margins' numbers are written into a figure of its own only: beside a second loop they would lie on top of each other.
+
+    Parameters
+    ----------
+    loop
+        from ``analyse``.
+    axes
+        two matplotlib axes; a new figure by default.
+    style
+        of the lines, for example ``label``.
+    """
+    alone = axes is None
+    top, low = axes = _axes(axes, 2, 1)
+    # At half the sampling rate itself a sampled plant may have a zero, and no phase.
+    omega = loop.omega[:-1]
+    L = loop.response("L", omega)
+    phase = np.degrees(np.unwrap(np.angle(L)))
+    margins = loop.margins
+    crossing = margins.phase_omega if np.isfinite(margins.phase_omega) else omega[-1]
+    phase -= 360.0 * np.ceil(np.interp(crossing, omega, phase) / 360.0)
+    (line,) = top.loglog(omega, np.abs(L), **style)
+    low.semilogx(omega, phase, color=line.get_color())
+    top.axhline(1.0, color="0.5", linewidth=0.8)
+    low.axhline(-180.0, color="0.5", linewidth=0.8)
+    if np.isfinite(margins.phase_omega):
+        at = float(np.interp(margins.phase_omega, omega, phase))
+        low.vlines(margins.phase_omega, -180.0, at, color=line.get_color(), linewidth=2.5, alpha=0.6)
+        if alone:
+            low.annotate(f"{margins.phase:.0f}°", (margins.phase_omega, 0.5 * (at - 180.0)), xytext=(5, -3), textcoords="offset points")
+    for factor, at in zip(margins.gain, margins.gain_omega, strict=True):
+        if np.isfinite(at):
+            top.vlines(at, *sorted((1.0, 1.0 / factor)), color=line.get_color(), linewidth=2.5, alpha=0.6)
+            if alone:
+                top.annotate(f"{factor:.2g}", (at, factor**-0.5), xytext=(5, -3), textcoords="offset points")
+    _limit_ratio(top, np.abs(L))
+    low.set_ylim(max(float(np.min(phase)), -720.0) - 20.0, min(float(np.max(phase)), 180.0) + 20.0)
+    for ax, label in zip(axes, ("|L|", "phase of L [°]"), strict=True):
+        _finish(ax, loop, label)
+    low.set_xlabel("ω [rad/s]")
+    return axes
+
+
+def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
+    """Draw the sizes of S, T, PS (load to y) and CS (noise to u); return the four axes, in this order.
+
+    Parameters
+    ----------
+    loop
+        from ``analyse``.
+    axes
+        four matplotlib axes; a new figure by default.
+    style
+        of the lines, for example ``label``.
+    """
+    axes = _axes(axes, 2, 2)
+    for ax, name, meaning in zip(
+        axes, ("S", "T", "PS", "CS"), ("", "", ": load at the plant's input to y", ": measurement noise to u"), strict=True
+    ):
+        size = np.abs(loop.response(name, loop.omega))
+        ax.loglog(loop.omega, size, **style)
+        _limit_ratio(ax, size)
+        if name in ("S", "T"):
+            ax.axhline(1.0, color="0.5", linewidth=0.8)
+        ax.set_title(f"|{name}|{meaning}", fontsize="medium")
+        _finish(ax, loop, "")
+    for ax in axes[2:]:
+        ax.set_xlabel("ω [rad/s]")
+    return axes
+
+
+def plot_margins_over_time(times: Any, loops: Sequence[LoopAnalysis], axes: Any = None, **style: Any) -> Any:
+    """Draw the margins of the loop with its learner frozen at each instant; return the axes.
+
+    Parameters
+    ----------
+    times
+        instants [s].
+    loops
+        one for each, from ``loops_over_time``.
+    axes
+        three matplotlib axes; a new figure by default.
+    style
+        of the lines.
+    """
+    axes = _plot_margins(checks.vector("times", times), loops, axes, style)
+    axes[-1].set_xlabel("learner frozen at [s]")
+    return axes
+
+
+def plot_margins_against_omega_o(plant: Any, make_controller: Callable[[float], Any], omegas: Any, axes: Any = None, **lags: float) -> Any:
+    """Draw the margins, and what noise does to u, over the observer's bandwidth; return the axes.
+
+    Parameters
+    ----------
+    plant, make_controller, omegas, lags
+        as for ``loops_over_omega_o``.
+    axes
+        four matplotlib axes; a new figure by default.
+    """
+    loops = loops_over_omega_o(plant, make_controller, omegas, **lags)
+    omegas = checks.vector("omegas", omegas)
+    axes = _axes(axes, 4, 1)
+    _plot_margins(omegas, loops, axes[:3], {})
+    axes[3].loglog(omegas, [loop.noise_to_control if loop.stable else np.nan for loop in loops])
+    axes[3].set_ylabel("RMS of u per\nRMS of noise")
+    axes[3].grid(alpha=0.3)
+    for ax in axes:
+        ax.set_xscale("log")
+    axes[3].set_xlabel("omega_o [rad/s]")
+    return axes
+
+
+def _plot_margins(x: Any, loops: Sequence[LoopAnalysis], axes: Any, style: dict[str, Any]) -> Any:
+    if len(x) != len(loops):
+        raise ValueError(f"loops has {len(loops)} entries: must have one for each of the {len(x)} abscissae")
+    axes = _axes(axes, 3, 1)
+    modulus, disk, phase = (np.array([getattr(loop.margins, name) for loop in loops]) for name in ("modulus", "disk", "phase"))
+    axes[0].plot(x, modulus, **({"label": "modulus margin"} | style))
+    axes[0].plot(x, disk, **({"label": "disk margin"} | style))
+    axes[0].set_ylim(0.0, None)
+    axes[1].plot(x, phase, **style)
+    axes[1].set_ylim(0.0, None)
+    low, high = np.array([loop.b_range if loop.stable else (np.nan, np.nan) for loop in loops]).T
+    axes[2].fill_between(x, np.maximum(low, 1e-3), np.minimum(high, 1e3), alpha=0.3, **style)
+    axes[2].set_yscale("log")
+    axes[2].axhline(1.0, color="0.5", linewidth=0.8)
+    for ax, label in zip(axes, ("margin", "phase margin [°]", "b/b0 for which\nit is stable"), strict=True):
+        ax.set_ylabel(label)
+        ax.grid(alpha=0.3)
+    axes[0].legend(fontsize="small")
+    return axes
+
+
+def _axes(axes: Any, rows: int, columns: int) -> Any:
+    """Return the axes as a list, in a new figure where there are none."""
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        size = (4.0 * columns if columns > 1 else 7.0, 2.4 * rows if rows < 4 else 1.9 * rows)
+        _, axes = plt.subplots(rows, columns, sharex=True, figsize=size, layout="constrained")
+    axes = list(np.ravel(axes))
+    if len(axes) != rows * columns:
+        raise ValueError(f"axes: must be {rows * columns} matplotlib axes, got {len(axes)}")
+    return axes
+
+
+def _limit_ratio(ax: Any, size: Any) -> None:
+    """Leave out what is more than six decades off: poles on the axis and zeros of a size."""
+    finite = size[np.isfinite(size) & (size > 0.0)]
+    middle = float(np.median(finite))
+    ax.set_ylim(max(0.5 * float(np.min(finite)), 1e-6 * middle), min(2.0 * float(np.max(finite)), 1e6 * middle))
+
+
+def _finish(ax: Any, loop: LoopAnalysis, label: str) -> None:
+    ax.axvline(np.pi / loop.dt, color="0.7", linestyle=":", linewidth=1.0)
+    ax.set_ylabel(label)
+    ax.grid(alpha=0.3)

@@ -1,0 +1,77 @@
+"""Frequency responses of sampled systems, and the frequencies at which to look.
+
+No polynomial is ever formed: poles of an observer lie on top of each other close to z = 1, where the roots of a polynomial of degree 5
+move by the fifth root of its rounding. A response is a linear solve, ``C (ζI − N)⁻¹ B + D`` with ``ζ = e^(jω dt) − 1`` and ``N = A − I``,
+so that what is slow is not the difference of two numbers near one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.types import Matrix, Vector
+
+Complex = NDArray[np.complex128]
+
+_PER_DECADE = 60
+# Beside a pole, in units of its damping; beside one without damping, in units of its frequency.
+_BESIDE = np.array([0.0, 0.1, 0.3, 1.0, 3.0])
+_UNDAMPED = np.logspace(-6.0, -1.0, 11)
+
+
+class System(NamedTuple):
+    """``x⁺ − x = N x + B u``, ``y = C x + D u``; one input, one output."""
+
+    N: Matrix
+    B: Vector
+    C: Vector
+    D: float
+
+    @classmethod
+    def balanced(cls, N: Matrix, B: Vector, C: Vector, D: float) -> System:
+        """Return the system with states scaled by powers of two to one size, which is exact."""
+        from scipy.linalg import matrix_balance
+
+        if N.shape[0] == 0:
+            return cls(N, B, C, D)
+        scaled, (scale, _) = matrix_balance(N, permute=False, separate=True)
+        return cls(scaled, B / scale, C * scale, D)
+
+
+def response(system: System, omega: Any, dt: float) -> Complex:
+    """Return the response (k,) at the frequencies ``omega`` (k,) [rad/s]."""
+    zeta = np.expm1(1j * np.atleast_1d(omega) * dt)
+    if system.N.shape[0] == 0:
+        return np.full(zeta.shape, complex(system.D))
+    resolvent = zeta[:, None, None] * np.eye(system.N.shape[0]) - system.N
+    solved = np.linalg.solve(resolvent, np.broadcast_to(system.B[:, None], (zeta.size, system.B.size, 1)))
+    return np.asarray(solved[:, :, 0] @ system.C + system.D, dtype=np.complex128)
+
+
+def in_s_plane(shifted: Complex, dt: float) -> Complex:
+    """Return ``log(z)/dt`` for poles given as z − 1; a pole at z = 0, a sample of memory, is at −inf."""
+    with np.errstate(divide="ignore"):
+        size = np.where(np.abs(1.0 + shifted) < 1e-7, -np.inf, 0.5 * np.log1p(2.0 * shifted.real + np.abs(shifted) ** 2))
+    angle = np.where(np.isinf(size), 0.0, np.angle(1.0 + shifted))
+    s: Complex = size / dt + 1j * (angle / dt)
+    return s
+
+
+def frequencies(poles: Complex, dt: float) -> Vector:
+    """Return frequencies [rad/s] up to half the sampling rate, dense where the poles (in the s-plane) are."""
+    top = math.pi / dt
+    size = np.abs(poles)
+    finite = size[(size > 1e-9 * top) & (size < top)]
+    bottom = 1e-2 * float(np.min(finite, initial=0.1 * top))
+    grid = [np.geomspace(bottom, top, math.ceil(_PER_DECADE * math.log10(top / bottom)) + 1)]
+    for pole in poles[np.isfinite(poles) & (poles.imag > 0.0)]:
+        center, damping = pole.imag, abs(pole.real)
+        away = damping * _BESIDE if damping > 1e-6 * center else center * _UNDAMPED
+        grid += [center - away, center + away]
+    omega = np.unique(np.concatenate(grid))
+    kept: Vector = omega[(omega >= bottom) & (omega <= top)]
+    return kept

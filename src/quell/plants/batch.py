@@ -1,0 +1,137 @@
+"""Many plants of one kind."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.plants.base import Plant
+
+
+class PlantBatch(Sequence[Plant]):
+    """Plants of one kind, order and number of disturbances: ``len(batch)`` of them, ``batch[i]`` is one, ``batch[i:j]`` a batch again.
+
+    Parameters
+    ----------
+    plants
+        at least one.
+    parameters
+        by name, in which they differ: arrays (runs,).
+
+    Raises
+    ------
+    ValueError
+        where one is no plant, or is of another kind, order or number of disturbances than the first; the message says which.
+    """
+
+    def __init__(self, plants: Sequence[Plant], parameters: Mapping[str, Any] | None = None) -> None:
+        self._plants = tuple(plants)
+        if not self._plants:
+            raise ValueError("plants has no entries: a batch must hold at least one plant")
+        for i, plant in enumerate(self._plants):
+            if isinstance(plant, type) or not hasattr(plant, "sampled"):
+                raise ValueError(f"plant[{i}] = {plant!r}: must be a plant, for example quell.plants.two_mass_spring()")
+            for what, (mine, first) in {
+                "kind": (type(plant).__name__, type(self._plants[0]).__name__),
+                "order": (plant.order, self._plants[0].order),
+                "disturbances": (plant.disturbances, self._plants[0].disturbances),
+            }.items():
+                if mine != first:
+                    raise ValueError(f"plant[{i}] has {what} {mine}, plant[0] {first}: must be the same; run them as two batches")
+        arrays = {name: np.array(values) for name, values in (parameters or {}).items()}
+        for name, array in arrays.items():
+            if array.shape != (len(self._plants),):
+                raise ValueError(f"parameters[{name!r}] has shape {array.shape}: must be ({len(self._plants)},), one value for each plant")
+            array.flags.writeable = False
+        self.parameters: Mapping[str, NDArray[Any]] = MappingProxyType(arrays)
+
+    @property
+    def name(self) -> str:
+        """Their name, where it is the same."""
+        return self._plants[0].name if len({plant.name for plant in self._plants}) == 1 else f"{len(self)} plants"
+
+    @property
+    def order(self) -> int:
+        """Number of states of each."""
+        return self._plants[0].order
+
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbance inputs of each."""
+        return self._plants[0].disturbances
+
+    def __len__(self) -> int:
+        return len(self._plants)
+
+    @overload
+    def __getitem__(self, which: int) -> Plant: ...
+    @overload
+    def __getitem__(self, which: slice) -> PlantBatch: ...
+    def __getitem__(self, which: int | slice) -> Plant | PlantBatch:
+        if isinstance(which, slice):
+            return PlantBatch(self._plants[which], {name: values[which] for name, values in self.parameters.items()})
+        return self._plants[which]
+
+
+def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
+    """Return a plant for each entry of the parameters' arrays.
+
+    Parameters
+    ----------
+    factory
+        makes one plant of numbers, for example ``quell.plants.two_mass_spring``; what is not a number belongs into a ``functools.partial``.
+        A factory that makes a new function for each ``NonlinearPlant`` has each compiled.
+    parameters
+        numbers or vectors (runs,), broadcast against each other.
+
+    Raises
+    ------
+    ValueError
+        for vectors that do not have the same length, a parameter that the factory does not know, and a plant that it refuses: the message
+        says which run.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quell.plants import two_mass_spring
+    >>> plants = batch(two_mass_spring, m1=np.linspace(0.5, 2.0, 4), k=1.0)
+    >>> len(plants), plants.parameters["m1"][3]
+    (4, np.float64(2.0))
+    """
+    arrays = {name: _numbers(name, value) for name, value in parameters.items()}
+    lengths = {name: array.size for name, array in arrays.items() if array.ndim}
+    runs = max(lengths.values(), default=1)
+    for name, length in lengths.items():
+        if length not in (1, runs) or length == 0:
+            longest = max(lengths, key=lambda name: lengths[name])
+            raise ValueError(f"{name} has {length} entries, {longest} {runs}: must be numbers or vectors of one length, at least 1")
+    whole = {name: np.broadcast_to(array, (runs,)) for name, array in arrays.items()}
+    columns = {name: values.tolist() for name, values in whole.items()}
+    try:
+        inspect.signature(factory).bind(**columns)
+    except TypeError as error:
+        raise ValueError(f"parameters = {', '.join(parameters) or 'none'}: the factory can't be called with them: {error}") from None
+    plants = []
+    for i in range(runs):
+        try:
+            plants.append(factory(**{name: values[i] for name, values in columns.items()}))
+        except ValueError as error:
+            raise ValueError(f"run {i}: {error}") from error
+    return PlantBatch(plants, whole)
+
+
+def _numbers(name: str, value: Any) -> NDArray[Any]:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # ragged
+        array = np.empty((), dtype=object)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name}: must be a number or a vector of numbers, one for each run, got {value!r:.60}")
+    if array.ndim > 1:
+        raise ValueError(f"{name} has shape {array.shape}: must be a number or a vector of numbers, one for each run")
+    return array

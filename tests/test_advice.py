@@ -1,0 +1,147 @@
+"""Advice on designs: sampling, noise, lags; and the bandwidth for a settling time."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell import analysis
+from quell.controllers import warn_if_unwise
+from quell.controllers.unwise import sampling_findings
+
+
+def adrc(omega_o: float, omega_c: float, dt: float, order: int = 2, form: str = "current", **limits: float) -> ql.ADRC:
+    """Return a controller for b0/s^n."""
+    return ql.ADRC(ql.ESO.model_free(order=order, b0=1.0, omega_o=omega_o, dt=dt, form=form), omega_c=omega_c, **limits)
+
+
+def ideal(order: int) -> tuple[list[float], list[float]]:
+    """Return the plant that the observer assumes."""
+    return [1.0], [1.0, *[0.0] * order]
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize(("form", "limit"), [("current", 1.0), ("predictor", 0.3)])
+def test_the_limit_of_sampling_is_where_it_costs_a_sixth_of_the_margin(order: int, form: str, limit: float) -> None:
+    """At the limit 5 to 17 % of the modulus margin are lost; at twice the limit twice as much and more."""
+    for ratio in (3.0, 10.0):
+        fast, at_limit, beyond = (
+            analysis.analyse(ideal(order), adrc(x / 1e-3, x / 1e-3 / ratio, 1e-3, order, form)).margins.modulus
+            for x in (0.01, limit, 2.0 * limit)
+        )
+        assert 0.05 < 1.0 - at_limit / fast < 0.17
+        assert 1.0 - beyond / fast > 1.8 * (1.0 - at_limit / fast)
+
+
+def test_beyond_the_law_s_limit_loops_are_lost() -> None:
+    """With omega_o = omega_c, chains of 3 and 4 integrators are stable at ``omega_c dt = 0.5``, and not at 0.7."""
+    for order in (3, 4):
+        for form in ("current", "predictor"):
+            for x, stable in ((0.5, True), (0.7, False)):
+                assert analysis.analyse(ideal(order), adrc(x / 0.01, x / 0.01, 0.01, order, form)).stable is stable
+
+
+def test_a_slow_sample_time_is_warned_of_with_its_number() -> None:
+    """On behalf of whoever designs; a good design passes in silence."""
+
+    def design(observer: ql.ESO, omega_c: float) -> None:
+        warn_if_unwise(observer, omega_c)
+
+    with pytest.warns(ql.DesignWarning, match=r"omega_o \* dt = 1\.4 is above 1.*0\.00714 s or faster.*to 100 rad/s") as caught:
+        design(adrc(140.0, 10.0, 0.01).observer, 10.0)
+    assert caught[0].filename == __file__
+    with pytest.warns(ql.DesignWarning, match=r"omega_o \* dt = 0\.5 is above 0\.3.*take the current form"):
+        design(adrc(50.0, 10.0, 0.01, form="predictor").observer, 10.0)
+    with pytest.warns(ql.DesignWarning, match=r"omega_c \* dt = 0\.6 is above 0\.5"):
+        design(adrc(90.0, 60.0, 0.01).observer, 60.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        design(adrc(100.0, 10.0, 0.01).observer, 10.0)
+    assert sampling_findings(adrc(30.0, 10.0, 0.01, form="predictor").observer, 10.0) == []
+
+
+def test_noise_is_judged_by_the_range_of_u() -> None:
+    """By the RMS that a simulation shows; the omega_o it names passes, and without a range there is nothing to judge by."""
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
+    controller = adrc(40.0, 4.0, 1e-3, u_min=-2.0, u_max=2.0)
+    (finding,) = analysis.advise(controller, noise=1e-3)
+    noise = 1e-3 * np.random.default_rng(1).normal(size=40_001)
+    run = ql.simulate(plant, controller, ql.Scenario(noise=ql.signals.Samples(np.arange(noise.size) * 1e-3, noise), duration=40.0))
+    assert finding.subject == "noise"
+    assert finding.value == pytest.approx(np.std(run["u"][2000:]) / 4.0, rel=0.05)
+    assert finding.value > finding.limit
+    lower = float(str(finding).split("lower omega_o to about ")[1].split()[0])
+    assert analysis.advise(adrc(0.98 * lower, 0.098 * lower, 1e-3, u_min=-2.0, u_max=2.0), noise=1e-3) == []
+    assert analysis.advise(adrc(40.0, 4.0, 1e-3), noise=1e-3) == []
+
+
+def test_a_lag_is_judged_by_what_it_leaves_of_the_margins() -> None:
+    """With the loop's own numbers: before, after, and the angle at the crossover."""
+    controller = adrc(40.0, 4.0, 1e-3)
+    assert analysis.advise(controller, actuator_lag=1e-3) == []
+    (finding,) = analysis.advise(controller, actuator_lag=0.02)
+    before, after = (analysis.analyse(ideal(2), controller, actuator_lag=lag).margins for lag in (0.0, 0.02))
+    assert finding.subject == "lag"
+    assert (finding.value, finding.limit) == pytest.approx((after.modulus, 0.8 * before.modulus))
+    cost = math.degrees(math.atan(0.02 * before.phase_omega))
+    assert f"an actuator lag of 20 ms, {cost:.1f}° at the crossover of {before.phase_omega:.3g} rad/s, leaves" in str(finding)
+    assert f"a phase margin of {after.phase:.1f}° of {before.phase:.1f}°" in str(finding)
+
+
+def test_a_delay_beyond_the_delay_margin_is_a_lost_loop() -> None:
+    """And is said with the margin."""
+    controller = adrc(40.0, 4.0, 1e-3)
+    margin = analysis.analyse(ideal(2), controller).margins.delay
+    (finding,) = analysis.advise(controller, delay=1.1 * margin)
+    assert finding.subject == "stability"
+    assert finding.value > 1.0
+    assert f"its delay margin is {1e3 * margin:.3g} ms" in str(finding)
+
+
+def test_a_thin_margin_and_a_lost_loop_are_found_with_the_true_plant() -> None:
+    """The plant that the observer assumes is kind to it; another gain is not."""
+    controller = adrc(20.0, 4.0, 1e-3)
+    assert analysis.advise(controller) == []
+    findings = [analysis.advise(controller, ([gain], [1.0, 0.0, 0.0])) for gain in (5.0, -1.0)]
+    assert [finding.subject for found in findings for finding in found] == ["margin", "stability"]
+    with pytest.raises(ValueError, match="does not say which plant"):
+        analysis.advise(SimpleNamespace(law=None, dt=0.1))
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 8])
+def test_the_ideal_loop_settles_when_asked(order: int) -> None:
+    """The step response of ``omega_c^n/(s + omega_c)^n``, summed, enters the band at that time."""
+    for band in (0.02, 0.002):
+        x = ql.omega_c_for(3.0, order, band) * 3.0
+        left = math.exp(-x) * sum(x**k / math.factorial(k) for k in range(order))
+        assert left == pytest.approx(band, rel=1e-9)
+
+
+def test_herbst_s_rules_are_rounded_up() -> None:
+    """4/T and 6/T for orders 1 and 2 and a band of 2 %."""
+    for order, rule in ((1, 4.0), (2, 6.0)):
+        assert 0.97 * rule < ql.omega_c_for(1.0, order) < rule
+
+
+def test_a_loop_with_a_model_and_a_fast_observer_settles_when_asked() -> None:
+    """To 1 %, for a plant of order 3."""
+    plant = ql.plants.LinearPlant([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, -2.0, -1.5]], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    controller = ql.ADRC(ql.ESO.model_based(plant, omega_o=60.0, dt=1e-3), ql.omega_c_for(4.0, 3))
+    run = ql.simulate(plant, controller, ql.Scenario(reference=1.0, duration=10.0))
+    assert run.metrics(target=1.0, band=0.02)["settling_time"] == pytest.approx(4.0, rel=0.01)
+
+
+def test_a_wish_that_can_not_be_met_is_said_in_a_line() -> None:
+    """By argument, value and rule."""
+    for arguments, message in (
+        ((0.0, 2), "settling_time = 0.0: must be finite and greater than zero"),
+        ((1.0, 0), "order = 0: must be a whole number of at least 1"),
+        ((1.0, 2, 1.0), "band = 1.0: must be below 1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ql.omega_c_for(*arguments)

@@ -1,0 +1,257 @@
+"""Starting under load, manual operation, retuning while running, increments, derivatives of the reference."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.observers.eso import ESO
+from quell.plants.base import advance, measure
+
+DT = 0.01
+OBSERVER = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=DT)
+PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0])
+LOAD = -3.0  # enters as u does
+
+
+class Rig:
+    """A plant under a constant load, sample by sample."""
+
+    def __init__(self, x: tuple[float, float] = (0.0, 0.0)) -> None:
+        self.model, self.x, self.scratch = PLANT.sampled(DT), np.array(x), np.zeros(12)
+
+    @property
+    def y(self) -> float:
+        """The measurement."""
+        return measure(self.model, self.x)
+
+    def apply(self, u: float) -> None:
+        """Hold ``u`` for a sample."""
+        advance(self.model, self.x, self.scratch, 0.0, u, np.array([LOAD]))
+
+
+def test_a_start_under_load_makes_no_bump() -> None:
+    """At rest at y with the u that holds it: u stays what it is, to rounding; a cold start drops the load by far."""
+    y, u = 0.5, 0.5 / 2.0 - LOAD  # -y + 2 (u + load) = 0
+    worst = {}
+    for name in ("start", "cold"):
+        rig, controller = Rig((y, 0.0)), ql.ADRC(OBSERVER, omega_c=3.0)
+        if name == "start":
+            controller.start(y, u)
+        moved = 0.0
+        for _ in range(300):
+            rig.apply(controller.step(y, rig.y))
+            moved = max(moved, abs(rig.y - y))
+        worst[name] = moved
+    assert worst["start"] < 1e-12
+    assert worst["cold"] > 0.1
+
+
+def test_a_start_towards_another_reference_goes_on_from_u() -> None:
+    """The first u is the old one to first order in dt, and the move still arrives."""
+    rig, controller = Rig((0.5, 0.0)), ql.ADRC(OBSERVER, omega_c=3.0)
+    controller.start(0.5, 3.25, r=1.0)
+    first = controller.step(1.0, rig.y)
+    assert first == pytest.approx(3.25, abs=0.1)
+    cold = ql.ADRC(OBSERVER, omega_c=3.0)
+    assert abs(cold.step(1.0, rig.y) - 3.25) > 0.9
+    rig.apply(first)
+    for _ in range(600):
+        rig.apply(controller.step(1.0, rig.y))
+    assert rig.y == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_start_keeps_what_was_learned_and_still_makes_no_bump() -> None:
+    """The learner's share of f and the observer's add up to what holds u."""
+    rig, controller = Rig(), ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman())
+    for k in range(3000):
+        rig.apply(controller.step(math.sin(0.01 * k), rig.y))
+    learned = controller.estimate.theta
+    rig = Rig((0.5, 0.0))
+    controller.start(0.5, 3.25)
+    assert controller.estimate.theta["x1"] == pytest.approx(learned["x1"], rel=1e-6)
+    assert abs(controller.estimate.f_learned) > 0.1
+    for _ in range(100):
+        rig.apply(controller.step(0.5, rig.y))
+        assert rig.y == pytest.approx(0.5, abs=2e-3)
+
+
+def test_manual_operation_and_back_makes_no_bump() -> None:
+    """While somebody else applies u the observer follows; the controller goes on from the last manual u, and arrives."""
+    rig, controller = Rig(), ql.ADRC(OBSERVER, omega_c=3.0, u_min=-20.0, u_max=20.0)
+    wished = 0.0
+    for k in range(500):
+        u = 3.0 + 0.4 * math.sin(0.02 * k)
+        wished = controller.track(1.0, rig.y, u)
+        assert controller.estimate.u == u
+        rig.apply(u)
+    assert controller.estimate.f == pytest.approx(2.0 * LOAD - controller.estimate.x[0] - 0.6 * controller.estimate.x[1], abs=0.05)
+    bumpy = copy.deepcopy(controller)
+    jump = abs(bumpy.step(1.0, rig.y) - u)
+    assert jump > 1.0
+    assert wished == pytest.approx(bumpy.estimate.u, abs=0.2)
+    controller.hand_over()
+    first = controller.step(1.0, rig.y)
+    assert abs(first - u) < 0.1 * jump
+    rig.apply(first)
+    for _ in range(600):
+        rig.apply(controller.step(1.0, rig.y))
+    assert rig.y == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("learner", [None, ql.learners.Kalman()])
+def test_retuning_while_running_makes_no_bump(learner: object) -> None:
+    """In the middle of a move: u goes on, where a controller with the new gains from the same state would jump; the move arrives."""
+    rig, controller = Rig(), ql.ADRC(OBSERVER, omega_c=2.0, learner=learner)
+    for _ in range(60):
+        u = controller.step(1.0, rig.y)
+        rig.apply(u)
+    before = controller.estimate.u
+    rough = copy.deepcopy(controller)
+    rough.retune(omega_c=6.0)
+    rough.state = controller.state  # the old f̂ under the new gains
+    assert abs(rough.step(1.0, rig.y) - before) > 1.0
+    controller.retune(omega_c=6.0, observer=ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT))
+    first = controller.step(1.0, rig.y)
+    assert abs(first - before) < 0.25
+    assert controller.omega_c == 6.0
+    rig.apply(first)
+    for _ in range(400):
+        rig.apply(controller.step(1.0, rig.y))
+    assert rig.y == pytest.approx(1.0, abs=1e-3)
+
+
+def test_another_nominal_gain_changes_nothing_at_rest() -> None:
+    """F is by definition what b0 u leaves: with b0 the estimate changes, u does not."""
+    rig, controller = Rig((0.5, 0.0)), ql.ADRC(OBSERVER, omega_c=3.0)
+    controller.start(0.5, 3.25)
+    for b0 in (1.0, 3.0, 2.0):
+        controller.retune(observer=ESO.model_free(order=2, b0=b0, omega_o=20.0, dt=DT))
+        for _ in range(50):
+            rig.apply(controller.step(0.5, rig.y))
+            assert rig.y == pytest.approx(0.5, abs=1e-11)
+        assert controller.estimate.f == pytest.approx(-b0 * 3.25, abs=1e-9)
+
+
+def test_a_model_that_comes_later_changes_nothing_at_rest() -> None:
+    """From model-free to model-based and back: part of f becomes the model's."""
+    rig, controller = Rig((0.5, 0.0)), ql.ADRC(OBSERVER, omega_c=3.0)
+    controller.start(0.5, 3.25)
+    for observer, f in ((ESO.model_based(PLANT, omega_o=20.0, dt=DT), 2.0 * LOAD), (OBSERVER, 2.0 * LOAD - 0.5)):
+        controller.retune(observer=observer)
+        for _ in range(50):
+            rig.apply(controller.step(0.5, rig.y))
+            assert rig.y == pytest.approx(0.5, abs=1e-11)
+        assert controller.estimate.f == pytest.approx(f, abs=1e-9)
+
+
+def test_retuning_does_not_compile_again() -> None:
+    """The types stay, so the step stays."""
+    from quell.controllers.handle import bound_control
+
+    controller = ql.ADRC(OBSERVER, omega_c=2.0)
+    controller.step(1.0, 0.0)
+    count = len(bound_control.signatures)
+    controller.retune(omega_c=3.0)
+    controller.step(1.0, 0.0)
+    assert len(bound_control.signatures) == count
+
+
+def test_increments_add_up_to_the_control_signal() -> None:
+    """Limits included; they are those of ``step``."""
+    limited = {"u_min": -1.0, "u_max": 3.5, "rate_limit": 20.0}
+    one, other = (ql.ADRC(OBSERVER, omega_c=3.0, **limited) for _ in range(2))
+    total, rig = 0.0, Rig()
+    for k in range(800):
+        r = float(k > 100)
+        total += one.increment(r, rig.y)
+        assert total == pytest.approx(other.step(r, rig.y), abs=1e-12)
+        rig.apply(total)
+
+
+def test_increments_need_not_know_where_the_actuator_is() -> None:
+    """An unknown offset is one more disturbance: started at y, the loop stays where it is."""
+    rig, controller, actuator = Rig((0.5, 0.0)), ql.ADRC(OBSERVER, omega_c=3.0), 3.25
+    controller.start(0.5)
+    for _ in range(200):
+        actuator += controller.increment(0.5, rig.y)
+        rig.apply(actuator)
+        assert rig.y == pytest.approx(0.5, abs=1e-11)
+
+
+def test_an_actuator_that_did_otherwise_is_believed() -> None:
+    """A limit that only the drive knows: told of it, the loop behaves as if the limit were its own; untold, it winds up."""
+    ends = {}
+    for name in ("own", "told", "untold"):
+        rig = Rig()
+        controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman(u=True), u_max=3.6 if name == "own" else math.inf)
+        ys = []
+        for k in range(700):
+            u = controller.step(2.0 if k < 400 else 0.4, rig.y)
+            applied = min(u, 3.6)
+            if name == "told":
+                controller.applied(applied)
+            rig.apply(applied)
+            ys.append(rig.y)
+        ends[name] = np.array(ys)
+    np.testing.assert_allclose(ends["told"], ends["own"], atol=1e-9)
+    assert np.max(np.abs(ends["untold"] - ends["own"])) > 0.01
+
+
+def test_the_reference_fed_forward_is_followed_without_lag() -> None:
+    """Y = r up to the observer's error, where the lag without derivatives is 2/omega_c."""
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0])
+    observer = ESO.model_based(plant, omega_o=40.0, dt=1e-3)
+    scenario = ql.Scenario(reference=ql.signals.SmoothMove(distance=1.0, duration=2.0, smoothness=3), duration=4.0)
+    errors = []
+    for feedforward in (False, True):
+        run = ql.simulate(plant, ql.ADRC(observer, omega_c=3.0, feedforward=feedforward), scenario)
+        errors.append(np.max(np.abs(run["y"] - run["r"])))
+    assert errors[0] > 0.3
+    assert errors[1] < 2e-3
+
+
+def test_derivatives_reach_a_loop_of_ones_own() -> None:
+    """``step(r, y, v, a)`` is what ``simulate`` does with the signal's derivatives."""
+    move = ql.signals.SmoothMove(distance=1.0, duration=2.0)
+    controller = ql.ADRC(OBSERVER, omega_c=3.0, feedforward=True)
+    run = ql.simulate(PLANT, controller, ql.Scenario(reference=move, duration=3.0))
+    speed, acceleration = move.derivative(), move.derivative().derivative()
+    u = [controller.step(r, y, v, a) for r, y, v, a in zip(run["r"], run["y"], speed(run.t), acceleration(run.t), strict=True)]
+    np.testing.assert_allclose(u, run["u"], atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda c: c.start(math.nan), "y = nan: must be a finite number"),
+        (lambda c: c.track(1.0, 0.0, math.inf), "u = inf: must be a finite number"),
+        (lambda c: c.applied(math.nan), "u = nan: must be a finite number"),
+        (lambda c: c.hand_over(), "hand_over: there was no sample yet"),
+        (lambda c: c.retune(omega_c=0.0), "omega_c = 0.0: must be finite and greater than zero"),
+        (lambda c: c.retune(observer=ESO.model_free(3, 1.0, 20.0, DT)), "observer has order = 3, the present one 2"),
+        (lambda c: c.retune(observer=ESO.model_free(2, 2.0, 20.0, 0.02)), "observer has dt = 0.02, the present one 0.01"),
+        (lambda c: c.retune(observer="eso"), "observer = 'eso': must be an ESO"),
+        (lambda c: c.step(1.0, 0.0, 1.0), "step was given 1 derivatives of the reference: make the controller with feedforward=True"),
+    ],
+)
+def test_a_mistake_is_named_and_changes_nothing(make: object, message: str) -> None:
+    """With the argument, its value and the rule."""
+    controller = ql.ADRC(OBSERVER, omega_c=3.0)
+    before = controller.state
+    with pytest.raises(ValueError, match=message):
+        make(controller)  # type: ignore[operator]
+    for name, array in controller.state.items():
+        np.testing.assert_array_equal(array, before[name])
+    assert controller.omega_c == 3.0
+
+
+def test_what_was_learned_forbids_another_nominal_gain() -> None:
+    """Its coefficients refer to the old one."""
+    controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman())
+    with pytest.raises(ValueError, match="what was learned refers to that"):
+        controller.retune(observer=ESO.model_free(2, 1.0, 20.0, DT))
