@@ -17,7 +17,7 @@ from quell.dispatch import compiled, for_types, interpreted
 from quell.driver import run_block
 from quell.learners.base import adapt, coefficients, commit, predict
 from quell.observers.base import begin, observe
-from quell.observers.discretize import zero_order_hold
+from quell.observers.delay import without_delay
 from quell.plants.base import advance, measure
 
 from .examples import CHAIN, LEARNERS, OBSERVERS, PLANTS, PYTHON_LEARNERS
@@ -93,17 +93,14 @@ def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state
     observer = OBSERVERS[name]
     size, model = observer.order + 1, observer.model
     before = copy.deepcopy(model)
-    A, B = np.diag(np.ones(size - 1), 1), np.zeros((size, 1))
-    A[-2, :-1] -= observer.a
-    B[-2] = observer.b0
-    transition, (input_vector,) = zero_order_hold(A, [B], observer.dt)
+    extended = without_delay(model)
     f, u = 0.7, 0.4
     truth = np.zeros(size)
     truth[-1] = f
     z, seen = np.zeros(observer.states), np.zeros(size)
     begin(model, z, seen, 0.0)
     for _ in range(1500):
-        truth = transition @ truth + input_vector[:, 0] * u
+        truth = extended.transition @ truth + extended.input * u
         observe(model, z, seen, truth[0], u, 0.0)
     scale = 12.0 ** -np.arange(size)
     np.testing.assert_allclose(seen * scale, truth * scale, rtol=1e-5, atol=1e-5 * np.max(np.abs(truth * scale)))

@@ -2,7 +2,7 @@
 
 from quell.plants.base import Plant
 from quell.plants.batch import PlantBatch, batch
-from quell.plants.delayed import delayed
+from quell.plants.delay import delayed
 from quell.plants.linear import LinearPlant
 from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.two_mass_spring import two_mass_spring
