@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quell.controllers.differentiator import TrackingDesign, TrackingDifferentiator, TrackingMemory, fhan, step
-from quell.dispatch import compiled
+from quell.controllers.differentiator import TrackingDesign, TrackingDifferentiator, TrackingMemory, fhan
+from quell.controllers.prefilter import prefilter
+from quell.dispatch import compiled, interpreted
 from quell.types import Matrix, Vector
 
 
@@ -16,14 +17,15 @@ from quell.types import Matrix, Vector
 def follow(design: TrackingDesign, memory: TrackingMemory, r: Vector, v: Matrix) -> None:
     """Run through a reference; write v_1 and v_2 (k, 2)."""
     for k in range(r.size):
-        v[k, 0] = step(design, memory, r[k])
+        v[k, 0] = prefilter(design, memory, r[k])
         v[k, 1] = memory.v[1]
 
 
 def profile(acceleration: float, dt: float, r: np.ndarray, horizon: float | None = None) -> np.ndarray:
     """Return v_1 and v_2 for a reference, from rest at zero."""
     differentiator, v = TrackingDifferentiator(acceleration, horizon), np.empty((r.size, 2))
-    follow(differentiator.design(dt), differentiator.memory(), r, v)
+    design = differentiator.design(dt)
+    follow(design, differentiator.memory(design), r, v)
     return v
 
 
@@ -57,7 +59,8 @@ def test_a_longer_horizon_filters_noise() -> None:
 def test_it_is_a_kernel_and_the_same_interpreted() -> None:
     """One function, compiled and not."""
     differentiator, v = TrackingDifferentiator(3.0), np.empty((200, 2))
-    follow.py_func(differentiator.design(0.01), differentiator.memory(), np.ones(200), v)
+    design = differentiator.design(0.01)
+    interpreted(follow)(design, differentiator.memory(design), np.ones(200), v)
     np.testing.assert_allclose(profile(3.0, 0.01, np.ones(200)), v, atol=1e-12)
     assert fhan(0.0, 0.0, 1.0, 0.1) == 0.0
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from quell import analysis, controllers, experiments, features, learners, metrics, observers, plants, signals
     from quell.batch_record import BatchTrajectory
+    from quell.controllers import baselines
     from quell.controllers.adrc import ADRC
     from quell.controllers.bandwidth import omega_c_for
     from quell.controllers.estimate import Estimate
@@ -46,7 +47,7 @@ _HOME = {
     "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation",
 }
-_ROOMS = ("analysis", "controllers", "experiments", "features", "learners", "metrics", "observers", "plants", "signals")
+_ROOMS = ("analysis", "baselines", "controllers", "experiments", "features", "learners", "metrics", "observers", "plants", "signals")
 
 __all__ = [
     "ADRC",
@@ -60,6 +61,7 @@ __all__ = [
     "Status",
     "Trajectory",
     "analysis",
+    "baselines",
     "canonical",
     "controllers",
     "experiments",
@@ -78,7 +80,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOME:
         value = getattr(importlib.import_module(_HOME[name]), name)
     elif name in _ROOMS:
-        value = importlib.import_module(f"quell.{name}")
+        value = importlib.import_module("quell.controllers.baselines" if name == "baselines" else f"quell.{name}")
     else:
         raise AttributeError(f"module 'quell' has no attribute {name!r}")
     globals()[name] = value

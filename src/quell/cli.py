@@ -98,6 +98,49 @@ def stress(
     run_stress(runs=runs, honest=honest, seed=seed, guarded=guard, json_file=json, figures=figures)
 
 
+@app.command(name="compare")
+def compare(
+    *,
+    controllers: str = "mf-eso,mb-eso,l-eso,pid,pi-notch,lqg,resonance-ratio",
+    m1: float = 1.0,
+    m2: float = 1.0,
+    k: float = 1.0,
+    dt: float = 1e-3,
+    u_max: float = float("inf"),
+    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    json: Annotated[Path | None, Parameter(name="--json")] = None,
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+) -> None:
+    """Compare controllers, designed for m1 = m2 = k = 1, on two masses and a spring: a step, a force on the load, noise.
+
+    Parameters
+    ----------
+    controllers
+        Which ones, with commas between; zv+ or zvd+ before a name shapes its reference, as in zv+lqg.
+    m1
+        Mass that is pushed, as it really is [kg].
+    m2
+        Mass that is measured [kg].
+    k
+        Stiffness of the spring [N/m].
+    dt
+        Sample time [s].
+    u_max
+        Limit of the control force, either way [N].
+    seed
+        Seed of the measurement noise.
+    json
+        Write all results to this file, for programs.
+    figures
+        Put the figure into this folder, as PNG and SVG.
+    """
+    from quell.commands.compare import run_compare
+    from quell.experiments.compare import Benchmark
+
+    settings = Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
+    run_compare(controllers=controllers, settings=settings, json_file=json, figures=figures)
+
+
 def main() -> None:
     """Run the command line; a mistake in what was asked gives one line and exit code 2."""
     try:

@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 _VECTORS = ("w", "x", "x_hat", "theta")
 _MEANINGS = {
     "r": ("reference", "y-unit"),
+    "r_shaped": ("reference behind the prefilter", "y-unit"),
     "y": ("output", "y-unit"),
     "y_measured": ("output as measured, with noise", "y-unit"),
     "u": ("control signal as applied", "u-unit"),
+    "u_wished": ("control signal before limits", "u-unit"),
     "w": ("disturbances", "w-unit"),
     "x": ("state of the plant", "state-unit"),
     "x_hat": ("estimated output and its derivatives", "y-unit/s^i"),

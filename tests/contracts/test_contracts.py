@@ -12,7 +12,7 @@ import pytest
 
 import quell as ql
 from quell import plants as plant_room
-from quell.controllers.adrc import _named_arrays
+from quell.controllers.running import named_arrays as _named_arrays
 from quell.dispatch import compiled, for_types, interpreted
 from quell.driver import run_block
 from quell.learners.base import adapt, coefficients, commit, predict

@@ -7,16 +7,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import heed
 from quell.controllers.estimate import Estimate
-from quell.controllers.handle import bind, bound_control, entry_point
 from quell.controllers.handover import HandOver
 from quell.controllers.law import F_LEARNED, LOOP, STATUS, AdrcDesign, AdrcState, U, law_gains
 from quell.controllers.limits import limits
-from quell.dispatch import compiling, for_types
+from quell.controllers.running import Running
+from quell.controllers.unwise import warn_if_unwise
 from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, explain
 from quell.learners.base import Learner, NoLearner, coefficients, tried
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
@@ -25,7 +24,7 @@ from quell.observers.eso import ESO
 from quell.types import Status
 
 
-class ADRC(HandOver):
+class ADRC(HandOver, Running):
     """Active disturbance rejection control around an ESO, with or without a learner.
 
     The object is immutable in all but its running state: ``step`` moves that on, ``simulate`` leaves it alone and uses a state of its own.
@@ -95,10 +94,8 @@ class ADRC(HandOver):
         self.half_gain = checks.flag("half_gain", half_gain)
         self._learned_at = self.omega_c
         self._limits = limits(u_min, u_max, rate_limit, observer.dt)
-        self._prepare_design()
-        self._state = self.initial_state()
-        self._arrays = _named_arrays(self._state)
-        self._handle: Any = None
+        self._begin()
+        warn_if_unwise(observer, self.omega_c)
 
     def _prepare_design(self) -> None:
         observer = self.observer
@@ -153,15 +150,6 @@ class ADRC(HandOver):
             guard=UnguardedMemory(np.zeros(0)) if self.guard is None else self.guard.memory(self.parameters.guard),
         )
 
-    def prepare(self) -> None:
-        """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
-        dispatcher = for_types(bound_control, self.parameters)
-        self._handle = bind(self.parameters, self._state)
-        # The first call is made on a state of its own: it must not count as a sample.
-        with compiling(self.parameters):
-            dispatcher(bind(self.parameters, self.initial_state()), 0.0, 0.0)
-        self._step = entry_point(dispatcher, self._handle, 0.0, 0.0)
-
     def step(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
 
@@ -187,68 +175,18 @@ class ADRC(HandOver):
             )
         heed(self.parameters, self._state, np.array(derivatives, dtype=np.float64))
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""
-        kept = {name: value for name, value in vars(self).items() if name not in ("parameters", "_state", "_arrays", "_handle", "_step")}
-        return kept | {"state": self.state}
-
-    def __setstate__(self, kept: dict[str, Any]) -> None:
-        saved = kept["state"]
-        vars(self).update({name: value for name, value in kept.items() if name != "state"})
-        # Parameters may hold addresses of compiled functions, and arrays of a state may share memory: both are made anew, not copied.
-        self._prepare_design()
-        self._state = self.initial_state()
-        self._arrays = _named_arrays(self._state)
-        self._handle = None
-        self.state = saved
-
-    def reset(self) -> None:
-        """Go back to the state before the first sample; what was learned is forgotten."""
-        self.state = self._saved(self.initial_state())
-
-    @property
-    def state(self) -> dict[str, NDArray[Any]]:
-        """The whole running state as named arrays, copied: ``numpy.savez(file, **controller.state)`` keeps it.
-
-        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then. A learner that is
-        a Python object is in it as an array () of objects, which is good in this process; quell does not pickle or unpickle it.
-        """
-        return self._saved(self._state)
-
-    @state.setter
-    def state(self, saved: Mapping[str, Any]) -> None:
-        if set(saved) != set(self._arrays):
-            raise ValueError(f"state has {sorted(saved)}: must have {sorted(self._arrays)}")
-        checked = {}
-        snapshots = {}
-        for name, array in self._arrays.items():
-            if name in self._outside:
-                snapshots[name.removeprefix("learner.")] = np.asarray(saved[name])[()]
-                continue
-            try:
-                checked[name] = np.asarray(saved[name], dtype=np.float64)
-            except (TypeError, ValueError):
-                raise ValueError(f"state[{name!r}]: must be an array of numbers") from None
-            if checked[name].shape != array.shape:
-                raise ValueError(f"state[{name!r}] has shape {checked[name].shape}: must have {array.shape}")
-        if snapshots:
-            self.learner.recall(self._state.learner, snapshots)  # type: ignore[attr-defined]
-        for name, value in checked.items():
-            self._arrays[name][...] = value
-
     @property
     def _outside(self) -> tuple[str, ...]:
-        """Names of what stands for something outside of the state's arrays."""
         return tuple(f"learner.{name}" for name in getattr(self.learner, "outside", ()))
 
-    def _saved(self, state: AdrcState) -> dict[str, NDArray[Any]]:
-        saved: dict[str, NDArray[Any]] = {name: array.copy() for name, array in _named_arrays(state).items()}
-        if self._outside:
-            for name, snapshot in self.learner.snapshot(state.learner).items():  # type: ignore[attr-defined]
-                box = np.empty((), dtype=object)
-                box[()] = snapshot
-                saved[f"learner.{name}"] = box
-        return saved
+    def _snapshots(self, state: AdrcState) -> dict[str, Any]:
+        if not self._outside:
+            return {}
+        return {f"learner.{name}": value for name, value in self.learner.snapshot(state.learner).items()}  # type: ignore[attr-defined]
+
+    def _recall(self, state: AdrcState, snapshots: Mapping[str, Any]) -> None:
+        named = {name.removeprefix("learner."): value for name, value in snapshots.items()}
+        self.learner.recall(state.learner, named)  # type: ignore[attr-defined]
 
     @property
     def estimate(self) -> Estimate:
@@ -289,14 +227,3 @@ def _check_zeros(observer: ESO) -> None:
             "so that u would grow, or swing, without end while y looks well; control another output, or take a controller that does not "
             "invert the plant (linear-quadratic, for instance)"
         )
-
-
-def _named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of a nested NamedTuple by dotted name; the arrays themselves, not copies."""
-    found: dict[str, NDArray[np.float64]] = {}
-    for name, value in state._asdict().items():
-        if isinstance(value, tuple):
-            found |= _named_arrays(value, f"{prefix}{name}.")
-        else:
-            found[prefix + name] = value
-    return found

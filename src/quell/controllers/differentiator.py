@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.controllers.prefilter import prefilter, settle, slopes
 from quell.dispatch import kernel
 from quell.types import Vector
 
@@ -50,9 +51,8 @@ def fhan(x1: float, x2: float, r0: float, h0: float) -> float:
     return -r0 * a / d if abs(a) <= d else -math.copysign(r0, a)
 
 
-@kernel
-def step(design: TrackingDesign, memory: TrackingMemory, r: float) -> float:
-    """Move on by a sample towards ``r``; return v_1. ``memory.v`` then has v_1 and v_2."""
+@prefilter.register(TrackingDesign)
+def _prefilter(design: TrackingDesign, memory: TrackingMemory, r: float) -> float:
     v = memory.v
     pull = fhan(v[0] - r, v[1], design.acceleration, design.horizon)
     v[0] += design.dt * v[1]
@@ -60,9 +60,19 @@ def step(design: TrackingDesign, memory: TrackingMemory, r: float) -> float:
     return float(v[0])
 
 
+@slopes.register(TrackingDesign)
+def _slopes(design: TrackingDesign, memory: TrackingMemory, derivatives: Vector) -> None:
+    derivatives[0] = memory.v[1]
+
+
+@settle.register(TrackingDesign)
+def _settle(design: TrackingDesign, memory: TrackingMemory, value: float) -> None:
+    memory.v[0], memory.v[1] = value, 0.0
+
+
 @dataclass(frozen=True)
 class TrackingDifferentiator:
-    """A reference whose second derivative stays within a limit, with its derivative.
+    """A reference whose second derivative stays within a limit, with its derivative; to be used in ``Prefiltered``.
 
     Parameters
     ----------
@@ -79,8 +89,9 @@ class TrackingDifferentiator:
     Examples
     --------
     >>> profile = TrackingDifferentiator(acceleration=2.0)
-    >>> design, memory = profile.design(dt=0.01), profile.memory()
-    >>> [round(step(design, memory, 1.0), 4) for _ in range(3)]
+    >>> design = profile.design(dt=0.01)
+    >>> memory = profile.memory(design)
+    >>> [round(prefilter(design, memory, 1.0), 4) for _ in range(3)]
     [0.0, 0.0002, 0.0006]
     """
 
@@ -92,6 +103,11 @@ class TrackingDifferentiator:
         if self.horizon is not None:
             checks.positive("horizon", self.horizon, "s")
 
+    @property
+    def derivatives(self) -> int:
+        """How many derivatives it gives: one."""
+        return 1
+
     def design(self, dt: float) -> TrackingDesign:
         """Return the parameters for a sample time [s]."""
         dt = checks.positive("dt", dt, "s")
@@ -100,6 +116,6 @@ class TrackingDifferentiator:
             raise ValueError(f"horizon = {horizon!r} s with dt = {dt!r} s: must be at least a sample, or the profile would swing")
         return TrackingDesign(float(self.acceleration), horizon, dt)
 
-    def memory(self, start: float = 0.0) -> TrackingMemory:
-        """Return the state at rest at ``start`` [y-unit]."""
-        return TrackingMemory(np.array([checks.finite("start", start), 0.0]))
+    def memory(self, design: TrackingDesign) -> TrackingMemory:
+        """Return the state at rest at zero."""
+        return TrackingMemory(np.zeros(2))

@@ -1,0 +1,10 @@
+"""What a practitioner would compare ADRC with, each with its usual design rule and its source."""
+
+from quell.controllers.baselines.equivalent import equivalent_pid
+from quell.controllers.baselines.lqg import LQG
+from quell.controllers.baselines.notch import Notch, NotchPID
+from quell.controllers.baselines.pid import PID
+from quell.controllers.baselines.resonance_ratio import ResonanceRatio
+from quell.controllers.baselines.shaping import ZV, ZVD, Shaper
+
+__all__ = ["LQG", "PID", "ZV", "ZVD", "Notch", "NotchPID", "ResonanceRatio", "Shaper", "equivalent_pid"]

@@ -1,0 +1,140 @@
+"""LQG with a disturbance state: state feedback with a Kalman filter that also estimates a disturbance at the input.
+
+::
+
+    minimise ∫ y² + ρ u² dt,      u = −K x̂ − d̂ + N r,      N = 1 / ( C (I − Φ + Γ K)⁻¹ Γ )
+
+(Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, sections 8.5 and 9; observer_law.py has the filter.) The cost
+is sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23, 1978) and K comes from its Riccati equation.
+
+Weights from two bandwidths: where u reaches y through ν integrators with the gain b, cheap control puts ν poles of the loop in a
+Butterworth pattern of radius ``(b²/ρ)^(1/(2ν))``, and the rest to the plant's zeros; with a random walk of density q at the input and
+measurement noise of density v the filter's N − (n − ν) fast poles have the radius ``(q b²/v)^(1/(2(ν + 1)))`` (Kwakernaak & Sivan,
+*Linear Optimal Control Systems*, 1972, sections 3.8 and 4.4). So ``ρ = b²/omega_c^(2ν)`` and ``q b²/v = omega_o^(2(ν+1))``: for a chain
+of integrators exact, else where both are above the plant's own frequencies.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.controllers.baselines.observer_law import (
+    check_reachable,
+    feedback_law,
+    kalman_gain,
+    leading_gain,
+    plant_matrices,
+    sampled_noise,
+    with_disturbance,
+)
+from quell.controllers.linear import LinearController
+from quell.types import Matrix, Vector
+
+
+class LQG(LinearController):
+    """Linear-quadratic state feedback with a Kalman filter and a disturbance state.
+
+    Parameters
+    ----------
+    plant
+        a linear plant, or a ``control.StateSpace`` in continuous time, of one input and output.
+    omega_c, omega_o
+        bandwidths of state feedback and filter [rad/s], from which the weights come.
+    dt
+        sample time [s].
+    Q
+        (n, n), weight of the state in place of ``C'C`` [1/s of cost].
+    rho
+        weight of u² in place of that from ``omega_c``.
+    process_noise
+        (n, n), density of white noise on the state's derivatives besides the disturbance [state-unit²/s]; none by default.
+    u_min, u_max, rate_limit, name
+        as for ``LinearController``.
+
+    Attributes
+    ----------
+    K : (n,) array
+        gains of the state; that of d̂ is 1.
+    L : (n + 1,) array
+        gains of the filter.
+    N : float
+        gain of the reference.
+
+    Raises
+    ------
+    ValueError
+        for a plant that is not stabilisable from u or not detectable from y, or has a zero at s = 0 (a constant disturbance
+        then does not show in y), and for numbers out of range.
+
+    Examples
+    --------
+    >>> from quell.plants import two_mass_spring
+    >>> controller = LQG(two_mass_spring(), omega_c=1.0, omega_o=10.0, dt=1e-2)
+    >>> controller.K.shape, controller.L.shape
+    ((4,), (5,))
+    """
+
+    def __init__(
+        self,
+        plant: Any,
+        omega_c: float,
+        omega_o: float,
+        dt: float,
+        *,
+        Q: Any = None,
+        rho: float | None = None,
+        process_noise: Any = None,
+        **options: Any,
+    ) -> None:
+        A, B, C = plant_matrices(plant)
+        n = A.shape[0]
+        omega_c, omega_o = checks.positive("omega_c", omega_c, "rad/s"), checks.positive("omega_o", omega_o, "rad/s")
+        dt = checks.positive("dt", dt, "s")
+        check_reachable(A, B, "plant is not stabilisable from u")
+        check_reachable(A.T, C.T, "plant is not detectable from y")
+        _check_zero(A, B, C)
+        b, degree = leading_gain(A, B, C)
+        rho = b**2 / omega_c ** (2 * degree) if rho is None else checks.positive("rho", rho)
+        weight = C.T @ C if Q is None else checks.matrix("Q", Q, n, n)
+        self.K = _state_gain(A, B, weight, rho, dt)
+        self.model = with_disturbance(A, B, C, B, dt)
+        # Densities become variances a sample: that of y over dt, that of the walk times dt; only their ratio counts.
+        W = np.zeros((n + 1, n + 1))
+        W[n, n] = dt * omega_o ** (2 * (degree + 1)) / b**2
+        if process_noise is not None:
+            W[:n, :n] = sampled_noise(A, checks.matrix("process_noise", process_noise, n, n), dt)
+        self.L = kalman_gain(self.model, W, 1.0 / dt)
+        phi, gamma = self.model.F[:n, :n], self.model.G[:n]
+        self.N = 1.0 / float(C[0] @ np.linalg.solve(np.eye(n) - phi + np.outer(gamma, self.K), gamma))
+        super().__init__(feedback_law(self.model, self.L, np.append(self.K, 1.0), self.N), dt, **({"name": "LQG"} | options))
+
+
+def _check_zero(A: Matrix, B: Matrix, C: Matrix) -> None:
+    singular = np.linalg.svd(np.block([[A, B], [C, np.zeros((1, 1))]]), compute_uv=False)
+    if singular[-1] <= 1e-12 * singular[0]:
+        raise ValueError("plant has a zero at s = 0: a constant disturbance does not show in y, nor can y be held at a reference")
+
+
+def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vector:
+    """Return K (n,) of the sampled regulator whose cost is the integral of ``x'Qx + ρ u²``, u held over a sample."""
+    from scipy.linalg import expm, solve_discrete_are
+
+    n = A.shape[0]
+    inner = np.block([[A, B], [np.zeros((1, n + 1))]])
+    cost = np.zeros((n + 1, n + 1))
+    cost[:n, :n], cost[n, n] = Q, rho
+    block = expm(np.block([[-inner.T, cost], [np.zeros_like(inner), inner]]) * dt)
+    moved = block[n + 1 :, n + 1 :]
+    sampled = moved.T @ block[: n + 1, n + 1 :]
+    sampled = 0.5 * (sampled + sampled.T)
+    phi, gamma = moved[:n, :n], moved[:n, n:]
+    S, R = sampled[:n, n:], sampled[n:, n:]
+    try:
+        P = solve_discrete_are(phi, gamma, sampled[:n, :n], R, s=S)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ValueError(f"no stabilising state feedback: {error}; every mode that does not fade must show in Q") from None
+    gain: Vector = np.linalg.solve(R + gamma.T @ P @ gamma, gamma.T @ P @ phi + S.T)[0]
+    return gain

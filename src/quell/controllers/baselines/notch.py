@@ -1,0 +1,99 @@
+"""PI or PID with a notch filter on a resonance.
+
+::
+
+    N(s) = (s² + 2 ζ_z ω s + ω²) / (s² + 2 ζ_p ω s + ω²),      |N(jω)| = ζ_z/ζ_p = depth,      −3 dB over about  2 ζ_p ω = width · ω
+
+(Ellis, *Control System Design Guide*, 4th ed. 2012, chapter 9; Vukosavić & Stojić, *IEEE Trans. Industrial Electronics* 45, 1998, for
+drives with torsional resonance.) The filter takes the resonance out of the loop and leaves its damping alone: a plant without friction
+goes on swinging after whatever has set it off from outside. Its lag at low frequencies is that of a delay ``2 (ζ_p − ζ_z)/ω``, which a
+tuning rule has to be told.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.controllers.baselines.pid import PID
+
+
+class Notch(NamedTuple):
+    """A notch filter; make it with ``Notch.at``."""
+
+    omega: float
+    """Centre [rad/s]."""
+    zero_damping: float
+    """ζ_z."""
+    pole_damping: float
+    """ζ_p."""
+
+    @classmethod
+    def at(cls, omega: float, *, depth: float = 0.1, width: float = 1.0) -> Notch:
+        """Return the notch at ``omega`` [rad/s] that lets ``depth`` of the amplitude through, about ``width · omega`` wide at −3 dB.
+
+        The less is known of the resonance, the wider; the wider, the more lag below.
+
+        Raises
+        ------
+        ValueError
+            for a frequency or width that is not positive, or a depth that is not from 0 to below 1.
+        """
+        omega, width = checks.positive("omega", omega, "rad/s"), checks.positive("width", width)
+        depth = checks.non_negative("depth", depth)
+        if depth >= 1.0:
+            raise ValueError(f"depth = {depth!r}: must be below 1, the share of the amplitude that passes at the centre")
+        return cls(omega, 0.5 * depth * width, 0.5 * width)
+
+    @property
+    def delay(self) -> float:
+        """The delay that it is to low frequencies [s]."""
+        return 2.0 * (self.pole_damping - self.zero_damping) / self.omega
+
+    def polynomials(self) -> tuple[list[float], list[float]]:
+        """Return numerator and denominator in s, highest power first."""
+        zeros, poles = ([1.0, 2.0 * damping * self.omega, self.omega**2] for damping in (self.zero_damping, self.pole_damping))
+        return zeros, poles
+
+
+class NotchPID(PID):
+    """A PID controller in series with a notch filter, on both its paths; PI + notch with ``kd = 0``.
+
+    It is sampled by Tustin's rule, with the notch where it belongs (prewarped there).
+
+    Parameters
+    ----------
+    notch
+        the filter, from ``Notch.at``.
+    kp, ki, kd, **options
+        as for ``PID``.
+
+    Raises
+    ------
+    ValueError
+        as ``PID``, for a notch above half the sampling rate, and for what is no notch.
+
+    Examples
+    --------
+    >>> controller = NotchPID(Notch.at(omega=1.4, depth=0.05), kp=0.2, ki=0.01, dt=0.01)
+    >>> round(controller.notch.delay, 2)
+    0.68
+    """
+
+    def __init__(self, notch: Notch, kp: float, ki: float = 0.0, kd: float = 0.0, *, dt: float, **options: Any) -> None:
+        if not isinstance(notch, Notch):
+            raise ValueError(f"notch = {notch!r}: must be from quell.baselines.Notch.at(omega)")
+        if notch.omega * checks.positive("dt", dt, "s") >= math.pi:
+            raise ValueError(f"notch at {notch.omega!r} rad/s with dt = {dt!r} s: must be below pi/dt = {math.pi / dt:.3g} rad/s")
+        self.notch = notch
+        self._prewarp = notch.omega
+        super().__init__(kp, ki, kd, dt=dt, **({"name": "PID + notch" if kd else "PI + notch"} | options))
+
+    def polynomials(self) -> tuple[list[Any], Any]:
+        """Return the numerators from r and from y, and the denominator that they share, in s, highest power first."""
+        numerators, denominator = super().polynomials()
+        zeros, poles = self.notch.polynomials()
+        return [np.polymul(part, zeros) for part in numerators], np.polymul(denominator, poles)

@@ -1,0 +1,121 @@
+"""What every controller does, whatever it is made of."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from numba.core.runtime import _nrt_python, rtsys
+
+import quell as ql
+from quell import controllers as room
+from quell.controllers import baselines as baseline_room
+from quell.controllers.running import named_arrays
+
+from .test_contracts import CHAIN, SCENARIO, check_run
+
+DT = 0.01
+ESO = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT)
+LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
+
+PID = baseline_room.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT, **LIMITS)
+CONTROLLERS: dict[str, Any] = {
+    "ADRC": ql.ADRC(ESO, 1.5, **LIMITS),
+    "LinearController": room.LinearController.from_transfer_function([2.0, 3.0], [1.0, 0.0], dt=DT, **LIMITS),
+    "PID": PID,
+    "NotchPID": baseline_room.NotchPID(baseline_room.Notch.at(9.0), 2.0, 1.0, dt=DT, **LIMITS),
+    "LQG": baseline_room.LQG(CHAIN, 3.0, 12.0, DT, **LIMITS),
+    "ResonanceRatio": baseline_room.ResonanceRatio(omega_o=5.0, dt=DT, **LIMITS),
+    "Prefiltered": room.Prefiltered(PID, baseline_room.ZVD(3.0, 0.1)),
+    "Prefiltered, Han's": room.Prefiltered(ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.TrackingDifferentiator(2.0)),
+    "Prefiltered feedforward": room.Prefiltered(ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.ReferenceModel(3.0)),
+    "Prefiltered ADRC": room.Prefiltered(ql.ADRC(ESO, 1.5, **LIMITS), baseline_room.ZV(3.0)),
+}
+PLANTS = {"ResonanceRatio": ql.plants.two_mass_spring()}
+# With a record of things not finite on both inputs, but for the first sample.
+REFERENCE = np.where(np.arange(400) % 31 == 7, np.nan, np.sin(0.03 * np.arange(400)))
+MEASURED = np.where(np.arange(400) % 17 == 5, np.inf, 0.3 * np.cos(0.05 * np.arange(400)))
+
+
+def test_every_controller_has_an_example() -> None:
+    """Nothing public escapes the contracts."""
+    for module in (room, baseline_room):
+        for name in module.__all__:
+            thing = getattr(module, name)
+            if inspect.isclass(thing) and hasattr(thing, "initial_state") and not getattr(thing, "_is_protocol", False):
+                assert name in CONTROLLERS
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_runs_the_same_again_and_interpreted(name: str) -> None:
+    """Same seed, same output; no second compilation; interpreted = compiled."""
+    check_run(PLANTS.get(name, CHAIN), CONTROLLERS[name], SCENARIO)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_step_at_a_time_is_the_simulated_run(name: str) -> None:
+    """``step`` with what was measured gives the u of ``simulate``, bit for bit, and the same state."""
+    controller = copy.deepcopy(CONTROLLERS[name])
+    run = ql.simulate(PLANTS.get(name, CHAIN), controller, ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise))
+    u = [controller.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]
+    np.testing.assert_allclose(u, run["u"], rtol=0.0, atol=1e-12)
+    for label, array in named_arrays(run.final_state).items():
+        np.testing.assert_allclose(controller.state[label], array, rtol=1e-9, atol=1e-12, err_msg=label)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_bad_sample_is_held_and_limits_hold(name: str) -> None:
+    """As if the last good ones had come again; u always a number within its limits."""
+    one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
+    r, y, before = 0.0, 0.0, 0.0
+    for bad_r, bad_y in zip(REFERENCE, MEASURED, strict=True):
+        r, y = bad_r if math.isfinite(bad_r) else r, bad_y if math.isfinite(bad_y) else y
+        u = one.step(bad_r, bad_y)
+        assert -2.0 <= u <= 3.0
+        assert abs(u - before) <= 60.0 * DT + 1e-12
+        assert u == other.step(r, y)
+        before = u
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_waits_for_its_first_measurement(name: str) -> None:
+    """Nothing moves, and then it is as if nothing had been."""
+    one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
+    assert [one.step(1.0, math.nan) for _ in range(3)] == [0.0] * 3
+    assert [one.step(1.0, y) for y in (0.5, 0.4)] == [other.step(1.0, y) for y in (0.5, 0.4)]
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_goes_on_without_a_trace(name: str) -> None:
+    """Saved and restored by named arrays, copied, or sent: the same bits from there on; reset, it begins anew."""
+    one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
+    first = [one.step(0.5, 0.01 * k) for k in range(100)]
+    other.state = one.state
+    others = (other, copy.deepcopy(one), pickle.loads(pickle.dumps(one)))
+    expected = [one.step(0.5, 1.0 - 0.01 * k) for k in range(100)]
+    for copied in others:
+        assert [copied.step(0.5, 1.0 - 0.01 * k) for k in range(100)] == expected
+    one.reset()
+    assert [one.step(0.5, 0.01 * k) for k in range(100)] == first
+    with pytest.raises(ValueError, match="state has"):
+        one.state = {}
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_step_allocates_nothing(name: str) -> None:
+    """Once compiled, a thousand steps ask Numba's runtime for no memory; preparing is no step."""
+    controller = copy.deepcopy(CONTROLLERS[name])
+    before = controller.state
+    controller.prepare()
+    for label, array in controller.state.items():
+        np.testing.assert_array_equal(array, before[label])
+    _nrt_python.memsys_enable_stats()
+    allocated = rtsys.get_allocation_stats().alloc
+    for k in range(1000):
+        controller.step(0.5, 0.001 * k)
+    assert rtsys.get_allocation_stats().alloc == allocated

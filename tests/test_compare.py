@@ -1,0 +1,112 @@
+"""Controllers side by side: in Python, and as ``quell compare``."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.experiments import compare, compare_figure
+from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
+
+LAG = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
+
+
+def test_any_controllers_on_any_plant_are_judged_alike() -> None:
+    """Each run is that of ``simulate``; the scores are what closed forms say: PI that cancels the lag leaves a lag of 1/4 s."""
+    scenario = ql.Scenario(reference=1.0, disturbances=(ql.signals.Step(at=5.0, height=0.5),), duration=10.0)
+    some = {
+        "PI": ql.baselines.PID(4.0, 4.0, dt=1e-3),
+        "ADRC": ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 0.005), 4.0),
+        "P": ql.baselines.PID(1.0, dt=1e-3),
+    }
+    result = compare.compare(LAG, some, scenario, load_at=5.0)
+    np.testing.assert_array_equal(result.runs["ADRC"].log, ql.simulate(LAG, some["ADRC"], scenario).log)
+    pi = result.scores["PI"]
+    assert pi["overshoot"] == pytest.approx(0.0, abs=1e-9)
+    assert pi["settling_time"] == pytest.approx(-math.log(0.02) / 4.0, abs=5e-3)
+    # A load through s/((s + 1)(s + 4)): its peak under 0.5.
+    peak_at = math.log(4.0) / 3.0
+    assert pi["disturbance_peak"] == pytest.approx(0.5 / 3.0 * (math.exp(-peak_at) - math.exp(-4.0 * peak_at)), rel=1e-3)
+    assert result.scores["P"]["settling_time"] is None
+    assert result.scores["P"]["disturbance_peak"] == pytest.approx(0.5, abs=1e-2)
+    assert set(result.to_json()["controllers"]["P"]) >= {"overshoot", "settling_time", "rms", "control_variation", "status", "diverged"}
+
+
+def test_a_run_that_diverges_is_shown_as_one() -> None:
+    """No number where there is none; the others are judged as ever, and the figure is drawn."""
+    some = {"wrong sign": ql.baselines.PID(-40.0, dt=0.01), "right": ql.baselines.PID(4.0, 4.0, dt=0.01)}
+    result = compare.compare(LAG, some, ql.Scenario(reference=1.0, duration=5.0))
+    assert result.runs["wrong sign"].diverged
+    assert set(result.scores["wrong sign"].values()) == {None}
+    assert result.scores["right"]["settling_time"] is not None
+    figure = compare_figure.draw(result)
+    assert "wrong sign (diverged)" in figure.axes[0].get_legend_handles_labels()[1]
+    assert figure.axes[0].get_ylim()[1] < 1e5
+
+
+def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() -> None:
+    """At 5 ms. No model: MF-ESO rejects the load to a fiftieth of PID. LQG and MB-ESO alike. PID is slow."""
+    result = compare.two_mass(Benchmark(dt=5e-3), [*compare.NAMES, "zv+lqg"])
+    scores = result.scores
+    assert not any(run.diverged for run in result.runs.values())
+    for name in ("mf-eso", "mb-eso", "l-eso", "lqg", "resonance-ratio", "zv+lqg"):
+        run = result.runs[name]
+        assert np.max(np.abs(run["y"][run.window(FORCE_AT - 5.0, FORCE_AT)] - 1.0)) < 0.01
+        assert np.max(np.abs(run["y"][run.window(95.0, 101.0)] - 1.0)) < 0.01
+        assert np.mean(run["u"][run.window(95.0, 101.0)]) == pytest.approx(-FORCE, abs=0.01)
+    assert scores["mf-eso"]["disturbance_peak"] < scores["pid"]["disturbance_peak"] / 50.0
+    assert scores["zv+lqg"]["overshoot"] < 0.5 * scores["lqg"]["overshoot"]
+    assert scores["pid"]["control_variation"] < 1.0
+    assert "r_shaped" in result.runs["zv+lqg"].names
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: compare.compare(LAG, {}, ql.Scenario()), "controllers is empty: must have at least one"),
+        (lambda: compare.compare(LAG, {"P": 1}, ql.Scenario(), load_at=11.0), "load_at = 11.0: must lie within .0, duration = 10.0."),
+        (lambda: compare.compare(LAG, {"P": 1}, ql.Scenario()), "controller = 1: must be a controller"),
+        (lambda: compare.controller("pdi", 0.01), "controllers: 'pdi' must be one of mf-eso, mb-eso"),
+        (lambda: compare.controller("zv+zv+pid", 0.01), "controllers: 'zv.zv.pid' must be one of"),
+        (lambda: Benchmark(dt=0.2), "dt = 0.2: must be at most 0.1 s"),
+        (lambda: Benchmark(u_max=0.0), "u_max = 0.0: must be greater than zero"),
+        (lambda: Benchmark(k=-1.0), "k = -1.0: must be finite and greater than zero"),
+        (lambda: Benchmark(seed=-1), "seed = -1: must be a whole number"),
+    ],
+)
+def test_a_mistake_is_named(wrong: object, message: str) -> None:
+    """With the argument, its value and the rule."""
+    with pytest.raises(ValueError, match=message):
+        wrong()  # type: ignore[operator]
+
+
+def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
+    return subprocess.run([sys.executable, "-m", "quell.cli", "compare", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def test_the_comparison_is_printed_written_and_drawn(tmp_path: Path) -> None:
+    """A table a line a controller, JSON, a figure as PNG and SVG; a mistake is one line, and nothing is written."""
+    shown = quell(
+        "--dt", "0.01", "--k", "1.2", "--u-max", "1", "--controllers", "lqg, pid", "--json", "out.json", "--figures", "p", cwd=tmp_path
+    )
+    assert shown.returncode == 0, shown.stderr
+    assert "lqg" in shown.stdout
+    assert "…" not in shown.stdout, "a column is cut"
+    assert "nan" not in shown.stdout.lower()
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["settings"] == {"m1": 1.0, "m2": 1.0, "k": 1.2, "dt": 0.01, "seed": 0, "u_max": 1.0}
+    assert list(result["controllers"]) == ["lqg", "pid"]
+    assert {p.name for p in (tmp_path / "p").iterdir()} == {"compare.png", "compare.svg"}
+    wrong = quell("--controllers", "lqg,nonsense", "--json", "other.json", cwd=tmp_path)
+    assert wrong.returncode == 2
+    assert wrong.stderr.startswith("quell: controllers: 'nonsense' must be one of mf-eso")
+    assert len(wrong.stderr.strip().splitlines()) == 1
+    assert {p.name for p in tmp_path.iterdir()} == {"out.json", "p"}
