@@ -16,7 +16,8 @@ import quell as ql
 from quell.learners.lag import lag_of
 from quell.observers import canonical
 from quell.observers.base import begin, observe
-from quell.observers.eso import ESO, noise_gains
+from quell.observers.eso import ESO
+from quell.observers.noise import noise_gains
 from quell.observers.placement import place
 
 

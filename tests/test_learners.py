@@ -12,9 +12,25 @@ from hypothesis import strategies as st
 import quell as ql
 from quell.learners.base import adapt, commit, predict, restart
 from quell.learners.gradient import outputs
-from quell.learners.lag import lag_of, lag_push
+from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
+
+LINEAR = {
+    "current": ESO.model_free(3, 2.0, 15.0, 2e-3),
+    "predictor": ESO.model_free(3, 2.0, 15.0, 2e-3, form="predictor"),
+    "model-based": ESO.model_based(([3.0, -1.0, 0.5], 2.0), 15.0, 2e-3),
+    "zeros": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), 15.0, 2e-3),
+    "zeros kept": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), 15.0, 2e-3, keep_zeros=True),
+    "reduced": ESO.model_free(3, 2.0, 15.0, 2e-3, form="reduced"),
+    "half gain": ESO.model_free(3, 2.0, 15.0, 2e-3, half_gain=True),
+    "half gain, predictor": ESO.model_free(3, 2.0, 15.0, 2e-3, half_gain=True, form="predictor"),
+    "Kalman": ESO.kalman(3, 2.0, 2e-3, noise=1e-6, drift=10.0),
+    "Kalman, predictor": ESO.kalman(3, 2.0, 2e-3, noise=1e-6, drift=10.0, form="predictor"),
+    "cascade": ESO.cascade(3, 2.0, 15.0, 2e-3, levels=3, ratio=1.5),
+    "delay": ESO.model_free(3, 2.0, 15.0, 2e-3, delay=0.01),
+    "cascade with delay": ESO.cascade(3, 2.0, 15.0, 2e-3, delay=0.01),
+}
 
 
 @settings(max_examples=40)
@@ -51,12 +67,15 @@ def test_a_constant_passes_the_lag_filter_unchanged(order: int) -> None:
     assert np.sum(lag.taps) == pytest.approx(1.0, abs=1e-8)
 
 
-def test_what_a_plain_eso_would_have_estimated_is_known_exactly(rng: np.random.Generator) -> None:
-    """``Δf̂ + f_L^F`` is the plain ESO's estimate from the same y and u, whatever was fed forward."""
-    observer = ESO.model_free(order=3, b0=2.0, omega_o=15.0, dt=2e-3)
-    lag, chain = lag_of(observer), np.zeros((1, 4))
+@pytest.mark.parametrize("name", LINEAR)
+def test_what_a_plain_eso_would_have_estimated_is_known_exactly(name: str, rng: np.random.Generator) -> None:
+    """``Δf̂ + f_L^F`` is the plain ESO's estimate from the same y and u, whatever was fed forward; for every linear form."""
+    observer = LINEAR[name]
+    lag = lag_of(observer)
+    chain = lag_memory(lag, 1)
     y, u, f_learned = (np.cumsum(rng.normal(size=2000)) * 1e-2 for _ in range(3))
-    z, seen, plain, plainly = (np.zeros(4) for _ in range(4))
+    z, plain = np.zeros(observer.states), np.zeros(observer.states)
+    seen, plainly = np.zeros(4), np.zeros(4)
     begin(observer.model, z, seen, y[0])
     begin(observer.model, plain, plainly, y[0])
     for k in range(1, y.size):

@@ -51,17 +51,6 @@ def test_a_model_moves_no_pole(a: list[float], dt: float, omega_o: float) -> Non
     np.testing.assert_allclose(error_polynomial(observer), wanted, rtol=1e-6, atol=1e-12)
 
 
-def test_gains_of_first_and_second_order_are_the_published_closed_forms() -> None:
-    """Miklosovic, Radke & Gao (2006), current estimator, in terms of β = exp(−omega_o dt)."""
-    omega_o, dt = 20.0, 0.005
-    beta = math.exp(-omega_o * dt)
-    first = ESO.model_free(order=1, b0=1.0, omega_o=omega_o, dt=dt).model.gain
-    np.testing.assert_allclose(first, [1.0 - beta**2, (1.0 - beta) ** 2 / dt], rtol=1e-12)
-    second = ESO.model_free(order=2, b0=1.0, omega_o=omega_o, dt=dt).model.gain
-    closed = [1.0 - beta**3, 1.5 * (1.0 - beta) ** 2 * (1.0 + beta) / dt, (1.0 - beta) ** 3 / dt**2]
-    np.testing.assert_allclose(second, closed, rtol=1e-12)
-
-
 def test_the_sampled_gain_tends_to_the_continuous_one() -> None:
     """L/dt approaches the gain that places the poles of A − lC at −omega_o, with an error of order dt."""
     a, omega_o = np.array([3.0, -1.0, 2.0, 0.5]), 10.0

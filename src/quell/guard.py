@@ -42,7 +42,7 @@ import numpy as np
 
 from quell import checks
 from quell.dispatch import generic, is_finite, kernel
-from quell.learners.lag import Lag, lag_of, lag_push
+from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -170,7 +170,7 @@ def _calm_nothing(guard: UnguardedDesign, memory: UnguardedMemory) -> None:
 class GuardDesign(NamedTuple):
     """Parameters of the guard."""
 
-    lag: Lag
+    lag: Any
     forget: float
     """dt/T."""
     attack: float
@@ -361,4 +361,4 @@ class Guard:
         """Return the state before the first sample: nothing proved."""
         record = np.zeros(5)
         _distrust(record)
-        return GuardMemory(np.zeros((3, parameters.lag.taps.size)), np.zeros(3), record, np.zeros(6))
+        return GuardMemory(lag_memory(parameters.lag, 3), np.zeros(3), record, np.zeros(6))

@@ -21,6 +21,7 @@ from quell.observers.eso import ESO, FORMS
 from .python_models import python_learners
 
 PLANTS: dict[str, Any] = {
+    "delayed": ql.plants.delayed(ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), delay=0.02, dt=0.01),
     "two_mass_spring": ql.plants.two_mass_spring(),
     "CubicSpringPlant": ql.plants.lagged_two_mass_spring(k_cubic=0.3),
     "lagged_two_mass_spring": ql.plants.lagged_two_mass_spring(),
@@ -104,4 +105,11 @@ OBSERVERS: dict[str, ESO] = {
     for kind in ("model-free", "model-based")
     for order in (1, 2, 4, 8)
     for form in FORMS
-} | {"model-based, order 3, with a zero": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), omega_o=12.0, dt=0.01)}
+} | {
+    "model-based, order 3, with a zero": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), omega_o=12.0, dt=0.01),
+    "half gain": ESO.model_free(2, 1.5, 12.0, 0.01, half_gain=True),
+    "Kalman": ESO.kalman(2, 1.5, 0.01, noise=1e-6, drift=3e-2),
+    "cascade": ESO.cascade(2, 1.5, 12.0, 0.01),
+    "nonlinear": ESO.nonlinear(2, 1.5, 12.0, 0.01, delta=0.05),
+    "delay": ESO.model_free(2, 1.5, 12.0, 0.01, delay=0.02),
+}

@@ -32,6 +32,7 @@ CONTROLLERS: dict[str, Any] = {
     "LQG": baseline_room.LQG(CHAIN, 3.0, 12.0, DT, **LIMITS),
     "ResonanceRatio": baseline_room.ResonanceRatio(omega_o=5.0, dt=DT, **LIMITS),
     "Prefiltered": room.Prefiltered(PID, baseline_room.ZVD(3.0, 0.1)),
+    "Prefiltered, Han's": room.Prefiltered(ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.TrackingDifferentiator(2.0)),
     "Prefiltered feedforward": room.Prefiltered(ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.ReferenceModel(3.0)),
     "Prefiltered ADRC": room.Prefiltered(ql.ADRC(ESO, 1.5, **LIMITS), baseline_room.ZV(3.0)),
 }

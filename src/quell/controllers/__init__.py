@@ -4,6 +4,7 @@ from quell.controllers import baselines
 from quell.controllers.adrc import ADRC
 from quell.controllers.bandwidth import omega_c_for
 from quell.controllers.base import Controller
+from quell.controllers.differentiator import TrackingDifferentiator
 from quell.controllers.estimate import Estimate
 from quell.controllers.linear import LinearController, LinearLaw
 from quell.controllers.prefilter import Prefilter, Prefiltered
@@ -19,6 +20,7 @@ __all__ = [
     "Prefilter",
     "Prefiltered",
     "ReferenceModel",
+    "TrackingDifferentiator",
     "baselines",
     "omega_c_for",
     "warn_if_unwise",

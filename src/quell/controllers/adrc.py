@@ -18,7 +18,7 @@ from quell.controllers.running import Running
 from quell.controllers.unwise import warn_if_unwise
 from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, explain
 from quell.learners.base import Learner, NoLearner, coefficients, tried
-from quell.learners.lag import lag_of
+from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.observers.canonical import spell
 from quell.observers.eso import ESO
 from quell.types import Status
@@ -46,6 +46,9 @@ class ADRC(HandOver, Running):
         limits of the control signal [u-unit].
     rate_limit
         how fast it may move, in either direction [u-unit/s].
+    half_gain
+        whether to halve the gains k of the law, reference included, not the cancellation of f: half the gain from noise in x̂, a loop
+        that settles about as fast (Herbst, Hempel, Göhrt & Streif 2020, arXiv 2003.03986).
 
     Raises
     ------
@@ -74,6 +77,7 @@ class ADRC(HandOver, Running):
         u_min: float = -math.inf,
         u_max: float = math.inf,
         rate_limit: float = math.inf,
+        half_gain: bool = False,
     ) -> None:
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO, from ESO.model_free or ESO.model_based")
@@ -87,16 +91,18 @@ class ADRC(HandOver, Running):
         if guard is not None and not isinstance(guard, Guard):
             raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
         self.feedforward = checks.flag("feedforward", feedforward)
+        self.half_gain = checks.flag("half_gain", half_gain)
         self._learned_at = self.omega_c
         self._limits = limits(u_min, u_max, rate_limit, observer.dt)
         self._begin()
         warn_if_unwise(observer, self.omega_c)
 
     def _prepare_design(self) -> None:
-        observer, lag = self.observer, lag_of(self.observer)
+        observer = self.observer
+        law = law_gains(observer.degree, self.omega_c) * (0.5 if self.half_gain else 1.0)
         self.parameters = AdrcDesign(
             eso=observer.model,
-            law=np.append(law_gains(observer.degree, self.omega_c), np.zeros(observer.order - observer.degree)),
+            law=np.append(law, np.zeros(observer.order - observer.degree)),
             cancel=observer.cancel,
             cancel_f=observer.cancel_f,
             degree=observer.degree,
@@ -104,7 +110,7 @@ class ADRC(HandOver, Running):
             b0=observer.b0,
             limits=self._limits,
             learner=tried(self.learner, observer, self._learned_at),  # its scales stay, whatever the loop is retuned to
-            lag=lag._replace(taps=np.zeros(0)) if isinstance(self.learner, NoLearner) else lag,
+            lag=NO_LAG if isinstance(self.learner, NoLearner) else lag_of(observer),
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer),
         )
         self.features = self.learner.feature_names(observer.order)
@@ -140,7 +146,7 @@ class ADRC(HandOver, Running):
             reference=np.zeros(order),
             loop=np.zeros(LOOP),
             learner=self.learner.memory(self.parameters.learner),
-            shadow=np.zeros((1, order + 1)),
+            shadow=lag_memory(self.parameters.lag, 1),
             guard=UnguardedMemory(np.zeros(0)) if self.guard is None else self.guard.memory(self.parameters.guard),
         )
 

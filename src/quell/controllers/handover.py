@@ -197,7 +197,7 @@ class HandOver:
         old = self.observer
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO")
-        for name in ("order", "degree", "dt", "form", "states"):
+        for name in ("order", "degree", "dt", "form", "states", "has_one_pole"):
             if getattr(observer, name) != getattr(old, name):
                 raise ValueError(
                     f"observer has {name} = {getattr(observer, name)!r}, the present one {getattr(old, name)!r}: must be the same"

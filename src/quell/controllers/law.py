@@ -5,7 +5,9 @@
 
 (Gao, ACC 2003; paper eq. (control), with the term ``a·x̂`` that the paper forgets.) The derivatives of r are zero where none are given; m
 is the relative degree from u to y, the plant's order unless it has zeros. With ``f_L = h + s u`` affine in u the loop through u is solved
-instead of closed a sample late: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``.
+instead of closed a sample late: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``. Where u reaches the plant with a delay, learner, guard
+and observer are told of the u that *acts* (``observers.base.acting``): ``f_L = h + s u_acting``. The law is the same then, for when the u
+it finds acts, f will have ``s u`` in it.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ from quell.controllers.limits import Limits, apply_limits
 from quell.dispatch import is_finite, kernel
 from quell.guard import calm, explain, note, permit, watch
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
-from quell.learners.lag import Lag, lag_push
-from quell.observers.base import begin, observe
+from quell.learners.lag import lag_push
+from quell.observers.base import acting, begin, observe
 from quell.types import Matrix, Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
@@ -68,7 +70,7 @@ class AdrcDesign(NamedTuple):
     b0: float
     limits: Limits
     learner: Any
-    lag: Lag
+    lag: Any
     """How f_L shows in Δf̂; without taps where there is no learner."""
     guard: Any
 
@@ -86,7 +88,7 @@ class AdrcState(NamedTuple):
     """(LOOP,)."""
     learner: Any
     shadow: Matrix
-    """The lag filter of f_L (1, N)."""
+    """The lag filter of f_L (1, …)."""
     guard: Any
 
 
@@ -95,6 +97,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop, state.seen
     status = 0
     f_plain = 0.0
+    acted = acting(design.eso, state.z, loop[U])
     if is_finite(y):
         loop[Y] = y
     else:
@@ -116,15 +119,15 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             return loop[U]
         loop[STARTED] = 1.0
     else:
-        _conclude(design, state)
+        _conclude(design, state, acted)
         observe(design.eso, state.z, seen, loop[Y], loop[U], loop[F_LEARNED])
         f_plain = seen[seen.size - 1] + loop[_F_SHOWN]
         watch(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
-            adapt(design.learner, state.learner, seen, loop[Y], loop[U], f_plain)
+            adapt(design.learner, state.learner, seen, loop[Y], acted, f_plain)
             status |= trouble(design.learner, state.learner)
-    constant, slope = predict(design.learner, state.learner, seen, loop[U])
-    constant, slope, cut_off = permit(design.guard, state.guard, f_plain, constant, slope, loop[U])
+    constant, slope = predict(design.learner, state.learner, seen, acted)
+    constant, slope, cut_off = permit(design.guard, state.guard, f_plain, constant, slope, acted)
     if cut_off:
         status |= _LEARNER_CUT
         restart(design.learner, state.learner)
@@ -149,19 +152,19 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         u = loop[MANUAL_U]
     loop[U] = u
     loop[CONSTANT], loop[SLOPE] = constant, slope
-    loop[F_LEARNED] = constant + slope * u
+    loop[F_LEARNED] = constant + slope * acting(design.eso, state.z, u)
     loop[STATUS] = status
     return u
 
 
 @kernel
-def _conclude(design: AdrcDesign, state: AdrcState) -> None:
-    """Take note of the u that was applied since the last sample: only now it is sure that nobody has corrected it."""
+def _conclude(design: AdrcDesign, state: AdrcState, acted: float) -> None:
+    """Take note of the u that acted since the last sample: only now it is sure that nobody has corrected it."""
     loop = state.loop
-    f_learned = loop[CONSTANT] + loop[SLOPE] * loop[U]
+    f_learned = loop[CONSTANT] + loop[SLOPE] * acted
     loop[F_LEARNED] = f_learned
     loop[_F_SHOWN] = lag_push(design.lag, state.shadow, 0, f_learned)
-    commit(design.learner, state.learner, state.seen, loop[U], f_learned)
+    commit(design.learner, state.learner, state.seen, acted, f_learned)
     note(design.guard, state.guard, f_learned)
 
 

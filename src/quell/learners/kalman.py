@@ -32,17 +32,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
 from quell.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.lag import WATCH, Lag, lag_of, lag_push
+from quell.learners.lag import WATCH, lag_memory, lag_of, lag_push
 from quell.learners.oscillators import Oscillators, retune, turn_phases
-from quell.learners.sight import AVERAGE, CLEAR, RESOLUTION
-from quell.observers.eso import ESO, noise_gains
+from quell.learners.sight import AVERAGE, CLEAR, RESOLUTION, noise_shown
+from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
 # The share of f that a linear model is taken to leave unexplained, at least.
@@ -55,7 +55,7 @@ _NOISE, _UNEXPLAINED, _FILLED, _SINCE = range(4)
 class KalmanDesign(NamedTuple):
     """Parameters for an observer of order n, with p features in the order state, bias, oscillators' pairs, u."""
 
-    lag: Lag
+    lag: Any
     scale: Vector
     """(p,): a feature is its signal times this."""
     walk: Vector
@@ -221,7 +221,7 @@ def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
     finite = is_finite(memory.moment[_NOISE]) and is_finite(memory.moment[_UNEXPLAINED])
     for i in range(size):
         memory.filtered[i] = 0.0
-        for j in range(learner.lag.taps.size):
+        for j in range(memory.chain.shape[1]):
             memory.chain[i, j] = 0.0
     for j in range(memory.omega.size):
         finite = finite and is_finite(memory.omega[j]) and is_finite(memory.phase[j])
@@ -321,7 +321,7 @@ class Kalman:
         frequency = omega_c if self.frequency is None else float(self.frequency)
         scale = frequency ** -np.arange(n, dtype=np.float64)
         # What noise in y leaves in x̂_i; what it leaves in f̂ is also in b0 u.
-        noise = noise_gains(observer)
+        noise = noise_shown(observer)
         threshold = (CLEAR * np.append(scale, 1.0)) ** 2 * noise
         size = self.prior * frequency**observer.f_degree
         oscillators, pair_bandwidth = self.oscillators(observer, omega_c)
@@ -351,11 +351,11 @@ class Kalman:
 
     def memory(self, parameters: KalmanDesign) -> KalmanMemory:
         """Return a state with nothing learned."""
-        p, size = parameters.scale.size, parameters.lag.taps.size
+        p = parameters.scale.size
         return KalmanMemory(
             theta=np.zeros(p),
             covariance=np.diag(parameters.prior**2),
-            chain=np.zeros((p, size)),
+            chain=lag_memory(parameters.lag, p),
             filtered=np.zeros(p),
             mean=np.zeros(p),
             variance=np.zeros(p),

@@ -9,17 +9,20 @@ without lag bias. All poles of the shadow lie at β = exp(−omega_o dt) in one 
 
     v_1⁺ = β v_1 + (1−β) φ,      v_j⁺ = β v_j + (1−β) v_{j−1},      φ^F = Σ c_j v_j
 
-which costs O(N) an input instead of O(N²), and moves all inputs side by side.
+which costs O(N) an input instead of O(N²), and moves all inputs side by side. An observer of another tuning or structure has other poles:
+then the shadow itself is kept, in full (``DenseLag``).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.dispatch import kernel
+from quell.dispatch import generic
+from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
+from quell.observers.response import f_lag, f_shadow, own_response, response
 from quell.types import Matrix, Vector
 
 # In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
@@ -27,7 +30,7 @@ WATCH = 2.0
 
 
 class Lag(NamedTuple):
-    """The lag filter of one observer, with N = n + 1 states for each input."""
+    """The lag filter of an observer whose poles lie in one place, with N = n + 1 states for each input."""
 
     pole: float
     """β."""
@@ -38,19 +41,79 @@ class Lag(NamedTuple):
     predictor: bool
     """One sample later, for an observer in predictor form."""
 
+    @property
+    def width(self) -> int:
+        """Numbers that an input needs."""
+        return int(self.taps.size)
+
+
+class DenseLag(NamedTuple):
+    """The lag filter of any linear observer, with m states for each input."""
+
+    transition: Matrix
+    """M (m, m)."""
+    input: Vector
+    """g (m,)."""
+    taps: Vector
+    """c (m,): what the next estimate shows of the state before."""
+    through: float
+    """d: and of the input."""
+
+    @property
+    def width(self) -> int:
+        """Numbers that an input needs: the states, and as much room to calculate."""
+        return 2 * int(self.taps.size)
+
+
+NO_LAG = Lag(0.0, 0.0, np.zeros(0), False)
+"""For where nothing is fed forward: it shows nothing."""
+
 
 def watch_samples(observer: ESO) -> int:
     """Return how many samples after a start from rest nothing is learned: the observer's own initial error is in Δf̂ then."""
-    return round(WATCH * (observer.order + 1) / observer.omega_o / observer.dt)
+    return round(WATCH * observer.lag_time / observer.dt)
 
 
-def lag_of(observer: ESO) -> Lag:
-    """Return the lag filter of an observer.
+def lag_memory(lag: Any, count: int) -> Matrix:
+    """Return the state of the lag filters of ``count`` inputs, at rest."""
+    return np.zeros((count, lag.width))
+
+
+def lag_of(observer: ESO) -> Any:
+    """Return the lag filter of an observer: a ``Lag`` where its poles lie in one place, else a ``DenseLag``.
+
+    A delay of u makes no difference: what is fed forward is not delayed.
+
+    Raises
+    ------
+    ValueError
+        for a nonlinear observer, which has no lag.
+    """
+    if observer.has_one_pole:
+        return _chain(observer)
+    M, g, c, d = f_shadow(response(without_delay(observer.model), observer.order + 1))
+    return DenseLag(M, g.copy(), c, d)
+
+
+def group_delay(observer: ESO) -> float:
+    """Return by how many samples f^F, as the next estimate shows it, lags slow changes of f.
+
+    The j-th lag of the chain delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
+    """
+    if not observer.has_one_pole:
+        return f_lag(own_response(observer))
+    lag = _chain(observer)
+    stage = np.arange(lag.taps.size)
+    return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (1.0 if lag.predictor else 0.0)
+
+
+def _chain(observer: ESO) -> Lag:
+    """Return the lags in a row.
 
     With ``M = (I − L C) Φ`` and ``g = (I − L C) Γ_f``, the chain is ``s = V v`` with ``V_1 = g/(1−β)`` and
     ``V_{j+1} = (M − βI) V_j/(1−β)``, which ends by Cayley-Hamilton; ``c_j = −(V_j)_N``.
     """
-    model = observer.model
+    model = without_delay(observer.model)
     size = observer.order + 1
     # In the coordinates x_i dt^(i−1), as for the design: there all entries are O(1).
     scale = observer.dt ** np.arange(size)
@@ -67,9 +130,14 @@ def lag_of(observer: ESO) -> Lag:
     return Lag(observer.pole, rise, taps, model.predictor)
 
 
-@kernel
-def lag_push(lag: Lag, chain: Matrix, i: int, value: float) -> float:
-    """Move chain ``i`` of (m, N) on by a sample with the input ``value``; return what the next estimate shows of it."""
+@generic
+def lag_push(lag: Any, memory: Matrix, i: int, value: float) -> float:
+    """Move filter ``i`` of ``lag_memory`` on by a sample with the input ``value``; return what the next estimate shows of it."""
+    raise TypeError
+
+
+@lag_push.register(Lag)
+def _push_chain(lag: Lag, chain: Matrix, i: int, value: float) -> float:
     shown = 0.0
     if lag.predictor:
         for j in range(lag.taps.size):
@@ -83,3 +151,18 @@ def lag_push(lag: Lag, chain: Matrix, i: int, value: float) -> float:
         chain[i, j] = new
         after += lag.taps[j] * new
     return shown if lag.predictor else after
+
+
+@lag_push.register(DenseLag)
+def _push_dense(lag: DenseLag, memory: Matrix, i: int, value: float) -> float:
+    size = lag.taps.size
+    shown = lag.through * value
+    for j in range(size):
+        shown += lag.taps[j] * memory[i, j]
+        total = lag.input[j] * value
+        for k in range(size):
+            total += lag.transition[j, k] * memory[i, k]
+        memory[i, size + j] = total
+    for j in range(size):
+        memory[i, j] = memory[i, size + j]
+    return shown

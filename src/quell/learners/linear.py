@@ -10,7 +10,7 @@ from quell import checks
 from quell.features import Bias, Features, State
 from quell.features.base import tried, write
 from quell.features.scaling import scaling
-from quell.learners.lag import lag_of, watch_samples
+from quell.learners.lag import lag_memory, lag_of, watch_samples
 from quell.learners.regression import LinearDesign, LinearMemory
 from quell.learners.sight import sight, sight_memory
 from quell.observers.eso import ESO
@@ -95,7 +95,7 @@ class Linear:
             shown=np.zeros(n),
             now=np.zeros(p),
             units=np.ones(p),
-            chain=np.zeros((p, parameters.lag.taps.size)),
+            chain=lag_memory(parameters.lag, p),
             filtered=np.zeros(p),
             place=np.zeros(4),
             sight=sight_memory(n),

@@ -29,7 +29,7 @@ from quell.features.base import tried as tried_features
 from quell.features.base import write
 from quell.features.scaling import Scaling, grow, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.lag import lag_of, watch_samples
+from quell.learners.lag import group_delay, watch_samples
 from quell.learners.model import infer, learn, packed, tried
 from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, sight, sight_memory, trust
 from quell.observers.eso import ESO
@@ -200,7 +200,7 @@ class Online:
             sight=sight(observer, self.frequency or omega_c),
             model=tried(self.fitted_model(observer, omega_c), len(self.features.names(n)), observer.dt),
             follow=min((observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth) * observer.dt, 1.0),
-            delay=round(group_delay(observer)),
+            delay=max(round(group_delay(observer)), 0),
             watch=watch_samples(observer),
         )
 
@@ -224,13 +224,3 @@ class Online:
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return no names: what a black box has learned is not said by coefficients."""
         return ()
-
-
-def group_delay(observer: ESO) -> float:
-    """Return by how many samples f^F, as the next estimate shows it, lags slow changes of f.
-
-    The j-th lag of the chain of ``lag.py`` delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
-    """
-    lag = lag_of(observer)
-    stage = np.arange(lag.taps.size)
-    return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (1.0 if lag.predictor else 0.0)

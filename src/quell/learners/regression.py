@@ -29,7 +29,7 @@ from quell.dispatch import generic, is_finite, kernel
 from quell.features.base import unit, write
 from quell.features.scaling import Scaling, grow
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.lag import Lag, lag_push
+from quell.learners.lag import lag_push
 from quell.learners.sight import Sight, SightMemory, clear_of_noise, look, look_anew, trust
 from quell.types import Matrix, Vector
 
@@ -58,7 +58,7 @@ class LinearDesign(NamedTuple):
     features: Any
     scaling: Scaling
     sight: Sight
-    lag: Lag
+    lag: Any
     rule: Any
     constant: int
     """Which feature is the constant 1; −1 for none."""

@@ -1,8 +1,8 @@
 """What the controller asks of an observer.
 
 An observer is an ``ESO``: an immutable description with ``order`` n, ``b0``, ``omega_o``, ``dt`` and ``model``, a NamedTuple of
-parameters. Its running state is one vector, as long as ``states`` says; entry n of it is a summand of the estimated f, so that a
-controller may shift the estimate there. For the type of ``model`` the two functions below are registered.
+parameters with ``states``, the length of its running state. That is one vector; entry n of it is a summand of the estimated f, so that a
+controller may shift the estimate there. For the type of ``model`` the functions below are registered; ``acting`` only where u is delayed.
 """
 
 from __future__ import annotations
@@ -26,3 +26,14 @@ def observe(model: Any, z: Vector, seen: Vector, y: float, u: float, f_learned: 
 def begin(model: Any, z: Vector, seen: Vector, y: float) -> None:
     """Start at rest at the first measurement: ``x̂_1 = y``, all else zero."""
     raise TypeError
+
+
+@generic
+def acting(model: Any, z: Vector, u: float) -> float:
+    """Return the control signal that reaches the plant in the sample for which ``u`` is applied: u itself, unless it is delayed."""
+    raise TypeError
+
+
+@acting.register(object)
+def _acts_at_once(model: Any, z: Vector, u: float) -> float:
+    return u

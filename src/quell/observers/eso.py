@@ -12,14 +12,18 @@ first two. It is sampled exactly with zero-order hold to ``Φ, Γ_u, Γ_f``. Eac
 
 All eigenvalues of ``(I − L C) Φ`` lie at ``exp(−omega_o dt)`` (the bandwidth parametrisation of Gao, ACC 2003, in the z-plane as
 Miklosovic, Radke & Gao, ACC 2006). The *current* form hands ``z`` to the controller; the *predictor* form hands it ``z⁻``, which
-knows y only up to the sample before: one sample of delay more, with the same poles.
+knows y only up to the sample before: one sample of delay more, with the same poles. The *reduced* form is a current one with one of its
+poles at z = 0: ``L_1 = 1`` and ``x̂_1 = y``, and the other n are those of the reduced-order observer, at ``exp(−omega_o dt)``.
+
+With *half gain* the correction is L/2: nearly the same loop for half the gain from noise (Herbst, Hempel, Göhrt & Streif, IFAC World
+Congress 2020, arXiv 2003.03986; Herbst & Madonski, arXiv 2211.07309). Other forms are in files of their own: ``cascade``, ``nonlinear``,
+``kalman_gains``, and ``delay`` for a known delay of u.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,11 +31,15 @@ import numpy as np
 from quell import checks
 from quell.observers.base import begin, observe
 from quell.observers.canonical import Canonical, canonical, spell
+from quell.observers.delay import delayed_model, without_delay
 from quell.observers.discretize import zero_order_hold
+from quell.observers.forms import OtherForms
+from quell.observers.nonlinear import NonlinearModel
 from quell.observers.placement import place, sampled_zeros
+from quell.observers.response import own_response, settling_samples
 from quell.types import Matrix, Vector
 
-FORMS = ("current", "predictor")
+FORMS = ("current", "predictor", "reduced")
 # In the coordinates of the design, where gains are O(1) and below: beyond this no pole is where it was put.
 _LARGEST_GAIN = 1e6
 
@@ -49,6 +57,11 @@ class EsoModel(NamedTuple):
     """L (N,)."""
     predictor: bool
     """Whether the controller sees z⁻ rather than z."""
+
+    @property
+    def states(self) -> int:
+        """Length of the running state."""
+        return int(self.gain.size)
 
 
 @observe.register(EsoModel)
@@ -75,8 +88,10 @@ def _begin(model: EsoModel, z: Vector, seen: Vector, y: float) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class ESO:
-    """An extended state observer of a plant of order 1 to 8; make it with ``model_free`` or ``model_based``.
+class ESO(OtherForms):
+    """An extended state observer of a plant of order 1 to 8.
+
+    Make it with ``model_free`` or ``model_based``; ``kalman``, ``cascade`` and ``nonlinear`` are for other gains and structures.
 
     Attributes
     ----------
@@ -89,9 +104,12 @@ class ESO:
     dt : float
         sample time [s].
     form : str
-        ``"current"`` or ``"predictor"``.
-    model : EsoModel
-        Φ, Γ_u, Γ_f and L.
+        ``"current"``, ``"predictor"`` or ``"reduced"``.
+    model
+        parameters of its update, for example an ``EsoModel``: Φ, Γ_u, Γ_f and L.
+    has_one_pole : bool
+        whether all poles with which it answers f lie in one place, ``pole``: as designed by the bandwidth, at full order and gain. Poles
+        kept at zeros do not count: f does not move them.
 
     Examples
     --------
@@ -105,10 +123,13 @@ class ESO:
     omega_o: float
     dt: float
     form: str
-    model: EsoModel
+    model: Any
+    has_one_pole: bool = True
 
     @classmethod
-    def model_free(cls, order: int, b0: float, omega_o: float, dt: float, *, form: str = "current") -> ESO:
+    def model_free(
+        cls, order: int, b0: float, omega_o: float, dt: float, *, form: str = "current", half_gain: bool = False, delay: float = 0.0
+    ) -> ESO:
         """Design an ESO that knows of the plant its order and nominal gain only (paper eq. (mfplant)).
 
         Parameters
@@ -122,14 +143,20 @@ class ESO:
         dt
             sample time [s].
         form
-            ``"current"`` (default) or ``"predictor"``.
+            ``"current"`` (default), ``"predictor"`` or ``"reduced"``.
+        half_gain
+            whether to halve the gains; not for the reduced form. It takes from the noise in f̂ 30 % at order 1, 20 % at order 3, and nothing
+            from order 5 on.
+        delay
+            after how long u reaches the plant [s], a whole number of samples.
 
         Raises
         ------
         ValueError
             naming the argument, its value and the rule.
         """
-        return cls._design(canonical((np.zeros(checks.whole("order", order, 1, 8)), 1.0)), b0, omega_o, dt, form)
+        chain = canonical((np.zeros(checks.whole("order", order, 1, 8)), 1.0))
+        return cls._design(chain, b0, omega_o, dt, form, half_gain, delay)
 
     @classmethod
     def model_based(
@@ -142,6 +169,8 @@ class ESO:
         E: Any = None,
         form: str = "current",
         keep_zeros: bool = False,
+        half_gain: bool = False,
+        delay: float = 0.0,
     ) -> ESO:
         """Design an ESO that knows a model of the plant (paper eq. (mbplant)), which may have zeros.
 
@@ -152,7 +181,7 @@ class ESO:
         ----------
         plant, E
             a linear plant, ``control.StateSpace``, ``control.TransferFunction``, matrices, coefficients; see ``canonical``.
-        omega_o, dt, form
+        omega_o, dt, form, half_gain, delay
             as for ``model_free``.
         b0
             nominal control gain, from u to y^(relative degree); the model's own by default.
@@ -174,10 +203,12 @@ class ESO:
                 f"plant has a zero at s = 0 (zeros from u: {spell(found.zeros)} rad/s): a constant f leaves no trace in y and can not be "
                 "estimated; measure another output"
             )
-        return cls._design(found, found.b if b0 is None else b0, omega_o, dt, form, keep_zeros)
+        return cls._design(found, found.b if b0 is None else b0, omega_o, dt, form, half_gain, delay, checks.flag("keep_zeros", keep_zeros))
 
     @classmethod
-    def _design(cls, plant: Canonical, b0: float, omega_o: float, dt: float, form: str, keep_zeros: bool = False) -> ESO:
+    def _design(
+        cls, plant: Canonical, b0: float, omega_o: float, dt: float, form: str, half_gain: bool, delay: float, keep_zeros: bool = False
+    ) -> ESO:
         b0 = checks.nonzero("b0", b0, "it is the gain from u to the plant's highest derivative")
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         checks.one_of("form", form, FORMS)
@@ -186,14 +217,13 @@ class ESO:
                 f"omega_o = {omega_o!r} rad/s with dt = {dt!r} s: omega_o * dt = {omega_o * dt:.3g} must be below pi, "
                 "no sampling can follow a bandwidth above half its rate; lower omega_o or dt"
             )
-        return cls(
-            plant,
-            b0,
-            omega_o,
-            dt,
-            form,
-            _sampled_design(plant, b0, omega_o, dt, form == "predictor", checks.flag("keep_zeros", keep_zeros)),
-        )
+        if checks.flag("half_gain", half_gain) and form == "reduced":
+            raise ValueError("half_gain = True with form = 'reduced': half its gain is not of reduced order; use form='current'")
+        kept = plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)] if keep_zeros and plant.matched else np.zeros(0)
+        model = _sampled_design(plant, b0, omega_o, dt, form, kept)
+        if half_gain:
+            model = model._replace(gain=0.5 * model.gain)
+        return cls(plant, b0, omega_o, dt, form, delayed_model(model, delay, dt), form != "reduced" and not half_gain)
 
     @property
     def a(self) -> Vector:
@@ -231,12 +261,17 @@ class ESO:
     @property
     def states(self) -> int:
         """Length of the observer's running state."""
-        return self.order + 1
+        return int(self.model.states)
 
     @property
     def lag_time(self) -> float:
-        """By how much the estimate of f trails f, ``N/omega_o`` [s]; at high sampling rates, and for what is slow."""
-        return (self.order + 1) / self.omega_o
+        """How long it takes [s], ``Σ 1/|p_i|`` over its poles: ``N/omega_o`` where they lie in one place.
+
+        By so much the estimate of f trails a slow f, at high sampling rates. (That of a cascade trails it by less.)
+        """
+        if self.has_one_pole or isinstance(without_delay(self.model), NonlinearModel):
+            return (self.order + 1) / self.omega_o
+        return self.dt * settling_samples(own_response(self))
 
     @property
     def pole(self) -> float:
@@ -289,49 +324,7 @@ def continuous_gain(a: Vector, omega_o: float) -> Vector:
     return ell[1:]
 
 
-def noise_gains(observer: ESO) -> Vector:
-    """Return the variance of each estimate (N,) that white noise of unit variance in y leaves, as for a model-free observer.
-
-    In continuous time ``x̂_i = Σ_{k=i}^{N} C(N, k) ω_o^k s^(N−k+i−1) / (s + ω_o)^N · y``, and sampled white noise has the density dt; so
-    the variance is ``dt ω_o^(2i−1) ∫ |·|² dω / 2π`` of what is left at ω_o = 1. Good while ``omega_o dt`` is small. Where f enters before
-    the last integrator, with zeros of the plant in its way, that says nothing of it, and its variance is summed up sample by sample.
-    """
-    size = observer.order + 1
-    if observer.f_degree < observer.order:
-        return _summed_noise_gains(observer)
-    return observer.dt * observer.omega_o ** (2.0 * np.arange(size) + 1.0) * _unit_noise_gains(size)
-
-
-@cache
-def _unit_noise_gains(size: int) -> Vector:
-    """Return the integrals of ``noise_gains``, which depend on the number of states only."""
-    omega = np.geomspace(1e-4, 1e4, 4001)
-    s = 1j * omega
-    gains = np.empty(size)
-    for i in range(1, size + 1):
-        response = sum(math.comb(size, k) * s ** (size - k + i - 1) for k in range(i, size + 1)) / (s + 1.0) ** size
-        gains[i - 1] = np.trapezoid(np.abs(response) ** 2, omega) / math.pi
-    gains.flags.writeable = False
-    return gains
-
-
-def _summed_noise_gains(observer: ESO) -> Vector:
-    """Return the diagonal of ``Σ M^k L Lᵀ M^kᵀ``, M = (I − L C) Φ, by doubling, in the observer's own time."""
-    model, size = observer.model, observer.order + 1
-    scale = observer.omega_o ** np.append(np.arange(observer.order), observer.f_degree)
-    gain = model.gain / scale
-    transition = model.transition * scale[None, :] / scale[:, None]
-    transition -= np.outer(gain, transition[0])
-    total = np.outer(gain, gain)
-    for _ in range(64):
-        total += transition @ total @ transition.T
-        transition = transition @ transition
-        if np.max(np.abs(transition)) < 1e-12:
-            break
-    return np.diag(total).reshape(size) * scale**2
-
-
-def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, predictor: bool, keep_zeros: bool) -> EsoModel:
+def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, form: str, kept: Vector) -> EsoModel:
     """Sample the extended model, in the coordinates ``x_i dt^(i−1)`` and ``f dt^q`` where all entries are O(1), and place the poles.
 
     That is done in the coordinates ``x_i/omega_o^(i−1)``, ``f/omega_o^q``: over a sample hardly anything happens there, but it is known
@@ -354,9 +347,12 @@ def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, pred
         if np.all(np.isfinite(phi)):
             difference *= slow
             rises = np.full(size, -math.expm1(-step), dtype=complex)
-            kept = plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)] if keep_zeros and plant.matched else np.zeros(0)
             rises[: kept.size] = sampled_zeros(difference, kept, dt)
+            if form == "reduced":
+                rises[-1] = 1.0
             gain = place(difference, rises) * step**power
+            if form == "reduced" and np.isfinite(gain[0]):
+                gain[0] = 1.0  # as it is, but for rounding
     if not np.all(np.abs(gain) < _LARGEST_GAIN):
         fastest = np.max(np.abs(np.roots([1.0, *plant.a[::-1]])), initial=0.0)
         zeros = f" or its zeros at {spell(plant.zeros)} rad/s" if plant.zeros.size else ""
@@ -371,5 +367,5 @@ def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, pred
         input=b0 * (gammas[:, 0] * dt**plant.degree / scale),
         feed=gammas[:, 1] * dt**q / scale,
         gain=gain / scale,
-        predictor=predictor,
+        predictor=form == "predictor",
     )

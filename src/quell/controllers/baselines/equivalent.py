@@ -62,8 +62,10 @@ def equivalent_pid(controller: Any, **options: Any) -> PID:
             "controller two at most"
         )
     usual = ESO.model_free(observer.order, observer.b0, observer.omega_o, observer.dt, form=observer.form).model
-    if type(observer.model) is not type(usual) or any(
-        not np.array_equal(getattr(observer.model, name), getattr(usual, name)) for name in usual._fields
+    if (
+        observer.form == "reduced"
+        or type(observer.model) is not type(usual)
+        or any(not np.array_equal(getattr(observer.model, name), getattr(usual, name)) for name in usual._fields)
     ):
         raise ValueError("controller has an observer that knows a model, or is of another kind: must be around ESO.model_free")
     if controller.derivatives:

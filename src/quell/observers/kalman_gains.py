@@ -1,0 +1,58 @@
+"""The steady-state Kalman gain of the extended state observer, from variances.
+
+The extended model is taken to be driven by white noise: ``f' = w`` with the density ``drift``, ``x_n' = … + f + v`` with the density
+``jitter``, and y is measured with noise of the variance ``noise`` in each sample. Sampled exactly (Van Loan, *IEEE Trans. Automatic
+Control* 23, 1978)::
+
+    Q = ∫_0^dt exp(A s) G exp(Aᵀ s) ds,      P⁻ = Φ (P⁻ − P⁻ Cᵀ (C P⁻ Cᵀ + R)⁻¹ C P⁻) Φᵀ + Q,      L = P⁻ Cᵀ / (C P⁻ Cᵀ + R)
+
+With drift alone, and sampled fast, the poles lie in a Butterworth pattern of the radius ``(drift/(noise dt))^(1/2N)`` (symmetric root
+locus of a chain of N integrators; Anderson & Moore, *Optimal Control*, 1990).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quell.types import Matrix, Vector
+
+
+def kalman_gain(A: Matrix, dt: float, noise: float, drift: float, jitter: float) -> tuple[Vector, float]:
+    """Return L (N,), in the coordinates of ``A`` (N, N), whose last state is f, and the geometric mean of ``|ln z_i|/dt`` [rad/s].
+
+    Solved in units of time of the Butterworth pattern's, where neither Φ nor Q nor P has entries of very different size.
+
+    Raises
+    ------
+    ValueError
+        where the variances are so far apart that no solution is found.
+    """
+    from scipy.linalg import expm, solve_discrete_are
+
+    size = A.shape[0]
+    # In sensible units q/(r dt) is the bandwidth to the power 2N; jitter alone would make a pattern of 2n. Take the faster.
+    density = noise * dt
+    omega = max((drift / density) ** (0.5 / size), (jitter / density) ** (0.5 / (size - 1)))
+    scale = omega ** -np.arange(size, dtype=np.float64)
+    scaled = A * scale[:, None] / scale[None, :] / omega
+    drive = np.zeros((size, size))
+    drive[-1, -1] = drift / density * (scale[-1] / omega) ** 2
+    drive[-2, -2] = jitter / density * (scale[-2] / omega) ** 2
+    step = omega * dt
+    block = np.block([[-scaled, drive], [np.zeros_like(scaled), scaled.T]])
+    sampled = expm(block * step)
+    phi = sampled[size:, size:].T
+    Q = phi @ sampled[:size, size:]
+    C, R = np.eye(1, size), np.array([[1.0 / step]])
+    try:
+        P = solve_discrete_are(phi.T, C.T, 0.5 * (Q + Q.T), R)
+    except (np.linalg.LinAlgError, ValueError):
+        P = np.full((size, size), np.nan)
+    gain = P[:, 0] / (P[0, 0] + R[0, 0])
+    poles = np.linalg.eigvals((np.eye(size) - np.outer(gain, C)) @ phi) if np.all(np.isfinite(gain)) else np.array([np.inf])
+    if not np.max(np.abs(poles)) < 1.0:
+        raise ValueError(
+            f"noise = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with dt = {dt!r} s: no steady-state gain is found; "
+            f"they ask for about {omega:.3g} rad/s, which should be between 1e-3/dt and 1/dt"
+        )
+    return np.asarray(gain / scale), float(np.exp(np.mean(np.log(np.abs(np.log(poles.astype(complex))))))) / dt

@@ -1,0 +1,104 @@
+"""A plant behind a delay: what is sent to it arrives a while later.
+
+``x' = f(x, u(t − τ), w)`` with ``τ = d dt``. Its state is the plant's, followed by the last d values of u, the newest first: the state that
+the record shows, and that a start from rest sets to zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from quell import checks
+from quell.plants.base import Plant, advance, measure
+from quell.types import Vector
+
+
+class DelayedPlantModel(NamedTuple):
+    """A sampled plant behind a delay of at least one sample."""
+
+    inner: Any
+    """The plant's own parameters."""
+    size: int
+    """Number of its states."""
+
+
+@measure.register(DelayedPlantModel)
+def _measure(plant: DelayedPlantModel, x: Vector) -> float:
+    return measure(plant.inner, x[: plant.size])
+
+
+@advance.register(DelayedPlantModel)
+def _advance(plant: DelayedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+    last = x.size - 1
+    arriving = x[last]
+    for i in range(last, plant.size, -1):
+        x[i] = x[i - 1]
+    x[plant.size] = u
+    advance(plant.inner, x[: plant.size], scratch, t, arriving, w)
+
+
+@dataclass(frozen=True, eq=False)
+class DelayedPlant:
+    """A plant whose control signal arrives ``samples`` samples of ``dt`` [s] late; make it with ``delayed``."""
+
+    plant: Any
+    samples: int
+    dt: float
+
+    @property
+    def name(self) -> str:
+        """What tables and plots call it."""
+        return f"{self.plant.name}, {self.samples * self.dt:g} s late"
+
+    @property
+    def order(self) -> int:
+        """Number of states, the u under way included."""
+        return int(self.plant.order) + self.samples
+
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbance inputs; they act at once."""
+        return int(self.plant.disturbances)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the driver can run it compiled."""
+        return bool(self.plant.compiled)
+
+    def sampled(self, dt: float, interpret: bool = False) -> DelayedPlantModel:
+        """Return the parameters for the sample time ``dt`` [s] that it was made for."""
+        if abs(dt - self.dt) > 1e-9 * self.dt:
+            raise ValueError(f"dt = {dt!r} s: this delayed plant has the states of {self.dt!r} s; make it with dt={dt!r}")
+        return DelayedPlantModel(self.plant.sampled(dt, interpret), int(self.plant.order))
+
+
+def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
+    """Return a plant that u reaches ``delay`` seconds late.
+
+    Parameters
+    ----------
+    plant
+        any plant.
+    delay
+        [s], at least one sample and a whole number of them.
+    dt
+        the sample time that it will be run with [s]; it decides how many values of u are under way.
+
+    Raises
+    ------
+    ValueError
+        for a delay of less than a sample or of no whole number of samples, and for something that is no plant.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> late = ql.plants.delayed(ql.plants.two_mass_spring(), delay=0.02, dt=0.01)
+    >>> late.order
+    6
+    """
+    if isinstance(plant, type) or not hasattr(plant, "sampled"):
+        raise ValueError(f"plant = {plant!r}: must be a plant, for example quell.plants.two_mass_spring()")
+    checks.positive("delay", delay, "s")
+    samples = checks.samples("delay", delay, checks.positive("dt", dt, "s"))
+    return DelayedPlant(plant, samples, float(dt))
