@@ -25,6 +25,7 @@ def ideal(order: int) -> tuple[list[float], list[float]]:
     return [1.0], [1.0, *[0.0] * order]
 
 
+@pytest.mark.filterwarnings("ignore::quell.DesignWarning")
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 @pytest.mark.parametrize(("form", "limit"), [("current", 1.0), ("predictor", 0.3)])
 def test_the_limit_of_sampling_is_where_it_costs_a_sixth_of_the_margin(order: int, form: str, limit: float) -> None:
@@ -38,6 +39,7 @@ def test_the_limit_of_sampling_is_where_it_costs_a_sixth_of_the_margin(order: in
         assert 1.0 - beyond / fast > 1.8 * (1.0 - at_limit / fast)
 
 
+@pytest.mark.filterwarnings("ignore::quell.DesignWarning")
 def test_beyond_the_law_s_limit_loops_are_lost() -> None:
     """With omega_o = omega_c, chains of 3 and 4 integrators are stable at ``omega_c dt = 0.5``, and not at 0.7."""
     for order in (3, 4):

@@ -34,7 +34,7 @@ from quell.controllers.law import (
 from quell.dispatch import compiled
 from quell.guard import permit
 from quell.learners.base import NoLearner, predict
-from quell.observers.base import begin, observe
+from quell.observers.base import acting, begin, observe
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -187,7 +187,8 @@ class HandOver:
         loop, size = self._state.loop, new_observer.order
         if loop[STARTED] != 0.0:
             # f is what b0 u and a·x leave: with another b0 or a it is another number.
-            change = (kept[0].b0 - new_observer.b0) * loop[U] + (new_observer.cancel - kept[0].cancel) @ self._state.seen[:size]
+            acted = acting(kept[0].model, self._state.z, float(loop[U]))
+            change = (kept[0].b0 - new_observer.b0) * acted + (new_observer.cancel - kept[0].cancel) @ self._state.seen[:size]
             self._state.z[size] += change
             self._state.seen[size] += change
             loop[BUMPLESS] = 1.0
