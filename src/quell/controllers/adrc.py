@@ -105,7 +105,6 @@ class ADRC(HandOver, Running):
             law=np.append(law, np.zeros(observer.order - observer.degree)),
             cancel=observer.cancel,
             cancel_f=observer.cancel_f,
-            degree=observer.degree,
             fade=math.exp(-self.omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,
@@ -143,7 +142,7 @@ class ADRC(HandOver, Running):
         return AdrcState(
             z=np.zeros(self.observer.states),
             seen=np.zeros(order + 1),
-            reference=np.zeros(order),
+            reference=np.zeros(self.derivatives),
             loop=np.zeros(LOOP),
             learner=self.learner.memory(self.parameters.learner),
             shadow=lag_memory(self.parameters.lag, 1),

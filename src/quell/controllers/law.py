@@ -31,6 +31,8 @@ _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 _LEARNER_CUT = int(Status.LEARNER_CUT)
 
+_NOTHING = 1e-200
+
 LOOP = 15
 """Length of ``AdrcState.loop``, whose places are:"""
 (
@@ -65,8 +67,6 @@ class AdrcDesign(NamedTuple):
     """1 where f enters as u does, else 0."""
     fade: float
     """What is left a sample later of an offset that avoids a bump."""
-    degree: int
-    """Relative degree m from u to y."""
     b0: float
     limits: Limits
     learner: Any
@@ -83,7 +83,7 @@ class AdrcState(NamedTuple):
     seen: Vector
     """What the law may know of it (N,)."""
     reference: Vector
-    """r', …, r^(n) (n,); zero where they are not given."""
+    """r', …, r^(m) (m,), zero where they are not given; empty where they are not fed forward."""
     loop: Vector
     """(LOOP,)."""
     learner: Any
@@ -142,8 +142,10 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     if loop[BUMPLESS] != 0.0:
         loop[OFFSET] = loop[U] - wished
         loop[BUMPLESS] = 0.0
-    wished += loop[OFFSET]
-    loop[OFFSET] *= design.fade
+    if loop[OFFSET] != 0.0:
+        wished += loop[OFFSET]
+        # Numbers near the end of the range are slow to calculate with.
+        loop[OFFSET] = loop[OFFSET] * design.fade if abs(loop[OFFSET]) > _NOTHING else 0.0
     u, cut = apply_limits(design.limits, wished, loop[U])
     loop[WISHED] = u
     if loop[MANUAL] == 0.0:
@@ -180,10 +182,12 @@ def forget_f_learned(design: AdrcDesign, state: AdrcState) -> None:
 @kernel
 def wish(design: AdrcDesign, state: AdrcState, constant: float, slope: float) -> float:
     """Return the u that the law wants, before limits, for ``f_L = constant + slope · u``."""
-    seen, order, degree = state.seen, design.law.size, design.degree
-    wished = design.law[0] * state.loop[R] + state.reference[degree - 1] - design.cancel_f * (seen[order] + constant)
-    for i in range(1, degree):
-        wished += design.law[i] * state.reference[i - 1]
+    seen, reference, order = state.seen, state.reference, design.law.size
+    wished = design.law[0] * state.loop[R] - design.cancel_f * (seen[order] + constant)
+    if reference.size > 0:
+        for i in range(1, reference.size):
+            wished += design.law[i] * reference[i - 1]
+        wished += reference[reference.size - 1]
     for i in range(order):
         wished += (design.cancel[i] - design.law[i]) * seen[i]
     return wished / (design.b0 + design.cancel_f * slope)
