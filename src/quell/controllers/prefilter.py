@@ -7,12 +7,16 @@ of what it makes of the reference says how many with ``derivatives``, and regist
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from quell.controllers.adrc import ADRC
 from quell.controllers.base import control, flags, heed, report, rest
+from quell.controllers.handle import bind
+from quell.controllers.handover import HandOver
 from quell.controllers.running import Running
 from quell.dispatch import generic, is_finite
 from quell.types import Status, Vector
@@ -114,12 +118,12 @@ def _rest(design: PrefilteredDesign, state: PrefilteredState) -> None:
     rest(design.controller, state.controller)
 
 
-class Prefiltered(Running):
+class Prefiltered(HandOver, Running):
     """A controller that follows a prefiltered reference.
 
     The prefilter starts at rest at the first good measurement, so that a reference that stands elsewhere from the first sample on is a
-    step to it. What it makes of the reference is the channel ``r_shaped``. The controller that is passed stays as it is: the running
-    state of both is kept here.
+    step to it. What it makes of the reference is the channel ``r_shaped``. The controller that is passed stays as it is: its copy here
+    runs. Around an ADRC there are ``start``, ``track``, ``hand_over``, ``applied``, ``increment`` and ``retune`` as there.
 
     Parameters
     ----------
@@ -152,9 +156,45 @@ class Prefiltered(Running):
                 f"controller has feedforward, and {type(prefilter).__name__} knows no derivatives of what it makes of the reference: "
                 "use feedforward=False, or a prefilter such as ReferenceModel"
             )
-        self.controller = controller
+        self.controller = copy.copy(controller)
         self.prefilter = prefilter
         self._begin()
+
+    def _begin(self) -> None:
+        super()._begin()
+        # One running state: what is done to the controller is done to what runs here.
+        if isinstance(self.controller, Running):
+            self.controller._adopt(self._state.controller)
+
+    @property
+    def _law(self) -> ADRC:
+        if isinstance(self.controller, ADRC):
+            return self.controller
+        if isinstance(self.controller, Prefiltered):
+            return self.controller._law
+        raise ValueError(f"controller = {type(self.controller).__name__}: only an ADRC starts under load, hands over and is retuned")
+
+    def _rebind(self) -> None:
+        if isinstance(self.controller, Prefiltered):
+            self.controller._rebind()
+        self.parameters = self.parameters._replace(controller=self.controller.parameters)
+        if self._handle is not None:
+            self._handle = bind(self.parameters, self._state)
+
+    def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
+        """Start where the plant rests, see ``ADRC.start``; the prefilter comes to rest at ``y``."""
+        if isinstance(self.controller, Prefiltered):
+            self.controller.start(y, u, r)
+        else:
+            super().start(y, u, r)
+        state = self._state
+        settle(self.parameters.prefilter, state.prefilter, float(y))
+        state.loop[_STARTED] = state.loop[_REFERENCED] = 1.0
+        state.loop[_R] = float(y if r is None else r)
+
+    def step(self, r: float, y: float) -> float:  # type: ignore[override]
+        """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit]."""
+        return Running.step(self, r, y)
 
     def _prepare_design(self) -> None:
         self.parameters = PrefilteredDesign(self.controller.parameters, self.prefilter.design(self.dt))

@@ -30,8 +30,12 @@ class Running:
 
     def _begin(self) -> None:
         self._prepare_design()
-        self._state = self.initial_state()
-        self._arrays = named_arrays(self._state)
+        self._adopt(self.initial_state())
+
+    def _adopt(self, state: Any) -> None:
+        """Run on ``state`` from here on."""
+        self._state = state
+        self._arrays = named_arrays(state)
         self._handle = None
 
     def _prepare_design(self) -> None:
@@ -60,7 +64,10 @@ class Running:
         """
         if self._handle is None:
             self.prepare()
-        return self._step(self._handle, r, y)
+        try:
+            return self._step(self._handle, r, y)
+        except TypeError:
+            raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""

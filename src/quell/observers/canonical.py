@@ -22,6 +22,10 @@ import numpy as np
 from quell.observers.models import Fraction, StateSpace, read
 from quell.types import Matrix, Vector
 
+# A state that y shows less than this is not put into larger units: it is not seen.
+_NOT_SEEN = 1e-8
+# Of coefficients, to the power of the fastest pole that they have as unit.
+_ROUNDING = 1e-13
 # Below this ratio of singular values the balanced observability matrix counts as rank deficient.
 _RANK_TOLERANCE = 1e-10
 # Markov parameters below this share of their own bound count as zero.
@@ -113,13 +117,16 @@ def _from_fraction(model: Fraction) -> Canonical:
 
 def _from_state_space(model: StateSpace) -> Canonical:
     A, n = model.A, model.B.size
+    # In states of such units that rows and columns of A are of one size: whether y shows them must not depend on the user's units.
+    A, units = _balanced(A)
     S = np.empty((n, n))
-    S[0] = model.C
+    S[0] = model.C * units
     for i in range(1, n):
         S[i] = S[i - 1] @ A
-    # Rows of one size, whatever the unit of time.
-    size = np.maximum(np.linalg.norm(S, axis=1), np.finfo(float).tiny)
-    balanced = S / size[:, None]
+    # Rows of one size, whatever the unit of time; and columns, for states that nothing ties to the others.
+    rows = np.maximum(np.linalg.norm(S, axis=1), np.finfo(float).tiny)
+    columns = np.maximum(np.linalg.norm(S / rows[:, None], axis=0), np.finfo(float).tiny)
+    balanced = S / rows[:, None] / np.where(columns > _NOT_SEEN, columns, 1.0)
     singular = np.linalg.svd(balanced, compute_uv=False)
     if not singular[-1] > _RANK_TOLERANCE * singular[0]:
         rank = int(np.sum(singular > _RANK_TOLERANCE * singular[0]))
@@ -130,9 +137,19 @@ def _from_state_space(model: StateSpace) -> Canonical:
         )
     # Row n of the companion matrix: C A^n = −a S. What is no more than its rounding is zero.
     condition = float(singular[0] / singular[-1])
-    a = -np.linalg.solve(balanced.T, S[-1] @ A) / size
-    a[np.abs(a) * size <= 1e-13 * condition * size[-1] * np.linalg.norm(A, 2)] = 0.0
+    a = -np.linalg.solve((S / rows[:, None]).T, S[-1] @ A) / rows
+    fastest = float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
+    a[np.abs(a) <= _ROUNDING * condition * fastest ** (n - np.arange(n))] = 0.0
+    S = S / units
     return _assemble(a, _markov(S, model.B), None if model.E is None else _markov(S, model.E), S, condition)
+
+
+def _balanced(A: Matrix) -> tuple[Matrix, Vector]:
+    """Return A in balanced states (Parlett & Reinsch, *Numer. Math.* 13, 1969), and what one unit of each is in the user's."""
+    from scipy.linalg import matrix_balance
+
+    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    return balanced, scale
 
 
 def _markov(S: Matrix, column: Vector) -> Vector:

@@ -15,6 +15,9 @@ from quell import checks
 from quell.observers.base import acting, begin, observe
 from quell.types import Vector
 
+# All of them are moved on each sample.
+_MOST_SAMPLES = 10_000
+
 
 class DelayedModel(NamedTuple):
     """An observer behind a delay of u."""
@@ -60,9 +63,11 @@ def delayed_model(model: Any, delay: float, dt: float) -> Any:
     Raises
     ------
     ValueError
-        where the delay is negative or no whole number of samples.
+        where the delay is negative, no whole number of samples, or longer than 10 000 of them.
     """
     samples = checks.samples("delay", delay, dt)
+    if samples > _MOST_SAMPLES:
+        raise ValueError(f"delay = {delay!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES} samples; is it in seconds?")
     return model if samples == 0 else DelayedModel(model, model.states, samples)
 
 

@@ -98,7 +98,7 @@ class ESO(OtherForms):
     plant : Canonical
         the plant as it is known to it; a chain of integrators for a model-free one.
     b0 : float
-        nominal control gain [y-unit / u-unit / s^n].
+        nominal control gain, from u to y^(degree) [y-unit / u-unit / s^degree].
     omega_o : float
         observer bandwidth [rad/s].
     dt : float
@@ -209,7 +209,7 @@ class ESO(OtherForms):
     def _design(
         cls, plant: Canonical, b0: float, omega_o: float, dt: float, form: str, half_gain: bool, delay: float, keep_zeros: bool = False
     ) -> ESO:
-        b0 = checks.nonzero("b0", b0, "it is the gain from u to the plant's highest derivative")
+        b0 = checks.nonzero("b0", b0, "it is the gain from u to the first derivative of y that u moves")
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         checks.one_of("form", form, FORMS)
         if omega_o * dt >= math.pi:
@@ -224,6 +224,10 @@ class ESO(OtherForms):
         if half_gain:
             model = model._replace(gain=0.5 * model.gain)
         return cls(plant, b0, omega_o, dt, form, delayed_model(model, delay, dt), form != "reduced" and not half_gain)
+
+    def __repr__(self) -> str:
+        kind = type(self.model).__name__.removesuffix("Model")
+        return f"ESO(order={self.order}, b0={self.b0:g}, omega_o={self.omega_o:g}, dt={self.dt:g}, form={self.form!r}) [{kind}]"
 
     @property
     def a(self) -> Vector:

@@ -35,7 +35,7 @@ class OtherForms:
         levels
             how many, p; with one it is the ESO of ``model_free``.
         ratio
-            by how much each is faster than the one before, α; the first has ``omega_o / α^(p−1)``.
+            by how much each is faster than the one before, α > 1; the first has ``omega_o / α^(p−1)``.
 
         Raises
         ------
@@ -43,6 +43,8 @@ class OtherForms:
             naming the argument, its value and the rule.
         """
         p, ratio = checks.whole("levels", levels, 1, 8), checks.positive("ratio", ratio)
+        if ratio <= 1.0:
+            raise ValueError(f"ratio = {ratio!r}: must be above 1, each level is faster than the one before")
         last = cls.model_free(order, b0, omega_o, dt)
         models = [cls.model_free(order, b0, omega_o / ratio ** (p - 1 - i), dt).model for i in range(p)]
         model = delayed_model(cascade_model(models), delay, dt)
