@@ -237,6 +237,7 @@ def test_an_observer_behind_a_delay_is_the_plain_one_fed_the_u_of_then(late: int
         observe(late_one.model, z, seen, y[k], u[k - 1], 0.0)
 
 
+@pytest.mark.filterwarnings("ignore::quell.DesignWarning")  # a delay of that size is unwise, and said to be
 def test_a_known_delay_saves_a_loop_that_swings_without() -> None:
     """With u 0.2 s late at omega_o = 20 rad/s the plain observer works against its own u; the one that knows the delay settles."""
     plant = ql.plants.delayed(ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [1.0, 0.0]), delay=0.2, dt=0.01)
