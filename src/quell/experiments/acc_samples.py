@@ -23,6 +23,8 @@ COLUMNS = ("m1", "m2", "k_lin", "k_nonlin", "lambda", "tau")
 NOMINAL = np.array([1.0, 1.0, 1.0, 0.0, 1.0, 0.0065])
 """The actuator's lag is a few milliseconds where all is well; uncertainty only adds to it."""
 
+# Beyond these no such plant is, and its loop's poles are rounding.
+_MOST, _LEAST_LAG = 1e6, 1e-9
 _UNITS = {"m1": "kg", "m2": "kg", "k_lin": "N/m", "tau": "s"}
 # Quantiles of the published samples, one row a parameter.
 _LEVELS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
@@ -97,7 +99,10 @@ def read(path: str | os.PathLike[str]) -> Matrix:
         text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{where}: can't be read as a text file ({getattr(error, 'strerror', None) or 'not UTF-8'})") from None
-    rows = [(number, row) for number, row in enumerate(csv.reader(text.splitlines()), 1) if any(cell.strip() for cell in row)]
+    try:
+        rows = [(number, row) for number, row in enumerate(csv.reader(text.splitlines()), 1) if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise ValueError(f"{where}: is no CSV file ({error})") from None
     if len(rows) < 2:
         raise ValueError(f"{where}: must have a line of column names and at least one sample")
     header = [cell.strip().lstrip("\\") for cell in rows[0][1]]
@@ -118,13 +123,17 @@ def _value(where: str, number: int, row: list[str], place: int, j: int) -> float
     name = COLUMNS[j]
     text = row[place].strip() if place < len(row) else ""
     try:
-        value = float(text)
+        value = float(text.replace("_", "?"))  # which Python would read over
     except ValueError:
         raise ValueError(f"{where}, line {number}: {name} = {text!r}: must be a number") from None
     try:
-        return checks.finite(name, value) if name == "k_nonlin" else checks.positive(name, value, _UNITS.get(name, ""))
+        value = checks.finite(name, value) if name == "k_nonlin" else checks.positive(name, value, _UNITS.get(name, ""))
     except ValueError as error:
         raise ValueError(f"{where}, line {number}: {error}") from None
+    least = 0.0 if name == "k_nonlin" else _LEAST_LAG if name == "tau" else 1.0 / _MOST
+    if not least <= abs(value) <= _MOST:
+        raise ValueError(f"{where}, line {number}: {name} = {value!r}: must be between {least:g} and {_MOST:g}, is the unit right?")
+    return value
 
 
 def plant(sample: Vector, cubic: bool) -> LinearPlant | CubicSpringPlant:
