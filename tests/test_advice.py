@@ -115,6 +115,45 @@ def test_a_thin_margin_and_a_lost_loop_are_found_with_the_true_plant() -> None:
         analysis.advise(SimpleNamespace(law=None, dt=0.1))
 
 
+SPRING = ([2.0, 6.0], [1.0, 0.4, 9.0, 0.0])
+WITH_ZEROS = ql.ESO.model_based(SPRING, omega_o=40.0, dt=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("observer", "plant"),
+    [
+        (WITH_ZEROS, SPRING),
+        (ql.ESO.model_based(SPRING, omega_o=40.0, dt=1e-3, b0=1.0), ([1.0, 3.0], SPRING[1])),
+        (
+            ql.ESO.model_based(([[0.0, 1.0], [-4.0, -0.4]], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]), omega_o=20.0, dt=1e-3),
+            ([1.0, 1.4], [1.0, 0.4, 4.0]),
+        ),
+        (ql.ESO.model_free(order=2, b0=3.0, omega_o=20.0, dt=1e-3), ([3.0], [1.0, 0.0, 0.0])),
+    ],
+    ids=["zeros", "zeros and a b0", "a channel for f", "a chain"],
+)
+def test_without_a_plant_it_is_the_one_that_the_observer_assumes(observer: ql.ESO, plant: tuple[list[float], list[float]]) -> None:
+    """Zeros, b0 and all: nothing but the lag is found, and that with the numbers of the plant itself."""
+    controller = ql.ADRC(observer, omega_c=4.0)
+    assert analysis.advise(controller) == []
+    (finding,) = analysis.advise(controller, actuator_lag=0.05)
+    expected = analysis.analyse(plant, controller, actuator_lag=0.05)
+    value = expected.margins.modulus if expected.stable else max(abs(expected.poles))
+    assert finding.value == pytest.approx(value, rel=1e-6)
+
+
+def test_a_delay_that_the_observer_knows_of_is_in_the_plant_that_it_assumes() -> None:
+    """It is no news, so no lag; what it takes of the margin is found. Another delay comes on top of it."""
+    calm, hasty = (ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01, delay=0.2), omega_c=omega_c) for omega_c in (0.5, 2.0))
+    assert analysis.advise(calm) == []
+    (margin,) = analysis.advise(hasty)
+    assert margin.subject == "margin"
+    assert margin.value == pytest.approx(analysis.analyse(ideal(2), hasty, delay=0.2).margins.modulus)
+    (lag,) = analysis.advise(calm, delay=0.1)
+    assert lag.subject == "lag"
+    assert lag.value == pytest.approx(analysis.analyse(ideal(2), calm, delay=0.3).margins.modulus)
+
+
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 8])
 def test_the_ideal_loop_settles_when_asked(order: int) -> None:
     """The step response of ``omega_c^n/(s + omega_c)^n``, summed, enters the band at that time."""

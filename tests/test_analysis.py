@@ -193,6 +193,45 @@ def test_the_range_of_b_ends_where_a_pole_reaches_the_unit_circle(plant: Any) ->
         assert end == pytest.approx(inside * b, rel=1e-7)
 
 
+def test_the_range_of_b_does_not_depend_on_the_gain_that_the_plant_has() -> None:
+    """With zeros neither: b is the gain to the derivative that u reaches first, as b0 is."""
+    num, den = np.array([2.0, 6.0]), [1.0, 0.4, 9.0, 0.0]
+    controller = ql.ADRC(ql.ESO.model_based((num, den), omega_o=40.0, dt=1e-3), omega_c=4.0)
+    once, twice = (analysis.analyse((gain * num, den), controller) for gain in (1.0, 2.0))
+    assert (once.b_over_b0, twice.b_over_b0) == pytest.approx((1.0, 2.0))
+    assert once.b_range == pytest.approx(once.margins.gain)
+    assert twice.b_range == pytest.approx(once.b_range, rel=1e-7)
+    assert "stable for b/b0 from 0.197 to 4.35" in once.summary()
+
+
+def test_where_b_can_not_be_compared_with_b0_the_range_is_in_gains_of_the_plant() -> None:
+    """For a plant that was given sampled, and for one that u reaches later than the controller thinks; and that is what it is called."""
+    plt = importlib.import_module("matplotlib.pyplot")
+    sampled = control.sample_system(control.ss(PLANT.A, PLANT.B, PLANT.C, 0.0), 0.01, method="zoh")
+    later = ([200.0], np.polymul([1.0, 100.0], [1.0, 0.4, 3.0]))
+    for plant in (sampled, later):
+        loop = analysis.analyse(plant, adrc(2))
+        assert loop.b_over_b0 is None
+        assert loop.b_range == loop.margins.gain
+        assert f"stable for a gain from {loop.b_range[0]:.3g} to {loop.b_range[1]:.3g} times what it is" in loop.summary()
+        axes = analysis.plot_margins_over_time([0.0], [loop])
+        assert axes[2].get_ylabel() == "gain for which\nit is stable"
+    known = analysis.analyse(PLANT, adrc(2))
+    assert known.b_range == pytest.approx([2.0 * gain for gain in known.margins.gain])
+    assert analysis.plot_margins_over_time([0.0], [known])[2].get_ylabel() == "b/b0 for which\nit is stable"
+    plt.close("all")
+
+
+def test_the_summary_says_what_the_disk_margin_allows() -> None:
+    """As a factor of the gain and as an angle: a gain or a phase at its end, on the edge of the disk, keeps the loop stable."""
+    loop = analysis.analyse(PLANT, adrc(2))
+    m = loop.margins
+    said = f"disk margin {m.disk:.3f}: gain {m.disk_gain[0]:.3g} … {m.disk_gain[1]:.3g} or phase ±{m.disk_phase:.1f}°, or some of both"
+    assert said in loop.summary().splitlines()
+    assert m.gain[0] < m.disk_gain[0] < 1.0 < m.disk_gain[1] < m.gain[1]
+    assert 0.0 < m.disk_phase < m.phase
+
+
 def test_a_loop_is_lost_with_the_first_sample_of_delay_beyond_its_delay_margin() -> None:
     """And with the last before it, it is stable."""
     controller = adrc(2)
@@ -353,7 +392,7 @@ def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
         ("whole samples", lambda: analysis.analyse(control.ss(0.5, 1.0, 1.0, 0.0, 0.01), adrc(2), delay=0.005)),
         ("at most 200 samples", lambda: analysis.analyse(PLANT, adrc(2), delay=3.0)),
         ("must be an ADRC", lambda: analysis.analyse(PLANT, "adrc")),
-        ("MLP has no coefficients", lambda: analysis.frozen(controller, run, 3.0)),
+        ("MLP has no coefficients to record; pass the scenario to loops_over_time,", lambda: analysis.frozen(controller, run, 3.0)),
         ("a time of the record", lambda: analysis.frozen(adrc(2, learner=ql.learners.Kalman()), other, 30.0)),
         ("a run of this controller", lambda: analysis.frozen(controller, other, 3.0)),
         ("asked once a period", lambda: analysis.analyse(PLANT, outside)),
@@ -370,7 +409,7 @@ def test_a_feature_that_is_not_linear_needs_more_than_its_coefficient() -> None:
     """The record of θ does not do; the state at the end of a run does."""
     controller = adrc(2, learner=ql.learners.RLS(ql.features.Polynomial(2)))
     run = ql.simulate(chain(2), controller, replace(TRAINING, duration=4.0), interpret=True)
-    with pytest.raises(ValueError, match="is not linear"):
+    with pytest.raises(ValueError, match=r"is not linear.*pass the scenario to loops_over_time,"):
         analysis.frozen(controller, run, 3.0)
     assert np.any(analysis.frozen(controller, run).gain != 0.0)
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.controllers.unwise import Finding, sampling_findings
+from quell.plants.linear import LinearPlant
 
 # RMS of u, as a share of its range: six standard deviations are then 30 % of it.
 _NOISE = 0.05
@@ -33,14 +36,15 @@ def advise(
     controller
         an ``ADRC``, or a linear controller.
     plant
-        what it is to control, linear (see ``analyse``); by default the plant that an ADRC's observer assumes, which is kind to it.
+        what it is to control, linear (see ``analyse``); by default the plant that an ADRC's observer assumes, with the delay that it knows
+        of, which is kind to it.
     noise
         standard deviation of the measurement noise, taken for white [y-unit]. It is judged by what it does to u as a share of ``u_max −
         u_min``; so a controller without limits is not judged.
     actuator_lag
         time constant of the actuator [s], where the plant does not have it.
     delay
-        dead time of actuator, transport, calculation [s].
+        dead time of actuator, transport, calculation [s]; what the observer assumes comes on top of it where no plant is given.
     at
         when the learner is frozen; see ``analyse``.
 
@@ -54,24 +58,33 @@ def advise(
     ValueError
         as ``analyse``; without a plant for a controller that assumes none.
     """
-    observer = getattr(controller, "observer", None)
+    observer, known_delay = getattr(controller, "observer", None), 0.0
     if plant is None:
         if observer is None:
             raise ValueError("plant = None: this controller does not say which plant it is made for; give one")
-        plant = [observer.b0], [1.0, *observer.a[::-1]]
+        plant, known_delay = _assumed_plant(observer)
     actuator_lag, delay = checks.non_negative("actuator_lag", actuator_lag, "s"), checks.non_negative("delay", delay, "s")
     found = [] if observer is None else sampling_findings(observer, controller.omega_c)
-    loop = analyse(plant, controller, at=at)
+    loop = analyse(plant, controller, at=at, delay=known_delay)
     if not loop.stable:
         return [*found, _unstable(loop, "with this plant", "check b0, raise omega_o or lower omega_c")]
     found += _judge_margin(loop, observer)
     if actuator_lag > 0.0 or delay > 0.0:
-        late = analyse(plant, controller, at=at, delay=delay, actuator_lag=actuator_lag)
+        late = analyse(plant, controller, at=at, delay=known_delay + delay, actuator_lag=actuator_lag)
         found += _judge_lag(loop, late, actuator_lag, delay)
         loop = late
     if noise is not None and loop.stable:
         found += _judge_noise(loop, controller, checks.non_negative("noise", noise))
     return found
+
+
+def _assumed_plant(observer: Any) -> tuple[LinearPlant, float]:
+    """Return the plant that an observer is made for, in its canonical form, with b0 for its gain; and the delay before it [s]."""
+    known = observer.plant
+    A = np.diag(np.ones(observer.order - 1), 1)
+    A[-1] = -known.a
+    plant = LinearPlant(A, known.B * (observer.b0 / known.b), np.eye(observer.order)[0], known.E[:, None])
+    return plant, observer.dt * getattr(observer.model, "samples", 0)
 
 
 def _unstable(loop: LoopAnalysis, when: str, what_to_do: str) -> Finding:

@@ -122,7 +122,7 @@ def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
     if not (run.features or isinstance(controller.learner, NoLearner)):
         raise ValueError(
             f"t = {t!r}: {type(controller.learner).__name__} has no coefficients to record; "
-            "pass the scenario to margins_over_time, or the final_state of a run that ends then"
+            "pass the scenario to loops_over_time, or the final_state of a run that ends then"
         )
     gain, slope = np.zeros(order + 1), 0.0
     states = {f"x{i + 1}": i for i in range(order)}
@@ -134,7 +134,7 @@ def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
         elif not name.startswith(_FEEDFORWARD):
             raise ValueError(
                 f"t = {t!r}: the feature {name!r} is not linear, its coefficient alone says nothing; "
-                "pass the scenario to margins_over_time, or the final_state of a run that ends then"
+                "pass the scenario to loops_over_time, or the final_state of a run that ends then"
             )
     return _heard(controller, gain, 0.0, slope, float(run["authority"][row]) if "authority" in run.names else 1.0)
 

@@ -55,12 +55,15 @@ def analyse(plant: Any, controller: Any, *, at: Any = None, delay: float = 0.0, 
     if not (hasattr(controller, "dt") and (hasattr(controller, "law") or hasattr(controller, "observer"))):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     dt = float(controller.dt)
-    return LoopAnalysis(sampled_plant(plant, dt, delay, actuator_lag), linear_law(controller, at), dt, _nominal(controller))
+    sampled = sampled_plant(plant, dt, delay, actuator_lag)
+    return LoopAnalysis(sampled, linear_law(controller, at), dt, _b_over_b0(sampled, getattr(controller, "observer", None)))
 
 
-def _nominal(controller: Any) -> tuple[int, float] | None:
-    observer = getattr(controller, "observer", None)
-    return None if observer is None else (int(observer.order), float(observer.b0))
+def _b_over_b0(plant: SampledPlant, observer: Any) -> float | None:
+    """Return the plant's gain over the nominal one, where both are gains to the same derivative of y."""
+    if observer is None or observer.degree not in plant.b:
+        return None
+    return plant.b[observer.degree] / float(observer.b0)
 
 
 class LoopAnalysis:
@@ -74,11 +77,13 @@ class LoopAnalysis:
         C_r and C_y.
     dt : float
         sample time [s].
+    b_over_b0 : float or None
+        the plant's gain over the b0 of the controller; None where there is no b0, where the plant was given sampled, and where u does not
+        reach the derivative of y first that the controller takes for it.
     """
 
-    def __init__(self, plant: SampledPlant, law: LinearLaw, dt: float, nominal: tuple[int, float] | None = None) -> None:
-        self.plant, self.law, self.dt = plant, law, dt
-        self._nominal = nominal
+    def __init__(self, plant: SampledPlant, law: LinearLaw, dt: float, b_over_b0: float | None = None) -> None:
+        self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
         self._N = law.A - np.eye(law.A.shape[0]) + np.outer(law.B_u, law.C)
         self._P = System.balanced(plant.N, plant.B, plant.C, 0.0)
         self._C_y = System.balanced(self._N, law.B_y + law.B_u * law.D_y, -law.C, -law.D_y)
@@ -93,11 +98,13 @@ class LoopAnalysis:
             return f"unstable: a pole at |z| = {np.max(np.abs(self.poles)):.6g}"
         m, (noise, peak) = self.margins, (self.noise_to_control, self.noise_to_control_peak)
         low, high = self.b_range
-        what, unit = ("b/b0", "") if self._nominal else ("a gain", " times what it is")
+        what, unit = ("a gain", " times what it is") if self.b_over_b0 is None else ("b/b0", "")
+        least_gain, most_gain = m.disk_gain
         return "\n".join(
             [
                 f"gain margin {m.gain[0]:.3g} … {m.gain[1]:.3g}, phase margin {m.phase:.1f}° at {m.phase_omega:.3g} rad/s",
-                f"modulus margin {m.modulus:.3f}, disk margin {m.disk:.3f}, delay margin {1e3 * m.delay:.3g} ms",
+                f"modulus margin {m.modulus:.3f}, delay margin {1e3 * m.delay:.3g} ms",
+                f"disk margin {m.disk:.3f}: gain {least_gain:.3g} … {most_gain:.3g} or phase ±{m.disk_phase:.1f}°, or some of both",
                 f"stable for {what} from {low:.3g} to {high:.3g}{unit}",
                 f"white noise of 1 in y makes u move by {noise:.3g} RMS, at most by a factor of {peak:.3g} at one frequency",
             ]
@@ -164,6 +171,11 @@ class LoopAnalysis:
         Returns
         -------
         (k,) complex array
+
+        Raises
+        ------
+        ValueError
+            for another name.
         """
         checks.one_of("name", name, ("P", "C_r", "C_y", "L", "S", "T", "PS", "CS", "closed_loop"))
         if name in ("P", "C_r", "C_y"):
@@ -199,12 +211,9 @@ class LoopAnalysis:
     def b_range(self) -> tuple[float, float]:
         """Between which values of b/b0 the loop is stable, b being the plant's input gain, its dynamics as they are.
 
-        Without a b0, or where the plant's relative degree is not the controller's order, it is in units of the gain that the plant has.
+        Where ``b_over_b0`` is None, it is in units of the gain that the plant has.
         """
-        relative = 1.0
-        if self._nominal is not None:
-            order, b0 = self._nominal
-            relative = self.plant.b.get(order, b0) / b0
+        relative = 1.0 if self.b_over_b0 is None else self.b_over_b0
         low, high = sorted(relative * factor for factor in self.margins.gain)
         return low, high
 
@@ -238,6 +247,16 @@ class LoopAnalysis:
             ``"r"``, ``"d"`` (load at the plant's input), ``"n"`` (noise), or ``"w1"``, ``"w2"``, … (the plant's disturbances).
         target
             ``"y"``, ``"u"`` or ``"e"``, which is r − y.
+
+        Returns
+        -------
+        System
+            A − I, B, C and D, the plant's states first.
+
+        Raises
+        ------
+        ValueError
+            for another source or target.
         """
         P, law = self.plant, self.law
         sources = ("r", "d", "n", *(f"w{i + 1}" for i in range(P.E.shape[1])))

@@ -76,5 +76,10 @@ def loops_over_omega_o(plant: Any, make_controller: Callable[[float], Any], omeg
     -------
     list of LoopAnalysis
         one for each bandwidth.
+
+    Raises
+    ------
+    ValueError
+        for a bandwidth that is not greater than zero; as ``analyse``.
     """
     return [analyse(plant, make_controller(omega_o), **lags) for omega_o in checks.positive_vector("omegas", omegas).tolist()]

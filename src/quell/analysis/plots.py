@@ -25,6 +25,11 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
         two matplotlib axes; a new figure by default.
     style
         of the lines, for example ``label``.
+
+    Raises
+    ------
+    ValueError
+        for another number of axes.
     """
     alone = axes is None
     top, low = axes = _axes(axes, 2, 1)
@@ -68,6 +73,11 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any
         four matplotlib axes; a new figure by default.
     style
         of the lines, for example ``label``.
+
+    Raises
+    ------
+    ValueError
+        for another number of axes.
     """
     axes = _axes(axes, 2, 2)
     for ax, name, meaning in zip(
@@ -98,6 +108,11 @@ def plot_margins_over_time(times: Any, loops: Sequence[LoopAnalysis], axes: Any 
         three matplotlib axes; a new figure by default.
     style
         of the lines.
+
+    Raises
+    ------
+    ValueError
+        for another number of loops than instants, or of axes.
     """
     axes = _plot_margins(checks.vector("times", times), loops, axes, style)
     axes[-1].set_xlabel("learner frozen at [s]")
@@ -113,6 +128,11 @@ def plot_margins_against_omega_o(plant: Any, make_controller: Callable[[float], 
         as for ``loops_over_omega_o``.
     axes
         four matplotlib axes; a new figure by default.
+
+    Raises
+    ------
+    ValueError
+        as ``loops_over_omega_o``; for another number of axes.
     """
     loops = loops_over_omega_o(plant, make_controller, omegas, **lags)
     omegas = checks.vector("omegas", omegas)
@@ -141,7 +161,8 @@ def _plot_margins(x: Any, loops: Sequence[LoopAnalysis], axes: Any, style: dict[
     axes[2].fill_between(x, np.maximum(low, 1e-3), np.minimum(high, 1e3), alpha=0.3, **style)
     axes[2].set_yscale("log")
     axes[2].axhline(1.0, color="0.5", linewidth=0.8)
-    for ax, label in zip(axes, ("margin", "phase margin [°]", "b/b0 for which\nit is stable"), strict=True):
+    gain = "gain" if any(loop.b_over_b0 is None for loop in loops) else "b/b0"
+    for ax, label in zip(axes, ("margin", "phase margin [°]", f"{gain} for which\nit is stable"), strict=True):
         ax.set_ylabel(label)
         ax.grid(alpha=0.3)
     axes[0].legend(fontsize="small")
