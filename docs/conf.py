@@ -1,6 +1,11 @@
 """Sphinx configuration."""
 
+import os
+
 import quell
+
+# Whatever the surroundings say: pages without their pictures would be built without a word.
+os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
 
 project = "quell"
 author = "The quell developers"
