@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.integrate import solve_ivp
 
 import quell as ql
 from quell.analysis import analyse, linear_law
 from quell.cli import app
+from quell.commands.acc import _print_cases
 from quell.experiments import acc, acc_designs, acc_samples
-from quell.experiments.acc_cases import study_cases
+from quell.experiments.acc_cases import CaseResult, study_cases
 from quell.experiments.acc_criteria import interval, judge
 from quell.experiments.acc_designs import DT, MB, MF, PUBLISHED, L, designs
 from quell.experiments.acc_loops import closed_loop, unstable
 from quell.experiments.acc_published import judge_published
-from quell.plants import lagged_two_mass_spring
+from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
 
 HEADER = "m1,m2,k_lin,k_nonlin,lambda,tau\n"
@@ -178,6 +182,18 @@ def test_the_original_design_cases_are_met() -> None:
         assert case.margins.modulus > 0.4
     assert cases[L].load_peak < 0.11 < 0.4 < cases[MF].load_peak
     assert cases[L].load_remains < 0.005 < 0.4 < cases[MF].load_remains
+
+
+def test_a_case_that_is_lost_is_called_unstable_and_one_that_does_not_settle_never() -> None:
+    """In the printed table: a size in metres is no time that never comes."""
+    margins = analyse(two_mass_spring(), designs()[MB]).margins
+    lost = CaseResult(margins, np.inf, 12.0, 0.6, 2.1, 0.1, np.inf, np.inf)
+    console = Console(file=io.StringIO(), width=120)
+    _print_cases(console, SimpleNamespace(cases={MB: lost}))  # type: ignore[arg-type]
+    rows = [line for line in console.file.getvalue().splitlines() if line.strip()]  # type: ignore[attr-defined]
+    told = {line.split(":")[0].strip() + line.split()[-1] for line in rows if line.strip()[0] in "13"}
+    assert {"1never", "112.0", "3unstable"} <= told
+    assert "3never" not in told
 
 
 def test_the_command_writes_what_programs_read(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -386,7 +386,7 @@ def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
     other = ql.simulate(chain(2), adrc(2, learner=ql.learners.Kalman()), TRAINING)
     for message, call in (
         ("linearised first", lambda: analysis.analyse(pendulum, adrc(2))),
-        ("lower degree", lambda: analysis.analyse(([1.0, 1.0], [1.0, 2.0]), adrc(2))),
+        ("biproper", lambda: analysis.analyse(([1.0, 1.0], [1.0, 2.0]), adrc(2))),
         ("may not follow the input at once", lambda: analysis.analyse(control.ss(-1.0, 1.0, 1.0, 1.0), adrc(2))),
         ("controller's dt", lambda: analysis.analyse(control.ss(0.5, 1.0, 1.0, 0.0, 0.5), adrc(2))),
         ("whole samples", lambda: analysis.analyse(control.ss(0.5, 1.0, 1.0, 0.0, 0.01), adrc(2), delay=0.005)),

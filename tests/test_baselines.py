@@ -11,7 +11,8 @@ import pytest
 import quell as ql
 from quell.controllers import LinearController, Prefiltered
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio, Shaper, equivalent_pid
-from quell.controllers.baselines.observer_law import kalman_gain, sampled_noise
+from quell.controllers.baselines.observer_law import stationary_gain
+from quell.observers.discretize import gramian
 from quell.observers.eso import continuous_gain
 
 TWO_MASS = ql.plants.two_mass_spring()
@@ -141,7 +142,7 @@ def test_the_gains_of_lqg_are_those_of_python_control() -> None:
     np.testing.assert_allclose(mine.K, np.asarray(K)[0], atol=3e-4)
     mine = LQG(TWO_MASS, 1.2, 6.0, 0.02, process_noise=np.diag([0.0, 0.0, 1.0, 2.0]))
     W = np.zeros((5, 5))
-    W[:4, :4], W[4, 4] = sampled_noise(TWO_MASS.A, np.diag([0.0, 0.0, 1.0, 2.0]), 0.02), 0.02 * 6.0**10
+    W[:4, :4], W[4, 4] = gramian(TWO_MASS.A, np.diag([0.0, 0.0, 1.0, 2.0]), 0.02), 0.02 * 6.0**10
     L = control.dlqe(mine.model.F, np.eye(5), mine.model.H[None], W, [[50.0]])[0]
     # python-control's gain is the predictor's, F L, or the current one, by its version.
     theirs = np.asarray(L)[:, 0]
@@ -298,4 +299,4 @@ def test_a_mistake_is_named(wrong: object, message: str) -> None:
 def test_a_filter_without_solution_says_so() -> None:
     """No noise on a plant with an integrator: the Riccati equation has no stabilising solution."""
     with pytest.raises(ValueError, match="stationary Kalman filter"):
-        kalman_gain(LQG(LAG, 1.0, 5.0, 0.01).model, np.zeros((3, 3)), 1.0)
+        stationary_gain(LQG(LAG, 1.0, 5.0, 0.01).model, np.zeros((3, 3)), 1.0)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.cli import app
 from quell.experiments import compare, compare_figure
 from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
 
@@ -90,6 +91,29 @@ def test_a_mistake_is_named(wrong: object, message: str) -> None:
 def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own."""
     return subprocess.run([sys.executable, "-m", "quell.cli", "compare", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On 80 columns with a spring of half the stiffness: PI + notch grows too slowly to be lost within 100 s, LQG is lost."""
+    monkeypatch.setenv("COLUMNS", "80")
+    names = ["lqg", "pid", "pi-notch", "resonance-ratio", "zvd+lqg"]
+    where = ["--json", str(tmp_path / "out.json"), "--no-figures"]
+    with pytest.raises(SystemExit, match="0"):
+        app(["compare", "--k", "0.5", "--dt", "0.01", "--controllers", ",".join(names), *where])
+    shown = capsys.readouterr().out
+    assert "…" not in shown, "a column is cut"
+    lines = {line.split()[0]: line.split() for line in shown.splitlines() if line.split() and line.split()[0] in names}
+    assert list(lines) == names
+    assert "[%]" in shown
+    assert "[m]" in shown, "a unit is taken for markup"
+    assert all(len(line) >= 7 for line in lines.values())
+    assert lines["pi-notch"][-1] == "unstable"
+    assert lines["pid"][-1] == "ok"
+    assert "diverged" in lines["lqg"]
+    stable = {name: told["stable"] for name, told in json.loads((tmp_path / "out.json").read_text())["controllers"].items()}
+    assert stable == {name: name == "pid" for name in names} | {"resonance-ratio": lines["resonance-ratio"][-1] == "ok"}
 
 
 def test_the_comparison_is_printed_written_and_drawn(tmp_path: Path) -> None:

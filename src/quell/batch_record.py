@@ -116,10 +116,21 @@ class BatchTrajectory(Record):
         A run that diverged within the window is judged by what there is of it; ``diverged`` says which. One that ended before the window is
         NaN throughout. So is whatever is not defined in a run while it is in others.
 
+        Parameters
+        ----------
+        start, stop
+            the window [s]; to the end of the record by default.
+        target
+            where y should go [y-unit]; each run's reference at the end of the window by default.
+        band
+            half width of the settling band, as a fraction of the move.
+
         Returns
         -------
         dict
-            of arrays (runs,).
+            of arrays (runs,), by the names and in the units of ``Trajectory.metrics``: ``peak_error`` and ``rms`` [y-unit], ``iae``
+            [y-unit s], ``ise`` [y-unit² s], ``itae`` [y-unit s²], ``control_variation`` [u-unit]; for a step ``overshoot`` (fraction of the
+            move), ``settling_time`` and ``rise_time`` [s].
 
         Raises
         ------

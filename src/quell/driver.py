@@ -24,7 +24,7 @@ _BLOCK = 8192
 _MOST_SAMPLES = 10**12
 # What each part of a loop is known by, and what to give.
 _PARTS = {
-    "plant": ("sampled", "a plant, for example quell.plants.two_mass_spring()"),
+    "plant": ("sampled", "a plant, for example quell.plants.two_mass_spring() or quell.plants.LinearPlant.of(model)"),
     "controller": ("initial_state", "a controller, for example quell.ADRC(...)"),
     "scenario": ("seeded_signals", "a quell.Scenario"),
 }

@@ -7,13 +7,16 @@ from dataclasses import dataclass, field
 from typing import Any, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.batch import simulate_batch
 from quell.batch_record import BatchTrajectory
 from quell.controllers.base import Controller
 from quell.driver import Course, Loop, channels_of, check_part, pieces
+from quell.observers.models import is_model
 from quell.plants.base import Plant
+from quell.plants.linear import LinearPlant
 from quell.signals import Constant, Signal, as_signal, seeded_apart
 from quell.trajectory import Trajectory
 from quell.types import Status
@@ -81,7 +84,7 @@ class Scenario:
 
 @overload
 def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
-    plant: Plant,
+    plant: Plant | tuple[ArrayLike, ...],
     controller: Controller,
     scenario: Scenario,
     *,
@@ -122,7 +125,9 @@ def simulate(
     Parameters
     ----------
     plant, controller, scenario
-        what to run; the sample time is the controller's. Where one of them is a sequence (for plants ``quell.plants.batch``), it is a
+        what to run; the sample time is the controller's. A linear plant may also be given as ``LinearPlant.of`` takes it, for example as
+        ``(numerator, denominator)``: numbers in a tuple or a list are one plant. Where one of the three is a sequence of plants
+        (``quell.plants.batch``, or a list of them), controllers or scenarios, it is a
         batch: a run for each of its entries, the others the same in all runs or a sequence of the same length. Run i is, bit for bit, what
         ``simulate`` gives for the i-th plant, controller and scenario alone. So all runs of one scenario have the same noise; for other
         noise give a sequence of scenarios with other seeds. All runs of a batch have the same sample time and duration.
@@ -148,9 +153,11 @@ def simulate(
     Raises
     ------
     ValueError
-        for arguments out of range, an x0 of the wrong size, more disturbances than the plant has inputs, or runs that do not fit into one
-        batch.
+        for arguments out of range, a plant that ``LinearPlant.of`` refuses, an x0 of the wrong size, more disturbances than the plant has
+        inputs, or runs that do not fit into one batch.
     """
+    if not hasattr(plant, "sampled") and is_model(plant):
+        plant = LinearPlant.of(plant)
     if any(isinstance(value, Sequence) for value in (plant, controller, scenario)):
         return simulate_batch(plant, controller, scenario, record_every, limit, interpret, progress, record, workers)
     for name, value in (("record", record), ("workers", workers)):

@@ -13,6 +13,8 @@ import numpy as np
 
 from quell import checks
 from quell.observers.discretize import zero_order_hold
+from quell.observers.models import Fraction, leading_gain, read, with_states
+from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
 # A dead time of more samples makes matrices too large to be quick.
@@ -40,8 +42,7 @@ def sampled_plant(plant: Any, dt: float, delay: float = 0.0, actuator_lag: float
     Parameters
     ----------
     plant
-        a ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction``, or ``(num, den)`` in powers of s; one of python-control
-        may be sampled already, with the same dt.
+        whatever ``LinearPlant.of`` takes; a system of python-control or scipy.signal may be sampled already, with the same dt.
     dt
         sample time [s].
     delay
@@ -56,15 +57,20 @@ def sampled_plant(plant: Any, dt: float, delay: float = 0.0, actuator_lag: float
     """
     delay = checks.non_negative("delay", delay, "s")
     actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")
-    A, B, C, E, is_sampled = _state_space(plant, dt)
-    if is_sampled:
+    if getattr(plant, "dt", None):
         if actuator_lag > 0.0 or not math.isclose(delay / dt, round(delay / dt), abs_tol=1e-9):
             raise ValueError(
                 f"delay = {delay!r} s, actuator_lag = {actuator_lag!r} s: a sampled plant takes whole samples of delay and no lag; "
                 "give it in continuous time"
             )
-        return _delayed(A - np.eye(A.shape[0]), B, np.zeros_like(B), C, E, round(delay / dt), {})
-    gains = _first_gain(A, B, C)
+        model = read(plant, dt=dt)
+        model = with_states(model) if isinstance(model, Fraction) else model
+        N, B = model.A - np.eye(model.C.size), model.B[:, None]
+        return _delayed(N, B, np.zeros_like(B), model.C, B, round(delay / dt), {})
+    linear = LinearPlant.of(plant)
+    A, B, C, E = linear.A, linear.B, linear.C[0], linear.E
+    first = leading_gain(A, B, linear.C)
+    gains = {} if first is None else {first[1]: first[0]}
     if actuator_lag > 0.0:
         n = A.shape[0]
         A = np.block([[A, B], [np.zeros((1, n)), np.full((1, 1), -1.0 / actuator_lag)]])
@@ -108,58 +114,3 @@ def _delayed(N: Matrix, now: Matrix, before: Matrix, C: Vector, E: Matrix, sampl
         B[:n] = now[:, 0]
     pad = np.zeros((waiting, E.shape[1]))
     return SampledPlant(big, B, np.vstack([E, pad]), np.append(C, np.zeros(waiting)), gains)
-
-
-def _first_gain(A: Matrix, B: Matrix, C: Vector) -> dict[int, float]:
-    """Return ``{k: C A^(k−1) B}`` for the first that is not zero."""
-    row = C.copy()
-    for k in range(1, A.shape[0] + 1):
-        gain, bound = float(row @ B[:, 0]), float(np.abs(row) @ np.abs(B[:, 0]))
-        if abs(gain) > 1e-12 * bound:
-            return {k: gain}
-        row = row @ A
-    return {}
-
-
-def _state_space(plant: Any, dt: float) -> tuple[Matrix, Matrix, Vector, Matrix, bool]:
-    """Return A, B (n, 1), C (n,), E (n, m), and whether they are sampled already."""
-    if isinstance(plant, tuple) and len(plant) == 2:
-        return *_companion(checks.vector("num", plant[0]), checks.vector("den", plant[1])), False
-    is_sampled = bool(getattr(plant, "dt", None))
-    if is_sampled and (plant.dt is True or not math.isclose(plant.dt, dt, rel_tol=1e-9)):
-        raise ValueError(
-            f"plant has a sample time of {plant.dt!r}: must be in continuous time, or sampled at the controller's dt = {dt!r} s"
-        )
-    if hasattr(plant, "num") and hasattr(plant, "den"):
-        if np.shape(plant.num)[:2] != (1, 1):
-            raise ValueError(f"plant has {np.shape(plant.num)[:2]} outputs and inputs: must have one of each")
-        return *_companion(np.asarray(plant.num[0][0], float), np.asarray(plant.den[0][0], float)), is_sampled
-    if not all(hasattr(plant, name) for name in "ABC"):
-        raise ValueError(
-            f"plant = {plant!r}: must be linear: a LinearPlant, a control.StateSpace or TransferFunction, or (num, den); "
-            "a nonlinear one has to be linearised first"
-        )
-    A = checks.matrix("A", plant.A)
-    n = A.shape[0]
-    A, B, C = checks.matrix("A", A, n, n), checks.matrix("B", plant.B, n, 1), checks.matrix("C", plant.C, 1, n)
-    if np.any(np.asarray(getattr(plant, "D", 0.0)) != 0.0):
-        raise ValueError(f"D = {np.asarray(plant.D).tolist()}: must be zero, the output may not follow the input at once")
-    E = checks.matrix("E", plant.E, n) if hasattr(plant, "E") else B
-    return A, B, C[0].copy(), E, is_sampled
-
-
-def _companion(num: Vector, den: Vector) -> tuple[Matrix, Matrix, Vector, Matrix]:
-    """Return a chain of states with the last row ``−den``; what disturbs enters as u does."""
-    num, den = np.trim_zeros(num, "f"), np.trim_zeros(den, "f")
-    if not 0 < num.size < den.size:
-        raise ValueError(
-            f"num = {num.tolist()}, den = {den.tolist()}: must be polynomials, num of lower degree than den and neither zero, "
-            "or the output follows the input at once"
-        )
-    n = den.size - 1
-    A = np.diag(np.ones(n - 1), 1)
-    A[-1] = -den[:0:-1] / den[0]
-    B, C = np.zeros((n, 1)), np.zeros(n)
-    B[-1, 0] = 1.0
-    C[: num.size] = num[::-1] / den[0]
-    return A, B, C, B

@@ -92,8 +92,8 @@ def _print_cases(console: Console, result: acc.Result) -> None:
         ("1: settled after impulse, k = 1 [s]", lambda case: _number(case.settled_at, ".1f")),
         ("1: the same, worst k from 0.5 to 2 [s]", lambda case: _number(case.settled_at_worst, ".1f")),
         ("2: stable for m1, m2, k, all within [%]", lambda case: f"±{100.0 * case.parameter_bound:.1f}"),
-        ("3: |y| under the load, from 20 s on [m]", lambda case: _number(case.load_peak, ".4f")),
-        ("3: the same, last period of 80 s [m]", lambda case: _number(case.load_remains, ".5f")),
+        ("3: |y| under the load, from 20 s on [m]", lambda case: _number(case.load_peak, ".4f", "unstable")),
+        ("3: the same, last period of 80 s [m]", lambda case: _number(case.load_remains, ".5f", "unstable")),
     )
     for label, cell in rows:
         table.add_row(escape(label), *map(cell, result.cases.values()))
@@ -101,5 +101,5 @@ def _print_cases(console: Console, result: acc.Result) -> None:
     console.print("Settled: |y| ≤ 0.1 m for good. Load: sin(0.5 t) N on m2, two phases, u not limited; worst k and phase.")
 
 
-def _number(value: float, form: str) -> str:
-    return format(value, form) if np.isfinite(value) else "never"
+def _number(value: float, form: str, otherwise: str = "never") -> str:
+    return format(value, form) if np.isfinite(value) else otherwise

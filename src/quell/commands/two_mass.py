@@ -99,7 +99,7 @@ def _print(console: Console, result: Result) -> None:
     scores = Table(title=f"All controllers ({about})", title_justify="left", box=SIMPLE_HEAD)
     scores.add_column("controller", no_wrap=True)
     for _, heading, _, _ in _COLUMNS:
-        scores.add_column(heading, justify="right")
+        scores.add_column(escape(heading), justify="right")
     for name, score in result.scores.items():
         values = [(score[key], factor, form) for key, _, factor, form in _COLUMNS]
         scores.add_row(name, *("–" if value is None else format(factor * value, form) for value, factor, form in values))

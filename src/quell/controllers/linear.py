@@ -260,7 +260,18 @@ class LinearController(Running):
 
 
 def checked_law(law: Any) -> LinearLaw:
-    """Return the law with contiguous arrays that can't be written to; a ``ValueError`` says what does not fit."""
+    """Return the law with contiguous arrays that can't be written to.
+
+    Parameters
+    ----------
+    law
+        a ``LinearLaw``: A (m, m); B_r, B_y, B_u and C (m,); D_r and D_y numbers [u-unit/y-unit].
+
+    Raises
+    ------
+    ValueError
+        for what is no ``LinearLaw``, shapes that do not fit, or an entry that is not finite; the message names the matrix.
+    """
     if not isinstance(law, LinearLaw):
         raise ValueError(f"law = {law!r}: must be a quell.controllers.LinearLaw")
     A = checks.matrix("law.A", law.A)

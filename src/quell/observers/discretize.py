@@ -1,4 +1,4 @@
-"""Exact zero-order-hold sampling."""
+"""Exact sampling: of inputs that are held, and of what adds up between samples."""
 
 from __future__ import annotations
 
@@ -41,3 +41,35 @@ def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Mat
     edges = np.cumsum([0, *(b.shape[1] for b in inputs)]) + n
     gammas = [np.ascontiguousarray(sampled[:n, i:j]) for i, j in pairwise(edges)]
     return np.ascontiguousarray(sampled[:n, :n]), gammas
+
+
+def gramian(A: Matrix, Q: Matrix, dt: float) -> Matrix:
+    """Return ``∫ exp(A s) Q exp(Aᵀ s) ds`` over a sample, from one exponential (Van Loan 1978).
+
+    ::
+
+        exp([[−A, Q], [0, Aᵀ]] dt) = [[·, G], [0, Φᵀ]],      ∫ = Φ G
+
+    For white noise of density Q on x' it is the covariance a sample. With Aᵀ in place of A it is the weight of x(0) in the cost
+    ``∫ xᵀ Q x dt`` of a sample.
+
+    Parameters
+    ----------
+    A
+        (n, n), in 1/s.
+    Q
+        (n, n), symmetric.
+    dt
+        sample time [s].
+
+    Returns
+    -------
+    (n, n) array
+        symmetric, in the unit of Q times s.
+    """
+    from scipy.linalg import expm
+
+    n = A.shape[0]
+    block = expm(np.block([[-A, Q], [np.zeros((n, n)), A.T]]) * dt)
+    found: Matrix = block[n:, n:].T @ block[:n, n:]
+    return 0.5 * (found + found.T)

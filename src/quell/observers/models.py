@@ -1,7 +1,11 @@
-"""What a user may give for a plant, brought to one of two shapes: matrices, or a polynomial over a polynomial."""
+"""What a user may give for a plant, brought to one of two shapes: matrices, or a polynomial over a polynomial.
+
+The only place that knows: ``canonical`` and ``LinearPlant.of`` read with it, and all that takes a linear plant reads with one of the two.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +15,10 @@ from quell.types import Matrix, Vector
 
 # A leading coefficient of a numerator that is below this share of the others, at the plant's own rate, is the rounding of a conversion.
 _ROUNDING = 1e-10
+# So much of a numerator's coefficient may be lost to rounding.
+_KEPT = 1e-6
+# Markov parameters below this share of their own bound count as zero.
+_ZERO_TOLERANCE = 1e-9
 
 
 class StateSpace(NamedTuple):
@@ -27,7 +35,7 @@ class StateSpace(NamedTuple):
 
 
 class Fraction(NamedTuple):
-    """``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = c_{n−1} u^(n−1) + … + c_0 u``."""
+    """``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = c_{n−1} u^(n−1) + … + c_0 u``; for a sampled model shifts in place of derivatives."""
 
     a: Vector
     """(n,)."""
@@ -35,21 +43,35 @@ class Fraction(NamedTuple):
     """(n,)."""
 
 
-def read(plant: Any, E: Any = None) -> StateSpace | Fraction:
-    """Return what ``plant`` is, checked; see ``canonical`` for what it may be.
+def read(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace | Fraction:
+    """Return what ``plant`` is, checked.
+
+    Parameters
+    ----------
+    plant
+        see ``LinearPlant.of`` for what it may be.
+    E
+        where the disturbance enters, if that is not where u does; see ``canonical``.
+    dt
+        a model in discrete time may be given too, if this is its sample time [s]; by default none may.
 
     Raises
     ------
     ValueError
         naming what does not fit.
     """
+    if isinstance(plant, list):
+        plant = tuple(plant)
     if isinstance(plant, tuple) and len(plant) in (3, 4):
         A, B, C = plant[0], plant[1], plant[-1]
-        if len(plant) == 4 and E is not None:
+        if len(plant) == 3:
+            return _state_space(A, B, C, None if E is None else _channel(E, None))
+        if E is not None:
             raise ValueError("E is given twice: in plant = (A, B, E, C) and as an argument; leave one out")
-        return _state_space(A, B, C, None if len(plant) == 3 else _channel(plant[2], None))
+        _check_four(A, C)
+        return _state_space(A, B, C, _channel(plant[2], None))
     if all(hasattr(plant, name) for name in "ABC"):
-        _check_continuous(plant)
+        _check_time(plant, dt)
         if hasattr(plant, "D") and np.any(np.asarray(plant.D) != 0.0):
             raise ValueError(f"D = {np.asarray(plant.D).tolist()}: must be zero, the output may not follow the input at once")
         return _state_space(plant.A, plant.B, plant.C, None if E is None else _channel(E, getattr(plant, "E", None)))
@@ -61,18 +83,84 @@ def read(plant: Any, E: Any = None) -> StateSpace | Fraction:
             b = checks.nonzero("b", plant[1], "or the input does not reach the plant")
             return Fraction(a, np.append(b, np.zeros(a.size - 1)))
         return _fraction(*plant)
+    if all(hasattr(plant, name) for name in ("zeros", "poles", "gain", "to_tf")):  # scipy.signal.ZerosPolesGain
+        plant = plant.to_tf()
     if hasattr(plant, "num") and hasattr(plant, "den"):
-        _check_continuous(plant)
+        _check_time(plant, dt)
         if np.ndim(plant.num) == 1:  # as scipy.signal has them
             return _fraction(plant.num, plant.den)
         outputs, inputs = len(plant.num), len(plant.num[0])
         if (outputs, inputs) != (1, 1):
-            raise ValueError(f"plant has {(outputs, inputs)} outputs and inputs: an ESO needs one of each")
+            raise ValueError(f"plant has {(outputs, inputs)} outputs and inputs: must have one of each")
         return _fraction(plant.num[0][0], plant.den[0][0])
     raise ValueError(
         f"plant = {plant!r}: must be a linear plant or control.StateSpace (with A, B, C), matrices (A, B, C) or (A, B, E, C), "
-        "a control.TransferFunction, (numerator, denominator) or (a, b)"
+        "a control.TransferFunction, (numerator, denominator) or (a, b); a nonlinear one has to be linearised first"
     )
+
+
+def with_states(model: Fraction) -> StateSpace:
+    """Return a transfer function's states, those of ``canonical``: x_1 = y, and u is not differentiated.
+
+    ``x_i' = x_{i+1} + B_i u``, ``x_n' = −a·x + B_n u``, with the quotient's powers of 1/s, the Markov parameters, for B: for
+    ``c_{n−k} = B_k + Σ_{j<k} a_{n−k+j} B_j``.
+
+    Raises
+    ------
+    ValueError
+        where rounding would change the numerator by a millionth, as for zeros at 0.01 rad/s beside three poles at 10000.
+    """
+    a, c = model
+    n = a.size
+    B = np.empty(n)
+    for k in range(n):
+        B[k] = c[n - 1 - k] - sum(a[n - j] * B[k - j] for j in range(1, k + 1))
+    for k in range(n):
+        kept = B[k] + sum(a[n - j] * B[k - j] for j in range(1, k + 1))
+        if c[n - 1 - k] != 0.0 and not abs(kept - c[n - 1 - k]) <= _KEPT * abs(c[n - 1 - k]):
+            raise ValueError(
+                f"transfer function has poles and zeros too far apart for states in double precision: the numerator's {c[n - 1 - k]:.6g} "
+                f"s^{n - 1 - k} would become {kept:.6g}; leave the fastest poles out, or give matrices (A, B, C)"
+            )
+    A = np.diag(np.ones(n - 1), 1)
+    A[-1] = -a
+    return StateSpace(A, B, np.eye(n)[0], None)
+
+
+def is_model(value: Any) -> bool:
+    """Return whether ``value`` is of a kind that ``read`` knows: an object with matrices or polynomials, or numbers in a tuple or list."""
+    if isinstance(value, tuple | list):
+        return len(value) > 0 and isinstance(value[0], int | float | np.number | np.ndarray | tuple | list)
+    return not isinstance(value, type) and any(
+        all(hasattr(value, name) for name in names) for names in (("A", "B", "C"), ("num", "den"), ("zeros", "poles", "gain"))
+    )
+
+
+def leading_gain(A: Matrix, column: Matrix, C: Matrix) -> tuple[float, int] | None:
+    """Return the first Markov parameter that is not zero, ``b = C A^(ν−1) column``, and the relative degree ν.
+
+    Parameters
+    ----------
+    A
+        (n, n), in 1/s.
+    column
+        (n, 1), where the input enters: B, or a column of E.
+    C
+        (1, n).
+
+    Returns
+    -------
+    tuple or None
+        b in y-unit / input-unit / s^ν, and ν from 1 to n; None where the input does not reach y. What is below 1e-9 of
+        ``|C| |A|^(ν−1) |column|`` is the rounding of sums that cancel.
+    """
+    row, bound = C[0], np.abs(C[0])
+    for degree in range(1, A.shape[0] + 1):
+        gain = float(row @ column[:, 0])
+        if abs(gain) > _ZERO_TOLERANCE * float(bound @ np.abs(column[:, 0])):
+            return gain, degree
+        row, bound = row @ A, bound @ np.abs(A)
+    return None
 
 
 def _state_space(A: Any, B: Any, C: Any, E: Any) -> StateSpace:
@@ -129,6 +217,19 @@ def _without_rounding(num: Vector, den: Vector) -> Vector:
     return num[int(np.argmax(size > _ROUNDING * np.max(size))) :]
 
 
-def _check_continuous(plant: Any) -> None:
-    if getattr(plant, "dt", None):
-        raise ValueError(f"plant has a sample time, dt = {plant.dt!r}: must be a continuous-time model (the ESO is sampled by its own dt)")
+def _check_four(A: Any, C: Any) -> None:
+    """Check that four matrices end with C: scipy's and python-control's order ends with D."""
+    n = checks.matrix("A", A).shape[0]
+    if np.size(C) != n or not np.any(C):
+        what = "is zero" if np.size(C) == n else f"has shape {np.shape(C)}"
+        raise ValueError(f"C, the last of four, {what}: four entries are (A, B, E, C), not (A, B, C, D); D must be zero, leave it out")
+
+
+def _check_time(plant: Any, dt: float | None) -> None:
+    own = getattr(plant, "dt", None)
+    if not own:
+        return
+    if dt is None:
+        raise ValueError(f"plant has a sample time, dt = {own!r}: must be a continuous-time model; it is sampled here")
+    if own is True or not math.isclose(own, dt, rel_tol=1e-9):
+        raise ValueError(f"plant has a sample time of {own!r}: must be in continuous time, or sampled at the controller's dt = {dt!r} s")

@@ -35,7 +35,7 @@ class PlantBatch(Sequence[Plant]):
             raise ValueError("plants has no entries: a batch must hold at least one plant")
         for i, plant in enumerate(self._plants):
             if isinstance(plant, type) or not hasattr(plant, "sampled"):
-                raise ValueError(f"plant[{i}] = {plant!r}: must be a plant, for example quell.plants.two_mass_spring()")
+                raise ValueError(f"plant[{i}] = {plant!r}: must be a plant, for example quell.plants.LinearPlant.of(model)")
             for what, (mine, first) in {
                 "kind": (type(plant).__name__, type(self._plants[0]).__name__),
                 "order": (plant.order, self._plants[0].order),

@@ -9,6 +9,7 @@ import numpy as np
 
 from quell import checks
 from quell.observers.discretize import zero_order_hold
+from quell.observers.models import Fraction, read, with_states
 from quell.plants.base import advance, measure
 from quell.types import Matrix, Vector
 
@@ -87,6 +88,52 @@ class LinearPlant:
         for name, value in (("A", A), ("B", B), ("C", C), ("E", E)):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def of(cls, model: Any, E: Any = None, *, name: str = "linear plant") -> LinearPlant:
+        """Return what ``model`` describes as a plant; all that takes a linear plant takes these too.
+
+        Parameters
+        ----------
+        model
+            one of
+
+            * matrices ``(A, B, C)``, or ``(A, B, E, C)`` as in the paper's eq. (1), in a tuple or a list; B, E and C may be vectors,
+            * a transfer function ``(numerator, denominator)``, sequences in descending powers of s,
+            * ``(a, b)`` with a number b: ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u``,
+            * a continuous-time ``control.StateSpace`` or ``control.TransferFunction``, of one input and output, with D = 0,
+            * the same of scipy.signal: ``StateSpace``, ``TransferFunction``, ``ZerosPolesGain``,
+            * a ``LinearPlant``, which is returned as it is, or anything else with A, B and C.
+        E
+            where the disturbance enters: a column (n,) or (n, 1), or the index of one of the plant's own disturbance inputs. By default a
+            plant keeps its own, and for the others it enters where u does.
+        name
+            for tables and plots.
+
+        Returns
+        -------
+        LinearPlant
+            with the model's own states. A transfer function has those of ``canonical``: without zeros y and its derivatives
+            [y-unit/s^(i−1)]; with zeros ``x_1 = y``, ``x_{i+1} = x_i' − B_i u``.
+
+        Raises
+        ------
+        ValueError
+            where shapes do not fit, an entry is not finite, y follows u at once, the model is of discrete time, or it is no linear model.
+
+        Examples
+        --------
+        >>> motor = LinearPlant.of(([50.0], [1.0, 22.0, 40.0, 0.0]))
+        >>> motor.order, motor.B[:, 0].tolist()
+        (3, [0.0, 0.0, 50.0])
+        """
+        if isinstance(model, cls) and E is None:
+            return model
+        found = read(model, E)
+        if isinstance(found, Fraction):
+            found = with_states(found)
+        column = getattr(model, "E", None) if found.E is None else found.E[:, None]
+        return cls(found.A, found.B, found.C, column, name=name)
 
     @property
     def order(self) -> int:

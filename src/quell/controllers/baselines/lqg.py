@@ -24,13 +24,13 @@ from quell import checks
 from quell.controllers.baselines.observer_law import (
     check_reachable,
     feedback_law,
-    kalman_gain,
-    leading_gain,
-    plant_matrices,
-    sampled_noise,
+    stationary_gain,
     with_disturbance,
 )
 from quell.controllers.linear import LinearController
+from quell.observers.discretize import gramian, zero_order_hold
+from quell.observers.models import leading_gain
+from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
 
@@ -40,7 +40,7 @@ class LQG(LinearController):
     Parameters
     ----------
     plant
-        a linear plant, or a ``control.StateSpace`` in continuous time, of one input and output.
+        whatever ``LinearPlant.of`` takes; it says which are the states of a transfer function.
     omega_c, omega_o
         bandwidths of state feedback and filter [rad/s], from which the weights come.
     dt
@@ -89,14 +89,18 @@ class LQG(LinearController):
         process_noise: Any = None,
         **options: Any,
     ) -> None:
-        A, B, C = plant_matrices(plant)
+        linear = LinearPlant.of(plant)
+        A, B, C = linear.A, linear.B, linear.C
         n = A.shape[0]
         omega_c, omega_o = checks.positive("omega_c", omega_c, "rad/s"), checks.positive("omega_o", omega_o, "rad/s")
         dt = checks.positive("dt", dt, "s")
         check_reachable(A, B, "plant is not stabilisable from u")
         check_reachable(A.T, C.T, "plant is not detectable from y")
         _check_zero(A, B, C)
-        b, degree = leading_gain(A, B, C)
+        first = leading_gain(A, B, C)
+        if first is None:
+            raise ValueError("u does not reach y: B or C is zero, or they have no mode in common")
+        b, degree = first
         rho = b**2 / omega_c ** (2 * degree) if rho is None else checks.positive("rho", rho)
         weight = C.T @ C if Q is None else checks.matrix("Q", Q, n, n)
         self.K = _state_gain(A, B, weight, rho, dt)
@@ -105,8 +109,8 @@ class LQG(LinearController):
         W = np.zeros((n + 1, n + 1))
         W[n, n] = dt * omega_o ** (2 * (degree + 1)) / b**2
         if process_noise is not None:
-            W[:n, :n] = sampled_noise(A, checks.matrix("process_noise", process_noise, n, n), dt)
-        self.L = kalman_gain(self.model, W, 1.0 / dt)
+            W[:n, :n] = gramian(A, checks.matrix("process_noise", process_noise, n, n), dt)
+        self.L = stationary_gain(self.model, W, 1.0 / dt)
         phi, gamma = self.model.F[:n, :n], self.model.G[:n]
         self.N = 1.0 / float(C[0] @ np.linalg.solve(np.eye(n) - phi + np.outer(gamma, self.K), gamma))
         super().__init__(feedback_law(self.model, self.L, np.append(self.K, 1.0), self.N), dt, **({"name": "LQG"} | options))
@@ -120,17 +124,14 @@ def _check_zero(A: Matrix, B: Matrix, C: Matrix) -> None:
 
 def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vector:
     """Return K (n,) of the sampled regulator whose cost is the integral of ``x'Qx + ρ u²``, u held over a sample."""
-    from scipy.linalg import expm, solve_discrete_are
+    from scipy.linalg import solve_discrete_are
 
     n = A.shape[0]
     inner = np.block([[A, B], [np.zeros((1, n + 1))]])
     cost = np.zeros((n + 1, n + 1))
     cost[:n, :n], cost[n, n] = Q, rho
-    block = expm(np.block([[-inner.T, cost], [np.zeros_like(inner), inner]]) * dt)
-    moved = block[n + 1 :, n + 1 :]
-    sampled = moved.T @ block[: n + 1, n + 1 :]
-    sampled = 0.5 * (sampled + sampled.T)
-    phi, gamma = moved[:n, :n], moved[:n, n:]
+    sampled = gramian(inner.T, cost, dt)
+    phi, (gamma,) = zero_order_hold(A, [B], dt)
     S, R = sampled[:n, n:], sampled[n:, n:]
     try:
         P = solve_discrete_are(phi, gamma, sampled[:n, :n], R, s=S)

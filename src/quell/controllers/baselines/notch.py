@@ -37,6 +37,15 @@ class Notch(NamedTuple):
 
         The less is known of the resonance, the wider; the wider, the more lag below.
 
+        Parameters
+        ----------
+        omega
+            centre [rad/s].
+        depth
+            share of the amplitude that passes at the centre, from 0 to below 1.
+        width
+            as a share of ``omega``, greater than zero.
+
         Raises
         ------
         ValueError

@@ -15,11 +15,10 @@ told the applied u, it does not wind up.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from quell import checks
 from quell.controllers.linear import LinearLaw
 from quell.observers.discretize import zero_order_hold
 from quell.types import Matrix, Vector
@@ -34,25 +33,6 @@ class SampledModel(NamedTuple):
     F: Matrix
     G: Vector
     H: Vector
-
-
-def plant_matrices(plant: Any) -> tuple[Matrix, Matrix, Matrix]:
-    """Return A (n, n), B (n, 1), C (1, n) of a linear plant or a continuous-time ``control.StateSpace``.
-
-    Raises
-    ------
-    ValueError
-        for what has no such matrices, a sample time, or a D that is not zero.
-    """
-    if not all(hasattr(plant, name) for name in "ABC"):
-        raise ValueError(f"plant = {plant!r}: must be a linear plant, with A, B and C, for example quell.plants.two_mass_spring()")
-    if getattr(plant, "dt", None):
-        raise ValueError(f"plant has a sample time, dt = {plant.dt!r}: must be a continuous-time model; it is sampled here")
-    if np.any(np.asarray(getattr(plant, "D", 0.0)) != 0.0):
-        raise ValueError(f"D = {np.asarray(plant.D).tolist()}: must be zero, the output may not follow the input at once")
-    A = checks.matrix("A", plant.A)
-    n = A.shape[0]
-    return checks.matrix("A", A, n, n), checks.matrix("B", plant.B, n, 1), checks.matrix("C", plant.C, 1, n)
 
 
 def with_disturbance(A: Matrix, B: Matrix, C: Matrix, E: Matrix, dt: float) -> SampledModel:
@@ -79,28 +59,10 @@ def check_reachable(A: Matrix, B: Matrix, what: str) -> None:
                 raise ValueError(f"{what}: its mode at s = {pole:.4g} rad/s does not fade by itself")
 
 
-def leading_gain(A: Matrix, B: Matrix, C: Matrix) -> tuple[float, int]:
-    """Return ``b = C A^(ν−1) B``, the first Markov parameter that is not zero, and ν."""
-    row, bound = C[0], float(np.linalg.norm(C) * np.linalg.norm(B))
-    for degree in range(1, A.shape[0] + 1):
-        gain = float(row @ B[:, 0])
-        if abs(gain) > 1e-9 * bound:
-            return gain, degree
-        row, bound = row @ A, bound * float(np.linalg.norm(A, 2))
-    raise ValueError("u does not reach y: B or C is zero, or they have no mode in common")
-
-
-def sampled_noise(A: Matrix, density: Matrix, dt: float) -> Matrix:
-    """Return the covariance a sample of white noise on x' (Van Loan 1978)."""
-    from scipy.linalg import expm
-
-    n = A.shape[0]
-    block = expm(np.block([[-A, density], [np.zeros((n, n)), A.T]]) * dt)
-    return np.asarray(block[n:, n:].T @ block[:n, n:])
-
-
-def kalman_gain(model: SampledModel, W: Matrix, V: float) -> Vector:
+def stationary_gain(model: SampledModel, W: Matrix, V: float) -> Vector:
     """Return the gain L (N,) of the stationary Kalman filter, for process noise W (N, N) a sample and measurement variance V.
+
+    W in state-unit², V in y-unit²; only their ratio counts.
 
     Raises
     ------

@@ -119,6 +119,11 @@ class PID(LinearController):
             sample time [s].
         **options
             passed on to ``PID``. With τ2 the filter time is τ2/10 by default.
+
+        Raises
+        ------
+        ValueError
+            for a gain of zero, a time out of range, a loop asked to be infinitely fast (θ = 0 without ``tau_c``), and as ``PID``.
         """
         gain, tau1 = checks.nonzero("gain", gain, "or u does not reach y"), checks.positive("tau1", tau1, "s")
         theta, tau2 = checks.non_negative("theta", theta, "s"), checks.non_negative("tau2", tau2, "s")
@@ -129,8 +134,25 @@ class PID(LinearController):
     def simc_double_integrator(cls, gain: float, theta: float, *, tau_c: float | None = None, dt: float, **options: Any) -> PID:
         """Tune for ``gain e^(−θs) / s²`` by the SIMC rule for double integrating processes (Skogestad 2003, table 1).
 
-        In series form ``K_c = 1 / (4 gain (τ_c + θ)²)``, ``τ_I = τ_D = 4 (τ_c + θ)``. Parameters as for ``simc``; the filter belongs to θ,
-        and is a tenth of τ_D by default.
+        In series form ``K_c = 1 / (4 gain (τ_c + θ)²)``, ``τ_I = τ_D = 4 (τ_c + θ)``.
+
+        Parameters
+        ----------
+        gain
+            of the model [y-unit/u-unit/s²]: the acceleration that a unit of u makes.
+        theta
+            its delay [s]; half of the sample time and the filter's lag belong to it.
+        tau_c
+            time constant of the loop [s]; θ by default.
+        dt
+            sample time [s].
+        **options
+            passed on to ``PID``. The filter time is τ_D/10 by default.
+
+        Raises
+        ------
+        ValueError
+            as ``simc``.
         """
         gain, theta = checks.nonzero("gain", gain, "or u does not reach y"), checks.non_negative("theta", theta, "s")
         tight = checks.positive("theta, or tau_c,", theta if tau_c is None else tau_c, "s") + theta

@@ -28,8 +28,10 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.baselines.observer_law import feedback_law, kalman_gain, leading_gain, sampled_noise, with_disturbance
+from quell.controllers.baselines.observer_law import feedback_law, stationary_gain, with_disturbance
 from quell.controllers.linear import LinearController
+from quell.observers.discretize import gramian
+from quell.observers.models import leading_gain
 from quell.plants import two_mass_spring
 
 
@@ -105,11 +107,12 @@ class ResonanceRatio(LinearController):
         # filter's fastest poles have the radius omega_o. From the force on the measured mass to y there is an anti-resonance, where that
         # force does not show: a filter that knew of no other would have undamped poles there.
         far = plant.E[:, :1] if measured == "load" else plant.E[:, 1:]
-        (b_far, degree_far), (b_d, degree_d) = (leading_gain(plant.A, column, plant.C) for column in (far, plant.E[:, 1:]))
+        reached = [leading_gain(plant.A, column, plant.C) for column in (far, plant.E[:, 1:])]
+        (b_far, degree_far), (b_d, degree_d) = (found for found in reached if found is not None)  # the spring joins both masses
         density = min(omega_o ** (2 * degree_far) / b_far**2, omega_o ** (2 * degree_d + 2) / (b_d * omega_d) ** 2)
         W = np.zeros((5, 5))
-        W[:4, :4] = sampled_noise(plant.A, far @ far.T * density, dt)
+        W[:4, :4] = gramian(plant.A, far @ far.T * density, dt)
         W[4, 4] = dt * density * omega_d**2
-        self.L = kalman_gain(model, W, 1.0 / dt)
+        self.L = stationary_gain(model, W, 1.0 / dt)
         law = feedback_law(model, self.L, np.append(self.K, self.K_d), m1 * kp)
         super().__init__(law, dt, **({"name": "resonance ratio"} | options))

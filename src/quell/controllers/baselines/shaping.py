@@ -109,7 +109,13 @@ class Shaper:
         return float(abs(left))
 
     def design(self, dt: float) -> ShaperDesign:
-        """Return the impulses on samples of ``dt`` [s]."""
+        """Return the impulses on samples of ``dt`` [s].
+
+        Raises
+        ------
+        ValueError
+            for a dt that is not positive, or so short that the shaper takes more than ten million samples.
+        """
         if self.times[-1] / checks.positive("dt", dt, "s") > _MOST_SAMPLES:
             raise ValueError(f"dt = {dt!r} s: the shaper's {self.times[-1]:.3g} s must be at most {_MOST_SAMPLES} samples")
         weights: dict[int, float] = {}
