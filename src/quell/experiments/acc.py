@@ -1,7 +1,7 @@
 """The ACC benchmark as an outside test: fixed controllers against a thousand uncertain plants.
 
 Two masses on a spring, pushed through an actuator with lag; all of it uncertain. From a unit impulse on m2 the output must be within
-0.1 m from 15 s on, with |u| ≤ 0.5 N always (Rocchetta, Crespo & Kenny, DSCC 2019). Every plant is simulated twice, without and with
+0.1 m from 15 s on, with ``|u| ≤ 0.5`` N always (Rocchetta, Crespo & Kenny, DSCC 2019). Every plant is simulated twice, without and with
 the cubic part of its spring, for 30 s at dt = 10 ms.
 """
 

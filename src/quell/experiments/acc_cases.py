@@ -44,7 +44,7 @@ class CaseResult:
     margins: Margins
     """Of the nominal loop."""
     settled_at: float
-    """When |y| has come below 0.1 m for good after an impulse on m2, at k = 1 [s]; infinite where it does not within 60 s."""
+    """When ``|y|`` has come below 0.1 m for good after an impulse on m2, at k = 1 [s]; infinite where it does not within 60 s."""
     settled_at_worst: float
     """The same for the worst k."""
     stable_from: float
@@ -53,7 +53,7 @@ class CaseResult:
     parameter_bound: float
     """Largest p such that the loop is stable for every m1, m2, k in [1 − p, 1 + p]."""
     load_peak: float
-    """Largest |y| from 20 s on under a sinusoid of 1 N on m2, for the worst k and phase [m]; infinite where a loop is unstable."""
+    """Largest ``|y|`` from 20 s on under a sinusoid of 1 N on m2, for the worst k and phase [m]; infinite where a loop is unstable."""
     load_remains: float
     """The same over the last period of 80 s."""
 

@@ -20,9 +20,9 @@ class Judged(NamedTuple):
     """What a sample of plants made of one controller; each array (count,)."""
 
     late_peak: Vector
-    """Largest |y| from 15 s on [m]; infinite where the loop is unstable."""
+    """Largest ``|y|`` from 15 s on [m]; infinite where the loop is unstable."""
     most_u: Vector
-    """Largest |u| [N]."""
+    """Largest ``|u|`` [N]."""
 
     @property
     def fails(self) -> NDArray[np.bool_]:

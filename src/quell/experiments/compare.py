@@ -110,7 +110,7 @@ def compare(
     >>> lag = LinearPlant([[-1.0]], [1.0], [1.0])
     >>> result = compare(lag, {"PI": PID(kp=4.0, ki=4.0, dt=0.01)}, Scenario(reference=1.0, duration=5.0))
     >>> round(result.scores["PI"]["settling_time"], 2)
-    0.98
+    0.96
     """
     if not controllers:
         raise ValueError("controllers is empty: must have at least one, as {name: controller}")

@@ -15,8 +15,6 @@ from quell.types import Matrix, Vector
 
 # A leading coefficient of a numerator that is below this share of the others, at the plant's own rate, is the rounding of a conversion.
 _ROUNDING = 1e-10
-# So much of a numerator's coefficient may be lost to rounding.
-_KEPT = 1e-6
 # Markov parameters below this share of their own bound count as zero.
 _ZERO_TOLERANCE = 1e-9
 
@@ -100,30 +98,21 @@ def read(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace | Fra
 
 
 def with_states(model: Fraction) -> StateSpace:
-    """Return a transfer function's states, those of ``canonical``: x_1 = y, and u is not differentiated.
+    """Return a transfer function with states, in observable companion form; its coefficients are taken as they are, so nothing is rounded.
 
-    ``x_i' = x_{i+1} + B_i u``, ``x_n' = −a·x + B_n u``, with the quotient's powers of 1/s, the Markov parameters, for B: for
-    ``c_{n−k} = B_k + Σ_{j<k} a_{n−k+j} B_j``.
-
-    Raises
-    ------
-    ValueError
-        where rounding would change the numerator by a millionth, as for zeros at 0.01 rad/s beside three poles at 10000.
+    Without zeros y and its derivatives, ``x_i' = x_{i+1}``, ``x_n' = −a·x + c_0 u``. With zeros, where those would jump with u,
+    ``x_1 = y`` and ``x_i' = x_{i+1} − a_{n−i} x_1 + c_{n−i} u``. The z of ``canonical`` would be rounded here: its Markov parameters hold
+    the slow zeros of a plant with a pole at 10000 rad/s as differences of numbers 1e8 times as large.
     """
     a, c = model
     n = a.size
-    B = np.empty(n)
-    for k in range(n):
-        B[k] = c[n - 1 - k] - sum(a[n - j] * B[k - j] for j in range(1, k + 1))
-    for k in range(n):
-        kept = B[k] + sum(a[n - j] * B[k - j] for j in range(1, k + 1))
-        if c[n - 1 - k] != 0.0 and not abs(kept - c[n - 1 - k]) <= _KEPT * abs(c[n - 1 - k]):
-            raise ValueError(
-                f"transfer function has poles and zeros too far apart for states in double precision: the numerator's {c[n - 1 - k]:.6g} "
-                f"s^{n - 1 - k} would become {kept:.6g}; leave the fastest poles out, or give matrices (A, B, C)"
-            )
     A = np.diag(np.ones(n - 1), 1)
-    A[-1] = -a
+    if not np.any(c[1:]):
+        A[-1] = -a
+        B = np.append(np.zeros(n - 1), c[0])
+    else:
+        A[:, 0] -= a[::-1]
+        B = c[::-1].copy()
     return StateSpace(A, B, np.eye(n)[0], None)
 
 

@@ -113,8 +113,8 @@ class LinearPlant:
         Returns
         -------
         LinearPlant
-            with the model's own states. A transfer function has those of ``canonical``: without zeros y and its derivatives
-            [y-unit/s^(i−1)]; with zeros ``x_1 = y``, ``x_{i+1} = x_i' − B_i u``.
+            with the model's own states. A transfer function ``(c_{n−1} s^(n−1) + … + c_0)/(s^n + a_{n−1} s^(n−1) + … + a_0)`` gets states
+            [y-unit/s^(i−1)]: without zeros y and its derivatives, with zeros ``x_1 = y``, ``x_{i+1} = x_i' + a_{n−i} y − c_{n−i} u``.
 
         Raises
         ------

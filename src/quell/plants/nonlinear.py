@@ -137,6 +137,7 @@ class NonlinearPlant:
 
     Examples
     --------
+    >>> import math
     >>> pendulum = NonlinearPlant(lambda t, x, u, w: (x[1], u - 9.81 * math.sin(x[0])), order=2)
     """
 
