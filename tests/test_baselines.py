@@ -12,7 +12,7 @@ import quell as ql
 from quell.controllers import LinearController, Prefiltered
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio, Shaper, equivalent_pid
 from quell.controllers.baselines.observer_law import stationary_gain
-from quell.observers.discretize import gramian
+from quell.discretize import gramian
 from quell.observers.eso import continuous_gain
 
 TWO_MASS = ql.plants.two_mass_spring()

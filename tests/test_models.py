@@ -11,7 +11,7 @@ import scipy.signal
 
 import quell as ql
 from quell.analysis import analyse
-from quell.observers.models import leading_gain
+from quell.models import leading_gain
 from quell.plants import LinearPlant, two_mass_spring
 
 NUM, DEN = [2.0, 3.0], [1.0, 1.5, 4.0, 0.5]

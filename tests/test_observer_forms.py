@@ -11,8 +11,8 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 import quell as ql
+from quell.discretize import zero_order_hold
 from quell.observers.base import acting, begin, observe
-from quell.observers.discretize import zero_order_hold
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
 from quell.observers.nonlinear import fal

@@ -14,7 +14,7 @@ from quell.batch import simulate_batch
 from quell.batch_record import BatchTrajectory
 from quell.controllers.base import Controller
 from quell.driver import Course, Loop, channels_of, check_part, pieces
-from quell.observers.models import is_model
+from quell.models import is_model
 from quell.plants.base import Plant
 from quell.plants.linear import LinearPlant
 from quell.signals import Constant, Signal, as_signal, seeded_apart

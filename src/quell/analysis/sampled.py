@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.observers.discretize import zero_order_hold
-from quell.observers.models import Fraction, leading_gain, read, with_states
+from quell.discretize import zero_order_hold
+from quell.models import Fraction, leading_gain, read, with_states
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.prefilter import prefilter, settle, slopes
-from quell.observers.discretize import zero_order_hold
+from quell.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.linear import LinearLaw
-from quell.observers.discretize import zero_order_hold
+from quell.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
 METHODS = ("tustin", "zoh")

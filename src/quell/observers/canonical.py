@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.observers.models import Fraction, StateSpace, read
+from quell.models import Fraction, StateSpace, read
 from quell.types import Matrix, Vector
 
 # A state that y shows less than this is not put into larger units: it is not seen.

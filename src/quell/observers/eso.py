@@ -29,10 +29,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.discretize import zero_order_hold
 from quell.observers.base import begin, observe
 from quell.observers.canonical import Canonical, canonical, spell
 from quell.observers.delay import delayed_model, without_delay
-from quell.observers.discretize import zero_order_hold
 from quell.observers.forms import OtherForms
 from quell.observers.nonlinear import NonlinearModel
 from quell.observers.placement import place, sampled_zeros

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.observers.discretize import zero_order_hold
-from quell.observers.models import Fraction, read, with_states
+from quell.discretize import zero_order_hold
+from quell.models import Fraction, read, with_states
 from quell.plants.base import advance, measure
 from quell.types import Matrix, Vector
 

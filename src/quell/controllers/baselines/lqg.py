@@ -28,8 +28,8 @@ from quell.controllers.baselines.observer_law import (
     with_disturbance,
 )
 from quell.controllers.linear import LinearController
-from quell.observers.discretize import gramian, zero_order_hold
-from quell.observers.models import leading_gain
+from quell.discretize import gramian, zero_order_hold
+from quell.models import leading_gain
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 

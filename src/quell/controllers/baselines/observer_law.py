@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.controllers.linear import LinearLaw
-from quell.observers.discretize import zero_order_hold
+from quell.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
 # Relative to their size: below this, singular values and distances to the unit circle count as zero.

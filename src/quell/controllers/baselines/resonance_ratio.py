@@ -30,8 +30,8 @@ import numpy as np
 from quell import checks
 from quell.controllers.baselines.observer_law import feedback_law, stationary_gain, with_disturbance
 from quell.controllers.linear import LinearController
-from quell.observers.discretize import gramian
-from quell.observers.models import leading_gain
+from quell.discretize import gramian
+from quell.models import leading_gain
 from quell.plants import two_mass_spring
 
 
