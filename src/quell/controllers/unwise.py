@@ -66,7 +66,7 @@ def sampling_findings(observer: Any, omega_c: float) -> list[Finding]:
         found.append(
             Finding(
                 *("lag", value, _DELAY_LIMIT),
-                f"order * omega_c * delay = {value:.3g} is above {_DELAY_LIMIT:g}: the delay stays in the loop, which is lost soon after 1; "
+                f"order * omega_c * delay = {value:.3g} is above {_DELAY_LIMIT:g}: the delay stays in the loop, lost soon after 1; "
                 f"lower omega_c to {_DELAY_LIMIT / (observer.degree * delay):.3g} rad/s",
             )
         )
