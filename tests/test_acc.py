@@ -214,3 +214,18 @@ def test_the_command_writes_what_programs_read(tmp_path: Path, capsys: pytest.Ca
     assert "published SP2" in capsys.readouterr().out
     with pytest.raises(ValueError, match="must exist"):
         app(["reproduce", "acc", "--samples", str(tmp_path / "few.csv"), "--json", str(tmp_path / "no" / "out.json"), "--no-figures"])
+
+
+def test_a_sweep_of_the_cubic_part_may_go_through_zero() -> None:
+    """All plants of a batch are of one kind then."""
+    swept = ql.plants.batch(lagged_two_mass_spring, k_cubic=np.linspace(-0.2, 0.2, 5))
+    assert len(swept) == 5
+
+
+def test_samples_are_read_or_drawn(tmp_path: Path) -> None:
+    """Not both."""
+    from quell.commands.acc import reproduce_acc
+
+    (tmp_path / "a.csv").write_text(HEADER + "1,1,1,0,1,0.01\n")
+    with pytest.raises(ValueError, match="--samples reads plants, --count, --spread and --seed are for drawing"):
+        reproduce_acc(samples=tmp_path / "a.csv", count=5, spread=None, seed=None, json_file=None, figures=None)

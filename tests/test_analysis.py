@@ -451,3 +451,17 @@ def test_pictures_show_what_was_calculated() -> None:
     with pytest.raises(ValueError, match="must be 2 matplotlib axes, got 3"):
         analysis.plot_bode(loop, plt.subplots(3)[1])
     plt.close("all")
+
+
+def test_a_prefilter_is_not_in_the_loop() -> None:
+    """What comes before a controller changes none of its margins."""
+    plant, law = ([1.0], [1.0, 1.0, 0.0]), ql.ADRC(ql.ESO.model_free(2, 1.0, 20.0, 0.01), 2.0)
+    behind = ql.controllers.Prefiltered(law, ql.baselines.ZV(3.0))
+    assert ql.analysis.analyse(plant, behind).margins == ql.analysis.analyse(plant, law).margins
+
+
+def test_a_response_at_a_pole_is_refused_by_its_frequency() -> None:
+    """An integrator has none at 0 rad/s."""
+    loop = ql.analysis.analyse(([1.0], [1.0, 0.0]), ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 0.01), 2.0))
+    with pytest.raises(ValueError, match=r"omega = \[0.0\] rad/s: the response is infinite"):
+        loop.response("P", [0.0])

@@ -300,3 +300,22 @@ def test_a_filter_without_solution_says_so() -> None:
     """No noise on a plant with an integrator: the Riccati equation has no stabilising solution."""
     with pytest.raises(ValueError, match="stationary Kalman filter"):
         stationary_gain(LQG(LAG, 1.0, 5.0, 0.01).model, np.zeros((3, 3)), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({"Q": -np.eye(1)}, "Q has the eigenvalue -1: must have none below zero"),
+        ({"process_noise": -np.eye(1)}, "process_noise has the eigenvalue -1"),
+    ],
+)
+def test_weights_of_the_wrong_sign_are_named(weights: dict[str, np.ndarray], message: str) -> None:
+    """Before an equation is solved with them."""
+    with pytest.raises(ValueError, match=message):
+        LQG(LAG, 1.0, 5.0, 0.01, **weights)
+
+
+def test_an_unsymmetric_weight_is_named() -> None:
+    """It would be half ignored."""
+    with pytest.raises(ValueError, match="Q: must be symmetric"):
+        LQG(ql.plants.two_mass_spring(), 1.0, 5.0, 0.01, Q=np.triu(np.ones((4, 4))))

@@ -125,6 +125,17 @@ def matrix(name: str, value: Any, rows: int | None = None, columns: int | None =
     return array
 
 
+def weight(name: str, value: Any, size: int) -> Matrix:
+    """Return ``value`` as a symmetric matrix (size, size) without negative eigenvalues."""
+    array = matrix(name, value, size, size)
+    if not np.allclose(array, array.T, rtol=1e-9, atol=0.0):
+        raise ValueError(f"{name}: must be symmetric")
+    least, most = np.linalg.eigvalsh(array)[[0, -1]].tolist()
+    if least < -1e-9 * abs(most):
+        raise ValueError(f"{name} has the eigenvalue {least:.3g}: must have none below zero")
+    return array
+
+
 def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
     """Return ``value`` if it is one of ``choices``."""
     if value not in choices:

@@ -70,9 +70,9 @@ def two_mass(
 def acc(
     *,
     samples: Path | None = None,
-    count: Annotated[int, Parameter(converter=_whole)] = 1000,
-    spread: float = 1.0,
-    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    count: Annotated[int | None, Parameter(converter=_whole)] = None,
+    spread: float | None = None,
+    seed: Annotated[int | None, Parameter(converter=_whole)] = None,
     json: Annotated[Path | None, Parameter(name="--json")] = None,
     figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
 ) -> None:
@@ -83,11 +83,12 @@ def acc(
     samples
         Read the plants from this CSV file (columns m1, m2, k_lin, k_nonlin, lambda, tau) instead of drawing them.
     count
-        How many plants are drawn.
+        How many plants are drawn: 1000 by default.
     spread
-        How uncertain those are: 1 is the published small uncertainty, 3 about where the best published design fails half of them.
+        How uncertain those are: 1, the default, is the published small uncertainty, 3 about where the best published design fails half of
+        them.
     seed
-        Seed of the plants.
+        Seed of the plants: 0 by default.
     json
         Write all results to this file, for programs.
     figures

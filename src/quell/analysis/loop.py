@@ -22,6 +22,7 @@ from quell.analysis.margins import Margins, least, margins
 from quell.analysis.response import Complex, System, frequencies, in_s_plane, response
 from quell.analysis.sampled import SampledPlant, sampled_plant
 from quell.controllers.linear import LinearLaw
+from quell.controllers.prefilter import Prefiltered
 from quell.types import Matrix, Vector
 
 
@@ -33,7 +34,7 @@ def analyse(plant: Any, controller: Any, *, at: Any = None, delay: float = 0.0, 
     plant
         a ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction``, or ``(num, den)`` in powers of s.
     controller
-        an ``ADRC``, or a linear controller.
+        an ``ADRC``, or a linear controller; one behind a prefilter is analysed without that.
     at
         when its learner is frozen: a ``Frozen`` from ``frozen(controller, run, t)``, or a run or state of the controller (then at its end);
         by default as the controller is now, which for a new one is with nothing learned.
@@ -52,6 +53,8 @@ def analyse(plant: Any, controller: Any, *, at: Any = None, delay: float = 0.0, 
     ValueError
         for a plant that is not linear or answers at once, a controller without linear law, a delay of more than 200 samples.
     """
+    while isinstance(controller, Prefiltered):  # what comes before the loop is not in it
+        controller = controller.controller
     if not (hasattr(controller, "dt") and (hasattr(controller, "law") or hasattr(controller, "observer"))):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     dt = float(controller.dt)

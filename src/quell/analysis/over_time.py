@@ -68,7 +68,7 @@ def loops_over_omega_o(plant: Any, make_controller: Callable[[float], Any], omeg
     make_controller
         returns the controller for an omega_o [rad/s].
     omegas
-        the bandwidths [rad/s].
+        the bandwidths [rad/s], at least one.
     lags
         ``delay`` and ``actuator_lag``, as for ``analyse``.
 
@@ -82,4 +82,7 @@ def loops_over_omega_o(plant: Any, make_controller: Callable[[float], Any], omeg
     ValueError
         for a bandwidth that is not greater than zero; as ``analyse``.
     """
-    return [analyse(plant, make_controller(omega_o), **lags) for omega_o in checks.positive_vector("omegas", omegas).tolist()]
+    bandwidths = checks.positive_vector("omegas", omegas)
+    if bandwidths.size == 0:
+        raise ValueError(f"omegas = {omegas!r}: must hold at least one bandwidth")
+    return [analyse(plant, make_controller(omega_o), **lags) for omega_o in bandwidths.tolist()]

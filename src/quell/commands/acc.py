@@ -19,16 +19,27 @@ from quell.experiments.figures import made
 from quell.files import check_writable, write_json
 
 
-def reproduce_acc(*, samples: Path | None, count: int, spread: float, seed: int, json_file: Path | None, figures: Path | None) -> None:
+def reproduce_acc(
+    *,
+    samples: Path | None,
+    count: int | None,
+    spread: float | None,
+    seed: int | None,
+    json_file: Path | None,
+    figures: Path | None,
+) -> None:
     """Run the benchmark, print its tables, write what was asked for.
 
     Raises
     ------
     ValueError
-        for samples that can't be read or drawn, or a place that can't be written to.
+        for samples that can't be read or drawn, or are to be both, or a place that can't be written to.
     """
     if samples is None:
-        plants, source = acc_samples.generated(count, spread, seed), f"generated, spread {spread:g}, seed {seed}"
+        spread, seed = 1.0 if spread is None else spread, seed or 0
+        plants, source = acc_samples.generated(1000 if count is None else count, spread, seed), f"generated, spread {spread:g}, seed {seed}"
+    elif not (count is None and spread is None and seed is None):
+        raise ValueError("--samples reads plants, --count, --spread and --seed are for drawing them: give one or the other")
     else:
         plants, source = acc_samples.read(samples), samples.name
     if json_file is not None:

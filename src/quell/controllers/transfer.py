@@ -73,7 +73,7 @@ def realised(numerators: list[Any], den: Any) -> System:
         polynomial = np.trim_zeros(checks.vector("num", given), "f")
         if polynomial.size > m + 1:
             raise ValueError(
-                f"num = {given!r}: is of degree {polynomial.size - 1}, den of degree {m}: C(s) must be proper; "
+                f"num = {np.asarray(given).tolist()!r}: is of degree {polynomial.size - 1}, den of degree {m}: C(s) must be proper; "
                 "add a filter to what differentiates"
             )
         row[m + 1 - polynomial.size :] = polynomial

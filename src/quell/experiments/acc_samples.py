@@ -139,5 +139,4 @@ def _value(where: str, number: int, row: list[str], place: int, j: int) -> float
 def plant(sample: Vector, cubic: bool) -> LinearPlant | CubicSpringPlant:
     """Return the plant of one sample; with ``cubic`` one with a cubic part, be that zero, so that all are of one kind."""
     m1, m2, k, k_cubic, effectiveness, lag = map(float, sample)
-    linear = lagged_two_mass_spring(m1, m2, k, 0.0, effectiveness, lag)
-    return CubicSpringPlant(linear, m1, m2, k_cubic) if cubic and isinstance(linear, LinearPlant) else linear
+    return lagged_two_mass_spring(m1, m2, k, k_cubic if cubic else None, effectiveness, lag)

@@ -94,7 +94,7 @@ class CubicSpringPlant:
 
 
 def lagged_two_mass_spring(
-    m1: float = 1.0, m2: float = 1.0, k: float = 1.0, k_cubic: float = 0.0, effectiveness: float = 1.0, lag: float = 0.01
+    m1: float = 1.0, m2: float = 1.0, k: float = 1.0, k_cubic: float | None = None, effectiveness: float = 1.0, lag: float = 0.01
 ) -> LinearPlant | CubicSpringPlant:
     """Return two masses on a spring, pushed through an actuator with lag.
 
@@ -109,7 +109,7 @@ def lagged_two_mass_spring(
     k
         stiffness of the spring [N/m].
     k_cubic
-        its cubic part [N/m³]: hardening above zero, softening below; a linear plant is returned where it is zero.
+        its cubic part [N/m³]: hardening above zero, softening below; by default there is none, and the plant is a ``LinearPlant``.
     effectiveness
         share λ of the actuator's force that reaches m1.
     lag
@@ -122,7 +122,7 @@ def lagged_two_mass_spring(
     """
     m1, m2, k = checks.positive("m1", m1, "kg"), checks.positive("m2", m2, "kg"), checks.positive("k", k, "N/m")
     effectiveness, lag = checks.positive("effectiveness", effectiveness), checks.positive("lag", lag, "s")
-    k_cubic = checks.finite("k_cubic", k_cubic)
+    cubic = None if k_cubic is None else checks.finite("k_cubic", k_cubic)
     A = np.zeros((5, 5))
     A[0, 2] = A[1, 3] = 1.0
     A[2, :2] = -k / m1, k / m1
@@ -131,4 +131,4 @@ def lagged_two_mass_spring(
     E = np.zeros((5, 2))
     E[2, 0], E[3, 1] = 1.0 / m1, 1.0 / m2
     linear = LinearPlant(A, B=[0.0, 0.0, 0.0, 0.0, 1.0 / lag], C=[0.0, 1.0, 0.0, 0.0, 0.0], E=E, name="two-mass-spring with lag")
-    return linear if k_cubic == 0.0 else CubicSpringPlant(linear, m1, m2, k_cubic)
+    return linear if cubic is None else CubicSpringPlant(linear, m1, m2, cubic)

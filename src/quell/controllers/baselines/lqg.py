@@ -46,11 +46,12 @@ class LQG(LinearController):
     dt
         sample time [s].
     Q
-        (n, n), weight of the state in place of ``C'C`` [1/s of cost].
+        (n, n), symmetric, weight of the state in place of ``C'C`` [1/s of cost].
     rho
         weight of u² in place of that from ``omega_c``.
     process_noise
-        (n, n), density of white noise on the state's derivatives besides the disturbance [state-unit²/s]; none by default.
+        (n, n), symmetric, density of white noise on the state's derivatives, besides that of the disturbance's, as a multiple of the
+        density of the measurement's noise [(state-unit/s)²/y-unit²]; none by default. Only the ratio of the two counts.
     u_min, u_max, rate_limit, name
         as for ``LinearController``.
 
@@ -102,14 +103,14 @@ class LQG(LinearController):
             raise ValueError("u does not reach y: B or C is zero, or they have no mode in common")
         b, degree = first
         rho = b**2 / omega_c ** (2 * degree) if rho is None else checks.positive("rho", rho)
-        weight = C.T @ C if Q is None else checks.matrix("Q", Q, n, n)
+        weight = C.T @ C if Q is None else checks.weight("Q", Q, n)
         self.K = _state_gain(A, B, weight, rho, dt)
         self.model = with_disturbance(A, B, C, B, dt)
         # Densities become variances a sample: that of y over dt, that of the walk times dt; only their ratio counts.
         W = np.zeros((n + 1, n + 1))
         W[n, n] = dt * omega_o ** (2 * (degree + 1)) / b**2
         if process_noise is not None:
-            W[:n, :n] = gramian(A, checks.matrix("process_noise", process_noise, n, n), dt)
+            W[:n, :n] = gramian(A, checks.weight("process_noise", process_noise, n), dt)
         self.L = stationary_gain(self.model, W, 1.0 / dt)
         phi, gamma = self.model.F[:n, :n], self.model.G[:n]
         self.N = 1.0 / float(C[0] @ np.linalg.solve(np.eye(n) - phi + np.outer(gamma, self.K), gamma))

@@ -100,7 +100,7 @@ class Shaper:
         object.__setattr__(self, "amplitudes", tuple(amplitudes.tolist()))
 
     def residual(self, omega: float, zeta: float = 0.0) -> float:
-        """Return the vibration V that is left of a mode, as a share of that without shaper (Singer & Seering 1990)."""
+        """Return the vibration V that is left of a mode after the last impulse: 1 is what a single impulse then would leave."""
         omega, zeta = _mode(omega, zeta)
         damped = omega * math.sqrt(1.0 - zeta**2)
         left = sum(
