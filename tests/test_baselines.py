@@ -305,8 +305,8 @@ def test_a_filter_without_solution_says_so() -> None:
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        ({"Q": -np.eye(1)}, "Q has the eigenvalue -1: must have none below zero"),
-        ({"process_noise": -np.eye(1)}, "process_noise has the eigenvalue -1"),
+        ({"Q": -np.eye(2)}, "Q has the eigenvalue -1: must have none below zero"),
+        ({"process_noise": -np.eye(2)}, "process_noise has the eigenvalue -1"),
     ],
 )
 def test_weights_of_the_wrong_sign_are_named(weights: dict[str, np.ndarray], message: str) -> None:
