@@ -71,15 +71,15 @@ def test_noise_is_judged_by_the_range_of_u() -> None:
     """By the RMS that a simulation shows; the omega_o it names passes, and without a range there is nothing to judge by."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
     controller = adrc(40.0, 4.0, 1e-3, u_min=-2.0, u_max=2.0)
-    (finding,) = analysis.advise(controller, noise=1e-3)
+    (finding,) = analysis.advise(controller, noise_std=1e-3)
     noise = 1e-3 * np.random.default_rng(1).normal(size=40_001)
     run = ql.simulate(plant, controller, ql.Scenario(noise=ql.signals.Samples(np.arange(noise.size) * 1e-3, noise), duration=40.0))
     assert finding.subject == "noise"
     assert finding.value == pytest.approx(np.std(run["u"][2000:]) / 4.0, rel=0.05)
     assert finding.value > finding.limit
     lower = float(str(finding).split("lower omega_o to about ")[1].split()[0])
-    assert analysis.advise(adrc(0.98 * lower, 0.098 * lower, 1e-3, u_min=-2.0, u_max=2.0), noise=1e-3) == []
-    assert analysis.advise(adrc(40.0, 4.0, 1e-3), noise=1e-3) == []
+    assert analysis.advise(adrc(0.98 * lower, 0.098 * lower, 1e-3, u_min=-2.0, u_max=2.0), noise_std=1e-3) == []
+    assert analysis.advise(adrc(40.0, 4.0, 1e-3), noise_std=1e-3) == []
 
 
 def test_a_lag_is_judged_by_what_it_leaves_of_the_margins() -> None:

@@ -79,7 +79,7 @@ def test_half_gain_is_half_of_the_bandwidth_design_and_less_noise() -> None:
 def test_kalman_gains_for_a_drifting_f_put_the_poles_in_a_butterworth_pattern(order: int, dt: float) -> None:
     """Symmetric root locus of a chain of integrators: radius ``(drift/(noise dt))^(1/2N)``, which is also omega_o."""
     radius, noise, size = 12.0, 1e-6, order + 1
-    observer = ESO.kalman(order, 1.0, dt, noise=noise, drift=noise * dt * radius ** (2 * size))
+    observer = ESO.kalman(order, 1.0, dt, noise_variance=noise, drift=noise * dt * radius ** (2 * size))
     found = np.log(poles(observer).astype(complex)) / dt
     angles = np.pi + (np.arange(size) - (size - 1) / 2) * np.pi / size
     wanted = radius * np.exp(1j * angles)
@@ -91,7 +91,7 @@ def test_kalman_gains_for_a_drifting_f_put_the_poles_in_a_butterworth_pattern(or
 def test_kalman_gains_are_those_of_python_control(order: int) -> None:
     """``control.dlqe`` gives the predictor's gain, Φ L."""
     dt, noise, drift, jitter, size = 0.01, 1e-4, 3.0, 0.2, order + 1
-    observer = ESO.kalman(order, 1.0, dt, noise=noise, drift=drift, jitter=jitter)
+    observer = ESO.kalman(order, 1.0, dt, noise_variance=noise, drift=drift, jitter=jitter)
     A = np.diag(np.ones(order), 1)
     # The sampled drive, by integration instead of an exponential of blocks.
     times = (np.arange(2000) + 0.5) * dt / 2000
@@ -106,7 +106,7 @@ def test_kalman_gains_are_those_of_python_control(order: int) -> None:
 def test_no_gain_near_the_kalman_gain_estimates_f_with_less_variance() -> None:
     """The optimum is one: in each direction the error's variance grows."""
     dt, noise, drift = 0.01, 1e-4, 3.0
-    observer = ESO.kalman(1, 1.0, dt, noise=noise, drift=drift)
+    observer = ESO.kalman(1, 1.0, dt, noise_variance=noise, drift=drift)
     phi, L = observer.model.transition, observer.model.gain
     Q = drift * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
 
@@ -277,8 +277,8 @@ FORMS = {
     "reduced": ESO.model_free(2, 1.5, 20.0, DT, form="reduced"),
     "half gain": ESO.model_free(2, 1.5, 20.0, DT, half_gain=True),
     "half gain, predictor": ESO.model_free(2, 1.5, 20.0, DT, half_gain=True, form="predictor"),
-    "Kalman": ESO.kalman(2, 1.5, DT, noise=1e-6, drift=1.0, jitter=1e-3),
-    "Kalman, predictor": ESO.kalman(2, 1.5, DT, noise=1e-6, drift=1.0, form="predictor"),
+    "Kalman": ESO.kalman(2, 1.5, DT, noise_variance=1e-6, drift=1.0, jitter=1e-3),
+    "Kalman, predictor": ESO.kalman(2, 1.5, DT, noise_variance=1e-6, drift=1.0, form="predictor"),
     "cascade": ESO.cascade(2, 1.5, 20.0, DT),
     "cascade of three": ESO.cascade(2, 1.5, 30.0, DT, levels=3, ratio=1.5),
     "delay": ESO.model_free(2, 1.5, 20.0, DT, delay=4 * DT),
@@ -352,8 +352,8 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
         (lambda: ESO.model_free(2, 1.0, 10.0, 0.01, half_gain=1), "half_gain = 1"),  # type: ignore[arg-type]
         (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, levels=0), "levels = 0"),
         (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, ratio=0.0), "ratio = 0.0"),
-        (lambda: ESO.kalman(2, 1.0, 0.01, noise=0.0, drift=1.0), "noise = 0.0"),
-        (lambda: ESO.kalman(2, 1.0, 0.01, noise=1e-30, drift=1e30), "no steady-state gain|must be below pi"),
+        (lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=0.0, drift=1.0), "noise_variance = 0.0"),
+        (lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-30, drift=1e30), "no steady-state gain|must be below pi"),
         (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.0), "delta = 0.0"),
         (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.1, alpha=(1.0, 0.5, 1.5)), "alpha = "),
         (lambda: ql.plants.delayed(PLANT, 0.0, 0.01), "delay = 0.0"),

@@ -108,7 +108,7 @@ OBSERVERS: dict[str, ESO] = {
 } | {
     "model-based, order 3, with a zero": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), omega_o=12.0, dt=0.01),
     "half gain": ESO.model_free(2, 1.5, 12.0, 0.01, half_gain=True),
-    "Kalman": ESO.kalman(2, 1.5, 0.01, noise=1e-6, drift=3e-2),
+    "Kalman": ESO.kalman(2, 1.5, 0.01, noise_variance=1e-6, drift=3e-2),
     "cascade": ESO.cascade(2, 1.5, 12.0, 0.01),
     "nonlinear": ESO.nonlinear(2, 1.5, 12.0, 0.01, delta=0.05),
     "delay": ESO.model_free(2, 1.5, 12.0, 0.01, delay=0.02),

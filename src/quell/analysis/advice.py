@@ -24,7 +24,7 @@ def advise(
     controller: Any,
     plant: Any = None,
     *,
-    noise: float | None = None,
+    noise_std: float | None = None,
     actuator_lag: float = 0.0,
     delay: float = 0.0,
     at: Any = None,
@@ -38,7 +38,7 @@ def advise(
     plant
         what it is to control, linear (see ``analyse``); by default the plant that an ADRC's observer assumes, with the delay that it knows
         of, which is kind to it.
-    noise
+    noise_std
         standard deviation of the measurement noise, taken for white [y-unit]. It is judged by what it does to u as a share of ``u_max −
         u_min``; so a controller without limits is not judged.
     actuator_lag
@@ -73,8 +73,8 @@ def advise(
         late = analyse(plant, controller, at=at, delay=known_delay + delay, actuator_lag=actuator_lag)
         found += _judge_lag(loop, late, actuator_lag, delay)
         loop = late
-    if noise is not None and loop.stable:
-        found += _judge_noise(loop, controller, checks.non_negative("noise", noise))
+    if noise_std is not None and loop.stable:
+        found += _judge_noise(loop, controller, checks.non_negative("noise_std", noise_std))
     return found
 
 

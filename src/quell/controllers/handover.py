@@ -204,7 +204,7 @@ class HandOver:
             law._prepare_design()
             if _structure(law.parameters) != _structure(old):
                 raise ValueError("observer is of another structure than the present one: make a new controller, and start(y, u) it")
-        except ValueError:
+        except Exception:
             law.observer, law.omega_c, law.parameters = kept
             raise
         warn_if_unwise(new_observer, new_omega_c)

@@ -90,7 +90,7 @@ class OtherForms:
         b0: float,
         dt: float,
         *,
-        noise: float,
+        noise_variance: float,
         drift: float,
         jitter: float = 0.0,
         form: str = "current",
@@ -104,7 +104,7 @@ class OtherForms:
         ----------
         order, b0, dt, delay
             as for ``model_free``.
-        noise
+        noise_variance
             variance of the measurement's noise in each sample [y-unit²].
         drift
             density of the white noise whose integral f is [(y-unit/s^n)²/s]: f moves by ``√(drift T)`` in the time T.
@@ -119,7 +119,7 @@ class OtherForms:
             naming the argument, its value and the rule.
         """
         n = checks.whole("order", order, 1, 8)
-        noise, drift = checks.positive("noise", noise), checks.positive("drift", drift)
+        noise, drift = checks.positive("noise_variance", noise_variance), checks.positive("drift", drift)
         jitter, dt = checks.non_negative("jitter", jitter), checks.positive("dt", dt, "s")
         checks.one_of("form", form, ("current", "predictor"))
         gain, omega_o = kalman_gain(np.diag(np.ones(n), 1), dt, noise, drift, jitter)

@@ -54,7 +54,7 @@ def kalman_gain(A: Matrix, dt: float, noise: float, drift: float, jitter: float)
         rate = float(np.exp(np.mean(np.log(np.abs(np.log(poles.astype(complex)))))))
     if not (np.max(np.abs(poles)) < 1.0 and rate < np.pi):
         raise ValueError(
-            f"noise = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with dt = {dt!r} s: no steady-state gain is found; "
+            f"noise_variance = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with dt = {dt!r} s: no steady-state gain is found; "
             f"they ask for about {omega:.3g} rad/s, which should be between 1e-3/dt and 1/dt"
         )
     return np.asarray(gain / scale), rate / dt
