@@ -19,8 +19,8 @@ SINE = ql.signals.Sinusoid
 
 @cache
 def trial() -> stress.Result:
-    """120 hostile runs and 300 honest ones, of which medians need more."""
-    return stress.run(120, 300, seed=3, guard=ql.Guard())
+    """120 hostile runs and 240 honest ones, of which medians need more."""
+    return stress.run(120, 240, seed=3, guard=ql.Guard())
 
 
 @pytest.mark.xdist_group("trial")
