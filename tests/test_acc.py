@@ -14,13 +14,14 @@ from scipy.integrate import solve_ivp
 
 import quell as ql
 from quell.analysis import analyse, linear_law
+from quell.analysis.laws import closed_loop_matrix
 from quell.cli import app
 from quell.commands.acc import _print_cases
 from quell.experiments import acc, acc_designs, acc_samples
 from quell.experiments.acc_cases import CaseResult, study_cases
 from quell.experiments.acc_criteria import interval, judge
 from quell.experiments.acc_designs import DT, MB, MF, PUBLISHED, L, designs
-from quell.experiments.acc_loops import closed_loop, unstable
+from quell.experiments.acc_loops import unstable
 from quell.experiments.acc_published import judge_published
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
@@ -140,7 +141,8 @@ def test_the_law_of_a_controller_is_the_one_it_runs() -> None:
     """As long as no limit holds, the linear loop and the driver agree to rounding."""
     plant, controller = lagged_two_mass_spring(lag=0.02), designs(most_u=1e3)[MF]
     run = ql.simulate(plant, controller, ql.Scenario(duration=5.0, x0=[0.0, 0.0, 0.0, 1e-3, 0.0]))
-    loop = closed_loop(plant, linear_law(controller), DT)
+    sampled, law = plant.sampled(DT), linear_law(controller)
+    loop = closed_loop_matrix(sampled.transition, sampled.input, sampled.output, law, law.A + np.outer(law.B_u, law.C))
     x = np.zeros(loop.shape[0])
     x[3] = 1e-3
     for y in run["y"]:

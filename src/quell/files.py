@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import uuid
 from collections.abc import Iterator
@@ -50,6 +51,15 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """
     with written_atomically(path) as part:
         part.write_text(json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def without_gaps(value: Any) -> Any:
+    """Return a value for ``write_json``: None in the place of each number that is not finite, lists in that of tuples."""
+    if isinstance(value, dict):
+        return {key: without_gaps(part) for key, part in value.items()}
+    if isinstance(value, tuple | list):
+        return [without_gaps(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _part_of(target: Path) -> Path:

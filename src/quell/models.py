@@ -16,7 +16,7 @@ from quell.types import Matrix, Vector
 # A leading coefficient of a numerator that is below this share of the others, at the plant's own rate, is the rounding of a conversion.
 _ROUNDING = 1e-10
 # Markov parameters below this share of their own bound count as zero.
-_ZERO_TOLERANCE = 1e-9
+ZERO_TOLERANCE = 1e-9
 
 
 class StateSpace(NamedTuple):
@@ -146,18 +146,25 @@ def leading_gain(A: Matrix, column: Matrix, C: Matrix) -> tuple[float, int] | No
     row, bound = C[0], np.abs(C[0])
     for degree in range(1, A.shape[0] + 1):
         gain = float(row @ column[:, 0])
-        if abs(gain) > _ZERO_TOLERANCE * float(bound @ np.abs(column[:, 0])):
+        if abs(gain) > ZERO_TOLERANCE * float(bound @ np.abs(column[:, 0])):
             return gain, degree
         row, bound = row @ A, bound @ np.abs(A)
     return None
 
 
-def _state_space(A: Any, B: Any, C: Any, E: Any) -> StateSpace:
+def matrices(A: Any, B: Any, C: Any) -> tuple[Matrix, Matrix, Matrix]:
+    """Return A (n, n), B (n, 1) and C (1, n), checked; B and C may be given as vectors."""
     A = checks.matrix("A", A)
     n = A.shape[0]
     checks.matrix("A", A, n, n)
     B = checks.matrix("B", np.reshape(B, (-1, 1)) if np.ndim(B) == 1 else B, n, 1)
     C = checks.matrix("C", np.reshape(C, (1, -1)) if np.ndim(C) == 1 else C, 1, n)
+    return A, B, C
+
+
+def _state_space(A: Any, B: Any, C: Any, E: Any) -> StateSpace:
+    A, B, C = matrices(A, B, C)
+    n = A.shape[0]
     if E is not None:
         E = checks.matrix("E", E, n, 1)[:, 0]
         if not np.any(E):

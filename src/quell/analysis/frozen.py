@@ -21,7 +21,7 @@ import numpy as np
 
 from quell import checks
 from quell.guard import UnguardedDesign
-from quell.learners.base import NoLearner, adapt, coefficients, commit, predict, restart
+from quell.learners.base import NoLearner, NoLearnerDesign, NoLearnerMemory, adapt, coefficients, commit, predict, restart
 from quell.record import first_sample_at
 from quell.trajectory import Trajectory
 from quell.types import Vector
@@ -42,39 +42,19 @@ class Frozen(NamedTuple):
     """s, for the control signal that is about to be applied."""
 
 
-class FrozenMemory(NamedTuple):
-    """State of a frozen learner: none."""
-
-    nothing: Vector
-    """(0,)."""
-
-
 @predict.register(Frozen)
-def _predict(learner: Frozen, memory: FrozenMemory, seen: Vector, u_before: float) -> tuple[float, float]:
+def _predict(learner: Frozen, memory: NoLearnerMemory, seen: Vector, u_before: float) -> tuple[float, float]:
     constant = learner.before * u_before
     for i in range(seen.size):
         constant += learner.gain[i] * seen[i]
     return constant, learner.slope
 
 
-@adapt.register(Frozen)
-def _adapt(learner: Frozen, memory: FrozenMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
-    pass
-
-
-@commit.register(Frozen)
-def _commit(learner: Frozen, memory: FrozenMemory, seen: Vector, u: float, f_learned: float) -> None:
-    pass
-
-
-@restart.register(Frozen)
-def _restart(learner: Frozen, memory: FrozenMemory) -> None:
-    pass
-
-
-@coefficients.register(Frozen)
-def _coefficients(learner: Frozen, memory: FrozenMemory, theta: Vector) -> None:
-    pass
+# It learns as little as no learner does, and has no more to remember.
+adapt.register(Frozen)(adapt.implementations[NoLearnerDesign])
+commit.register(Frozen)(commit.implementations[NoLearnerDesign])
+restart.register(Frozen)(restart.implementations[NoLearnerDesign])
+coefficients.register(Frozen)(coefficients.implementations[NoLearnerDesign])
 
 
 def frozen(controller: Any, run: Any = None, t: float | None = None) -> Frozen:

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.analysis.frozen import Frozen, FrozenMemory, copied, frozen
+from quell.analysis.frozen import Frozen, copied, frozen
 from quell.controllers.base import control
 from quell.controllers.limits import Limits
 from quell.controllers.linear import LinearLaw
 from quell.guard import UnguardedDesign, UnguardedMemory
+from quell.learners.base import NoLearnerMemory
 from quell.types import Matrix, Vector
 
 _UNIT = 2.0**-60
@@ -54,7 +55,7 @@ def linear_law(controller: Any, at: Any = None) -> LinearLaw:
     learner = at if isinstance(at, Frozen) else frozen(controller, at)
     design = controller.parameters._replace(learner=learner, guard=UnguardedDesign(), limits=_FREE)
     nothing = np.zeros(0)
-    state = controller.initial_state()._replace(learner=FrozenMemory(nothing), guard=UnguardedMemory(nothing))
+    state = controller.initial_state()._replace(learner=NoLearnerMemory(nothing), guard=UnguardedMemory(nothing))
     control(design, state, 0.0, 0.0)
     law = _asked(design, state)
     control(design, state, 0.0, 0.0)
@@ -64,6 +65,19 @@ def linear_law(controller: Any, at: Any = None) -> LinearLaw:
     if not all(np.all(np.isfinite(part)) for part in law):
         raise ValueError(f"controller = {controller!r}: the gain b0 + ∂f_L/∂u is zero with this learner, so its law is not finite")
     return law
+
+
+def closed_loop_matrix(A: Matrix, B: Vector, C: Vector, law: LinearLaw, inner: Matrix) -> Matrix:
+    """Return a sampled plant and the law around it, which no limit cuts, as one matrix; the plant's states first.
+
+    ``inner`` is ``law.A + B_u C``, the law with what it wishes applied. A and it are both as they are, or both less the unit matrix.
+    """
+    return np.block(
+        [
+            [A + law.D_y * np.outer(B, C), np.outer(B, law.C)],
+            [np.outer(law.B_y + law.B_u * law.D_y, C), inner],
+        ]
+    )
 
 
 def _asked(design: Any, origin: Any) -> LinearLaw:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.laws import linear_law
+from quell.analysis.laws import closed_loop_matrix, linear_law
 from quell.analysis.margins import Margins, least, margins
 from quell.analysis.response import Complex, System, frequencies, in_s_plane, response
 from quell.analysis.sampled import SampledPlant, sampled_plant
@@ -117,14 +117,7 @@ class LoopAnalysis:
 
     def closed_loop_matrix(self, gain: float = 1.0) -> Matrix:
         """Return ``A − I`` of the closed loop, the plant's states first, with the plant's gain multiplied by ``gain``."""
-        P, law = self.plant, self.law
-        B = gain * P.B
-        return np.block(
-            [
-                [P.N + law.D_y * np.outer(B, P.C), np.outer(B, law.C)],
-                [np.outer(law.B_y + law.B_u * law.D_y, P.C), self._N],
-            ]
-        )
+        return closed_loop_matrix(self.plant.N, gain * self.plant.B, self.plant.C, self.law, self._N)
 
     def _shifted_poles(self, gain: float = 1.0) -> Complex:
         poles: Complex = np.linalg.eigvals(self.closed_loop_matrix(gain)).astype(np.complex128)

@@ -9,14 +9,12 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
+from quell.commands.output import check_places, progress, write_results
 from quell.experiments import acc, acc_figures, acc_samples
 from quell.experiments.acc_cases import CaseResult
 from quell.experiments.acc_designs import DT, designs
-from quell.experiments.figures import made
-from quell.files import check_writable, write_json
 
 
 def reproduce_acc(
@@ -42,31 +40,18 @@ def reproduce_acc(
         raise ValueError("--samples reads plants, --count, --spread and --seed are for drawing them: give one or the other")
     else:
         plants, source = acc_samples.read(samples), samples.name
-    if json_file is not None:
-        check_writable(json_file)
-    if figures is not None:
-        made(figures)
+    check_places(json_file, figures)
     console = Console()
     with console.status("Compiling what is not in the cache: about 20 seconds, once for this version."):
         for controller in designs(DT).values():
             for cubic in (False, True):
                 acc.judge_sampled(controller, plants[:1], cubic)
-    with Progress(TextColumn("{task.description:<28}"), BarColumn(), console=console, transient=True) as bar:
-        task = bar.add_task("simulating", total=1.0)
-
-        def tell(what: str, share: float) -> None:
-            bar.update(task, description=what, completed=share)
-
+    with progress(console, width=28) as tell:
         result = acc.run(plants, source, tell)
         paths = acc_figures.save(result, figures, tell) if figures is not None else []
     _print_rates(console, result)
     _print_cases(console, result)
-    if paths:
-        names = ", ".join(sorted({path.stem for path in paths}))
-        console.print(f"Figures: {names} (PNG and SVG) in {escape(str(figures))}/", soft_wrap=True)
-    if json_file is not None:
-        write_json(json_file, result.to_json())
-        console.print(f"Results: {escape(str(json_file))}", soft_wrap=True)
+    write_results(console, result.to_json(), json_file, paths, figures)
 
 
 def _print_rates(console: Console, result: acc.Result) -> None:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from quell.analysis import analyse
+from quell.commands.output import check_places, progress, write_results
 from quell.experiments import compare, compare_figure
 from quell.experiments.compare import BAND, END, FORCE, FORCE_AT, Benchmark, Comparison
-from quell.experiments.figures import made
-from quell.files import check_writable, write_json
 from quell.plants import two_mass_spring
 
 _COLUMNS = (
@@ -42,26 +41,19 @@ def run_compare(*, controllers: str, settings: Benchmark, json_file: Path | None
         raise ValueError(f"controllers = {controllers!r}: must be names with commas between, of {', '.join(compare.NAMES)}")
     # What can't be designed or written is said before the work is done.
     stable = {name: _stable(compare.controller(name, settings.dt, settings.u_max), settings) for name in names}
-    if json_file is not None:
-        check_writable(json_file)
-    if figures is not None:
-        made(figures)
+    check_places(json_file, figures)
     console = Console()
-    with Progress(TextColumn("{task.description}"), BarColumn(), console=console, transient=True) as bar:
-        task = bar.add_task("simulating (the first run compiles for some seconds)", total=1.0)
-        result = compare.two_mass(settings, names, lambda share: bar.update(task, completed=share))
+    what = "simulating (the first run compiles for some seconds)"
+    with progress(console, what) as tell:
+        result = compare.two_mass(settings, names, partial(tell, what))
     _print(console, result, settings, stable)
-    if figures is not None:
-        compare_figure.save(result, figures)
-        console.print(f"Figure: compare (PNG and SVG) in {escape(str(figures))}/", soft_wrap=True)
-    if json_file is not None:
-        about = {"m1": settings.m1, "m2": settings.m2, "k": settings.k, "dt": settings.dt, "seed": settings.seed}
-        limit = {} if settings.u_max == float("inf") else {"u_max": settings.u_max}
-        found = result.to_json()
-        for name, told in found["controllers"].items():
-            told["stable"] = stable[name]
-        write_json(json_file, {"settings": about | limit, **found})
-        console.print(f"Results: {escape(str(json_file))}", soft_wrap=True)
+    paths = compare_figure.save(result, figures) if figures is not None else []
+    about = {"m1": settings.m1, "m2": settings.m2, "k": settings.k, "dt": settings.dt, "seed": settings.seed}
+    limit = {} if settings.u_max == float("inf") else {"u_max": settings.u_max}
+    found = result.to_json()
+    for name, told in found["controllers"].items():
+        told["stable"] = stable[name]
+    write_results(console, {"settings": about | limit, **found}, json_file, paths, figures)
 
 
 def _stable(controller: Any, settings: Benchmark) -> bool | None:

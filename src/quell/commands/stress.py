@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from quell.commands.output import check_places, progress, write_results
 from quell.experiments import stress, stress_figure
-from quell.experiments.figures import made
 from quell.experiments.stress import HONEST, Outcome
-from quell.files import check_writable, write_json
 from quell.guard import Guard
 
 
@@ -25,26 +25,14 @@ def run_stress(*, runs: int, honest: int, seed: int, guarded: bool, json_file: P
     ValueError
         for settings out of range, or a place that can't be written to.
     """
-    if json_file is not None:
-        check_writable(json_file)
-    if figures is not None:
-        made(figures)
+    check_places(json_file, figures)
     console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("simulating (the first run compiles for half a minute)", total=1.0)
-
-        def tell(share: float) -> None:
-            bar.update(task, description="simulating", completed=share)
-
-        result = stress.run(runs, honest, seed, guard=Guard() if guarded else None, tell=tell)
+    first = "simulating (the first run compiles for half a minute)"
+    with progress(console, first, TextColumn("{task.percentage:>3.0f} %"), TimeRemainingColumn()) as tell:
+        result = stress.run(runs, honest, seed, guard=Guard() if guarded else None, tell=partial(tell, "simulating"))
     _print(console, result, guarded)
-    if figures is not None:
-        stress_figure.save(result, figures)
-        console.print(f"Figure: stress (PNG and SVG) in {escape(str(figures))}/", soft_wrap=True)
-    if json_file is not None:
-        write_json(json_file, result.to_json())
-        console.print(f"Results: {escape(str(json_file))}", soft_wrap=True)
+    paths = stress_figure.save(result, figures) if figures is not None else []
+    write_results(console, result.to_json(), json_file, paths, figures)
 
 
 def _print(console: Console, result: stress.Result, guarded: bool) -> None:

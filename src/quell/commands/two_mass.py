@@ -8,17 +8,15 @@ from pathlib import Path
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from quell import plants
+from quell.commands.output import check_places, progress, write_results
 from quell.dispatch import compilations
 from quell.driver import run_block
 from quell.experiments import two_mass_figures, two_mass_spring, two_mass_study
-from quell.experiments.figures import made
 from quell.experiments.two_mass_spring import Settings
 from quell.experiments.two_mass_study import Result
-from quell.files import check_writable, write_json
 from quell.simulation import Scenario, simulate
 
 _COLUMNS = (
@@ -44,27 +42,14 @@ def reproduce_two_mass(*, dt: float, seed: int, omega_o: float, reset: bool, jso
         two_mass_spring.controllers(settings)
     except ValueError as error:
         raise ValueError(f"{error} (the study goes up to 3 times omega_o)") from None
-    if json_file is not None:
-        check_writable(json_file)
-    if figures is not None:
-        made(figures)
+    check_places(json_file, figures)
     console = Console()
     _compile(console, settings)
-    with Progress(TextColumn("{task.description:<15}"), BarColumn(), console=console, transient=True) as bar:
-        task = bar.add_task("simulating", total=1.0)
-
-        def tell(what: str, share: float) -> None:
-            bar.update(task, description=what, completed=share)
-
+    with progress(console, width=15) as tell:
         result = two_mass_study.run(settings, tell)
         paths = two_mass_figures.save(result, figures, tell) if figures is not None else []
     _print(console, result)
-    if paths:
-        names = ", ".join(sorted({path.stem for path in paths}))
-        console.print(f"Figures: {names} (PNG and SVG) in {escape(str(figures))}/", soft_wrap=True)
-    if json_file is not None:
-        write_json(json_file, result.to_json())
-        console.print(f"Results: {escape(str(json_file))}", soft_wrap=True)
+    write_results(console, result.to_json(), json_file, paths, figures)
 
 
 def _compile(console: Console, settings: Settings) -> None:

@@ -15,7 +15,6 @@ from quell.controllers.handle import bind
 from quell.controllers.handover import HandOver
 from quell.controllers.law import F_LEARNED, LOOP, STATUS, AdrcDesign, AdrcState, U, law_gains
 from quell.controllers.limits import limits
-from quell.controllers.running import Running
 from quell.controllers.unwise import warn_if_unwise
 from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, explain
 from quell.learners.base import Learner, NoLearner, coefficients, tried
@@ -25,7 +24,7 @@ from quell.observers.eso import ESO
 from quell.types import Status
 
 
-class ADRC(HandOver, Running):
+class ADRC(HandOver):
     """Active disturbance rejection control around an ESO, with or without a learner.
 
     The object is immutable in all but its running state: ``step`` moves that on, ``simulate`` leaves it alone and uses a state of its own.

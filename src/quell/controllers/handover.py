@@ -31,6 +31,7 @@ from quell.controllers.law import (
     Y,
     wish,
 )
+from quell.controllers.running import Running
 from quell.controllers.unwise import warn_if_unwise
 from quell.dispatch import compiled
 from quell.guard import permit
@@ -51,10 +52,8 @@ _SETTLED = 40.0
 _MOST_SAMPLES = 100_000_000
 
 
-class HandOver:
+class HandOver(Running):
     """What starts, hands over and retunes an ADRC, be it alone or behind a prefilter."""
-
-    _handle: Any
 
     @property
     def _law(self) -> ADRC:
@@ -63,10 +62,6 @@ class HandOver:
 
     def _rebind(self) -> None:
         """Take note that the parameters are new ones."""
-        raise NotImplementedError
-
-    def step(self, r: float, y: float, *derivatives: float) -> float:
-        """See ``ADRC``."""
         raise NotImplementedError
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
@@ -130,7 +125,7 @@ class HandOver:
         """
         u = checks.finite("u", u)
         if self._handle is None:
-            self.prepare()  # type: ignore[attr-defined]
+            self.prepare()
         loop = self._law._state.loop
         loop[MANUAL], loop[MANUAL_U] = 1.0, u
         try:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.controllers.base import control, flags, heed, report, rest
+from quell.controllers.hold import hold, rest_within
 from quell.controllers.limits import Limits, apply_limits
 from quell.dispatch import is_finite, kernel
 from quell.guard import calm, explain, note, permit, watch
@@ -27,7 +28,6 @@ from quell.observers.base import acting, begin, observe
 from quell.types import Matrix, Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
-_REFERENCE_HELD = int(Status.REFERENCE_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 _LEARNER_CUT = int(Status.LEARNER_CUT)
 
@@ -95,25 +95,13 @@ class AdrcState(NamedTuple):
 @control.register(AdrcDesign)
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop, state.seen
-    status = 0
+    status = hold(loop, R, r, y)
     f_plain = 0.0
     acted = acting(design.eso, state.z, loop[U])
-    if is_finite(y):
-        loop[Y] = y
-    else:
-        status |= _MEASUREMENT_HELD
-    if is_finite(r):
-        loop[R] = r
-        loop[REFERENCED] = 1.0
-    else:
-        status |= _REFERENCE_HELD
-        if loop[REFERENCED] == 0.0:
-            loop[R] = loop[Y]  # no reference yet: stay
     if loop[STARTED] == 0.0:
         begin(design.eso, state.z, seen, loop[Y])
         if status & _MEASUREMENT_HELD != 0:
-            # Nothing is known before a first good measurement: u rests at zero, or as near as the limits let it.
-            loop[WISHED] = min(max(0.0, design.limits.low), design.limits.high)
+            loop[WISHED] = rest_within(design.limits)
             loop[U] = loop[WISHED] if loop[MANUAL] == 0.0 else loop[MANUAL_U]
             loop[STATUS] = status
             return loop[U]

@@ -9,13 +9,13 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import control, flags, report, rest
+from quell.controllers.hold import hold, rest_within
 from quell.controllers.limits import Limits, apply_limits, limits
 from quell.controllers.running import Running
 from quell.dispatch import is_finite, kernel
 from quell.types import Matrix, Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
-_REFERENCE_HELD = int(Status.REFERENCE_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 
 # Places in LinearState.loop.
@@ -76,22 +76,10 @@ def _start(design: LinearDesign, state: LinearState, y: float) -> None:
 @control.register(LinearDesign)
 def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> float:
     law, x, loop = design.law, state.x, state.loop
-    status = 0
-    if is_finite(y):
-        loop[_Y] = y
-    else:
-        status |= _MEASUREMENT_HELD
-    if is_finite(r):
-        loop[_R] = r
-        loop[_REFERENCED] = 1.0
-    else:
-        status |= _REFERENCE_HELD
-        if loop[_REFERENCED] == 0.0:
-            loop[_R] = loop[_Y]  # no reference yet: stay
+    status = hold(loop, _R, r, y)
     if loop[_STARTED] == 0.0:
         if status & _MEASUREMENT_HELD != 0:
-            # Nothing is known before a first good measurement: u rests at zero, or as near as the limits let it.
-            loop[_U] = loop[_WISHED] = min(max(0.0, design.limits.low), design.limits.high)
+            loop[_U] = loop[_WISHED] = rest_within(design.limits)
             loop[_STATUS] = status
             return loop[_U]
         _start(design, state, loop[_Y])

@@ -118,7 +118,7 @@ def _rest(design: PrefilteredDesign, state: PrefilteredState) -> None:
     rest(design.controller, state.controller)
 
 
-class Prefiltered(HandOver, Running):
+class Prefiltered(HandOver):
     """A controller that follows a prefiltered reference.
 
     The prefilter starts at rest at the first good measurement, so that a reference that stands elsewhere from the first sample on is a
@@ -191,10 +191,6 @@ class Prefiltered(HandOver, Running):
         settle(self.parameters.prefilter, state.prefilter, float(y))
         state.loop[_STARTED] = state.loop[_REFERENCED] = 1.0
         state.loop[_R] = float(y if r is None else r)
-
-    def step(self, r: float, y: float) -> float:  # type: ignore[override]
-        """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit]."""
-        return Running.step(self, r, y)
 
     def _prepare_design(self) -> None:
         self.parameters = PrefilteredDesign(self.controller.parameters, self.prefilter.design(self.dt))

@@ -24,6 +24,7 @@ from quell.analysis.margins import Margins
 from quell.experiments.acc_criteria import MOST_Y
 from quell.experiments.acc_designs import DT, OURS, designs
 from quell.experiments.acc_loops import unstable
+from quell.files import without_gaps
 from quell.parallel import in_parallel
 from quell.plants import two_mass_spring
 from quell.signals import Sinusoid
@@ -60,15 +61,7 @@ class CaseResult:
     def to_json(self) -> dict[str, Any]:
         """Return numbers for ``json.dump``; what is infinite is None."""
         plain = asdict(self) | {"margins": self.margins._asdict()}
-        return {key: _plain(value) for key, value in plain.items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(part) for part in value]
-    return value if np.isfinite(value) else None
+        return dict(without_gaps(plain))
 
 
 def study_cases() -> dict[str, CaseResult]:

@@ -16,6 +16,7 @@ import numpy as np
 from quell import checks
 from quell.experiments import adversaries, random_loops
 from quell.experiments.random_loops import END, LOAD_AT, Loop
+from quell.files import without_gaps
 from quell.guard import Guard
 from quell.learners import Harmonic, Learner
 from quell.parallel import in_parallel
@@ -78,13 +79,8 @@ class Result:
             "adversarial": summary(self.hostile),
             "honest": summary(self.of(HONEST)),
             "kinds": {kind: summary(self.of(kind)) for kind in self.kinds if kind != HONEST},
-            "worst": [_plain(asdict(outcome)) for outcome in worst],
+            "worst": [without_gaps(asdict(outcome)) for outcome in worst],
         }
-
-
-def _plain(outcome: dict[str, Any]) -> dict[str, Any]:
-    """Return an outcome with None where a ratio is none."""
-    return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in outcome.items()}
 
 
 def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:

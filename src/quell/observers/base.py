@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quell.dispatch import generic
+from quell.dispatch import generic, kernel
 from quell.types import Vector
 
 
@@ -37,3 +37,21 @@ def acting(model: Any, z: Vector, u: float) -> float:
 @acting.register(object)
 def _acts_at_once(model: Any, z: Vector, u: float) -> float:
     return u
+
+
+@kernel
+def forecast(model: Any, z: Vector, ahead: Vector, u: float, f: float) -> None:
+    """Write ``Φ z + Γ_u u + Γ_f f`` into ``ahead``, both (N,), for a model with ``transition``, ``input`` and ``feed``."""
+    for i in range(z.size):
+        total = model.input[i] * u + model.feed[i] * f
+        for j in range(z.size):
+            total += model.transition[i, j] * z[j]
+        ahead[i] = total
+
+
+@kernel
+def begin_at(z: Vector, seen: Vector, y: float) -> None:
+    """Put y into the first entry of both (N,), zero into all others."""
+    for i in range(z.size):
+        z[i] = seen[i] = 0.0
+    z[0] = seen[0] = y

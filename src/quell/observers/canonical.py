@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.models import Fraction, StateSpace, read
+from quell.models import ZERO_TOLERANCE, Fraction, StateSpace, read
 from quell.types import Matrix, Vector
 
 # A state that y shows less than this is not put into larger units: it is not seen.
@@ -28,8 +28,6 @@ _NOT_SEEN = 1e-8
 _ROUNDING = 1e-13
 # Below this ratio of singular values the balanced observability matrix counts as rank deficient.
 _RANK_TOLERANCE = 1e-10
-# Markov parameters below this share of their own bound count as zero.
-_ZERO_TOLERANCE = 1e-9
 # A zero this much slower than the plant's fastest pole or zero counts as one at s = 0.
 _AT_REST = 1e-9
 
@@ -155,7 +153,7 @@ def _balanced(A: Matrix) -> tuple[Matrix, Vector]:
 def _markov(S: Matrix, column: Vector) -> Vector:
     """Return ``S column``, without what is only the rounding of sums that cancel."""
     markov = S @ column
-    markov[np.abs(markov) <= _ZERO_TOLERANCE * (np.abs(S) @ np.abs(column))] = 0.0
+    markov[np.abs(markov) <= ZERO_TOLERANCE * (np.abs(S) @ np.abs(column))] = 0.0
     return markov
 
 
@@ -182,7 +180,7 @@ def _assemble(a: Vector, B: Vector, E: Vector | None, S: Matrix, condition: floa
 
 def _parallel(one: Vector, other: Vector) -> bool:
     at = np.flatnonzero(other)[0]
-    return bool(one[at] != 0.0 and np.allclose(one, other * (one[at] / other[at]), rtol=_ZERO_TOLERANCE, atol=0.0))
+    return bool(one[at] != 0.0 and np.allclose(one, other * (one[at] / other[at]), rtol=ZERO_TOLERANCE, atol=0.0))
 
 
 def _zeros(a: Vector, column: Vector) -> Vector:

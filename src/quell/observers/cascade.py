@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.observers.base import begin, observe
+from quell.observers.base import begin, forecast, observe
 from quell.types import Matrix, Vector
 
 
@@ -51,11 +51,7 @@ def _observe(model: CascadeModel, z: Vector, seen: Vector, y: float, u: float, f
     for level in range(levels):
         state = z[level * size : (level + 1) * size]
         f_before = state[size - 1]
-        for i in range(size):
-            total = model.input[i] * u + model.feed[i] * told
-            for j in range(size):
-                total += model.transition[i, j] * state[j]
-            seen[i] = total
+        forecast(model, state, seen, u, told)
         error = target - seen[0]
         for i in range(size):
             state[i] = seen[i] + model.gains[level, i] * error

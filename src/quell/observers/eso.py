@@ -30,7 +30,7 @@ import numpy as np
 
 from quell import checks
 from quell.discretize import zero_order_hold
-from quell.observers.base import begin, observe
+from quell.observers.base import begin, begin_at, forecast, observe
 from quell.observers.canonical import Canonical, canonical, spell
 from quell.observers.delay import delayed_model, without_delay
 from quell.observers.forms import OtherForms
@@ -66,25 +66,18 @@ class EsoModel(NamedTuple):
 
 @observe.register(EsoModel)
 def _observe(model: EsoModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
-    size = z.size
-    for i in range(size):
-        total = model.input[i] * u + model.feed[i] * f_learned
-        for j in range(size):
-            total += model.transition[i, j] * z[j]
-        seen[i] = total
+    forecast(model, z, seen, u, f_learned)
     error = y - seen[0]
-    for i in range(size):
+    for i in range(z.size):
         z[i] = seen[i] + model.gain[i] * error
     if not model.predictor:
-        for i in range(size):
+        for i in range(z.size):
             seen[i] = z[i]
 
 
 @begin.register(EsoModel)
 def _begin(model: EsoModel, z: Vector, seen: Vector, y: float) -> None:
-    for i in range(z.size):
-        z[i] = seen[i] = 0.0
-    z[0] = seen[0] = y
+    begin_at(z, seen, y)
 
 
 @dataclass(frozen=True, eq=False)

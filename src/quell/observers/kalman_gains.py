@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from quell.discretize import gramian, zero_order_hold
 from quell.types import Matrix, Vector
 
 
@@ -27,7 +28,7 @@ def kalman_gain(A: Matrix, dt: float, noise: float, drift: float, jitter: float)
     ValueError
         where the variances are so far apart that no solution is found.
     """
-    from scipy.linalg import expm, solve_discrete_are
+    from scipy.linalg import solve_discrete_are
 
     size = A.shape[0]
     # In sensible units q/(r dt) is the bandwidth to the power 2N; jitter alone would make a pattern of 2n. Take the faster.
@@ -39,13 +40,10 @@ def kalman_gain(A: Matrix, dt: float, noise: float, drift: float, jitter: float)
     drive[-1, -1] = drift / density * (scale[-1] / omega) ** 2
     drive[-2, -2] = jitter / density * (scale[-2] / omega) ** 2
     step = omega * dt
-    block = np.block([[-scaled, drive], [np.zeros_like(scaled), scaled.T]])
-    sampled = expm(block * step)
-    phi = sampled[size:, size:].T
-    Q = phi @ sampled[:size, size:]
+    phi, _ = zero_order_hold(scaled, [], step)
     C, R = np.eye(1, size), np.array([[1.0 / step]])
     try:
-        P = solve_discrete_are(phi.T, C.T, 0.5 * (Q + Q.T), R)
+        P = solve_discrete_are(phi.T, C.T, gramian(scaled, drive, step), R)
     except (np.linalg.LinAlgError, ValueError):
         P = np.full((size, size), np.nan)
     gain = P[:, 0] / (P[0, 0] + R[0, 0])

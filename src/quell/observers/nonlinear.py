@@ -20,7 +20,7 @@ import math
 from typing import NamedTuple
 
 from quell.dispatch import kernel
-from quell.observers.base import begin, observe
+from quell.observers.base import begin, begin_at, forecast, observe
 from quell.types import Matrix, Vector
 
 
@@ -57,20 +57,13 @@ def fal(error: float, alpha: float, delta: float) -> float:
 
 @observe.register(NonlinearModel)
 def _observe(model: NonlinearModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
-    size = z.size
-    for i in range(size):
-        total = model.input[i] * u + model.feed[i] * f_learned
-        for j in range(size):
-            total += model.transition[i, j] * z[j]
-        seen[i] = total
+    forecast(model, z, seen, u, f_learned)
     error = y - seen[0]
-    for i in range(size):
+    for i in range(z.size):
         seen[i] += model.gain[i] * model.delta ** (1.0 - model.alpha[i]) * fal(error, model.alpha[i], model.delta)
         z[i] = seen[i]
 
 
 @begin.register(NonlinearModel)
 def _begin(model: NonlinearModel, z: Vector, seen: Vector, y: float) -> None:
-    for i in range(z.size):
-        z[i] = seen[i] = 0.0
-    z[0] = seen[0] = y
+    begin_at(z, seen, y)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from quell import checks
 from quell.discretize import zero_order_hold
-from quell.models import Fraction, read, with_states
+from quell.models import Fraction, matrices, read, with_states
 from quell.plants.base import advance, measure
 from quell.types import Matrix, Vector
 
@@ -79,12 +77,8 @@ class LinearPlant:
     name: str = "linear plant"
 
     def __post_init__(self) -> None:
-        A = checks.matrix("A", self.A)
-        n = A.shape[0]
-        checks.matrix("A", A, n, n)
-        B = checks.matrix("B", np.reshape(self.B, (-1, 1)) if np.ndim(self.B) == 1 else self.B, n, 1)
-        C = checks.matrix("C", np.reshape(self.C, (1, -1)) if np.ndim(self.C) == 1 else self.C, 1, n)
-        E = B if self.E is None else checks.matrix("E", self.E, n)
+        A, B, C = matrices(self.A, self.B, self.C)
+        E = B if self.E is None else checks.matrix("E", self.E, A.shape[0])
         for name, value in (("A", A), ("B", B), ("C", C), ("E", E)):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
