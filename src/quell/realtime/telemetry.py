@@ -25,7 +25,7 @@ from quell.types import Matrix
 _LOG = logging.getLogger(__name__)
 
 # So many numbers are written in one go, which takes about 0.1 ms, and so long the interpreter is left alone then [s].
-_BURST = 200
+_BURST = 100
 _PAUSE = 1e-4
 # The ring holds what comes in so many seconds: a disk may be away as long.
 _PATIENCE = 10.0
