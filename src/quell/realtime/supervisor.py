@@ -47,11 +47,16 @@ START, RUN, HOLD, RAMP, STOPPED = range(5)
     OVER,
     RAMPED,
     SILENT,
-) = range(18)
+    UNSETTLED,
+) = range(19)
 # What the main thread asks for: to ramp down, or zero at once.
 GO_ON, END, ZERO = range(3)
 # So many more zeros are written once u is zero.
 FLUSH = 3
+
+
+# To settle may take so many times as many samples as it has to.
+_LONGEST_START = 10
 
 
 class Mode(IntEnum):
@@ -85,6 +90,7 @@ class Cause(IntEnum):
     OVER = OVER
     RAMPED = RAMPED
     SILENT = SILENT
+    UNSETTLED = UNSETTLED
 
     @property
     def words(self) -> str:
@@ -110,7 +116,8 @@ _WORDS = {
     Cause.AT_ONCE: "it was asked to stop at once",
     Cause.OVER: "the scenario is over",
     Cause.RAMPED: "u is zero",
-    Cause.SILENT: "no measurement ever came",
+    Cause.SILENT: "no measurement ever came: is the device running?",
+    Cause.UNSETTLED: "there were never enough good samples in a row to begin with",
 }
 
 
@@ -214,7 +221,7 @@ def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, tripped: boo
         if cause != NONE:
             change(watch, k, RAMP, cause)
         elif mode == START:
-            if not good:
+            if not good or tripped:
                 counts[SAMPLES] = 0
             elif counts[SAMPLES] >= rules.settle:
                 change(watch, k, RUN, SETTLED)
@@ -244,6 +251,8 @@ def _cause(rules: Rules, watch: Watch, k: int, good: bool, asked: int, tripped: 
         cause = OVERRUN
     elif tripped and counts[MODE] != START:
         cause = WATCHDOG
+    elif counts[MODE] == START and k > _LONGEST_START * (rules.settle + 100):
+        cause = UNSETTLED
     elif counts[BEGAN] >= 0 and k - counts[BEGAN] >= samples:
         cause = OVER
     return cause
