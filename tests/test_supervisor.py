@@ -74,7 +74,7 @@ def test_plain_python_does_what_compiled_code_does() -> None:
 @pytest.mark.parametrize("value", [MISS, math.inf, -math.inf])
 @pytest.mark.parametrize("missed", [1, HOLD])
 def test_a_few_missed_samples_hold_u(value: float, missed: int) -> None:
-    """u stays as it was; with the first good sample the controller goes on, and says that it held y."""
+    """The last u stays; with the first good sample the controller goes on, and says that it held y."""
     outcome = run(ScriptedDevice(PLANT, y={60 + i: value for i in range(missed)}))
     u = outcome["U"]
     assert np.all(u[60 : 60 + missed] == u[59])
