@@ -98,14 +98,14 @@ def test_a_start_under_load_is_replayed_when_the_load_is_told() -> None:
 
 
 def test_another_observer_sees_what_happened() -> None:
-    """Sample by sample what ``track`` gives; a quicker observer follows f more closely than a slow one."""
+    """Sample by sample what ``step`` and ``applied`` give; a quicker observer follows f more closely than a slow one."""
     run = simulated()
     other, by_hand = (ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT), omega_c=5.0) for _ in range(2))
     again = replay(run, other)
     for k in range(300):
-        wished = by_hand.track(run["r"][k], run["y_measured"][k], run["u"][k])
-        assert wished == pytest.approx(again["u_wished"][k], rel=1e-9, abs=1e-12)
+        assert by_hand.step(run["r"][k], run["y_measured"][k]) == pytest.approx(again["u_wished"][k], rel=1e-9, abs=1e-12)
         np.testing.assert_allclose(by_hand.estimate.x, again["x_hat"][k], rtol=1e-9, atol=1e-12)
+        by_hand.applied(run["u"][k])
     f = -1.0 * run["x"][:, 0] - 0.6 * run["x"][:, 1]
     late = slice(300, None)
     error = {}
@@ -113,6 +113,14 @@ def test_another_observer_sees_what_happened() -> None:
         observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=omega_o, dt=DT)
         error[omega_o] = np.sqrt(np.mean((replay(run, ql.ADRC(observer, omega_c=3.0))["f_hat"] - f)[late] ** 2))
     assert error[40.0] < 0.5 * error[10.0]
+
+
+def test_controllers_of_other_kinds_are_replayed_too() -> None:
+    """A PID would have applied what it applied, and follows what an ADRC applied."""
+    pid = PID(kp=2.0, ki=1.0, dt=DT, u_min=-1.0, u_max=1.0)
+    run = ql.simulate(PLANT, pid, ql.Scenario(reference=1.0, duration=2.0))
+    np.testing.assert_array_equal(replay(run, pid)["u_wished"], run["u"])
+    assert np.max(np.abs(replay(simulated(2.0), pid)["u_wished"])) <= 1.0
 
 
 def test_the_controller_that_is_passed_stays_as_it_is() -> None:
@@ -137,12 +145,16 @@ def test_what_can_not_be_replayed_is_refused() -> None:
     for given, other, rule in [
         (thin, controller(), "run has every 5th sample: .* record_every=1"),
         (run, slow, "controller has dt = 0.02 s: must have that of the run, 0.01 s"),
-        (run, PID(kp=1.0, dt=DT), "must be an ADRC"),
-        (run, Prefiltered(PID(kp=1.0, dt=DT), ZV(omega=3.0)), "only an ADRC"),
+        (run, ql.ADRC, "controller = .*: must be a controller"),
         (blind, controller(), "run has no finite y_measured"),
         (unknown, controller(), "run has no finite u at 0.3 s"),
     ]:
         with pytest.raises(ValueError, match=rule):
             replay(given, other)
-    with pytest.raises(ValueError, match="u_before = nan"):
-        replay(run, controller(), u_before=math.nan)
+    for other, u, rule in [
+        (controller(), math.nan, "u_before = nan"),
+        (PID(kp=1.0, dt=DT), 1.0, "u_before = 1.0: only an ADRC"),
+        (Prefiltered(PID(kp=1.0, dt=DT), ZV(omega=3.0)), 1.0, "only an ADRC"),
+    ]:
+        with pytest.raises(ValueError, match=rule):
+            replay(run, other, u_before=u)
