@@ -13,10 +13,15 @@ import quell as ql
 from quell.controllers.baselines import PID, ZV
 from quell.controllers.prefilter import Prefiltered
 from quell.plants.base import advance, measure
+from quell.realtime.channels import row_channels
+from quell.realtime.header import Header
 from quell.realtime.recording import load, trajectory_of
 from quell.realtime.replay import replay
 from quell.realtime.sinks import CsvSink, McapSink
+from quell.realtime.supervisor import Mode
+from tests import scripted
 from tests.recordings import DT, OBSERVER, PLANT, controller, header_of, rows_of, simulated
+from tests.scripted import ScriptedDevice
 from tests.test_telemetry import recorded
 
 
@@ -58,24 +63,18 @@ def test_a_prefilter_is_replayed_too() -> None:
     np.testing.assert_array_equal(again["r_shaped"], run["r_shaped"])
 
 
-def test_missed_samples_are_held_as_on_the_rig() -> None:
-    """A loop sample by sample, with bursts of missing measurements: its estimates come out again."""
-    design, rig = controller(), controller()
-    model, x, scratch = PLANT.sampled(DT), np.zeros(2), np.zeros(12)
-    held, rows = 0.0, []
-    for k in range(600):
-        y = measure(model, x)
-        measured = math.nan if k % 50 in (7, 8, 9, 31) else y
-        held = y if math.isfinite(measured) else held
-        r = math.sin(0.02 * k)
-        u = rig.step(r, measured)
-        told = np.zeros(sum(width for _, width in design.channels))
-        ql.controllers.base.report(design.parameters, rig._state, told)
-        rows.append([k, 0.0, 0.0, 0.0, 0.0, r, held, measured, u, *told])
-        advance(model, x, scratch, 0.0, u, np.zeros(1))
-    run = trajectory_of(header_of(simulated(1.0), design), np.array(rows))
-    again = replay(run, design)
-    check_same_estimates(again, run, tolerance=1e-12)
+def test_a_run_of_the_loop_is_replayed_from_its_first_cycle_to_its_last() -> None:
+    """Settling, taking over, missing samples, coming to rest: estimates as on the rig, and the u that the controller wished there."""
+    missing = dict.fromkeys((3, 80, 81, 82, 150), math.nan)
+    rig = scripted.run(ScriptedDevice(scripted.PLANT, y=missing), reference=1.0, approach=0.5)
+    run = trajectory_of(Header(row_channels(scripted.adrc().channels), DT), rig.rows)
+    again = replay(run, scripted.adrc())
+    awake = run["mode"] != Mode.STOPPED
+    for name in ("x_hat", "f_residual"):
+        np.testing.assert_allclose(again[name][awake], run[name][awake], rtol=0.0, atol=1e-12 * np.max(np.abs(run[name])))
+    ruled = run["mode"] == Mode.RUN
+    assert {int(mode) for mode in run["mode"]} == set(Mode)
+    np.testing.assert_allclose(again["u_wished"][ruled], run["u"][ruled], rtol=0.0, atol=1e-12)
     assert ql.Status.MEASUREMENT_HELD in again.status
 
 
