@@ -109,6 +109,7 @@ def run_rig(
         )
         writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
         loop = Prepared.of(device, controller, points, rules, system_clock(spin), writer.ring)
+        writer.urgent = loop.interpreted and priority > 1
         with writer, quiet_process(priority, loop.interpreted) as notes, _signals(loop.requests):
             _supervised(loop, controller.dt, priority, cpu, notes, on_change or (lambda change: None))
     record = memory.trajectory()
