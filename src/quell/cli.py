@@ -216,9 +216,8 @@ def rig(
     """
     from quell.commands.rig import run_rig
 
-    run_rig(
-        device=device, plant=plant, dt=dt, watchdog=watchdog, u_max=u_max, rest=rest, seconds=seconds, log=log, priority=priority, cpu=cpu
-    )
+    settings = {"dt": dt, "watchdog": watchdog, "u_max": u_max, "rest": rest}
+    run_rig(device=device, plant=plant, settings=settings, seconds=seconds, log=log, priority=priority, cpu=cpu)
 
 
 def main() -> None:
