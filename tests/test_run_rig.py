@@ -84,7 +84,7 @@ def test_a_run_from_end_to_end(tmp_path: Path) -> None:
     for part in (
         "RUN: enough good samples",
         "0 missed",
-        f"device: {run.tally.cycles} written",
+        f"device: {run.tally.cycles + 1} written",
         "lateness: p50",
         "step time: p50",
         "ordinary",
