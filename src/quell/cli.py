@@ -185,6 +185,8 @@ def rig(
     rest: bool = True,
     seconds: float | None = None,
     log: Path | None = None,
+    priority: Annotated[int, Parameter(converter=_whole)] = 50,
+    cpu: Annotated[int | None, Parameter(converter=_whole)] = None,
 ) -> None:
     """Be the device at the other end of a wire: a simulated plant with a clock and a watchdog of its own, until interrupted.
 
@@ -207,10 +209,15 @@ def rig(
         For how long [s]; until interrupted by default.
     log
         Write each tick to this CSV file: y, u as applied, the command as it came, state.
+    priority
+        SCHED_FIFO priority of the ticks, 1 to 99; 0 for ordinary scheduling. What is not permitted is said at the end.
+    cpu
+        Number of the processor that the ticks are to have; any by default.
     """
     from quell.commands.rig import run_rig
 
-    run_rig(device=device, plant=plant, dt=dt, watchdog=watchdog, u_max=u_max, rest=rest, seconds=seconds, log=log)
+    settings = {"dt": dt, "watchdog": watchdog, "u_max": u_max, "rest": rest}
+    run_rig(device=device, plant=plant, settings=settings, seconds=seconds, log=log, priority=priority, cpu=cpu)
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ import math
 import signal
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 from quell import checks
 from quell.realtime.devices import listen, plant_named
@@ -14,7 +15,7 @@ from quell.realtime.server import Rig
 
 
 def run_rig(
-    *, device: str, plant: str, dt: float, watchdog: int, u_max: float, rest: bool, seconds: float | None, log: Path | None
+    *, device: str, plant: str, settings: dict[str, Any], seconds: float | None, log: Path | None, priority: int, cpu: int | None
 ) -> None:
     """Run the rig, and say at the end how it went.
 
@@ -26,23 +27,29 @@ def run_rig(
     model = plant_named(plant, "--plant")
     if seconds is not None:
         checks.positive("--seconds", seconds, "s")
-    with closing(listen(device)) as listener, Rig(model, dt, listener, watchdog=watchdog, u_max=u_max, rest=rest, log=log) as rig:
+    with closing(listen(device)) as listener, Rig(model, listener=listener, log=log, **settings) as rig:
         before = {number: signal.signal(number, lambda *_: rig.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             rig.prepare()
-            limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
-            print(f"{plant} at {listener.url}: a tick every {dt:g} s, u = 0 after {watchdog} ticks without a command{limit}", flush=True)
-            rig.run(seconds)
+            print(f"{plant} at {listener.url}: {_described(**settings)}", flush=True)
+            notes = rig.run(seconds, priority=priority, cpu=cpu)
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
     _tell(rig)
+    for note in notes:
+        print(note)
+
+
+def _described(dt: float, watchdog: int, u_max: float, rest: bool) -> str:
+    limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
+    return f"a tick every {dt:g} s, u = 0 after {watchdog} ticks without a command{limit}{', from rest' if rest else ''}"
 
 
 def _tell(rig: Rig) -> None:
     """Print what was counted."""
     counted = rig.counters
-    late = ", ".join(f"{name} {1e6 * value:.0f}" for name, value in rig.lateness().items())
+    late = ", ".join(f"{name} {1e6 * value:.0f}" for name, value in rig.lateness.summary().items())
     refused = ", ".join(f"{name} {counted[name]}" for name in REFUSALS if counted[name]) or "none"
     print(f"ticks: {counted['ticks']}, of which late by more than one: {counted['caught_up']}; lateness [us]: {late}")
     print(f"sessions: {counted['sessions']}, refused: {counted['refused']}, ended by the watchdog: {counted['watchdog']}")
