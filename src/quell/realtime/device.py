@@ -46,7 +46,7 @@ def fetch(line: Any, clock: Any, until: int) -> tuple[float, int]:
 
 @generic
 def put(line: Any, u: float) -> int:
-    """Apply ``u`` [u-unit]; return 0, or another number where the device can't be reached."""
+    """Apply ``u`` [u-unit]; return 0, 1 where the device can't be reached, or more where it has set u to zero for good."""
     raise TypeError
 
 
