@@ -526,9 +526,9 @@ def test_through_a_relay_every_fault_is_counted_and_no_wrong_number_gets_through
         Fault("flip", "rig", 20, 3),
         Fault("duplicate", "rig", 30, 4),
         Fault("delay", "rig", 40, 1),
-        Fault("foreign", "loop", 45, 2),
-        Fault("drop", "loop", 50, 5),
-        Fault("short", "loop", 60, 2),
+        Fault("foreign", "loop", 45, 1),
+        Fault("drop", "loop", 50, 2),
+        Fault("short", "loop", 60, 1),
     ]
     with Relay("udp://127.0.0.1:0", here.url, plan) as relay:
         device = here.open(relay.url)
@@ -548,4 +548,4 @@ def test_through_a_relay_every_fault_is_counted_and_no_wrong_number_gets_through
     assert (theirs["not_finite"], theirs["malformed"]) == (2, 3)
     assert theirs["duplicated"] == 4
     assert theirs["reordered"] == 1
-    assert (ours["session"], ours["malformed"]) == (2, 2)
+    assert (ours["session"], ours["malformed"]) == (1, 1)
