@@ -109,6 +109,7 @@ def run_rig(
         writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
         _try_out(line)
         loop = Prepared.of(device, controller, points, rules, system_clock(spin), writer.ring)
+        writer.urgent = loop.interpreted and priority > 1
         _begin_anew(device)
         with writer, quiet_process(priority, loop.interpreted) as notes, _signals(loop.requests):
             _supervised(loop, controller.dt, priority, cpu, notes, on_change or (lambda change: None))
