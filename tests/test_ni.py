@@ -263,7 +263,7 @@ def test_a_closed_device_can_not_be_used(device):
 
 def test_an_address_says_all_that_the_arguments_say(rack):
     """The one for the paper's cards, with an enable line."""
-    device = ni_device("ni://Dev1/ctr2+Dev2/ao1?counts=8000&u_max=5&enable=Dev2/port0/line7")
+    device = ni_device("ni://Dev1/ctr2+Dev2/ao1?counts=8000&u_max=5&enable=Dev2/port0/line7", 1e-3)
     rack.edges = 8000
     assert device.read() == pytest.approx(TAU)
     device.write(9.0)
@@ -285,7 +285,7 @@ def test_an_address_says_all_that_the_arguments_say(rack):
 def test_addresses_that_are_none_are_refused(rack, address, says):
     """In one line."""
     with pytest.raises(ValueError, match=says):
-        ni_device(address)
+        ni_device(address, 1e-3)
 
 
 def test_a_loop_through_the_cards_is_the_simulated_loop_but_for_their_resolution(rack):

@@ -239,26 +239,27 @@ _WHOLE, _WORDS = ("counts", "bits"), ("enable", "heartbeat")
 _KEYS = (*_WHOLE, "ratio", "volts", "u_min", "u_max", "pulse_filter", *_WORDS, "watchdog")
 
 
-def ni_device(address: str) -> NiDevice:
+def ni_device(url: str, dt: float) -> NiDevice:
     """Return the device at ``ni://COUNTER+OUTPUT?name=value&…``, such as ``ni://Dev1/ctr0+Dev2/ao0?counts=16000&enable=Dev2/port0/line0``.
 
-    The names behind the question mark are the parameters of ``NiDevice``.
+    The names behind the question mark are the parameters of ``NiDevice``; the sample time dt is the loop's, these cards have none.
 
     Raises
     ------
     ValueError
-        for an address that is none, and whatever ``NiDevice`` raises.
+        for a URL that is not of this form, and whatever ``NiDevice`` raises.
     """
-    parts = urlsplit(address)
+    checks.positive("dt", dt, "s")
+    parts = urlsplit(url)
     channels = (parts.netloc + parts.path).split("+")
     if parts.scheme != "ni" or len(channels) != 2 or not all(channels):
-        raise ValueError(f"address = {address!r}: must be ni://COUNTER+OUTPUT, such as ni://Dev1/ctr0+Dev2/ao0?counts=16000")
+        raise ValueError(f"device = {url!r}: must be ni://COUNTER+OUTPUT, such as ni://Dev1/ctr0+Dev2/ao0?counts=16000")
     given: dict[str, Any] = {}
     for key, text in parse_qsl(parts.query, keep_blank_values=True):
         if key not in _KEYS:
-            raise ValueError(f"address = {address!r}: {key} is none of {', '.join(_KEYS)}")
+            raise ValueError(f"device = {url!r}: {key} is none of {', '.join(_KEYS)}")
         try:
             given[key] = text if key in _WORDS else int(text) if key in _WHOLE else float(text)
         except ValueError:
-            raise ValueError(f"address = {address!r}: {key} = {text!r} must be a {'whole ' * (key in _WHOLE)}number") from None
+            raise ValueError(f"device = {url!r}: {key} = {text!r} must be a {'whole ' * (key in _WHOLE)}number") from None
     return NiDevice(*channels, **given)
