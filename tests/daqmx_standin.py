@@ -225,7 +225,7 @@ class Rack:
             raise DriverError(INVALID_AO_DATA)
         step = 20.0 / (1 << 16)
         card = self.cards[task.device]
-        card.volts[task.channel] = min(round(value / step), (1 << 15) - 1) * step
+        card.volts[task.channel] = min(math.floor(value / step + 0.5), (1 << 15) - 1) * step
         card.history.append((task.channel, value))
 
     def DAQmxWriteDigitalLines(self, handle, samples, auto_start, timeout, layout, values, written, reserved):

@@ -4,6 +4,7 @@ import gc
 import math
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.plants.base import advance, measure
 from quell.realtime.clock import virtual_clock
 from quell.realtime.device import Device, fetch, line_of
 from quell.realtime.ni import NiDevice, ni_device
+from quell.realtime.twin import TwinDevice
 
 from .daqmx_standin import Card, Rack
 
@@ -131,7 +132,7 @@ def test_the_output_is_zero_before_and_after(rack):
 def test_the_output_is_zero_when_python_ends():
     """Also where nobody closed the device: here the program ends by an exception."""
     program = (
-        "import sys; from quell.realtime.ni import NiDevice\n"
+        "from quell.realtime.ni import NiDevice\n"
         "from tests.daqmx_standin import Card, Rack; from nidaqmx._lib import lib_importer as library\n"
         "import atexit\n"
         "rack = Rack(Dev1=Card(counters=1), Dev2=Card(outputs=1))\n"
@@ -288,25 +289,24 @@ def test_addresses_that_are_none_are_refused(rack, address, says):
         ni_device(address, 1e-3)
 
 
-def test_a_loop_through_the_cards_is_the_simulated_loop_but_for_their_resolution(rack):
-    """The two-mass-spring benchmark as a rotating plant behind the cards: encoder 2π/16000, output in steps of 20 V / 2^16."""
+def test_a_loop_through_the_cards_is_the_simulated_loop(rack):
+    """The paper's testbed, but without encoder and converter, behind these cards is the testbed with them, count for count."""
     dt = 1e-3
-    plant = ql.plants.two_mass_spring()
-    observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=dt)
-    scenario = ql.Scenario(reference=ql.signals.Step(1.0), duration=15.0)
-    ideal = ql.simulate(plant, ql.ADRC(observer, omega_c=1.0, u_min=-10, u_max=10), scenario)
+    observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=dt)
+    controller = ql.ADRC(observer, omega_c=20.0, u_min=-5, u_max=5)
+    scenario = ql.Scenario(reference=ql.signals.Sinusoid(amplitude=math.pi / 2, omega=math.pi / 2), duration=2.0)
+    ideal = ql.simulate(ql.plants.torsional(counts=16000, dac_bits=16), controller, scenario)
 
-    model, state = plant.sampled(dt), np.zeros(plant.order)
-    scratch, still = np.zeros(plant.order), np.zeros(plant.disturbances)
-    controller = ql.ADRC(observer, omega_c=1.0, u_min=-10, u_max=10)
-    device = NiDevice("Dev1/ctr0", "Dev2/ao0", counts=16000)
-    y = np.empty(ideal["y"].size)
-    for k in range(y.size):
-        rack.edges = round(measure(model, state) * 16000 / TAU)
-        y[k] = device.read()
-        device.write(controller.step(1.0, y[k]))
-        advance(model, state, scratch, k * dt, rack.cards["Dev2"].volts["ao0"], still)
-    device.close()
-    assert abs(ideal["y"][-1] - 1.0) < 0.02
-    np.testing.assert_allclose(y, ideal["y"], atol=0.02)
-    assert np.abs(y - ideal["y"]).max() > 0.5 * TAU / 16000, "the encoder must have been in between"
+    twin = TwinDevice(ql.plants.torsional(counts=None, dac_bits=None), dt)
+    y, u = np.empty(len(ideal)), np.empty(len(ideal))
+    with closing(NiDevice("Dev1/ctr0", "Dev2/ao0", counts=16000)) as device:
+        for k, r in enumerate(ideal["r"]):
+            rack.edges = math.floor(twin.read() * 16000 / TAU + 0.5)
+            y[k] = device.read()
+            u[k] = controller.step(r, y[k])
+            device.write(u[k])
+            twin.write(rack.cards["Dev2"].volts["ao0"])
+    assert np.ptp(y) > 1.0
+    assert np.ptp(u) > 0.1
+    np.testing.assert_allclose(y, ideal["y"], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(u, ideal["u"], rtol=1e-6, atol=1e-9)
