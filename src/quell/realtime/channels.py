@@ -24,6 +24,16 @@ LOOP_WIDTH = len(LOOP_CHANNELS)
 class Event(IntFlag):
     """What befell a cycle; flags add up. The low sixteen bits are the loop's."""
 
+    MISSED = 1
+    """No measurement came in time, or one that is no number."""
+    OVERRUN = 2
+    """The loop woke, or was done, after the next deadline: deadlines were skipped."""
+    CLIPPED = 4
+    """The supervisor's limits changed the controller's u."""
+    UNSENT = 8
+    """The device could not be reached."""
+    CHANGED = 16
+    """The mode changed."""
     GAP = 1 << 16
     """There was no such cycle: its deadline was skipped, or its row found the ring full. The row was filled in when it was loaded."""
 
