@@ -18,6 +18,7 @@ from quell.realtime.device import Device, fetch, line_of
 from quell.realtime.ni import NiDevice, ni_device
 from quell.realtime.twin import TwinDevice
 
+from . import scripted
 from .daqmx_standin import Card, Rack
 
 library = pytest.importorskip("nidaqmx._lib").lib_importer
@@ -310,3 +311,42 @@ def test_a_loop_through_the_cards_is_the_simulated_loop(rack):
     assert np.ptp(u) > 0.1
     np.testing.assert_allclose(y, ideal["y"], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(u, ideal["u"], rtol=1e-6, atol=1e-9)
+
+
+class Shaft:
+    """The device, and what it moves: a sample passes with each write."""
+
+    def __init__(self, rack, device, plant):
+        self.rack, self.device, self.twin, self.samples = rack, device, TwinDevice(plant, scripted.DT), 0
+        self.close = device.close
+
+    def read(self):
+        """Let the counter see where the shaft is, and read it."""
+        self.samples += 1
+        if self.samples == 150:
+            self.rack.cards["Dev1"].present = False
+        self.rack.edges = math.floor(self.twin.read() * 16000 / TAU + 0.5)
+        return self.device.read()
+
+    def write(self, u):
+        """Write u, and let the card's voltage act for a sample."""
+        self.device.write(u)
+        self.twin.write(self.rack.cards["Dev2"].volts["ao0"])
+
+
+def test_the_loop_goes_to_its_safe_state_when_the_counter_card_is_lost(rack):
+    """It holds u for as many samples as it may, ramps it to zero within as many as it says, and the amplifier loses its enable."""
+    device = NiDevice("Dev1/ctr0", "Dev2/ao0", enable="Dev2/port0/line0", u_min=-3.0, u_max=3.0)
+    shaft = Shaft(rack, device, scripted.PLANT)
+    done = scripted.run(shaft, duration=5.0, hold=5, ramp=20)
+    volts = [value for name, value in rack.cards["Dev2"].history if name == "ao0"][1:]
+    before, after = volts[:149], volts[149:]
+    assert max(map(abs, volts)) <= 3.0
+    assert abs(before[-1]) > 0.1
+    assert after[:5] == [before[-1]] * 5
+    assert after[25:] == [0.0] * len(after[25:])
+    assert done.rows.shape[0] < 200
+    assert "-200324" in str(done.prepared.line.errors[0])
+    rack.cards["Dev1"].present = True
+    shaft.close()
+    assert not rack.cards["Dev2"].levels["port0/line0"]

@@ -92,6 +92,7 @@ class NiDevice:
         shortest = checks.non_negative("pulse_filter", pulse_filter, "s")
         patience = None if watchdog is None else checks.positive("watchdog", watchdog, "s")
 
+        self.name = f"NI {counter} and {output}"
         self._ni = driver()
         self._close: list[tuple[str, Callable[[], Any]]] = []
         self._strobe: Callable[[], Any] | None = None
