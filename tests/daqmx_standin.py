@@ -148,6 +148,10 @@ class Rack:
         task.kind, task.device, task.channel = kind, device, channel
         self.last_channel = physical
 
+    def _is_taken(self, task):
+        others = (other for other in self.tasks.values() if other is not task and other.running)
+        return any((other.device, other.channel) == (task.device, task.channel) for other in others)
+
     def _new(self, handle, task):
         handle._obj.value = 1 + max(self.tasks, default=0)
         self.tasks[handle._obj.value] = task
@@ -203,10 +207,9 @@ class Rack:
     def DAQmxStartTask(self, handle):
         task = self._task(handle)
         self._card(task)
-        others = [other for other in self.tasks.values() if other is not task and other.running]
-        if any((other.device, other.channel) == (task.device, task.channel) for other in others):
+        if self._is_taken(task):
             raise DriverError(RESERVED)
-        if task.kind == "watchdog" and any(other.device == task.device for other in others):
+        if task.kind == "watchdog" and any(other.device == task.device and other.running for other in self.tasks.values()):
             raise DriverError(-201477)
         task.running = True
         if task.kind == "counter":
@@ -239,6 +242,8 @@ class Rack:
     def _writable(self, handle, auto_start):
         task = self._task(handle)
         self._card(task)
+        if not task.running and auto_start and self._is_taken(task):
+            raise DriverError(RESERVED)
         if not task.running and not auto_start:
             raise DriverError(NOT_STARTED)
         if any(other.expired and other.device == task.device for other in self.tasks.values()):

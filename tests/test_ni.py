@@ -119,15 +119,15 @@ def test_a_u_that_is_no_number_is_zero_on_the_card(rack, device):
 
 
 def test_the_output_is_zero_before_and_after(rack):
-    """Whatever voltage the last program left on it; the amplifier is enabled after, and disabled before it is given free."""
+    """Whatever voltage the last program left on it; the amplifier is enabled by the first write, and disabled at the end."""
     card = rack.cards["Dev2"]
     card.volts["ao0"] = 7.0
     device = NiDevice("Dev1/ctr0", "Dev2/ao0", enable="Dev2/port0/line0")
-    assert card.history == [("ao0", 0.0), ("port0/line0", False), ("port0/line0", True)]
+    assert card.history == [("ao0", 0.0), ("port0/line0", False)]
     device.write(5.0)
     device.close()
     device.close()
-    assert card.history[3:] == [("ao0", 5.0), ("port0/line0", False), ("ao0", 0.0)]
+    assert card.history[2:] == [("port0/line0", True), ("ao0", 5.0), ("port0/line0", False), ("ao0", 0.0)]
 
 
 def test_the_output_is_zero_when_python_ends():
@@ -158,9 +158,10 @@ def test_the_heartbeat_changes_its_level_at_each_write(rack):
 
 
 def test_the_card_s_watchdog_stops_the_motor_when_the_loop_does_not_write(rack):
-    """On a card that has one: zero volts, amplifier off, and the late loop is told."""
+    """On a card that has one: zero volts, amplifier off, and the late loop is told; it begins with the first write."""
     rack.cards["Dev3"] = Card(outputs=1, lines=1, watchdog=True)
     device = NiDevice("Dev1/ctr0", "Dev3/ao0", watchdog=0.01, enable="Dev3/port0/line0")
+    rack.pass_time(30.0)
     for _ in range(20):
         rack.pass_time(0.009)
         device.write(2.0)
@@ -172,6 +173,14 @@ def test_the_card_s_watchdog_stops_the_motor_when_the_loop_does_not_write(rack):
         device.write(2.0)
     with pytest.warns(RuntimeWarning, match="Dev3/ao0 can't be set to zero, switch the amplifier off"):
         device.close()
+
+
+def test_a_watchdog_that_never_began_is_closed_like_any(rack):
+    """Nothing was written, nothing runs, the output is zero."""
+    rack.cards["Dev3"] = Card(outputs=1, lines=1, watchdog=True)
+    NiDevice("Dev1/ctr0", "Dev3/ao0", watchdog=0.01, enable="Dev3/port0/line0").close()
+    assert rack.cards["Dev3"].volts["ao0"] == 0.0
+    assert not rack.tasks
 
 
 def test_a_card_without_watchdog_is_refused_in_words_that_help(rack):

@@ -51,11 +51,12 @@ class NiDevice:
     pulse_filter
         shortest pulse on A and B that counts [s], where the card can filter; 0 for all pulses.
     enable
-        digital line, such as "Dev2/port0/line0", that is high while the device is open: for the amplifier's enable input.
+        digital line, such as "Dev2/port0/line0", that is high from the first write until the device is closed: for the amplifier's enable.
     heartbeat
         digital line that changes its level at each write: for a relay or a charge pump that drops the amplifier's enable when it stops.
     watchdog
-        after so long without a write, the card itself sets the output to zero [s]; None for cards that have none, as the PCI-6221.
+        after so long without a write the card itself sets the output to zero [s], counted from the first write on; None for cards that have
+        no watchdog, as the PCI-6221.
 
     Raises
     ------
@@ -95,20 +96,17 @@ class NiDevice:
         self.name = f"NI {counter} and {output}"
         self._ni = driver()
         self._close: list[tuple[str, Callable[[], Any]]] = []
-        self._strobe: Callable[[], Any] | None = None
-        self._level = False
+        self._watched: list[Any] = []
+        self._armed = self._level = False
         atexit.register(self.close)
         try:
-            # The watchdog first: on some chassis it can't be started beside other tasks.
-            self._reset_timer = self._start_watchdog(output, enable, patience)
+            self._watchdog = self._make_watchdog(output, enable, patience)
             self._read_count = self._start_counter(counter, shortest)
             self._write_volts = self._start_output(output)
             self._write_enable = self._start_line("enable", enable)
             self._write_heartbeat = self._start_line("heartbeat", heartbeat)
             with said(f"counter = {counter!r}"):
                 self._count = self._zero = self._read_count(_PATIENCE)
-            self._reset_timer()
-            self._write_enable(True)
         except BaseException:
             self.close()
             raise
@@ -140,10 +138,13 @@ class NiDevice:
         self._check_open()
         sound = math.isfinite(u)
         with said("the output can't be written"):
+            if not self._armed:
+                self._arm()
             self._write_volts(self._volts * min(max(u, self._low), self._high) if sound else 0.0)
             self._level = not self._level
             self._write_heartbeat(self._level)
-            self._reset_timer()
+            if self._watchdog is not None:
+                self._watchdog.reset_timer()
         if not sound:
             raise ValueError(f"u = {u!r}: must be a finite number; the output is zero now")
 
@@ -167,6 +168,18 @@ class NiDevice:
     def _check_open(self) -> None:
         if not self._close:
             raise OSError("the device is closed: open it again")
+
+    def _arm(self) -> None:
+        """Start the watchdog, now that a loop writes, and enable the amplifier.
+
+        On some chassis a watchdog can't be started while other tasks run there: so these begin after it.
+        """
+        if self._watchdog is not None:
+            self._watchdog.start()
+            for task in self._watched:
+                task.start()
+        self._write_enable(True)
+        self._armed = True
 
     def _task(self, what: str) -> Any:
         """Return a new task, which is cleared at the end."""
@@ -198,9 +211,9 @@ class NiDevice:
         task = self._task("the output's task")
         with said(f"output = {output!r} from {ends[0]:g} to {ends[1]:g} V"):
             task.ao_channels.add_ao_voltage_chan(output, min_val=ends[0], max_val=ends[1])
-            task.start()
-            writer = self._ni.stream_writers.AnalogSingleChannelWriter(task.out_stream, auto_start=False)
+            writer = self._ni.stream_writers.AnalogSingleChannelWriter(task.out_stream, auto_start=True)
             writer.write_one_sample(0.0, _PATIENCE)
+            self._begin(task)
         self._close.append((f"{output} can't be set to zero, switch the amplifier off", lambda: writer.write_one_sample(0.0, _PATIENCE)))
         return lambda value: writer.write_one_sample(value, _PATIENCE)
 
@@ -211,15 +224,22 @@ class NiDevice:
         task = self._task(f"the task of {name}")
         with said(f"{name} = {line!r}"):
             task.do_channels.add_do_chan(line)
-            task.start()
-            writer = self._ni.stream_writers.DigitalSingleChannelWriter(task.out_stream, auto_start=False)
+            writer = self._ni.stream_writers.DigitalSingleChannelWriter(task.out_stream, auto_start=True)
             writer.write_one_sample_one_line(False, _PATIENCE)
+            self._begin(task)
         self._close.append((f"{line} can't be set low", lambda: writer.write_one_sample_one_line(False, _PATIENCE)))
         return lambda level: writer.write_one_sample_one_line(level, _PATIENCE)
 
-    def _start_watchdog(self, output: str, enable: str | None, patience: float | None) -> Callable[[], Any]:
+    def _begin(self, task: Any) -> None:
+        """Start a task, so that a write need not start and stop it; beside a watchdog, at the first write."""
+        if self._watchdog is None:
+            task.start()
+        else:
+            self._watched.append(task)
+
+    def _make_watchdog(self, output: str, enable: str | None, patience: float | None) -> Any:
         if patience is None:
-            return _nothing
+            return None
         ni, card = self._ni, output.split("/")[0]
         with said(f"watchdog = {patience!r} s"):
             task = ni.system.watchdog.WatchdogTask(card, timeout=patience)
@@ -228,8 +248,7 @@ class NiDevice:
             task.cfg_watchdog_ao_expir_states([ni.types.AOExpirationState(output, 0.0, ni.constants.WatchdogAOExpirState.VOLTAGE)])
             if enable is not None and enable.split("/")[0] == card:
                 task.cfg_watchdog_do_expir_states([ni.types.DOExpirationState(enable, ni.constants.Level.LOW)])
-            task.start()
-        return task.reset_timer
+        return task
 
 
 def _nothing(*_: Any) -> None:
