@@ -12,7 +12,7 @@ from quell.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.realtime.channels import row_channels
 from quell.realtime.clock import pass_time, virtual_clock
-from quell.realtime.device import alarm, fetch, put
+from quell.realtime.device import fetch, put
 from quell.realtime.prepared import Prepared, scenario_of, setpoints
 from quell.realtime.ring import drain, ring
 from quell.realtime.safety import Safety
@@ -35,8 +35,6 @@ class Scripted(NamedTuple):
     """How long fetching takes [ns]."""
     refused: Any
     """What ``put`` returns."""
-    tripped: Any
-    """What ``alarm`` returns."""
     written: Any
     """What was put (·,)."""
 
@@ -60,14 +58,9 @@ def _put(line: Scripted, u: float) -> int:
     line.at[1] += 1
     line.written[k] = u
     if _entry(line.refused, k) != 0:
-        return 1
+        return _entry(line.refused, k)
     advance(line.plant, line.x, line.scratch, 0.0, u, line.w)
     return 0
-
-
-@alarm.register(Scripted)
-def _alarm(line: Scripted) -> int:
-    return int(_entry(line.tripped, line.at[1]))
 
 
 class ScriptedDevice:
@@ -77,7 +70,7 @@ class ScriptedDevice:
         self.paced = False
         model = plant.sampled(DT, False)
         x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=float)
-        kinds = {"y": float, "stall": np.int64, "refused": np.int64, "tripped": np.int64}
+        kinds = {"y": float, "stall": np.int64, "refused": np.int64}
         told = {name: np.zeros(samples, dtype=kind) for name, kind in kinds.items()}
         for name, script in scripts.items():
             for k, value in script.items():

@@ -174,6 +174,52 @@ def compare(
     run_compare(controllers=controllers, settings=settings, json_file=json, figures=figures)
 
 
+@app.command(name="rig")
+def rig(
+    *,
+    device: str,
+    plant: str = "torsional",
+    dt: float = 1e-3,
+    watchdog: Annotated[int, Parameter(converter=_whole)] = 20,
+    u_max: float = float("inf"),
+    rest: bool = True,
+    seconds: float | None = None,
+    log: Path | None = None,
+    priority: Annotated[int, Parameter(converter=_whole)] = 50,
+    cpu: Annotated[int | None, Parameter(converter=_whole)] = None,
+) -> None:
+    """Be the device at the other end of a wire: a simulated plant with a clock and a watchdog of its own, until interrupted.
+
+    Parameters
+    ----------
+    device
+        Where it listens: udp://127.0.0.1:5005 (this computer only; another address of this computer for others to reach it), shm://NAME,
+        or serial:///dev/ttyX.
+    plant
+        What it is: torsional, torsional-identified or two-mass.
+    dt
+        Its tick [s].
+    watchdog
+        After so many ticks in a row without a fresh command u is zero until a new session.
+    u_max
+        Larger commands are cut to this [V, N].
+    rest
+        Whether each session starts from rest, or from where the last one left the plant.
+    seconds
+        For how long [s]; until interrupted by default.
+    log
+        Write each tick to this CSV file: y, u as applied, the command as it came, state.
+    priority
+        SCHED_FIFO priority of the ticks, 1 to 99; 0 for ordinary scheduling. What is not permitted is said at the end.
+    cpu
+        Number of the processor that the ticks are to have; any by default.
+    """
+    from quell.commands.rig import run_rig
+
+    settings = {"dt": dt, "watchdog": watchdog, "u_max": u_max, "rest": rest}
+    run_rig(device=device, plant=plant, settings=settings, seconds=seconds, log=log, priority=priority, cpu=cpu)
+
+
 def main() -> None:
     """Run the command line; a mistake in what was asked gives one line and exit code 2."""
     try:

@@ -103,7 +103,10 @@ class RigRun:
 
 def tally_of(watch: Watch, rows_lost: int) -> Tally:
     """Return what the supervisor counted."""
-    return Tally(*(int(watch.counts[place]) for place in (CYCLES, OVERRUNS, SKIPPED, MISSES, CLIPPED, UNSENT)), rows_lost)
+    cycles, overruns, skipped, missed, clipped, unsent = (
+        int(watch.counts[place]) for place in (CYCLES, OVERRUNS, SKIPPED, MISSES, CLIPPED, UNSENT)
+    )
+    return Tally(cycles, overruns, skipped, missed, clipped, unsent, rows_lost)
 
 
 def told(rows: Any, dt: float) -> tuple[ModeChange, ...]:
