@@ -304,8 +304,8 @@ def test_a_loop_through_the_cards_is_the_simulated_loop(rack):
     dt = 1e-3
     observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=dt)
     controller = ql.ADRC(observer, omega_c=20.0, u_min=-5, u_max=5)
-    scenario = ql.Scenario(reference=ql.signals.Sinusoid(amplitude=math.pi / 2, omega=math.pi / 2), duration=2.0)
-    ideal = ql.simulate(ql.plants.torsional(counts=16000, dac_bits=16), controller, scenario)
+    scenario = ql.Scenario(reference=ql.signals.Sinusoid(amplitude=math.pi / 2, omega=math.pi / 2), duration=0.5)
+    ideal = ql.simulate(ql.plants.torsional(counts=16000, dac_bits=16), controller, scenario, interpret=True)
 
     twin = TwinDevice(ql.plants.torsional(counts=None, dac_bits=None), dt)
     y, u = np.empty(len(ideal)), np.empty(len(ideal))
@@ -316,7 +316,7 @@ def test_a_loop_through_the_cards_is_the_simulated_loop(rack):
             u[k] = controller.step(r, y[k])
             device.write(u[k])
             twin.write(rack.cards["Dev2"].volts["ao0"])
-    assert np.ptp(y) > 1.0
+    assert np.ptp(y) > 0.5
     assert np.ptp(u) > 0.1
     np.testing.assert_allclose(y, ideal["y"], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(u, ideal["u"], rtol=1e-6, atol=1e-9)

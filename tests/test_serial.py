@@ -271,7 +271,7 @@ def test_a_loop_over_the_line_is_the_loop_on_the_delayed_plant(rig):
     plant = ql.plants.delayed(ql.plants.two_mass_spring(), DT, DT)
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT)
     controller = ql.ADRC(observer, omega_c=2.0, u_min=-10, u_max=10)
-    ideal = ql.simulate(plant, controller, ql.Scenario(reference=ql.signals.Step(1.0), duration=2.0))
+    ideal = ql.simulate(plant, controller, ql.Scenario(reference=ql.signals.Step(1.0), duration=0.5), interpret=True)
     with opened(rig) as device:
         while device.line.peer.numbers[frames.HEARD] < rig.model.peer.numbers[frames.SENT]:
             device.read()
@@ -374,6 +374,13 @@ def test_a_port_that_is_not_ours_is_said_so(monkeypatch):
     monkeypatch.setattr("serial.Serial", refuse)
     with pytest.raises(ValueError, match="no permission: join the group dialout"):
         SerialDevice("serial:///dev/ttyS0", DT)
+
+
+def test_other_systems_are_told_what_to_do(monkeypatch):
+    """The line is read through functions that only Linux has."""
+    monkeypatch.setattr("sys.platform", "win32")
+    with pytest.raises(ValueError, match="serial lines are for Linux; elsewhere give run_rig a device of your own"):
+        SerialDevice("serial://COM3", DT)
 
 
 def test_without_pyserial_one_line_says_which_extra(monkeypatch):

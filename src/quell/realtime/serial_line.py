@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import sys
 import warnings
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
@@ -235,6 +236,8 @@ def _check_rate(baud: int, dt: float) -> None:
 
 def _opened(url: str, path: str, baud: int) -> Any:
     """Return the open port: raw, 8N1, ours alone, without delay where its driver can do without."""
+    if sys.platform != "linux":
+        raise ValueError(f"device = {url!r}: serial lines are for Linux; elsewhere give run_rig a device of your own around pyserial")
     try:
         import serial
     except ImportError as error:
