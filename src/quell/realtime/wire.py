@@ -132,6 +132,7 @@ class WireDevice:
         )
         self._clock = system_clock()
         self._open = True
+        self._timeout, self._hint = timeout, hint
         self._compiled = False
         try:
             self._begin_session(time.monotonic() + timeout, hint)
@@ -167,6 +168,19 @@ class WireDevice:
         fault = self._call(put_one, float(u))
         if fault:
             raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
+
+    def begin_anew(self) -> None:
+        """Begin a new session in place of this one: what the loop does before its first cycle, as the device waits for that only so long.
+
+        Raises
+        ------
+        ConnectionError
+            where no device answers.
+        """
+        self._check_open()
+        self._say(frames.GOODBYE, 0.0)
+        frames.start_session(self.line.peer, _new_session())
+        self._begin_session(time.monotonic() + self._timeout, self._hint)
 
     def tick(self, timeout: float = 1.0) -> int:
         """Wait for a measurement that comes now, and return the time at which it came: the system's monotonic clock [ns].
