@@ -12,8 +12,8 @@ from quell.realtime.device import line_of
 _SCHEMES: dict[str, tuple[str, str, str | None, str]] = {
     "udp": ("quell.realtime.udp", "UdpDevice", "UdpListener", "udp://127.0.0.1:5005"),
     "shm": ("quell.realtime.shared", "SharedDevice", "SharedListener", "shm://rig"),
-    "serial": ("quell.realtime.serial", "SerialDevice", "SerialListener", "serial:///dev/ttyACM0"),
-    "ni": ("quell.realtime.ni", "NiDevice", None, "ni://"),
+    "serial": ("quell.realtime.serial_line", "SerialDevice", "SerialListener", "serial:///dev/ttyACM0"),
+    "ni": ("quell.realtime.ni", "ni_device", None, "ni://Dev1/ctr0+Dev2/ao0"),
     "twin": ("quell.realtime.devices", "twin", None, "twin:torsional"),
 }
 

@@ -1,0 +1,221 @@
+/* The device's side of quell's serial line, to put into a microcontroller.
+ *
+ * Frames, packets and sessions are those of src/quell/realtime/{frames,cobs,rig}.py. Give the four board_ functions, call quell_byte() for
+ * each byte that the UART has received, and quell_tick() every DT, from a timer. Little-endian, with 64-bit double (not AVR).
+ *
+ * With -DQUELL_HOST it is a program that simulates y' = u at the other end of a pseudoterminal, whose name it prints.
+ */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#define DT 0.001     /* sample time [s] */
+#define U_MAX 10.0   /* larger commands are cut to it [u-unit] */
+#define WATCHDOG 20  /* after so many ticks without a fresh command u is zero until a new session */
+#define PATIENCE 60000 /* so many ticks a session may wait for its first command */
+#define MOST_AGE 20  /* a command that answers a measurement from more ticks ago is stale */
+
+double board_measure(void);                     /* y, now [y-unit] */
+void board_apply(double u);                     /* u, until the next call [u-unit] */
+void board_send(const uint8_t *data, int size); /* into the UART's queue; must not wait */
+int64_t board_time(void);                       /* any monotonic clock [ns] */
+
+enum { MEASUREMENT = 1, COMMAND, HELLO, WELCOME, GOODBYE };
+enum { TRIPPED_FLAG = 1, BUSY_FLAG = 2, OTHER_DT_FLAG = 4 };
+
+typedef struct {
+    char magic[2];
+    uint8_t version, kind;
+    uint32_t session, number, answers;
+    int64_t time;
+    double value;
+    uint32_t state, crc;
+} Frame; /* 40 bytes, without gaps */
+
+static enum { IDLE, WAITING, LIVE, TRIPPED } mode = IDLE;
+static uint32_t session, sent, heard;
+static double newest, applied;
+static int fresh, silent;
+
+static uint32_t crc32(const void *data, int size)
+{
+    const uint8_t *byte = data;
+    uint32_t crc = 0xFFFFFFFFu;
+    while (size-- > 0) {
+        crc ^= *byte++;
+        for (int bit = 0; bit < 8; bit++)
+            crc = crc >> 1 ^ (crc & 1 ? 0xEDB88320u : 0);
+    }
+    return ~crc;
+}
+
+static void send_frame(uint8_t kind, uint32_t to, uint32_t number, double value, uint32_t state)
+{
+    Frame frame = {{'Q', 'L'}, 1, kind, to, number, number ? heard : 0, board_time(), value, state, 0};
+    uint8_t packet[sizeof frame + 2], *code = packet, *out = packet + 1;
+    const uint8_t *data = (const uint8_t *)&frame;
+    frame.crc = crc32(&frame, sizeof frame - 4);
+    for (unsigned i = 0; i < sizeof frame; i++) {
+        if (data[i]) {
+            *out++ = data[i];
+        } else {
+            *code = (uint8_t)(out - code);
+            code = out++;
+        }
+    }
+    *code = (uint8_t)(out - code);
+    *out++ = 0;
+    board_send(packet, (int)(out - packet));
+}
+
+static void greet(const Frame *hello)
+{
+    uint32_t refusal = 0;
+    int known = hello->session == session;
+    if (hello->session == 0 || (known && (mode == IDLE || mode == TRIPPED)))
+        return; /* a session that is over does not come back */
+    if (!known) {
+        if (!(fabs(hello->value - DT) <= 1e-9 * DT)) {
+            refusal = OTHER_DT_FLAG;
+        } else if (mode == WAITING || mode == LIVE) {
+            refusal = BUSY_FLAG;
+        } else {
+            session = hello->session;
+            sent = heard = 0;
+            silent = fresh = 0;
+            applied = 0.0;
+            mode = WAITING;
+        }
+    }
+    send_frame(WELCOME, hello->session, 0, DT, refusal);
+}
+
+static void take(const Frame *frame)
+{
+    if (memcmp(frame->magic, "QL\1", 3) || frame->crc != crc32(frame, sizeof *frame - 4))
+        return;
+    if (frame->kind == HELLO) {
+        greet(frame);
+    } else if (mode != IDLE && frame->session == session) {
+        if (frame->kind == GOODBYE) {
+            mode = IDLE;
+        } else if (frame->kind == COMMAND) {
+            int32_t ahead = (int32_t)(frame->number - heard), age = (int32_t)(sent - frame->answers);
+            if (ahead <= 0 || age < 0 || age > MOST_AGE)
+                return;
+            heard = frame->number;
+            if (isfinite(frame->value)) {
+                newest = frame->value;
+                fresh = 1;
+            }
+        }
+    }
+}
+
+void quell_byte(uint8_t byte)
+{
+    static uint8_t packet[sizeof(Frame) + 2];
+    static unsigned size;
+    if (byte != 0) {
+        if (size < sizeof packet)
+            packet[size] = byte;
+        size += size < sizeof packet;
+        return;
+    }
+    uint8_t data[sizeof packet];
+    unsigned in = 0, out = 0, end = size;
+    size = 0;
+    if (end >= sizeof packet)
+        return;
+    while (in < end) {
+        unsigned code = packet[in];
+        if (in + code > end)
+            return;
+        memcpy(data + out, packet + in + 1, code - 1);
+        out += code - 1;
+        in += code;
+        if (in < end)
+            data[out++] = 0;
+    }
+    if (out == sizeof(Frame)) {
+        Frame frame;
+        memcpy(&frame, data, sizeof frame);
+        take(&frame);
+    }
+}
+
+void quell_tick(void)
+{
+    if (fresh && mode == WAITING)
+        mode = LIVE;
+    silent = fresh ? 0 : silent + 1;
+    if (fresh)
+        applied = fmin(fmax(newest, -U_MAX), U_MAX);
+    fresh = 0;
+    if (mode == LIVE && silent >= WATCHDOG)
+        mode = TRIPPED;
+    else if (mode == WAITING && silent >= PATIENCE)
+        mode = IDLE;
+    if (mode != LIVE)
+        applied = 0.0;
+    double y = board_measure();
+    if (mode != IDLE)
+        send_frame(MEASUREMENT, session, ++sent, y, mode == TRIPPED ? TRIPPED_FLAG : 0);
+    board_apply(applied);
+}
+
+#ifdef QUELL_HOST
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+#include <unistd.h>
+
+static int line, packets;
+static double y;
+
+double board_measure(void) { return y; }
+void board_apply(double u) { y += DT * u; }
+void board_send(const uint8_t *data, int size)
+{
+    if (write(line, data, (size_t)size) != size)
+        fputs("a frame was cut short\n", stderr);
+}
+int64_t board_time(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
+}
+
+/* Each t on the standard input is a tick, each c waits for a packet: so a test goes step by step. */
+int main(void)
+{
+    uint8_t byte;
+    int c;
+    line = posix_openpt(O_RDWR | O_NOCTTY);
+    if (line < 0 || grantpt(line) || unlockpt(line))
+        return 1;
+    int other = open(ptsname(line), O_RDWR | O_NOCTTY); /* kept open, or the line hangs up whenever nobody has it */
+    printf("serial://%s\n", ptsname(line));
+    fflush(stdout);
+    while ((c = getchar()) != EOF) {
+        if (c == 't')
+            quell_tick();
+        for (packets = 0; c == 'c' && packets == 0;) {
+            static int within;
+            if (read(line, &byte, 1) != 1)
+                return 1;
+            quell_byte(byte);
+            packets += within && byte == 0;
+            within = byte != 0;
+        }
+        if (c == 't' || c == 'c') {
+            printf("%d %.17g %.17g\n", mode, y, applied);
+            fflush(stdout);
+        }
+    }
+    close(other);
+    return 0;
+}
+#endif

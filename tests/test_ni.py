@@ -1,0 +1,361 @@
+"""Cards of NI: the package nidaqmx runs as it is, on a stand-in for the C library below it."""
+
+import gc
+import math
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import quell as ql
+from quell.realtime.clock import virtual_clock
+from quell.realtime.device import Device, fetch, line_of
+from quell.realtime.ni import NiDevice, ni_device
+from quell.realtime.twin import TwinDevice
+
+from . import scripted
+from .daqmx_standin import Card, Rack
+
+library = pytest.importorskip("nidaqmx._lib").lib_importer
+TAU = 2.0 * math.pi
+
+
+def put_under(rack, monkeypatch):
+    """Make the stand-in the library that the package finds."""
+    for name, value in (("_windll", rack), ("_cdll", rack), ("_encoding", "utf-8")):
+        monkeypatch.setattr(library, name, value)
+
+
+def paper_s_rack(**more):
+    """A PCI-6601 (Dev1) and a PCI-6221 (Dev2)."""
+    return Rack(Dev1=Card(counters=4, lines=8), Dev2=Card(counters=2, outputs=2, lines=24), **more)
+
+
+@pytest.fixture
+def rack(monkeypatch):
+    """The paper's two cards; nothing may be left on them that still runs."""
+    rack = paper_s_rack()
+    put_under(rack, monkeypatch)
+    yield rack
+    gc.collect()
+    assert not rack.tasks, "a task was not cleared"
+
+
+@pytest.fixture
+def device(rack):
+    """The paper's device on them."""
+    device = NiDevice("Dev1/ctr0", "Dev2/ao0", counts=16000)
+    yield device
+    device.close()
+
+
+def test_an_ni_device_is_a_device(device):
+    """It has what the loop asks for, and is reached through Python."""
+    assert isinstance(device, Device)
+    assert fetch(line_of(device), virtual_clock(), 0) == (0.0, 0)
+
+
+def test_a_turn_of_the_shaft_is_two_pi(rack, device):
+    """16000 edges a turn; zero is where it was opened."""
+    assert device.read() == 0.0
+    rack.edges = 16000
+    assert device.read() == pytest.approx(TAU, rel=1e-15)
+    rack.edges = -1
+    assert device.read() == -TAU / 16000
+
+
+def test_zero_is_where_the_device_was_opened(rack):
+    """Wherever the shaft stood before."""
+    rack.edges = 12345
+    device = NiDevice("Dev1/ctr0", "Dev2/ao0")
+    rack.edges += 4000
+    assert device.read() == pytest.approx(TAU / 4)
+    device.close()
+
+
+@given(st.lists(st.integers(-(2**23) + 1, 2**23 - 1), max_size=30), st.sampled_from([24, 32]))
+def test_a_counter_that_rolls_over_is_followed_across(steps, bits):
+    """Both ways, as often as it likes, for counters of 24 and of 32 bits: the position is the sum of what the shaft turned."""
+    rack = paper_s_rack()
+    rack.cards["Dev1"].bits = bits
+    with pytest.MonkeyPatch.context() as patch:
+        put_under(rack, patch)
+        device = NiDevice("Dev1/ctr0", "Dev2/ao0", counts=4, bits=bits)
+        for step in steps:
+            rack.edges += step
+            assert device.read() == TAU * rack.edges / 4
+        device.close()
+
+
+def test_the_ratio_and_the_sign_of_the_encoder_are_the_user_s(rack):
+    """An encoder on the motor's side of a 3:1 belt that counts the other way."""
+    device = NiDevice("Dev1/ctr0", "Dev2/ao0", counts=16000, ratio=-1 / 3)
+    rack.edges = 48000
+    assert device.read() == pytest.approx(-TAU)
+    device.close()
+
+
+def test_u_comes_out_in_volts_and_is_cut_at_its_limits(rack):
+    """U beyond the limits never reaches the card; the driver was told the same limits."""
+    device = NiDevice("Dev1/ctr0", "Dev2/ao1", volts=-2.0, u_min=-1.0, u_max=4.0)
+    for u in (0.5, -7.0, 99.0):
+        device.write(u)
+    assert rack.cards["Dev2"].history == [("ao1", 0.0), ("ao1", -1.0), ("ao1", 2.0), ("ao1", -8.0)]
+    assert next(task.limits for task in rack.tasks.values() if task.kind == "output") == (-8.0, 2.0)
+    device.close()
+
+
+def test_a_u_that_is_no_number_is_zero_on_the_card(rack, device):
+    """And said."""
+    device.write(3.0)
+    with pytest.raises(ValueError, match="u = nan: must be a finite number; the output is zero now"):
+        device.write(math.nan)
+    assert rack.cards["Dev2"].volts["ao0"] == 0.0
+
+
+def test_the_output_is_zero_before_and_after(rack):
+    """Whatever voltage the last program left on it; the amplifier is enabled by the first write, and disabled at the end."""
+    card = rack.cards["Dev2"]
+    card.volts["ao0"] = 7.0
+    device = NiDevice("Dev1/ctr0", "Dev2/ao0", enable="Dev2/port0/line0")
+    assert card.history == [("ao0", 0.0), ("port0/line0", False)]
+    device.write(5.0)
+    device.close()
+    device.close()
+    assert card.history[2:] == [("port0/line0", True), ("ao0", 5.0), ("port0/line0", False), ("ao0", 0.0)]
+
+
+def test_the_output_is_zero_when_python_ends():
+    """Also where nobody closed the device: here the program ends by an exception."""
+    program = (
+        "from quell.realtime.ni import NiDevice\n"
+        "from tests.daqmx_standin import Card, Rack; from nidaqmx._lib import lib_importer as library\n"
+        "import atexit\n"
+        "rack = Rack(Dev1=Card(counters=1), Dev2=Card(outputs=1))\n"
+        "library._windll = library._cdll = rack; library._encoding = 'utf-8'\n"
+        "atexit.register(lambda: print(rack.cards['Dev2'].history, rack.tasks))\n"
+        "NiDevice('Dev1/ctr0', 'Dev2/ao0').write(4.0)\n"
+        "raise SystemExit(1)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1]
+    )
+    assert done.stdout.strip() == "[('ao0', 0.0), ('ao0', 4.0), ('ao0', 0.0)] {}", done.stderr
+
+
+def test_the_heartbeat_changes_its_level_at_each_write(rack):
+    """So that a relay behind it sees the loop live; it rests low."""
+    device = NiDevice("Dev1/ctr0", "Dev2/ao0", heartbeat="Dev2/port0/line3")
+    for _ in range(4):
+        device.write(0.0)
+    device.close()
+    assert [level for name, level in rack.cards["Dev2"].history if name == "port0/line3"] == [False, True, False, True, False, False]
+
+
+def test_the_card_s_watchdog_stops_the_motor_when_the_loop_does_not_write(rack):
+    """On a card that has one: zero volts, amplifier off, and the late loop is told; it begins with the first write."""
+    rack.cards["Dev3"] = Card(outputs=1, lines=1, watchdog=True)
+    device = NiDevice("Dev1/ctr0", "Dev3/ao0", watchdog=0.01, enable="Dev3/port0/line0")
+    rack.pass_time(30.0)
+    for _ in range(20):
+        rack.pass_time(0.009)
+        device.write(2.0)
+    assert rack.cards["Dev3"].volts["ao0"] == pytest.approx(2.0, abs=1e-3)
+    rack.pass_time(0.011)
+    assert rack.cards["Dev3"].volts["ao0"] == 0.0
+    assert not rack.cards["Dev3"].levels["port0/line0"]
+    with pytest.raises(OSError, match="-200678.*the loop came too late; reset the card"):
+        device.write(2.0)
+    with pytest.warns(RuntimeWarning, match="Dev3/ao0 can't be set to zero, switch the amplifier off"):
+        device.close()
+
+
+def test_a_watchdog_that_never_began_is_closed_like_any(rack):
+    """Nothing was written, nothing runs, the output is zero."""
+    rack.cards["Dev3"] = Card(outputs=1, lines=1, watchdog=True)
+    NiDevice("Dev1/ctr0", "Dev3/ao0", watchdog=0.01, enable="Dev3/port0/line0").close()
+    assert rack.cards["Dev3"].volts["ao0"] == 0.0
+    assert not rack.tasks
+
+
+def test_a_card_without_watchdog_is_refused_in_words_that_help(rack):
+    """The PCI-6221 has none."""
+    with pytest.raises(ValueError, match=r"watchdog = 0.1 s: .*-200662: this card has none .*heartbeat"):
+        NiDevice("Dev1/ctr0", "Dev2/ao0", watchdog=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"counter": "Dev9/ctr0"}, r"counter = 'Dev9/ctr0': .*-200220: the names of the cards that are there"),
+        ({"counter": "Dev1/ctr7"}, r"counter = 'Dev1/ctr7': .*-200170: counters are called like"),
+        ({"output": "Dev1/ao0"}, r"output = 'Dev1/ao0' from -10 to 10 V: .*-200170"),
+        ({"volts": 2.0}, r"output = 'Dev2/ao0' from -20 to 20 V: .*-200077: take limits within the range"),
+        ({"enable": "Dev2/port9/line0"}, r"enable = 'Dev2/port9/line0': .*-200170"),
+        ({"counts": 0}, "counts = 0: must be a whole number"),
+        ({"ratio": 0.0}, "ratio = 0.0: must not be zero"),
+        ({"volts": 0.0}, "volts = 0.0: must not be zero"),
+        ({"u_min": 1.0}, "u_min = 1.0, u_max = 10.0: must enclose zero"),
+        ({"u_max": math.inf}, "u_max = inf: must be a finite number"),
+        ({"bits": 64}, "bits = 64: must be a whole number from 8 to 32"),
+        ({"watchdog": 0.0}, "watchdog = 0.0: must be finite and greater than zero"),
+        ({"pulse_filter": -1.0}, "pulse_filter = -1.0: must be finite and not negative"),
+    ],
+)
+def test_bad_arguments_are_named_in_one_line(rack, arguments, says):
+    """And no task stays behind, no output at any voltage."""
+    with pytest.raises(ValueError, match=says) as caught:
+        NiDevice(**{"counter": "Dev1/ctr0", "output": "Dev2/ao0"} | arguments)
+    assert "\n" not in str(caught.value)
+    assert rack.cards["Dev2"].volts.get("ao0", 0.0) == 0.0
+
+
+def test_a_card_that_another_program_holds_is_said_so(rack, device):
+    """Two devices can't have one output."""
+    with pytest.raises(OSError, match="-50103: another program holds the card: close it"):
+        NiDevice("Dev1/ctr1", "Dev2/ao0")
+    device.write(1.0)
+    assert rack.cards["Dev2"].volts["ao0"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_pulse_filter_reaches_both_lines_of_the_encoder(rack):
+    """Both its width and that it is on."""
+    device = NiDevice("Dev1/ctr0", "Dev2/ao0", pulse_filter=1e-6)
+    counter = next(task for task in rack.tasks.values() if task.kind == "counter")
+    assert sorted(counter.attributes.values()) == [1e-6, 1e-6, True, True]
+    device.close()
+
+
+def test_without_a_driver_one_line_says_where_to_get_it(monkeypatch):
+    """As on this machine, where there is none."""
+    for name in ("_windll", "_cdll", "_encoding"):
+        monkeypatch.setattr(library, name, None)
+    monkeypatch.setattr("nidaqmx._lib.find_library", lambda name: None)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(OSError, match="Could not find an installation of NI-DAQmx.*python -m nidaqmx installdriver") as caught:
+        NiDevice("Dev1/ctr0", "Dev2/ao0")
+    assert "\n" not in str(caught.value)
+
+
+def test_without_the_package_one_line_says_which_extra(monkeypatch):
+    """The extra is called ni."""
+    monkeypatch.setitem(sys.modules, "nidaqmx", None)
+    with pytest.raises(ImportError, match=r"pip install 'quell\[ni\]'"):
+        NiDevice("Dev1/ctr0", "Dev2/ao0")
+
+
+def test_a_card_that_is_lost_is_an_error_that_the_loop_counts(rack, device):
+    """Reading gives no number then, writing says that it failed; when it is closed, a warning says that the output could not be zeroed."""
+    line = line_of(device)
+    rack.cards["Dev1"].present = rack.cards["Dev2"].present = False
+    value, _ = fetch(line, virtual_clock(), 0)
+    assert math.isnan(value)
+    assert ql.realtime.device.put(line, 1.0) != 0
+    assert line.faults[0] == 2
+    assert "-200324: the card is gone" in str(line.errors[0])
+    with pytest.warns(RuntimeWarning, match="switch the amplifier off"):
+        device.close()
+
+
+def test_a_closed_device_can_not_be_used(device):
+    """It says so, and closing it again does no harm."""
+    device.close()
+    device.close()
+    with pytest.raises(OSError, match="the device is closed"):
+        device.read()
+    with pytest.raises(OSError, match="the device is closed"):
+        device.write(0.0)
+
+
+def test_an_address_says_all_that_the_arguments_say(rack):
+    """The one for the paper's cards, with an enable line."""
+    device = ni_device("ni://Dev1/ctr2+Dev2/ao1?counts=8000&u_max=5&enable=Dev2/port0/line7", 1e-3)
+    rack.edges = 8000
+    assert device.read() == pytest.approx(TAU)
+    device.write(9.0)
+    assert ("ao1", 5.0) in rack.cards["Dev2"].history
+    assert rack.cards["Dev2"].levels["port0/line7"] is True
+    device.close()
+
+
+@pytest.mark.parametrize(
+    ("address", "says"),
+    [
+        ("ni://Dev1/ctr0", "must be ni://COUNTER\\+OUTPUT"),
+        ("ni://Dev1/ctr0+", "must be ni://COUNTER\\+OUTPUT"),
+        ("ni://Dev1/ctr0+Dev2/ao0?count=3", "count is none of counts, bits, ratio"),
+        ("ni://Dev1/ctr0+Dev2/ao0?counts=1.5", "counts = '1.5' must be a whole number"),
+        ("ni://Dev1/ctr0+Dev2/ao0?ratio=x", "ratio = 'x' must be a number"),
+    ],
+)
+def test_addresses_that_are_none_are_refused(rack, address, says):
+    """In one line."""
+    with pytest.raises(ValueError, match=says):
+        ni_device(address, 1e-3)
+
+
+def test_a_loop_through_the_cards_is_the_simulated_loop(rack):
+    """The paper's testbed, but without encoder and converter, behind these cards is the testbed with them, count for count."""
+    dt = 1e-3
+    observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=dt)
+    controller = ql.ADRC(observer, omega_c=20.0, u_min=-5, u_max=5)
+    scenario = ql.Scenario(reference=ql.signals.Sinusoid(amplitude=math.pi / 2, omega=math.pi / 2), duration=0.5)
+    ideal = ql.simulate(ql.plants.torsional(counts=16000, dac_bits=16), controller, scenario, interpret=True)
+
+    twin = TwinDevice(ql.plants.torsional(counts=None, dac_bits=None), dt)
+    y, u = np.empty(len(ideal)), np.empty(len(ideal))
+    with closing(NiDevice("Dev1/ctr0", "Dev2/ao0", counts=16000)) as device:
+        for k, r in enumerate(ideal["r"]):
+            rack.edges = math.floor(twin.read() * 16000 / TAU + 0.5)
+            y[k] = device.read()
+            u[k] = controller.step(r, y[k])
+            device.write(u[k])
+            twin.write(rack.cards["Dev2"].volts["ao0"])
+    assert np.ptp(y) > 0.5
+    assert np.ptp(u) > 0.1
+    np.testing.assert_allclose(y, ideal["y"], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(u, ideal["u"], rtol=1e-6, atol=1e-9)
+
+
+class Shaft:
+    """The device, and what it moves: a sample passes with each write."""
+
+    def __init__(self, rack, device, plant):
+        self.rack, self.device, self.twin, self.samples = rack, device, TwinDevice(plant, scripted.DT), 0
+        self.close = device.close
+
+    def read(self):
+        """Let the counter see where the shaft is, and read it."""
+        self.samples += 1
+        if self.samples == 150:
+            self.rack.cards["Dev1"].present = False
+        self.rack.edges = math.floor(self.twin.read() * 16000 / TAU + 0.5)
+        return self.device.read()
+
+    def write(self, u):
+        """Write u, and let the card's voltage act for a sample."""
+        self.device.write(u)
+        self.twin.write(self.rack.cards["Dev2"].volts["ao0"])
+
+
+def test_the_loop_goes_to_its_safe_state_when_the_counter_card_is_lost(rack):
+    """It holds u for as many samples as it may, ramps it to zero within as many as it says, and the amplifier loses its enable."""
+    device = NiDevice("Dev1/ctr0", "Dev2/ao0", enable="Dev2/port0/line0", u_min=-3.0, u_max=3.0)
+    shaft = Shaft(rack, device, scripted.PLANT)
+    done = scripted.run(shaft, duration=5.0, hold=5, ramp=20)
+    volts = [value for name, value in rack.cards["Dev2"].history if name == "ao0"][1:]
+    before, after = volts[:149], volts[149:]
+    assert max(map(abs, volts)) <= 3.0
+    assert abs(before[-1]) > 0.1
+    assert after[:5] == [before[-1]] * 5
+    assert after[25:] == [0.0] * len(after[25:])
+    assert done.rows.shape[0] < 200
+    assert "-200324" in str(done.prepared.line.errors[0])
+    rack.cards["Dev1"].present = True
+    shaft.close()
+    assert not rack.cards["Dev2"].levels["port0/line0"]
