@@ -174,13 +174,39 @@ def compare(
     run_compare(controllers=controllers, settings=settings, json_file=json, figures=figures)
 
 
+@app.command(name="run")
+def run(
+    setup: Path,
+    *,
+    json: Annotated[Path | None, Parameter(name="--json")] = None,
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    save: Path | None = None,
+) -> None:
+    """Simulate what a setup file describes: a plant, a controller, what happens to them.
+
+    Parameters
+    ----------
+    setup
+        The file, in TOML; docs/setup has all keys, examples/two_mass.toml is one.
+    json
+        Write metrics and settings to this file, for programs.
+    figures
+        Put the figure into this folder, as PNG and SVG.
+    save
+        Write the whole record to this file, which `Trajectory.load` reads.
+    """
+    from quell.commands.run import run_setup
+
+    run_setup(path=setup, json_file=json, figures=figures, save=save)
+
+
 def main() -> None:
-    """Run the command line; a mistake in what was asked gives one line and exit code 2."""
+    """Run the command line; each mistake in what was asked gives one line, and the exit code is 2."""
     try:
         app()
     except (CycloptsError, ValueError) as error:
-        message = " ".join(str(error).split())
-        print(f"quell: {message}", file=sys.stderr)
+        for mistake in getattr(error, "mistakes", (str(error),)):
+            print(f"quell: {' '.join(mistake.split())}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:  # whoever was reading has read enough
         sys.stdout = None
