@@ -38,6 +38,11 @@ _MEANINGS = {
     "reason": ("why the authority is what it is (quell.guard.Reason)", "1"),
     "status": ("status flags of the step", "1"),
     "theta": ("coefficients of the learner", "y-unit/s^n per feature-unit"),
+    "k": ("index of the deadline", "1"),
+    "lateness": ("wake-up behind the deadline", "s"),
+    "step_time": ("from the wake-up until u was written", "s"),
+    "mode": ("state of the supervisor", "1"),
+    "events": ("what befell the cycle (quell.realtime.channels.Event)", "1"),
 }
 
 
@@ -65,7 +70,7 @@ class Record:
         if checks.one_of("channel", name, self.names) == "f_hat":
             return self["f_learned"] + self["f_residual"]
         columns = columns_of(self.channels, name)
-        return self.log[..., columns] if name in _VECTORS else self.log[..., columns.start]
+        return self.log[..., columns] if is_vector(name, columns.stop - columns.start) else self.log[..., columns.start]
 
     def window(self, start: float, stop: float) -> slice:
         """Return the samples with ``start <= t < stop`` as a slice."""
@@ -92,8 +97,8 @@ class Record:
         coordinates: dict[str, Any] = {"time": ("time", self.t, {"units": "s"})}
         for name in self.names:
             values = np.ascontiguousarray(self[name])
-            meaning, unit = _MEANINGS.get(name, (name, "1"))
-            attributes = {"long_name": meaning, "units": unit}
+            told, unit = meaning(name)
+            attributes = {"long_name": told, "units": unit}
             if values.ndim > len(axes):
                 axis = f"{name}_index"
                 coordinates[axis] = (axis, list(labels.get(name) or range(1, values.shape[-1] + 1)), {})
@@ -101,6 +106,16 @@ class Record:
             else:
                 variables[name] = (axes, values, attributes)
         return xarray.Dataset(variables, coordinates, attrs={"dt": self.dt, "every": self.every, **about})
+
+
+def meaning(name: str) -> tuple[str, str]:
+    """Return what a channel is, in words, and its unit."""
+    return _MEANINGS.get(name, (name, "1"))
+
+
+def is_vector(name: str, width: int) -> bool:
+    """Say whether a channel has several values a sample, be it that in this run it is only one."""
+    return width > 1 or name in _VECTORS
 
 
 def names_of(channels: tuple[tuple[str, int], ...]) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from numba.core.runtime import _nrt_python, rtsys
 import quell as ql
 from quell import controllers as room
 from quell.controllers import baselines as baseline_room
+from quell.controllers.base import take_over
 from quell.controllers.running import named_arrays
 
 from .test_contracts import CHAIN, SCENARIO, check_run
@@ -82,6 +83,41 @@ def test_a_bad_sample_is_held_and_limits_hold(name: str) -> None:
         assert abs(u - before) <= 60.0 * DT + 1e-12
         assert u == other.step(r, y)
         before = u
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_that_is_told_of_limits_is_one_that_has_them(name: str) -> None:
+    """Told sample after sample what narrower limits behind it leave of u, it does what it does with those limits of its own."""
+    told, own = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
+    _narrow(own, -0.5, 0.4)
+    lie = 0
+    for k in range(400):
+        y = 0.3 * math.cos(0.05 * k)
+        u = told.step(math.sin(0.03 * k), y)
+        told.applied(min(max(u, -0.5), 0.4))
+        lie += not -0.5 <= u <= 0.4
+        assert min(max(u, -0.5), 0.4) == pytest.approx(own.step(math.sin(0.03 * k), y), rel=1e-9, abs=1e-9)
+    assert lie > 10
+
+
+def _narrow(controller: Any, low: float, high: float) -> None:
+    """Give a controller, or the one behind its prefilter, other limits."""
+    inner = controller.controller if isinstance(controller, room.Prefiltered) else controller
+    inner._limits = controller.limits._replace(low=low, high=high)
+    inner._begin()
+    if inner is not controller:
+        controller._begin()
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_takes_over_without_a_bump(name: str) -> None:
+    """It watched a plant that rests where u = 0 holds it, with its reference there; what it then applies itself begins at zero."""
+    controller = copy.deepcopy(CONTROLLERS[name])
+    for _ in range(500):
+        controller.step(0.7, 0.7)
+        controller.applied(0.0)
+    take_over(controller.parameters, controller._state)
+    assert controller.step(0.7, 0.7) == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

@@ -69,3 +69,26 @@ def flags(controller: Any, state: Any) -> int:
 def rest(controller: Any, state: Any) -> None:
     """Start from rest at the next sample, with what was learned."""
     raise TypeError
+
+
+@generic
+def applied(controller: Any, state: Any, u: float) -> None:
+    """Say that ``u`` is applied until the next sample, not what the last ``control`` returned.
+
+    A controller with wide limits that is told of narrower ones, sample after sample, is the controller with the narrower limits.
+    """
+    raise TypeError
+
+
+@generic
+def take_over(controller: Any, state: Any) -> None:
+    """Take over at the next sample from whoever applied u until now: u goes on from there as if the loop had been at rest.
+
+    Where the reference then is elsewhere, it is a step of the reference. A controller that follows the applied u by itself does nothing.
+    """
+    raise TypeError
+
+
+@take_over.register(object)
+def _follows_by_itself(controller: Any, state: Any) -> None:
+    pass

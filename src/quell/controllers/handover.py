@@ -147,18 +147,6 @@ class HandOver(Running):
             raise ValueError("hand_over: there was no sample yet; call track(r, y, u) in manual operation, or start(y, u)")
         loop[BUMPLESS] = 1.0
 
-    def applied(self, u: float) -> None:
-        """Say what was really applied [u-unit] since the last ``step``, where something behind the controller changed it.
-
-        To be called before the next ``step``. Limits that are known beforehand belong in ``u_min``, ``u_max`` and ``rate_limit``.
-
-        Raises
-        ------
-        ValueError
-            where u is not finite.
-        """
-        self._law._state.loop[U] = checks.finite("u", u)
-
     def increment(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return by how much the control signal is to change [u-unit], limits of magnitude and rate included.
 

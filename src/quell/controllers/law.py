@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.base import control, flags, heed, report, rest
+from quell.controllers.base import applied, control, flags, heed, report, rest, take_over
 from quell.controllers.hold import hold, rest_within
 from quell.controllers.limits import Limits, apply_limits
 from quell.dispatch import is_finite, kernel
@@ -212,6 +212,19 @@ def _rest(design: AdrcDesign, state: AdrcState) -> None:
         state.reference[i] = 0.0
     forget_f_learned(design, state)
     restart(design.learner, state.learner)
+
+
+@applied.register(AdrcDesign)
+def _applied(design: AdrcDesign, state: AdrcState, u: float) -> None:
+    state.loop[U] = u
+
+
+@take_over.register(AdrcDesign)
+def _take_over(design: AdrcDesign, state: AdrcState) -> None:
+    loop = state.loop
+    if loop[STARTED] != 0.0:
+        # Without this offset the law, whose reference is where y is, would already have applied something else.
+        loop[OFFSET] = loop[U] - wish(design, state, loop[CONSTANT], loop[SLOPE])
 
 
 def law_gains(order: int, omega_c: float) -> Vector:

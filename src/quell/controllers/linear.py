@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import control, flags, report, rest
+from quell.controllers.base import applied, control, flags, report, rest
 from quell.controllers.hold import hold, rest_within
 from quell.controllers.limits import Limits, apply_limits, limits
 from quell.controllers.running import Running
@@ -120,6 +120,15 @@ def _flags(design: LinearDesign, state: LinearState) -> int:
 def _rest(design: LinearDesign, state: LinearState) -> None:
     for i in range(state.loop.size):
         state.loop[i] = 0.0
+
+
+@applied.register(LinearDesign)
+def _applied(design: LinearDesign, state: LinearState, u: float) -> None:
+    # The law's state went on with the u that was returned.
+    correction = u - state.loop[_U]
+    for i in range(state.x.size):
+        state.x[i] += design.law.B_u[i] * correction
+    state.loop[_U] = u
 
 
 class LinearController(Running):

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from quell.controllers.adrc import ADRC
-from quell.controllers.base import control, flags, heed, report, rest
+from quell.controllers.base import applied, control, flags, heed, report, rest, take_over
 from quell.controllers.handle import bind
 from quell.controllers.handover import HandOver
+from quell.controllers.limits import Limits
 from quell.controllers.running import Running
 from quell.dispatch import generic, is_finite
 from quell.types import Status, Vector
@@ -118,6 +119,16 @@ def _rest(design: PrefilteredDesign, state: PrefilteredState) -> None:
     rest(design.controller, state.controller)
 
 
+@applied.register(PrefilteredDesign)
+def _applied(design: PrefilteredDesign, state: PrefilteredState, u: float) -> None:
+    applied(design.controller, state.controller, u)
+
+
+@take_over.register(PrefilteredDesign)
+def _take_over(design: PrefilteredDesign, state: PrefilteredState) -> None:
+    take_over(design.controller, state.controller)
+
+
 class Prefiltered(HandOver):
     """A controller that follows a prefiltered reference.
 
@@ -199,6 +210,11 @@ class Prefiltered(HandOver):
     def dt(self) -> float:
         """Sample time [s]."""
         return float(self.controller.dt)
+
+    @property
+    def limits(self) -> Limits:
+        """What the control signal keeps to."""
+        return self.controller.limits  # type: ignore[no-any-return]
 
     @property
     def features(self) -> tuple[str, ...]:

@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quell import checks
+from quell.controllers.base import applied
 from quell.controllers.handle import bind, bound_control, entry_point
+from quell.controllers.limits import Limits
 from quell.dispatch import compiling, for_types
 
 # What only this process can use, or what can be made anew.
@@ -25,6 +28,7 @@ class Running:
     parameters: Any
     """What the compiled functions need, a NamedTuple."""
     _state: Any
+    _limits: Limits
     _handle: Any
     _step: Callable[[Any, float, float], float]
 
@@ -68,6 +72,23 @@ class Running:
             return self._step(self._handle, r, y)
         except TypeError:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
+
+    def applied(self, u: float) -> None:
+        """Say what was really applied [u-unit] since the last ``step``, where something behind the controller changed it.
+
+        To be called before the next ``step``. Limits that are known beforehand belong in ``u_min``, ``u_max`` and ``rate_limit``.
+
+        Raises
+        ------
+        ValueError
+            where u is not finite.
+        """
+        applied(self.parameters, self._state, checks.finite("u", u))
+
+    @property
+    def limits(self) -> Limits:
+        """What the control signal keeps to: ``low`` and ``high`` [u-unit], and ``most_change`` in a sample."""
+        return self._limits
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""

@@ -50,6 +50,17 @@ def put(line: Any, u: float) -> int:
     raise TypeError
 
 
+@generic
+def alarm(line: Any) -> int:
+    """Return a number other than 0 where the device says, with its last measurement, that its watchdog has set u to zero."""
+    raise TypeError
+
+
+@alarm.register(object)
+def _no_alarm(line: Any) -> int:
+    return 0
+
+
 class PythonLine(NamedTuple):
     """A device of which only Python can make use."""
 
