@@ -11,13 +11,16 @@ offset  size  type        what
 12      4     uint32      answers: number of the newest frame that the sender has accepted of the other side; 0 where there was none
 16      8     int64       time: the sender's monotonic clock [ns]
 24      8     float64     value: y [y-unit], u [u-unit]; hello and welcome: the sample time [s]
-32      4     uint32      state of the sender: 0, or flags (1: the watchdog has set u to zero)
+32      4     uint32      state of the sender: 0, or flags: 1 the watchdog has set u to zero; in a welcome that refuses: 2 another session
+                          is alive, 4 the device has another sample time; in a goodbye of the device: 8
 36      4     uint32      CRC-32 of the 36 bytes before (IEEE 802.3: that of zlib, Ethernet, PNG)
 ======  ====  ==========  ==========================================================================================================
 
-All little-endian. A receiver accepts a frame only where it has this length, these first three bytes, the CRC, a kind it expects, its
-session, and a number that is newer than that of the last one it accepted (modulo 2^32, RFC 1982); and where the sender has heard of it
-at all, what it answers must not be longer ago than ``most_age`` frames. All others are counted by the rule that they break.
+All little-endian. A receiver accepts a measurement or a command only where it has this length, these first three bytes, the CRC, the kind
+it expects, its session, and a number that is newer than that of the last one it accepted (modulo 2^32, RFC 1982); and what it answers must
+not be longer ago than ``most_age`` frames, nor be still to come. All others are counted by the rule that they break.
+
+Hello, welcome and goodbye have the number 0 and answer nothing.
 """
 
 from __future__ import annotations
@@ -32,11 +35,12 @@ from quell.dispatch import is_finite, kernel
 LENGTH = 40
 VERSION = 1
 MEASUREMENT, COMMAND, HELLO, WELCOME, GOODBYE = range(1, 6)
-WATCHDOG_TRIPPED = 1
+WATCHDOG_TRIPPED, BUSY, OTHER_DT, GONE = 1, 2, 4, 8
 
 # Entries of the counters.
 _REFUSED = ("malformed", "version", "kind", "session", "duplicated", "reordered", "stale")
 COUNTERS = ("accepted", *_REFUSED, "not_finite", "skipped", "not_sent")
+# Skipped are frames that were never used: lost, or overtaken by a newer one before they were looked at.
 ACCEPTED, MALFORMED, WRONG_VERSION, WRONG_KIND, WRONG_SESSION, DUPLICATED, REORDERED, STALE, NOT_FINITE, SKIPPED, NOT_SENT = range(11)
 
 _MAGIC = int.from_bytes(b"QL", "little")
@@ -57,10 +61,10 @@ _CRC = _crc_table()
 
 
 class Buffer(NamedTuple):
-    """Room for one frame, seen as bytes and as numbers; all six share memory."""
+    """Room for a frame, seen as bytes and as numbers; all share memory."""
 
     bytes: NDArray[np.uint8]
-    """(40,)."""
+    """(48,): what is longer than a frame has to be seen to be."""
     shorts: NDArray[np.uint16]
     words: NDArray[np.uint32]
     longs: NDArray[np.int64]
@@ -69,9 +73,9 @@ class Buffer(NamedTuple):
     """Of the first byte."""
 
 
-def buffer(memory: NDArray[np.uint8] | None = None) -> Buffer:
-    """Return room for a frame, in ``memory`` (40 bytes, at an address that 8 divides) where that is given."""
-    raw = np.zeros(LENGTH // 8).view(np.uint8) if memory is None else memory
+def buffer() -> Buffer:
+    """Return room for a frame and a little more."""
+    raw = np.zeros(LENGTH // 8 + 1).view(np.uint8)
     return Buffer(raw, raw.view("<u2"), raw.view("<u4"), raw.view("<i8"), raw.view("<f8"), raw.ctypes.data)
 
 
@@ -81,7 +85,7 @@ class Peer(NamedTuple):
     expects: int
     """The kind it accepts: MEASUREMENT or COMMAND."""
     most_age: int
-    """Frames [1]: what answers a frame that was sent longer ago is stale."""
+    """What answers a frame that was sent more than so many frames ago is stale."""
     numbers: NDArray[np.int64]
     """Session, number of the last frame sent, number of the last one accepted, what that answered, its state (5,)."""
     counters: NDArray[np.int64]
@@ -143,13 +147,17 @@ def compose(out: Buffer, own: Peer, kind: int, time: int, value: float, state: i
 
 @kernel
 def accept(frame: Buffer, size: int, own: Peer) -> bool:
-    """Tell whether what was received is the news that was expected; count it either way.
+    """Tell whether the first ``size`` bytes are the news that was expected; count them either way."""
+    return well_formed(frame, size, own.counters) and is_news(frame, own)
+
+
+@kernel
+def is_news(frame: Buffer, own: Peer) -> bool:
+    """Tell whether a well-formed frame is the news that was expected; count it either way.
 
     Accepted is also a frame whose value is no number: that it came is news. It is counted once more, as ``not_finite``.
     """
     counters, numbers = own.counters, own.numbers
-    if not well_formed(frame, size, counters):
-        return False
     if frame.bytes[3] != own.expects:
         counters[WRONG_KIND] += 1
         return False
@@ -157,25 +165,29 @@ def accept(frame: Buffer, size: int, own: Peer) -> bool:
         counters[WRONG_SESSION] += 1
         return False
     ahead = _ahead(int(frame.words[2]), numbers[HEARD])
-    if numbers[HEARD] > 0 and ahead <= 0:
+    if ahead <= 0:
         counters[DUPLICATED if ahead == 0 else REORDERED] += 1
         return False
-    answers = int(frame.words[3])
-    age = -_ahead(answers, numbers[SENT])
-    if answers != 0 and age > own.most_age:
+    age = -_ahead(int(frame.words[3]), numbers[SENT])
+    if age > own.most_age or age < 0:
         counters[STALE] += 1
         return False
-    if numbers[HEARD] > 0:
-        counters[SKIPPED] += ahead - 1
-        numbers[HEARD] += ahead
-    else:
-        numbers[HEARD] = int(frame.words[2])
-    numbers[ANSWERED] = answers
+    counters[SKIPPED] += ahead - 1
+    numbers[HEARD] += ahead
+    numbers[ANSWERED] = int(frame.words[3])
     numbers[STATE] = int(frame.words[8])
     counters[ACCEPTED] += 1
     if not is_finite(frame.doubles[3]):
         counters[NOT_FINITE] += 1
     return True
+
+
+@kernel
+def start_session(own: Peer, session: int) -> None:
+    """Begin anew: nothing sent, nothing heard; what was counted stays."""
+    for i in range(own.numbers.size):
+        own.numbers[i] = 0
+    own.numbers[SESSION] = session
 
 
 @kernel
