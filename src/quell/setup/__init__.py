@@ -12,7 +12,7 @@ from quell.controllers import Prefiltered
 from quell.controllers.base import Controller
 from quell.files import without_gaps
 from quell.plants import Plant
-from quell.setup.build import Builder
+from quell.setup.build import Builder, linear_part
 from quell.setup.description import Description, describe, read
 from quell.setup.mistakes import SetupError, refused
 from quell.simulation import Scenario
@@ -112,12 +112,13 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
         return None if table is None else builder.build(table, key, **dt, **context)
 
     plant = part("plant")
-    parts = {key: part(key, plant=plant) for key in ("observer", "learner", "guard")}
+    model = linear_part(plant)
+    parts = {key: part(key, plant=model) for key in ("observer", "learner", "guard")}
     idle = [key for key, value in parts.items() if value is not None and key not in described.controller.context]
     if idle:
         kind = described.controller.called
         raise SetupError([f"{name}: {key}: a controller of the kind {kind} has no use for it" for key in idle])
-    controller = part("controller", plant=plant, **parts)
+    controller = part("controller", plant=model, **parts)
     prefilter, scenario = part("prefilter"), part("scenario")
     try:
         if prefilter is not None:

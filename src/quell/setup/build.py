@@ -12,6 +12,14 @@ from quell.setup.mistakes import SetupError, refused
 from quell.setup.tables import Call
 from quell.signals import Signal
 
+# Where a plant is a model of one.
+_MODELS = ("observer.plant", "controller.plant")
+
+
+def linear_part(plant: Any) -> Any:
+    """Return what of a plant can be designed for: of one with friction, say, what it is without."""
+    return getattr(plant, "linear", plant)
+
 
 class Builder:
     """Builds the tables of one file, whose ``name`` is in front of what they are refused for."""
@@ -51,7 +59,8 @@ class Builder:
     def _value(self, value: Any, path: str, joined: bool, context: dict[str, Any]) -> Any:
         """Build the tables in a value; features and signals in a list are added up where they are ``joined``."""
         if isinstance(value, Call):
-            return self.build(value, path, **context)
+            built = self.build(value, path, **context)
+            return linear_part(built) if path in _MODELS else built
         if not isinstance(value, tuple):
             return value
         parts = tuple(self._value(part, f"{path}[{i}]", True, context) for i, part in enumerate(value))

@@ -67,15 +67,17 @@ def describe(name: str, data: Mapping[str, Any]) -> Description:
     SetupError
         with a line for each mistake.
     """
-    whole = _without_lists(data)
+    whole = _as_python(data)
     try:
         return Description.model_validate(whole)
     except ValidationError as error:
         raise mistakes(name, error, whole) from None
 
 
-def _without_lists(value: Any) -> Any:
-    """Return the same with tuples in the place of lists: nothing that is built shall change."""
+def _as_python(value: Any) -> Any:
+    """Return the same with tuples in the place of lists, as nothing that is built shall change, and None in that of the text none."""
     if isinstance(value, Mapping):
-        return {key: _without_lists(part) for key, part in value.items()}
-    return tuple(_without_lists(part) for part in value) if isinstance(value, list | tuple) else value
+        return {key: _as_python(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return tuple(_as_python(part) for part in value)
+    return None if value == "none" else value

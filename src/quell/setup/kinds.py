@@ -7,11 +7,11 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from quell import features, guard, learners, signals, simulation
+from quell import features, guard, learners, plants, signals, simulation
 from quell.controllers import ADRC, LinearController, ReferenceModel, TrackingDifferentiator
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio, Shaper
 from quell.observers import ESO
-from quell.plants import LinearPlant, delayed, lagged_two_mass_spring, two_mass_spring
+from quell.plants import LinearPlant
 from quell.setup.tables import Call, call, list_of, one_of
 from quell.trajectory import Trajectory
 
@@ -41,8 +41,10 @@ def linear(num: Any = None, den: Any = None, A: Any = None, B: Any = None, C: An
     raise ValueError(f"given: {', '.join(given) or 'nothing'}; must be num and den, or A, B and C")
 
 
-def _calls(made: Mapping[str, Callable[..., Any]], types: Mapping[str, Any] | None = None) -> dict[str, type[Call]]:
-    return {kind: call(kind, make, types=types) for kind, make in made.items()}
+def _calls(
+    made: Mapping[str, Callable[..., Any]], types: Mapping[str, Any] | None = None, words: Mapping[str, str] | None = None
+) -> dict[str, type[Call]]:
+    return {kind: call(kind, make, types=types, words=words) for kind, make in made.items()}
 
 
 def _discovered(room: Any, *methods: str, but: type | None = None) -> dict[str, Callable[..., Any]]:
@@ -78,14 +80,29 @@ def _in_time(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
 
 # A plant may be in a plant, and a signal in a signal: their types are known by name until all of their tables are there.
 PLANTS = _calls(
-    {"two-mass": two_mass_spring, "lagged-two-mass": lagged_two_mass_spring, "linear": linear, "delayed": delayed}, {"plant": "Plant"}
+    {
+        "two-mass": plants.two_mass_spring,
+        "lagged-two-mass": plants.lagged_two_mass_spring,
+        "torsional": plants.torsional,
+        "torsional-identified": plants.torsional_identified,
+        "linear": linear,
+        "delayed": plants.delayed,
+        "encoded": plants.encoded,
+    },
+    {"plant": "Plant"},
 )
-SIGNALS = _calls({kind: _in_time(cls) for kind, cls in signals.KINDS.items()}, {"then": "Signal | None"})
+_IN_TIME = {"until": "the end of it [s], where `then` takes over.", "then": "the signal, or number, from `until` on."}
+SIGNALS = {kind: call(kind, _in_time(cls), types={"then": "Signal | None"}, words=_IN_TIME) for kind, cls in signals.KINDS.items()}
 Plant: Any = one_of(PLANTS)
 Signal: Any = one_of(SIGNALS, number=True, several=one_of(SIGNALS, number=True))
 for _model in (*PLANTS.values(), *SIGNALS.values()):
     _model.model_rebuild(_types_namespace={"Plant": Plant, "Signal": Signal})
 
+# A controller's or observer's own model of the plant.
+_MODEL = {
+    "plant": "a model of the plant; by default what [plant] has, less what is not linear in it.",
+    "E": "how f enters; as u by default.",
+}
 OBSERVERS = _calls(
     {
         "model-free": ESO.model_free,
@@ -95,16 +112,17 @@ OBSERVERS = _calls(
         "nonlinear": ESO.nonlinear,
     },
     {"plant": Plant | None},
+    _MODEL,
 )
 FEATURES = _calls(_discovered(features, "design", "names", but=features.Features))
 LEARNERS = _calls(_discovered(learners, "design", "memory"), {"features": list_of(one_of(FEATURES)) | None})
 CONTROLLERS = {
     "adrc": call("adrc", ADRC),
-    "pid": call("pid", PID),
-    "pid-simc": call("pid-simc", PID.simc, passed_on=(PID,)),
-    "pid-simc-double-integrator": call("pid-simc-double-integrator", PID.simc_double_integrator, passed_on=(PID,)),
-    "notch-pid": call("notch-pid", NotchPID, passed_on=(PID,), types={"notch": call("notch", Notch.at, sole=True)}),
-    "lqg": call("lqg", LQG, passed_on=(LinearController,), types={"plant": Plant | None}),
+    "pid": call("pid", PID, passed_on=(LinearController,)),
+    "pid-simc": call("pid-simc", PID.simc, passed_on=(PID, LinearController)),
+    "pid-simc-double-integrator": call("pid-simc-double-integrator", PID.simc_double_integrator, passed_on=(PID, LinearController)),
+    "notch-pid": call("notch-pid", NotchPID, passed_on=(PID, LinearController), types={"notch": call("notch", Notch.at, sole=True)}),
+    "lqg": call("lqg", LQG, passed_on=(LinearController,), types={"plant": Plant | None}, words=_MODEL),
     "resonance-ratio": call("resonance-ratio", ResonanceRatio, passed_on=(LinearController,)),
 }
 PREFILTERS = _calls(

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import inspect
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from quell.setup.words import described, summary
+from quell.setup.words import described, refers, summary
 
 # Parameters for which a table has no key: the rest of the file has them.
 CONTEXT = ("dt", "observer", "learner", "guard")
@@ -55,6 +55,7 @@ def call(
     sole: bool = False,
     passed_on: Sequence[Callable[..., Any]] = (),
     types: Mapping[str, Any] | None = None,
+    words: Mapping[str, str] | None = None,
 ) -> type[Call]:
     """Return the model of a table whose keys are the parameters of ``make``.
 
@@ -67,24 +68,27 @@ def call(
     sole
         whether it is the only kind of its table, which then has no key ``kind``.
     passed_on
-        what it passes its ``**options`` on to: their parameters with defaults are keys too.
+        what it passes its ``**options`` on to: their keyword-only parameters are keys too.
     types
         of the keys that are tables themselves, by name.
+    words
+        on keys of which the docstring says nothing, by name.
     """
     found: dict[str, Any] = {} if sole else {"kind": (Literal[kind], Field(kind, description="which one."))}
     context: list[str] = []
+    told = {key: text for function in (*reversed(passed_on), make) for key, text in described(function).items() if not refers(text)}
+    told |= words or {}
     for function in (make, *passed_on):
-        told = described(function)
         for parameter in _parameters(function):
-            key, required = parameter.name, parameter.default is parameter.empty
+            key = parameter.name
             if key in found or key == "self" or parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
                 continue
             if key in CONTEXT:
                 context += [key] if function is make else []
-            elif function is make or not required:
-                annotation = types[key] if types and key in types else _plain(parameter.annotation)
-                default = ... if required and type(None) not in get_args(annotation) else None if required else parameter.default
-                found[key] = (annotation, Field(default, description=told.get(key, "")))
+            elif function is make or parameter.kind is parameter.KEYWORD_ONLY:
+                annotation = types[key] if types and key in types else _plain(_evaluated(parameter.annotation, function))
+                text = told.get(key) or described(function).get(key, "")
+                found[key] = (annotation, Field(_default(parameter, annotation), description=text))
     model = create_model(kind, __base__=Call, __doc__=summary(make), **found)
     model.called = kind
     model.make = staticmethod(make)
@@ -129,11 +133,26 @@ def _table(value: Any) -> Any:
     return {"kind": value} if isinstance(value, str) else value
 
 
-def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
+def _parameters(function: Callable[..., Any]) -> Iterable[inspect.Parameter]:
+    return inspect.signature(function).parameters.values()
+
+
+def _evaluated(annotation: Any, function: Callable[..., Any]) -> Any:
+    """Return an annotation that is a text as what it means; Any where only type checkers know that."""
+    if not isinstance(annotation, str):
+        return annotation
+    written = inspect.getattr_static(function, "__init__") if isinstance(function, type) else inspect.unwrap(function)
     try:
-        return list(inspect.signature(function, eval_str=True).parameters.values())
-    except NameError:  # a name that only type checkers know
-        return list(inspect.signature(function).parameters.values())
+        return eval(annotation, written.__globals__)
+    except (NameError, AttributeError):
+        return Any
+
+
+def _default(parameter: inspect.Parameter, annotation: Any) -> Any:
+    """Return the default of a key; what the rest of the file may have, and its type says so, is not asked for."""
+    if parameter.default is not parameter.empty:
+        return parameter.default
+    return None if type(None) in get_args(annotation) else ...
 
 
 def _union(kinds: Sequence[Any]) -> Any:

@@ -23,11 +23,16 @@ def described(call: Callable[..., Any]) -> dict[str, str]:
     return _section(inspect.getdoc(call) or "")
 
 
+def refers(text: str) -> bool:
+    """Tell whether what a docstring says of a parameter is that another one says it."""
+    return text.startswith("as for")
+
+
 def _section(text: str) -> dict[str, str]:
     match = re.search(r"^Parameters\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL)
     told: dict[str, str] = {}
     if match:
         for names, words in re.findall(r"^(\S[^\n]*)\n((?:[ ]+[^\n]*\n?|\n)+)", match[1] + "\n", re.MULTILINE):
             for name in names.split(","):
-                told[name.strip().lstrip("*")] = " ".join(words.split())
+                told[name.strip().lstrip("*")] = " ".join(re.sub(r"\s*\[\d+\]_", "", words).split())
     return told
