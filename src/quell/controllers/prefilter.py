@@ -214,7 +214,7 @@ class Prefiltered(HandOver):
     @property
     def limits(self) -> Limits:
         """What the control signal keeps to."""
-        return self.controller.limits  # type: ignore[no-any-return]
+        return self.controller.limits
 
     @property
     def features(self) -> tuple[str, ...]:

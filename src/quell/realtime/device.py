@@ -46,19 +46,8 @@ def fetch(line: Any, clock: Any, until: int) -> tuple[float, int]:
 
 @generic
 def put(line: Any, u: float) -> int:
-    """Apply ``u`` [u-unit]; return 0, or another number where the device can't be reached."""
+    """Apply ``u`` [u-unit]; return 0, 1 where the device can't be reached, or more where it has set u to zero for good."""
     raise TypeError
-
-
-@generic
-def alarm(line: Any) -> int:
-    """Return a number other than 0 where the device says, with its last measurement, that its watchdog has set u to zero."""
-    raise TypeError
-
-
-@alarm.register(object)
-def _no_alarm(line: Any) -> int:
-    return 0
 
 
 class PythonLine(NamedTuple):

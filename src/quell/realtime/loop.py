@@ -25,7 +25,7 @@ from quell.realtime.channels import R as ROW_R
 from quell.realtime.channels import U as ROW_U
 from quell.realtime.channels import Y as ROW_Y
 from quell.realtime.clock import now, wait_until
-from quell.realtime.device import alarm, fetch, put
+from quell.realtime.device import fetch, put
 from quell.realtime.ring import Ring, load_acquire, push
 from quell.realtime.supervisor import (
     BEGAN,
@@ -43,6 +43,7 @@ from quell.realtime.supervisor import (
     SILENT,
     SKIPPED,
     STOPPED,
+    TRIPPED,
     UNSENT,
     UNSURE,
     UNWAITED,
@@ -138,9 +139,11 @@ def run_cycles(
         origin += shift
         changes = counts[CHANGES]
         clipped = counts[CLIPPED]
-        u = _steer(design, state, rules, watch, setpoints, books, k, y, alarm(line) != 0)
-        unsent = put(line, u) != 0
+        u = _steer(design, state, rules, watch, setpoints, books, k, y)
+        fault = put(line, u)
+        unsent = fault != 0
         counts[FAILED] = counts[FAILED] + 1 if unsent else 0
+        counts[TRIPPED] = fault > 1
         written = now(clock)
         due = origin + int((k + 1) * pace.period)
         missed_next = 1 + int((written - due) / pace.period) if written >= due else 0
@@ -223,12 +226,10 @@ def _measure(line: Any, clock: Any, pace: Pace, counts: NDArray[np.int64], deadl
 
 
 @kernel
-def _steer(
-    design: Any, state: Any, rules: Rules, watch: Watch, setpoints: Setpoints, books: Books, k: int, y: float, tripped: bool
-) -> float:
+def _steer(design: Any, state: Any, rules: Rules, watch: Watch, setpoints: Setpoints, books: Books, k: int, y: float) -> float:
     """Take a sample of supervisor and controller; return the u to apply, and write reference and report into the row."""
     counts, values, row = watch.counts, watch.values, books.row
-    judge(rules, watch, k, y, load_acquire(books.requests, 0), tripped, setpoints.r.size)
+    judge(rules, watch, k, y, load_acquire(books.requests, 0), setpoints.r.size)
     if counts[MODE] == RUN and counts[BEGAN] == k:
         take_over(design, state)
         values[GAP] = y - setpoints.r[0]

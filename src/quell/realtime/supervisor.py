@@ -107,7 +107,7 @@ _WORDS = {
     Cause.STALLED: "the loop itself stood still for too many samples: look at the load of the machine",
     Cause.OVERRUN: "too many cycles in a row took longer than a sample: take a longer dt, or less work",
     Cause.UNREACHED: "the device could not be reached too often in a row: look at the wire",
-    Cause.WATCHDOG: "the device's own watchdog had set u to zero: commands did not arrive",
+    Cause.WATCHDOG: "the device has set u to zero for good: commands did not arrive in time, or it was ended",
     Cause.ERROR: "|r − y| went beyond most_error",
     Cause.F_HAT: "|f_hat| went beyond most_f",
     Cause.SATURATED: "u lay at a limit for longer than most_saturated samples",
@@ -157,8 +157,9 @@ class Rules(NamedTuple):
     UNSENT,  # commands
     UNSURE,  # whether a measurement may be an old one
     UNWAITED,  # cycles in a row in which a paced device was not waited for
-) = range(16)
-COUNTS = 16
+    TRIPPED,  # whether the device has set u to zero for good
+) = range(17)
+COUNTS = 17
 # Places of Watch.values.
 U, FROM, Y, GAP = range(4)
 VALUES = 4
@@ -200,11 +201,10 @@ def change(watch: Watch, k: int, mode: int, cause: int) -> None:
 
 
 @kernel
-def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, tripped: bool, samples: int) -> None:
+def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, samples: int) -> None:
     """Choose the mode for this cycle, before the controller's step.
 
-    ``y`` is the measurement, ``asked`` what the main thread wants, ``tripped`` whether the device says that it has set u to zero itself,
-    ``samples`` how many the scenario has.
+    ``y`` is the measurement, ``asked`` what the main thread wants, ``samples`` how many the scenario has.
     """
     counts, values = watch.counts, watch.values
     good = is_finite(y)
@@ -217,11 +217,11 @@ def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, tripped: boo
     if asked == ZERO and mode != STOPPED:
         change(watch, k, STOPPED, AT_ONCE)
     elif mode <= HOLD:
-        cause = _cause(rules, watch, k, good, asked, tripped, samples)
+        cause = _cause(rules, watch, k, good, asked, samples)
         if cause != NONE:
             change(watch, k, RAMP, cause)
         elif mode == START:
-            if not good or tripped:
+            if not good:
                 counts[SAMPLES] = 0
             elif counts[SAMPLES] >= rules.settle:
                 change(watch, k, RUN, SETTLED)
@@ -237,7 +237,7 @@ def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, tripped: boo
 
 
 @kernel
-def _cause(rules: Rules, watch: Watch, k: int, good: bool, asked: int, tripped: bool, samples: int) -> int:
+def _cause(rules: Rules, watch: Watch, k: int, good: bool, asked: int, samples: int) -> int:
     """Return why it has to end, as far as that is known before the controller's step."""
     counts = watch.counts
     cause = NONE
@@ -249,7 +249,7 @@ def _cause(rules: Rules, watch: Watch, k: int, good: bool, asked: int, tripped: 
         cause = UNREACHED
     elif counts[IN_A_ROW] > rules.most_overruns:
         cause = OVERRUN
-    elif tripped and counts[MODE] != START:
+    elif counts[TRIPPED] != 0:
         cause = WATCHDOG
     elif counts[MODE] == START and k > _LONGEST_START * (rules.settle + 100):
         cause = UNSETTLED

@@ -1,0 +1,140 @@
+"""A line whose measurements, and whatever goes wrong with it, come from arrays; and a loop around it on a virtual clock."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import quell as ql
+from quell.dispatch import kernel
+from quell.plants.base import advance, measure
+from quell.realtime.channels import row_channels
+from quell.realtime.clock import pass_time, virtual_clock
+from quell.realtime.device import fetch, put
+from quell.realtime.prepared import Prepared, scenario_of, setpoints
+from quell.realtime.ring import drain, ring
+from quell.realtime.safety import Safety
+
+DT = 0.01
+
+
+class Scripted(NamedTuple):
+    """A plant behind a wire that does what a script says; sample by sample, the last entry for all that follow."""
+
+    plant: Any
+    x: Any
+    scratch: Any
+    w: Any
+    at: Any
+    """Samples fetched, samples put (2,)."""
+    y: Any
+    """What is added to y: NaN where nothing comes."""
+    stall: Any
+    """How long fetching takes [ns]."""
+    refused: Any
+    """What ``put`` returns."""
+    written: Any
+    """What was put (·,)."""
+
+
+@kernel
+def _entry(script: Any, k: int) -> Any:
+    return script[min(k, script.size - 1)]
+
+
+@fetch.register(Scripted)
+def _fetch(line: Scripted, clock: Any, until: int) -> tuple[float, int]:
+    k = line.at[0]
+    line.at[0] += 1
+    pass_time(clock, _entry(line.stall, k))
+    return measure(line.plant, line.x) + _entry(line.y, k), 0
+
+
+@put.register(Scripted)
+def _put(line: Scripted, u: float) -> int:
+    k = line.at[1]
+    line.at[1] += 1
+    line.written[k] = u
+    if _entry(line.refused, k) != 0:
+        return _entry(line.refused, k)
+    advance(line.plant, line.x, line.scratch, 0.0, u, line.w)
+    return 0
+
+
+class ScriptedDevice:
+    """The line as a device; scripts as dictionaries from sample to value."""
+
+    def __init__(self, plant: Any, *, samples: int = 3000, x0: Any = None, **scripts: dict[int, Any]) -> None:
+        self.paced = False
+        model = plant.sampled(DT, False)
+        x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=float)
+        kinds = {"y": float, "stall": np.int64, "refused": np.int64}
+        told = {name: np.zeros(samples, dtype=kind) for name, kind in kinds.items()}
+        for name, script in scripts.items():
+            for k, value in script.items():
+                told[name][k] = value
+        room = np.full(samples, math.nan)
+        self.line = Scripted(model, x, np.zeros(6 * plant.order), np.zeros(plant.disturbances), np.zeros(2, np.int64), **told, written=room)
+
+    @property
+    def written(self) -> Any:
+        """What was put."""
+        return self.line.written[: self.line.at[1]]
+
+    def read(self) -> float:
+        """Not used: there is a line."""
+        raise NotImplementedError
+
+    def write(self, u: float) -> None:
+        """Not used: there is a line."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
+
+
+def adrc(**options: Any) -> ql.ADRC:
+    """A controller for ``PLANT``."""
+    return ql.ADRC(ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT), omega_c=1.5, **{"u_min": -3.0, "u_max": 3.0} | options)
+
+
+class Outcome(NamedTuple):
+    """What a scripted loop did."""
+
+    prepared: Prepared
+    rows: Any
+    device: ScriptedDevice
+
+    def __getitem__(self, name: Any) -> Any:
+        """Return a column of the rows."""
+        from quell.realtime import channels
+
+        return self.rows[:, getattr(channels, name)]
+
+
+def run(
+    device: ScriptedDevice,
+    controller: Any = None,
+    reference: Any = 1.0,
+    duration: float = 3.0,
+    *,
+    late: Any = (0,),
+    approach: float = 0.0,
+    interpret: bool = False,
+    asked: int = 0,
+    **safety: Any,
+) -> Outcome:
+    """Run a loop around a scripted device to its end; settle in ten samples, where nothing else is said."""
+    controller = adrc() if controller is None else controller
+    width = sum(width for _, width in row_channels(controller.channels))
+    points = setpoints(scenario_of(reference, duration), DT, getattr(controller, "derivatives", 0), approach)
+    rules = Safety(**{"settle": 10} | safety).rules(controller)
+    prepared = Prepared.of(device, controller, points, rules, virtual_clock(late), ring(4096, width), interpret=interpret)
+    prepared.requests[0] = asked
+    prepared.run()
+    return Outcome(prepared, drain(prepared.books.ring), device)
