@@ -66,6 +66,32 @@ def two_mass(
     reproduce_two_mass(dt=dt, seed=seed, omega_o=omega_o, reset=reset, json_file=json, figures=figures)
 
 
+@reproduce.command(name="torsional")
+def torsional(
+    *,
+    dt: float = 1e-3,
+    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    json: Annotated[Path | None, Parameter(name="--json")] = None,
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+) -> None:
+    """Run the torsional testbed's experiment on its twin: MF-ESO, MB-ESO and L-ESO at three pairs of bandwidths, with every claim judged.
+
+    Parameters
+    ----------
+    dt
+        Sample time [s].
+    seed
+        Seed of where the runs start between two edges of the encoder.
+    json
+        Write all results to this file, for programs.
+    figures
+        Put the figures into this folder, as PNG and SVG.
+    """
+    from quell.commands.torsional import reproduce_torsional
+
+    reproduce_torsional(dt=dt, seed=seed, json_file=json, figures=figures)
+
+
 @reproduce.command(name="acc")
 def acc(
     *,
