@@ -55,7 +55,8 @@ class LiveSink:
     def open(self, header: Header) -> None:
         """Begin to listen."""
         foxglove = needed("foxglove", "telemetry", "watching live")
-        self._header, context = header, foxglove.Context()
+        self._header = header
+        self._context = context = foxglove.Context()  # a channel is closed with it
         self._apart, self._next, self._events = max(math.ceil(1.0 / (self.rate * header.dt) - 1e-9), 1), -math.inf, 0
         try:
             self._server = foxglove.start_server(name=header.device or "quell", host=self.host, port=self.port, context=context)

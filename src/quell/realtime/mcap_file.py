@@ -28,6 +28,45 @@ RECORD = "quell"
 """Name of the metadata record with the header."""
 
 _ON_DISK_EVERY = 0.5  # [s]
+_BLOCK = 4096  # rows are numbers, not objects, from so many on
+
+
+class _File:
+    """The file under foxglove's writer, which would keep the reason of a failure to itself and log each message after it.
+
+    So a failure is noted here, and the writer is told that all went well until it is closed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._raw = path.open("xb", buffering=0)
+        self._place = self._end = 0
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        """Write all of ``data``, or take note of why not."""
+        rest = memoryview(data)
+        try:
+            while rest and self.error is None:
+                rest = rest[self._raw.write(rest) :]
+        except OSError as error:
+            self.error = error
+        self._place += len(data)
+        self._end = max(self._end, self._place)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Go to a place: the length of a chunk is written before it when it is finished."""
+        self._place = offset + (0, self._place, self._end)[whence]
+        if self.error is None:
+            self._raw.seek(self._place)
+        return self._place
+
+    def flush(self) -> None:
+        """Do nothing: all is with the operating system."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._raw.close()
 
 
 class McapSink:
@@ -50,9 +89,10 @@ class McapSink:
         foxglove = needed("foxglove", "telemetry", "an MCAP file")
         mcap = needed("foxglove.mcap", "telemetry", "an MCAP file")
         check_new(self.path)
-        self._header, context = header, foxglove.Context()
-        options = mcap.MCAPWriteOptions(compression=None)
-        self._writer = foxglove.open_mcap(str(self.path), context=context, writer_options=options)
+        self._header = header
+        self._context = context = foxglove.Context()  # a channel is closed with it
+        self._file = _File(self.path)
+        self._writer = foxglove.open_mcap(self._file, context=context, writer_options=mcap.MCAPWriteOptions(compression=None))
         self._writer.write_metadata(RECORD, {"header": header.to_json()})
         schema = foxglove.Schema(name=SCHEMA, encoding="ros2msg", data=definition(header).encode())
         self._channel = foxglove.Channel(TOPIC, schema=schema, message_encoding="cdr", context=context)
@@ -63,12 +103,14 @@ class McapSink:
         """Add a message for each row."""
         for message, k in zip(messages(rows), rows[:, K].tolist(), strict=True):
             self._channel.log(message, log_time=log_time(self._header, k))
+        self._check()
 
     def flush(self) -> None:
-        """Finish the chunk, where half a second has passed since the last one; whatever was not written fails here."""
+        """Finish the chunk, where half a second has passed since the last one."""
         if time.monotonic() - self._flushed >= _ON_DISK_EVERY:
             self._writer.flush()
             self._flushed = time.monotonic()
+        self._check()
 
     def close(self) -> None:
         """Finish the file."""
@@ -76,6 +118,13 @@ class McapSink:
             writer, self._writer = self._writer, None
             self._channel.close()
             writer.close()
+            self._file.close()
+            self._check()
+
+    def _check(self) -> None:
+        """Say what the file could not do."""
+        if self._file.error is not None:
+            raise self._file.error
 
 
 def read_mcap(path: Path) -> tuple[Header, Matrix]:
@@ -93,11 +142,15 @@ def read_mcap(path: Path) -> tuple[Header, Matrix]:
     schemas: dict[int, str] = {}
     topics: dict[int, tuple[str, str | None]] = {}
     rows: list[bytes] = []
+    blocks: list[Matrix] = []
     for record in _records(path):
         kind = type(record).__name__
         if kind == "Message":
             if topics.get(record.channel_id) == (TOPIC, SCHEMA):
                 rows.append(record.data)
+                if len(rows) == _BLOCK:
+                    blocks.append(_numbers(rows))
+                    rows = []
         elif kind == "Schema":
             schemas[record.id] = record.name
         elif kind == "Channel":
@@ -106,11 +159,21 @@ def read_mcap(path: Path) -> tuple[Header, Matrix]:
             header = Header.from_json(record.metadata.get("header", ""))
     if header is None:
         raise ValueError(f"it has no metadata record {RECORD!r}: it was not recorded by quell")
-    size = len(MARK) + 8 * header.width
-    if any(len(row) != size or row[:4] != MARK for row in rows):
-        raise ValueError(f"a message on {TOPIC} is not one of a row of {header.width} numbers")
-    numbers = np.frombuffer(b"".join(row[4:] for row in rows), dtype="<f8")
-    return header, numbers.reshape(-1, header.width).astype(np.float64)
+    blocks = [block for block in (*blocks, _numbers(rows)) if block.size]
+    if any(block.shape[1] != header.width for block in blocks):
+        raise ValueError(f"a message on {TOPIC} is not a row of {header.width} numbers")
+    return header, np.concatenate(blocks) if blocks else np.empty((0, header.width))
+
+
+def _numbers(messages: list[bytes]) -> Matrix:
+    """Return the rows (messages, width) that messages hold."""
+    if not messages:
+        return np.empty((0, 0))
+    size = len(messages[0])
+    if size % 8 != len(MARK) or not all(len(message) == size and message.startswith(MARK) for message in messages):
+        raise ValueError(f"the messages on {TOPIC} are not rows of the same width")
+    numbers = np.frombuffer(b"".join(message[len(MARK) :] for message in messages), dtype="<f8")
+    return numbers.reshape(len(messages), -1).astype(np.float64)
 
 
 def _records(path: Path) -> Iterator[Any]:

@@ -25,7 +25,7 @@ from quell.types import Matrix
 _LOG = logging.getLogger(__name__)
 
 # So many numbers are written in one go, which takes about 0.1 ms, and so long the interpreter is left alone then [s].
-_BURST = 200
+_BURST = 100
 _PAUSE = 1e-4
 # The ring holds what comes in so many seconds: a disk may be away as long.
 _PATIENCE = 10.0
@@ -150,21 +150,21 @@ class Telemetry:
             for sink in tuple(self._sinks):
                 self._attempt(sink, sink.write, piece)
                 time.sleep(_PAUSE)
+            self.rows += piece.shape[0]
         for sink in tuple(self._sinks):
             self._attempt(sink, sink.flush)
-        self.rows += rows.shape[0]
 
     def _attempt(self, sink: Sink, action: object, *arguments: Matrix) -> None:
         """Call a method of a sink; close the sink where that fails."""
         try:
             action(*arguments)  # type: ignore[operator]
-        except Exception as error:
+        except BaseException as error:  # a panic of a library in Rust is no Exception
             self._sinks.remove(sink)
             why = error.strerror if isinstance(error, OSError) and error.strerror else error
             self._report(f"{sink.name}: {why}; closed after {self.rows} rows")
             try:
                 sink.close()
-            except Exception as again:
+            except BaseException as again:
                 _LOG.debug("%s: closing failed as well: %s", sink.name, again)
 
     def _report(self, problem: str) -> None:

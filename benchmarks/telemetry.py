@@ -1,0 +1,127 @@
+"""What telemetry costs: a row's way to disk, what a loop in Python notices of it, what a kill loses.
+
+    python benchmarks/telemetry.py [seconds]
+
+A loop in Python shares the interpreter with the writer's thread, a compiled one does not; the first is the worse case.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from quell.realtime.channels import row_channels
+from quell.realtime.header import Header
+from quell.realtime.recording import load
+from quell.realtime.ring import push
+from quell.realtime.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
+from quell.realtime.telemetry import Telemetry
+
+CHANNELS = row_channels((("x_hat", 4), ("f_residual", 1), ("f_learned", 1), ("status", 1), ("theta", 9)))
+
+
+def rows_like_a_loops(count: int) -> np.ndarray:
+    """Numbers with all their digits, as estimates have."""
+    rows = np.random.default_rng(1).standard_normal((count, sum(width for _, width in CHANNELS)))
+    rows[:, 0] = np.arange(count)
+    rows[:, 3:5] = 0.0
+    return rows
+
+
+def cost(folder: Path) -> None:
+    """Print what a row costs the writer."""
+    rows = rows_like_a_loops(20_000)
+    for sink in (MemorySink(), CsvSink(folder / "cost.csv"), McapSink(folder / "cost.mcap"), LiveSink(0)):
+        sink.open(Header(CHANNELS, 1e-3))
+        started = time.process_time()
+        for first in range(0, len(rows), 10):
+            sink.write(rows[first : first + 10])
+        sink.flush()
+        took = time.process_time() - started
+        sink.close()
+        size = sink.path.stat().st_size / len(rows) if hasattr(sink, "path") else 0
+        print(f"{type(sink).__name__:10s} {took / len(rows) * 1e6:6.2f} µs a row of {rows.shape[1]}, {size:4.0f} bytes")
+
+
+def lateness(folder: Path, seconds: float) -> None:
+    """Print how late a loop in Python wakes up at 1 kHz, without telemetry and with."""
+    header = Header(CHANNELS, 1e-3)
+    rows = rows_like_a_loops(round(seconds * 1000))
+    kinds = {
+        "no sink": [],
+        "csv": [CsvSink(folder / "late.csv")],
+        "mcap": [McapSink(folder / "late.mcap")],
+        "csv, mcap, live": [CsvSink(folder / "all.csv"), McapSink(folder / "all.mcap"), LiveSink(0)],
+    }
+    for name, sinks in kinds.items():
+        late = np.empty(len(rows))
+        with Telemetry(header, sinks) as telemetry:
+            in_front(True)
+            start = time.perf_counter() + 0.01
+            for k, row in enumerate(rows):
+                time.sleep(max(start + k * 1e-3 - time.perf_counter(), 0.0))
+                late[k] = time.perf_counter() - start - k * 1e-3
+                push(telemetry.ring, row)
+            in_front(False)
+        shares = np.percentile(late, [50, 99, 99.9, 100]) * 1e6
+        print(f"{name:16s} wakes up late by p50 {shares[0]:.0f}, p99 {shares[1]:.0f}, p99.9 {shares[2]:.0f}, most {shares[3]:.0f} µs")
+
+
+def in_front(wanted: bool) -> None:
+    """Give the loop's thread a real-time priority, where that is permitted, or take it back."""
+    policy, priority = (os.SCHED_FIFO, 50) if wanted else (os.SCHED_OTHER, 0)
+    try:
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+    except OSError as error:
+        print(f"no real-time priority ({error.strerror}): other processes show in what follows")
+
+
+def produce(dt: float, *paths: str) -> None:
+    """Push rows for ever, and say each time which one."""
+    telemetry = Telemetry(Header(CHANNELS, dt), [file_sink(path) for path in paths])
+    telemetry.start()
+    row, start = np.zeros(telemetry.header.width), time.monotonic()
+    for k in range(10**9):
+        time.sleep(max(start + k * dt - time.monotonic(), 0.0))
+        row[0] = k
+        push(telemetry.ring, row)
+        os.write(1, k.to_bytes(8, "little"))
+
+
+def killed(folder: Path, trials: int = 8) -> None:
+    """Print what a kill -9 loses at most."""
+    rng = np.random.default_rng(2)
+    for dt in (1e-3, 0.1):
+        lost: dict[str, list[float]] = {".csv": [], ".mcap": []}
+        for trial in range(trials):
+            paths = [folder / f"killed-{dt}-{trial}{suffix}" for suffix in lost]
+            process = subprocess.Popen([sys.executable, __file__, "produce", str(dt), *map(str, paths)], stdout=subprocess.PIPE)
+            assert process.stdout is not None
+            process.stdout.read(8)
+            time.sleep(1.5 + rng.random())
+            process.send_signal(signal.SIGKILL)
+            said = process.stdout.read()
+            process.wait()
+            last = int.from_bytes(said[len(said) // 8 * 8 - 8 :][:8], "little")
+            for path in paths:
+                lost[path.suffix].append((last - load(path)["k"][-1]) * dt)
+        for suffix, seconds in lost.items():
+            print(
+                f"killed at {1 / dt:g} Hz: {suffix[1:]} lost {max(seconds):.3f} s at most, {np.mean(seconds):.3f} s on average of {trials}"
+            )
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["produce"]:
+        produce(float(sys.argv[2]), *sys.argv[3:])
+    with tempfile.TemporaryDirectory() as folder:
+        cost(Path(folder))
+        lateness(Path(folder), float(sys.argv[1]) if sys.argv[1:] else 10.0)
+        killed(Path(folder))

@@ -1,0 +1,465 @@
+"""From the loop's rows to files and viewers, and back to trajectories."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import resource
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from threading import Event as ThreadEvent
+from typing import Any
+
+import numpy as np
+import pytest
+import websockets
+
+import quell as ql
+from quell.realtime.channels import EVENTS, LOOP_WIDTH, Y_MEASURED, Event, K, row_channels
+from quell.realtime.header import Header
+from quell.realtime.recording import load, trajectory_of
+from quell.realtime.ring import push
+from quell.realtime.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
+from quell.realtime.telemetry import Telemetry
+from quell.types import Matrix
+from tests.recordings import DT, controller, header_of, rows_of, simulated
+
+NARROW = Header(row_channels((("status", 1),)), dt=DT)
+
+
+@pytest.fixture(scope="module")
+def run() -> ql.Trajectory:
+    """What the loop is thought to have done."""
+    return simulated()
+
+
+@pytest.fixture(scope="module")
+def rows(run: ql.Trajectory) -> Matrix:
+    """Its rows."""
+    return rows_of(run, controller())
+
+
+@pytest.fixture(scope="module")
+def header(run: ql.Trajectory) -> Header:
+    """Its header."""
+    return header_of(run, controller())
+
+
+def recorded(header: Header, rows: Matrix, *sinks: Any) -> Telemetry:
+    """Send rows through a ring to sinks, as quickly as they find a place."""
+    with Telemetry(header, sinks) as telemetry:
+        offer(telemetry, rows)
+    assert telemetry.rows == len(rows)
+    assert not telemetry.problems
+    return telemetry
+
+
+def offer(telemetry: Telemetry, rows: Matrix) -> None:
+    """Push rows; wait where the ring is full."""
+    for row in rows:
+        while not push(telemetry.ring, row):
+            time.sleep(0.01)
+
+
+def counted(count: int, width: int = LOOP_WIDTH + 1) -> Matrix:
+    """Rows with k, and zeros."""
+    rows = np.zeros((count, width))
+    rows[:, K] = np.arange(count)
+    return rows
+
+
+@pytest.mark.parametrize("suffix", ["csv", "mcap"])
+def test_a_run_comes_back_to_the_last_bit(run: ql.Trajectory, header: Header, rows: Matrix, suffix: str, tmp_path: Path) -> None:
+    """Simulate, record, load: channels, bits, features, sample time, metrics."""
+    path = tmp_path / f"run.{suffix}"
+    recorded(header, rows, file_sink(path))
+    again = load(path)
+    np.testing.assert_array_equal(again.log, rows)
+    assert again.channels == header.channels
+    assert (again.dt, again.features, again.plant) == (DT, run.features, "a lift")
+    assert again.status == run.status
+    assert again.metrics(1.0) == run.metrics(1.0)
+    np.testing.assert_array_equal(again["theta"], run["theta"])
+    again.plot()
+
+
+@pytest.mark.parametrize("suffix", ["csv", "mcap"])
+def test_numbers_at_the_ends_of_the_range_come_back(suffix: str, tmp_path: Path) -> None:
+    """The largest, the smallest, infinities, minus zero and NaN, also in the first row, which CSV writes without exponents."""
+    rows = counted(8)
+    rows[:, Y_MEASURED] = [5e-324, 1.7976931348623157e308, -np.inf, np.inf, np.nan, -0.0, 0.1 + 0.2, -1e-5]
+    rows[:, Y_MEASURED + 1] = rows[::-1, Y_MEASURED]
+    path = tmp_path / f"run.{suffix}"
+    recorded(NARROW, rows, file_sink(path))
+    assert load(path).log.tobytes() == rows.tobytes()
+
+
+def test_a_trajectory_of_a_recording_is_saved_as_any_other(header: Header, rows: Matrix, tmp_path: Path) -> None:
+    """NetCDF has the loop's channels too, with their units."""
+    run = trajectory_of(header, rows)
+    run.save(tmp_path / "run.nc")
+    np.testing.assert_array_equal(ql.Trajectory.load(tmp_path / "run.nc").log, run.log)
+    assert run.to_xarray()["lateness"].attrs["units"] == "s"
+
+
+def test_skipped_deadlines_are_filled_in() -> None:
+    """What was known stays, what was not measured is NaN, and an event says so; deadlines count on."""
+    rows = counted(6)
+    rows[:, 1:EVENTS] = rows[:, EVENTS + 1 :] = np.arange(6.0)[:, None]
+    rows[:, EVENTS] = 3.0
+    run = trajectory_of(NARROW, np.delete(rows, [2, 3], axis=0))
+    np.testing.assert_array_equal(run["k"], np.arange(6.0))
+    for name in ("r", "y", "u", "mode", "status"):
+        np.testing.assert_array_equal(run[name], [0, 1, 1, 1, 4, 5])
+    for name in ("y_measured", "lateness", "step_time"):
+        np.testing.assert_array_equal(run[name], [0, 1, np.nan, np.nan, 4, 5])
+    np.testing.assert_array_equal(run["events"], [3, 3, Event.GAP, Event.GAP, 3, 3])
+    assert run.ended == pytest.approx(5 * DT)
+
+
+def test_a_csv_file_is_a_line_of_names_and_lines_of_numbers(header: Header, rows: Matrix, tmp_path: Path) -> None:
+    """Time comes first; the first line has no exponents, which some readers take for text."""
+    recorded(header, rows, CsvSink(tmp_path / "run.csv"))
+    names, first, *_ = (tmp_path / "run.csv").read_text().splitlines()
+    assert names.startswith("time,k,lateness,step_time,mode,events,r,y,y_measured,u,x_hat[0],x_hat[1],f_residual,")
+    assert "e" not in first
+    table = np.loadtxt(tmp_path / "run.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(table[:, 0], np.arange(len(rows)) * DT)
+
+
+@pytest.mark.parametrize("dt", [1e-3, 1.0 / 3.0, 0.1, 1.0 / 44100.0, 2.2675736961451248e-05 * (1 + 2**-52)])
+def test_a_csv_file_without_its_header_still_knows_its_sample_time(dt: float, tmp_path: Path) -> None:
+    """To the last bit, from the column of times."""
+    rows = counted(1000)
+    recorded(Header(NARROW.channels, dt=dt), rows, CsvSink(tmp_path / "run.csv"))
+    (tmp_path / "run.csv.json").unlink()
+    run = load(tmp_path / "run.csv")
+    np.testing.assert_array_equal(run.log, rows)
+    np.testing.assert_array_equal(run["k"] * run.dt, rows[:, K] * dt)
+    assert run.dt == pytest.approx(dt, rel=1e-15)
+
+
+def test_a_message_is_what_its_definition_says(header: Header, rows: Matrix, tmp_path: Path) -> None:
+    """Read field by field as ROS 2 lays plain CDR out, from nothing but the definition in the file."""
+    from mcap.reader import make_reader
+
+    recorded(header, rows, McapSink(tmp_path / "run.mcap"))
+    with (tmp_path / "run.mcap").open("rb") as file:
+        found = list(make_reader(file).iter_messages(topics=["/loop"]))
+    assert len(found) == len(rows)
+    schema, channel, message = found[17]
+    assert (schema.name, schema.encoding, channel.message_encoding) == ("quell/msg/Cycle", "ros2msg", "cdr")
+    assert message.log_time == header.started + round(17 * DT * 1e9)
+    told, at = {}, 4
+    for line in schema.data.decode().splitlines():
+        kind, name = line.split("#")[0].split()
+        count = int(kind.removeprefix("float64").strip("[]") or 1)
+        told[name] = struct.unpack_from(f"<{count}d", message.data, at)
+        at += 8 * count
+    assert at == len(message.data)
+    assert told["x_hat"] == tuple(rows[17, LOOP_WIDTH : LOOP_WIDTH + 2])
+    assert told["y"] == (rows[17, 6],)
+    assert b"float64 y  # output [m]" in schema.data
+
+
+@pytest.mark.parametrize("suffix", ["csv", "mcap"])
+def test_a_file_cut_short_anywhere_is_readable_up_to_there(suffix: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    """Whole rows, the first ones, or one line that says there is none."""
+    sink, rows = file_sink(tmp_path / f"run.{suffix}"), counted(400)
+    sink.open(NARROW)
+    for first in range(0, 400, 40):
+        sink.write(rows[first : first + 40])
+        sink._flushed = -np.inf  # type: ignore[attr-defined]  # as if half a second had passed
+        sink.flush()
+    sink.close()
+    whole = (tmp_path / f"run.{suffix}").read_bytes()
+    cut = tmp_path / f"cut.{suffix}"
+    (tmp_path / "cut.csv.json").write_text(NARROW.to_json())
+    lengths = []
+    for size in sorted(rng.integers(0, len(whole), 60)):
+        cut.write_bytes(whole[:size])
+        lengths.append(whole_rows(cut, rows))
+    assert lengths == sorted(lengths)
+    assert lengths[-1] > 350
+
+
+def whole_rows(path: Path, rows: Matrix) -> int:
+    """Return how many of the rows are in a file; where there are none, that has to be said in a line."""
+    try:
+        run = load(path)
+    except ValueError as error:
+        told = str(error)
+    else:
+        np.testing.assert_array_equal(run.log, rows[: len(run)])
+        return len(run)
+    assert "\n" not in told
+    return 0
+
+
+KILLED = """
+import sys, time, os, signal
+import numpy as np
+from quell.realtime.header import Header
+from quell.realtime.channels import row_channels
+from quell.realtime.ring import push
+from quell.realtime.sinks import file_sink
+from quell.realtime.telemetry import Telemetry
+
+def begin(dt, count):
+    sinks = [file_sink(f"{sys.argv[1]}/{count}.{suffix}") for suffix in ("csv", "mcap")]
+    telemetry = Telemetry(Header(row_channels((("status", 1),)), dt=dt), sinks)
+    telemetry.start()
+    go_on(telemetry, 0, count)
+    return telemetry
+
+
+def go_on(telemetry, first, last):
+    row = np.zeros(telemetry.header.width)
+    for k in range(first, last):
+        row[0] = k
+        push(telemetry.ring, row)
+
+
+quick, slow = begin(1e-3, 2000), begin(0.1, 3)
+time.sleep(1.0)
+go_on(quick, 2000, 2003), go_on(slow, 3, 4)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_is_a_second_old_survives_the_end_of_the_process(tmp_path: Path) -> None:
+    """At 1 kHz as at 10 Hz: however few rows there are, no buffer waits to be full."""
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], timeout=120)
+    assert ended.returncode == -9
+    for count in (2000, 3):
+        for suffix in ("csv", "mcap"):
+            run = load(tmp_path / f"{count}.{suffix}")
+            assert len(run) >= count
+            np.testing.assert_array_equal(run["k"], np.arange(float(len(run))))
+
+
+class Broken(MemorySink):
+    """A sink that fails at its third piece, and again when it is closed."""
+
+    name = "broken"
+    pieces = 0
+
+    def write(self, rows: Matrix) -> None:
+        """Fail late."""
+        self.pieces += 1
+        if self.pieces == 3:
+            raise OSError(28, "No space left on device")
+        super().write(rows)
+
+    def close(self) -> None:
+        """Fail again."""
+        raise OSError(28, "No space left on device")
+
+
+def test_a_sink_that_fails_is_closed_and_reported_and_the_others_go_on(header: Header, rows: Matrix) -> None:
+    """One line says which, and why."""
+    broken, kept = Broken(), MemorySink()
+    with Telemetry(header, [broken, kept]) as telemetry:
+        offer(telemetry, rows)
+    assert broken.pieces == 3
+    assert len(telemetry.problems) == 1
+    assert telemetry.problems[0].startswith("broken: No space left on device; closed after ")
+    np.testing.assert_array_equal(kept.trajectory().log, rows)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "mcap"])
+def test_a_full_disk_ends_a_recording_and_nothing_else(header: Header, rows: Matrix, suffix: str, tmp_path: Path) -> None:
+    """The limit on the size of a file stands for the disk; what was written before can be read."""
+    sink, kept = file_sink(tmp_path / f"run.{suffix}"), MemorySink()
+    telemetry = Telemetry(header, [sink, kept])
+    telemetry.start()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+    try:
+        offer(telemetry, np.concatenate([rows, rows]))
+        telemetry.stop()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert len(telemetry.problems) == 1
+    assert telemetry.problems[0].startswith(f"{tmp_path / f'run.{suffix}'}: ")
+    assert sum(map(len, kept._rows)) == 2 * len(rows)
+    if suffix == "csv":
+        assert 100 < len(load(tmp_path / "run.csv")) < len(rows)
+    assert "File too large" in telemetry.problems[0]
+
+
+class Stuck(MemorySink):
+    """A sink that lets nothing through until it is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.freed = ThreadEvent()
+
+    def write(self, rows: Matrix) -> None:
+        """Wait."""
+        self.freed.wait(60.0)
+        super().write(rows)
+
+
+def test_a_disk_that_hangs_costs_rows_not_time() -> None:
+    """Rows that find the ring full are dropped and counted; the recording has a gap where they were."""
+    stuck = Stuck()
+    with Telemetry(NARROW, [stuck]) as telemetry:
+        capacity = telemetry.ring.rows.shape[0]
+        offered = counted(3 * capacity)
+        went = sum(push(telemetry.ring, row) for row in offered)
+        assert capacity <= went < len(offered)
+        assert telemetry.dropped == len(offered) - went
+        stuck.freed.set()
+        last = counted(3 * capacity + 1)[-1:]
+        offer(telemetry, last)
+    run = stuck.trajectory()
+    assert len(run) == len(offered) + 1
+    assert np.sum(run["events"] == Event.GAP) == len(offered) - went
+
+
+def test_a_writer_that_does_not_end_is_given_up() -> None:
+    """The loop's process is not held up; the result says that rows may be missing."""
+    stuck = Stuck()
+    telemetry = Telemetry(NARROW, [stuck])
+    telemetry.start()
+    offer(telemetry, counted(3))
+    telemetry.stop(timeout=0.01)
+    assert telemetry.problems == ["writing did not end within 0.01 s; the last rows may be missing"]
+    stuck.freed.set()
+    telemetry._thread.join()
+
+
+@pytest.mark.parametrize(
+    ("make", "rule"),
+    [
+        (lambda folder: CsvSink(folder / "no" / "run.csv"), "folder .* must exist"),
+        (lambda folder: McapSink(folder / "no" / "run.mcap"), "folder .* must exist"),
+        (lambda folder: CsvSink(folder / "old.csv"), "recordings are not overwritten"),
+        (lambda folder: McapSink(folder / "old.mcap"), "recordings are not overwritten"),
+        (lambda folder: McapSink(folder), "must be a file"),
+    ],
+)
+def test_what_can_not_be_written_is_refused_before_the_loop_starts(make: Any, rule: str, tmp_path: Path) -> None:
+    """In one line; and what was opened before it is closed."""
+    for suffix in ("csv", "mcap"):
+        (tmp_path / f"old.{suffix}").write_text("precious")
+    first = CsvSink(tmp_path / "first.csv")
+    telemetry = Telemetry(NARROW, [first, make(tmp_path)])
+    with pytest.raises(ValueError, match=rule) as refused:
+        telemetry.start()
+    assert "\n" not in str(refused.value)
+    assert first._file is None
+    assert (tmp_path / "old.csv").read_text() == "precious"
+
+
+def test_other_suffixes_and_lazy_writers_are_refused() -> None:
+    """With what to do."""
+    with pytest.raises(ValueError, match=r"path = 'run.txt': must end in .csv or .mcap"):
+        file_sink("run.txt")
+    with pytest.raises(ValueError, match="period = 2 s: must be at most 0.25 s"):
+        Telemetry(NARROW, period=2)
+    with pytest.raises(ValueError, match="channels = .* must begin with k, lateness"):
+        Header((("y", 1),), dt=0.1)
+
+
+@pytest.mark.parametrize("module", ["foxglove", "mcap"])
+def test_a_missing_package_is_named_with_the_extra_that_brings_it(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one line, before the loop starts."""
+    recorded(NARROW, counted(3), McapSink(tmp_path / "run.mcap"))
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError, match=r'pip install "quell\[telemetry\]"'):
+        load(tmp_path / "run.mcap") if module == "mcap" else McapSink(tmp_path / "other.mcap").open(NARROW)
+
+
+def test_files_that_are_no_recordings_are_refused_in_one_line(run: ql.Trajectory, tmp_path: Path) -> None:
+    """Text, tables of something else, a NetCDF record, an empty file, a folder, no file, an MCAP file of others, broken rows."""
+    import foxglove
+
+    (tmp_path / "empty.csv").touch()
+    (tmp_path / "text.csv").write_text("time flies\nlike an arrow\n")
+    (tmp_path / "table.csv").write_text("time,a,b\n0,1,2\n")
+    (tmp_path / "names.csv").write_text("time," + ",".join(NARROW.columns) + "\n")
+    line = ",".join(["0.0"] * (NARROW.width + 1))
+    (tmp_path / "short.csv").write_text((tmp_path / "names.csv").read_text() + f"{line}\n0,1\n{line}\n")
+    (tmp_path / "twice.csv").write_text((tmp_path / "names.csv").read_text() + f"0.01,1.0{line[7:]}\n" * 2)
+    (tmp_path / "noise.mcap").write_bytes(b"\x89MCAP0\r\n" + np.random.default_rng(1).bytes(5000))
+    run.save(tmp_path / "run.nc")
+    context = foxglove.Context()
+    with foxglove.open_mcap(tmp_path / "others.mcap", context=context):
+        foxglove.Channel("/loop", message_encoding="json", context=context).log({"y": 1.0})
+    paths = [*sorted(tmp_path.iterdir()), tmp_path, tmp_path / "nothing.csv"]
+    for path in paths:
+        with pytest.raises(ValueError, match="path = ") as refused:
+            load(path)
+        assert "\n" not in str(refused.value), path
+        assert path.name in str(refused.value)
+
+
+async def _watch(url: str, wanted: int, begin: Any) -> tuple[dict[str, Any], list[bytes]]:
+    """Subscribe to all there is, as a Foxglove viewer does; call ``begin`` then; return the channel and so many messages."""
+    async with websockets.connect(url, subprotocols=["foxglove.sdk.v1", "foxglove.websocket.v1"]) as socket:  # type: ignore[list-item]
+        while (told := json.loads(await socket.recv()))["op"] != "advertise":
+            pass
+        channel = told["channels"][0]
+        await socket.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]}))
+        messages: list[bytes] = []
+        while len(messages) < wanted:
+            begin()
+            try:
+                message = await asyncio.wait_for(socket.recv(), 0.2)
+            except TimeoutError:
+                continue
+            if isinstance(message, bytes) and message[0] == 1:
+                messages.append(message)
+        return channel, messages
+
+
+def test_a_viewer_sees_rows_at_a_rate_it_can_follow_and_no_event_is_lost() -> None:
+    """A loop at 1 kHz, 50 rows a second: every twentieth row, with the events of those before it."""
+    live = LiveSink(port=0, rate=50.0)
+    live.open(Header(NARROW.channels, dt=1e-3))
+    rows = counted(400)
+    rows[:, EVENTS] = np.where(np.arange(400) % 20 == 7, 4.0, 1.0)
+    sent = 0
+
+    def send() -> None:
+        nonlocal sent
+        live.write(rows[sent : sent + 33])  # pieces that fit nothing
+        sent += 33
+
+    try:
+        assert live.url.startswith("ws://127.0.0.1:")
+        channel, messages = asyncio.run(asyncio.wait_for(_watch(live.url, 5, send), 60))
+    finally:
+        live.close()
+    assert (channel["topic"], channel["encoding"], channel["schemaEncoding"]) == ("/loop", "cdr", "ros2msg")
+    seen = np.array([np.frombuffer(message[13 + 4 :], dtype="<f8") for message in messages])
+    np.testing.assert_array_equal(np.diff(seen[:, K]), 20.0)
+    np.testing.assert_array_equal(seen[:, EVENTS], np.where(seen[:, K] == 0, 1.0, 5.0))
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
+    """Before the loop starts."""
+    first = LiveSink(port=0)
+    first.open(NARROW)
+    port = int(first.url.rpartition(":")[2])
+    try:
+        with pytest.raises(ValueError, match=f"port = {port}: can't listen there .* choose another port"):
+            LiveSink(port=port).open(NARROW)
+    finally:
+        first.close()
+
+
+def test_the_writer_gives_up_a_real_time_priority_that_it_inherited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else it would keep a loop of lower priority, or of none, from running."""
+    from quell.realtime import telemetry
+
+    asked = []
+    monkeypatch.setattr(telemetry.os, "sched_getscheduler", lambda pid: telemetry.os.SCHED_FIFO)
+    monkeypatch.setattr(telemetry.os, "sched_setscheduler", lambda *given: asked.append(given[1]))
+    recorded(NARROW, counted(3), MemorySink())
+    assert asked == [telemetry.os.SCHED_OTHER]
