@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.setup import SetupError, load, made
+from quell.setup import EXAMPLES, SetupError, load, made
 from quell.setup.kinds import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
 from quell.setup.reference import keys, markdown
-
-EXAMPLE = Path(__file__).parents[1] / "examples" / "two_mass.toml"
 
 BASE = """
 dt = 0.01
@@ -45,7 +43,7 @@ def setup(more: str = "", *, without: tuple[str, ...] = ()) -> Any:
 
 def test_the_example_is_the_python_of_the_first_example() -> None:
     """The same run, bit for bit, as from the objects of examples/01_step.py."""
-    read = load(EXAMPLE)
+    read = load(EXAMPLES / "two_mass.toml")
     plant = ql.plants.two_mass_spring(m1=1.0, m2=0.5, k=2.0)
     observer = ql.ESO.model_free(order=4, b0=ql.canonical(plant).b, omega_o=12.0, dt=2e-3)
     scenario = ql.Scenario(

@@ -29,16 +29,16 @@ def judge(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
     """Return the metrics of each window that the setup asks for: by default, of all that follows the last start from rest.
 
     Each has ``start`` and ``stop`` [s] besides; where the run ended before a window there is nothing else. None is for a number that
-    there is not.
+    there is not. Windows that the scenario does not reach are left out.
     """
-    rests = setup.scenario.rest_at if setup.scenario else ()
-    windows = setup.windows or ({"start": float(rests[-1])} if len(rests) else {"start": 0.0},)
+    end = run.ended if setup.scenario is None else setup.scenario.duration
+    rests = () if setup.scenario is None else setup.scenario.rest_at
+    windows = [window for window in setup.windows if window.get("start", 0.0) < end]
     found = []
-    for window in windows:
+    for window in windows or [{"start": float(rests[-1]) if len(rests) else 0.0}]:
         start, stop = window.get("start", 0.0), window.get("stop")
-        about: dict[str, Any] = {"start": start, "stop": run.ended if stop is None else stop}
-        reached = len(run) > 0 and start < run.t[-1]
-        values = run.metrics(**window) if reached else {}
+        about: dict[str, Any] = {"start": start, "stop": end if stop is None else min(stop, end)}
+        values = run.metrics(**window) if len(run) and start < run.t[-1] else {}
         found.append(about | {name: value if math.isfinite(value) else None for name, value in values.items()})
     return found
 
@@ -56,14 +56,14 @@ def print_judgement(console: Console, title: str, scores: list[dict[str, Any]]) 
     console.print(table)
 
 
-def print_outcome(console: Console, run: Trajectory, setup: Setup) -> dict[str, float]:
+def print_outcome(console: Console, run: Trajectory) -> dict[str, float]:
     """Print what was learned and what happened; return the coefficients."""
     theta = run["theta"][-1] if "theta" in run.names and len(run) else ()
     learned = {name: float(value) for name, value in zip(run.features, theta, strict=False)}
     if learned:
-        console.print("Learned: " + escape(", ".join(f"{name} {value:.4g}" for name, value in learned.items())))
+        console.print("Learned: " + escape(", ".join(f"{name} {value:.4g}" for name, value in learned.items())), soft_wrap=True)
     if run.diverged or run.status:
-        console.print(("[red]" if run.diverged else "") + escape(run.message))
+        console.print(("[red]" if run.diverged else "") + escape(run.message), soft_wrap=True)
     return learned
 
 

@@ -36,7 +36,7 @@ def run_setup(*, path: Path, json_file: Path | None, figures: Path | None, save:
             raise SetupError([f"{setup.name}: {error}"]) from None
     scores = judge(run, setup)
     print_judgement(console, f"{setup.title}: {run.plant}, dt = {run.dt:g} s", scores)
-    learned = print_outcome(console, run, setup)
+    learned = print_outcome(console, run)
     paths = figure_of(run, setup.title, figures, path.stem) if figures is not None else []
     if save is not None:
         run.save(save)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from quell import checks
@@ -17,7 +18,10 @@ from quell.setup.description import Description, describe, read
 from quell.setup.mistakes import SetupError, refused
 from quell.simulation import Scenario
 
-__all__ = ["Description", "Setup", "SetupError", "load", "made"]
+__all__ = ["EXAMPLES", "Description", "Setup", "SetupError", "load", "made", "read"]
+
+EXAMPLES = Path(__file__).parent / "examples"
+"""The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +40,8 @@ class Setup:
         what is controlled, or None.
     scenario : Scenario
         what happens, or None.
+    rig : dict
+        the arguments of ``run_rig`` and ``live``, or None.
     windows : tuple of dict
         for each window in which the response is judged the arguments of ``Trajectory.metrics``.
     description : Description
@@ -47,6 +53,7 @@ class Setup:
     controller: Controller
     plant: Plant | None
     scenario: Scenario | None
+    rig: dict[str, Any] | None
     windows: tuple[dict[str, Any], ...]
     description: Description
 
@@ -119,7 +126,7 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
         kind = described.controller.called
         raise SetupError([f"{name}: {key}: a controller of the kind {kind} has no use for it" for key in idle])
     controller = part("controller", plant=model, **parts)
-    prefilter, scenario = part("prefilter"), part("scenario")
+    prefilter, scenario, rig = part("prefilter"), part("scenario"), part("rig")
     try:
         if prefilter is not None:
             controller = Prefiltered(controller, prefilter)
@@ -128,4 +135,4 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
     except ValueError as error:
         raise refused(name, "scenario" if "disturbances" in str(error) else "prefilter", error, ("disturbances",)) from None
     title = described.title or name.removesuffix(".toml").replace("_", " ")
-    return Setup(name, title, controller, plant, scenario, tuple(window.given() for window in described.metrics), described)
+    return Setup(name, title, controller, plant, scenario, rig, tuple(window.given() for window in described.metrics), described)

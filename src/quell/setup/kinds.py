@@ -12,6 +12,8 @@ from quell.controllers import ADRC, LinearController, ReferenceModel, TrackingDi
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio, Shaper
 from quell.observers import ESO
 from quell.plants import LinearPlant
+from quell.realtime import safety
+from quell.realtime.run import run_rig
 from quell.setup.tables import Call, call, list_of, one_of
 from quell.trajectory import Trajectory
 
@@ -39,6 +41,21 @@ def linear(num: Any = None, den: Any = None, A: Any = None, B: Any = None, C: An
     if given == ["A", "B", "C"]:
         return LinearPlant(A, B, C, E)
     raise ValueError(f"given: {', '.join(given) or 'nothing'}; must be num and den, or A, B and C")
+
+
+def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
+    """Return what ``quell run-rig`` closes a loop around, and how.
+
+    Parameters
+    ----------
+    device
+        URL of the device: ``udp://127.0.0.1:5005``, ``serial:///dev/ttyACM0``, ``ni://``, ``twin:torsional``, …
+    live
+        port at which Foxglove and PlotJuggler can watch, 8765 for instance; none by default.
+    telemetry
+        files that the record is written to, ending in ``.mcap`` or ``.csv``; from the folder where the command is run.
+    """
+    return {"device": device, "live": live, **options}
 
 
 def _calls(
@@ -139,3 +156,12 @@ Controller = one_of(CONTROLLERS, default="adrc")
 Guard = call("guard", guard.Guard, sole=True)
 Scenario = call("scenario", simulation.Scenario, sole=True, types={"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)})
 Metrics = call("metrics", Trajectory.metrics, sole=True)
+Safety = call("safety", safety.Safety, sole=True)
+Rig = call(
+    "rig",
+    rig,
+    sole=True,
+    passed_on=(run_rig,),
+    types={"safety": Safety | None, "telemetry": list_of(str)},
+    without=("duration", "on_change"),
+)

@@ -56,6 +56,7 @@ def call(
     passed_on: Sequence[Callable[..., Any]] = (),
     types: Mapping[str, Any] | None = None,
     words: Mapping[str, str] | None = None,
+    without: Sequence[str] = (),
 ) -> type[Call]:
     """Return the model of a table whose keys are the parameters of ``make``.
 
@@ -73,6 +74,8 @@ def call(
         of the keys that are tables themselves, by name.
     words
         on keys of which the docstring says nothing, by name.
+    without
+        parameters that are not for files.
     """
     found: dict[str, Any] = {} if sole else {"kind": (Literal[kind], Field(kind, description="which one."))}
     context: list[str] = []
@@ -81,7 +84,7 @@ def call(
     for function in (make, *passed_on):
         for parameter in _parameters(function):
             key = parameter.name
-            if key in found or key == "self" or parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            if key in found or key in ("self", *without) or parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
                 continue
             if key in CONTEXT:
                 context += [key] if function is make else []
