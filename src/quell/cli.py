@@ -6,13 +6,13 @@ Heavy imports stand inside the commands, so that ``quell --help`` answers at onc
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from cyclopts import App, CycloptsError, Parameter, Token
+from cyclopts import App, CycloptsError, Parameter
 
-from quell import __version__
+from quell import __version__, cli_setups
+from quell.arguments import whole as _whole
 
 app = App(
     name="quell",
@@ -23,15 +23,6 @@ app = App(
 )
 reproduce = App(name="reproduce", help="Run a published experiment again and judge its claims.")
 app.command(reproduce)
-
-
-def _whole(kind: Any, tokens: Sequence[Token]) -> int:
-    """Read a whole number; the parser's own conversion would round 1.5 to 2 without a word."""
-    text = tokens[0].value
-    try:
-        return int(text)
-    except ValueError:
-        raise ValueError(f"{tokens[0].keyword} = {text!r}: must be a whole number") from None
 
 
 @reproduce.command(name="two-mass")
@@ -200,117 +191,55 @@ def compare(
     run_compare(controllers=controllers, settings=settings, json_file=json, figures=figures)
 
 
-@app.command(name="run")
-def run(
-    setup: Path | None = None,
+@app.command(name="rig")
+def rig(
     *,
-    example: Annotated[bool, Parameter(negative="")] = False,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
-    save: Path | None = None,
-) -> None:
-    """Simulate what a setup file describes: a plant, a controller, what happens to them.
-
-    Parameters
-    ----------
-    setup
-        The file, in TOML; docs/setup has all keys.
-    example
-        Print such a file, and do no more.
-    json
-        Write metrics and settings to this file, for programs.
-    figures
-        Put the figure into this folder, as PNG and SVG.
-    save
-        Write the whole record to this file, which `Trajectory.load` reads.
-    """
-    if example:
-        _print_example("two_mass.toml")
-        return
-    if setup is None:
-        raise ValueError("setup: missing; must be a TOML file, and quell run --example prints one")
-    from quell.commands.run import run_setup
-
-    run_setup(path=setup, json_file=json, figures=figures, save=save)
-
-
-@app.command(name="run-rig")
-def run_rig(
-    setup: Path | None = None,
-    *,
-    example: Annotated[bool, Parameter(negative="")] = False,
-    device: str | None = None,
+    device: str,
+    plant: str = "torsional",
+    dt: float = 1e-3,
+    watchdog: Annotated[int, Parameter(converter=_whole)] = 20,
+    u_max: float = float("inf"),
+    rest: bool = True,
     seconds: float | None = None,
-    omega_c: float | None = None,
-    omega_o: float | None = None,
-    spin: float | None = None,
-    priority: Annotated[int | None, Parameter(converter=_whole)] = None,
-    mcap: Path | None = None,
-    csv: Path | None = None,
-    live: Annotated[int | None, Parameter(converter=_whole)] = None,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
-    save: Path | None = None,
+    log: Path | None = None,
+    priority: Annotated[int, Parameter(converter=_whole)] = 50,
+    cpu: Annotated[int | None, Parameter(converter=_whole)] = None,
 ) -> None:
-    """Run a setup in real time around a device, for instance the twin that `quell rig` is.
-
-    Ends with exit code 0 where the scenario was run to its end, 3 where a limit or a fault ended it, 130 after Ctrl-C; u was ramped to
-    zero in each case. 2 is for a mistake in what was asked.
+    """Be the device at the other end of a wire: a simulated plant with a clock and a watchdog of its own, until interrupted.
 
     Parameters
     ----------
-    setup
-        The file, in TOML; by default the paper's torsional experiment with an L-ESO, at udp://127.0.0.1:5005.
-    example
-        Print that file, and do no more.
     device
-        Another device than the file's: udp://HOST:PORT, shm://NAME, serial:///dev/ttyACM0, ni://, twin:torsional.
+        Where it listens: udp://127.0.0.1:5005 (this computer only; another address of this computer for others to reach it), shm://NAME,
+        or serial:///dev/ttyX.
+    plant
+        What it is: torsional, torsional-identified or two-mass.
+    dt
+        Its tick [s].
+    watchdog
+        After so many ticks in a row without a fresh command u is zero until a new session.
+    u_max
+        Larger commands are cut to this [V, N].
+    rest
+        Whether each session starts from rest, or from where the last one left the plant.
     seconds
-        Another duration of the scenario [s].
-    omega_c
-        Another controller bandwidth [rad/s].
-    omega_o
-        Another observer bandwidth [rad/s].
-    spin
-        Keep the processor busy for so long before each deadline [s].
+        For how long [s]; until interrupted by default.
+    log
+        Write each tick to this CSV file: y, u as applied, the command as it came, state.
     priority
-        Real-time priority, 1 to 99, where permitted; 0 for none.
-    mcap
-        Write the record to this file, ending in .mcap, while it runs; Foxglove and PlotJuggler read it.
-    csv
-        The same, ending in .csv.
-    live
-        Let Foxglove and PlotJuggler watch at this port.
-    json
-        Write metrics, timing, events and settings to this file, for programs.
-    figures
-        Put the figures into this folder, as PNG and SVG.
-    save
-        Write the scenario's part of the record to this file, which `Trajectory.load` reads.
+        SCHED_FIFO priority of the ticks, 1 to 99; 0 for ordinary scheduling. What is not permitted is said at the end.
+    cpu
+        Number of the processor that the ticks are to have; any by default.
     """
-    if example:
-        _print_example("torsional_rig.toml")
-        return
-    from quell.commands.run_rig import run_setup
+    from quell.commands.rig import run_rig
 
-    changes = {
-        ("rig", "device"): device,
-        ("rig", "spin"): spin,
-        ("rig", "priority"): priority,
-        ("scenario", "duration"): seconds,
-        ("controller", "omega_c"): omega_c,
-        ("observer", "omega_o"): omega_o,
-    }
-    telemetry = tuple(path for path in (mcap, csv) if path is not None)
-    code = run_setup(path=setup, changes=changes, telemetry=telemetry, live=live, json_file=json, figures=figures, save=save)
-    if code:
-        sys.exit(code)
+    settings = {"dt": dt, "watchdog": watchdog, "u_max": u_max, "rest": rest}
+    run_rig(device=device, plant=plant, settings=settings, seconds=seconds, log=log, priority=priority, cpu=cpu)
 
 
-def _print_example(name: str) -> None:
-    from quell.setup import EXAMPLES
-
-    print((EXAMPLES / name).read_text(encoding="utf-8"), end="")
+app.command(cli_setups.run, name="run")
+app.command(cli_setups.run_rig, name="run-rig")
+app.command(cli_setups.replay, name="replay")
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -67,13 +68,15 @@ def print_outcome(console: Console, run: Trajectory) -> dict[str, float]:
     return learned
 
 
-def figure_of(run: Trajectory, title: str, folder: Path, name: str) -> list[Path]:
-    """Draw a run; return the paths of the files."""
+def figure_of(run: Trajectory, title: str, folder: Path, name: str, add: Callable[[Trajectory, Any], None] | None = None) -> list[Path]:
+    """Draw a run, and what is to be added; return the paths of the files."""
     import matplotlib.pyplot as plt
 
     axes = run.plot()
     figure = axes[0].figure
     figure.suptitle(title)
+    if add is not None:
+        add(run, axes)
     try:
         return save_figure(figure, folder, name)
     finally:

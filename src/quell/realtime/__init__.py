@@ -1,1 +1,65 @@
-"""Real time: a controller closed around a device at a fixed rate, with a stated safe action for whatever goes wrong."""
+"""Real time: a controller closed around a device at a fixed rate, with a stated safe action for whatever goes wrong.
+
+The public names, imported when first used::
+
+    from quell.realtime import Safety, open_device, run_rig
+
+    device = open_device("udp://127.0.0.1:5005", dt=1e-3)
+    run    = run_rig(device, controller, scenario, safety=Safety(most_error=1.0), telemetry=["run.mcap"])
+    print(run.text())
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from quell.realtime.device import Device
+    from quell.realtime.devices import open_device
+    from quell.realtime.outcome import RigRun
+    from quell.realtime.recording import load
+    from quell.realtime.replay import replay
+    from quell.realtime.run import run_rig
+    from quell.realtime.safety import Safety
+    from quell.realtime.server import Rig
+    from quell.realtime.sinks import CsvSink, LiveSink, McapSink
+    from quell.realtime.twin import TwinDevice
+
+_HOME = {
+    "CsvSink": "sinks",
+    "Device": "device",
+    "LiveSink": "sinks",
+    "McapSink": "sinks",
+    "Rig": "server",
+    "RigRun": "outcome",
+    "Safety": "safety",
+    "TwinDevice": "twin",
+    "load": "recording",
+    "open_device": "devices",
+    "replay": "replay",
+    "run_rig": "run",
+}
+
+__all__ = [
+    "CsvSink",
+    "Device",
+    "LiveSink",
+    "McapSink",
+    "Rig",
+    "RigRun",
+    "Safety",
+    "TwinDevice",
+    "load",
+    "open_device",
+    "replay",
+    "run_rig",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'quell.realtime' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"quell.realtime.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value

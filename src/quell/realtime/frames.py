@@ -38,8 +38,8 @@ MEASUREMENT, COMMAND, HELLO, WELCOME, GOODBYE = range(1, 6)
 WATCHDOG_TRIPPED, BUSY, OTHER_DT, GONE = 1, 2, 4, 8
 
 # Entries of the counters.
-_REFUSED = ("malformed", "version", "kind", "session", "duplicated", "reordered", "stale")
-COUNTERS = ("accepted", *_REFUSED, "not_finite", "skipped", "not_sent")
+REFUSALS = ("malformed", "version", "kind", "session", "duplicated", "reordered", "stale")
+COUNTERS = ("accepted", *REFUSALS, "not_finite", "skipped", "not_sent")
 # Skipped are frames that were never used: lost, or overtaken by a newer one before they were looked at.
 ACCEPTED, MALFORMED, WRONG_VERSION, WRONG_KIND, WRONG_SESSION, DUPLICATED, REORDERED, STALE, NOT_FINITE, SKIPPED, NOT_SENT = range(11)
 

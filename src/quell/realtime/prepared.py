@@ -92,6 +92,8 @@ class Prepared:
     setpoints: Setpoints
     pace: Pace
     books: Books
+    interpreted: bool
+    """Whether the loop is Python."""
 
     @classmethod
     def of(
@@ -99,14 +101,14 @@ class Prepared:
     ) -> Prepared:
         """Put together a device, a controller that begins with nothing learned, and what it has to follow; compile it.
 
-        The loop is interpreted where the device needs it, or ``interpret`` says so; the controller is compiled all the same.
+        The loop is interpreted where the device needs it, but the controller is compiled all the same; unless ``interpret`` wants both as
+        plain Python, to debug.
         """
         line = line_of(device)
-        as_python = interpret or isinstance(line, PythonLine)
         design, state = controller.parameters, controller.initial_state()
         channels = row_channels(controller.channels)
         row = np.zeros(sum(width for _, width in channels))
-        if as_python:
+        if isinstance(line, PythonLine) and not interpret:
             design = bound(design)
             warm(design, controller.initial_state(), setpoints.now.copy(), row[len(row) - _reported(controller) :].copy())
         known = {name for name, width in channels if width}
@@ -114,14 +116,11 @@ class Prepared:
             columns_of(channels, name).start if {"f_learned", "f_residual"} <= known else -1 for name in ("f_learned", "f_residual")
         )
         books = Books(ring, row, f_learned, f_residual, tally(), tally(), np.zeros(1, dtype=np.int64))
-        prepared = cls(line, clock, design, state, rules, watch(), setpoints, pace(controller.dt, getattr(device, "paced", False)), books)
+        due = pace(controller.dt, getattr(device, "paced", False))
+        as_python = interpret or isinstance(line, PythonLine)
+        prepared = cls(line, clock, design, state, rules, watch(), setpoints, due, books, as_python)
         prepared._compile()
         return prepared
-
-    @property
-    def interpreted(self) -> bool:
-        """Whether the loop is Python."""
-        return hasattr(self.design, "take_over")
 
     @property
     def requests(self) -> NDArray[np.int64]:

@@ -36,6 +36,7 @@ from quell.realtime.clock import now, wait_until
 from quell.realtime.frames import Buffer, Peer
 from quell.realtime.link import adopt, answer, receive, send
 from quell.realtime.ring import Ring, load_acquire, push
+from quell.realtime.timing import count
 from quell.realtime.wire import MOST_AT_ONCE
 from quell.types import Vector
 
@@ -50,9 +51,6 @@ APPLIED, COMMANDED, LARGEST = range(3)
 LOG = ("tick", "t", "session", "state", "y", "u", "command")
 """What a row of the log has: number of the tick and its time [s], session, state (0 idle … 3 tripped), y, u as applied, and the command
 that came in this tick, NaN where none has."""
-
-# Lateness is counted in bins of a microsecond; the last one has all that was later.
-BINS = 20_001
 
 
 class RigModel(NamedTuple):
@@ -83,6 +81,7 @@ class RigModel(NamedTuple):
     log: Ring
     logged: bool
     lateness: NDArray[np.int64]
+    """A ``tally``: how late ticks were."""
     stop: NDArray[np.int64]
     """Not zero: ``serve`` is to end (1,)."""
 
@@ -233,7 +232,7 @@ def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
             deadline = begin + int(np.rint(k * period))
             time = wait_until(clock, deadline)
             late = time - deadline
-            rig.lateness[min(max(late // 1000, 0), BINS - 1)] += 1
+            count(rig.lateness, late)
             if late > period:
                 rig.counts[CAUGHT_UP] += 1
         tick(rig, time)

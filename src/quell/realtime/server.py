@@ -19,13 +19,14 @@ from quell.realtime.clock import system_clock
 from quell.realtime.link import send
 from quell.realtime.rig import RigModel, serve
 from quell.realtime.ring import drain, dropped, ring, store_release
+from quell.realtime.scheduling import checked_cpu, checked_priority, enter_real_time, quiet_process
+from quell.realtime.timing import Histogram, tally
 
 # The log is written so often [s], and has room for so many seconds.
 _WRITE_EVERY = 0.05
 _ROOM = 5.0
 # A session whose first command does not come keeps the rig so long [s]: the loop may have to be compiled.
 _PATIENCE = 60.0
-_QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 
 
 class Listener(Protocol):
@@ -108,7 +109,7 @@ class Rig:
             row=np.zeros(len(kernels.LOG)),
             log=ring(max(round(_ROOM / dt), 100) if log is not None else 1, len(kernels.LOG)),
             logged=log is not None,
-            lateness=np.zeros(kernels.BINS, dtype=np.int64),
+            lateness=tally(),
             stop=np.zeros(1, dtype=np.int64),
         )
         self._file = None if log is None else _opened(log)
@@ -147,15 +148,10 @@ class Rig:
         """Largest |command| that came [u-unit], whether it was applied or not."""
         return float(self.model.signals[kernels.LARGEST])
 
-    def lateness(self) -> dict[str, float]:
-        """Return how late ticks were [s]: quantiles, rounded up to microseconds, and the largest, for all that ``run`` timed."""
-        bins = self.model.lateness
-        total = int(bins.sum())
-        if total == 0:
-            return {}
-        share = np.cumsum(bins) / total
-        found = {name: float(np.searchsorted(share, q) + 1) * 1e-6 for name, q in _QUANTILES.items()}
-        return found | {"max": float(np.flatnonzero(bins)[-1] + 1) * 1e-6}
+    @property
+    def lateness(self) -> Histogram:
+        """How late ticks were [s], for all that ``run`` timed."""
+        return Histogram.of(self.model.lateness)
 
     def tick(self, count: int = 1) -> None:
         """Let ``count`` ticks pass at once, without a clock: for tests that go step by step."""
@@ -166,23 +162,50 @@ class Rig:
         """Compile what ``run`` needs, or load it from the disk."""
         self._serve(0, False)
 
-    def run(self, seconds: float | None = None) -> None:
+    def run(self, seconds: float | None = None, *, priority: int = 0, cpu: int | None = None) -> list[str]:
         """Tick in real time until ``stop`` is called, from a signal or another thread, or for so long [s].
 
         The ticks are on a thread of their own, which needs no Python; the calling one writes the log.
+
+        Parameters
+        ----------
+        seconds
+            for how long; until ``stop`` by default.
+        priority
+            SCHED_FIFO priority of the ticks, 1 to 99, together with locked memory; 0 leaves all that alone.
+        cpu
+            number of the processor that the ticks are to have; any by default.
+
+        Returns
+        -------
+        list of str
+            what was permitted of that, and what was not, in sentences.
+
+        Raises
+        ------
+        ValueError
+            for arguments out of range.
         """
         most = -1 if seconds is None else max(round(checks.positive("seconds", seconds, "s") / self.dt), 1)
+        priority, cpu = checked_priority(priority), checked_cpu(cpu)
         self.prepare()
-        thread = threading.Thread(target=self._serve, args=(most, True), name="quell-rig")
-        thread.start()
-        try:
-            while thread.is_alive():
-                thread.join(_WRITE_EVERY)
+        with quiet_process(priority, False) as notes:
+
+            def work() -> None:
+                enter_real_time(priority, cpu, notes)
+                self._serve(most, True)
+
+            thread = threading.Thread(target=work, name="quell-rig")
+            thread.start()
+            try:
+                while thread.is_alive():
+                    thread.join(_WRITE_EVERY)
+                    self._write()
+            finally:
+                self.stop()
+                thread.join()
                 self._write()
-        finally:
-            self.stop()
-            thread.join()
-            self._write()
+        return notes
 
     def stop(self) -> None:
         """End ``run`` at its next tick."""

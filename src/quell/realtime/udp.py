@@ -120,19 +120,19 @@ class UdpListener:
 
     def __init__(self, url: str) -> None:
         family, address = resolved(url)
-        self._socket = _socket(family)
+        self.socket = _socket(family)
         try:
-            self._socket.bind(address)
+            self.socket.bind(address)
         except OSError as error:
-            self._socket.close()
+            self.socket.close()
             raise ValueError(f"device = {url!r}: can't listen there ({error.strerror}); give another port, or end what has it") from None
-        host, port = self._socket.getsockname()[:2]
+        host, port = self.socket.getsockname()[:2]
         self.url = f"udp://[{host}]:{port}" if ":" in host else f"udp://{host}:{port}"
-        self.link = udp_link(self._socket)
+        self.link = udp_link(self.socket)
 
     def close(self) -> None:
         """Give the port free."""
-        self._socket.close()
+        self.socket.close()
 
 
 def resolved(url: str) -> tuple[int, Any]:

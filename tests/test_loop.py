@@ -1,0 +1,300 @@
+"""The loop's own dealings: with a device's clock, with the reference, with controllers of other kinds, with time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import quell as ql
+from quell.controllers.running import named_arrays
+from quell.dispatch import compilations
+from quell.realtime.channels import LOOP_WIDTH, Event, row_channels
+from quell.realtime.clock import now, pass_time, virtual_clock
+from quell.realtime.device import PythonLine, fetch, put
+from quell.realtime.loop import run_cycles
+from quell.realtime.prepared import Prepared, scenario_of, setpoints, sliding
+from quell.realtime.ring import drain, ring
+from quell.realtime.safety import Safety
+from quell.realtime.supervisor import OVERRUNS, Cause, changes
+from quell.realtime.timing import BINS, Histogram, count, tally
+
+from .scripted import DT, PLANT, ScriptedDevice, adrc, run
+
+SAMPLE = round(1e9 * DT)
+
+
+class Ticking(NamedTuple):
+    """A device with a clock of its own: at its ticks it sends the number of the tick."""
+
+    period: float
+    """Of its ticks, by the loop's clock [ns]."""
+    late: Any
+    """How much later the k-th comes [ns]; one that is never sent comes after all others."""
+    seen: Any
+    """Number of the last one fetched (1,)."""
+
+
+@fetch.register(Ticking)
+def _fetch(line: Ticking, clock: Any, until: int) -> tuple[float, int]:
+    begin = now(clock)
+    newest = _newest(line, begin)
+    if newest > line.seen[0]:
+        line.seen[0] = newest
+        return float(newest), 0
+    for k in range(int(line.seen[0]) + 1, int(until / line.period) + 1):
+        comes = int(k * line.period) + int(line.late[min(k, line.late.size - 1)])
+        if comes <= until:
+            pass_time(clock, max(comes - begin, 1))
+            line.seen[0] = k
+            return float(k), now(clock) - begin
+    pass_time(clock, max(until - begin, 0))
+    return math.nan, now(clock) - begin
+
+
+def _newest(line: Ticking, time: int) -> int:
+    last = int(time / line.period)
+    came = [k for k in range(max(last - 50, 0), last + 1) if int(k * line.period) + line.late[min(k, line.late.size - 1)] <= time]
+    return came[-1] if came else -1
+
+
+@put.register(Ticking)
+def _put(line: Ticking, u: float) -> int:
+    return 0
+
+
+class TickingDevice:
+    """The line as a device."""
+
+    paced = True
+
+    def __init__(self, period: float, late: dict[int, int] | None = None, samples: int = 30_000) -> None:
+        delays = np.zeros(samples, dtype=np.int64)
+        for k, value in (late or {}).items():
+            delays[k] = value
+        self.line = Ticking(period, delays, np.full(1, -1, dtype=np.int64))
+
+    def read(self) -> float:
+        """Not used."""
+        raise NotImplementedError
+
+    def write(self, u: float) -> None:
+        """Not used."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+FLAT = ql.controllers.LinearController(
+    ql.controllers.LinearLaw(*[np.zeros(s) for s in ((0, 0), 0, 0, 0, 0)], 0.0, 0.0), DT, u_min=-1, u_max=1
+)
+
+
+def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: Any) -> Any:
+    """Run an idle controller around a device with a clock; return the rows, and how old each measurement was [ticks]."""
+    clock = virtual_clock(late)
+    width = sum(width for _, width in row_channels(FLAT.channels))
+    rows = ring(40_000, width)
+    rules = Safety(**{"settle": 1} | safety).rules(FLAT)
+    loop = Prepared.of(device, FLAT, setpoints(scenario_of(0.0, duration), DT, 0, 0.0), rules, clock, rows, interpret=True)
+    loop.run()
+    return drain(rows), loop
+
+
+@pytest.mark.parametrize("drift", [-50e-6, 0.0, 50e-6, 1e-3])
+def test_the_grid_follows_a_devices_clock(drift: float) -> None:
+    """Whether it is as quick as the loop's or not: each cycle gets the next tick, none twice, none left out."""
+    found, loop = ticks(TickingDevice(SAMPLE * (1.0 + drift)), 100.0)
+    y = found[:, LOOP_WIDTH - 2]
+    np.testing.assert_array_equal(np.diff(y), 1.0)
+    assert len(y) > 10_000
+    assert loop.watch.counts[OVERRUNS] == 0
+
+
+@pytest.mark.parametrize("hiccup", [SAMPLE // 2 + 1000, SAMPLE, 5 * SAMPLE // 2])
+def test_after_a_hiccup_of_the_device_no_measurement_is_old(hiccup: int) -> None:
+    """Ticks that come late are in the way of those that come in time; two cycles after the last late one, all are fresh again."""
+    late = {300 + i: max(hiccup - i * SAMPLE, 0) for i in range(4)}
+    found, _ = ticks(TickingDevice(SAMPLE, late), 10.0)
+    smooth, _ = ticks(TickingDevice(SAMPLE), 10.0)
+    y, k = found[:, LOOP_WIDTH - 2], found[:, 0]
+    assert np.any(np.isnan(y))
+    np.testing.assert_array_equal((y - k)[310:], (smooth[:, LOOP_WIDTH - 2] - smooth[:, 0])[310 : len(y)])
+
+
+def test_after_a_hiccup_of_the_loop_no_measurement_is_old() -> None:
+    """It wakes three samples late, on its grid: the newest tick counts."""
+    late = np.zeros(20_000, dtype=np.int64)
+    late[300] = 3 * SAMPLE + 1000
+    found, _ = ticks(TickingDevice(SAMPLE), 10.0, late)
+    y, k = found[:, LOOP_WIDTH - 2], found[:, 0]
+    assert np.max(np.diff(k)) == 4.0
+    np.testing.assert_array_equal(np.diff((y - k)[310:]), 0.0)
+    assert (y - k)[310] == (y - k)[200]
+
+
+def test_a_device_that_sends_nothing_is_not_started() -> None:
+    """It stops before the first cycle, within two seconds, and says why."""
+    found, loop = ticks(TickingDevice(1e18), 1.0)
+    assert changes(loop.watch)[:, 2].tolist() == [Cause.SILENT]
+    assert now(loop.clock) < 2.1e9
+    assert np.all(found[:, LOOP_WIDTH - 1] == 0.0)
+
+
+def test_the_reference_slides_from_where_y_is() -> None:
+    """With the least jerk, at rest at both ends; derivatives to match; after ``approach`` it is the scenario's own, to the bit."""
+    controller = adrc()
+    fed = ql.ADRC(controller.observer, 1.5, feedforward=True, u_min=-3.0, u_max=3.0)
+    reference = ql.signals.Sinusoid(omega=1.0)
+    outcome = run(ScriptedDevice(PLANT, x0=[0.0, 0.0], y=dict.fromkeys(range(3000), 0.5)), fed, reference, approach=1.0, interpret=True)
+    r = outcome["R"][10:311]
+    t = np.arange(301) * DT
+    assert r[0] == 0.5
+    np.testing.assert_array_equal(r[100:], np.sin(t)[100:])
+    tau = t[:100]
+    np.testing.assert_allclose(r[:100], np.sin(tau) + 0.5 * (1.0 - (10 * tau**3 - 15 * tau**4 + 6 * tau**5)), atol=1e-12)
+    slide = sliding(1e-4, 1.0, 3)
+    for i in range(3):
+        np.testing.assert_allclose(np.gradient(slide[:, i], 1e-4)[2:-2], slide[2:-2, i + 1], atol=2e-5)
+    assert slide[0].tolist() == [1.0, 0.0, 0.0, -60.0]
+    assert abs(slide[-1, 0]) < 1e-10
+    assert sliding(DT, 0.0, 2).shape == (0, 3)
+
+
+def test_it_takes_over_without_a_bump() -> None:
+    """Where the plant rests at y = 0.4 with u = 0, u begins at zero and stays small, though the scenario begins elsewhere."""
+    free = ql.plants.LinearPlant([[0.0, 1.0], [0.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
+    u = run(ScriptedDevice(free, x0=[0.4, 0.0]), reference=1.0, approach=2.0, settle=50)["U"]
+    assert np.all(np.abs(np.diff(u)[:60]) < 0.02)
+    jumps = run(ScriptedDevice(free, x0=[0.4, 0.0]), reference=1.0, approach=0.0, settle=50)["U"]
+    assert np.max(np.abs(np.diff(jumps))) > 0.5
+
+
+class ThroughPython:
+    """A device that only Python can use."""
+
+    def __init__(self, device: ScriptedDevice) -> None:
+        self.inner, self.clock = device, virtual_clock()
+
+    def read(self) -> float:
+        """Read."""
+        y, _ = fetch(self.inner.line, self.clock, 0)
+        if math.isinf(y):
+            raise OSError("the driver is not well")
+        return y
+
+    def write(self, u: float) -> None:
+        """Write; the driver may refuse."""
+        if put(self.inner.line, u):
+            raise OSError("the driver is not well")
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+CONTROLLERS = {
+    "ADRC": adrc(),
+    "PID behind a filter": ql.controllers.Prefiltered(
+        ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT, u_min=-3, u_max=3), ql.baselines.ZV(3.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_is_stepped_compiled_though_the_device_is_python(name: str) -> None:
+    """The same run as compiled, as plain Python, or half and half; what a driver raises is a miss, or a command that did not get out."""
+    scripts: dict[str, Any] = {"y": {60: math.inf}, "refused": {90: 1}}
+    plain = run(ScriptedDevice(PLANT, **scripts), CONTROLLERS[name], interpret=True)
+    device: Any = ThroughPython(ScriptedDevice(PLANT, **scripts))
+    half = run(device, CONTROLLERS[name])
+    # A driver that raises has measured nothing: NaN, where the line of the script says infinite.
+    plain.rows[:, LOOP_WIDTH - 2][np.isinf(plain.rows[:, LOOP_WIDTH - 2])] = math.nan
+    np.testing.assert_allclose(half.rows, plain.rows, rtol=1e-9, atol=1e-9)
+    line = half.prepared.line
+    assert isinstance(line, PythonLine)
+    assert (line.faults[0], str(line.errors[0])) == (2, "the driver is not well")
+    assert int(half["EVENTS"][60]) & Event.MISSED
+    assert int(half["EVENTS"][90]) & Event.UNSENT
+
+
+def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> None:
+    """Preparing is no cycle; the second loop of the same types compiles nothing; the controller's own state is as it was."""
+    controller = adrc()
+    before = controller.state
+    device = ScriptedDevice(PLANT)
+    rules, points = Safety(settle=10).rules(controller), setpoints(scenario_of(1.0, 1.0), DT, 0, 0.0)
+    width = sum(width for _, width in row_channels(controller.channels))
+    loop = Prepared.of(device, controller, points, rules, virtual_clock(), ring(4096, width))
+    assert device.line.at.tolist() == [0, 0]
+    for array in named_arrays(loop.state).values():
+        assert not np.any(array)
+    compiled = compilations(run_cycles)
+    loop.run()
+    run(ScriptedDevice(PLANT))
+    assert compilations(run_cycles) == compiled
+    for label, array in controller.state.items():
+        np.testing.assert_array_equal(array, before[label])
+
+
+@pytest.mark.parametrize(
+    ("scenario", "duration", "message"),
+    [
+        (1.0, None, "duration = None: give the duration"),
+        ("up", 1.0, "scenario = 'up': must be a number"),
+        (ql.Scenario(1.0, 5.0, rest_at=(1.0,)), None, "a plant of metal can't be put back to rest"),
+        (ql.Scenario(1.0, 1e6), None, "must be at most 1e\\+07 samples"),
+    ],
+)
+def test_a_course_that_can_not_be_run_is_refused(scenario: Any, duration: float | None, message: str) -> None:
+    """Before anything moves."""
+    with pytest.raises(ValueError, match=message):
+        setpoints(scenario_of(scenario, duration), DT, 0, 1.0)
+
+
+def test_a_reference_that_is_no_number_is_refused() -> None:
+    """Before anything moves, with the time at which it is not."""
+
+    class Gap(ql.signals.Signal):
+        def evaluate(self, t: Any) -> Any:
+            return np.where(t > 0.5, np.nan, t)
+
+    with pytest.raises(ValueError, match="is no number at 0.51 s"):
+        setpoints(scenario_of(Gap(), 1.0), DT, 0, 1.0)
+
+
+@given(st.lists(st.integers(0, 10**12), min_size=1, max_size=300))
+def test_a_histograms_percentiles_are_those_of_what_was_counted(durations: list[int]) -> None:
+    """Rounded up, by a thirty-second at most; the longest as it is."""
+    counts = tally()
+    for duration in durations:
+        count(counts, duration)
+    histogram = Histogram.of(counts)
+    assert len(histogram) == len(durations)
+    assert histogram.max == pytest.approx(1e-9 * max(durations))
+    ordered = sorted(durations)
+    for percent in (1.0, 50.0, 99.0, 99.9, 100.0):
+        exact = 1e-9 * ordered[math.ceil(percent / 100.0 * len(ordered) - 1e-9) - 1]
+        assert exact - 1e-15 <= histogram.percentile(percent) <= exact * (1.0 + 1.0 / 32.0) + 1.001e-9
+
+
+def test_a_histogram_tells_and_shows_itself() -> None:
+    """As text, a line for each quarter of a decade, and as a picture; an empty one has nothing to tell."""
+    counts = tally()
+    for duration in [20_000] * 990 + [300_000] * 10:
+        count(counts, duration)
+    histogram = Histogram.of(counts)
+    assert histogram.text("lateness").splitlines()[0].startswith("lateness: p50 20.5 µs, p99 20.5 µs, p99.9 300 µs, max 300 µs of 1000")
+    assert [int(line.split()[4]) for line in histogram.text().splitlines()[1:]] == [990, 0, 0, 0, 0, 10]
+    ax = histogram.plot()
+    assert ax.get_xlabel() == "duration [µs]"
+    empty = Histogram.of(tally())
+    assert math.isnan(empty.p50)
+    assert empty.text().endswith("of 0")
+    with pytest.raises(ValueError, match="percent = 0"):
+        histogram.percentile(0.0)
+    assert len(histogram.edges) == BINS

@@ -1,0 +1,294 @@
+"""What the loop does where something goes wrong: the table of docs/rig, row by row, on a virtual clock."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import quell as ql
+from quell.controllers.base import applied, control, report
+from quell.realtime import Safety
+from quell.realtime.channels import Event
+from quell.realtime.outcome import told
+from quell.realtime.supervisor import BEGAN, END, FLUSH, ZERO, Cause, Mode, changes
+
+from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
+
+HOLD, RAMP, SETTLE = 5, 50, 10
+SAMPLE = round(1e9 * DT)
+MISS = math.nan
+
+
+def modes(outcome: Outcome) -> list[tuple[int, Mode, Cause]]:
+    """Return when which mode began, and why."""
+    return [(round(change.t / DT), change.mode, change.cause) for change in told(changes(outcome.prepared.watch), DT)]
+
+
+def check_ramped(outcome: Outcome, k: int, ramp: int = RAMP) -> None:
+    """From cycle ``k`` on u goes to zero in a straight line, in ``ramp`` samples, and stays there."""
+    u = outcome["U"]
+    first = int(np.flatnonzero(outcome["K"] == k)[0])
+    before = u[first - 1]
+    assert before != 0.0
+    np.testing.assert_allclose(u[first : first + ramp], before * (1.0 - np.arange(1, ramp + 1) / ramp), atol=1e-12)
+    assert np.all(u[first + ramp :] == 0.0)
+    assert len(u) == first + ramp + FLUSH + 1
+    assert np.all(outcome["MODE"][first + ramp - 1 :] == Mode.STOPPED)
+
+
+def check_ended_by(outcome: Outcome, k: int, cause: Cause) -> None:
+    """At cycle ``k``, for this reason, the ramp began, and ended as it should."""
+    assert modes(outcome)[-2:] == [(k, Mode.RAMP, cause), (int(outcome["K"][-1]) - FLUSH - 1, Mode.STOPPED, Cause.RAMPED)]
+    check_ramped(outcome, k)
+
+
+def test_nothing_happens_where_nothing_goes_wrong() -> None:
+    """Watch, run to the end, ramp, stop; and in between it is ``simulate``, sample for sample."""
+    outcome = run(ScriptedDevice(PLANT))
+    run_ = ql.simulate(PLANT, adrc(), ql.Scenario(1.0, 3.0))
+    mine = slice(SETTLE, SETTLE + len(run_))
+    np.testing.assert_array_equal(outcome["U"][mine], run_["u"])
+    np.testing.assert_array_equal(outcome["Y"][mine], run_["y"])
+    np.testing.assert_array_equal(
+        outcome.rows[mine, 9:], np.column_stack([run_["x_hat"], run_["f_residual"], run_["f_learned"], run_["status"]])
+    )
+    assert modes(outcome)[0] == (SETTLE, Mode.RUN, Cause.SETTLED)
+    check_ended_by(outcome, SETTLE + len(run_), Cause.OVER)
+    assert not outcome["EVENTS"][outcome["EVENTS"] != Event.CHANGED].any()
+
+
+def test_plain_python_does_what_compiled_code_does() -> None:
+    """Through misses, a stall, a device that is not reached, and a trip: the same modes, the same numbers."""
+    scripts: dict[str, Any] = {"y": {60: MISS, 61: MISS, 200: 1.0}, "stall": {100: 3 * SAMPLE}, "refused": {80: 1}}
+    compiled, plain = (run(ScriptedDevice(PLANT, **scripts), interpret=interpret, most_error=1.1) for interpret in (False, True))
+    assert modes(compiled) == modes(plain)
+    assert len(modes(compiled)) == 5
+    np.testing.assert_allclose(plain.rows, compiled.rows, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [MISS, math.inf, -math.inf])
+@pytest.mark.parametrize("missed", [1, HOLD])
+def test_a_few_missed_samples_hold_u(value: float, missed: int) -> None:
+    """The last u stays; with the first good sample the controller goes on, and says that it held y."""
+    outcome = run(ScriptedDevice(PLANT, y={60 + i: value for i in range(missed)}))
+    u = outcome["U"]
+    assert np.all(u[60 : 60 + missed] == u[59])
+    assert u[60 + missed] != u[59]
+    assert np.all(outcome["Y"][60 : 60 + missed] == outcome["Y"][59])
+    assert modes(outcome)[1:3] == [(60, Mode.HOLD, Cause.MISSED), (60 + missed, Mode.RUN, Cause.BACK)]
+    assert np.all(outcome["EVENTS"].astype(int)[60 : 60 + missed] & Event.MISSED)
+    assert outcome["Y"][SETTLE + 300] == pytest.approx(run(ScriptedDevice(PLANT))["Y"][SETTLE + 300], abs=0.05)
+
+
+@pytest.mark.parametrize("value", [MISS, math.inf])
+def test_one_missed_sample_too_many_ramps_u_down(value: float) -> None:
+    """With the sample after ``hold`` held ones; good ones that come later change nothing."""
+    outcome = run(ScriptedDevice(PLANT, y={60 + i: value for i in range(HOLD + 1)}))
+    check_ended_by(outcome, 60 + HOLD, Cause.LOST)
+
+
+def test_a_device_that_never_comes_back_is_lost() -> None:
+    """As above, and the ramp needs no measurement."""
+    check_ended_by(run(ScriptedDevice(PLANT, y=dict.fromkeys(range(60, 3000), MISS))), 60 + HOLD, Cause.LOST)
+
+
+def test_a_stall_skips_deadlines_and_never_catches_up() -> None:
+    """Fetching takes 3.5 samples: three deadlines are left out, then the loop is where it would have been, on the grid."""
+    outcome = run(ScriptedDevice(PLANT, stall={60: 7 * SAMPLE // 2}))
+    k = outcome["K"]
+    np.testing.assert_array_equal(np.diff(k)[:70], [1.0] * 60 + [4.0] + [1.0] * 9)
+    assert int(outcome["EVENTS"][60]) == Event.OVERRUN
+    assert outcome["STEP_TIME"][60] == pytest.approx(3.5 * DT)
+    assert np.all(outcome["LATENESS"] == 0.0)
+    assert modes(outcome)[1] == (SETTLE + 301, Mode.RAMP, Cause.OVER)
+
+
+def test_to_oversleep_skips_deadlines_as_well() -> None:
+    """It woke 2.2 samples late: the cycle is that of the newest deadline, its lateness is told."""
+    late = np.zeros(100, dtype=np.int64)
+    late[60] = 11 * SAMPLE // 5
+    outcome = run(ScriptedDevice(PLANT), late=late)
+    np.testing.assert_array_equal(np.diff(outcome["K"])[57:63], [1.0, 1.0, 3.0, 1.0, 1.0, 1.0])
+    assert outcome["LATENESS"][60] == pytest.approx(2.2 * DT)
+    assert int(outcome["EVENTS"][60]) == Event.OVERRUN
+
+
+def test_a_stall_of_too_many_samples_ramps_u_down() -> None:
+    """The first cycle after it begins the ramp: what the plant did meanwhile nobody knows."""
+    outcome = run(ScriptedDevice(PLANT, stall={60: (HOLD + 1) * SAMPLE + 1}))
+    check_ended_by(outcome, 60 + HOLD + 2, Cause.STALLED)
+    assert not any(cause is Cause.STALLED for _, _, cause in modes(run(ScriptedDevice(PLANT, stall={60: HOLD * SAMPLE + 1}))))
+
+
+def test_one_cycle_after_the_other_that_overruns_ramps_u_down() -> None:
+    """``most_overruns`` are put up with, one more is not."""
+    enough = run(ScriptedDevice(PLANT, stall=dict.fromkeys(range(60, 65), SAMPLE)))
+    assert modes(enough)[1][2] is Cause.OVER
+    outcome = run(ScriptedDevice(PLANT, stall=dict.fromkeys(range(60, 66), SAMPLE)))
+    check_ended_by(outcome, 60 + 2 * 6, Cause.OVERRUN)
+
+
+def test_a_device_that_is_not_reached_too_often_is_given_up() -> None:
+    """``hold`` commands in a row may fail; what is written after that is the ramp, in case somebody hears it."""
+    few = run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 60 + HOLD), 1)))
+    assert modes(few)[1][2] is Cause.OVER
+    assert np.sum(few["EVENTS"].astype(int) & Event.UNSENT > 0) == HOLD
+    check_ended_by(run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 3000), 1))), 60 + HOLD + 1, Cause.UNREACHED)
+
+
+@pytest.mark.parametrize("fault", [2, 3])
+def test_a_device_that_has_set_u_to_zero_itself_ends_the_run(fault: int) -> None:
+    """At the sample after it said so: the controller would be working on a plant that does not listen."""
+    check_ended_by(run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 3000), fault))), 61, Cause.WATCHDOG)
+
+
+def test_a_tracking_error_beyond_its_limit_trips() -> None:
+    """In the very sample that shows it."""
+    check_ended_by(run(ScriptedDevice(PLANT, y={200: 2.0}), most_error=1.5), 200, Cause.ERROR)
+    assert modes(run(ScriptedDevice(PLANT), most_error=1.5))[1][2] is Cause.OVER
+
+
+def test_an_f_hat_beyond_its_limit_trips() -> None:
+    """In the very sample that shows it: the controller's own estimate, learned part included."""
+    outcome = run(ScriptedDevice(PLANT), most_f=1.0)
+    plain = run(ScriptedDevice(PLANT))
+    f_hat = plain.rows[:, 11] + plain.rows[:, 12]
+    check_ended_by(outcome, int(np.flatnonzero(np.abs(f_hat) > 1.0)[0]), Cause.F_HAT)
+
+
+def test_a_u_that_stays_at_its_limit_trips() -> None:
+    """After ``most_saturated`` samples; it is allowed to touch it for as long."""
+    outcome = run(ScriptedDevice(PLANT), most_saturated=30, u_min=-0.5, u_max=0.5)
+    check_ended_by(outcome, SETTLE + 30, Cause.SATURATED)
+    assert np.max(np.abs(outcome["U"])) == 0.5
+    assert np.all(outcome["EVENTS"].astype(int)[SETTLE + 1 : SETTLE + 30] & Event.CLIPPED)
+    assert modes(run(ScriptedDevice(PLANT), most_saturated=30, u_min=-1.4, u_max=1.4))[1][2] is Cause.OVER
+
+
+class Broken(NamedTuple):
+    """A controller of somebody else's, which breaks after so many samples."""
+
+    good: int
+
+
+class BrokenState(NamedTuple):
+    """Samples so far (1,)."""
+
+    samples: Any
+
+
+@control.register(Broken)
+def _control(design: Broken, state: BrokenState, r: float, y: float) -> float:
+    state.samples[0] += 1.0
+    return 1.0 if state.samples[0] <= design.good else math.nan
+
+
+@applied.register(Broken)
+def _applied(design: Broken, state: BrokenState, u: float) -> None:
+    assert math.isfinite(u)
+
+
+@report.register(Broken)
+def _report(design: Broken, state: BrokenState, row: Any) -> None:
+    pass
+
+
+class BrokenController:
+    """As an object."""
+
+    dt, parameters, features, channels = DT, Broken(70), (), ()
+
+    def initial_state(self) -> BrokenState:
+        """Return the state before the first sample."""
+        return BrokenState(np.zeros(1))
+
+
+def test_a_u_that_is_no_number_is_never_written() -> None:
+    """The controller says NaN: the ramp begins in that sample, from what was applied."""
+    outcome = run(ScriptedDevice(PLANT), BrokenController(), interpret=True, u_min=-2.0, u_max=2.0)
+    check_ended_by(outcome, 70, Cause.NOT_A_NUMBER)
+
+
+def test_asked_to_stop_it_ramps_and_asked_again_it_is_zero_at_once() -> None:
+    """Before it took over, there is nothing to ramp."""
+    assert modes(run(ScriptedDevice(PLANT), asked=END)) == [(0, Mode.RAMP, Cause.ASKED), (0, Mode.STOPPED, Cause.RAMPED)]
+    assert modes(run(ScriptedDevice(PLANT), asked=ZERO)) == [(0, Mode.STOPPED, Cause.AT_ONCE)]
+
+
+def test_it_takes_over_only_after_good_samples_in_a_row() -> None:
+    """A missed one begins the count anew; u is zero all the while."""
+    outcome = run(ScriptedDevice(PLANT, x0=[0.3, 0.0], y={4: MISS}), settle=SETTLE)
+    assert modes(outcome)[0] == (5 + SETTLE, Mode.RUN, Cause.SETTLED)
+    assert np.all(outcome["U"][: 5 + SETTLE] == 0.0)
+    np.testing.assert_array_equal(outcome["R"][: 5 + SETTLE], outcome["Y"][: 5 + SETTLE])
+
+
+def test_a_device_that_stutters_never_starts() -> None:
+    """Where there are never enough good samples in a row, it gives up, and says so."""
+    outcome = run(ScriptedDevice(PLANT, y=dict.fromkeys(range(0, 3000, 5), MISS)))
+    assert [cause for _, _, cause in modes(outcome)] == [Cause.UNSETTLED, Cause.RAMPED]
+    assert np.all(outcome.device.written == 0.0)
+
+
+faults = st.fixed_dictionaries(
+    {
+        "y": st.dictionaries(st.integers(0, 120), st.sampled_from([MISS, math.inf, -1e300, 50.0]), max_size=40),
+        "stall": st.dictionaries(st.integers(0, 120), st.integers(0, 20 * SAMPLE), max_size=10),
+        "refused": st.dictionaries(st.integers(0, 120), st.integers(1, 3), max_size=10),
+    }
+)
+
+
+@settings(max_examples=200)
+@given(scripts=faults)
+def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(scripts: dict[str, dict[int, Any]]) -> None:
+    """Random drops, bursts, nonsense, stalls, refusals: the modes go one way, the ramp only shrinks u, the last commands are zeros."""
+    outcome = run(ScriptedDevice(PLANT, **scripts), duration=1.0)
+    u, mode = outcome.device.written, outcome["MODE"]
+    assert np.all(np.abs(u) <= 3.0)
+    assert np.all(u[-FLUSH - 1 :] == 0.0)
+    assert np.all(u[mode == Mode.START] == 0.0)
+    ending = mode >= Mode.RAMP
+    assert np.all(np.diff(ending.astype(int)) >= 0)
+    assert np.all(np.diff(np.abs(u[np.flatnonzero(ending)])) <= 0.0)
+    assert np.sum(ending) <= RAMP + FLUSH + 1
+    assert np.all(np.diff(outcome["K"]) >= 1.0)
+    # Where u was held, it was held.
+    held = np.flatnonzero(mode == Mode.HOLD)
+    np.testing.assert_array_equal(u[held], u[held - 1])
+    began = outcome.prepared.watch.counts[BEGAN]
+    assert (began >= SETTLE) == bool(np.any(mode == Mode.RUN))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"u_min": 1.0, "u_max": 2.0}, "u_min = 1.0, u_max = 2.0: zero, which is what u goes to where something fails, must lie within"),
+        ({"u_min": 2.0, "u_max": 1.0}, "u_min must be less than u_max"),
+        ({"most_error": 0.0}, "most_error = 0.0: must be finite and greater than zero"),
+        ({"most_f": math.nan}, "most_f = nan"),
+        ({"ramp": 0}, "ramp = 0: must be a whole number of at least 1"),
+        ({"hold": -1}, "hold = -1: must be a whole number of at least 0"),
+        ({"most_saturated": 0.5}, "most_saturated = 0.5: must be a whole number"),
+    ],
+)
+def test_what_is_out_of_range_is_named(options: dict[str, Any], message: str) -> None:
+    """One line: the argument, its value, the rule."""
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        Safety(**options)
+
+
+def test_without_limits_of_u_no_loop_is_closed() -> None:
+    """They come from the controller, from the safety, or from both: then the narrower ones hold."""
+    bare = ql.ADRC(ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT), omega_c=1.5)
+    with pytest.raises(ValueError, match="u_min = -inf, u_max = inf: must be finite for a real device"):
+        Safety().rules(bare)
+    assert Safety(u_min=-1.0, u_max=2.0).rules(bare)[:2] == (-1.0, 2.0)
+    assert Safety(u_min=-9.0, u_max=2.0).rules(adrc())[:2] == (-3.0, 2.0)
+    shaped = ql.controllers.Prefiltered(adrc(), ql.baselines.ZV(3.0))
+    assert Safety().rules(shaped)[:2] == (-3.0, 3.0)
