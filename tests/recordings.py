@@ -15,8 +15,8 @@ PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0]
 
 
 def controller(**options: object) -> ql.ADRC:
-    """An ADRC with a learner, whose channels are of all kinds."""
-    return ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman(), **options)  # type: ignore[arg-type]
+    """An ADRC with a learner under guard, whose channels are of all kinds."""
+    return ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman(), guard=ql.Guard(), **options)  # type: ignore[arg-type]
 
 
 def simulated(duration: float = 10.0, **options: object) -> ql.Trajectory:

@@ -1,0 +1,148 @@
+"""A recorded run through the same controller, and through others."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.controllers.baselines import PID, ZV
+from quell.controllers.prefilter import Prefiltered
+from quell.plants.base import advance, measure
+from quell.realtime.recording import load, trajectory_of
+from quell.realtime.replay import replay
+from quell.realtime.sinks import CsvSink, McapSink
+from tests.recordings import DT, OBSERVER, PLANT, controller, header_of, rows_of, simulated
+from tests.test_telemetry import recorded
+
+
+def check_same_estimates(again: ql.Trajectory, run: ql.Trajectory, tolerance: float = 0.0) -> None:
+    """Compare what the controller knew, against its size."""
+    for name in {"x_hat", "f_residual", "f_learned", "theta", "authority"} & set(run.names):
+        np.testing.assert_allclose(again[name], run[name], rtol=0.0, atol=tolerance * np.max(np.abs(run[name])), err_msg=name)
+
+
+@pytest.mark.parametrize("options", [{}, {"u_min": -0.3, "u_max": 0.4}], ids=["free", "limited"])
+def test_the_controller_that_made_a_run_knows_the_same_again(options: dict[str, Any]) -> None:
+    """To the last bit, and it would have applied what was applied."""
+    run = simulated(**options)
+    again = replay(run, controller(**options))
+    check_same_estimates(again, run)
+    np.testing.assert_array_equal(again["u_wished"], run["u"])
+    for name in ("r", "y", "y_measured", "u"):
+        np.testing.assert_array_equal(again[name], run[name])
+    assert (again.dt, again.features, again.ended) == (run.dt, run.features, run.ended)
+    again.plot()
+    assert again.metrics(1.0) == run.metrics(1.0)
+
+
+@pytest.mark.parametrize("make", [CsvSink, McapSink])
+def test_it_does_so_from_a_file(make: Any, tmp_path: Path) -> None:
+    """A run recorded, loaded and replayed."""
+    run = simulated()
+    path = tmp_path / "run"
+    recorded(header_of(run, controller()), rows_of(run, controller()), make(path))
+    check_same_estimates(replay(load(path), controller()), run)
+
+
+def test_a_prefilter_is_replayed_too() -> None:
+    """With what it makes of the reference."""
+    shaped = Prefiltered(ql.ADRC(OBSERVER, omega_c=3.0), ZV(omega=3.0))
+    run = ql.simulate(PLANT, shaped, ql.Scenario(reference=ql.signals.Step(at=0.5), duration=3.0))
+    again = replay(run, shaped)
+    check_same_estimates(again, run)
+    np.testing.assert_array_equal(again["r_shaped"], run["r_shaped"])
+
+
+def test_missed_samples_are_held_as_on_the_rig() -> None:
+    """A loop sample by sample, with bursts of missing measurements: its estimates come out again."""
+    design, rig = controller(), controller()
+    model, x, scratch = PLANT.sampled(DT), np.zeros(2), np.zeros(12)
+    held, rows = 0.0, []
+    for k in range(600):
+        y = measure(model, x)
+        measured = math.nan if k % 50 in (7, 8, 9, 31) else y
+        held = y if math.isfinite(measured) else held
+        r = math.sin(0.02 * k)
+        u = rig.step(r, measured)
+        told = np.zeros(sum(width for _, width in design.channels))
+        ql.controllers.base.report(design.parameters, rig._state, told)
+        rows.append([k, 0.0, 0.0, 0.0, 0.0, r, held, measured, u, *told])
+        advance(model, x, scratch, 0.0, u, np.zeros(1))
+    run = trajectory_of(header_of(simulated(1.0), design), np.array(rows))
+    again = replay(run, design)
+    check_same_estimates(again, run, tolerance=1e-12)
+    assert ql.Status.MEASUREMENT_HELD in again.status
+
+
+def test_a_start_under_load_is_replayed_when_the_load_is_told() -> None:
+    """Else the observer has to find it, as in a cold start."""
+    rig = controller()
+    model, x, scratch = PLANT.sampled(DT), np.array([0.5, 0.0]), np.zeros(12)
+    rig.start(0.5, 3.25, r=0.7)
+    rows = []
+    for k in range(200):
+        y = measure(model, x)
+        u = rig.step(0.7, y)
+        told = np.zeros(sum(width for _, width in rig.channels))
+        ql.controllers.base.report(rig.parameters, rig._state, told)
+        rows.append([k, 0.0, 0.0, 0.0, 0.0, 0.7, y, y, u, *told])
+        advance(model, x, scratch, 0.0, u, np.array([-3.0]))
+    run = trajectory_of(header_of(simulated(1.0), rig), np.array(rows))
+    check_same_estimates(replay(run, controller(), u_before=3.25), run, tolerance=1e-12)
+    assert np.max(np.abs(replay(run, controller())["f_hat"] - run["f_hat"])) > 1.0
+
+
+def test_another_observer_sees_what_happened() -> None:
+    """Sample by sample what ``track`` gives; a quicker observer follows f more closely than a slow one."""
+    run = simulated()
+    other, by_hand = (ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT), omega_c=5.0) for _ in range(2))
+    again = replay(run, other)
+    for k in range(300):
+        wished = by_hand.track(run["r"][k], run["y_measured"][k], run["u"][k])
+        assert wished == pytest.approx(again["u_wished"][k], rel=1e-9, abs=1e-12)
+        np.testing.assert_allclose(by_hand.estimate.x, again["x_hat"][k], rtol=1e-9, atol=1e-12)
+    f = -1.0 * run["x"][:, 0] - 0.6 * run["x"][:, 1]
+    late = slice(300, None)
+    error = {}
+    for omega_o in (10.0, 40.0):
+        observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=omega_o, dt=DT)
+        error[omega_o] = np.sqrt(np.mean((replay(run, ql.ADRC(observer, omega_c=3.0))["f_hat"] - f)[late] ** 2))
+    assert error[40.0] < 0.5 * error[10.0]
+
+
+def test_the_controller_that_is_passed_stays_as_it_is() -> None:
+    """Its running state is another one."""
+    run, design = simulated(2.0), controller()
+    design.step(1.0, 0.3)
+    before = design.state
+    first, second = replay(run, design), replay(run, design)
+    np.testing.assert_array_equal(first.log, second.log)
+    assert all(np.array_equal(value, before[name]) for name, value in design.state.items())
+
+
+def test_what_can_not_be_replayed_is_refused() -> None:
+    """In a line that says what to do."""
+    run = simulated(1.0)
+    thin = ql.simulate(PLANT, controller(), ql.Scenario(reference=1.0, duration=1.0), record_every=5)
+    slow = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=2 * DT), omega_c=3.0)
+    blind = trajectory_of(header_of(run, controller()), rows_of(run, controller()))
+    blind.log[:, 7] = np.nan
+    unknown = trajectory_of(header_of(run, controller()), rows_of(run, controller()))
+    unknown.log[30, 8] = np.nan
+    for given, other, rule in [
+        (thin, controller(), "run has every 5th sample: .* record_every=1"),
+        (run, slow, "controller has dt = 0.02 s: must have that of the run, 0.01 s"),
+        (run, PID(kp=1.0, dt=DT), "must be an ADRC"),
+        (run, Prefiltered(PID(kp=1.0, dt=DT), ZV(omega=3.0)), "only an ADRC"),
+        (blind, controller(), "run has no finite y_measured"),
+        (unknown, controller(), "run has no finite u at 0.3 s"),
+    ]:
+        with pytest.raises(ValueError, match=rule):
+            replay(given, other)
+    with pytest.raises(ValueError, match="u_before = nan"):
+        replay(run, controller(), u_before=math.nan)
