@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -14,6 +14,7 @@ from rich.table import Table
 from quell import metrics
 from quell.commands.judged import figure_of, print_outcome
 from quell.commands.output import check_places, write_results
+from quell.controllers import ADRC
 from quell.files import check_writable
 from quell.plotting import draw
 from quell.realtime.recording import load as load_record
@@ -38,7 +39,7 @@ def run_replay(*, record: Path, path: Path | None, json_file: Path | None, figur
         check_writable(save)
     recorded = load_record(record)
     try:
-        told = replay(recorded, setup.controller)
+        told = replay(recorded, cast(ADRC, setup.controller))  # what else it may be, replay itself says no to
     except ValueError as error:
         raise refused(setup.name, "", error, ()) from None
     console = Console()

@@ -19,7 +19,7 @@ from quell.files import check_writable, without_gaps
 from quell.realtime.devices import open_device
 from quell.realtime.outcome import RigRun
 from quell.realtime.run import run_rig
-from quell.realtime.sinks import LiveSink
+from quell.realtime.sinks import LiveSink, file_sink
 from quell.realtime.supervisor import Cause
 from quell.setup import EXAMPLES, Setup, made, read
 from quell.setup.mistakes import refused
@@ -57,7 +57,10 @@ def run_setup(
         check_writable(save)
     console = Console()
     port = live if live is not None else arguments["live"]
-    sinks = [*arguments.pop("telemetry", ()), *telemetry, *([] if port is None else [LiveSink(port)])]
+    files = [*map(Path, arguments.pop("telemetry", ())), *telemetry]
+    for file in files:
+        check_new(file)
+    sinks = [*files, *([] if port is None else [LiveSink(port)])]
     url = arguments.pop("device")
     del arguments["live"]
     what = f"{setup.title}: {url}, dt = {setup.controller.dt:g} s, for {scenario.duration:g} s. Ctrl-C ramps u to zero."
@@ -98,6 +101,20 @@ def changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> 
     return tables
 
 
+def check_new(file: Path) -> None:
+    """Say that a recording can't be made, before the device is woken.
+
+    Raises
+    ------
+    ValueError
+        for another suffix than ``.mcap`` and ``.csv``, a file that is there, and a place that can't be written to.
+    """
+    file_sink(file)
+    if file.exists():
+        raise ValueError(f"path = {str(file)!r}: there is such a file; recordings are not overwritten: move it, or choose another name")
+    check_writable(file)
+
+
 def exit_code(run: RigRun) -> int:
     """Return 0 where a run came to its end, 130 where it was asked to stop, 3 where a limit or a fault ended it."""
     if run.completed:
@@ -116,18 +133,17 @@ def _print(console: Console, run: RigRun) -> None:
         table.add_row(label, *cells)
     console.print(table)
     for label, histogram in (("Lateness", run.timing.lateness), ("Step time", run.timing.step)):
-        console.print(f"{label}, cycles (bars logarithmic):\n{bars(histogram.text())}\n", highlight=False)
+        bars = "\n".join(histogram.text().splitlines()[1:])
+        console.print(f"{label}, cycles (bars are logarithmic):\n{bars}\n", highlight=False)
     console.print(f"Loop: {_counted(run.tally._asdict())}", soft_wrap=True)
     if run.counters:
-        counted = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in run.counters.items())
-        console.print(f"Device: {counted}", soft_wrap=True)
+        console.print(f"Device: {_counted(run.counters)}", soft_wrap=True)
     for note in run.notes:
         console.print(escape(f"Note: {note}"), soft_wrap=True)
 
 
-def bars(text: str) -> str:
-    """Return the lines of a histogram without its heading."""
-    return "\n".join(text.splitlines()[1:])
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
 
 
 def _timing_figure(run: RigRun, setup: Setup, folder: Path) -> list[Path]:
