@@ -13,10 +13,15 @@ import quell as ql
 from quell.controllers.baselines import PID, ZV
 from quell.controllers.prefilter import Prefiltered
 from quell.plants.base import advance, measure
+from quell.realtime.channels import row_channels
+from quell.realtime.header import Header
 from quell.realtime.recording import load, trajectory_of
 from quell.realtime.replay import replay
 from quell.realtime.sinks import CsvSink, McapSink
+from quell.realtime.supervisor import Mode
+from tests import scripted
 from tests.recordings import DT, OBSERVER, PLANT, controller, header_of, rows_of, simulated
+from tests.scripted import ScriptedDevice
 from tests.test_telemetry import recorded
 
 
@@ -58,24 +63,18 @@ def test_a_prefilter_is_replayed_too() -> None:
     np.testing.assert_array_equal(again["r_shaped"], run["r_shaped"])
 
 
-def test_missed_samples_are_held_as_on_the_rig() -> None:
-    """A loop sample by sample, with bursts of missing measurements: its estimates come out again."""
-    design, rig = controller(), controller()
-    model, x, scratch = PLANT.sampled(DT), np.zeros(2), np.zeros(12)
-    held, rows = 0.0, []
-    for k in range(600):
-        y = measure(model, x)
-        measured = math.nan if k % 50 in (7, 8, 9, 31) else y
-        held = y if math.isfinite(measured) else held
-        r = math.sin(0.02 * k)
-        u = rig.step(r, measured)
-        told = np.zeros(sum(width for _, width in design.channels))
-        ql.controllers.base.report(design.parameters, rig._state, told)
-        rows.append([k, 0.0, 0.0, 0.0, 0.0, r, held, measured, u, *told])
-        advance(model, x, scratch, 0.0, u, np.zeros(1))
-    run = trajectory_of(header_of(simulated(1.0), design), np.array(rows))
-    again = replay(run, design)
-    check_same_estimates(again, run, tolerance=1e-12)
+def test_a_run_of_the_loop_is_replayed_from_its_first_cycle_to_its_last() -> None:
+    """Settling, taking over, missing samples, coming to rest: estimates as on the rig, and the u that the controller wished there."""
+    missing = dict.fromkeys((3, 80, 81, 82, 150), math.nan)
+    rig = scripted.run(ScriptedDevice(scripted.PLANT, y=missing), reference=1.0, approach=0.5)
+    run = trajectory_of(Header(row_channels(scripted.adrc().channels), DT), rig.rows)
+    again = replay(run, scripted.adrc())
+    awake = run["mode"] != Mode.STOPPED
+    for name in ("x_hat", "f_residual"):
+        np.testing.assert_allclose(again[name][awake], run[name][awake], rtol=0.0, atol=1e-12 * np.max(np.abs(run[name])))
+    ruled = run["mode"] == Mode.RUN
+    assert {int(mode) for mode in run["mode"]} == set(Mode)
+    np.testing.assert_allclose(again["u_wished"][ruled], run["u"][ruled], rtol=0.0, atol=1e-12)
     assert ql.Status.MEASUREMENT_HELD in again.status
 
 
@@ -98,14 +97,14 @@ def test_a_start_under_load_is_replayed_when_the_load_is_told() -> None:
 
 
 def test_another_observer_sees_what_happened() -> None:
-    """Sample by sample what ``track`` gives; a quicker observer follows f more closely than a slow one."""
+    """Sample by sample what ``step`` and ``applied`` give; a quicker observer follows f more closely than a slow one."""
     run = simulated()
     other, by_hand = (ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT), omega_c=5.0) for _ in range(2))
     again = replay(run, other)
     for k in range(300):
-        wished = by_hand.track(run["r"][k], run["y_measured"][k], run["u"][k])
-        assert wished == pytest.approx(again["u_wished"][k], rel=1e-9, abs=1e-12)
+        assert by_hand.step(run["r"][k], run["y_measured"][k]) == pytest.approx(again["u_wished"][k], rel=1e-9, abs=1e-12)
         np.testing.assert_allclose(by_hand.estimate.x, again["x_hat"][k], rtol=1e-9, atol=1e-12)
+        by_hand.applied(run["u"][k])
     f = -1.0 * run["x"][:, 0] - 0.6 * run["x"][:, 1]
     late = slice(300, None)
     error = {}
@@ -113,6 +112,14 @@ def test_another_observer_sees_what_happened() -> None:
         observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=omega_o, dt=DT)
         error[omega_o] = np.sqrt(np.mean((replay(run, ql.ADRC(observer, omega_c=3.0))["f_hat"] - f)[late] ** 2))
     assert error[40.0] < 0.5 * error[10.0]
+
+
+def test_controllers_of_other_kinds_are_replayed_too() -> None:
+    """A PID would have applied what it applied, and follows what an ADRC applied."""
+    pid = PID(kp=2.0, ki=1.0, dt=DT, u_min=-1.0, u_max=1.0)
+    run = ql.simulate(PLANT, pid, ql.Scenario(reference=1.0, duration=2.0))
+    np.testing.assert_array_equal(replay(run, pid)["u_wished"], run["u"])
+    assert np.max(np.abs(replay(simulated(2.0), pid)["u_wished"])) <= 1.0
 
 
 def test_the_controller_that_is_passed_stays_as_it_is() -> None:
@@ -137,12 +144,16 @@ def test_what_can_not_be_replayed_is_refused() -> None:
     for given, other, rule in [
         (thin, controller(), "run has every 5th sample: .* record_every=1"),
         (run, slow, "controller has dt = 0.02 s: must have that of the run, 0.01 s"),
-        (run, PID(kp=1.0, dt=DT), "must be an ADRC"),
-        (run, Prefiltered(PID(kp=1.0, dt=DT), ZV(omega=3.0)), "only an ADRC"),
+        (run, ql.ADRC, "controller = .*: must be a controller"),
         (blind, controller(), "run has no finite y_measured"),
         (unknown, controller(), "run has no finite u at 0.3 s"),
     ]:
         with pytest.raises(ValueError, match=rule):
             replay(given, other)
-    with pytest.raises(ValueError, match="u_before = nan"):
-        replay(run, controller(), u_before=math.nan)
+    for other, u, rule in [
+        (controller(), math.nan, "u_before = nan"),
+        (PID(kp=1.0, dt=DT), 1.0, "u_before = 1.0: only an ADRC"),
+        (Prefiltered(PID(kp=1.0, dt=DT), ZV(omega=3.0)), 1.0, "only an ADRC"),
+    ]:
+        with pytest.raises(ValueError, match=rule):
+            replay(run, other, u_before=u)

@@ -1,8 +1,8 @@
 """A recorded run through another observer or learner: what it would have known, and what it would have done.
 
-The controller sees the recorded reference and measurements, sample by sample, and is told of the recorded u as the one that was applied, as
-in manual operation (``ADRC.track``). So its observer and its learner run on what really happened, and what it would have applied is
-recorded as ``u_wished``. (Its u never acts: whether *the loop* would have been a better one is for ``simulate`` to say.)
+The controller sees the recorded reference and measurements, sample by sample, and is told that the recorded u was applied, whatever it
+wished. So its observer and its learner run on what really happened; what it would have applied is recorded as ``u_wished``. (Its u never
+acts: whether *the loop* would have been a better one is for ``simulate`` to say.)
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc import ADRC
-from quell.controllers.base import control, flags, heed, report
-from quell.controllers.law import MANUAL, MANUAL_U, WISHED
-from quell.controllers.prefilter import Prefiltered
+from quell.controllers.base import Controller, applied, control, flags, heed, report, take_over
 from quell.dispatch import compiled, compiling, for_types
+from quell.driver import check_part
+from quell.realtime.supervisor import RUN
 from quell.trajectory import Trajectory
 from quell.types import Matrix, Status, Vector
 
@@ -25,21 +24,22 @@ _TOLD = (("r", 1), ("y", 1), ("y_measured", 1), ("u", 1), ("u_wished", 1))
 _NO_DERIVATIVES = np.zeros(0)
 
 
-def replay(run: Trajectory, controller: ADRC | Prefiltered, *, u_before: float | None = None) -> Trajectory:
+def replay(run: Trajectory, controller: Controller, *, u_before: float | None = None) -> Trajectory:
     """Let a controller follow a recorded run.
 
-    It starts with nothing learned, on a state of its own, as in ``simulate``. Derivatives of the reference are not recorded: a controller
-    with feedforward is given none, which shows in ``u_wished`` alone. Through the controller that made the run, its estimates come out
-    again, to rounding.
+    It starts with nothing learned, on a state of its own, as in ``simulate``. Through the controller that made the run, its estimates come
+    out again, to rounding, as long as no deadline was skipped: those that were are samples without measurement here, while the controller
+    on the rig knew nothing of them. Derivatives of the reference are not recorded: a controller with feedforward is given none, which
+    shows in ``u_wished`` alone.
 
     Parameters
     ----------
     run
-        every sample of it: recorded on a rig (``load``), or from ``simulate`` with ``record_every=1``.
+        every sample of it: recorded on a rig (``load``, or ``RigRun.record``), or from ``simulate`` with ``record_every=1``.
     controller
-        an ``ADRC``, alone or behind a prefilter, of the run's sample time.
+        any controller of the run's sample time.
     u_before
-        control signal under which the plant rested before the first sample [u-unit], where the controller is to know: it then starts as by
+        control signal under which the plant rested before the first sample [u-unit], where an ADRC is to know: it then starts as by
         ``controller.start(y, u_before)``, else as by its first sample.
 
     Returns
@@ -51,9 +51,9 @@ def replay(run: Trajectory, controller: ADRC | Prefiltered, *, u_before: float |
     ------
     ValueError
         for a run that lacks r, y, y_measured or u or does not have all samples, one without a single measurement, another sample time,
-        and a controller that is no ADRC.
+        and ``u_before`` for a controller that is no ADRC.
     """
-    follower = _fresh(controller)
+    check_part("controller", controller)
     r, y, measured, u = (np.ascontiguousarray(run[name]) for name in ("r", "y", "y_measured", "u"))
     if run.every != 1:
         raise ValueError(f"run has every {run.every}th sample: a replay needs all of them; record with record_every=1")
@@ -64,14 +64,15 @@ def replay(run: Trajectory, controller: ADRC | Prefiltered, *, u_before: float |
     good = np.flatnonzero(np.isfinite(measured))
     if good.size == 0:
         raise ValueError("run has no finite y_measured: there is nothing to observe")
+    design, state = controller.parameters, controller.initial_state()
     if u_before is not None:
         first = good[0]
-        follower.start(float(measured[first]), checks.finite("u_before", u_before), float(r[first]) if np.isfinite(r[first]) else None)
-    channels = (*_TOLD, *follower.channels)
+        design, state = _started(controller, measured[first], checks.finite("u_before", u_before), r[first])
+    channels = (*_TOLD, *controller.channels)
     log = np.empty((len(run), sum(width for _, width in channels)))
-    design, state = follower.parameters, follower._state
+    began = int(np.argmax(run["mode"] == RUN)) if "mode" in run.names else 0
     with np.errstate(over="ignore", invalid="ignore"), compiling(design):
-        status = for_types(_follow, design)(design, state, follower._law._state.loop, _NO_DERIVATIVES, r, y, measured, u, log)
+        status = for_types(_follow, design)(design, state, _NO_DERIVATIVES, r, y, measured, u, began, log)
     return Trajectory(
         log=log,
         channels=channels,
@@ -79,39 +80,39 @@ def replay(run: Trajectory, controller: ADRC | Prefiltered, *, u_before: float |
         status=Status(int(status)),
         ended=(len(run) - 1) * run.dt,
         plant=run.plant,
-        features=follower.features,
+        features=controller.features,
         final_state=state,
     )
 
 
-def _fresh(controller: Any) -> Any:
-    """Return a copy of a controller, in the state before the first sample."""
-    try:
-        controller._law  # noqa: B018  # one that is no ADRC at heart says so here
-    except AttributeError:
-        raise ValueError(f"controller = {controller!r}: must be an ADRC, alone or behind a prefilter: others can't be told of u") from None
+def _started(controller: Any, y: float, u: float, r: float) -> tuple[Any, Any]:
+    """Return parameters and state of a controller, nothing learned, that starts where the plant rests at ``y`` under ``u``."""
+    if not hasattr(controller, "start"):
+        raise ValueError(f"u_before = {u!r}: only an ADRC starts under load; leave it out for a {type(controller).__name__}")
     follower = copy.copy(controller)
     follower.reset()
-    return follower
+    follower.start(float(y), u, float(r) if np.isfinite(r) else None)
+    return follower.parameters, follower._state
 
 
 @compiled
 def _follow(
-    design: Any, state: Any, loop: Vector, derivatives: Vector, r: Vector, y: Vector, measured: Vector, u: Vector, log: Matrix
+    design: Any, state: Any, derivatives: Vector, r: Vector, y: Vector, measured: Vector, u: Vector, began: int, log: Matrix
 ) -> int:
-    """Take all samples in manual operation and log them; ``loop`` is the ADRC's share of ``state``. Return all status flags seen."""
+    """Take all samples as the loop does, log them, and return all status flags seen; from ``began`` on the controller had its say."""
     status = 0
-    loop[MANUAL] = 1.0
     for k in range(r.size):
-        loop[MANUAL_U] = u[k]
+        if k == began and k > 0:
+            take_over(design, state)
         heed(design, state, derivatives)
-        control(design, state, r[k], measured[k])
+        wished = control(design, state, r[k], measured[k])
         status |= flags(design, state)
         log[k, 0] = r[k]
         log[k, 1] = y[k]
         log[k, 2] = measured[k]
         log[k, 3] = u[k]
-        log[k, 4] = loop[WISHED]
+        log[k, 4] = wished
         report(design, state, log[k, 5:])
-    loop[MANUAL] = 0.0
+        if u[k] != wished:
+            applied(design, state, u[k])
     return status

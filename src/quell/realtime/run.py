@@ -89,8 +89,7 @@ def run_rig(
     ConnectionError
         where the device's driver does not come back from a call.
     """
-    if not isinstance(device, Device) or isinstance(device, type):
-        line_of(device)  # says what it must be
+    line = line_of(device)
     with ExitStack() as stack:
         stack.callback(device.close)
         check_part("controller", controller)
@@ -108,6 +107,7 @@ def run_rig(
             controller=getattr(controller, "name", type(controller).__name__),
         )
         writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
+        _try_out(line)
         loop = Prepared.of(device, controller, points, rules, system_clock(spin), writer.ring)
         with writer, quiet_process(priority, loop.interpreted) as notes, _signals(loop.requests):
             _supervised(loop, controller.dt, priority, cpu, notes, on_change or (lambda change: None))
@@ -144,24 +144,31 @@ def _supervised(
     thread = threading.Thread(target=work, name="quell-loop", daemon=True)
     thread.start()
     seen, cycles, moved = 0, -1, time.monotonic()
+    hung = False
     try:
-        while thread.is_alive():
+        while thread.is_alive() and not hung:
             thread.join(_LOOK)
             for change in told(changes(loop.watch, seen), dt):
                 seen += 1
                 on_change(change)
             if loop.watch.counts[CYCLES] != cycles or not loop.interpreted:
                 cycles, moved = int(loop.watch.counts[CYCLES]), time.monotonic()
-            elif time.monotonic() - moved > max(_HUNG, _HUNG_SAMPLES * dt):
-                raise ConnectionError(f"device: read() or write() did not return for {time.monotonic() - moved:.1f} s; it was closed")
-    except ConnectionError:
-        raise
+            hung = time.monotonic() - moved > max(_HUNG, _HUNG_SAMPLES * dt)
     except BaseException:
         loop.requests[0] = max(int(loop.requests[0]), END)
         thread.join(_HUNG)
         raise
+    if hung:
+        raise ConnectionError(f"device: read() or write() did not return for {time.monotonic() - moved:.1f} s; it was closed")
     if raised:
         raise raised[0]
+
+
+def _try_out(line: Any) -> None:
+    """Read and write a device that only Python can use once: what it has to set up, or to complain of, comes before the first cycle."""
+    if isinstance(line, PythonLine):
+        line.device.read()
+        line.device.write(0.0)
 
 
 def _check_dt(device: Any, dt: float) -> None:

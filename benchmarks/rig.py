@@ -1,0 +1,86 @@
+"""How punctual the loop is: 1 kHz against the twin in another process, and whether the wire changes what the controller achieves.
+
+    python benchmarks/rig.py                              # 60 s over UDP, on an idle machine
+    python benchmarks/rig.py --seconds 10 --wire shm --spin 0.0001
+
+The second part runs the same scenario in process (``simulate``) and over the wire, with the same delay of a sample, and prints the metrics
+of both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import quell as ql
+from quell.realtime import RigRun, Safety, open_device, run_rig
+
+DT = 1e-3
+PLANT = ql.plants.two_mass_spring()
+
+
+def controller() -> ql.ADRC:
+    """L-ESO on the two-mass-spring system, as in the paper's simulation."""
+    observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT)
+    return ql.ADRC(observer, omega_c=1.0, learner=ql.learners.Kalman(), guard=ql.Guard(), u_min=-20.0, u_max=20.0)
+
+
+@contextlib.contextmanager
+def rig(wire: str, priority: int) -> Iterator[str]:
+    """Start ``quell rig`` as a process of its own; yield its URL, and print what it says when it ends."""
+    url = "udp://127.0.0.1:0" if wire == "udp" else f"shm://quell-benchmark-{os.getpid()}"
+    command = [sys.executable, "-m", "quell.cli", "rig", "--device", url, "--plant", "two-mass", "--dt", str(DT)]
+    process = subprocess.Popen([*command, "--priority", str(priority)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        first = process.stdout.readline()
+        yield first.partition(" at ")[2].partition(": ")[0]
+    finally:
+        process.terminate()
+        print("the rig says:", *process.stdout.read().splitlines(), sep="\n  ")
+        process.wait()
+
+
+def over_the_wire(url: str, reference: ql.signals.Signal, seconds: float, options: argparse.Namespace) -> RigRun:
+    """Run at the rig."""
+    return run_rig(
+        *(open_device(url, DT), controller(), reference),
+        duration=seconds,
+        approach=0.0,
+        safety=Safety(settle=500),
+        spin=options.spin,
+        priority=options.priority,
+        on_change=lambda change: print(change, flush=True),
+    )
+
+
+def main() -> None:
+    """Print histograms, counts and metrics."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--wire", choices=("udp", "shm"), default="udp")
+    parser.add_argument("--spin", type=float, default=0.0)
+    parser.add_argument("--priority", type=int, default=50)
+    options = parser.parse_args()
+    reference = ql.signals.Sinusoid().until(0.5 * options.seconds, then=ql.signals.Step(at=0.5 * options.seconds))
+    with rig(options.wire, options.priority) as url:
+        run = over_the_wire(url, reference, options.seconds, options)
+    print(run.text())
+    print(f"\nno overrun: {run.overruns == 0}; p99.9 of the lateness {1e6 * run.timing.lateness.p999:.0f} µs (at most 500 wanted)\n")
+    delayed = ql.plants.delayed(PLANT, delay=DT, dt=DT)
+    plain = ql.simulate(delayed, controller(), ql.Scenario(reference, options.seconds))
+    if run.completed:
+        step = 0.5 * options.seconds
+        print(f"{'metric':<20} {'in process':>12} {'over ' + options.wire:>12} {'difference':>11}")
+        wire = run.metrics(step)
+        for name, value in plain.metrics(step).items():
+            difference = abs(wire[name] - value) / abs(value) if value else abs(wire[name])
+            print(f"{name:<20} {value:12.6g} {wire[name]:12.6g} {100 * difference:9.4f} %")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""Frames: what is accepted, and by which rule all else is refused."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quell.dispatch import compiled, interpreted
+from quell.realtime import frames
+from quell.realtime.frames import COMMAND, GOODBYE, MEASUREMENT, accept, buffer, compose, crc32, peer, told
+
+SESSION = 0x5EED0001
+PAGE = Path(__file__).parents[1] / "docs" / "wire.md"
+
+
+@compiled
+def _accept(frame: Any, size: int, own: Any) -> bool:
+    return accept(frame, size, own)
+
+
+@compiled
+def _compose(out: Any, own: Any, kind: int, time: int, value: float, state: int) -> None:
+    compose(out, own, kind, time, value, state)
+
+
+@compiled
+def _crc32(data: Any, size: int) -> int:
+    return crc32(data, size)
+
+
+def packed(kind: int, number: int, answers: int, value: float, *, session: int = SESSION, version: int = 1, state: int = 0) -> bytes:
+    """Return a frame, made without the package."""
+    head = struct.pack("<2sBBIIIqdI", b"QL", version, kind, session, number % 2**32, answers % 2**32, 123_456_789, value, state)
+    return head + struct.pack("<I", zlib.crc32(head))
+
+
+def offered(own: Any, data: bytes, entry: Any = accept) -> bool:
+    """Offer what was received to ``own``, as a link would put it into its buffer."""
+    frame = buffer()
+    frame.bytes[: len(data)] = np.frombuffer(data[: frame.bytes.size], dtype=np.uint8)
+    return bool(entry(frame, min(len(data), frame.bytes.size), own))
+
+
+def refused_as(own: Any) -> str:
+    """Return by which rule the only frame that was offered has been refused."""
+    (rule,) = [name for name in frames.REFUSALS if told(own.counters)[name]]
+    return rule
+
+
+@given(st.binary(max_size=48))
+def test_the_checksum_is_that_of_zlib(data: bytes) -> None:
+    """Interpreted and compiled."""
+    room = np.frombuffer(data + b"\0", dtype=np.uint8).copy()
+    assert crc32(room, len(data)) == _crc32(room, len(data)) == zlib.crc32(data)
+
+
+@pytest.mark.parametrize("entry", [_compose, interpreted(_compose)])
+def test_a_frame_is_what_the_table_says(entry: Any) -> None:
+    """Byte by byte the one that ``struct`` and ``zlib`` make."""
+    own, out = peer(COMMAND, SESSION, 20), buffer()
+    own.numbers[frames.SENT], own.numbers[frames.HEARD] = 2**32 + 6, 41
+    entry(out, own, MEASUREMENT, 123_456_789, -1.5, 1)
+    assert out.bytes[:40].tobytes() == packed(MEASUREMENT, 7, 41, -1.5, state=1)
+
+
+@pytest.mark.skipif(not PAGE.exists(), reason="the pages are in the repository, not in what is built of it")
+def test_the_frame_on_the_page_is_one() -> None:
+    """The example in hexadecimal is accepted as what the page says it is."""
+    (block,) = re.findall(r"```text\n((?:[0-9a-f]{2}[ \n])+)```", PAGE.read_text(encoding="utf-8"))
+    data = bytes.fromhex(block)
+    assert data == packed(COMMAND, 7, 41, 2.5)
+    own = peer(COMMAND, SESSION, 20)
+    own.numbers[frames.SENT] = 41
+    assert offered(own, data)
+
+
+@pytest.mark.parametrize("entry", [_accept, interpreted(_accept)])
+def test_news_is_accepted_once_and_in_order(entry: Any) -> None:
+    """What is lost in between is counted."""
+    own = peer(MEASUREMENT, SESSION, 20)
+    assert offered(own, packed(MEASUREMENT, 1, 0, 0.1), entry)
+    assert offered(own, packed(MEASUREMENT, 5, 0, 0.2), entry)
+    assert not offered(own, packed(MEASUREMENT, 5, 0, 0.2), entry)
+    assert not offered(own, packed(MEASUREMENT, 4, 0, 0.2), entry)
+    assert {name: n for name, n in told(own.counters).items() if n} == {"accepted": 2, "skipped": 3, "duplicated": 1, "reordered": 1}
+
+
+def test_numbers_go_on_behind_the_largest() -> None:
+    """From 2^32 − 1 to 0, as RFC 1982 has it."""
+    own = peer(COMMAND, SESSION, 20)
+    own.numbers[frames.SENT] = 2**32 + 3
+    own.numbers[frames.HEARD] = 2**32 - 2
+    for number in (2**32 - 1, 2**32, 2**32 + 1):
+        assert offered(own, packed(COMMAND, number, number, 0.0))
+    assert not offered(own, packed(COMMAND, 2**32 - 1, 2**32, 0.0))
+    assert own.numbers[frames.HEARD] == 2**32 + 1
+    assert told(own.counters)["reordered"] == 1
+
+
+@pytest.mark.parametrize(
+    ("data", "rule"),
+    [
+        (b"", "malformed"),
+        (packed(COMMAND, 1, 100, 0.0)[:-1], "malformed"),
+        (packed(COMMAND, 1, 100, 0.0) + b"\0", "malformed"),
+        (packed(COMMAND, 1, 100, 0.0) * 2, "malformed"),
+        (b"XL" + packed(COMMAND, 1, 100, 0.0)[2:], "malformed"),
+        (packed(COMMAND, 1, 100, 0.0)[:24] + bytes(8) + packed(COMMAND, 1, 100, 1.0)[32:], "malformed"),
+        (packed(COMMAND, 1, 100, 0.0, version=2), "version"),
+        (packed(MEASUREMENT, 1, 100, 0.0), "kind"),
+        (packed(77, 1, 100, 0.0), "kind"),
+        (packed(COMMAND, 1, 100, 0.0, session=SESSION + 1), "session"),
+        (packed(COMMAND, 1, 79, 0.0), "stale"),
+        (packed(COMMAND, 1, 0, 0.0), "stale"),
+        (packed(COMMAND, 1, 101, 0.0), "stale"),
+    ],
+)
+def test_what_breaks_a_rule_is_counted_by_it(data: bytes, rule: str) -> None:
+    """And changes nothing else. The receiver has sent a hundred frames, of which the last twenty may be answered."""
+    own = peer(COMMAND, SESSION, 20)
+    own.numbers[frames.SENT] = 100
+    before = own.numbers.copy()
+    assert not offered(own, data)
+    assert refused_as(own) == rule
+    assert sum(told(own.counters).values()) == 1
+    assert np.array_equal(own.numbers, before)
+    assert offered(own, packed(COMMAND, 1, 80, 0.0))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_value_that_is_no_number_is_news_and_counted(value: float) -> None:
+    """That the other side is alive is known; whoever uses the value has to look at it."""
+    own = peer(MEASUREMENT, SESSION, 20)
+    assert offered(own, packed(MEASUREMENT, 1, 0, value))
+    assert told(own.counters)["not_finite"] == 1
+
+
+@given(st.binary(max_size=60), st.booleans())
+def test_no_bytes_are_accepted_but_frames(data: bytes, magic: bool) -> None:
+    """Whatever comes is counted, never an error; interpreted and compiled do the same."""
+    data = b"QL\x01\x02" + data if magic else data
+    first, second = peer(COMMAND, SESSION, 20), peer(COMMAND, SESSION, 20)
+    assert not offered(first, data, interpreted(_accept))
+    assert not offered(second, data, _accept)
+    assert told(first.counters) == told(second.counters)
+    assert refused_as(first) == "malformed"
+
+
+@given(st.integers(0, 39), st.integers(1, 255))
+def test_a_wrong_byte_is_found(place: int, wrong: int) -> None:
+    """Wherever it is."""
+    data = bytearray(packed(COMMAND, 1, 0, 3.25))
+    data[place] ^= wrong
+    own = peer(COMMAND, SESSION, 20)
+    assert not offered(own, bytes(data))
+    assert refused_as(own) == "malformed"
+
+
+@given(
+    kind=st.integers(0, 255),
+    version=st.integers(0, 255),
+    session=st.sampled_from([0, SESSION, SESSION + 1]),
+    number=st.integers(0, 2**32 - 1),
+    answers=st.integers(0, 2**32 - 1),
+    value=st.floats(),
+)
+def test_what_is_accepted_obeys_all_rules(kind: int, version: int, session: int, number: int, answers: int, value: float) -> None:
+    """Well-formed frames of any content, against the rules written down a second time."""
+    own = peer(COMMAND, SESSION, 20)
+    own.numbers[frames.SENT], own.numbers[frames.HEARD] = 1000, 2**31
+    taken = offered(own, packed(kind, number, answers, value, session=session, version=version), _accept)
+    assert taken == (kind == COMMAND and version == 1 and session == SESSION and number > 2**31 and 980 <= answers <= 1000)
+    assert sum(told(own.counters)[name] for name in ("accepted", *frames.REFUSALS)) == 1
+
+
+def test_a_session_begins_with_nothing_heard() -> None:
+    """What was counted stays."""
+    own = peer(COMMAND, SESSION, 20)
+    assert offered(own, packed(COMMAND, 9, 0, 0.0))
+    assert not offered(own, packed(GOODBYE, 0, 0, 0.0))
+    frames.start_session(own, 5)
+    assert own.numbers.tolist() == [5, 0, 0, 0, 0]
+    assert told(own.counters)["accepted"] == 1

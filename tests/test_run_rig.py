@@ -1,0 +1,253 @@
+"""``run_rig`` from end to end, in real time: nothing here depends on how punctual the machine is."""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.realtime import Safety, TwinDevice, load, run_rig
+from quell.realtime.outcome import ModeChange
+from quell.realtime.scheduling import checked_cpu, enter_real_time, quiet_process
+from quell.realtime.supervisor import Cause, Mode
+
+from .scripted import DT, PLANT, adrc
+
+# A machine that is busy with other things may make the loop as late as it likes.
+PATIENT = Safety(settle=5, hold=10_000, most_overruns=10_000, ramp=10)
+
+
+class Rig:
+    """A plant as somebody would write it who has read two lines of documentation."""
+
+    def __init__(self) -> None:
+        self.twin = TwinDevice(PLANT, DT)
+        self.written: list[float] = []
+        self.closed = 0
+        self.counters = {"written": 0}
+
+    def read(self) -> float:
+        """Measure."""
+        return self.twin.read()
+
+    def write(self, u: float) -> None:
+        """Apply."""
+        self.written.append(u)
+        self.counters["written"] += 1
+        self.twin.write(u)
+
+    def close(self) -> None:
+        """Set u to zero."""
+        self.closed += 1
+
+
+def short(device: Any, duration: float = 0.3, **options: Any) -> Any:
+    """Run something short."""
+    return run_rig(device, adrc(), 1.0, duration=duration, **{"safety": PATIENT, "priority": 0, "approach": 0.0} | options)
+
+
+def test_a_run_from_end_to_end(tmp_path: Path) -> None:
+    """The scenario as a trajectory, all cycles as a record, both also in the files; what was counted; the device closed."""
+    device, told = Rig(), list[ModeChange]()
+    paths = [tmp_path / "run.csv", tmp_path / "run.mcap"]
+    run = short(device, telemetry=paths, on_change=told.append)
+    assert run.completed
+    assert [change.mode for change in run.changes] == [Mode.RUN, Mode.RAMP, Mode.STOPPED]
+    assert tuple(told) == run.changes
+    assert run.verdict.endswith("RAMP: the scenario is over")
+    assert device.closed >= 1
+    assert device.written[-1] == 0.0
+    assert run.tally.cycles == len(run.timing.lateness) == len(run.timing.step)
+    assert len(device.written) == run.counters["written"] == 1 + run.tally.cycles
+    assert run.tally[3:] == (0, 0, 0, 0)
+    # Deadlines that were skipped are filled in, so that time is time.
+    assert len(run.trajectory) == 31
+    assert run.trajectory.ended == pytest.approx(0.3)
+    assert run.trajectory["r"].tolist() == [1.0] * 31
+    began = round(run.changes[0].t / DT)
+    first = began - int(run.record["k"][0])
+    assert len(run.record) >= first + 31 + 10 + 3
+    np.testing.assert_array_equal(run.trajectory["u"], run.record["u"][first : first + 31])
+    assert run.metrics()["peak_error"] == 1.0
+    for path in paths:
+        np.testing.assert_array_equal(load(path).log, run.record.log)
+    text = run.text()
+    for part in (
+        "RUN: enough good samples",
+        "0 missed",
+        f"device: {run.tally.cycles + 1} written",
+        "lateness: p50",
+        "step time: p50",
+        "ordinary",
+    ):
+        assert part in text
+
+
+def test_ctrl_c_ramps_down_and_what_stood_before_is_put_back() -> None:
+    """A signal to this process: the run ends as it should, with a record; the handlers and the collector are as before."""
+    before, device = signal.getsignal(signal.SIGINT), Rig()
+    collecting = gc.isenabled()
+
+    def interrupt(change: ModeChange) -> None:
+        if change.mode is Mode.RUN:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    run = short(device, 60.0, on_change=interrupt)
+    assert not run.completed
+    assert [change.cause for change in run.changes][-2:] == [Cause.ASKED, Cause.RAMPED]
+    assert device.written[-1] == 0.0
+    assert signal.getsignal(signal.SIGINT) is before
+    assert gc.isenabled() == collecting
+
+
+def test_a_second_ctrl_c_is_zero_at_once() -> None:
+    """The ramp, which would take minutes, is cut short."""
+    device = Rig()
+
+    def interrupt(change: ModeChange) -> None:
+        if change.mode in (Mode.RUN, Mode.RAMP):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    run = short(device, 60.0, on_change=interrupt, safety=Safety(settle=5, hold=10_000, most_overruns=10_000, ramp=100_000))
+    assert [change.cause for change in run.changes][-2:] == [Cause.ASKED, Cause.AT_ONCE]
+    assert device.written[-4:] == [0.0] * 4
+    assert device.written[-5] != 0.0
+
+
+def test_a_driver_that_fails_leads_to_the_safe_action() -> None:
+    """Whatever it raises, when it is read or written; the run says what it was."""
+
+    class Failing(Rig):
+        def read(self) -> float:
+            if len(self.written) > 20:
+                raise RuntimeError("cable out")
+            return super().read()
+
+    device = Failing()
+    run = short(device, 60.0, safety=Safety(settle=5, hold=3, most_overruns=10_000, ramp=10))
+    assert run.changes[-2].cause in (Cause.LOST, Cause.STALLED)
+    assert any("'cable out'" in note for note in run.notes)
+    assert device.written[-1] == 0.0
+
+
+def test_a_driver_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It does not come back from a call: the device is closed from outside."""
+    monkeypatch.setattr("quell.realtime.run._HUNG", 0.2)
+    monkeypatch.setattr("quell.realtime.run._HUNG_SAMPLES", 1.0)
+    release = threading.Event()
+
+    class Hanging(Rig):
+        def read(self) -> float:
+            if len(self.written) > 20:
+                release.wait(60.0)
+            return super().read()
+
+    device = Hanging()
+    with pytest.raises(ConnectionError, match=r"device: read\(\) or write\(\) did not return for"):
+        short(device, 60.0)
+    assert device.closed >= 1
+    release.set()
+
+
+def test_what_a_listener_raises_ends_the_run_safely() -> None:
+    """The loop is asked to ramp down, and the device is closed, before the error goes on its way."""
+    device = Rig()
+
+    def listen(change: ModeChange) -> None:
+        raise BrokenPipeError("nobody reads")
+
+    with pytest.raises(BrokenPipeError, match="nobody reads"):
+        short(device, 60.0, on_change=listen)
+    assert device.closed >= 1
+    assert device.written[-1] == 0.0
+
+
+def test_an_error_in_the_loops_thread_comes_out_of_it() -> None:
+    """What is no driver's error is raised here; the device is closed."""
+
+    class Exiting(Rig):
+        def read(self) -> float:
+            if len(self.written) > 10:
+                raise SystemExit(3)
+            return super().read()
+
+    device = Exiting()
+    with pytest.raises(SystemExit):
+        short(device, 60.0)
+    assert device.closed >= 1
+
+
+def test_a_run_may_be_made_from_another_thread() -> None:
+    """Signals can't be caught there; all else is the same."""
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.append(short(Rig())))
+    thread.start()
+    thread.join()
+    assert found[0].completed
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"priority": 100}, "priority = 100: must be a whole number from 0 to 99"),
+        ({"cpu": 10_000}, "cpu = 10000: must be one of"),
+        ({"spin": -1.0}, "spin = -1.0"),
+        ({"approach": math.nan}, "approach = nan"),
+        ({"duration": None}, "duration = None"),
+        ({"telemetry": ["run.txt"]}, "must end in .csv or .mcap"),
+    ],
+)
+def test_what_is_out_of_range_is_named_and_the_device_closed(options: dict[str, Any], message: str) -> None:
+    """Nothing was written, and the caller need not clean up."""
+    device = Rig()
+    with pytest.raises(ValueError, match=message):
+        short(device, **options)
+    assert not any(device.written)
+    assert device.closed == 1
+
+
+def test_a_device_of_another_sample_time_is_refused() -> None:
+    """As is what is no device, and what is no controller."""
+    with pytest.raises(ValueError, match=r"device has dt = 0.02 s, the controller 0.01 s: must be the same"):
+        short(TwinDevice(PLANT, 0.02))
+    with pytest.raises(ValueError, match=r"device = 3: must have read\(\), write\(u\) and close\(\)"):
+        short(3)
+    with pytest.raises(ValueError, match="controller = 3: must be a controller"):
+        run_rig(Rig(), 3, 1.0, duration=1.0)
+
+
+def test_the_scenarios_own_disturbances_are_left_to_the_rig() -> None:
+    """A scenario made for simulation can be run as it is; that is said."""
+    scenario = ql.Scenario(1.0, 0.1, disturbances=(1.0,), noise=ql.signals.BandLimitedNoise(1e-6, DT))
+    run = run_rig(Rig(), adrc(), scenario, safety=PATIENT, priority=0)
+    assert any("left to the rig" in note for note in run.notes)
+
+
+def test_what_real_time_scheduling_is_not_permitted_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a sentence each, with what to do; the run goes on."""
+
+    def refuse(*_: Any) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    monkeypatch.setattr("quell.realtime.scheduling._mlockall", lambda flags: -1)
+    interval = sys.getswitchinterval()
+    with quiet_process(50, interpreted=True) as notes:
+        assert sys.getswitchinterval() < interval
+        assert not gc.isenabled()
+        enter_real_time(50, 0, notes)
+    assert sys.getswitchinterval() == pytest.approx(interval)
+    assert gc.isenabled()
+    assert [note.split(" ", 2)[0] for note in notes] == ["memory", "the", "priority"]
+    assert "run as root, or raise ulimit -r to 50" in notes[2]
+    assert checked_cpu(None) is None
