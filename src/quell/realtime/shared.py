@@ -213,6 +213,7 @@ class _Mailbox:
     def close(self) -> None:
         """Give it, and its lock, free; its memory goes when the last array on it does."""
         if self._file >= 0:
+            fcntl.flock(self._file, fcntl.LOCK_UN)  # the memory has a copy of the descriptor, which would hold it
             os.close(self._file)
             self._file = -1
 
