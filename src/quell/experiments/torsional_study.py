@@ -147,7 +147,7 @@ def _claims(scores: Mapping[str, Scores], dt: float) -> Iterable[Claim]:
 
     Overshoots are told apart by a count of the encoder, settling times by a sample.
     """
-    for key, what, unit, least in (("overshoot", "overshoot", "", COUNT), ("settling_time", "settling time", "s", dt)):
+    for key, what, unit, least in (("overshoot", "overshoot", "", COUNT), ("settling_time", "settling", "s", dt)):
         for other in (MF, MB_OFF, MB):
             rival = scores[other][key]
             yield Claim.at_most(f"{L}: {what} ≤ {other}'s", "best", scores[L][key], None if rival is None else rival + least, unit)
