@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from quell.commands.output import check_places, progress, write_results
+from quell.commands.output import check_places, compile_loops, progress, write_results
 from quell.experiments import torsional, torsional_figures, torsional_study
 from quell.experiments.torsional import PLANTS, Settings
 from quell.experiments.torsional_study import Result
@@ -33,6 +33,8 @@ def reproduce_torsional(*, dt: float, seed: int, json_file: Path | None, figures
     settings = Settings(dt=dt, seed=seed)
     check_places(json_file, figures)
     console = Console()
+    loops = [(torsional.plant(kind), law) for kind in PLANTS for law in torsional.controllers(settings, *torsional.CASES[0]).values()]
+    compile_loops(console, loops)
     with progress(console, width=15) as tell:
         result = torsional_study.run(settings, tell)
         paths = torsional_figures.save(result, figures, tell) if figures is not None else []
@@ -54,7 +56,7 @@ def _print(console: Console, result: Result) -> None:
                 table.add_row(kind, name, *values, end_section=name == torsional.NAMES[-1])
         console.print(table)
     console.print(
-        "Profile to π in 2 s, 40–50 s, after 40 s of training; settling (±0.2 %) from its start.\n"
+        "Profile to π in 2 s, after 40 s of training; settling (±0.2 %) from its start.\n"
         "friction: the twin with Coulomb friction; linear: as the paper identified it. The encoder has 16000 counts.\n"
     )
     _print_claims(console, result)
@@ -66,7 +68,7 @@ def _print(console: Console, result: Result) -> None:
 
 
 def _print_claims(console: Console, result: Result) -> None:
-    title = "What the paper claims in section V, and whether it holds here: with friction / linear"
+    title = "Section V's claims: do they hold, with friction / linear?"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("claim")
     for case in result.cases:

@@ -57,6 +57,7 @@ def _figures(result: Result) -> Iterator[tuple[str, Any]]:
 def _position(result: Result) -> Any:
     """Draw the upper disk's angle: the move, and the arrival on either plant."""
     figure = blank(8.4)
+    figure.subplots_adjust(top=0.93, hspace=0.2)
     rows = figure.subplots(len(result.cases), 3, squeeze=False)
     for case, axes in zip(result.cases, rows, strict=True):
         runs = case.outcomes[FRICTION].runs
@@ -82,13 +83,15 @@ def _position(result: Result) -> Any:
 def _control(result: Result) -> Any:
     """Draw the control signal on either plant."""
     figure = blank(8.4)
+    figure.subplots_adjust(left=0.1, hspace=0.1, wspace=0.05)
     rows = figure.subplots(len(result.cases), 2, squeeze=False, sharex=True, sharey="row")
     for case, axes in zip(result.cases, rows, strict=True):
         for ax, kind in zip(axes, PLANTS, strict=True):
             runs = case.outcomes[kind].runs
             # The quieter in front.
             for name in (MF, L, MB):
-                _line(ax, runs[name], "u", (0.0, END - PROFILE_AT), 1.0, 0.0, label=label_of(name, runs[name]), **_STYLES[name])
+                style = _STYLES[name] | {"linewidth": 0.7, "alpha": 0.8}
+                _line(ax, runs[name], "u", (0.0, END - PROFILE_AT), 1.0, 0.0, label=label_of(name, runs[name]), **style)
         axes[0].set_ylabel(f"{case.name}\ncontrol signal [V]")
     for ax, kind in zip(rows[0], PLANTS, strict=True):
         ax.set_title(_HEADINGS[kind], fontsize="medium")
@@ -102,6 +105,7 @@ def _learning(case: Case) -> Any:
     """Draw what L-ESO learned on the plant with friction, in terms of the paper's model, and how it splits up f."""
     run = case.outcomes[FRICTION].runs[L]
     figure = blank(7.2)
+    figure.subplots_adjust(left=0.1)
     above, below = figure.subplots(2, 1)
     # f = −(b0/b) a·x + (1 − b0/b)(…): what the plant itself would have, its gain being b and not b0.
     numbers = -torsional_identified().A[-1] * B0 / float(torsional_identified().B[-1, 0])

@@ -147,11 +147,11 @@ def _claims(scores: Mapping[str, Scores], dt: float) -> Iterable[Claim]:
 
     Overshoots are told apart by a count of the encoder, settling times by a sample.
     """
-    for key, what, unit, least in (("overshoot", "overshoot", "", COUNT), ("settling_time", "settling time", "s", dt)):
+    for key, what, unit, least in (("overshoot", "overshoot", "", COUNT), ("settling_time", "settling", "s", dt)):
         for other in (MF, MB_OFF, MB):
             rival = scores[other][key]
-            yield Claim.at_most(f"{L}: {what}, at most {other}'s", "best", scores[L][key], None if rival is None else rival + least, unit)
+            yield Claim.at_most(f"{L}: {what} ≤ {other}'s", "best", scores[L][key], None if rival is None else rival + least, unit)
     mine = scores[L]["control_variation"]
     for other, judge in ((MF, Claim.below_one), (MB, Claim.above_one)):
         rival = scores[other]["control_variation"]
-        yield judge(f"{L}: control variation over {other}'s", None if mine is None or not rival else mine / rival)
+        yield judge(f"{L}: variation over {other}'s", None if mine is None or not rival else mine / rival)
