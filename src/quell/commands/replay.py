@@ -17,6 +17,7 @@ from quell.commands.output import check_places, write_results
 from quell.controllers import ADRC
 from quell.files import check_writable
 from quell.plotting import draw
+from quell.realtime.channels import Event
 from quell.realtime.recording import load as load_record
 from quell.realtime.replay import replay
 from quell.realtime.supervisor import RUN
@@ -46,6 +47,14 @@ def run_replay(*, record: Path, path: Path | None, json_file: Path | None, figur
     part = _controlled(recorded)
     scores = {name: _score(run, part) for name, run in (("recorded", recorded), ("replayed", told))}
     _print(console, f"{record.name} through {setup.title}", scores)
+    gaps = np.flatnonzero(recorded["events"].astype(np.int64) & Event.GAP) if "events" in recorded.names else np.zeros(0)
+    if gaps.size:
+        first = recorded.t[gaps[0]]
+        console.print(
+            f"{gaps.size} of {len(recorded)} samples were skipped by the loop and are filled in, the first at {first:.3f} s: from there on "
+            "a replay is not what the loop did, sample by sample.",
+            soft_wrap=True,
+        )
     differs = metrics.rms((told["u_wished"] - told["u"])[part])
     console.print(f"Wished u less applied u, RMS: {differs:.4g}. Judged: the {part.stop - part.start} samples under control.")
     learned = print_outcome(console, told)
