@@ -45,6 +45,28 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
 
 
+def test_the_torsional_experiment_is_printed_written_and_drawn(tmp_path: Path) -> None:
+    """Tables, JSON in the study's form with one entry a pair of bandwidths, figures; without a terminal."""
+    shown = quell("reproduce", "torsional", "--dt", "0.002", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    assert "nan" not in shown.stdout.lower()
+    assert "…" not in shown.stdout, "a column is cut"
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["settings"]["dt"] == 0.002
+    assert [(case["omega_c"], case["omega_o"]) for case in result["cases"]] == [(90.0, 40.0), (40.0, 90.0), (20.0, 90.0)]
+    for case in result["cases"]:
+        for outcome in (case, case["linear"]):
+            assert list(outcome["controllers"]) == ["MF-ESO", "MB-ESO", "L-ESO", "MB-ESO (10 % off)", "L-ESO (guarded)"]
+            for scores in outcome["controllers"].values():
+                assert set(scores) >= {"overshoot", "settling_time", "control_variation"}
+            assert all(set(claim) >= {"claim", "paper", "measured", "holds"} for claim in outcome["claims"])
+    names = {"position", "control", "learning"}
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
+    wrong = quell("reproduce", "torsional", "--dt", "0.01", cwd=tmp_path)
+    assert wrong.returncode == 2
+    assert wrong.stderr.strip() == "quell: dt = 0.01: must be from 0.0001 to 0.002 s, as the loops have up to 90 rad/s"
+
+
 def test_the_guards_trial_is_printed_written_and_drawn(tmp_path: Path) -> None:
     """A table a line a kind, JSON, and a figure as PNG and SVG; without a terminal."""
     shown = quell("stress", "--runs", "12", "--honest", "2", "--seed", "4", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)

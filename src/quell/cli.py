@@ -6,13 +6,13 @@ Heavy imports stand inside the commands, so that ``quell --help`` answers at onc
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from cyclopts import App, CycloptsError, Parameter, Token
+from cyclopts import App, CycloptsError, Parameter
 
-from quell import __version__
+from quell import __version__, cli_setups
+from quell.arguments import whole as _whole
 
 app = App(
     name="quell",
@@ -23,15 +23,6 @@ app = App(
 )
 reproduce = App(name="reproduce", help="Run a published experiment again and judge its claims.")
 app.command(reproduce)
-
-
-def _whole(kind: Any, tokens: Sequence[Token]) -> int:
-    """Read a whole number; the parser's own conversion would round 1.5 to 2 without a word."""
-    text = tokens[0].value
-    try:
-        return int(text)
-    except ValueError:
-        raise ValueError(f"{tokens[0].keyword} = {text!r}: must be a whole number") from None
 
 
 @reproduce.command(name="two-mass")
@@ -64,6 +55,32 @@ def two_mass(
     from quell.commands.two_mass import reproduce_two_mass
 
     reproduce_two_mass(dt=dt, seed=seed, omega_o=omega_o, reset=reset, json_file=json, figures=figures)
+
+
+@reproduce.command(name="torsional")
+def torsional(
+    *,
+    dt: float = 1e-3,
+    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    json: Annotated[Path | None, Parameter(name="--json")] = None,
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+) -> None:
+    """Run the torsional testbed's experiment on its twin: MF-ESO, MB-ESO and L-ESO at three pairs of bandwidths, with every claim judged.
+
+    Parameters
+    ----------
+    dt
+        Sample time [s].
+    seed
+        Seed of where the runs start between two edges of the encoder.
+    json
+        Write all results to this file, for programs.
+    figures
+        Put the figures into this folder, as PNG and SVG.
+    """
+    from quell.commands.torsional import reproduce_torsional
+
+    reproduce_torsional(dt=dt, seed=seed, json_file=json, figures=figures)
 
 
 @reproduce.command(name="acc")
@@ -220,13 +237,18 @@ def rig(
     run_rig(device=device, plant=plant, settings=settings, seconds=seconds, log=log, priority=priority, cpu=cpu)
 
 
+app.command(cli_setups.run, name="run")
+app.command(cli_setups.run_rig, name="run-rig")
+app.command(cli_setups.replay, name="replay")
+
+
 def main() -> None:
-    """Run the command line; a mistake in what was asked gives one line and exit code 2."""
+    """Run the command line; each mistake in what was asked gives one line, and the exit code is 2."""
     try:
         app()
     except (CycloptsError, ValueError) as error:
-        message = " ".join(str(error).split())
-        print(f"quell: {message}", file=sys.stderr)
+        for mistake in getattr(error, "mistakes", (str(error),)):
+            print(f"quell: {' '.join(mistake.split())}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:  # whoever was reading has read enough
         sys.stdout = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,8 +12,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
+from quell.controllers import Controller
+from quell.dispatch import compilations
+from quell.driver import run_block
 from quell.experiments.figures import made
 from quell.files import check_writable, write_json
+from quell.plants import Plant
+from quell.simulation import Scenario, simulate
 
 
 class Tell(Protocol):
@@ -34,6 +40,19 @@ def check_places(json_file: Path | None, figures: Path | None) -> None:
         check_writable(json_file)
     if figures is not None:
         made(figures)
+
+
+def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -> None:
+    """Compile the loops that a study needs, or load them; where that takes long, say so and how long it took."""
+    began = time.perf_counter()
+    with console.status("Compiling what is not in the cache: some ten seconds, once for this version."):
+        for plant, controller in loops:
+            simulate(plant, controller, Scenario(duration=10 * controller.dt, rest_at=(5 * controller.dt,)))
+    compiled = compilations(run_block)
+    if compiled:
+        console.print(
+            f"First run of this version: {compiled} loops compiled in {time.perf_counter() - began:.1f} s, and kept for later runs."
+        )
 
 
 @contextmanager

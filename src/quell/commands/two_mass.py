@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
@@ -11,13 +10,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from quell import plants
-from quell.commands.output import check_places, progress, write_results
-from quell.dispatch import compilations
-from quell.driver import run_block
+from quell.commands.output import check_places, compile_loops, progress, write_results
 from quell.experiments import two_mass_figures, two_mass_spring, two_mass_study
 from quell.experiments.two_mass_spring import Settings
 from quell.experiments.two_mass_study import Result
-from quell.simulation import Scenario, simulate
 
 _COLUMNS = (
     ("overshoot", "overshoot\n[‰]", 1e3, ".2f"),
@@ -44,26 +40,13 @@ def reproduce_two_mass(*, dt: float, seed: int, omega_o: float, reset: bool, jso
         raise ValueError(f"{error} (the study goes up to 3 times omega_o)") from None
     check_places(json_file, figures)
     console = Console()
-    _compile(console, settings)
+    loops = [(plants.two_mass_spring(), candidate) for candidate in two_mass_spring.controllers(settings).values()]
+    compile_loops(console, loops)
     with progress(console, width=15) as tell:
         result = two_mass_study.run(settings, tell)
         paths = two_mass_figures.save(result, figures, tell) if figures is not None else []
     _print(console, result)
     write_results(console, result.to_json(), json_file, paths, figures)
-
-
-def _compile(console: Console, settings: Settings) -> None:
-    """Compile what the study needs, or load it; where that takes long, say so and how long it took."""
-    began = time.perf_counter()
-    brief = Scenario(duration=10 * settings.dt, rest_at=(5 * settings.dt,))
-    with console.status("Compiling what is not in the cache: about 10 seconds, once for this version."):
-        for candidate in two_mass_spring.controllers(settings).values():
-            simulate(plants.two_mass_spring(), candidate, brief)
-    compiled = compilations(run_block)
-    if compiled:
-        console.print(
-            f"First run of this version: {compiled} loops compiled in {time.perf_counter() - began:.1f} s, and kept for later runs."
-        )
 
 
 def _print(console: Console, result: Result) -> None:

@@ -36,3 +36,9 @@ class Claim:
     def at_least(cls, claim: str, paper: float, measured: float | None) -> Claim:
         """Judge a rounded figure that should be reached: 3 holds from 2.5 on."""
         return cls(claim, paper, measured, measured is not None and measured >= paper - 0.5, f"≥ {paper - 0.5:g}")
+
+    @classmethod
+    def at_most(cls, claim: str, paper: str, measured: float | None, most: float | None, unit: str = "") -> Claim:
+        """Judge a figure against another that was measured; where that could not be, there is nothing to exceed."""
+        holds = measured is not None and (most is None or measured <= most * (1.0 + 1e-9))
+        return cls(claim, paper, measured, holds, "any" if most is None else f"≤ {most:.5g}", unit)

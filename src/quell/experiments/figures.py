@@ -7,6 +7,29 @@ from pathlib import Path
 from typing import Any
 
 from quell.files import written_atomically
+from quell.trajectory import Trajectory
+
+# How the paper's three controllers are drawn in every figure.
+STYLES: dict[str, dict[str, Any]] = {
+    "MF-ESO": {"color": "#c1440e", "linewidth": 1.2},
+    "MB-ESO": {"color": "#2a6f97", "linewidth": 2.4, "alpha": 0.55},
+    "L-ESO": {"color": "black", "linewidth": 1.2},
+}
+
+
+def blank(height: float) -> Any:
+    """Return an empty figure, apart from any that the user has open; its margins are fixed, as measuring them takes longer than drawing."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, height))
+    margin = 0.5 / height
+    figure.subplots_adjust(left=0.08, right=0.98, bottom=margin, top=1.0 - 0.65 * margin, hspace=0.3, wspace=0.2)
+    return figure
+
+
+def label_of(name: str, run: Trajectory) -> str:
+    """Return what a legend calls a run."""
+    return f"{name} (diverged at {run.ended:.3g} s)" if run.diverged else name
 
 
 def made(folder: str | os.PathLike[str]) -> Path:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.experiments.figures import made, save_figure
+from quell.experiments.figures import STYLES, blank, label_of, made, save_figure
 from quell.experiments.gradient_range import HORIZON, Trial
 from quell.experiments.two_mass_spring import END, FORCE_AT, L1, MB, MF, STEP_AT, L
 from quell.experiments.two_mass_study import Result
@@ -20,10 +20,10 @@ from quell.trajectory import Trajectory
 _FROM = 120.0
 _ZOOMS = ((126.0, 134.0), (170.0, 195.0))
 _STYLES: Mapping[str, dict[str, Any]] = {
-    MF: {"color": "#c1440e", "linewidth": 1.2},
-    MB: {"color": "#2a6f97", "linewidth": 2.4, "alpha": 0.55},
+    MF: STYLES[MF],
+    MB: STYLES[MB],
     L1: {"color": "0.55", "linewidth": 1.0, "linestyle": "--"},
-    L: {"color": "black", "linewidth": 1.2},
+    L: STYLES[L],
 }
 # The benchmark's f is −2 y'' + disturbance (paper eq. (disturbance-twomass-MFESO) with m1 = m2 = k = 1, b0 = b).
 _TRUE_THETA = {"x1": 0.0, "x2": 0.0, "x3": -2.0, "x4": 0.0}
@@ -56,19 +56,9 @@ def _figures(result: Result) -> Iterator[tuple[str, Any]]:
     yield "algorithm-1", _algorithm_1(result)
 
 
-def _figure(height: float) -> Any:
-    """Return an empty figure, apart from any that the user has open; its margins are fixed, as measuring them takes longer than drawing."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, height))
-    margin = 0.5 / height
-    figure.subplots_adjust(left=0.08, right=0.98, bottom=margin, top=1.0 - 0.65 * margin, hspace=0.3, wspace=0.2)
-    return figure
-
-
 def _comparison(result: Result, channel: str, label: str) -> Any:
     """Draw one channel of all controllers of the same bandwidth: whole, and the paper's two zooms."""
-    figure = _figure(6.4)
+    figure = blank(6.4)
     axes = figure.subplot_mosaic([["all", "all"], ["step", "force"]])
     spans = {"all": (_FROM, END), "step": _ZOOMS[0], "force": _ZOOMS[1]}
     for place, (start, stop) in spans.items():
@@ -77,7 +67,7 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
             run = result.runs[name]
             part = run.window(start, stop)
             if part.stop > part.start:
-                draw(ax, run.t[part], run[channel][part], label=_label(name, run), **style)
+                draw(ax, run.t[part], run[channel][part], label=label_of(name, run), **style)
         ax.set_xlim(start, stop)
         ax.set_xlabel("time [s]")
     axes["all"].set_ylabel(label)
@@ -93,7 +83,7 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
 def _learning(result: Result) -> Any:
     """Draw what L-ESO learned, what it takes f to be and how the three observers estimate it."""
     run = result.runs[L]
-    figure = _figure(8.0)
+    figure = blank(8.0)
     axes = figure.subplots(3, 1, sharex=True)
     for i, feature in enumerate(run.features):
         draw(axes[0], run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
@@ -109,7 +99,7 @@ def _learning(result: Result) -> Any:
     axes[1].set_title("total disturbance as L-ESO has it", fontsize="medium")
     for name in (MF, MB, L):
         other = result.runs[name]
-        draw(axes[2], other.t, other["f_hat"] - _true_disturbance(other, known=name == MB), label=_label(name, other), **_STYLES[name])
+        draw(axes[2], other.t, other["f_hat"] - _true_disturbance(other, known=name == MB), label=label_of(name, other), **_STYLES[name])
     axes[2].set_title("error of the three estimates of f (MB-ESO estimates what its model leaves)", fontsize="medium")
     axes[2].set_xlabel("time [s]")
     for ax in axes[1:]:
@@ -132,7 +122,7 @@ def _true_disturbance(run: Trajectory, known: bool = False) -> Any:
 
 def _algorithm_1(result: Result) -> Any:
     """Draw when Algorithm 1 diverges, and what it gains where it does not."""
-    figure = _figure(6.0)
+    figure = blank(6.0)
     axes = figure.subplots(2, 1, sharex=True)
     markers = "osx"
     for marker, batch in zip(markers, sorted({trial.batch for trial in result.gradient_trials}), strict=False):
@@ -153,7 +143,3 @@ def _algorithm_1(result: Result) -> Any:
     for ax in axes:
         ax.legend(fontsize="small")
     return figure
-
-
-def _label(name: str, run: Trajectory) -> str:
-    return f"{name} (diverged at {run.ended:.3g} s)" if run.diverged else name

@@ -1,0 +1,138 @@
+"""What is run, described in a file: ``load`` reads TOML and builds plant, controller and scenario of it (docs/setup)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from quell import checks
+from quell.controllers import Prefiltered
+from quell.controllers.base import Controller
+from quell.files import without_gaps
+from quell.plants import Plant
+from quell.setup.build import Builder, linear_part
+from quell.setup.description import Description, describe, read
+from quell.setup.mistakes import SetupError, refused
+from quell.simulation import Scenario
+
+__all__ = ["EXAMPLES", "Description", "Setup", "SetupError", "load", "made", "read"]
+
+EXAMPLES = Path(__file__).parent / "examples"
+"""The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What a setup file describes, built.
+
+    Attributes
+    ----------
+    name : str
+        the file's name.
+    title : str
+        what tables and figures call it.
+    controller
+        what controls, behind its prefilter if there is one; its ``dt`` is the loop's.
+    plant
+        what is controlled, or None.
+    scenario : Scenario
+        what happens, or None.
+    rig : dict
+        the arguments of ``run_rig`` and ``live``, or None.
+    windows : tuple of dict
+        for each window in which the response is judged the arguments of ``Trajectory.metrics``.
+    description : Description
+        the file's own tables.
+    """
+
+    name: str
+    title: str
+    controller: Controller
+    plant: Plant | None
+    scenario: Scenario | None
+    rig: dict[str, Any] | None
+    windows: tuple[dict[str, Any], ...]
+    description: Description
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what the file has, for ``quell.files.write_json``; in the place of an infinite number is None."""
+        kept: dict[str, Any] = without_gaps(self.description.model_dump(exclude_unset=True))
+        return kept
+
+    def needed(self, table: str) -> Any:
+        """Return what was built of a table that the file need not have, but should.
+
+        Raises
+        ------
+        SetupError
+            where it has not.
+        """
+        if getattr(self, table) is None:
+            raise SetupError([f"{self.name}: {table}: missing; give a table [{table}]"])
+        return getattr(self, table)
+
+
+def load(path: str | os.PathLike[str]) -> Setup:
+    r"""Read a TOML file and build what it describes.
+
+    Raises
+    ------
+    SetupError
+        with a line for each mistake: the file, the key's path, the value and the rule, or the nearest known name.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> text = "dt = 0.01\ncontroller = {omega_c = 2.0}\nobserver = {kind = 'model-free', order = 2, b0 = 1.0, omega_0 = 9.0}"
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "rig.toml"
+    ...     _ = path.write_text(text)
+    ...     load(path)
+    Traceback (most recent call last):
+        ...
+    quell.setup.mistakes.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
+    """
+    return made(*read(path))
+
+
+def made(name: str, data: Mapping[str, Any]) -> Setup:
+    """Build what ``data`` describes, which is as ``tomllib`` reads it from a file called ``name``.
+
+    Raises
+    ------
+    SetupError
+        as ``load``.
+    """
+    described = describe(name, data)
+    try:
+        checks.positive("dt", described.dt, "s")
+    except ValueError as error:
+        raise refused(name, "", error, ()) from None
+    builder, dt = Builder(name), {"dt": described.dt}
+
+    def part(key: str, **context: Any) -> Any:
+        table = getattr(described, key)
+        return None if table is None else builder.build(table, key, **dt, **context)
+
+    plant = part("plant")
+    model = linear_part(plant)
+    parts = {key: part(key, plant=model) for key in ("observer", "learner", "guard")}
+    idle = [key for key, value in parts.items() if value is not None and key not in described.controller.context]
+    if idle:
+        kind = described.controller.called
+        raise SetupError([f"{name}: {key}: a controller of the kind {kind} has no use for it" for key in idle])
+    controller = part("controller", plant=model, **parts)
+    prefilter, scenario, rig = part("prefilter"), part("scenario"), part("rig")
+    try:
+        if prefilter is not None:
+            controller = Prefiltered(controller, prefilter)
+        if scenario is not None and plant is not None:
+            scenario.seeded_signals(plant.disturbances)
+    except ValueError as error:
+        raise refused(name, "scenario" if "disturbances" in str(error) else "prefilter", error, ("disturbances",)) from None
+    title = described.title or name.removesuffix(".toml").replace("_", " ")
+    return Setup(name, title, controller, plant, scenario, rig, tuple(window.given() for window in described.metrics), described)

@@ -1,0 +1,57 @@
+"""All keys of setup files, as tables for people: what the page of the documentation shows."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from typing import Any, Union, get_args, get_origin
+
+from pydantic_core import PydanticUndefined
+
+from quell.setup.tables import Call, Table
+
+_TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
+
+
+def keys(table: type[Table]) -> list[tuple[str, str, str, str]]:
+    """Return name, type, default and meaning of each key of a table, but for ``kind``."""
+    return [
+        (key, _type(field.annotation), _default(field.default), field.description or "")
+        for key, field in table.model_fields.items()
+        if key != "kind"
+    ]
+
+
+def markdown(tables: Mapping[str, type[Call]]) -> str:
+    """Return the kinds of a table and their keys in Markdown, a heading and a table for each kind."""
+    parts, bar = [], r"\|"
+    for kind, table in tables.items():
+        rows = [f"| `{key}` | {of} | {default} | {words.replace('|', bar)} |" for key, of, default, words in keys(table)]
+        head = ["| key | type | default | |", "|---|---|---|---|"] if rows else []
+        parts.append("\n".join([f"**`{kind}`** {table.__doc__}", "", *head, *rows]))
+    return "\n\n".join(parts).replace("``", "`")
+
+
+def _default(value: Any) -> str:
+    if value is PydanticUndefined:
+        return "**needed**"
+    if value is None:
+        return ""
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
+    return f"`{str(value).lower() if isinstance(value, bool) else repr(value)}`"
+
+
+def _type(annotation: Any) -> str:
+    """Return the name of a type in TOML."""
+    if annotation in _TYPES:
+        return _TYPES[annotation]
+    origin, inside = get_origin(annotation), [part for part in get_args(annotation) if part is not types.NoneType]
+    if origin is tuple:
+        return "list"
+    if origin in (Union, types.UnionType):
+        named = list(dict.fromkeys(_type(part) for part in inside))
+        return "table" if all(name == "table" for name in named) else ", ".join(named)
+    if origin is not None and inside:  # Annotated
+        return _type(inside[0])
+    return "table" if isinstance(annotation, type) and issubclass(annotation, Table) else "numbers"

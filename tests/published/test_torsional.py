@@ -1,0 +1,68 @@
+"""The torsional experiment: the reference figures of docs/torsional, and the bars that were set. Seeds 0 to 2, five starts each."""
+
+from __future__ import annotations
+
+import statistics
+from functools import cache
+
+import pytest
+
+from quell.experiments import torsional as study
+from quell.simulation import simulate
+
+SEEDS = range(2)
+SLOW = (20.0, 90.0)
+
+
+@cache
+def median(name: str, kind: str, seed: int, case: tuple[float, float] = SLOW, starts: int = 3) -> dict[str, float]:
+    """Run a controller from some starts; return the medians of its scores."""
+    settings = study.Settings(seed=seed)
+    controller, plant = study.controllers(settings, *case)[name], study.plant(kind)
+    found = [study.score(simulate(plant, controller, course)) for course in study.scenarios(settings, kind)[:starts]]
+    return {key: statistics.median(score[key] for score in found) for key in ("overshoot", "settling_time", "control_variation")}
+
+
+@pytest.mark.parametrize(("name", "overshoot", "settling"), [(study.MF, 0.0066, 3.84), (study.MB, 0.0001, 2.26), (study.L, 0.0003, 2.26)])
+@pytest.mark.xdist_group("torsional")
+def test_the_reference_figures_of_the_linear_plant_are_met(name: str, overshoot: float, settling: float) -> None:
+    """Within a count and a half of the encoder, and 20 ms."""
+    for seed in SEEDS:
+        found = median(name, study.LINEAR, seed)
+        assert found["overshoot"] == pytest.approx(overshoot, abs=1.5 * 2.0 / study.COUNTS)
+        assert found["settling_time"] == pytest.approx(settling, abs=0.02)
+
+
+@pytest.mark.parametrize("kind", study.PLANTS)
+@pytest.mark.xdist_group("torsional")
+def test_l_eso_beats_both_mf_eso_and_a_model_that_is_ten_percent_off(kind: str) -> None:
+    """Overshoot at most 0.1 %, settling at most 2.4 s, both no more than the others', control variation no larger than MF-ESO's."""
+    for seed in SEEDS:
+        found = median(study.L, kind, seed)
+        assert found["overshoot"] <= 0.001 * (1.0 + 1e-9)
+        assert found["settling_time"] <= 2.4
+        for other in (study.MF, study.MB_OFF):
+            rival = median(other, kind, seed)
+            assert found["overshoot"] <= rival["overshoot"]
+            assert found["settling_time"] <= rival["settling_time"]
+        assert found["control_variation"] <= 0.9 * median(study.MF, kind, seed)["control_variation"]
+
+
+@pytest.mark.xdist_group("torsional")
+def test_the_guard_keeps_most_of_it() -> None:
+    """Overshoot and settling of the guarded learner lie nearer to L-ESO's than to MF-ESO's."""
+    for kind in study.PLANTS:
+        free, guarded, plain = (median(name, kind, 0) for name in (study.L, study.LG, study.MF))
+        for key in ("overshoot", "settling_time"):
+            assert guarded[key] - free[key] < 0.5 * (plain[key] - free[key])
+
+
+@pytest.mark.parametrize("case", [(90.0, 40.0), (40.0, 90.0)])
+@pytest.mark.xdist_group("torsional")
+def test_the_papers_bandwidths_are_stable_either_way_round(case: tuple[float, float]) -> None:
+    """L-ESO arrives within 10 ms of what the design asks for, on the linear plant and with friction."""
+    asked = {90.0: 1.995, 40.0: 2.073}[case[0]]
+    for kind in study.PLANTS:
+        found = median(study.L, kind, 0, case, starts=1)
+        assert found["settling_time"] == pytest.approx(asked, abs=0.01)
+        assert found["overshoot"] <= 0.0015

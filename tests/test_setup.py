@@ -1,0 +1,217 @@
+"""Setup files: what they describe is built, and what is wrong in them is said in a line each."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.setup import EXAMPLES, SetupError, load, made
+from quell.setup.kinds import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
+from quell.setup.reference import keys, markdown
+
+BASE = """
+dt = 0.01
+[plant]
+kind = "two-mass"
+[observer]
+kind = "model-free"
+order = 4
+b0 = 1.0
+omega_o = 10.0
+[controller]
+omega_c = 1.0
+"""
+
+
+def setup(more: str = "", *, without: tuple[str, ...] = ()) -> Any:
+    """Build the base with more in it: keys are added to a table of the same kind, and take the place of one of another."""
+    data = copy.deepcopy(tomllib.loads(BASE))
+    for key in without:
+        del data[key]
+    for key, value in tomllib.loads(more).items():
+        old = data.get(key)
+        alike = isinstance(value, dict) and isinstance(old, dict) and value.get("kind", old.get("kind")) == old.get("kind")
+        data[key] = old | value if alike else value
+    return made("rig.toml", data)
+
+
+def test_the_example_is_the_python_of_the_first_example() -> None:
+    """The same run, bit for bit, as from the objects of examples/01_step.py."""
+    read = load(EXAMPLES / "two_mass.toml")
+    plant = ql.plants.two_mass_spring(m1=1.0, m2=0.5, k=2.0)
+    observer = ql.ESO.model_free(order=4, b0=ql.canonical(plant).b, omega_o=12.0, dt=2e-3)
+    scenario = ql.Scenario(
+        reference=ql.signals.Sinusoid(omega=0.8).until(60.0, then=ql.signals.Step(at=60.0)),
+        disturbances=(0.0, ql.signals.Step(height=0.5, at=90.0)),
+        noise=ql.signals.BandLimitedNoise(power=1e-12, sample_time=0.01),
+        duration=120.0,
+        rest_at=(60.0,),
+    )
+    assert read.scenario == scenario
+    ours = ql.simulate(read.plant, read.controller, read.scenario)
+    theirs = ql.simulate(plant, ql.ADRC(observer, omega_c=1.2, learner=ql.learners.Kalman()), scenario)
+    np.testing.assert_array_equal(ours.log, theirs.log)
+    assert [ours.metrics(**window) for window in read.windows] == [theirs.metrics(60.0, 90.0), theirs.metrics(90.0)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[observer]\nomega_0 = 1.0", "observer.omega_0: unknown; did you mean omega_o?"),
+        ("[controler]\nomega_c = 1.0", "controler: unknown; did you mean controller?"),
+        ("[plant]\nmass = 1.0", "plant.mass: unknown; must be one of kind, m1, m2, k, c1, c2"),
+        ("[observer]\nkind = 'model-fre'", "observer.kind = 'model-fre': unknown; did you mean model-free?"),
+        ("learner = 'kallman'", "learner.kind = 'kallman': unknown; did you mean kalman?"),
+        ("learner = 3", "learner = 3: must be a table"),
+        ("[observer]\nomega_o = -1.0", "observer.omega_o = -1.0: must be finite and greater than zero [rad/s]"),
+        ("[observer]\norder = 4.5", "observer.order = 4.5: must be a whole number"),
+        ("[observer]\nb0 = 'one'", "observer.b0 = 'one': must be a number"),
+        ("[controller]\nfeedforward = 1", "controller.feedforward = 1: must be true or false"),
+        ("[controller]\nomega_c = true", "controller.omega_c = True: must be a number"),
+        ("[observer]\ndt = 0.01", "observer.dt: unknown; dt has its place at the top of the file"),
+        ("[controller]\nlearner = 'rls'", "controller.learner: unknown; [learner] is a table of its own"),
+        ("dt = -1.0", "dt = -1.0: must be finite and greater than zero [s]"),
+        ("[learner]\nkind = 'kalman'\nstate_bandwidth = 'x'", "learner.state_bandwidth = 'x': must be a number or a list"),
+        ("[learner]\nkind = 'rls'\nfeatures = ['state', 'inputs']", "learner.features[1].kind = 'inputs': unknown; did you mean input?"),
+        ("[learner]\nkind = 'rls'\nfeatures = ['input', 'state']", "learner.features: features: Input() must be the last"),
+        (
+            "[learner]\nkind = 'rls'\nfeatures = [{kind = 'polynomial', degree = 1}]",
+            "learner.features[0].degree = 1: must be a whole number of at least 2",
+        ),
+        ("scenario = {disturbances = [{kind = 'step', hight = 1.0}]}", "scenario.disturbances[0].hight: unknown; did you mean height?"),
+        ("scenario = {disturbances = [0.0, 0.0, 1.0]}", "scenario.disturbances has 3 signals: the plant has 2 disturbance inputs"),
+        ("scenario = {reference = {kind = 'step', until = 1.0}}", "scenario.reference: only one of until and then"),
+        ("scenario = {duration = 0.0}", "scenario.duration = 0.0: must be finite and greater than zero [s]"),
+        ("metrics = {start = 1.0}", "metrics = {'start': 1.0}: must be [[metrics]]"),
+        ("[prefilter]\nkind = 'zv'", "prefilter.omega: missing"),
+        ("[plant]\nkind = 'linear'\nnum = [1.0]", "plant: given: num; must be num and den, or A, B and C"),
+        ("[plant]\nkind = 'delayed'\nplant = 'two-mass'\ndelay = 0.015", "plant.delay = 0.015 s with dt = 0.01 s: must be a whole number"),
+        ("[controller]\nkind = 'pid'\nkp = 1.0", "observer: a controller of the kind pid has no use for it"),
+    ],
+)
+def test_a_mistake_gives_a_line_with_file_key_and_rule(text: str, message: str) -> None:
+    """Whether a table finds it, or the constructor that is called in the end."""
+    with pytest.raises(SetupError) as caught:
+        setup(text)
+    assert len(caught.value.mistakes) == 1
+    assert caught.value.mistakes[0].startswith(f"rig.toml: {message}")
+
+
+def test_several_mistakes_are_told_at_once() -> None:
+    """A line for each, in all tables."""
+    with pytest.raises(SetupError) as caught:
+        setup("[observer]\norder = 'four'\nb0 = 'one'\n[guard]\nbond = 1.0")
+    assert sorted(caught.value.mistakes) == [
+        "rig.toml: guard.bond: unknown; did you mean bound?",
+        "rig.toml: observer.b0 = 'one': must be a number",
+        "rig.toml: observer.order = 'four': must be a whole number",
+    ]
+
+
+def test_what_is_missing_is_named() -> None:
+    """A file without a plant, or an observer, can be of use; where it is not, that is said."""
+    with pytest.raises(SetupError, match="rig.toml: controller: observer is missing; give a table"):
+        setup(without=("observer",))
+    with pytest.raises(SetupError, match="rig.toml: observer: plant is missing; give a table"):
+        setup("[observer]\nkind = 'model-based'\nomega_o = 9.0", without=("plant",))
+    with pytest.raises(SetupError, match="rig.toml: scenario: missing; give a table"):
+        setup().needed("scenario")
+    assert setup(without=("plant",)).plant is None
+
+
+def test_a_file_that_is_none_is_told_apart(tmp_path: Path) -> None:
+    """Not there, or not TOML: with the place."""
+    with pytest.raises(SetupError, match=r"nowhere.toml: can't be read \(No such file or directory\)"):
+        load(tmp_path / "nowhere.toml")
+    (tmp_path / "bad.toml").write_text("dt = 0.01\n[plant\n")
+    with pytest.raises(SetupError, match=r"bad.toml: not TOML: .*at line 2"):
+        load(tmp_path / "bad.toml")
+
+
+def test_every_learner_that_numbers_suffice_for_has_a_kind() -> None:
+    """Discovered, not listed: all public ones whose parameters have defaults, and each is built from its name alone."""
+    assert set(LEARNERS) >= {"kalman", "harmonic", "nlms", "rls", "batch-gradient", "gaussian-process", "mlp"}
+    for kind, table in LEARNERS.items():
+        learner = setup(f"learner = '{kind}'").controller.learner
+        assert type(learner) is table.make
+        assert hasattr(ql.learners, type(learner).__name__)
+
+
+def test_tables_take_what_their_calls_take() -> None:
+    """Numbers, texts and lists reach the constructor under the names they have in Python."""
+    learner = setup("[learner]\nkind = 'harmonic'\ncount = 2\nomegas = [0.5, 1.5]\nlimits = [0.1, 3.0]").controller.learner
+    assert learner == ql.learners.Harmonic(count=2, omegas=(0.5, 1.5), limits=(0.1, 3.0))
+    learner = setup("[learner]\nkind = 'rls'\nfeatures = ['state', {kind = 'polynomial', degree = 2}, 'input']").controller.learner
+    assert repr(learner.features) == repr(ql.features.State() + ql.features.Polynomial(2) + ql.features.Input())
+    guarded = setup("learner = 'kalman'\nguard = {time = 5.0}\n[prefilter]\nkind = 'zvd'\nomega = 1.4").controller
+    assert guarded.prefilter == ql.baselines.ZVD(1.4)
+    assert guarded.controller.guard == ql.Guard(time=5.0)
+
+
+def test_signals_add_up_and_follow_each_other() -> None:
+    """A list is a sum, ``until`` and ``then`` are ``Signal.until``, a text is a kind, a number a constant."""
+    scenario = setup(
+        "[scenario]\nreference = [1.0, 'step', {kind = 'ramp', slope = 2.0, until = 3.0, then = {kind = 'sinusoid'}}]\n"
+        "disturbances = [['step', 0.5], 2.0]\nnoise = 'noise'"
+    ).scenario
+    shapes, t = ql.signals, np.linspace(0.0, 5.0, 51)
+    expected = 1.0 + shapes.Step() + shapes.Ramp(2.0).until(3.0, then=shapes.Sinusoid())
+    np.testing.assert_array_equal(scenario.reference(t), expected(t))
+    assert scenario.disturbances == (shapes.Step() + 0.5, 2.0)
+    assert scenario.noise == shapes.BandLimitedNoise()
+    assert set(SIGNALS) == set(shapes.KINDS)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("kind = 'pid'\nkp = 2.0\nu_max = 3.0", ql.baselines.PID),
+        ("kind = 'pid-simc'\ngain = 1.0\ntau1 = 2.0\ntheta = 0.1\nb = 0.5", ql.baselines.PID),
+        ("kind = 'pid-simc-double-integrator'\ngain = 1.0\ntheta = 0.1", ql.baselines.PID),
+        ("kind = 'notch-pid'\nkp = 1.0\nnotch = {omega = 1.4, depth = 0.05}", ql.baselines.NotchPID),
+        ("kind = 'lqg'\nomega_c = 1.0\nomega_o = 10.0\nu_max = 3.0", ql.baselines.LQG),
+        ("kind = 'resonance-ratio'\nomega_o = 10.0", ql.baselines.ResonanceRatio),
+    ],
+)
+def test_the_baselines_are_kinds_of_controllers(text: str, expected: type) -> None:
+    """Each with the options it passes on, and the file's plant where it needs one."""
+    controller = setup(f"[controller]\n{text}", without=("observer",)).controller
+    assert type(controller) is expected
+    assert controller.dt == 0.01
+
+
+def test_a_model_is_the_files_plant_or_its_own() -> None:
+    """Of a plant with friction the observer is designed for the linear part; a delay is of the loop's samples."""
+    default = setup("[observer]\nkind = 'model-based'\nomega_o = 9.0").controller.observer
+    np.testing.assert_allclose(default.a, [0.0, 0.0, 2.0, 0.0], atol=1e-12)
+    own = setup("[observer]\nkind = 'model-based'\nomega_o = 9.0\nplant = {kind = 'two-mass', k = 2.0}").controller.observer
+    np.testing.assert_allclose(own.a, [0.0, 0.0, 4.0, 0.0], atol=1e-12)
+    rough = setup("plant = 'torsional'\n[observer]\nkind = 'model-based'\nomega_o = 40.0", without=("plant",))
+    assert rough.controller.observer.order == 4
+    late = setup("[plant]\nkind = 'delayed'\ndelay = 0.03\nplant = {kind = 'two-mass', m2 = 0.5}")
+    assert late.plant.samples == 3
+    linear = setup("[plant]\nkind = 'linear'\nnum = [2.0]\nden = [1.0, 3.0, 0.0]").plant
+    assert sorted(np.linalg.eigvals(linear.A).real) == [-3.0, 0.0]
+
+
+def test_none_stands_for_no_value() -> None:
+    """TOML has no word for it: an encoder that is none, a learner that is none."""
+    assert setup("[plant]\nkind = 'torsional'\ncounts = 'none'").plant.resolution == 0.0
+    assert setup("learner = 'none'").controller.features == ()
+
+
+def test_the_page_of_all_keys_has_a_row_for_each_and_says_what_it_means() -> None:
+    """Taken from the docstrings of what is called; the summary of a simple signal says it for all of its keys."""
+    for tables in (PLANTS, OBSERVERS, FEATURES, LEARNERS, CONTROLLERS):
+        page = markdown(tables)
+        for kind, table in tables.items():
+            assert f"**`{kind}`**" in page
+            assert [key for key, *_, words in keys(table) if not words] == []
+        assert page.count("\n| `") == sum(len(keys(table)) for table in tables.values())
+    assert "| `omega_o` | number | **needed** | observer bandwidth [rad/s]" in markdown(OBSERVERS)
