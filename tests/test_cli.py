@@ -45,6 +45,7 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
 
 
+@pytest.mark.xdist_group("torsional")
 def test_the_torsional_experiment_is_printed_written_and_drawn(tmp_path: Path) -> None:
     """Tables, JSON in the study's form with one entry a pair of bandwidths, figures; without a terminal."""
     shown = quell("reproduce", "torsional", "--dt", "0.002", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)

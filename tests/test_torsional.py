@@ -11,6 +11,8 @@ from scipy.integrate import solve_ivp
 
 import quell as ql
 from quell.dispatch import compiled
+from quell.experiments import torsional as study
+from quell.experiments.claims import Claim
 from quell.plants.base import advance, measure
 
 DT = 1e-3
@@ -212,3 +214,28 @@ def test_only_a_plant_can_have_an_encoder() -> None:
         ql.plants.encoded(3, 100)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"counts = 0\.5: must be a whole number"):
         ql.plants.encoded(ql.plants.torsional_identified(), 0.5)  # type: ignore[arg-type]
+
+
+def test_a_figure_is_judged_against_anothers() -> None:
+    """At most the other's, equal is enough; where the other has none there is nothing to exceed; what was not reached does not hold."""
+    judged = [Claim.at_most("a", "best", *values).holds for values in ((1.0, 1.0), (1.1, 1.0), (1.0, None), (None, 1.0))]
+    assert judged == [True, False, True, False]
+
+
+def test_a_record_that_ends_early_has_no_score() -> None:
+    """Rather None than the figures of a part."""
+    law, course = study.controllers(study.Settings(), 20.0, 90.0)[study.MF], study.scenarios(study.Settings(), study.LINEAR)[0]
+    early = ql.simulate(study.plant(study.LINEAR), law, course, limit=1.0)
+    assert early.diverged
+    assert set(study.score(early).values()) == {None}
+
+
+def test_the_starts_lie_between_two_edges_and_follow_the_seed() -> None:
+    """Half a count to either side, both disks alike; the same seed, the same starts."""
+    starts = {seed: [course.x0 for course in study.scenarios(study.Settings(seed=seed), study.FRICTION)] for seed in (0, 1)}
+    again = [course.x0 for course in study.scenarios(study.Settings(), study.FRICTION)]
+    np.testing.assert_array_equal(starts[0], again)
+    assert np.any(np.array(starts[0]) != np.array(starts[1]))
+    for x0 in starts[0]:
+        assert abs(x0[1]) <= 0.5 * math.tau / study.COUNTS
+        assert x0[0] == x0[1]

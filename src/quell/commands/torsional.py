@@ -45,7 +45,7 @@ def reproduce_torsional(*, dt: float, seed: int, json_file: Path | None, figures
 def _print(console: Console, result: Result) -> None:
     about = f"dt = {result.settings.dt:g} s, medians of {torsional.STARTS} starts, seed {result.settings.seed}"
     for case in result.cases:
-        table = Table(title=f"omega_c/omega_o = {case.name} rad/s ({about})", title_justify="left", box=SIMPLE_HEAD)
+        table = Table(title=f"omega_c/omega_o = {case.label} rad/s ({about})", title_justify="left", box=SIMPLE_HEAD)
         table.add_column("plant", no_wrap=True)
         table.add_column("controller", no_wrap=True)
         for _, heading, _, _ in _COLUMNS:
@@ -62,9 +62,9 @@ def _print(console: Console, result: Result) -> None:
     _print_claims(console, result)
     for case in result.cases:
         for kind, outcome in case.outcomes.items():
-            for name, run in outcome.runs.items():
+            for name, run in outcome.records.items():
                 if run.diverged:
-                    console.print(f"{case.name}, {kind}, {name}: {run.message}")
+                    console.print(f"{case.label}, {kind}, {name}: {run.message}")
 
 
 def _print_claims(console: Console, result: Result) -> None:
@@ -72,7 +72,7 @@ def _print_claims(console: Console, result: Result) -> None:
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("claim")
     for case in result.cases:
-        table.add_column(case.name, justify="right", no_wrap=True)
+        table.add_column(case.label, justify="right", no_wrap=True)
     judged = [tuple(zip(*(case.outcomes[kind].claims for kind in PLANTS), strict=True)) for case in result.cases]
     for row in zip(*judged, strict=True):
         cells = [" / ".join("[green]yes[/]" if claim.holds else "[red]no[/]" for claim in pair) for pair in row]

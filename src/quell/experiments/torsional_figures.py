@@ -60,14 +60,14 @@ def _position(result: Result) -> Any:
     figure.subplots_adjust(top=0.93, hspace=0.2)
     rows = figure.subplots(len(result.cases), 3, squeeze=False)
     for case, axes in zip(result.cases, rows, strict=True):
-        runs = case.outcomes[FRICTION].runs
+        runs = case.outcomes[FRICTION].records
         for name, style in _STYLES.items():
             _line(axes[0], runs[name], "y", _MOVE, 1.0, 0.0, label=label_of(name, runs[name]), **style)
         _line(axes[0], runs[MF], "r", _MOVE, 1.0, 0.0, label="r", color="0.3", linestyle=":", linewidth=1.0)
-        axes[0].set_ylabel(f"{case.name}\nupper disk [rad]")
+        axes[0].set_ylabel(f"{case.label}\nupper disk [rad]")
         for ax, kind in zip(axes[1:], PLANTS, strict=True):
             for name, style in _STYLES.items():
-                _line(ax, case.outcomes[kind].runs[name], "y", _ARRIVAL, 100.0 / TARGET, TARGET, **style)
+                _line(ax, case.outcomes[kind].records[name], "y", _ARRIVAL, 100.0 / TARGET, TARGET, **style)
             ax.axhspan(-100.0 * BAND, 100.0 * BAND, color="0.9", zorder=0)
             ax.set_ylim(-100.0 * _NEAR * BAND, 100.0 * _NEAR * BAND)
     rows[0, 0].set_title("with friction", fontsize="medium")
@@ -87,12 +87,12 @@ def _control(result: Result) -> Any:
     rows = figure.subplots(len(result.cases), 2, squeeze=False, sharex=True, sharey="row")
     for case, axes in zip(result.cases, rows, strict=True):
         for ax, kind in zip(axes, PLANTS, strict=True):
-            runs = case.outcomes[kind].runs
+            runs = case.outcomes[kind].records
             # The quieter in front.
             for name in (MF, L, MB):
                 style = _STYLES[name] | {"linewidth": 0.7, "alpha": 0.8}
                 _line(ax, runs[name], "u", (0.0, END - PROFILE_AT), 1.0, 0.0, label=label_of(name, runs[name]), **style)
-        axes[0].set_ylabel(f"{case.name}\ncontrol signal [V]")
+        axes[0].set_ylabel(f"{case.label}\ncontrol signal [V]")
     for ax, kind in zip(rows[0], PLANTS, strict=True):
         ax.set_title(_HEADINGS[kind], fontsize="medium")
     rows[0, 0].legend(fontsize="small", loc="upper right", ncols=3)
@@ -103,7 +103,7 @@ def _control(result: Result) -> Any:
 
 def _learning(case: Case) -> Any:
     """Draw what L-ESO learned on the plant with friction, in terms of the paper's model, and how it splits up f."""
-    run = case.outcomes[FRICTION].runs[L]
+    run = case.outcomes[FRICTION].records[L]
     figure = blank(7.2)
     figure.subplots_adjust(left=0.1)
     above, below = figure.subplots(2, 1)
@@ -113,7 +113,7 @@ def _learning(case: Case) -> Any:
         draw(above, run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         above.axhline(-numbers[i], color=f"C{i}", linestyle=":", linewidth=1.2)
     above.set_ylim(-4000.0, 2000.0)
-    above.set_title(f"coefficients of L-ESO at {case.name} with friction; dotted: the identified plant's, for b0", fontsize="medium")
+    above.set_title(f"coefficients of L-ESO at {case.label} with friction; dotted: the identified plant's, for b0", fontsize="medium")
     above.set_ylabel("theta")
     for channel, label in (("f_hat", "estimate"), ("f_learned", "learned"), ("f_residual", "residual")):
         draw(below, run.t, _smooth(run[channel], run.dt * run.every), label=label, linewidth=1.0)

@@ -44,7 +44,7 @@ COUNT = 2.0 / COUNTS
 class Outcome:
     """What came out on one plant."""
 
-    runs: Mapping[str, Trajectory]
+    records: Mapping[str, Trajectory]
     """Of the first start."""
     scores: Mapping[str, Scores]
     """Medians over the starts."""
@@ -54,12 +54,12 @@ class Outcome:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries and lists; what could not be measured is None."""
-        messages = {name: run.message for name, run in self.runs.items() if run.diverged}
+        messages = {name: run.message for name, run in self.records.items() if run.diverged}
         return {
             "controllers": {name: dict(score) for name, score in self.scores.items()},
             "spread": {name: dict(spread) for name, spread in self.spread.items()},
             "claims": [asdict(claim) for claim in self.claims],
-            "ended_early": {name: {"at": self.runs[name].ended, "message": text} for name, text in messages.items()},
+            "ended_early": {name: {"at": self.records[name].ended, "message": text} for name, text in messages.items()},
         }
 
 
@@ -72,7 +72,7 @@ class Case:
     outcomes: Mapping[str, Outcome]
 
     @property
-    def name(self) -> str:
+    def label(self) -> str:
         """The pair, as in ``"20/90"``."""
         return f"{self.omega_c:g}/{self.omega_o:g}"
 
