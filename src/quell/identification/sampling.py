@@ -1,0 +1,119 @@
+"""Filters 1/A(s) and their derivatives, sampled exactly: what all of identification is calculated with.
+
+Polynomials are in ``p = s dt``, so that a sample is a unit of time and nothing depends on the user's seconds: of
+``A = p^n + a_{n−1} p^(n−1) + … + a_0`` the vector ``a`` (n,) has the coefficients in ascending powers. A *chain* is the filter bank
+``p^i/A(p)``, i = 0 … n − 1, on one signal: the states of the controllable companion form.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from quell.discretize import zero_order_hold
+from quell.dispatch import compiled
+from quell.types import Matrix, Vector
+
+
+class Sampled(NamedTuple):
+    """``x⁺ = Φ x + Γ v + Γ₁ (v⁺ − v)``: inputs that are held, or straight between samples."""
+
+    phi: Matrix
+    """Φ (n, n)."""
+    gamma: Matrix
+    """Γ (n, m)."""
+    slope: Matrix
+    """Γ₁ (n, m); zero where the inputs are held."""
+
+
+@compiled
+def _states(phi: Matrix, gamma: Matrix, slope: Matrix, v: Matrix, x: Vector, out: Matrix) -> None:
+    """Write the states at all samples of ``v`` (N, m) into ``out`` (N, n); ``x`` (n,) is the first and is used up."""
+    n, m = gamma.shape
+    last = v.shape[0] - 1
+    for k in range(v.shape[0]):
+        for i in range(n):
+            out[k, i] = x[i]
+        after = min(k + 1, last)
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += phi[i, j] * out[k, j]
+            for j in range(m):
+                total += gamma[i, j] * v[k, j] + slope[i, j] * (v[after, j] - v[k, j])
+            x[i] = total
+
+
+@compiled
+def _states_with_friction(phi: Matrix, gamma: Matrix, v: Matrix, speed: Vector, x: Vector, out: Matrix) -> None:
+    """As ``_states`` for held inputs, the last of which is written: minus the sign of the speed ``speed·x``."""
+    n, m = gamma.shape
+    for k in range(v.shape[0]):
+        rate = 0.0
+        for i in range(n):
+            out[k, i] = x[i]
+            rate += speed[i] * x[i]
+        v[k, m - 1] = -1.0 if rate > 0.0 else (1.0 if rate < 0.0 else 0.0)
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += phi[i, j] * out[k, j]
+            for j in range(m):
+                total += gamma[i, j] * v[k, j]
+            x[i] = total
+
+
+def companion(a: Vector) -> tuple[Matrix, Matrix]:
+    """Return A and B of the controllable companion form, whose states are ``p^i/A(p)`` times the input."""
+    n = a.size
+    A = np.diag(np.ones(n - 1), 1)
+    A[-1] = -a
+    return A, np.eye(n)[:, -1:]
+
+
+def observable(a: Vector) -> Matrix:
+    """Return A of the observable companion form, ``y = x_1``: a numerator in descending powers is its column of B."""
+    A = np.diag(np.ones(a.size - 1), 1)
+    A[:, 0] -= a[::-1]
+    return A
+
+
+def sampled(A: Matrix, B: Matrix, straight: bool = False) -> Sampled:
+    """Sample ``x' = A x + B v`` exactly over a unit of time, ``v`` held, or straight between its samples."""
+    n, m = B.shape
+    if not straight:
+        phi, (gamma,) = zero_order_hold(A, [B], 1.0)
+        return Sampled(phi, gamma, np.zeros((n, m)))
+    # A straight input is the state of an integrator whose own input, the slope, is held.
+    block = np.zeros((n + m, n + m))
+    block[:n, :n], block[:n, n:] = A, B
+    phi, (slope,) = zero_order_hold(block, [np.eye(n + m)[:, n:]], 1.0)
+    return Sampled(np.ascontiguousarray(phi[:n, :n]), np.ascontiguousarray(phi[:n, n:]), np.ascontiguousarray(slope[:n]))
+
+
+def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
+    """Return the states (N, n) for the inputs ``v`` (N, m), from ``x0``, zero by default."""
+    n = system.phi.shape[0]
+    out = np.empty((v.shape[0], n))
+    start = np.zeros(n) if x0 is None else np.array(x0, dtype=np.float64)
+    _states(*system, np.ascontiguousarray(v), start, out)
+    return out
+
+
+def states_with_friction(system: Sampled, v: Matrix, speed: Vector, x0: Vector) -> tuple[Matrix, Vector]:
+    """Return the states, and minus the sign of the speed ``speed·x``, which replaces the last input."""
+    out, inputs = np.empty((v.shape[0], x0.size)), np.array(v, order="C")
+    _states_with_friction(system.phi, system.gamma, inputs, np.ascontiguousarray(speed), np.array(x0, dtype=np.float64), out)
+    return out, inputs[:, -1]
+
+
+def chain(a: Vector, v: Vector, straight: bool = False) -> Matrix:
+    """Return ``p^i/A(p) v`` (N, n) at the samples, from rest."""
+    return states(sampled(*companion(a), straight), v[:, None])
+
+
+def impulse_chain(a: Vector, count: int) -> Matrix:
+    """Return ``p^i/A(p) δ`` (count, n): how y answers to what it starts with."""
+    A, B = companion(a)
+    return states(sampled(A, B), np.zeros((count, 1)), B[:, 0])

@@ -1,0 +1,91 @@
+"""Which model is fitted: its parameters, how it answers, and how that changes with them.
+
+    A(p) y = B(p) u + Σ_j F_j(p) v_j + D(p) δ(t),        A = p^q (p^(n−q) + … + a_q),   p = s dt
+
+with u held between samples, further known inputs v_j (1 for a constant force, −sign(speed) for Coulomb friction), and D for the state that
+the record starts with: ``D(p)/A(p) δ`` is the free motion from any state. The answer to held inputs is exact at the samples. With
+``ŷ = A⁻¹(B u + …)`` its derivatives are exact too, and as cheap::
+
+    ∂ŷ/∂a_i = −p^i/A ŷ,      ∂ŷ/∂b_i = p^i/A u,      ∂ŷ/∂d_i = p^i/A δ
+
+(Ljung, *System Identification*, 2nd ed. 1999, eqs. (10.52)–(10.55) has them in the shift operator.)
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from quell.identification.sampling import chain, companion, impulse_chain, observable, sampled, states
+from quell.types import Matrix, Vector
+
+
+class Structure(NamedTuple):
+    """How many parameters there are of what, in the order of the vector θ: a_q … a_{n−1}; each input's numerator; D."""
+
+    order: int
+    """n."""
+    integrators: int
+    """q, how many poles are known to lie at s = 0."""
+    degrees: tuple[int, ...]
+    """degree of the numerator of each input, that of u first."""
+
+    @property
+    def free(self) -> int:
+        """Number of free coefficients of A."""
+        return self.order - self.integrators
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.free + sum(self.degrees) + len(self.degrees) + self.order
+
+    def denominator(self, theta: Vector) -> Vector:
+        """Return a (n,), in ascending powers."""
+        a = np.zeros(self.order)
+        a[self.integrators :] = theta[: self.free]
+        return a
+
+    def numerators(self, theta: Vector) -> Matrix:
+        """Return the numerators (inputs, n), in ascending powers."""
+        found, at = np.zeros((len(self.degrees), self.order)), self.free
+        for row, degree in zip(found, self.degrees, strict=True):
+            row[: degree + 1] = theta[at : at + degree + 1]
+            at += degree + 1
+        return found
+
+    def start(self, theta: Vector) -> Vector:
+        """Return D (n,), in ascending powers."""
+        return theta[self.size - self.order :]
+
+
+def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
+    """Return the derivatives of y by all parameters but those of A, which it is linear in (N, size − free)."""
+    parts = [chain(a, v[:, j])[:, : degree + 1] for j, degree in enumerate(structure.degrees)]
+    return np.hstack([*parts, impulse_chain(a, v.shape[0])])
+
+
+def respond(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Matrix]:
+    """Return y (N,), and ``p^i/A y`` (N, n), for the inputs ``v`` (N, inputs)."""
+    n = structure.order
+    a = structure.denominator(theta)
+    A, B = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, v.shape[1]))
+    A[:n, :n] = observable(a)
+    A[n:, n:] = companion(a)[0]
+    A[-1, 0] = 1.0
+    B[:n] = structure.numerators(theta)[:, ::-1].T
+    x = states(sampled(A, B), v, np.append(structure.start(theta)[::-1], np.zeros(n)))
+    return x[:, 0], x[:, n:]
+
+
+def output(structure: Structure, theta: Vector, v: Matrix) -> Vector:
+    """Return y (N,) for the inputs ``v`` (N, inputs)."""
+    B = np.ascontiguousarray(structure.numerators(theta)[:, ::-1].T)
+    return states(sampled(observable(structure.denominator(theta)), B), v, structure.start(theta)[::-1])[:, 0]
+
+
+def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Matrix]:
+    """Return y (N,) and its derivatives by θ (N, size)."""
+    y, filtered = respond(structure, theta, v)
+    return y, np.hstack([-filtered[:, structure.integrators :], linear_columns(structure, structure.denominator(theta), v)])
