@@ -22,6 +22,10 @@ from .python_models import python_learners
 
 PLANTS: dict[str, Any] = {
     "delayed": ql.plants.delayed(ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), delay=0.02, dt=0.01),
+    "encoded": ql.plants.encoded(ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), counts=16_000),
+    "torsional": ql.plants.torsional(late=2),
+    "TorsionalPlant": ql.plants.torsional(dac_bits=None, counts=None),
+    "torsional_identified": ql.plants.torsional_identified(),
     "two_mass_spring": ql.plants.two_mass_spring(),
     "CubicSpringPlant": ql.plants.lagged_two_mass_spring(k_cubic=0.3),
     "lagged_two_mass_spring": ql.plants.lagged_two_mass_spring(),

@@ -4,8 +4,10 @@ from quell.plants.base import Plant
 from quell.plants.batch import PlantBatch, batch
 from quell.plants.cubic_spring import CubicSpringPlant, lagged_two_mass_spring
 from quell.plants.delay import delayed
+from quell.plants.encoder import encoded
 from quell.plants.linear import LinearPlant
 from quell.plants.nonlinear import NonlinearPlant
+from quell.plants.torsional import TorsionalPlant, torsional, torsional_identified
 from quell.plants.two_mass_spring import two_mass_spring
 
 __all__ = [
@@ -14,8 +16,12 @@ __all__ = [
     "NonlinearPlant",
     "Plant",
     "PlantBatch",
+    "TorsionalPlant",
     "batch",
     "delayed",
+    "encoded",
     "lagged_two_mass_spring",
+    "torsional",
+    "torsional_identified",
     "two_mass_spring",
 ]
