@@ -18,25 +18,20 @@ import math
 import numpy as np
 
 from quell.identification.sampling import chain
-from quell.identification.structure import Structure, gradient, linear_columns, output
+from quell.identification.structure import Structure, gradient, lengths, linear_columns, output
 from quell.types import Matrix, Vector
 
 _RATES = 7
 _ROUNDS = 8
+# Averages are over so much of the filter's time constant at most, and so many to a parameter at least.
+_FINE = 0.1
+_FEWEST = 100
 
 
 def started(structure: Structure, v: Matrix, y: Vector) -> Vector:
     """Return parameters near those of least output error, for the inputs ``v`` (N, inputs) and the output ``y`` (N,)."""
-    n = structure.order
-    slowest = min(10.0 / y.size, 1e-2)
-    tried = []
-    for rate in np.geomspace(slowest, 0.5, _RATES).tolist():
-        prefilter = np.array([math.comb(n, i) * rate ** (n - i) for i in range(n)])
-        known = linear_columns(structure, prefilter, v)
-        target, regressors = _equation(structure, prefilter, known, y)
-        theta = stable(structure, _solve(regressors, target))
-        tried.append((cost(structure, theta, v, y), theta))
-    best, theta = min(tried, key=lambda pair: pair[0])
+    tried = [_filtered(structure, v, y, rate) for rate in np.geomspace(min(10.0 / y.size, 1e-2), 0.5, _RATES).tolist()]
+    best, theta = min(((cost(structure, theta, v, y), theta) for theta in tried), key=lambda pair: pair[0])
     for _ in range(_ROUNDS):
         refined = stable(structure, _refined(structure, theta, v, y))
         value = cost(structure, refined, v, y)
@@ -66,6 +61,17 @@ def stable(structure: Structure, theta: Vector) -> Vector:
     return found
 
 
+def _filtered(structure: Structure, v: Matrix, y: Vector, rate: float) -> Vector:
+    """Return θ by least squares with ``Λ = (p + rate)^n``; what is slow is found in averages over several samples, which are fewer."""
+    n = structure.order
+    every = max(1, min(int(_FINE / rate), y.size // (_FEWEST * structure.size)))
+    whole = y.size // every * every
+    coarse, mean = y[:whole:every], v[:whole].reshape(-1, every, v.shape[1]).mean(axis=1)
+    prefilter = np.array([math.comb(n, i) * (every * rate) ** (n - i) for i in range(n)])
+    target, regressors = _equation(structure, prefilter, linear_columns(structure, prefilter, mean), coarse)
+    return stable(structure, _solve(regressors, target) / structure.powers(float(every)))
+
+
 def _equation(structure: Structure, prefilter: Vector, known: Matrix, y: Vector) -> tuple[Vector, Matrix]:
     """Return left and right side of the equation divided by Λ; y is taken as straight between samples."""
     filtered = chain(prefilter, y, straight=True)
@@ -81,19 +87,12 @@ def _refined(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Vecto
 
 
 def _solve(regressors: Matrix, target: Vector, instruments: Matrix | None = None) -> Vector:
-    """Solve ``Zᵀ R θ = Zᵀ target`` by the singular values of columns of length 1, so that what is not excited is left at zero."""
-    size = np.linalg.norm(regressors, axis=0)
-    size = np.where((size > 0.0) & np.isfinite(size), size, 1.0)
-    scaled = regressors / size
-    if not np.all(np.isfinite(scaled)):
-        return np.full(size.size, np.nan)
-    if instruments is None:
-        triangle = np.linalg.qr(np.column_stack([scaled, target]), mode="r")
-        left, right = triangle[:-1, :-1], triangle[:-1, -1]
-    else:
-        if not np.all(np.isfinite(instruments)):
-            return np.full(size.size, np.nan)
-        lengths = np.linalg.norm(instruments, axis=0)
-        Z = instruments / np.where(lengths > 0.0, lengths, 1.0)
-        left, right = Z.T @ scaled, Z.T @ target
-    return np.linalg.lstsq(left, right, rcond=1e-13)[0] / size
+    """Solve ``Zᵀ R θ = Zᵀ target``, Z being R itself without instruments; what is not excited is left at zero."""
+    Z = regressors if instruments is None else instruments
+    with np.errstate(all="ignore"):
+        left, right = Z.T @ regressors, Z.T @ target
+        rows, columns = lengths(Z), lengths(regressors)
+    if not (np.all(np.isfinite(left)) and np.all(np.isfinite(right)) and np.all(np.isfinite(rows)) and np.all(np.isfinite(columns))):
+        return np.full(columns.size, np.nan)
+    rows, columns = np.where(rows > 0.0, rows, 1.0), np.where(columns > 0.0, columns, 1.0)
+    return np.linalg.lstsq(left / np.outer(rows, columns), right / rows, rcond=1e-14)[0] / columns

@@ -60,6 +60,13 @@ class Structure(NamedTuple):
         return theta[self.size - self.order :]
 
 
+    def powers(self, unit: float) -> Vector:
+        """Return what each parameter is multiplied with when time is counted in units ``unit`` times as long."""
+        n = self.order
+        parts = [unit ** (n - np.arange(degree + 1.0)) for degree in self.degrees]
+        return np.concatenate([unit ** (n - np.arange(float(self.integrators), n)), *parts, unit ** (n - 1.0 - np.arange(n))])
+
+
 def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
     """Return the derivatives of y by all parameters but those of A, which it is linear in (N, size − free)."""
     parts = [chain(a, v[:, j])[:, : degree + 1] for j, degree in enumerate(structure.degrees)]
@@ -89,3 +96,8 @@ def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Ma
     """Return y (N,) and its derivatives by θ (N, size)."""
     y, filtered = respond(structure, theta, v)
     return y, np.hstack([-filtered[:, structure.integrators :], linear_columns(structure, structure.denominator(theta), v)])
+
+
+def lengths(columns: Matrix) -> Vector:
+    """Return the columns' lengths."""
+    return np.sqrt(np.einsum("ki,ki->i", columns, columns))

@@ -1,0 +1,121 @@
+"""The search as a whole: start, refinement, what rubs, how late u is, whether a pole lies at s = 0."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from quell.identification.friction import free_run, measured_sign
+from quell.identification.output_error import Refined, refined
+from quell.identification.start import started
+from quell.identification.structure import Structure
+from quell.types import Matrix, Vector
+
+# The slope of the measured output is taken over so many samples either way until there is a model.
+_HALF_WIDTH = 10
+_PASSES = 10
+# So few signs, as a share, may still change.
+_AT_REST = 1e-4
+# Steps of the search on the way, and at the end.
+_BRIEFLY, _THOROUGHLY = 4, 30
+# A pole within so many of its standard deviations of s = 0, or this much slower than the record is long, is taken for an integrator.
+_DEVIATIONS = 3.0
+_SLOWER = 10.0
+
+
+class Fit(NamedTuple):
+    """What was fitted to the samples used for it."""
+
+    structure: Structure
+    found: Refined
+    late: int
+    """By how many samples u is late."""
+    bias: bool
+    friction: bool
+
+    def inputs(self, u: Vector) -> Matrix:
+        """Return the inputs (N, inputs) for ``u``; that of friction is zero, ``free_run`` fills it in."""
+        return inputs(delayed(u, self.late), self.bias, np.zeros(u.size) if self.friction else None)
+
+
+def inputs(u: Vector, bias: bool, sign: Vector | None) -> Matrix:
+    """Return the inputs side by side: u, one, minus the sign of the speed."""
+    return np.column_stack([u, *([np.ones(u.size)] if bias else []), *([] if sign is None else [sign])])
+
+
+def delayed(u: Vector, late: int) -> Vector:
+    """Return ``u`` so many samples later; before the record it was what it is at its start."""
+    return u if late == 0 else np.concatenate([np.full(late, u[0]), u[:-late]])
+
+
+def fit(u: Vector, y: Vector, order: int, zeros: int, integrators: int | None, late: tuple[int, int], bias: bool, friction: bool) -> Fit:
+    """Return the model of least output error; ``late`` is the range of delays [samples] that is looked through."""
+    degrees = (zeros, *([0] if bias else []), *([max(order - 2, 0)] if friction else []))
+    structure = Structure(order, integrators or 0, degrees)
+    v = inputs(delayed(u, late[0]), bias, measured_sign(y, _HALF_WIDTH) if friction else None)
+    found = refined(structure, started(structure, v, y), v, y, _BRIEFLY)
+    samples, found, v = _latest(structure, found, u, v, y, late, late[0])
+    if integrators is None and order > 1 and _integrates(structure, found, y.size):
+        structure, found = structure._replace(integrators=1), found._replace(theta=found.theta[1:])
+    found, v = _settled(structure, found, v, y, friction)
+    if friction and late[0] < late[1]:
+        # Beside a wrong sign of the speed another delay may have looked best.
+        again, found, v = _latest(structure, found, u, v, y, late, samples)
+        if again != samples:
+            samples = again
+            found, v = _settled(structure, found, v, y, friction)
+    return Fit(structure, found, samples, bias, friction)
+
+
+def _settled(structure: Structure, found: Refined, v: Matrix, y: Vector, friction: bool) -> tuple[Refined, Matrix]:
+    """Return the parameters, with friction those for the sign of the speed that they themselves give, and the inputs."""
+    found = refined(structure, found.theta, v, y, _BRIEFLY if friction else _THOROUGHLY)
+    for _ in range(_PASSES if friction else 0):
+        _, own = free_run(structure, found.theta, v, own_friction=True)
+        rests = float(np.mean(own[:, -1] != v[:, -1])) <= _AT_REST
+        v = own
+        found = refined(structure, found.theta, v, y, _THOROUGHLY if rests else _BRIEFLY)
+        if rests:
+            break
+    return found, v
+
+
+def _latest(
+    structure: Structure, found: Refined, u: Vector, v: Matrix, y: Vector, late: tuple[int, int], now: int
+) -> tuple[int, Refined, Matrix]:
+    """Return the delay of least output error, found going down from ``now`` in steps of 8, 4, 2, 1; the parameters and inputs with it."""
+
+    def moved(samples: int) -> Matrix:
+        return np.column_stack([delayed(u, samples), v[:, 1:]])
+
+    known = {now: found}
+    step = min(8, late[1] - late[0])
+    while step:
+        for samples in (now + step, now - step):
+            if late[0] <= samples <= late[1] and samples not in known:
+                known[samples] = refined(structure, known[now].theta, moved(samples), y, _BRIEFLY)
+        best = min(known, key=lambda one: known[one].cost)
+        now, step = (best, step) if best != now else (now, step // 2)
+    return now, known[now], moved(now)
+
+
+def _integrates(structure: Structure, found: Refined, samples: int) -> bool:
+    """Whether the slowest pole can't be told from one at s = 0."""
+    a = structure.denominator(found.theta)
+    poles = np.roots(np.append(1.0, a[::-1]))
+    slowest = poles[np.argmin(np.abs(poles))]
+    if abs(slowest.imag) > 0.0:
+        return False
+    spread = float(np.sqrt(root_covariance(a, found.covariance[: a.size, : a.size], slowest)[0]))
+    return abs(slowest) * _SLOWER * samples < 1.0 or abs(slowest) < _DEVIATIONS * spread
+
+
+def root_covariance(a: Vector, covariance: Matrix, root: complex) -> tuple[float, float]:
+    """Return the variances of real and imaginary part of a root of ``p^n + a_{n−1} p^(n−1) + …``, from the covariance of its ``a``.
+
+    To first order ``δp = −Σ p^i δa_i / A'(p)``.
+    """
+    powers = root ** np.arange(a.size)
+    slope = -powers / np.polyval(np.polyder(np.append(1.0, a[::-1])), root)
+    return float(slope.real @ covariance @ slope.real), float(slope.imag @ covariance @ slope.imag)
