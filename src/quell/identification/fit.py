@@ -18,7 +18,7 @@ _PASSES = 10
 # So few signs, as a share, may still change.
 _AT_REST = 1e-4
 # Steps of the search on the way, and at the end.
-_BRIEFLY, _THOROUGHLY = 4, 30
+_BRIEFLY, _THOROUGHLY = 2, 30
 # A pole within so many of its standard deviations of s = 0, or this much slower than the record is long, is taken for an integrator.
 _DEVIATIONS = 3.0
 _SLOWER = 10.0

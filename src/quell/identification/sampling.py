@@ -7,7 +7,7 @@ Polynomials are in ``p = s dt``, so that a sample is a unit of time and nothing 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,6 +47,23 @@ def _states(phi: Matrix, gamma: Matrix, slope: Matrix, v: Matrix, x: Vector, out
                 total += gamma[i, j] * v[k, j] + slope[i, j] * (v[after, j] - v[k, j])
             # What has died away stays zero: processors are slow with numbers that are nearly too small.
             x[i] = total if abs(total) > _DIED_AWAY else 0.0
+
+
+@compiled
+def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Any) -> None:
+    """Write the states of one filter on several held inputs ``v`` (N, m) into ``out`` (N, n, m); ``x`` (n, m) is used up."""
+    n, m = x.shape
+    for k in range(v.shape[0]):
+        for i in range(n):
+            for c in range(m):
+                out[k, i, c] = x[i, c]
+                x[i, c] = gamma[i] * v[k, c]
+        for i in range(n):
+            for j in range(n):
+                for c in range(m):
+                    x[i, c] += phi[i, j] * out[k, j, c]
+            for c in range(m):
+                x[i, c] = x[i, c] if abs(x[i, c]) > _DIED_AWAY else 0.0
 
 
 @compiled
@@ -112,12 +129,16 @@ def states_with_friction(system: Sampled, v: Matrix, speed: Vector, x0: Vector) 
     return out, inputs[:, -1]
 
 
-def chain(a: Vector, v: Vector, straight: bool = False) -> Matrix:
-    """Return ``p^i/A(p) v`` (N, n) at the samples, from rest."""
-    return states(sampled(*companion(a), straight), v[:, None])
+def chain(a: Vector, v: Vector) -> Matrix:
+    """Return ``p^i/A(p) v`` (N, n) at the samples, from rest, for a ``v`` that is straight between them."""
+    return states(sampled(*companion(a), straight=True), v[:, None])
 
 
-def impulse_chain(a: Vector, count: int) -> Matrix:
-    """Return ``p^i/A(p) δ`` (count, n): how y answers to what it starts with."""
-    A, B = companion(a)
-    return states(sampled(A, B), np.zeros((count, 1)), B[:, 0])
+def chains(a: Vector, v: Matrix) -> Any:
+    """Return ``p^i/A(p)`` (N, n, inputs + 1) of the held inputs ``v`` (N, inputs), and of an impulse at the start, at the samples."""
+    (phi, gamma, _), count = sampled(*companion(a)), v.shape[1]
+    x = np.zeros((a.size, count + 1))
+    x[-1, -1] = 1.0
+    out = np.empty((v.shape[0], *x.shape))
+    _chains(phi, gamma[:, 0].copy(), np.column_stack([v, np.zeros(v.shape[0])]), x, out)
+    return out

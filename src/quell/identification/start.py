@@ -74,7 +74,7 @@ def _filtered(structure: Structure, v: Matrix, y: Vector, rate: float) -> Vector
 
 def _equation(structure: Structure, prefilter: Vector, known: Matrix, y: Vector) -> tuple[Vector, Matrix]:
     """Return left and right side of the equation divided by Λ; y is taken as straight between samples."""
-    filtered = chain(prefilter, y, straight=True)
+    filtered = chain(prefilter, y)
     return y - filtered @ prefilter, np.hstack([-filtered[:, structure.integrators :], known])
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.sampling import chain, companion, impulse_chain, observable, sampled, states
+from quell.identification.sampling import chains, companion, observable, sampled, states
 from quell.types import Matrix, Vector
 
 
@@ -69,8 +69,8 @@ class Structure(NamedTuple):
 
 def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
     """Return the derivatives of y by all parameters but those of A, which it is linear in (N, size − free)."""
-    parts = [chain(a, v[:, j])[:, : degree + 1] for j, degree in enumerate(structure.degrees)]
-    return np.hstack([*parts, impulse_chain(a, v.shape[0])])
+    bank = chains(a, v)
+    return np.hstack([bank[:, : degree + 1, j] for j, degree in enumerate((*structure.degrees, structure.order - 1))])
 
 
 def respond(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Matrix]:
