@@ -27,10 +27,10 @@ def frequency_response(u: Any, y: Any, dt: float, *, reference: Any = None, segm
     """Estimate the frequency response from u to y by averaged spectra, without a model.
 
     ``Ĝ = S_yu/S_uu`` over half-overlapping segments with a Hann window (Welch, *IEEE Trans. Audio Electroacoustics* 15, 1967), of the
-    differences of u and y: that leaves the ratio as it is, and an integrator's drift does not leak over all frequencies. In a closed loop it
-    is biased, as u answers to the noise in y too; with what was sent into the loop from outside it is not: ``Ĝ = S_yr/S_ur`` (Söderström &
-    Stoica, *System Identification*, 1989, sec. 10.3). Its relative variance is about ``(1 − γ²)/(2 γ² n)`` for the coherence γ² and n
-    independent averages (Bendat & Piersol, *Random Data*, 4th ed. 2010, sec. 9.2).
+    differences of u and y: that leaves the ratio as it is, and an integrator's drift does not leak over all frequencies. In a closed loop
+    it is biased, as u answers to the noise in y too; with what was sent into the loop from outside it is not: ``Ĝ = S_yr/S_ur``
+    (Söderström & Stoica, *System Identification*, 1989, sec. 10.3). Its relative variance is about ``(1 − γ²)/(2 γ² n)`` for the
+    coherence γ² and n independent averages (Bendat & Piersol, *Random Data*, 4th ed. 2010, sec. 9.2).
 
     Parameters
     ----------

@@ -90,7 +90,7 @@ class Identified:
     @property
     def t(self) -> Vector:
         """Times of the samples [s]."""
-        return np.arange(self.y.size) * self.dt
+        return np.arange(float(self.y.size)) * self.dt
 
     def response(self, omega: Any) -> Any:
         """Return the model's frequency response at ``omega`` [rad/s], delay and the hold of u included.
@@ -135,7 +135,11 @@ class Identified:
             lines += [f"Coulomb friction {self.friction:.4g} (in units of u)"]
         lines += [f"fit, {name}: {value:.3f} %" for name, value in self.fits.items()]
         left = self.residuals
-        quantum = f" ({left.rms / self.resolution * math.sqrt(12.0):.3g} times that of rounding to {self.resolution:.3g})" if self.resolution else ""
+        quantum = (
+            f" ({left.rms / self.resolution * math.sqrt(12.0):.3g} times that of rounding to {self.resolution:.3g})"
+            if self.resolution
+            else ""
+        )
         lines += [
             f"error of the simulation: RMS {left.rms:.3g}{quantum}",
             f"white: {'yes' if left.white else 'no'} (zeta = {left.whiteness:.3g}, limit {left.whiteness_limit:.3g}, {left.lags} lags)",

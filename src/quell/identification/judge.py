@@ -1,13 +1,14 @@
 """How well a model explains a record: simulation, prediction, and what is left.
 
-The fit is ``100 (1 − |y − ŷ| / |y − mean(y)|)`` in % (NRMSE). A simulation knows u and where the record begins, nothing else; friction comes
-from its own speed. A prediction k samples ahead knows y up to now: to the simulation is added what its own errors say of the error k samples
-later, a linear predictor of n + 1 terms found by least squares on the samples of the fit (Ljung 1999, sec. 3.2: an output-error
+The fit is ``100 (1 − |y − ŷ| / |y − mean(y)|)`` in % (NRMSE). A simulation knows u and where the record begins, nothing else; friction
+comes from its own speed. A prediction k samples ahead knows y up to now: to the simulation is added what its own errors say of the error
+k samples later, a linear predictor of n + 1 terms found by least squares on the samples of the fit (Ljung 1999, sec. 3.2: an output-error
 model has no noise model of its own, so it gets the simplest).
 
-What is left, ε, is judged by the two tests of Ljung 1999, sec. 16.6. *Whiteness*: ``ζ = N Σ_{τ=1}^{M} (R_ε(τ)/R_ε(0))²`` is χ² with M degrees
-of freedom where ε is white. *Independence of u*: where ε does not depend on past u, ``√N R_εu(τ)`` is normal with variance ``Σ_k R_ε(k) R_u(k)``.
-The first says whether the noise is understood, which an output-error model does not claim; the second whether the plant is.
+What is left, ε, is judged by the two tests of Ljung 1999, sec. 16.6. *Whiteness*: ``ζ = N Σ_{τ=1}^{M} (R_ε(τ)/R_ε(0))²`` is χ² with M
+degrees of freedom where ε is white. *Independence of u*: where ε does not depend on past u, ``√N R_εu(τ)`` is normal with variance ``Σ_k
+R_ε(k) R_u(k)``. The first says whether the noise is understood, which an output-error model does not claim; the second whether the plant
+is.
 """
 
 from __future__ import annotations
@@ -16,12 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.fit import Fit
 from quell.identification.friction import free_run
 from quell.identification.sampling import chains
+from quell.identification.search import Fit
 from quell.identification.structure import lengths
 from quell.types import Matrix, Vector
-
 
 _ROUNDS = 6
 
@@ -92,7 +92,8 @@ class Predictor(NamedTuple):
     def fitted(cls, error: Vector, horizon: int, terms: int) -> Predictor:
         """Return the predictor of least squares."""
         past, ahead = cls._parts(error, horizon, terms)
-        return cls(horizon, np.linalg.lstsq(past, ahead, rcond=1e-12)[0])
+        weights: Vector = np.linalg.lstsq(past, ahead, rcond=1e-12)[0]
+        return cls(horizon, weights)
 
     def fit_percent(self, y: Vector, error: Vector) -> float:
         """Return the fit of what is predicted of ``y`` whose simulation has this error."""

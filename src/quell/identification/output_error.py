@@ -4,9 +4,10 @@ With e = y − ŷ(θ) and ψ the gradient of ŷ (``structure``), a step of Leven
 
     (Σ ψ ψᵀ + μ diag(Σ ψ ψᵀ)) δθ = Σ ψ e
 
-with μ lowered after a step that helped and raised after one that did not. The estimate is the maximum of likelihood where e is white and normal; where e is coloured it is still consistent with u open
-loop (Ljung 1999, th. 8.3), but the textbook covariance is not. So that is taken from the scores ψ e themselves, summed over blocks
-that are longer than e remembers (the sandwich of Huber and White; Liang & Zeger, *Biometrika* 73, 1986)::
+with μ lowered after a step that helped and raised after one that did not. The estimate is the maximum of likelihood where e is white and
+normal; where e is coloured it is still consistent with u open loop (Ljung 1999, th. 8.3), but the textbook covariance is not. So that is
+taken from the scores ψ e themselves, summed over blocks that are longer than e remembers (the sandwich of Huber and White; Liang & Zeger,
+*Biometrika* 73, 1986)::
 
     cov θ = H⁻¹ (Σ_blocks s sᵀ) H⁻¹,     H = Σ ψ ψᵀ,  s = Σ_{k in block} ψ_k e_k
 """
@@ -51,12 +52,12 @@ def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: in
             near = _linearised(structure, theta, v, y)
         else:
             # What is left of e in the range of its gradient may be no more than rounding.
-            converged = near.right @ np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0] <= _ENOUGH * best * y.size
+            converged = bool(near.right @ np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0] <= _ENOUGH * best * y.size)
             damping = max(10.0 * damping, 1e-8)
         if converged or damping > _GIVE_UP:
             break
     half = np.linalg.pinv(near.hessian, rcond=_RANK, hermitian=True) @ near.scores.T
-    return Refined(theta, half @ half.T / np.outer(near.size, near.size), best, bool(converged or damping > _GIVE_UP))
+    return Refined(theta, half @ half.T / np.outer(near.size, near.size), best, converged or damping > _GIVE_UP)
 
 
 class _Near(NamedTuple):

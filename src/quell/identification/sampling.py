@@ -15,7 +15,7 @@ from quell.discretize import zero_order_hold
 from quell.dispatch import compiled
 from quell.types import Matrix, Vector
 
-
+# Far below what matters in any unit, far above where processors become slow.
 _DIED_AWAY = 1e-140
 
 

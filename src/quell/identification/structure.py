@@ -59,7 +59,6 @@ class Structure(NamedTuple):
         """Return D (n,), in ascending powers."""
         return theta[self.size - self.order :]
 
-
     def powers(self, unit: float) -> Vector:
         """Return what each parameter is multiplied with when time is counted in units ``unit`` times as long."""
         n = self.order

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.identification.fit import Fit, fit, root_covariance
 from quell.identification.identified import Identified, Root
 from quell.identification.judge import Predictor, nrmse, residuals, simulated
+from quell.identification.search import Fit, fit, root_covariance
 from quell.identification.structure import Structure
 from quell.parallel import one_blas_thread
 from quell.types import Matrix, Vector
@@ -60,14 +60,15 @@ def identify(
     bias
         whether a constant force acts besides u, as an offset of u does.
     friction
-        whether Coulomb friction acts. The sign of the model's own speed is then a second input, with a numerator of its own of degree n − 2.
+        whether Coulomb friction acts. The sign of the model's own speed is then a second input, with a numerator of its own of degree n −
+        2.
     held_out
         the share of the record, its end, that is not used for the fit but to judge it; 0 to 0.9.
     horizon
         how many samples ahead is predicted for the fits of prediction.
     reference
-        what was sent into the loop from outside (N,), of data from a closed loop, where it is known: the part of u that answers to it is found
-        first, and the model is fitted to that (see Notes).
+        what was sent into the loop from outside (N,), of data from a closed loop, where it is known: the part of u that answers to it is
+        found first, and the model is fitted to that (see Notes).
 
     Returns
     -------
@@ -82,8 +83,8 @@ def identify(
     Notes
     -----
     *Closed loop.* u then answers to the noise in y. The output-error fit stays free of bias as long as what is measured wrongly is white,
-    as an encoder's rounding nearly is (Ljung 1999, th. 8.3 and sec. 13.4); forces on the plant, and friction that is not modelled, are not. With
-    ``reference`` the estimate uses only what was sent in from outside.
+    as an encoder's rounding nearly is (Ljung 1999, th. 8.3 and sec. 13.4); forces on the plant, and friction that is not modelled, are
+    not. With ``reference`` the estimate uses only what was sent in from outside.
 
     Examples
     --------
@@ -215,7 +216,9 @@ def _split(u: Vector, y: Vector, order: int, zeros: int, friction: bool, held_ou
     held_from = u.size - int(share * u.size)
     least = max(_SAMPLES_A_PARAMETER * (3 * order + zeros + 2), 3 * horizon * (order + 1), 4 * late)
     if held_from < least:
-        raise ValueError(f"u has {u.size} samples, {held_from} of them for the fit: must have at least {least} for order {order}; record longer")
+        raise ValueError(
+            f"u has {u.size} samples, {held_from} of them for the fit: must have at least {least} for order {order}; record longer"
+        )
     if 0 < u.size - held_from < 3 * horizon * (order + 1):
         raise ValueError(
             f"held_out = {held_out!r}: of {u.size} samples these are {u.size - held_from}, must be at least "
