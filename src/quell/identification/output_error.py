@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.identification.start import cost
-from quell.identification.structure import Structure, gradient, lengths
+from quell.identification.structure import Structure, gradient
 from quell.types import Matrix, Vector
 
 _ENOUGH = 1e-7
@@ -74,10 +74,11 @@ class _Near(NamedTuple):
 
 def _linearised(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Near:
     predicted, psi = gradient(structure, theta, v)
-    size = lengths(psi)
-    size = np.where(size > 0.0, size, 1.0)
     error = y - predicted
+    hessian = psi.T @ psi
+    size = np.sqrt(np.diag(hessian))
+    size = np.where(size > 0.0, size, 1.0)
     blocks = min(max(4 * theta.size, 60), y.size)
     edges = np.linspace(0, y.size, blocks + 1).astype(int)
     scores = np.array([error[i:j] @ psi[i:j] for i, j in pairwise(edges)]) / size
-    return _Near(size, psi.T @ psi / np.outer(size, size), error @ psi / size, scores)
+    return _Near(size, hessian / np.outer(size, size), np.sum(scores, axis=0), scores)

@@ -67,6 +67,41 @@ def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Any) -> None:
 
 
 @compiled
+def _gradient(one: Sampled, bank: Matrix, columns: Any, both: Sampled, x: Vector, skipped: int, v: Matrix, y: Vector, out: Matrix) -> None:
+    """Write y (N,) and its derivatives ``out`` (N, size); see ``structure.gradient``.
+
+    ``one`` is the filter on each input, ``bank`` (2, n, inputs) has room for its states now and then, ``columns`` (n, inputs) says where they
+    go, below zero for nowhere; ``both`` is the model with its filter behind it, ``x`` (2, 2 n) has their states.
+    """
+    _, n, m = bank.shape
+    now, then = 0, 1
+    for k in range(v.shape[0]):
+        y[k] = x[now, 0]
+        for i in range(skipped, n):
+            out[k, i - skipped] = -x[now, n + i]
+        for i in range(n):
+            for c in range(m):
+                if columns[i, c] >= 0:
+                    out[k, columns[i, c]] = bank[now, i, c]
+        for i in range(n):
+            for c in range(m):
+                bank[then, i, c] = one.gamma[i, 0] * v[k, c]
+            for j in range(n):
+                for c in range(m):
+                    bank[then, i, c] += one.phi[i, j] * bank[now, j, c]
+            for c in range(m):
+                bank[then, i, c] = bank[then, i, c] if abs(bank[then, i, c]) > _DIED_AWAY else 0.0
+        for i in range(2 * n):
+            total = 0.0
+            for j in range(n if i < n else 2 * n):
+                total += both.phi[i, j] * x[now, j]
+            for c in range(m - 1):
+                total += both.gamma[i, c] * v[k, c]
+            x[then, i] = total if abs(total) > _DIED_AWAY else 0.0
+        now, then = then, now
+
+
+@compiled
 def _states_with_friction(phi: Matrix, gamma: Matrix, v: Matrix, speed: Vector, x: Vector, out: Matrix) -> None:
     """As ``_states`` for held inputs, the last of which is written: minus the sign of the speed ``speed·x``."""
     n, m = gamma.shape
@@ -136,9 +171,35 @@ def chain(a: Vector, v: Vector) -> Matrix:
 
 def chains(a: Vector, v: Matrix) -> Any:
     """Return ``p^i/A(p)`` (N, n, inputs + 1) of the held inputs ``v`` (N, inputs), and of an impulse at the start, at the samples."""
-    (phi, gamma, _), count = sampled(*companion(a)), v.shape[1]
-    x = np.zeros((a.size, count + 1))
-    x[-1, -1] = 1.0
-    out = np.empty((v.shape[0], *x.shape))
-    _chains(phi, gamma[:, 0].copy(), np.column_stack([v, np.zeros(v.shape[0])]), x, out)
+    one, count = sampled(*companion(a)), v.shape[1] + 1
+    out = np.empty((v.shape[0], a.size, count))
+    _chains(one.phi, one.gamma[:, 0].copy(), _with_impulse(v), _first(a.size, count), out)
     return out
+
+
+def gradient(a: Vector, B: Matrix, start: Vector, columns: Any, skipped: int, v: Matrix, size: int) -> tuple[Vector, Matrix]:
+    """Return y (N,) of a model in observable companion form, from the state ``start``, and its derivatives (N, size).
+
+    The first are ``−p^i/A y`` for i from ``skipped`` on, the others the states of ``chains`` that ``columns`` (n, inputs + 1) gives a place.
+    """
+    n = a.size
+    A, both = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, B.shape[1]))
+    A[:n, :n], A[n:, n:] = observable(a), companion(a)[0]
+    A[-1, 0] = 1.0
+    both[:n] = B
+    x, bank = np.zeros((2, 2 * n)), np.zeros((2, n, v.shape[1] + 1))
+    x[0, :n], bank[0] = start, _first(n, v.shape[1] + 1)
+    y, out = np.empty(v.shape[0]), np.empty((v.shape[0], size))
+    _gradient(sampled(*companion(a)), bank, columns, sampled(A, both), x, skipped, _with_impulse(v), y, out)
+    return y, out
+
+
+def _with_impulse(v: Matrix) -> Matrix:
+    """Return the inputs and a zero: after the start nothing is left of an impulse but the state."""
+    return np.column_stack([v, np.zeros(v.shape[0])])
+
+
+def _first(n: int, count: int) -> Matrix:
+    x = np.zeros((n, count))
+    x[-1, -1] = 1.0
+    return x

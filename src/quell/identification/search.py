@@ -14,9 +14,9 @@ from quell.types import Matrix, Vector
 
 # The slope of the measured output is taken over so many samples either way until there is a model.
 _HALF_WIDTH = 10
-_PASSES = 10
+_PASSES = 12
 # So few signs, as a share, may still change.
-_AT_REST = 1e-4
+_AT_REST = 5e-4
 # Steps of the search on the way, and at the end.
 _BRIEFLY, _THOROUGHLY = 2, 30
 # A pole within so many of its standard deviations of s = 0, or this much slower than the record is long, is taken for an integrator.
@@ -70,15 +70,13 @@ def fit(u: Vector, y: Vector, order: int, zeros: int, integrators: int | None, l
 
 def _settled(structure: Structure, found: Refined, v: Matrix, y: Vector, friction: bool) -> tuple[Refined, Matrix]:
     """Return the parameters, with friction those for the sign of the speed that they themselves give, and the inputs."""
-    found = refined(structure, found.theta, v, y, _BRIEFLY if friction else _THOROUGHLY)
     for _ in range(_PASSES if friction else 0):
-        _, own = free_run(structure, found.theta, v, own_friction=True)
-        rests = float(np.mean(own[:, -1] != v[:, -1])) <= _AT_REST
-        v = own
-        found = refined(structure, found.theta, v, y, _THOROUGHLY if rests else _BRIEFLY)
-        if rests:
+        found = refined(structure, found.theta, v, y, _BRIEFLY)
+        own = free_run(structure, found.theta, v, own_friction=True)[1]
+        moved, v = float(np.mean(own[:, -1] != v[:, -1])), own
+        if moved <= _AT_REST:
             break
-    return found, v
+    return refined(structure, found.theta, v, y, _THOROUGHLY), v
 
 
 def _latest(

@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.sampling import chains, companion, observable, sampled, states
+from quell.identification import sampling
+from quell.identification.sampling import chains, observable, sampled, states
 from quell.types import Matrix, Vector
 
 
@@ -72,19 +73,6 @@ def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
     return np.hstack([bank[:, : degree + 1, j] for j, degree in enumerate((*structure.degrees, structure.order - 1))])
 
 
-def respond(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Matrix]:
-    """Return y (N,), and ``p^i/A y`` (N, n), for the inputs ``v`` (N, inputs)."""
-    n = structure.order
-    a = structure.denominator(theta)
-    A, B = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, v.shape[1]))
-    A[:n, :n] = observable(a)
-    A[n:, n:] = companion(a)[0]
-    A[-1, 0] = 1.0
-    B[:n] = structure.numerators(theta)[:, ::-1].T
-    x = states(sampled(A, B), v, np.append(structure.start(theta)[::-1], np.zeros(n)))
-    return x[:, 0], x[:, n:]
-
-
 def output(structure: Structure, theta: Vector, v: Matrix) -> Vector:
     """Return y (N,) for the inputs ``v`` (N, inputs)."""
     B = np.ascontiguousarray(structure.numerators(theta)[:, ::-1].T)
@@ -93,8 +81,14 @@ def output(structure: Structure, theta: Vector, v: Matrix) -> Vector:
 
 def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Matrix]:
     """Return y (N,) and its derivatives by θ (N, size)."""
-    y, filtered = respond(structure, theta, v)
-    return y, np.hstack([-filtered[:, structure.integrators :], linear_columns(structure, structure.denominator(theta), v)])
+    n, degrees = structure.order, (*structure.degrees, structure.order - 1)
+    columns, at = np.full((n, len(degrees)), -1), structure.free
+    for j, degree in enumerate(degrees):
+        columns[: degree + 1, j] = np.arange(at, at + degree + 1)
+        at += degree + 1
+    B = structure.numerators(theta)[:, ::-1].T
+    a, start = structure.denominator(theta), structure.start(theta)[::-1]
+    return sampling.gradient(a, B, start, columns, structure.integrators, v, structure.size)
 
 
 def lengths(columns: Matrix) -> Vector:
