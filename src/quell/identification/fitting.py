@@ -129,7 +129,8 @@ def _judged(found: Fit, u: Vector, y: Vector, dt: float, held_from: int, horizon
         fits |= {"held out": nrmse(y[held], fresh), "held out, predicted": predictor.fit_percent(y[held], error)}
     b = numerators[0, : structure.degrees[0] + 1]
     gain = b[0] if b[0] != 0.0 else np.nan
-    rub = numerators[-1, : structure.degrees[-1] + 1] if found.friction else np.zeros(0)
+    rubs = len(structure.rubbing)
+    rubbed = numerators[-rubs:] if rubs else np.zeros((0, structure.order))
     free = structure.free
     return Identified(
         num=b[::-1].copy(),
@@ -140,8 +141,7 @@ def _judged(found: Fit, u: Vector, y: Vector, dt: float, held_from: int, horizon
         integrators=structure.integrators,
         delay=found.late * dt,
         bias=float(numerators[1, 0] / gain) if found.bias else 0.0,
-        friction=float(rub[0] / gain) if found.friction else None,
-        friction_numerator=rub[::-1].copy(),
+        friction=float(np.sum(rubbed[:, 0]) / gain) if rubs else None,
         dt=dt,
         horizon=horizon,
         fits=fits,

@@ -60,8 +60,6 @@ class Identified:
     """A constant force on the plant, in units of u; NaN where the plant does not let a constant u through."""
     friction: float | None
     """Coulomb friction, in units of u: what |u| has to overcome in slow motion; None where it was not asked for."""
-    friction_numerator: Vector
-    """Of the transfer function from −sign(speed) to y, over ``den``, descending powers; empty without friction."""
     dt: float
     """Sample time of the record [s]."""
     horizon: int
@@ -167,7 +165,6 @@ class Identified:
             "delay": self.delay,
             "bias": self.bias,
             "friction": self.friction,
-            "friction_numerator": self.friction_numerator.tolist(),
             "dt": self.dt,
             "samples": self.y.size,
             "held_from": self.held_from,

@@ -69,16 +69,16 @@ def simulated(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
     """
     structure, theta = fit.structure, fit.found.theta
     if y is None:
-        return free_run(structure, theta, v, fit.friction)[0]
+        return free_run(structure, theta, v, own_friction=True)[0]
     theta = theta.copy()
     theta[-structure.order :] = 0.0
     free = chains(structure.denominator(theta), np.zeros((y.size, 0)))[:, :, 0]
     size = lengths(free)
     predicted = free_run(structure, theta, v)[0]
     # With friction the start decides on the sign of the speed, and that on the start.
-    for _ in range(_ROUNDS if fit.friction else 1):
+    for _ in range(_ROUNDS if structure.rubbing else 1):
         theta[-structure.order :] += np.linalg.lstsq(free / size, y - predicted, rcond=1e-12)[0] / size
-        predicted = free_run(structure, theta, v, fit.friction)[0]
+        predicted = free_run(structure, theta, v, own_friction=True)[0]
     return predicted
 
 

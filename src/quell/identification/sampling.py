@@ -102,15 +102,18 @@ def _gradient(one: Sampled, bank: Matrix, columns: Any, both: Sampled, x: Vector
 
 
 @compiled
-def _states_with_friction(phi: Matrix, gamma: Matrix, v: Matrix, speed: Vector, x: Vector, out: Matrix) -> None:
-    """As ``_states`` for held inputs, the last of which is written: minus the sign of the speed ``speed·x``."""
+def _states_with_friction(phi: Matrix, gamma: Matrix, v: Matrix, speeds: Matrix, x: Vector, out: Matrix) -> None:
+    """As ``_states`` for held inputs, the last of which are written: minus the signs of ``speeds`` (frictions, n) times the state."""
     n, m = gamma.shape
+    first = m - speeds.shape[0]
     for k in range(v.shape[0]):
-        rate = 0.0
         for i in range(n):
             out[k, i] = x[i]
-            rate += speed[i] * x[i]
-        v[k, m - 1] = -1.0 if rate > 0.0 else (1.0 if rate < 0.0 else 0.0)
+        for j in range(first, m):
+            rate = 0.0
+            for i in range(n):
+                rate += speeds[j - first, i] * x[i]
+            v[k, j] = -1.0 if rate > 0.0 else (1.0 if rate < 0.0 else 0.0)
         for i in range(n):
             total = 0.0
             for j in range(n):
@@ -157,11 +160,11 @@ def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
     return out
 
 
-def states_with_friction(system: Sampled, v: Matrix, speed: Vector, x0: Vector) -> tuple[Matrix, Vector]:
-    """Return the states, and minus the sign of the speed ``speed·x``, which replaces the last input."""
+def states_with_friction(system: Sampled, v: Matrix, speeds: Matrix, x0: Vector) -> tuple[Matrix, Matrix]:
+    """Return the states and the inputs, of which the last are minus the signs of ``speeds`` (frictions, n) times the state."""
     out, inputs = np.empty((v.shape[0], x0.size)), np.array(v, order="C")
-    _states_with_friction(system.phi, system.gamma, inputs, np.ascontiguousarray(speed), np.array(x0, dtype=np.float64), out)
-    return out, inputs[:, -1]
+    _states_with_friction(system.phi, system.gamma, inputs, np.ascontiguousarray(speeds), np.array(x0, dtype=np.float64), out)
+    return out, inputs
 
 
 def chain(a: Vector, v: Vector) -> Matrix:

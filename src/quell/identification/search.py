@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.friction import free_run, measured_sign
+from quell.identification.friction import free_run, measured_sign, resonance
 from quell.identification.output_error import Refined, refined
 from quell.identification.start import started
 from quell.identification.structure import Structure
@@ -17,6 +17,8 @@ _HALF_WIDTH = 10
 _PASSES = 12
 # So few signs, as a share, may still change.
 _AT_REST = 5e-4
+# Of the resonance's square, where the driven side's own frequency is looked for: it is its inertia's share of both.
+_SHARES, _TRIALS = (0.1, 1.0), 14
 # Steps of the search on the way, and at the end.
 _BRIEFLY, _THOROUGHLY = 2, 30
 # A pole within so many of its standard deviations of s = 0, or this much slower than the record is long, is taken for an integrator.
@@ -32,16 +34,11 @@ class Fit(NamedTuple):
     late: int
     """By how many samples u is late."""
     bias: bool
-    friction: bool
 
     def inputs(self, u: Vector) -> Matrix:
-        """Return the inputs (N, inputs) for ``u``; that of friction is zero, ``free_run`` fills it in."""
-        return inputs(delayed(u, self.late), self.bias, np.zeros(u.size) if self.friction else None)
-
-
-def inputs(u: Vector, bias: bool, sign: Vector | None) -> Matrix:
-    """Return the inputs side by side: u, one, minus the sign of the speed."""
-    return np.column_stack([u, *([np.ones(u.size)] if bias else []), *([] if sign is None else [sign])])
+        """Return the inputs (N, inputs) for ``u``; those of friction are zero, ``free_run`` fills them in."""
+        columns = [delayed(u, self.late), *([np.ones(u.size)] if self.bias else []), *[np.zeros(u.size)] * len(self.structure.rubbing)]
+        return np.column_stack(columns)
 
 
 def delayed(u: Vector, late: int) -> Vector:
@@ -52,31 +49,66 @@ def delayed(u: Vector, late: int) -> Vector:
 def fit(u: Vector, y: Vector, order: int, zeros: int, integrators: int | None, late: tuple[int, int], bias: bool, friction: bool) -> Fit:
     """Return the model of least output error; ``late`` is the range of delays [samples] that is looked through."""
     degrees = (zeros, *([0] if bias else []), *([max(order - 2, 0)] if friction else []))
-    structure = Structure(order, integrators or 0, degrees)
-    v = inputs(delayed(u, late[0]), bias, measured_sign(y, _HALF_WIDTH) if friction else None)
+    structure = Structure(order, integrators or 0, degrees, (0.0,) if friction else ())
+    v = np.column_stack([delayed(u, late[0]), *([np.ones(u.size)] if bias else []), *([measured_sign(y, _HALF_WIDTH)] if friction else [])])
     found = refined(structure, started(structure, v, y), v, y, _BRIEFLY)
     samples, found, v = _latest(structure, found, u, v, y, late, late[0])
     if integrators is None and order > 1 and _integrates(structure, found, y.size):
         structure, found = structure._replace(integrators=1), found._replace(theta=found.theta[1:])
-    found, v = _settled(structure, found, v, y, friction)
+    if friction and order > 3:
+        structure, found, v = _driven(structure, found, v, y)
+    found, v = _settled(structure, found, v, y)
     if friction and late[0] < late[1]:
         # Beside a wrong sign of the speed another delay may have looked best.
         again, found, v = _latest(structure, found, u, v, y, late, samples)
         if again != samples:
             samples = again
-            found, v = _settled(structure, found, v, y, friction)
-    return Fit(structure, found, samples, bias, friction)
+            found, v = _settled(structure, found, v, y)
+    return Fit(structure, found, samples, bias)
 
 
-def _settled(structure: Structure, found: Refined, v: Matrix, y: Vector, friction: bool) -> tuple[Refined, Matrix]:
-    """Return the parameters, with friction those for the sign of the speed that they themselves give, and the inputs."""
-    for _ in range(_PASSES if friction else 0):
+def _settled(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Refined, Matrix]:
+    """Return the parameters, with friction those for the signs of the speeds that they themselves give, and the inputs."""
+    for _ in range(_PASSES if structure.rubbing else 0):
         found = refined(structure, found.theta, v, y, _BRIEFLY)
         own = free_run(structure, found.theta, v, own_friction=True)[1]
-        moved, v = float(np.mean(own[:, -1] != v[:, -1])), own
+        moved, v = float(np.mean(np.any(own != v, axis=1))), own
         if moved <= _AT_REST:
             break
     return refined(structure, found.theta, v, y, _THOROUGHLY), v
+
+
+def _driven(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Structure, Refined, Matrix]:
+    """Return the structure with friction on what is driven too, where there is a resonance to tell the two apart; parameters and inputs."""
+    from scipy.optimize import minimize_scalar
+
+    found, v = _settled_briefly(structure, found, v, y)
+    omega = resonance(structure.denominator(found.theta))
+    if omega == 0.0:
+        return structure, found, v
+    # A coefficient more, before those of friction on what is measured; what that had becomes the driven side's.
+    at = structure.free + sum(structure.degrees[:-1]) + len(structure.degrees) - 1
+    theta = np.insert(found.theta, at, found.theta[at])
+    theta[at + 1 : at + 2 + structure.degrees[-1]] = 0.0
+    wider = structure._replace(degrees=(*structure.degrees[:-1], 0, structure.degrees[-1]))
+    v = np.column_stack([v, v[:, -1]])
+    tried: list[tuple[Structure, Refined, Matrix]] = []
+
+    def error(share: float) -> float:
+        candidate = wider._replace(rubbing=(1.0 / (share * omega**2), 0.0))
+        best = min(tried, key=lambda one: one[1].cost)[1].theta if tried else theta
+        result = Refined(best, np.zeros((0, 0)), np.inf, False)
+        tried.append((candidate, *_settled_briefly(candidate, result, free_run(candidate, best, v, own_friction=True)[1], y)))
+        return float(np.log(tried[-1][1].cost))
+
+    minimize_scalar(error, bounds=_SHARES, method="bounded", options={"xatol": 5e-3, "maxiter": _TRIALS})
+    return min(tried, key=lambda one: one[1].cost)
+
+
+def _settled_briefly(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Refined, Matrix]:
+    found = refined(structure, found.theta, v, y, _BRIEFLY)
+    v = free_run(structure, found.theta, v, own_friction=True)[1]
+    return refined(structure, found.theta, v, y, _BRIEFLY), v
 
 
 def _latest(

@@ -31,6 +31,8 @@ class Structure(NamedTuple):
     """q, how many poles are known to lie at s = 0."""
     degrees: tuple[int, ...]
     """degree of the numerator of each input, that of u first."""
+    rubbing: tuple[float, ...] = ()
+    """for each of the last inputs, those of friction, what the speed is that it goes by; see ``friction``."""
 
     @property
     def free(self) -> int:
