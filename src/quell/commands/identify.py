@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from quell.commands.output import check_places, write_results
 from quell.experiments.figures import made, save_figure
@@ -93,24 +91,8 @@ def _drawn(found: Identified, folder: Path) -> list[Path]:
 def _print(console: Console, found: Identified, source: str) -> None:
     told = found.describe().splitlines()
     console.print(f"{escape(source)}: {found.y.size} samples, dt = {found.dt:g} s", soft_wrap=True)
-    console.print(escape("\n".join(told[:2])), soft_wrap=True)
-    roots = Table(title="Poles and zeros", title_justify="left", box=SIMPLE_HEAD)
-    roots.add_column("")
-    for heading in ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad/s]", "damping"):
-        roots.add_column(escape(heading), justify="right", no_wrap=True)
-    for what, which in (("pole", found.poles), ("zero", found.zeros)):
-        for root in which:
-            roots.add_row(what, *_cells(root))
-    console.print(roots)
-    fits = Table(title=f"Fit (NRMSE; predicted: {found.horizon} samples ahead)", title_justify="left", box=SIMPLE_HEAD)
-    fits.add_column("on")
-    fits.add_column("%", justify="right")
-    for name, value in found.fits.items():
-        fits.add_row(name, f"{value:.3f}")
-    console.print(fits)
-    console.print(
-        escape("\n".join(told[next(i for i, line in enumerate(told) if line.startswith("constant force")) :]).replace("\n\n", "\n"))
-    )
+    rest = told[next(i for i, line in enumerate(told) if line.startswith("constant force")) :]
+    console.print(escape("\n".join(line for line in rest if not line.startswith("fit, "))), soft_wrap=True)
 
 
 def _cells(root: Root) -> tuple[str, ...]:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.identification.closed_loop import instrumental
+from quell.identification.friction import free_run
 from quell.identification.identified import Identified, Root
 from quell.identification.judge import Predictor, nrmse, residuals, simulated
 from quell.identification.search import Fit, fit, root_covariance
@@ -14,6 +16,7 @@ from quell.identification.structure import Structure
 from quell.parallel import one_blas_thread
 from quell.types import Matrix, Vector
 
+_METHODS = ("output error, started by refined instrumental variables", "instrumental variables from the reference, started by output error")
 _LAGS = 50
 _SAMPLES_A_PARAMETER = 10
 
@@ -101,6 +104,8 @@ def identify(
     """
     u, y = checks.vector("u", u), checks.vector("y", y)
     checks.vector("y", y, u.size)
+    if reference is not None:
+        reference = checks.vector("reference", reference, u.size)
     dt = checks.positive("dt", dt, "s")
     order = checks.whole("order", order, 1, 8)
     zeros = checks.whole("zeros", zeros, 0, order - 1)
@@ -112,10 +117,14 @@ def identify(
     held_from = _split(u, y, order, zeros, friction, held_out, horizon, late[1])
     with one_blas_thread():
         found = fit(u[:held_from], y[:held_from], order, zeros, integrators, late, bias, friction)
-        return _judged(found, u, y, dt, held_from, horizon)
+        if reference is not None:
+            v = found.inputs(u[:held_from])
+            v = free_run(found.structure, found.found.theta, v, own_friction=True)[1]
+            found = found._replace(found=instrumental(found.structure, found.found.theta, v, y[:held_from], reference[:held_from]))
+        return _judged(found, u, y, reference, dt, held_from, horizon)
 
 
-def _judged(found: Fit, u: Vector, y: Vector, dt: float, held_from: int, horizon: int) -> Identified:
+def _judged(found: Fit, u: Vector, y: Vector, reference: Vector | None, dt: float, held_from: int, horizon: int) -> Identified:
     structure = found.structure
     a, numerators, covariance = _in_seconds(structure, found.found.theta, found.found.covariance, dt)
     v, fitted, held = found.inputs(u), slice(0, held_from), slice(held_from, y.size)
@@ -151,9 +160,9 @@ def _judged(found: Fit, u: Vector, y: Vector, dt: float, held_from: int, horizon
         u=u,
         y=y,
         simulated=model,
-        reference=None,
+        reference=reference,
         converged=found.found.converged,
-        method="output error, started by refined instrumental variables",
+        method=_METHODS[reference is not None],
     )
 
 
@@ -192,11 +201,11 @@ def _resolution(y: Vector) -> float:
     steps = steps[steps > 1e-9 * np.max(np.abs(y))]
     if steps.size == 0:
         return 0.0
-    least = float(np.min(steps))
+    # The mean of the smallest: a file has their last digits rounded.
+    step = float(np.mean(steps[steps < 1.5 * np.min(steps)]))
+    counts = steps[steps < 50.0 * step] / step
     # Of numbers that are not rounded the smallest difference is no measure of the others.
-    counts = steps / least
-    off = np.abs(counts - np.round(counts))
-    return least if np.all(off < 1e-3 * np.maximum(1.0, counts * 1e-3)) and np.max(counts) < 1e6 else 0.0
+    return step if counts.size > 0.01 * y.size and np.all(np.abs(counts - np.round(counts)) < 0.1) else 0.0
 
 
 def _range_of_delays(delay: Any, dt: float) -> tuple[int, int]:

@@ -2,9 +2,9 @@
 
     A y = B u + F₁ v₁ + F₂ v₂,      v₁ = −sign(speed of what is driven),   v₂ = −sign(y')
 
-Where everything turns one way the v are known, and the model stays linear in F. So they are found from the last model's own motion (at first
-v₂ from the measured one), the parameters for these v, and so on until the v rest. A model with friction that is simulated takes them
-from its own speeds. Where it stands still, a sign then changes at every sample, and its mean does what sticking does.
+Where everything turns one way the v are known, and the model stays linear in F. So they are found from the last model's own motion (at
+first v₂ from the measured one), the parameters for these v, and so on until the v rest. A model with friction that is simulated takes
+them from its own speeds. Where it stands still, a sign then changes at every sample, and its mean does what sticking does.
 
 On what is measured, friction moves y″ at once: F₂ has degree n − 2. On what is driven it enters as u does; F₁ has degree 0. Up to order 3
 the two move as one and there is v₂ alone. From order 4 on a spring may lie between. For two inertias J₁ (driven), J₂ and a spring k::

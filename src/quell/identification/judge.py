@@ -92,8 +92,7 @@ class Predictor(NamedTuple):
     def fitted(cls, error: Vector, horizon: int, terms: int) -> Predictor:
         """Return the predictor of least squares."""
         past, ahead = cls._parts(error, horizon, terms)
-        weights: Vector = np.linalg.lstsq(past, ahead, rcond=1e-12)[0]
-        return cls(horizon, weights)
+        return cls(horizon, np.asarray(np.linalg.lstsq(past, ahead, rcond=1e-12)[0], dtype=np.float64))
 
     def fit_percent(self, y: Vector, error: Vector) -> float:
         """Return the fit of what is predicted of ``y`` whose simulation has this error."""

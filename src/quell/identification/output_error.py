@@ -60,6 +60,13 @@ def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: in
     return Refined(theta, half @ half.T / np.outer(near.size, near.size), best, converged or damping > _GIVE_UP)
 
 
+def promised(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
+    """Return the mean square of the output error that one step of Gauss and Newton promises, and the parameters after it."""
+    near = _linearised(structure, theta, v, y)
+    step = np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0]
+    return max(near.error - float(near.right @ step), 0.0) / y.size, theta + step / near.size
+
+
 class _Near(NamedTuple):
     """The output error near a θ, with columns of the gradient of length 1."""
 
@@ -70,6 +77,8 @@ class _Near(NamedTuple):
     """Σ ψ e."""
     scores: Matrix
     """its sums over blocks."""
+    error: float
+    """Σ e²."""
 
 
 def _linearised(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Near:
@@ -81,4 +90,4 @@ def _linearised(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _N
     blocks = min(max(4 * theta.size, 60), y.size)
     edges = np.linspace(0, y.size, blocks + 1).astype(int)
     scores = np.array([error[i:j] @ psi[i:j] for i, j in pairwise(edges)]) / size
-    return _Near(size, hessian / np.outer(size, size), np.sum(scores, axis=0), scores)
+    return _Near(size, hessian / np.outer(size, size), np.sum(scores, axis=0), scores, float(error @ error))

@@ -70,8 +70,8 @@ def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Any) -> None:
 def _gradient(one: Sampled, bank: Matrix, columns: Any, both: Sampled, x: Vector, skipped: int, v: Matrix, y: Vector, out: Matrix) -> None:
     """Write y (N,) and its derivatives ``out`` (N, size); see ``structure.gradient``.
 
-    ``one`` is the filter on each input, ``bank`` (2, n, inputs) has room for its states now and then, ``columns`` (n, inputs) says where they
-    go, below zero for nowhere; ``both`` is the model with its filter behind it, ``x`` (2, 2 n) has their states.
+    ``one`` is the filter on each input, ``bank`` (2, n, inputs) has room for its states now and then, ``columns`` (n, inputs) says where
+    they go, below zero for nowhere; ``both`` is the model with its filter behind it, ``x`` (2, 2 n) has their states.
     """
     _, n, m = bank.shape
     now, then = 0, 1
@@ -183,7 +183,8 @@ def chains(a: Vector, v: Matrix) -> Any:
 def gradient(a: Vector, B: Matrix, start: Vector, columns: Any, skipped: int, v: Matrix, size: int) -> tuple[Vector, Matrix]:
     """Return y (N,) of a model in observable companion form, from the state ``start``, and its derivatives (N, size).
 
-    The first are ``−p^i/A y`` for i from ``skipped`` on, the others the states of ``chains`` that ``columns`` (n, inputs + 1) gives a place.
+    The first are ``−p^i/A y`` for i from ``skipped`` on, the others the states of ``chains`` that ``columns`` (n, inputs + 1) gives a
+    place.
     """
     n = a.size
     A, both = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, B.shape[1]))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.identification.friction import free_run, measured_sign, resonance
-from quell.identification.output_error import Refined, refined
+from quell.identification.output_error import Refined, promised, refined
 from quell.identification.start import started
 from quell.identification.structure import Structure
 from quell.types import Matrix, Vector
@@ -53,10 +53,12 @@ def fit(u: Vector, y: Vector, order: int, zeros: int, integrators: int | None, l
     v = np.column_stack([delayed(u, late[0]), *([np.ones(u.size)] if bias else []), *([measured_sign(y, _HALF_WIDTH)] if friction else [])])
     found = refined(structure, started(structure, v, y), v, y, _BRIEFLY)
     samples, found, v = _latest(structure, found, u, v, y, late, late[0])
-    if integrators is None and order > 1 and _integrates(structure, found, y.size):
-        structure, found = structure._replace(integrators=1), found._replace(theta=found.theta[1:])
+    if integrators is None:
+        structure, found = _with_integrator(structure, found, v, y)
     if friction and order > 3:
         structure, found, v = _driven(structure, found, v, y)
+        if integrators is None:
+            structure, found = _with_integrator(structure, found, v, y)
     found, v = _settled(structure, found, v, y)
     if friction and late[0] < late[1]:
         # Beside a wrong sign of the speed another delay may have looked best.
@@ -69,12 +71,16 @@ def fit(u: Vector, y: Vector, order: int, zeros: int, integrators: int | None, l
 
 def _settled(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Refined, Matrix]:
     """Return the parameters, with friction those for the signs of the speeds that they themselves give, and the inputs."""
+    best = (np.inf, found, v)
     for _ in range(_PASSES if structure.rubbing else 0):
-        found = refined(structure, found.theta, v, y, _BRIEFLY)
-        own = free_run(structure, found.theta, v, own_friction=True)[1]
-        moved, v = float(np.mean(np.any(own != v, axis=1))), own
-        if moved <= _AT_REST:
+        predicted, own = free_run(structure, found.theta, v, own_friction=True)
+        best = min(best, (float(np.mean((y - predicted) ** 2)), found, own), key=lambda one: one[0])
+        if np.mean(np.any(own != v, axis=1)) <= _AT_REST:
             break
+        v = own
+        found = refined(structure, found.theta, v, y, _BRIEFLY)
+    # On the way it may have been better than where it came to.
+    _, found, v = best
     return refined(structure, found.theta, v, y, _THOROUGHLY), v
 
 
@@ -82,7 +88,8 @@ def _driven(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple
     """Return the structure with friction on what is driven too, where there is a resonance to tell the two apart; parameters and inputs."""
     from scipy.optimize import minimize_scalar
 
-    found, v = _settled_briefly(structure, found, v, y)
+    v = free_run(structure, found.theta, v, own_friction=True)[1]
+    found = refined(structure, found.theta, v, y, _BRIEFLY)
     omega = resonance(structure.denominator(found.theta))
     if omega == 0.0:
         return structure, found, v
@@ -92,23 +99,20 @@ def _driven(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple
     theta[at + 1 : at + 2 + structure.degrees[-1]] = 0.0
     wider = structure._replace(degrees=(*structure.degrees[:-1], 0, structure.degrees[-1]))
     v = np.column_stack([v, v[:, -1]])
-    tried: list[tuple[Structure, Refined, Matrix]] = []
+    tried: list[tuple[float, Structure, Vector]] = []
 
     def error(share: float) -> float:
         candidate = wider._replace(rubbing=(1.0 / (share * omega**2), 0.0))
-        best = min(tried, key=lambda one: one[1].cost)[1].theta if tried else theta
-        result = Refined(best, np.zeros((0, 0)), np.inf, False)
-        tried.append((candidate, *_settled_briefly(candidate, result, free_run(candidate, best, v, own_friction=True)[1], y)))
-        return float(np.log(tried[-1][1].cost))
+        value, after = min(tried, key=lambda one: one[0])[2] if tried else theta, 0.0
+        for _ in range(2):
+            after, value = promised(candidate, value, free_run(candidate, value, v, own_friction=True)[1], y)
+        tried.append((after, candidate, value))
+        return after
 
     minimize_scalar(error, bounds=_SHARES, method="bounded", options={"xatol": 5e-3, "maxiter": _TRIALS})
-    return min(tried, key=lambda one: one[1].cost)
-
-
-def _settled_briefly(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Refined, Matrix]:
-    found = refined(structure, found.theta, v, y, _BRIEFLY)
-    v = free_run(structure, found.theta, v, own_friction=True)[1]
-    return refined(structure, found.theta, v, y, _BRIEFLY), v
+    _, wider, theta = min(tried, key=lambda one: one[0])
+    v = free_run(wider, theta, v, own_friction=True)[1]
+    return wider, refined(wider, theta, v, y, _BRIEFLY), v
 
 
 def _latest(
@@ -130,15 +134,18 @@ def _latest(
     return now, known[now], moved(now)
 
 
-def _integrates(structure: Structure, found: Refined, samples: int) -> bool:
-    """Whether the slowest pole can't be told from one at s = 0."""
+def _with_integrator(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Structure, Refined]:
+    """Return the structure with a pole at s = 0, and its parameters, where the slowest pole can't be told from that."""
+    if structure.order == 1 or structure.integrators:
+        return structure, found
     a = structure.denominator(found.theta)
     poles = np.roots(np.append(1.0, a[::-1]))
     slowest = poles[np.argmin(np.abs(poles))]
-    if abs(slowest.imag) > 0.0:
-        return False
     spread = float(np.sqrt(root_covariance(a, found.covariance[: a.size, : a.size], slowest)[0]))
-    return abs(slowest) * _SLOWER * samples < 1.0 or abs(slowest) < _DEVIATIONS * spread
+    if abs(slowest.imag) > 0.0 or not (abs(slowest) * _SLOWER * y.size < 1.0 or abs(slowest) < _DEVIATIONS * spread):
+        return structure, found
+    structure = structure._replace(integrators=1)
+    return structure, refined(structure, found.theta[1:], v, y, _BRIEFLY)
 
 
 def root_covariance(a: Vector, covariance: Matrix, root: complex) -> tuple[float, float]:

@@ -68,11 +68,11 @@ def _filtered(structure: Structure, v: Matrix, y: Vector, rate: float) -> Vector
     whole = y.size // every * every
     coarse, mean = y[:whole:every], v[:whole].reshape(-1, every, v.shape[1]).mean(axis=1)
     prefilter = np.array([math.comb(n, i) * (every * rate) ** (n - i) for i in range(n)])
-    target, regressors = _equation(structure, prefilter, linear_columns(structure, prefilter, mean), coarse)
+    target, regressors = equation(structure, prefilter, linear_columns(structure, prefilter, mean), coarse)
     return stable(structure, _solve(regressors, target) / structure.powers(float(every)))
 
 
-def _equation(structure: Structure, prefilter: Vector, known: Matrix, y: Vector) -> tuple[Vector, Matrix]:
+def equation(structure: Structure, prefilter: Vector, known: Matrix, y: Vector) -> tuple[Vector, Matrix]:
     """Return left and right side of the equation divided by Λ; y is taken as straight between samples."""
     filtered = chain(prefilter, y)
     return y - filtered @ prefilter, np.hstack([-filtered[:, structure.integrators :], known])
@@ -82,7 +82,7 @@ def _refined(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Vecto
     """Return θ after a round of refined instrumental variables."""
     with np.errstate(all="ignore"):
         _, instruments = gradient(structure, theta, v)
-        target, regressors = _equation(structure, structure.denominator(theta), instruments[:, structure.free :], y)
+        target, regressors = equation(structure, structure.denominator(theta), instruments[:, structure.free :], y)
         return _solve(regressors, target, instruments)
 
 
