@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
 from quell.commands.output import check_places, write_results
 from quell.experiments.figures import made, save_figure
@@ -91,6 +93,22 @@ def _drawn(found: Identified, folder: Path) -> list[Path]:
 def _print(console: Console, found: Identified, source: str) -> None:
     told = found.describe().splitlines()
     console.print(f"{escape(source)}: {found.y.size} samples, dt = {found.dt:g} s", soft_wrap=True)
+    console.print(escape("\n".join(told[:2])), soft_wrap=True)
+    roots = Table(title="Poles and zeros", title_justify="left", box=SIMPLE_HEAD)
+    roots.add_column("")
+    for heading in ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad/s]", "damping"):
+        roots.add_column(escape(heading), justify="right", no_wrap=True)
+    for what, which in (("pole", found.poles), ("zero", found.zeros)):
+        for root in which:
+            roots.add_row(what, *_cells(root))
+    console.print(roots)
+    fits = Table(title="Fit (NRMSE)", title_justify="left", box=SIMPLE_HEAD)
+    fits.add_column("on")
+    fits.add_column("%", justify="right")
+    for name, value in found.fits.items():
+        ahead = f" {found.horizon} samples ahead" if name.endswith("predicted") else ""
+        fits.add_row(name + ahead, f"{value:.3f}")
+    console.print(fits)
     rest = told[next(i for i, line in enumerate(told) if line.startswith("constant force")) :]
     console.print(escape("\n".join(line for line in rest if not line.startswith("fit, "))), soft_wrap=True)
 
