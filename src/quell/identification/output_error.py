@@ -26,6 +26,7 @@ from quell.types import Matrix, Vector
 _ENOUGH = 1e-7
 _GIVE_UP = 1e8
 _RANK = 1e-14
+_ROUNDING = 1e-24
 
 
 class Refined(NamedTuple):
@@ -41,9 +42,14 @@ class Refined(NamedTuple):
 
 def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: int) -> Refined:
     """Return the parameters of least output error near ``theta``, for the inputs ``v`` (N, inputs) and the output ``y`` (N,)."""
-    best, damping, converged = cost(structure, theta, v, y), 1e-4, False
+    best, damping = cost(structure, theta, v, y), 1e-4
+    # Without noise the error goes down to its own rounding, and no step is sure to make it less.
+    rounding = _ROUNDING * float(np.mean(y**2))
+    converged = best <= rounding
     near = _linearised(structure, theta, v, y)
     for _ in range(steps):
+        if converged:
+            break
         step = np.linalg.solve(near.hessian + damping * np.eye(theta.size), near.right) / near.size
         value = cost(structure, theta + step, v, y)
         if value < best:
@@ -54,10 +60,9 @@ def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: in
             # What is left of e in the range of its gradient may be no more than rounding.
             converged = bool(near.right @ np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0] <= _ENOUGH * best * y.size)
             damping = max(10.0 * damping, 1e-8)
-        if converged or damping > _GIVE_UP:
-            break
+        converged = converged or best <= rounding or damping > _GIVE_UP
     half = np.linalg.pinv(near.hessian, rcond=_RANK, hermitian=True) @ near.scores.T
-    return Refined(theta, half @ half.T / np.outer(near.size, near.size), best, converged or damping > _GIVE_UP)
+    return Refined(theta, half @ half.T / np.outer(near.size, near.size), best, converged)
 
 
 def promised(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:

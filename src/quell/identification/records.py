@@ -47,6 +47,8 @@ def read_record(path: str | os.PathLike[str], columns: Sequence[str] = ("t", "u"
     ValueError
         where the file can't be read, a column is missing, a value is no number, or the times are not even; it names line and column.
     """
+    if dt is not None:
+        checks.positive("dt", dt, "s")
     where = f"data = {os.fspath(path)!r}"
     wanted = (2, 3) if dt is not None else (3, 4)
     if len(columns) not in wanted or len(set(columns)) != len(columns):
@@ -67,7 +69,7 @@ def read_record(path: str | os.PathLike[str], columns: Sequence[str] = ("t", "u"
         dt = _sample_time(where, values[:, 0], [number for number, _ in rows])
         values = values[:, 1:]
     reference = values[:, 2].copy() if values.shape[1] > 2 else None
-    return Measured(values[:, 0].copy(), values[:, 1].copy(), checks.positive("dt", dt, "s"), reference)
+    return Measured(values[:, 0].copy(), values[:, 1].copy(), dt, reference)
 
 
 def _rows(path: Path, where: str) -> list[tuple[int, list[str]]]:
