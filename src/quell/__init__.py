@@ -17,13 +17,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quell import analysis, controllers, experiments, features, learners, metrics, observers, plants, signals
+    from quell import analysis, controllers, experiments, features, identification, learners, metrics, observers, plants, signals
     from quell.batch_record import BatchTrajectory
     from quell.controllers import baselines
     from quell.controllers.adrc import ADRC
     from quell.controllers.bandwidth import omega_c_for
     from quell.controllers.estimate import Estimate
     from quell.guard import Guard, Reason
+    from quell.identification.fitting import identify
     from quell.observers.canonical import canonical
     from quell.observers.eso import ESO
     from quell.simulation import Scenario, simulate
@@ -44,10 +45,23 @@ _HOME = {
     "Status": "quell.types",
     "Trajectory": "quell.trajectory",
     "canonical": "quell.observers.canonical",
+    "identify": "quell.identification.fitting",
     "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation",
 }
-_ROOMS = ("analysis", "baselines", "controllers", "experiments", "features", "learners", "metrics", "observers", "plants", "signals")
+_ROOMS = (
+    "analysis",
+    "baselines",
+    "controllers",
+    "experiments",
+    "features",
+    "identification",
+    "learners",
+    "metrics",
+    "observers",
+    "plants",
+    "signals",
+)
 
 __all__ = [
     "ADRC",
@@ -66,6 +80,8 @@ __all__ = [
     "controllers",
     "experiments",
     "features",
+    "identification",
+    "identify",
     "learners",
     "metrics",
     "observers",

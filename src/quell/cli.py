@@ -191,6 +191,114 @@ def compare(
     run_compare(controllers=controllers, settings=settings, json_file=json, figures=figures)
 
 
+@app.command(name="identify")
+def identify(
+    data: Path,
+    *,
+    order: Annotated[int, Parameter(converter=_whole)] = 4,
+    zeros: Annotated[int, Parameter(converter=_whole)] = 0,
+    integrators: Annotated[int | None, Parameter(converter=_whole)] = None,
+    columns: str = "",
+    dt: float | None = None,
+    delay: float = 0.0,
+    max_delay: float | None = None,
+    friction: bool = False,
+    held_out: float = 0.3,
+    horizon: Annotated[int, Parameter(converter=_whole)] = 10,
+    json: Annotated[Path | None, Parameter(name="--json")] = None,
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+) -> None:
+    """Fit a continuous transfer function to recorded input and output.
+
+    Parameters
+    ----------
+    data
+        CSV file of the record, with or without a line of names.
+    order
+        Number of poles.
+    zeros
+        Number of zeros.
+    integrators
+        How many poles lie at s = 0: by default one is put there if the slowest can't be told from it.
+    columns
+        Names or numbers (from 1 on) of the columns: t,u,y by default, or t,u,y,r with what was sent into a closed loop from outside.
+    dt
+        Sample time [s] of a record without times; columns are then u,y by default.
+    delay
+        How late u is [s].
+    max_delay
+        Look for the delay from --delay up to this [s].
+    friction
+        Find Coulomb friction along with the model.
+    held_out
+        Share of the record, its end, that the model is judged on.
+    horizon
+        How many samples ahead is predicted.
+    json
+        Write all results to this file, for programs.
+    figures
+        Put the figure into this folder, as PNG and SVG.
+    """
+    from quell.commands.identify import run_identify
+
+    run_identify(
+        data=data,
+        order=order,
+        zeros=zeros,
+        integrators=integrators,
+        columns=columns,
+        dt=dt,
+        delay=delay,
+        max_delay=max_delay,
+        friction=friction,
+        held_out=held_out,
+        horizon=horizon,
+        json_file=json,
+        figures=figures,
+    )
+
+
+@app.command(name="excite")
+def excite(
+    out: Path,
+    *,
+    kind: str = "prbs",
+    low: float = 0.5,
+    high: float = 60.0,
+    duration: float = 60.0,
+    dt: float = 1e-3,
+    u_min: float = -1.0,
+    u_max: float = 1.0,
+    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+) -> None:
+    """Design an input that excites a band within limits, for quell identify, and write it as CSV.
+
+    Parameters
+    ----------
+    out
+        CSV file to write, with columns t,u.
+    kind
+        multisine, prbs or chirp.
+    low
+        Lowest frequency of the band [rad/s].
+    high
+        Highest frequency of the band [rad/s].
+    duration
+        How long it takes [s].
+    dt
+        Sample time [s].
+    u_min
+        Lower limit of u.
+    u_max
+        Upper limit of u.
+    seed
+        Where a PRBS begins, or the phase of a multisine.
+    """
+    from quell.commands.identify import run_excite
+
+    run_excite(kind=kind, low=low, high=high, duration=duration, dt=dt, u_min=u_min, u_max=u_max, seed=seed, out=out)
+
+
 @app.command(name="rig")
 def rig(
     *,

@@ -15,14 +15,17 @@ from typing import Any
 
 from quell import checks
 from quell.signals.base import Constant, Scaled, Signal, Sum, Switched, as_signal, seeded_apart
+from quell.signals.excitation import PRBS, Multisine
 from quell.signals.noise import BandLimitedNoise
 from quell.signals.shapes import Chirp, Ramp, Samples, Sinusoid, SmoothMove, Step, Trapezoid
 
 __all__ = [
     "KINDS",
+    "PRBS",
     "BandLimitedNoise",
     "Chirp",
     "Constant",
+    "Multisine",
     "Ramp",
     "Samples",
     "Scaled",
@@ -44,6 +47,8 @@ KINDS: Mapping[str, type[Signal]] = {
     "ramp": Ramp,
     "sinusoid": Sinusoid,
     "chirp": Chirp,
+    "prbs": PRBS,
+    "multisine": Multisine,
     "trapezoid": Trapezoid,
     "move": SmoothMove,
     "samples": Samples,

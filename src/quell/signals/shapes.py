@@ -82,9 +82,10 @@ class Sinusoid(Signal):
 
 @dataclass(frozen=True)
 class Chirp(Signal):
-    """A sinusoid whose frequency moves linearly from ``omega_start`` to ``omega_end`` [rad/s] in ``duration`` [s], then stays.
+    """A sinusoid whose frequency moves from ``omega_start`` to ``omega_end`` [rad/s] in ``duration`` [s], then stays.
 
-    The phase is the integral of the frequency, so it has no jump.
+    It moves linearly, or with ``logarithmic`` by the same factor in every second: then each octave gets the same time. The phase is the
+    integral of the frequency, so it has no jump.
     """
 
     amplitude: float = 1.0
@@ -92,16 +93,32 @@ class Chirp(Signal):
     omega_end: float = 10.0
     duration: float = 10.0
     start: float = 0.0
+    logarithmic: bool = False
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        for name in ("amplitude", "omega_start", "omega_end", "start"):
+            checks.finite(name, getattr(self, name))
         checks.positive("duration", self.duration, "s")
+        if checks.flag("logarithmic", self.logarithmic):
+            checks.positive("omega_start", self.omega_start, "rad/s")
+            checks.positive("omega_end", self.omega_end, "rad/s")
+
+    def omega(self, t: Any) -> Vector:
+        """Return its frequency [rad/s] at the times ``t`` [s]."""
+        share = np.clip((np.asarray(t, dtype=np.float64) - self.start) / self.duration, 0.0, 1.0)
+        if self.logarithmic:
+            return np.asarray(self.omega_start * (self.omega_end / self.omega_start) ** share)
+        return np.asarray(self.omega_start + (self.omega_end - self.omega_start) * share)
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the chirp."""
         since = np.maximum(t - self.start, 0.0)
         sweep = np.minimum(since, self.duration)
-        phase = self.omega_start * sweep + 0.5 * (self.omega_end - self.omega_start) * sweep**2 / self.duration
+        growth = math.log(self.omega_end / self.omega_start) / self.duration if self.logarithmic else 0.0
+        if growth:
+            phase = self.omega_start * np.expm1(growth * sweep) / growth
+        else:
+            phase = self.omega_start * sweep + 0.5 * (self.omega_end - self.omega_start) * sweep**2 / self.duration
         return self.amplitude * np.sin(phase + self.omega_end * (since - sweep))
 
 

@@ -1,0 +1,143 @@
+"""Signals that excite a whole band: a pseudo-random binary sequence, a sum of sinusoids."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.signals.base import EDGE, Constant, Signal
+from quell.types import Vector
+
+# Registers whose feedback, the sum of these stages, has the longest period (Golomb, *Shift Register Sequences*, 1967).
+_TAPS = {
+    2: (2, 1), 3: (3, 2), 4: (4, 3), 5: (5, 3), 6: (6, 5), 7: (7, 6), 8: (8, 6, 5, 4), 9: (9, 5), 10: (10, 7), 11: (11, 9),
+    12: (12, 11, 10, 4), 13: (13, 12, 11, 8), 14: (14, 13, 12, 2), 15: (15, 14), 16: (16, 15, 13, 4), 17: (17, 14), 18: (18, 11),
+    19: (19, 18, 17, 14), 20: (20, 17),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PRBS(Signal):
+    """A pseudo-random binary sequence: ``±amplitude``, from a shift register of so many bits, each value held for ``step`` [s].
+
+    It repeats after ``(2^bits − 1) step`` seconds. Over a period its values correlate with 1 at lag 0, at all others with
+    ``−1/(2^bits − 1)`` (Golomb 1967): all its lines up to about ``2.8/step`` rad/s have within 3 dB the same power, and no signal has more
+    power for its peak.
+
+    Parameters
+    ----------
+    amplitude
+        half of the distance of its two values.
+    bits
+        length of the register, 2 to 20.
+    step
+        how long each value is held [s].
+    start
+        when it begins [s]; before, it is zero.
+    seed
+        where in the sequence it begins: at the value number ``seed``.
+    """
+
+    amplitude: float = 1.0
+    bits: int = 10
+    step: float = 0.05
+    start: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks.finite("amplitude", self.amplitude)
+        checks.whole("bits", self.bits, min(_TAPS), max(_TAPS))
+        checks.positive("step", self.step, "s")
+        checks.finite("start", self.start)
+        checks.whole("seed", self.seed, 0)
+
+    @property
+    def period(self) -> float:
+        """After how long it repeats [s]."""
+        return (2**self.bits - 1) * self.step
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the sequence."""
+        since = (t - self.start + EDGE) / self.step
+        which = np.floor(since).astype(np.int64) + self.seed
+        return np.where(since >= 0.0, self.amplitude * _sequence(self.bits)[which % (2**self.bits - 1)], 0.0)
+
+    def derivative(self) -> Signal:
+        """Return zero."""
+        return Constant(0.0)
+
+    def seeded(self, seed: int) -> Signal:
+        """Return the same sequence from another place on."""
+        return replace(self, seed=seed)
+
+
+@lru_cache(maxsize=4)
+def _sequence(bits: int) -> Vector:
+    """Return a period of the sequence, ±1."""
+    register, taps = [1] * bits, [tap - 1 for tap in _TAPS[bits]]
+    values = np.empty(2**bits - 1)
+    for k in range(values.size):
+        values[k] = 2.0 * register[-1] - 1.0
+        register = [sum(register[tap] for tap in taps) % 2, *register[:-1]]
+    values.flags.writeable = False
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class Multisine(Signal):
+    """A sum of sinusoids ``Σ amplitudes_k sin(omegas_k (t − start) + phases_k)``, zero before ``start`` [s].
+
+    Parameters
+    ----------
+    omegas
+        frequencies [rad/s] (lines,).
+    amplitudes
+        of each (lines,); 1 by default.
+    phases
+        of each [rad] (lines,); by default Schroeder's, which keep the peak low (``schroeder_phases``).
+    start
+        when it begins [s].
+    """
+
+    omegas: Any = (1.0, 2.0, 3.0)
+    amplitudes: Any = None
+    phases: Any = None
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        omegas = checks.positive_vector("omegas", self.omegas)
+        amplitudes = np.ones(omegas.size) if self.amplitudes is None else checks.vector("amplitudes", self.amplitudes, omegas.size)
+        phases = schroeder_phases(amplitudes) if self.phases is None else checks.vector("phases", self.phases, omegas.size)
+        for name, value in (("omegas", omegas), ("amplitudes", amplitudes), ("phases", phases)):
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        checks.finite("start", self.start)
+
+    def evaluate(self, t: Vector) -> Vector:
+        """Return the sum."""
+        since, total = t - self.start, np.zeros(t.shape)
+        for omega, amplitude, phase in zip(self.omegas.tolist(), self.amplitudes.tolist(), self.phases.tolist(), strict=True):
+            total += amplitude * np.sin(omega * since + phase)
+        return np.where(since >= -EDGE, total, 0.0)
+
+    def derivative(self) -> Signal:
+        """Return the sum of the derivatives."""
+        return Multisine(self.omegas, self.amplitudes * self.omegas, self.phases + 0.5 * math.pi, self.start)
+
+
+def schroeder_phases(amplitudes: Vector) -> Vector:
+    """Return phases (lines,) [rad] that keep the peak of a sum of sines low.
+
+    ``φ_k = π/2 − 2π Σ_{j<k} (k − j) p_j`` with the lines' shares p of the power (Schroeder, *IEEE Trans. Information Theory* 16, 1970,
+    eq. (11)): each line is given its share of the period as group delay, as a sweep would. Cosines, hence the
+    π/2, have a crest factor of 1.7, sines of 1.9.
+    """
+    share = amplitudes**2 / max(float(np.sum(amplitudes**2)), np.finfo(float).tiny)
+    delay = np.concatenate([[0.0], np.cumsum(share)[:-1]])
+    phases: Vector = np.mod(0.5 * math.pi - 2.0 * math.pi * np.cumsum(delay), 2.0 * math.pi)
+    return phases

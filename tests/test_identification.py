@@ -1,0 +1,400 @@
+"""Identification: exact where it must be, good where there is noise, friction or a loop, and plain about what it can not do."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.identification import Identified, excitation, frequency_response, read_record
+from quell.identification.search import root_covariance
+from quell.identification.structure import Structure, gradient, output
+from quell.plants.base import advance, measure
+
+from .test_cli import quell
+
+DT = 1e-3
+TESTBED = ([4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032])
+QUANTUM = 2.0 * np.pi / 16_000
+
+
+def answer(plant: Any, u: np.ndarray, dt: float, quantum: float = 0.0) -> np.ndarray:
+    """Return the output of a linear plant to held inputs, from rest, by its exact sampled matrices."""
+    model = ql.plants.LinearPlant.of(plant).sampled(dt)
+    x, y = np.zeros(model.input.size), np.empty(u.size)
+    for k, value in enumerate(u.tolist()):
+        y[k] = model.output @ x
+        x = model.transition @ x + model.input * value
+    return np.round(y / quantum) * quantum if quantum else y
+
+
+@cache
+def twin_record(band: tuple[float, float], amplitude: float, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return u and y of the twin with all its friction and quantisation, driven open loop by a PRBS for 60 s at 1 kHz."""
+    u = excitation("prbs", band, 60.0, DT, offset - amplitude, offset + amplitude).u
+    # An "observer" that is told y and answers with the design: open loop through the same compiled driver.
+    twin = ql.plants.torsional()
+    return u, _driven(twin, u)
+
+
+def _driven(twin: Any, u: np.ndarray) -> np.ndarray:
+    from quell.dispatch import compiled
+
+    global _run
+    if _run is None:
+
+        def run(model: Any, x: Any, scratch: Any, w: Any, u: Any, y: Any) -> None:
+            for k in range(u.size):
+                y[k] = measure(model, x)
+                advance(model, x, scratch, 0.0, u[k], w)
+
+        _run = compiled(run)
+    y = np.empty(u.size)
+    _run(twin.sampled(DT), np.zeros(twin.order), np.zeros(6 * twin.order), np.zeros(2), u, y)
+    return y
+
+
+_run: Any = None
+
+
+@cache
+def twin_loop() -> tuple[np.ndarray, np.ndarray]:
+    """Return u and y of the twin in a loop with an ADRC that knows no model, its reference a multisine within ±3 rad."""
+    reference = excitation("multisine", (0.3, 40.0), 60.0, DT, -3.0, 3.0).signal
+    observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=DT)
+    controller = ql.ADRC(observer, omega_c=20.0, u_min=-5.0, u_max=5.0)
+    run = ql.simulate(ql.plants.torsional(), controller, ql.Scenario(reference=reference, duration=60.0))
+    return run["u"], run["y_measured"]
+
+
+def off(found: Identified) -> np.ndarray:
+    """Return how far each pole is from the twin's that is nearest, as a share of that; from s = 0 in rad/s."""
+    truth = np.linalg.eigvals(ql.plants.torsional().linear.A)
+    poles = np.array([root.value for root in found.poles])
+    assert poles.size == truth.size
+    nearest = np.array([poles[np.argmin(np.abs(poles - p))] for p in truth])
+    return np.abs(nearest - truth) / np.where(np.abs(truth) > 1e-6, np.abs(truth), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("plant", "order", "zeros"),
+    [
+        (([3.0], [1.0, 2.0]), 1, 0),
+        (([2.0], [1.0, 0.6, 9.0]), 2, 0),
+        (([0.5, 3.0], [1.0, 1.0, 4.0]), 2, 1),
+        (([50.0], [1.0, 22.0, 40.0, 0.0]), 3, 0),
+        (([1.0, 0.4, 30.0], [1.0, 1.2, 40.0, 20.0, 100.0]), 4, 2),
+    ],
+    ids=["order 1", "resonance", "zero", "integrator", "two resonances and zeros"],
+)
+def test_without_noise_the_coefficients_are_exact(plant: Any, order: int, zeros: int) -> None:
+    """To seven digits, whatever the start; nothing is told of the integrator."""
+    u = excitation("prbs", (0.2, 30.0), 60.0, 0.01).u
+    found = ql.identify(u, answer(plant, u, 0.01), 0.01, order=order, zeros=zeros)
+    np.testing.assert_allclose(found.num, plant[0], rtol=1e-6)
+    np.testing.assert_allclose(found.den, plant[1], rtol=1e-6, atol=1e-6)
+    assert found.fits["held out"] > 99.9999
+    assert found.converged
+    assert found.integrators == int(plant[1][-1] == 0.0)
+
+
+def test_the_testbed_is_found_through_its_encoder() -> None:
+    """The paper's plant with 16000 counts a turn: what is left is the rounding of the encoder and passes for white."""
+    u = excitation("prbs", (0.2, 60.0), 60.0, DT, -1.0, 1.0).u
+    found = ql.identify(u, answer(TESTBED, u, DT, QUANTUM), DT, integrators=0)
+    poles = np.array([root.value for root in found.poles])
+    truth = np.roots(TESTBED[1])
+    for p in truth:
+        assert np.min(np.abs(poles - p)) < 1e-4 * abs(p) + 1e-6
+    assert found.residuals.rms == pytest.approx(QUANTUM / np.sqrt(12.0), rel=0.05)
+    assert found.residuals.white
+    assert found.residuals.independent
+    assert found.resolution == pytest.approx(QUANTUM, rel=1e-6)
+
+
+@pytest.mark.parametrize(("band", "amplitude"), [((0.2, 20.0), 2.0), ((0.2, 60.0), 5.0)])
+def test_the_twin_is_found_with_its_friction(band: tuple[float, float], amplitude: float) -> None:
+    """Open loop, all friction and quantisation: held-out fit ≥ 99.9 %, poles within 0.5 %, friction within 3 %."""
+    found = ql.identify(*twin_record(band, amplitude), DT, friction=True)
+    assert found.fits["held out"] > 99.9
+    assert np.max(off(found)) < 5e-3
+    assert found.integrators == 1
+    gain = 3.0 * 0.09617 * 2.0
+    assert found.friction == pytest.approx((0.01 + 0.001) / gain, rel=0.03)
+
+
+def test_the_twin_is_found_in_a_closed_loop() -> None:
+    """With an ADRC around it, and friction: held-out fit ≥ 99 %, poles within 2 %."""
+    found = ql.identify(*twin_loop(), DT, friction=True)
+    assert found.fits["held out"] > 99.0
+    assert np.max(off(found)) < 2e-2
+
+
+def test_where_it_never_turns_back_friction_is_a_constant_force() -> None:
+    """A positive u: the linear plant is exact to 1e-4 without any model of friction, and the friction is the bias."""
+    found = ql.identify(*twin_record((0.3, 60.0), 1.0, 1.5), DT)
+    assert np.max(off(found)) < 1e-4
+    assert found.fits["held out"] > 99.999
+    assert -found.bias == pytest.approx((0.01 + 0.001) / (3.0 * 0.09617 * 2.0), rel=0.02)
+
+
+def test_without_a_model_of_friction_the_slow_pole_is_wrong() -> None:
+    """Coulomb friction is taken for viscous friction: 3 % and more, where with it there is a thousandth."""
+    record = twin_record((0.2, 20.0), 2.0)
+    assert np.max(off(ql.identify(*record, DT, integrators=1))) > 0.02
+    assert np.max(off(ql.identify(*record, DT, integrators=1, friction=True))) < 2e-3
+
+
+def test_friction_of_a_single_inertia_is_found() -> None:
+    """Order 2: mass, viscous and Coulomb friction, which sticks; from a simulation of small steps."""
+    dt, fine = 0.01, 50
+    u = excitation("multisine", (0.5, 10.0), 40.0, dt, -1.0, 1.0).u
+    y, position, speed = np.empty(u.size), 0.0, 0.0
+    for k, force in enumerate(u.tolist()):
+        y[k] = position
+        for _ in range(fine):
+            after = speed + dt / fine * (5.0 * force - 0.8 * speed)
+            speed = after - np.clip(after, -dt / fine, dt / fine)  # friction of 1.0, which stops what it can
+            position += dt / fine * speed
+    found = ql.identify(u, y, dt, order=2, friction=True)
+    assert found.poles[1].value.real == pytest.approx(-0.8, rel=0.02)
+    assert found.friction == pytest.approx(0.2, rel=0.03)
+    assert found.fits["held out"] > 99.0
+
+
+@pytest.mark.parametrize("friction", [False, True])
+def test_the_delay_is_found(friction: bool) -> None:
+    """Of up to 20 samples, by itself."""
+    u, y = twin_record((0.2, 20.0), 2.0) if friction else (excitation("prbs", (0.2, 60.0), 30.0, DT).u, np.zeros(0))
+    y = y if friction else answer(TESTBED, u, DT, QUANTUM)
+    late = np.concatenate([np.zeros(7), y[:-7]])
+    found = ql.identify(u, late, DT, delay=(0.0, 0.02), friction=friction, held_out=0.2)
+    assert found.delay == pytest.approx(0.007)
+
+
+def test_the_deviations_of_poles_are_those_of_many_records() -> None:
+    """Forty records with other coloured noise: the spread of the poles is what each record says it is, within a third."""
+    plant, dt, rng = ([2.0], [1.0, 0.6, 9.0]), 0.02, np.random.default_rng(5)
+    u = excitation("prbs", (0.3, 20.0), 60.0, dt).u
+    clean = answer(plant, u, dt)
+    real, imag, told = [], [], []
+    for _ in range(40):
+        noise = np.zeros(u.size)
+        for k, value in enumerate(rng.standard_normal(u.size - 1), 1):
+            noise[k] = 0.95 * noise[k - 1] + 0.01 * value
+        found = ql.identify(u, clean + noise, dt, order=2, held_out=0.0)
+        real.append(found.poles[0].value.real)
+        imag.append(found.poles[0].value.imag)
+        told.append((found.poles[0].real_std, found.poles[0].imag_std))
+    spread = np.array([np.std(real, ddof=1), np.std(imag, ddof=1)])
+    np.testing.assert_allclose(spread, np.median(told, axis=0), rtol=0.35)
+    assert abs(np.mean(real) + 0.3) < 3.0 * spread[0] / np.sqrt(40)
+
+
+def test_a_reference_frees_a_closed_loop_of_bias() -> None:
+    """A slow strong force in the loop: output error is far off, instrumental variables from the reference are not."""
+    dt, plant = 0.01, ql.plants.LinearPlant.of(([3.0], [1.0, 0.6, 4.0]))
+    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=3.0, omega_o=15.0, dt=dt), omega_c=5.0)
+    plain, freed = [], []
+    for seed in range(3):
+        scenario = ql.Scenario(
+            reference=excitation("prbs", (0.2, 10.0), 200.0, dt, seed=seed).signal,
+            disturbances=(ql.signals.BandLimitedNoise(power=0.2, sample_time=0.3),),
+            noise=ql.signals.BandLimitedNoise(power=1e-6, sample_time=dt),
+            duration=200.0,
+            seed=seed,
+        )
+        run = ql.simulate(plant, controller, scenario)
+        record = run["u"], run["y_measured"], dt
+        plain.append(ql.identify(*record, order=2, held_out=0.0).den[1])
+        freed.append(ql.identify(*record, order=2, held_out=0.0, reference=run["r"]).den[1])
+    assert np.min(np.abs(np.array(plain) - 0.6)) > 0.3
+    assert np.mean(freed) == pytest.approx(0.6, abs=0.15)
+
+
+def test_the_gradient_is_that_of_differences() -> None:
+    """All parameters of a structure with integrator, zeros and a second input, against central differences."""
+    structure = Structure(3, 1, (1, 0))
+    theta = np.array([0.02, 0.3, 0.01, 0.2, 0.05, 0.4, -0.1, 1.0])
+    v = np.column_stack([np.sign(np.sin(0.3 * np.arange(400.0))), np.ones(400)])
+    y, psi = gradient(structure, theta, v)
+    np.testing.assert_allclose(y, output(structure, theta, v), atol=1e-12)
+    for i in range(theta.size):
+        step = np.zeros(theta.size)
+        step[i] = 1e-6
+        slope = (output(structure, theta + step, v) - output(structure, theta - step, v)) / 2e-6
+        np.testing.assert_allclose(psi[:, i], slope, atol=1e-5 * np.max(np.abs(slope)))
+
+
+def test_the_deviation_of_a_root_is_its_derivative() -> None:
+    """Of ``p² + a₁ p + a₀``: moving one coefficient by a little moves the root as the variance says."""
+    a = np.array([4.0, 0.5])
+    root = np.roots([1.0, 0.5, 4.0])[0]
+    for i in range(2):
+        moved = a.copy()
+        moved[i] += 1e-6
+        near = np.roots(np.append(1.0, moved[::-1]))
+        shift = (near[np.argmin(np.abs(near - root))] - root) / 1e-6
+        covariance = np.zeros((2, 2))
+        covariance[i, i] = 1.0
+        real, imag = root_covariance(a, covariance, root)
+        assert (np.sqrt(real), np.sqrt(imag)) == pytest.approx((abs(shift.real), abs(shift.imag)), rel=1e-4, abs=1e-8)
+
+
+def test_the_result_is_a_plant_for_an_observer() -> None:
+    """A loop designed on the identified twin, friction and all, moves it to π as one with the true model does."""
+    found = ql.identify(*twin_record((0.2, 20.0), 2.0), DT, friction=True)
+    twin = ql.plants.torsional()
+    scenario = ql.Scenario(reference=ql.signals.Trapezoid(np.pi, 2.0), duration=5.0)
+    ends = []
+    for model in (found.plant, twin.linear):
+        controller = ql.ADRC(ql.ESO.model_based(model, omega_o=90.0, dt=DT), omega_c=20.0, u_min=-5.0, u_max=5.0)
+        ends.append(ql.simulate(twin, controller, scenario)["y"])
+    assert abs(ends[0][-1] - np.pi) < 0.01
+    assert np.max(np.abs(ends[0] - ends[1])) < 0.01
+
+
+def test_the_empirical_response_is_the_plants_and_says_where_it_is_not() -> None:
+    """Nine tenths of it within 10 % of the sampled plant where the coherence is high; noise has none."""
+    u = excitation("prbs", (0.5, 60.0), 60.0, 0.005).u
+    plant = ([30.0], [1.0, 4.0, 30.0, 0.0])
+    found = ql.identify(u, answer(plant, u, 0.005), 0.005, order=3)
+    empirical = found.empirical(segments=4)
+    good = (empirical.coherence > 0.99) & (empirical.omega > 1.0) & (empirical.omega < 50.0)
+    assert np.count_nonzero(good) > 20
+    assert np.quantile(np.abs(empirical.response[good] / found.response(empirical.omega[good]) - 1.0), 0.9) < 0.1
+    noise = np.random.default_rng(1).standard_normal(u.size)
+    assert np.median(frequency_response(u, noise, 0.005).coherence) < 0.4
+
+
+def test_prediction_beats_simulation_and_both_are_told() -> None:
+    """With a force that the model does not know, ten samples ahead y is known better than from u alone."""
+    dt, rng = 0.01, np.random.default_rng(2)
+    u = excitation("prbs", (0.3, 20.0), 60.0, dt).u
+    force = np.repeat(0.3 * rng.standard_normal(u.size // 100), 100)
+    found = ql.identify(u, answer(([3.0], [1.0, 0.5, 4.0]), u + force, dt), dt, order=2)
+    assert found.fits["held out"] < found.fits["held out, predicted"] - 5.0
+    assert not found.residuals.white
+    assert "white: no" in str(found)
+
+
+def test_the_report_has_all_of_it() -> None:
+    """As text, as JSON without gaps, as a picture."""
+    found = ql.identify(*twin_record((0.2, 20.0), 2.0), DT, friction=True)
+    for part in ("G(s) =", "pole [rad/s]", "constant force", "Coulomb friction", "fit, held out:", "white:", "independent of past u"):
+        assert part in str(found)
+    told = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert told["poles"][1]["real"] == pytest.approx(found.poles[1].value.real)
+    assert set(told["fits"]) == {"estimation", "estimation, predicted", "held out", "held out, predicted"}
+    axes = found.plot()
+    assert len(axes) == 7
+    plt.close(axes[0].figure)
+    with pytest.raises(ValueError, match="axes: must be 7 matplotlib axes"):
+        found.plot([None])
+
+
+U = np.sign(np.sin(0.05 * np.arange(2000.0) ** 1.1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"u": np.append(U[:-1], np.nan)}, "u: entry (1999,) is nan"),
+        ({"y": U[:-1]}, "y has shape (1999,): must be a vector of 2000"),
+        ({"u": np.ones(2000)}, "u is 1 all through the samples for the fit: must move"),
+        ({"u": U[:60], "y": U[:60]}, "u has 60 samples, 42 of them for the fit: must have at least"),
+        ({"dt": -1.0}, "dt = -1.0: must be finite and greater than zero"),
+        ({"order": 0}, "order = 0: must be a whole number from 1 to 8"),
+        ({"zeros": 2}, "zeros = 2: must be a whole number from 0 to 1"),
+        ({"integrators": 5}, "integrators = 5: must be a whole number from 0 to 2"),
+        ({"delay": 0.0155}, "delay = 0.0155 s with dt = 0.01 s: must be a whole number of samples"),
+        ({"delay": (0.1, 0.0)}, "delay = (0.1, 0.0): the smallest comes first"),
+        ({"held_out": 0.95}, "held_out = 0.95: must be from 0 to 0.9"),
+        ({"held_out": 0.01}, "held_out = 0.01: of 2000 samples these are 20"),
+        ({"friction": 1}, "friction = 1: must be True or False"),
+        ({"reference": U[:10]}, "reference has shape (10,): must be a vector of 2000"),
+    ],
+)
+def test_a_wrong_argument_is_named(change: dict[str, Any], message: str) -> None:
+    """Argument, value and rule."""
+    arguments: dict[str, Any] = {"u": U, "y": np.cumsum(U), "dt": 0.01, "order": 2} | change
+    with pytest.raises(ValueError) as caught:
+        ql.identify(**arguments)
+    assert message in str(caught.value)
+
+
+def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
+    """Tables, JSON and a figure from a file; the same numbers as the function."""
+    u = excitation("prbs", (0.5, 30.0), 20.0, 0.01).u
+    y = answer(([2.0], [1.0, 0.6, 9.0]), u, 0.01)
+    np.savetxt(tmp_path / "data.csv", np.column_stack([np.arange(u.size) * 0.01, u, y]), delimiter=",", header="t,u,y", comments="")
+    shown = quell("identify", "data.csv", "--order", "2", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    assert all(part in shown.stdout for part in ("Poles and zeros", "Fit (NRMSE)", "white:"))
+    told = json.loads((tmp_path / "out.json").read_text())
+    assert told["den"] == pytest.approx([1.0, 0.6, 9.0], rel=1e-6)
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {"identified.png", "identified.svg"}
+    wrong = quell("identify", "data.csv", "--columns", "t,u,z", cwd=tmp_path)
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert wrong.stderr.strip() == (
+        "quell: data = 'data.csv': column z is missing; the first line names t, u, y; say which with --columns"
+    )
+    made = quell("excite", "u.csv", "--high", "30", "--dt", "0.01", "--duration", "20", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    assert "PRBS of" in made.stdout
+    assert read_record(tmp_path / "u.csv", ("t", "u", "1")).u.size == 2000
+
+
+GOOD = "\n".join(f"{0.1 * k:.1f},{k % 3},{k % 5}" for k in range(20))
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "dt", "message"),
+    [
+        ("", ("t", "u", "y"), None, "is empty"),
+        ("t,u\n" + GOOD, ("t", "u", "y"), None, "column y is missing; the first line names t, u"),
+        ("t,u,y\n0,1\n" + GOOD, ("t", "u", "y"), None, "line 2: y = '': must be a number"),
+        ("t,u,y\n" + GOOD.replace("0.5,2,0", "0.5,nan,0"), ("t", "u", "y"), None, "line 7: u = nan: must be finite"),
+        (GOOD.replace("0.5,2,0", "0.5,x,0"), ("t", "u", "y"), None, "line 6: u = 'x': must be a number"),
+        (GOOD.replace("0.5,2,0\n", ""), ("t", "u", "y"), None, "line 6: t rises by 0.2 s where samples are 0.1"),
+        (GOOD.replace("0.5,2,0", "0.55,2,0"), ("t", "u", "y"), None, "must be evenly sampled"),
+        ("0,1,2\n1,2,3", ("t", "u", "y"), None, "has 2 samples; must have at least 8"),
+        (GOOD, ("t", "u"), None, "columns = 't,u': must be t,u,y or t,u,y,r"),
+        (GOOD, ("t", "u", "y"), -0.1, "dt = -0.1"),
+        (GOOD, ("1", "2", "7"), None, "column 7 is missing; there are 3, counted from 1"),
+    ],
+)
+def test_a_record_that_is_none_is_refused_with_its_line(
+    text: str, columns: tuple[str, ...], dt: float | None, message: str, tmp_path: Path
+) -> None:
+    """File, line, column, value."""
+    (tmp_path / "data.csv").write_text(text)
+    with pytest.raises(ValueError) as caught:
+        read_record(tmp_path / "data.csv", columns, dt)
+    assert message in str(caught.value)
+
+
+def test_records_are_read_with_and_without_names_and_times(tmp_path: Path) -> None:
+    """By name in any order, by place, by number, with a sample time in place of times, with a reference."""
+    rows = np.column_stack([np.arange(20) * 0.1, np.arange(20) % 3, np.arange(20) % 5, np.arange(20) % 2])
+    plain = "\n".join(",".join(f"{value:g}" for value in row) for row in rows)
+    (tmp_path / "plain.csv").write_text(plain)
+    (tmp_path / "named.csv").write_text("# a rig\ny, u, t\n" + "\n".join(f"{row[2]:g},{row[1]:g},{row[0]:g}" for row in rows))
+    for record in (
+        read_record(tmp_path / "plain.csv"),
+        read_record(tmp_path / "named.csv"),
+        read_record(tmp_path / "plain.csv", ("2", "3"), dt=0.1),
+    ):
+        np.testing.assert_array_equal(record.u, rows[:, 1])
+        np.testing.assert_array_equal(record.y, rows[:, 2])
+        assert record.dt == pytest.approx(0.1)
+        assert record.reference is None
+    reference = read_record(tmp_path / "plain.csv", ("t", "u", "y", "r")).reference
+    assert reference is not None
+    np.testing.assert_array_equal(reference, rows[:, 3])
