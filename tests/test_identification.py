@@ -342,9 +342,7 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {"identified.png", "identified.svg"}
     wrong = quell("identify", "data.csv", "--columns", "t,u,z", cwd=tmp_path)
     assert (wrong.returncode, wrong.stdout) == (2, "")
-    assert wrong.stderr.strip() == (
-        "quell: data = 'data.csv': column z is missing; the first line names t, u, y; say which with --columns"
-    )
+    assert wrong.stderr.strip() == ("quell: data = 'data.csv': column z is missing; the first line names t, u, y; say which with --columns")
     made = quell("excite", "u.csv", "--high", "30", "--dt", "0.01", "--duration", "20", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
     assert "PRBS of" in made.stdout

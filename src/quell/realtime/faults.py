@@ -95,7 +95,7 @@ class Spoiler:
         self._faults = [fault for fault in faults if fault.towards == towards]
         self._kind = MEASUREMENT if towards == "loop" else COMMAND
         self._random = random.Random(f"{seed} {towards}")
-        self._number = 0
+        self.number = 0
         self._kept: list[bytes] = []
         self._late: list[tuple[int, bytes]] = []
         self.done: Counter[str] = Counter()
@@ -104,8 +104,8 @@ class Spoiler:
         """Return what is sent in the place of ``data``, in this order."""
         if len(data) != LENGTH or data[3] != self._kind:
             return [data]
-        number, out = self._number, [data]
-        self._number += 1
+        number, out = self.number, [data]
+        self.number += 1
         burst = False
         for fault in self._faults:
             if not fault.first <= number < fault.first + fault.count:
@@ -163,6 +163,11 @@ class Relay:
         self._bell, self._ring = socket.socketpair()
         self._thread = threading.Thread(target=self._work, name="quell-relay", daemon=True)
         self._thread.start()
+
+    @property
+    def passed(self) -> dict[str, int]:
+        """How many measurements and commands have come by, towards the loop and towards the rig."""
+        return {towards: way.number for towards, way in self._ways.items()}
 
     @property
     def done(self) -> dict[str, dict[str, int]]:
