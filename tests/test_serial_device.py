@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -48,9 +49,12 @@ class Board:
         with ThreadPoolExecutor(1) as pool:
             heard = pool.submit(self.step, "c")
             try:
-                return SerialDevice(self.url, dt, timeout=30.0)
+                device = SerialDevice(self.url, dt, timeout=30.0)
             finally:
                 heard.result()
+        with suppress(ConnectionError):  # nothing ticks yet: but what a first call compiles is there then
+            device.tick(timeout=1e-3)
+        return device
 
     def close(self):
         """End it."""
