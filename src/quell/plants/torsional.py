@@ -218,8 +218,7 @@ def torsional(
 
     Examples
     --------
-    >>> import quell as ql
-    >>> twin = ql.plants.torsional()
+    >>> twin = torsional()
     >>> twin.order, twin.u_max
     (4, 5.0)
     """
