@@ -165,42 +165,42 @@ def torsional(
     amplifier's input; the disturbances are torques on the lower and the upper disk [N m]. Output: the upper disk's angle [rad] as the
     encoder counts it.
 
-    The defaults are those of the manual or of published notes where there are some; what is left free is such that the plant without
-    Coulomb friction has the transfer function that the paper identified, but for its ``0.1032``: an integrator stands in place of a pole
-    at −5.7e-5 rad/s. The other coefficients agree to 0.01 %.
+    The defaults are published ones where there are some; what is left free is such that the plant without Coulomb friction has the
+    transfer function that the paper identified, but for its ``0.1032``: an integrator stands in place of a pole at −5.7e-5 rad/s. The
+    other coefficients agree to 0.01 %.
 
     Parameters
     ----------
     lower_inertia
-        of the lower disk [kg m²]: the bare disk, 0.0019 [1]_, and four brass weights of 0.5 kg and 5 cm at 9 cm from the axis [2]_.
+        of the lower disk [kg m²]: the bare disk, as the upper one, and four weights of 0.5 kg and 5 cm across at 9 cm from the axis [1]_.
     upper_inertia
-        of the upper disk [kg m²]: bare [1]_.
+        of the upper disk [kg m²]: 0.0103 with two such weights [2]_, less the weights.
     motor_inertia
-        of the motor and what turns with it [kg m²]: published as 0.0005 at the disk [2]_, so less by ``belt²``.
+        of the motor and what turns with it [kg m²]: 0.0005 at the disk [1]_, so less by ``belt²``.
     belt
         speed reduction N from the motor to the lower disk: 3 (paper, section V; [1]_).
     stiffness
-        of the shaft between the disks [N m/rad]; adjustable on the plant, 2.7 to 2.8 published for one of its two lengths [1]_. Here 4 %
-        more, which puts the resonance where the paper has it.
+        of the shaft between the disks [N m/rad]: 1.37 for its whole length [2]_, twice that for half of it, where a disk may be put too
+        [1]_. Here 6 % more than twice, which puts the resonance where the paper has it.
     shaft_damping
-        d [N m s/rad]: none in the manual's models; assumed zero.
+        d [N m s/rad]: none in the published models; assumed zero.
     lower_viscous, upper_viscous
-        viscous friction of the disks [N m s/rad]; published 0.007 and 0.001 [3]_. These are what the paper's transfer function has in
-        it: the upper one is like the published, the lower one three times as large (identification takes some Coulomb friction for
-        viscous).
+        viscous friction of the disks [N m s/rad]: published 0.007 and 0.001 [2]_. These are what the paper's transfer function has in
+        it: the upper one half as much again as the published, the lower one three times as large (identification takes some Coulomb
+        friction for viscous).
     lower_coulomb, upper_coulomb
-        their Coulomb friction [N m]: assumed. The notes say that friction rules free swings of less than 0.04 rad [2]_; 0.01 is a tenth
-        of the spring's torque there, and the upper disk, on its bearings alone, is given a tenth of that.
+        their Coulomb friction [N m]: assumed. Friction is said to rule free swings of less than 0.04 rad [1]_; 0.01 is a tenth of the
+        spring's torque there, and the upper disk, on its bearings alone, is given a tenth of that.
     torque_constant
-        of the motor k_t [N m/A]: about 0.1 [1]_ [2]_; here such as to give the paper's gain.
+        of the motor k_t [N m/A]: about 0.1 [1]_; here such as to give the paper's gain.
     amplifier
-        its gain k_a [A/V]: about 2 [1]_ [2]_.
+        its gain k_a [A/V]: about 2 [1]_.
     current_limit
         of the amplifier [A]: assumed.
     dac_bits
         of the converter, over ±10 V: 16 (NI PCI-6221 data sheet); None for no rounding, as of a sampled u that is a number.
     counts
-        of the encoder a turn: 16000 [1]_ [2]_; None for the angle itself.
+        of the encoder a turn: 16000 [1]_; None for the angle itself.
     late
         how many samples after it is sent u arrives: assumed 0, as where the computer answers within the sample.
 
@@ -212,16 +212,15 @@ def torsional(
 
     References
     ----------
-    .. [1] ECP, *Manual for Model 205/205a Torsional Control System*, sections 5 and 6.
-    .. [2] A university's laboratory notes on the plant, Experiment 4: hardware gains, weights, drive inertia.
-    .. [3] Course work on the plant in a public repository (ELEC 481): J, c and k of the manual's plant 2.
+    .. [1] *Torsional Pendulum*, laboratory manual for the ECP Model 205a in a public repository: weights, inertia of the drive, "hardware
+       gains" as in the maker's manual, range of amplitudes.
+    .. [2] Course work on the Model 205a (ELEC 481, tasks 1 to 3) in a public repository: J, c and k of two disks with two weights each.
 
     Examples
     --------
-    >>> import quell as ql
-    >>> twin = ql.plants.torsional()
-    >>> [round(p, 2) for p in sorted(abs(__import__("numpy").linalg.eigvals(twin.linear.A)))]
-    [0.0, 1.08, 41.01, 41.01]
+    >>> twin = torsional()
+    >>> twin.order, twin.u_max
+    (4, 5.0)
     """
     positive = {
         "lower_inertia": (lower_inertia, "kg m²"),
