@@ -36,7 +36,7 @@ class Ticking(NamedTuple):
     late: Any
     """How much later the k-th comes [ns]; one that is never sent comes after all others."""
     seen: Any
-    """Number of the last one fetched (1,)."""
+    """Number of the last one fetched, and the greatest age of one when it was fetched, but for the first thousand [ns] (2,)."""
 
 
 @fetch.register(Ticking)
@@ -45,6 +45,8 @@ def _fetch(line: Ticking, clock: Any, until: int) -> tuple[float, int]:
     newest = _newest(line, begin)
     if newest > line.seen[0]:
         line.seen[0] = newest
+        if newest > 1000:
+            line.seen[1] = max(line.seen[1], begin - int(newest * line.period))
         return float(newest), 0
     for k in range(int(line.seen[0]) + 1, int(until / line.period) + 1):
         comes = int(k * line.period) + int(line.late[min(k, line.late.size - 1)])
@@ -76,7 +78,7 @@ class TickingDevice:
         delays = np.zeros(samples, dtype=np.int64)
         for k, value in (late or {}).items():
             delays[k] = value
-        self.line = Ticking(period, delays, np.full(1, -1, dtype=np.int64))
+        self.line = Ticking(period, delays, np.array([-1, 0]))
 
     def read(self) -> float:
         """Not used."""
@@ -108,8 +110,10 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
 
 @pytest.mark.parametrize("drift", [-50e-6, 0.0, 50e-6, 1e-3])
 def test_the_grid_follows_a_devices_clock(drift: float) -> None:
-    """Whether it is as quick as the loop's or not: each cycle gets the next tick, none twice, none left out."""
-    found, loop = ticks(TickingDevice(SAMPLE * (1.0 + drift)), 100.0)
+    """Whether it is as quick as the loop's or not: each cycle gets the next tick, none twice, none left out, none old."""
+    device = TickingDevice(SAMPLE * (1.0 + drift))
+    found, loop = ticks(device, 100.0)
+    assert device.line.seen[1] <= SAMPLE // 5_000
     y = found[:, LOOP_WIDTH - 2]
     np.testing.assert_array_equal(np.diff(y), 1.0)
     assert len(y) > 10_000
@@ -173,6 +177,11 @@ def test_it_takes_over_without_a_bump() -> None:
     free = ql.plants.LinearPlant([[0.0, 1.0], [0.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
     u = run(ScriptedDevice(free, x0=[0.4, 0.0]), reference=1.0, approach=2.0, settle=50)["U"]
     assert np.all(np.abs(np.diff(u)[:60]) < 0.02)
+    # Where the plant does not rest, the controller would rather have done something already.
+    moving = run(ScriptedDevice(PLANT, x0=[0.4, 0.0]), approach=2.0, settle=20)
+    assert abs(moving["U"][20]) < 0.05
+    wish = (moving.rows[19, 11] + moving.rows[19, 12]) / 1.5
+    assert abs(wish) > 0.3
     jumps = run(ScriptedDevice(free, x0=[0.4, 0.0]), reference=1.0, approach=0.0, settle=50)["U"]
     assert np.max(np.abs(np.diff(jumps))) > 0.5
 
