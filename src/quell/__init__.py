@@ -17,7 +17,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quell import analysis, controllers, experiments, features, learners, metrics, observers, plants, signals
+    from quell import analysis, controllers, experiments, features, learners, metrics, observers, plants, setup, signals
     from quell.batch_record import BatchTrajectory
     from quell.controllers import baselines
     from quell.controllers.adrc import ADRC
@@ -47,7 +47,19 @@ _HOME = {
     "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation",
 }
-_ROOMS = ("analysis", "baselines", "controllers", "experiments", "features", "learners", "metrics", "observers", "plants", "signals")
+_ROOMS = (
+    "analysis",
+    "baselines",
+    "controllers",
+    "experiments",
+    "features",
+    "learners",
+    "metrics",
+    "observers",
+    "plants",
+    "setup",
+    "signals",
+)
 
 __all__ = [
     "ADRC",
@@ -71,6 +83,7 @@ __all__ = [
     "observers",
     "omega_c_for",
     "plants",
+    "setup",
     "signals",
     "simulate",
 ]

@@ -60,7 +60,7 @@ def run_setup(
     files = [*map(Path, arguments.pop("telemetry", ())), *telemetry]
     for file in files:
         check_new(file)
-    sinks = [*files, *([] if port is None else [LiveSink(port)])]
+    sinks: list[Any] = [*files, *([] if port is None else [LiveSink(port)])]
     url = arguments.pop("device")
     del arguments["live"]
     what = f"{setup.title}: {url}, dt = {setup.controller.dt:g} s, for {scenario.duration:g} s. Ctrl-C ramps u to zero."
