@@ -62,7 +62,7 @@ def lateness(folder: Path, seconds: float) -> None:
     }
     for name, sinks in kinds.items():
         late = np.empty(len(rows))
-        with Telemetry(header, sinks) as telemetry:
+        with Telemetry(header, sinks, urgent=True) as telemetry:
             in_front(True)
             start = time.perf_counter() + 0.01
             for k, row in enumerate(rows):

@@ -454,12 +454,23 @@ def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
         first.close()
 
 
-def test_the_writer_gives_up_a_real_time_priority_that_it_inherited(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else it would keep a loop of lower priority, or of none, from running."""
+@pytest.mark.parametrize("permitted", [True, False])
+@pytest.mark.parametrize("urgent", [True, False])
+def test_the_writer_has_the_priority_that_it_should(urgent: bool, permitted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lowest real-time priority for a loop in Python, where that is permitted; else none, even where it inherits one."""
     from quell.realtime import telemetry
 
-    asked = []
-    monkeypatch.setattr(telemetry.os, "sched_getscheduler", lambda pid: telemetry.os.SCHED_FIFO)
-    monkeypatch.setattr(telemetry.os, "sched_setscheduler", lambda *given: asked.append(given[1]))
-    recorded(NARROW, counted(3), MemorySink())
-    assert asked == [telemetry.os.SCHED_OTHER]
+    now = [telemetry.os.SCHED_RR]
+
+    def ask(thread: int, policy: int, parameters: Any) -> None:
+        if policy != telemetry.os.SCHED_OTHER:
+            if not permitted:
+                raise PermissionError(1, "Operation not permitted")
+            assert parameters.sched_priority == 1
+        now[0] = policy
+
+    monkeypatch.setattr(telemetry.os, "sched_getscheduler", lambda thread: now[0])
+    monkeypatch.setattr(telemetry.os, "sched_setscheduler", ask)
+    with Telemetry(NARROW, [MemorySink()], urgent=urgent) as writer:
+        offer(writer, counted(3))
+    assert now[0] == (telemetry.os.SCHED_FIFO if urgent and permitted else telemetry.os.SCHED_OTHER)

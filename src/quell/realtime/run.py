@@ -109,8 +109,11 @@ def run_rig(
         writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
         _try_out(line)
         loop = Prepared.of(device, controller, points, rules, system_clock(spin), writer.ring)
+        writer.urgent = loop.interpreted and priority > 1
+        _begin_anew(device)
         with writer, quiet_process(priority, loop.interpreted) as notes, _signals(loop.requests):
             _supervised(loop, controller.dt, priority, cpu, notes, on_change or (lambda change: None))
+            device.close()  # before the record is finished, which may take its time
     record = memory.trajectory()
     watch = loop.watch
     if course.disturbances or course.noise != 0.0:
@@ -169,6 +172,12 @@ def _try_out(line: Any) -> None:
     if isinstance(line, PythonLine):
         line.device.read()
         line.device.write(0.0)
+
+
+def _begin_anew(device: Any) -> None:
+    """Let a device that has sessions begin one now: compiling may have taken longer than it waits for a loop."""
+    if hasattr(device, "begin_anew"):
+        device.begin_anew()
 
 
 def _check_dt(device: Any, dt: float) -> None:

@@ -1,9 +1,12 @@
 """Telemetry: rows leave the loop through a ring, and another thread writes them down.
 
 The loop puts a row into the ring each cycle and never waits. The writer's thread empties the ring some twenty times a second and hands the
-rows to its sinks: files, or whoever watches. It works in bursts of a tenth of a millisecond and sleeps in between: where the loop itself
-is Python, it gets the interpreter back that soon. A sink that fails (disk full, no permission) is closed and reported; the loop, and the
-other sinks, go on.
+rows to its sinks: files, or whoever watches. A sink that fails (disk full, no permission) is closed and reported; the loop, and the other
+sinks, go on.
+
+A loop that is Python itself shares the interpreter with the writer. So the writer works in bursts of a tenth of a millisecond and sleeps
+in between. That is not enough on a busy machine, where a thread of ordinary priority may be set aside for milliseconds in the middle of a
+burst, and the interpreter with it: for such a loop the writer takes the lowest real-time priority (``urgent``).
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from threading import Event, Thread
 from types import TracebackType
 from typing import Protocol
@@ -64,6 +68,9 @@ class Telemetry:
         where it goes; see ``quell.realtime.sinks``.
     period
         how often the ring is emptied [s].
+    urgent
+        whether the loop is Python and has a real-time priority above 1: then the writer takes that of 1, where it is permitted. Else it has
+        none, even where it inherits one.
 
     Attributes
     ----------
@@ -80,11 +87,12 @@ class Telemetry:
         for a period that is not positive or beyond a quarter of a second: a killed process must lose less than one second.
     """
 
-    def __init__(self, header: Header, sinks: Sequence[Sink] = (), *, period: float = 0.05) -> None:
+    def __init__(self, header: Header, sinks: Sequence[Sink] = (), *, period: float = 0.05, urgent: bool = False) -> None:
         self.header, self.period = header, checks.positive("period", period, "s")
         if period > 0.25:
             raise ValueError(f"period = {period!r} s: must be at most 0.25 s, or a killed process may lose more than a second")
         self.ring: Ring = ring(max(_LEAST_ROWS, math.ceil(_PATIENCE / header.dt)), header.width)
+        self.urgent = urgent
         self.rows = 0
         self.problems: list[str] = []
         self._sinks, self._given = list[Sink](), tuple(sinks)
@@ -135,7 +143,7 @@ class Telemetry:
         self.stop()
 
     def _run(self) -> None:
-        _leave_real_time()
+        _schedule(self.urgent)
         while not self._stopped.wait(self.period):
             self._pass_on()
         self._pass_on()
@@ -172,7 +180,13 @@ class Telemetry:
         _LOG.warning("telemetry: %s", problem)
 
 
-def _leave_real_time() -> None:
-    """Give up a real-time priority that was inherited: writing may take its time."""
-    if hasattr(os, "SCHED_OTHER") and os.sched_getscheduler(0) != os.SCHED_OTHER:
+def _schedule(urgent: bool) -> None:
+    """Take the lowest real-time priority, or give up one that was inherited."""
+    if not hasattr(os, "sched_setscheduler"):
+        return
+    if urgent:
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO)))
+            return
+    if os.sched_getscheduler(0) != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

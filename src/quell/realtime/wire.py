@@ -132,6 +132,8 @@ class WireDevice:
         )
         self._clock = system_clock()
         self._open = True
+        self._timeout, self._hint = timeout, hint
+        self._compiled = False
         try:
             self._begin_session(time.monotonic() + timeout, hint)
         except BaseException:
@@ -152,8 +154,7 @@ class WireDevice:
     def read(self) -> float:
         """Return the newest measurement [y-unit]; NaN where for fifty samples none has come."""
         self._check_open()
-        y, _ = self._call(fetch_one, self._clock, time.monotonic_ns() + round(1e9 * _MOST_AGE * self.dt))
-        return float(y)
+        return self._fetch(_MOST_AGE * self.dt)
 
     def write(self, u: float) -> None:
         """Send u [u-unit].
@@ -168,6 +169,19 @@ class WireDevice:
         if fault:
             raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
 
+    def begin_anew(self) -> None:
+        """Begin a new session in place of this one: what the loop does before its first cycle, as the device waits for that only so long.
+
+        Raises
+        ------
+        ConnectionError
+            where no device answers.
+        """
+        self._check_open()
+        self._say(frames.GOODBYE, 0.0)
+        frames.start_session(self.line.peer, _new_session())
+        self._begin_session(time.monotonic() + self._timeout, self._hint)
+
     def tick(self, timeout: float = 1.0) -> int:
         """Wait for a measurement that comes now, and return the time at which it came: the system's monotonic clock [ns].
 
@@ -178,9 +192,9 @@ class WireDevice:
         """
         self._check_open()
         counters = self.line.peer.counters
-        self._call(fetch_one, self._clock, 0)
+        self._fetch(0.0)
         before = counters[frames.ACCEPTED]
-        self._call(fetch_one, self._clock, time.monotonic_ns() + round(1e9 * timeout))
+        self._fetch(timeout)
         if counters[frames.ACCEPTED] == before:
             raise ConnectionError(f"{self.url}: no measurement has come for {timeout:g} s")
         return time.monotonic_ns()
@@ -230,6 +244,14 @@ class WireDevice:
         session = int(line.peer.numbers[frames.SESSION])
         frames.write_frame(line.outbox, kind, session, 0, 0, time.monotonic_ns(), value, 0)
         send(line.link, line.outbox)
+
+    def _fetch(self, seconds: float) -> float:
+        """Return the newest measurement, or the first that comes within so many seconds."""
+        if not self._compiled:  # that may take seconds: what has come until then is old
+            self._compiled = True
+            self._call(fetch_one, self._clock, 0)
+        y, _ = self._call(fetch_one, self._clock, time.monotonic_ns() + round(1e9 * seconds))
+        return float(y)
 
     def _call(self, entry: Any, *arguments: Any) -> Any:
         return for_types(entry, self.line, *arguments)(self.line, *arguments)
