@@ -63,7 +63,7 @@ def test_a_full_ring_drops_the_newest_rows_and_counts_them(attempt: Any) -> None
 
 def test_no_row_is_torn_lost_or_repeated_between_two_threads() -> None:
     """A compiled producer at full speed, without the interpreter's lock, on a ring that is full and empty in turn."""
-    count, shared, told = 400_000, ring(61, WIDTH), []
+    count, shared, told = 200_000, ring(61, WIDTH), []
     producer = Thread(target=lambda: told.append(_produce(shared, np.empty(WIDTH), count)))
     parts = []
     producer.start()

@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from quell.files import check_writable
+from quell.files import check_writable, written_atomically
 from quell.realtime.channels import K
 from quell.realtime.header import Header
 from quell.types import Matrix, Vector
@@ -39,9 +39,8 @@ class CsvSink:
     def open(self, header: Header) -> None:
         """Write the names, and the header beside."""
         check_new(self.path)
-        beside = beside_of(self.path)
-        check_writable(beside)
-        beside.write_text(header.to_json() + "\n", encoding="utf-8")
+        with written_atomically(beside_of(self.path)) as part:
+            part.write_text(header.to_json() + "\n", encoding="utf-8")
         self._dt, self._first = header.dt, True
         self._file = self.path.open("xb")
         self._file.write((",".join(("time", *header.columns)) + "\n").encode())
