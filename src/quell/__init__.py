@@ -17,7 +17,20 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quell import analysis, controllers, experiments, features, identification, learners, metrics, observers, plants, signals
+    from quell import (
+        analysis,
+        controllers,
+        experiments,
+        features,
+        identification,
+        learners,
+        metrics,
+        observers,
+        plants,
+        realtime,
+        setup,
+        signals,
+    )
     from quell.batch_record import BatchTrajectory
     from quell.controllers import baselines
     from quell.controllers.adrc import ADRC
@@ -60,6 +73,8 @@ _ROOMS = (
     "metrics",
     "observers",
     "plants",
+    "realtime",
+    "setup",
     "signals",
 )
 
@@ -87,6 +102,8 @@ __all__ = [
     "observers",
     "omega_c_for",
     "plants",
+    "realtime",
+    "setup",
     "signals",
     "simulate",
 ]

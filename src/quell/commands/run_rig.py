@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from quell.commands.output import check_places, write_results
 from quell.experiments.figures import save_figure
 from quell.files import check_writable, without_gaps
 from quell.realtime.devices import open_device
-from quell.realtime.outcome import RigRun
+from quell.realtime.outcome import ModeChange, RigRun
 from quell.realtime.run import run_rig
 from quell.realtime.sinks import LiveSink, file_sink
 from quell.realtime.supervisor import Cause
@@ -55,25 +56,16 @@ def run_setup(
     check_places(json_file, figures)
     if save is not None:
         check_writable(save)
-    console = Console()
-    port = live if live is not None else arguments["live"]
     files = [*map(Path, arguments.pop("telemetry", ())), *telemetry]
     for file in files:
         check_new(file)
-    sinks = [*files, *([] if port is None else [LiveSink(port)])]
-    url = arguments.pop("device")
-    del arguments["live"]
-    what = f"{setup.title}: {url}, dt = {setup.controller.dt:g} s, for {scenario.duration:g} s. Ctrl-C ramps u to zero."
+    port = arguments.pop("live") if live is None else live
+    console = Console()
+    what = f"{setup.title}: {arguments['device']}, dt = {setup.controller.dt:g} s, for {scenario.duration:g} s. Ctrl-C ramps u to zero."
     console.print(escape(what), soft_wrap=True)
-    try:
-        device = open_device(url, setup.controller.dt)
-        if port is not None:
-            console.print(f"Live: ws://127.0.0.1:{port}")
-        run = run_rig(
-            device, setup.controller, scenario, telemetry=sinks, on_change=lambda change: console.print(escape(str(change))), **arguments
-        )
-    except ValueError as error:
-        raise refused(name, "rig", error, [*arguments, "device"]) from None
+    run = _closed(console, setup, arguments, files, None if port is None else LiveSink(port))
+    if run is None:
+        return TRIPPED
     scores = judge(run.trajectory, setup)
     _print(console, run)
     print_judgement(console, f"{setup.title}, times from the scenario's first sample", scores)
@@ -85,11 +77,36 @@ def run_setup(
         run.trajectory.save(save)
         console.print(f"Record: {escape(str(save))}", soft_wrap=True)
     code = exit_code(run)
-    about = {"title": setup.title, "device": url, "dt": setup.controller.dt, "verdict": run.verdict, "exit_code": code}
+    about = {"title": setup.title, "device": arguments["device"], "dt": setup.controller.dt, "verdict": run.verdict, "exit_code": code}
     write_results(
         console, about | _as_json(run) | {"metrics": scores, "learned": learned, "setup": setup.as_json()}, json_file, paths, figures
     )
     return code
+
+
+def _closed(console: Console, setup: Setup, arguments: dict[str, Any], files: list[Path], live: LiveSink | None) -> RigRun | None:
+    """Close the loop and tell of each change of mode; None where the device's driver hung in the middle of it."""
+    url, options = arguments["device"], {key: value for key, value in arguments.items() if key not in ("device", "live")}
+    began = False
+
+    def tell(change: ModeChange) -> None:
+        nonlocal began
+        if live is not None and not began:
+            console.print(f"Live: {live.url}")
+        began = True
+        console.print(escape(str(change)), soft_wrap=True)
+
+    sinks: list[Any] = [*files, *([] if live is None else [live])]
+    try:
+        device = open_device(url, setup.controller.dt)
+        return run_rig(device, setup.controller, setup.scenario, telemetry=sinks, on_change=tell, **options)
+    except ValueError as error:
+        raise refused(setup.name, "rig", error, [*arguments]) from None
+    except ConnectionError as error:
+        if not began:
+            raise
+        print(f"quell: {error}", file=sys.stderr)
+        return None
 
 
 def changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from quell.files import without_gaps
 from quell.plants import Plant
 from quell.setup.build import Builder, linear_part
 from quell.setup.description import Description, describe, read
-from quell.setup.mistakes import SetupError, refused
+from quell.setup.mistakes import SetupError
 from quell.simulation import Scenario
 
 __all__ = ["EXAMPLES", "Description", "Setup", "SetupError", "load", "made", "read"]
@@ -107,16 +107,12 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
     SetupError
         as ``load``.
     """
-    described = describe(name, data)
-    try:
-        checks.positive("dt", described.dt, "s")
-    except ValueError as error:
-        raise refused(name, "", error, ()) from None
-    builder, dt = Builder(name), {"dt": described.dt}
+    described, builder = describe(name, data), Builder(name)
+    dt = builder.attempt("", (), checks.positive, "dt", described.dt, "s")
 
     def part(key: str, **context: Any) -> Any:
         table = getattr(described, key)
-        return None if table is None else builder.build(table, key, **dt, **context)
+        return None if table is None else builder.build(table, key, dt=dt, **context)
 
     plant = part("plant")
     model = linear_part(plant)
@@ -127,12 +123,9 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
         raise SetupError([f"{name}: {key}: a controller of the kind {kind} has no use for it" for key in idle])
     controller = part("controller", plant=model, **parts)
     prefilter, scenario, rig = part("prefilter"), part("scenario"), part("rig")
-    try:
-        if prefilter is not None:
-            controller = Prefiltered(controller, prefilter)
-        if scenario is not None and plant is not None:
-            scenario.seeded_signals(plant.disturbances)
-    except ValueError as error:
-        raise refused(name, "scenario" if "disturbances" in str(error) else "prefilter", error, ("disturbances",)) from None
+    if prefilter is not None:
+        controller = builder.attempt("prefilter", (), Prefiltered, controller, prefilter)
+    if scenario is not None and plant is not None:
+        builder.attempt("scenario", ("disturbances",), scenario.seeded_signals, plant.disturbances)
     title = described.title or name.removesuffix(".toml").replace("_", " ")
     return Setup(name, title, controller, plant, scenario, rig, tuple(window.given() for window in described.metrics), described)

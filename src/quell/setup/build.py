@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from functools import reduce
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
 from operator import add
 from typing import Any
 
@@ -51,10 +52,20 @@ class Builder:
         for key, parameter in takes.items():
             if key not in arguments and parameter.default is parameter.empty and parameter.kind is not parameter.VAR_KEYWORD:
                 raise SetupError([f"{self.name}: {path}: {key} is missing; give a table [{key}]"])
+        return self.attempt(path, [*arguments], partial(table.make, **arguments))
+
+    def attempt(self, path: str, keys: Sequence[str], action: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what ``action`` returns; what it refuses is told with the path, and the key where it begins with one of ``keys``.
+
+        Raises
+        ------
+        SetupError
+            in the place of a ``ValueError``.
+        """
         try:
-            return table.make(**arguments)
+            return action(*arguments)
         except ValueError as error:
-            raise refused(self.name, path, error, [*arguments]) from None
+            raise refused(self.name, path, error, keys) from None
 
     def _value(self, value: Any, path: str, joined: bool, context: dict[str, Any]) -> Any:
         """Build the tables in a value; features and signals in a list are added up where they are ``joined``."""
@@ -66,7 +77,4 @@ class Builder:
         parts = tuple(self._value(part, f"{path}[{i}]", True, context) for i, part in enumerate(value))
         if not (joined and any(isinstance(part, Features | Signal) for part in parts)):
             return parts
-        try:
-            return reduce(add, parts)
-        except ValueError as error:
-            raise refused(self.name, path, error, ()) from None
+        return self.attempt(path, (), reduce, add, parts)

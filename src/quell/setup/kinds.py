@@ -9,7 +9,7 @@ from typing import Any
 
 from quell import features, guard, learners, plants, signals, simulation
 from quell.controllers import ADRC, LinearController, ReferenceModel, TrackingDifferentiator
-from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio, Shaper
+from quell.controllers.baselines import LQG, PID, ZV, ZVD, NotchPID, ResonanceRatio, Shaper, notch
 from quell.observers import ESO
 from quell.plants import LinearPlant
 from quell.realtime import safety
@@ -133,12 +133,13 @@ OBSERVERS = _calls(
 )
 FEATURES = _calls(_discovered(features, "design", "names", but=features.Features))
 LEARNERS = _calls(_discovered(learners, "design", "memory"), {"features": list_of(one_of(FEATURES)) | None})
+Notch = call("notch", notch.Notch.at, sole=True)
 CONTROLLERS = {
     "adrc": call("adrc", ADRC),
     "pid": call("pid", PID, passed_on=(LinearController,)),
     "pid-simc": call("pid-simc", PID.simc, passed_on=(PID, LinearController)),
     "pid-simc-double-integrator": call("pid-simc-double-integrator", PID.simc_double_integrator, passed_on=(PID, LinearController)),
-    "notch-pid": call("notch-pid", NotchPID, passed_on=(PID, LinearController), types={"notch": call("notch", Notch.at, sole=True)}),
+    "notch-pid": call("notch-pid", NotchPID, passed_on=(PID, LinearController), types={"notch": Notch}),
     "lqg": call("lqg", LQG, passed_on=(LinearController,), types={"plant": Plant | None}, words=_MODEL),
     "resonance-ratio": call("resonance-ratio", ResonanceRatio, passed_on=(LinearController,)),
 }

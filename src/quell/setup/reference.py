@@ -13,23 +13,25 @@ from quell.setup.tables import Call, Table
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
 
-def keys(table: type[Table]) -> list[tuple[str, str, str, str]]:
+def keys(of: type[Table]) -> list[tuple[str, str, str, str]]:
     """Return name, type, default and meaning of each key of a table, but for ``kind``."""
     return [
         (key, _type(field.annotation), _default(field.default), field.description or "")
-        for key, field in table.model_fields.items()
+        for key, field in of.model_fields.items()
         if key != "kind"
     ]
 
 
-def markdown(tables: Mapping[str, type[Call]]) -> str:
-    """Return the kinds of a table and their keys in Markdown, a heading and a table for each kind."""
-    parts, bar = [], r"\|"
-    for kind, table in tables.items():
-        rows = [f"| `{key}` | {of} | {default} | {words.replace('|', bar)} |" for key, of, default, words in keys(table)]
-        head = ["| key | type | default | |", "|---|---|---|---|"] if rows else []
-        parts.append("\n".join([f"**`{kind}`** {table.__doc__}", "", *head, *rows]))
-    return "\n\n".join(parts).replace("``", "`")
+def table(of: type[Table]) -> str:
+    """Return the keys of a table in Markdown; nothing where there are none."""
+    bar = r"\|"
+    rows = [f"| `{key}` | {kind} | {default} | {words.replace('|', bar)} |" for key, kind, default, words in keys(of)]
+    return "\n".join(["| key | type | default | |", "|---|---|---|---|", *rows] if rows else []).replace("``", "`")
+
+
+def markdown(kinds: Mapping[str, type[Call]]) -> str:
+    """Return the kinds of a table and their keys in Markdown."""
+    return "\n\n".join(f"**`{kind}`** {of.__doc__}\n\n{table(of)}".replace("``", "`") for kind, of in kinds.items())
 
 
 def _default(value: Any) -> str:
