@@ -43,7 +43,7 @@ def test_a_prbs_is_held_starts_and_can_begin_elsewhere() -> None:
     values = signal(t)
     assert np.all(values[t < 1.0 - 1e-9] == 0.0)
     np.testing.assert_array_equal(values[40:].reshape(-1, 4), np.repeat(values[40::4], 4).reshape(-1, 4))
-    np.testing.assert_array_equal(signal.seeded(3)(t[40:200]), signal(t[40:200] + 0.3))
+    np.testing.assert_array_equal(s.PRBS(2.0, 5, 0.1, 1.0, seed=3)(t[40:200]), signal(t[40:200] + 0.3))
     np.testing.assert_array_equal(signal(t[40:] + signal.period), values[40:])
     assert np.all(signal.derivative()(t) == 0.0)
 

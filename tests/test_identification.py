@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.identification import Identified, excitation, frequency_response, read_record
+from quell.cli import app
+from quell.identification import Identified, excitation, excited, frequency_response, read_record
 from quell.identification.search import root_covariance
 from quell.identification.structure import Structure, gradient, output
-from quell.plants.base import advance, measure
 
 from .test_cli import quell
 
@@ -37,30 +37,8 @@ def answer(plant: Any, u: np.ndarray, dt: float, quantum: float = 0.0) -> np.nda
 @cache
 def twin_record(band: tuple[float, float], amplitude: float, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return u and y of the twin with all its friction and quantisation, driven open loop by a PRBS for 60 s at 1 kHz."""
-    u = excitation("prbs", band, 60.0, DT, offset - amplitude, offset + amplitude).u
-    # An "observer" that is told y and answers with the design: open loop through the same compiled driver.
-    twin = ql.plants.torsional()
-    return u, _driven(twin, u)
-
-
-def _driven(twin: Any, u: np.ndarray) -> np.ndarray:
-    from quell.dispatch import compiled
-
-    global _run
-    if _run is None:
-
-        def run(model: Any, x: Any, scratch: Any, w: Any, u: Any, y: Any) -> None:
-            for k in range(u.size):
-                y[k] = measure(model, x)
-                advance(model, x, scratch, 0.0, u[k], w)
-
-        _run = compiled(run)
-    y = np.empty(u.size)
-    _run(twin.sampled(DT), np.zeros(twin.order), np.zeros(6 * twin.order), np.zeros(2), u, y)
-    return y
-
-
-_run: Any = None
+    record = excited(ql.plants.torsional(), excitation("prbs", band, 60.0, DT, offset - amplitude, offset + amplitude))
+    return record.u, record.y
 
 
 @cache
@@ -260,6 +238,14 @@ def test_the_result_is_a_plant_for_an_observer() -> None:
     assert np.max(np.abs(ends[0] - ends[1])) < 0.01
 
 
+def test_an_excited_plant_is_told_the_design() -> None:
+    """From rest, each sample held: what a linear plant answers is what its sampled matrices give."""
+    design = excitation("prbs", (0.5, 60.0), 10.0, 0.005)
+    record = excited(ql.plants.LinearPlant.of(([2.0], [1.0, 0.6, 9.0])), design)
+    np.testing.assert_allclose(record.u, design.u, atol=1e-12)
+    np.testing.assert_allclose(record.y, answer(([2.0], [1.0, 0.6, 9.0]), design.u, 0.005), atol=1e-10)
+
+
 def test_the_empirical_response_is_the_plants_and_says_where_it_is_not() -> None:
     """Nine tenths of it within 10 % of the sampled plant where the coherence is high; noise has none."""
     u = excitation("prbs", (0.5, 60.0), 60.0, 0.005).u
@@ -299,6 +285,7 @@ def test_the_report_has_all_of_it() -> None:
         found.plot([None])
 
 
+GOOD = "\n".join(f"{0.1 * k:.1f},{k % 3},{k % 5}" for k in range(20))
 U = np.sign(np.sin(0.05 * np.arange(2000.0) ** 1.1))
 
 
@@ -340,16 +327,21 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
     told = json.loads((tmp_path / "out.json").read_text())
     assert told["den"] == pytest.approx([1.0, 0.6, 9.0], rel=1e-6)
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {"identified.png", "identified.svg"}
-    wrong = quell("identify", "data.csv", "--columns", "t,u,z", cwd=tmp_path)
-    assert (wrong.returncode, wrong.stdout) == (2, "")
-    assert wrong.stderr.strip() == ("quell: data = 'data.csv': column z is missing; the first line names t, u, y; say which with --columns")
-    made = quell("excite", "u.csv", "--high", "30", "--dt", "0.01", "--duration", "20", cwd=tmp_path)
-    assert made.returncode == 0, made.stderr
-    assert "PRBS of" in made.stdout
-    assert read_record(tmp_path / "u.csv", ("t", "u", "1")).u.size == 2000
 
 
-GOOD = "\n".join(f"{0.1 * k:.1f},{k % 3},{k % 5}" for k in range(20))
+def test_the_commands_refuse_in_a_line_and_design(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is wrong with a file is a line; an excitation is told and written."""
+    monkeypatch.chdir(tmp_path)
+    Path("data.csv").write_text("t,u,y\n" + GOOD)
+    with pytest.raises(ValueError, match="column z is missing; the first line names t, u, y; say which with --columns"):
+        app(["identify", "data.csv", "--columns", "t,u,z"], result_action="return_value")
+    with pytest.raises(ValueError, match="band = .*must rise"):
+        app(["excite", "u.csv", "--low", "70"], result_action="return_value")
+    app(["excite", "u.csv", "--high", "30", "--dt", "0.01", "--duration", "20"], result_action="return_value")
+    assert "PRBS of" in capsys.readouterr().out
+    assert read_record("u.csv", ("t", "u", "1")).u.size == 2000
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from quell.identification.design import Excitation, excitation
 from quell.identification.empirical import FrequencyResponse, frequency_response
+from quell.identification.experiment import excited
 from quell.identification.fitting import identify
 from quell.identification.identified import Identified, Root
 from quell.identification.judge import Residuals
@@ -15,6 +16,7 @@ __all__ = [
     "Residuals",
     "Root",
     "excitation",
+    "excited",
     "frequency_response",
     "identify",
     "read_record",

@@ -62,9 +62,17 @@ def read_record(path: str | os.PathLike[str], columns: Sequence[str] = ("t", "u"
         raise ValueError(f"{where}: has {len(rows)} samples; must have at least {_FEWEST}")
     width = len(header if header is not None else rows[0][1])
     places = [_place(where, header, width, name, i + (dt is not None)) for i, name in enumerate(columns)]
-    values = np.array(
-        [[_value(where, number, row, place, name) for place, name in zip(places, columns, strict=True)] for number, row in rows]
-    )
+    values, plain = np.zeros((0, 0)), False
+    try:
+        values = np.array([[row[place] for place in places] for _, row in rows], dtype=np.float64)
+        plain = bool(np.all(np.isfinite(values))) and not any("_" in row[place] for _, row in rows for place in places)
+    except (ValueError, IndexError):
+        pass
+    if not plain:
+        # One at a time, to say which one it is.
+        values = np.array(
+            [[_value(where, number, row, place, name) for place, name in zip(places, columns, strict=True)] for number, row in rows]
+        )
     if dt is None:
         dt = _sample_time(where, values[:, 0], [number for number, _ in rows])
         values = values[:, 1:]

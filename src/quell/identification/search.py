@@ -18,7 +18,7 @@ _PASSES = 12
 # So few signs, as a share, may still change.
 _AT_REST = 5e-4
 # Of the resonance's square, where the driven side's own frequency is looked for: it is its inertia's share of both.
-_SHARES, _TRIALS = (0.1, 1.0), 14
+_SHARES, _TRIALS = (0.1, 1.0), 10
 # Steps of the search on the way, and at the end.
 _BRIEFLY, _THOROUGHLY = 2, 30
 # A pole within so many of its standard deviations of s = 0, or this much slower than the record is long, is taken for an integrator.
@@ -109,7 +109,7 @@ def _driven(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple
         tried.append((after, candidate, value))
         return after
 
-    minimize_scalar(error, bounds=_SHARES, method="bounded", options={"xatol": 5e-3, "maxiter": _TRIALS})
+    minimize_scalar(error, bounds=_SHARES, method="bounded", options={"xatol": 1e-2, "maxiter": _TRIALS})
     _, wider, theta = min(tried, key=lambda one: one[0])
     v = free_run(wider, theta, v, own_friction=True)[1]
     return wider, refined(wider, theta, v, y, _BRIEFLY), v

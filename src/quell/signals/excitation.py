@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -40,7 +40,7 @@ class PRBS(Signal):
     start
         when it begins [s]; before, it is zero.
     seed
-        where in the sequence it begins: at the value number ``seed``.
+        where in the sequence it begins: at the value number ``seed``. It is no noise: a scenario's own seed leaves it as it is.
     """
 
     amplitude: float = 1.0
@@ -70,10 +70,6 @@ class PRBS(Signal):
     def derivative(self) -> Signal:
         """Return zero."""
         return Constant(0.0)
-
-    def seeded(self, seed: int) -> Signal:
-        """Return the same sequence from another place on."""
-        return replace(self, seed=seed)
 
 
 @lru_cache(maxsize=4)

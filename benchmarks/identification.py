@@ -1,0 +1,99 @@
+"""Identification of the torsional twin: how long, how well; open loop, in a closed loop, with friction and without a model of it.
+
+    python benchmarks/identification.py [--json FILE]
+
+60 s at 1 kHz, with the twin's own friction, converter and encoder. The slow pole and the resonance are compared with those of its linear
+part. Times are the best of several, after the kernels are compiled or loaded, of the whole of ``identify``, search and judgement: by the
+clock, and of the processor, which is what the clock shows on an idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import quell as ql
+from quell.identification import Identified, excitation, excited
+
+DT = 1e-3
+TRIALS = 3
+TWIN = ql.plants.torsional()
+
+
+def closed_loop(reference: Any) -> tuple[Any, Any]:
+    """Return u and y of the twin in a loop with an ADRC that knows no model."""
+    observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=DT)
+    controller = ql.ADRC(observer, omega_c=20.0, u_min=-5.0, u_max=5.0)
+    run = ql.simulate(TWIN, controller, ql.Scenario(reference=reference, duration=60.0))
+    return run["u"], run["y_measured"]
+
+
+def records() -> dict[str, tuple[Any, Any]]:
+    """Return what is identified."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for name, kind, band, low, high in (
+        ("PRBS to 20 rad/s, ±2 V", "prbs", (0.2, 20.0), -2.0, 2.0),
+        ("PRBS to 60 rad/s, ±2 V", "prbs", (0.2, 60.0), -2.0, 2.0),
+        ("PRBS to 60 rad/s, ±5 V", "prbs", (0.2, 60.0), -5.0, 5.0),
+        ("multisine to 60 rad/s, ±2 V", "multisine", (0.3, 60.0), -2.0, 2.0),
+        ("one way: PRBS to 60 rad/s, 0.5 to 2.5 V", "prbs", (0.3, 60.0), 0.5, 2.5),
+    ):
+        record = excited(TWIN, excitation(kind, band, 60.0, DT, low, high))
+        found[name] = record.u, record.y
+    found["closed loop: multisine to 40 rad/s, ±3 rad"] = closed_loop(excitation("multisine", (0.3, 40.0), 60.0, DT, -3.0, 3.0).signal)
+    found["closed loop: PRBS to 10 rad/s, ±π/2"] = closed_loop(excitation("prbs", (0.3, 10.0), 60.0, DT, -np.pi / 2, np.pi / 2).signal)
+    found["closed loop: (π/2) sin(π t/2)"] = closed_loop(ql.signals.Sinusoid(0.5 * np.pi, 0.5 * np.pi))
+    return found
+
+
+def judged(found: Identified) -> dict[str, float]:
+    """Return how far off the poles are [%], and the fits [%]."""
+    truth = np.linalg.eigvals(TWIN.linear.A)
+    slow = min((p for p in truth if abs(p) > 1e-6), key=abs)
+    resonance = max(truth, key=lambda p: p.imag)
+    poles = np.array([root.value for root in found.poles])
+    near = poles[np.argmin(np.abs(poles - resonance))]
+    return {
+        "slow": 100.0 * abs(poles[np.argmin(np.abs(poles - slow))] - slow) / abs(slow),
+        "resonance": 100.0 * abs(near - resonance) / abs(resonance),
+        "damping": 100.0 * abs(near.real / resonance.real - 1.0),
+        "integrators": found.integrators,
+        "held out": found.fits["held out"],
+        "estimation": found.fits["estimation"],
+    }
+
+
+def main() -> None:
+    """Run all and print one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    arguments = parser.parse_args()
+    rows = []
+    print(f"{'record':44} friction  time [s]  CPU [s]  slow [%]  resonance [%]  its damping [%]  held out [%]")
+    for name, (u, y) in records().items():
+        for friction in (True, False):
+            taken, used = [], []
+            for _ in range(TRIALS + 1):
+                began, before = time.perf_counter(), time.process_time()
+                found = ql.identify(u, y, DT, friction=friction)
+                taken.append(time.perf_counter() - began)
+                used.append(time.process_time() - before)
+            row = {"record": name, "friction": friction, "seconds": min(taken[1:]), "cpu": min(used[1:]), **judged(found)}
+            rows.append(row)
+            print(
+                f"{name:44} {'yes' if friction else 'no':8} {row['seconds']:9.2f} {row['cpu']:8.2f} "
+                f"{row['slow']:9.3f} {row['resonance']:14.3f} "
+                f"{row['damping']:16.2f} {row['held out']:13.3f}",
+                flush=True,
+            )
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
