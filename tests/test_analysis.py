@@ -14,10 +14,10 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.analysis.frozen import Frozen, FrozenMemory
+from quell.analysis.frozen import Frozen
 from quell.analysis.sampled import sampled_plant
 from quell.controllers.linear import LinearLaw
-from quell.learners.base import predict
+from quell.learners.base import NoLearnerMemory, predict
 
 PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.4]], [0.0, 2.0], [1.0, 0.0])
 LEARNED = np.array([-2.5, -0.3, 0.1, 0.05])
@@ -33,9 +33,9 @@ class Held:
         """Return what was learned."""
         return Frozen(np.append(self.gain[: observer.order], 0.0), self.before, self.slope)
 
-    def memory(self, parameters: Frozen) -> FrozenMemory:
+    def memory(self, parameters: Frozen) -> NoLearnerMemory:
         """Return nothing."""
-        return FrozenMemory(np.zeros(0))
+        return NoLearnerMemory(np.zeros(0))
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return no names."""
