@@ -243,6 +243,18 @@ def test_the_watchdog_waits_for_the_first_command(bench: Callable[..., Bench]) -
     assert here.rig.state == "live"
 
 
+def test_a_session_that_never_begins_gives_way(bench: Callable[..., Bench]) -> None:
+    """After a minute of ticks; before that a second hello is refused, however long the first takes."""
+    here = bench("udp")
+    here.open()
+    here.rig.tick(int(30.0 / DT))
+    with pytest.raises(ConnectionError, match="another session"):
+        here.open(timeout=0.2)
+    here.rig.tick(int(30.0 / DT))
+    here.cycle(here.open(), law, 2)
+    assert here.rig.state == "live"
+
+
 def test_what_is_no_number_is_not_applied_nor_a_sign_of_life(bench: Callable[..., Bench]) -> None:
     """The last u holds until the watchdog trips."""
     here = bench("udp", watchdog=4)

@@ -7,39 +7,30 @@ import subprocess
 import sys
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from quell.realtime.devices import open_device
+from quell.commands.rig import run_rig
+from quell.realtime.devices import listen, open_device
 
 # A tick so long that a machine with much else to do still keeps the session alive.
 DT = 0.01
+SETTINGS = {"dt": DT, "watchdog": 20, "u_max": 1.0, "rest": True}
 
 
 @contextmanager
 def rig(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Start a rig; yield it and what it says when it is ready."""
-    plant = () if "--plant" in arguments else ("--plant", "two-mass")
-    command = [sys.executable, "-m", "quell.cli", "rig", *plant, "--dt", str(DT), "--priority", "0", *arguments]
+    command = [sys.executable, "-m", "quell.cli", "rig", "--plant", "two-mass", "--dt", str(DT), "--priority", "0", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process, str(process.stdout and process.stdout.readline())
         finally:
             process.kill()
-
-
-def refused(*arguments: str) -> str:
-    """Return the one line with which a rig refuses to start."""
-    with rig(*arguments) as (process, ready):
-        said = process.communicate(timeout=60)[1]
-        assert ready == ""
-        assert process.returncode == 2
-    assert said.count("\n") == 1
-    return said
 
 
 def exchanged(device: Any, count: int) -> list[float]:
@@ -121,8 +112,42 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 def test_bad_input_is_a_line_and_exit_code_2() -> None:
     """Before anything is opened."""
-    assert "must be like udp://" in refused("--device", "tcp://x")
-    assert "--plant = 'moon'" in refused("--device", "udp://127.0.0.1:0", "--plant", "moon")
-    assert "can't be written" in refused("--device", "udp://127.0.0.1:0", "--log", "/nowhere/x.csv")
-    with rig("--device", "udp://127.0.0.1:0") as (_, ready):
-        assert "can't listen there" in refused("--device", ready.split()[2].rstrip(":"))
+    with rig("--device", "udp://127.0.0.1") as (process, ready):
+        said = process.communicate(timeout=60)[1]
+        assert (ready, process.returncode, said.count("\n")) == ("", 2, 1)
+    assert "must be udp://HOST:PORT" in said
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"device": "tcp://x"}, "must be like udp://"),
+        ({"plant": "moon"}, "--plant = 'moon'"),
+        ({"log": Path("/nowhere/x.csv")}, "log = '/nowhere/x.csv': can't be written"),
+        ({"seconds": -1.0}, "--seconds = -1.0"),
+        ({"priority": 100}, "priority = 100"),
+        ({"settings": SETTINGS | {"dt": 0.0}}, "dt = 0.0"),
+        ({"settings": SETTINGS | {"watchdog": 0}}, "watchdog = 0"),
+    ],
+)
+def test_what_is_wrong_is_named(changed: dict[str, Any], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing is printed that would look like a rig."""
+    given = {
+        "device": "udp://127.0.0.1:0",
+        "plant": "two-mass",
+        "settings": SETTINGS,
+        "seconds": 1.0,
+        "log": None,
+        "priority": 0,
+        "cpu": None,
+    }
+    with pytest.raises(ValueError) as raised:
+        run_rig(**{**given, **changed})
+    assert message in str(raised.value)
+    assert capsys.readouterr().out == ""
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    """The second rig does not start."""
+    with closing(listen("udp://127.0.0.1:0")) as first, pytest.raises(ValueError, match="can't listen there"):
+        run_rig(device=first.url, plant="two-mass", settings=SETTINGS, seconds=1.0, log=None, priority=0, cpu=None)

@@ -11,6 +11,7 @@ from typing import Any
 from quell import checks
 from quell.realtime.devices import listen, plant_named
 from quell.realtime.frames import REFUSALS
+from quell.realtime.scheduling import checked_cpu, checked_priority
 from quell.realtime.server import Rig
 
 
@@ -27,6 +28,8 @@ def run_rig(
     model = plant_named(plant, "--plant")
     if seconds is not None:
         checks.positive("--seconds", seconds, "s")
+    checked_priority(priority)
+    checked_cpu(cpu)
     with closing(listen(device)) as listener, Rig(model, listener=listener, log=log, **settings) as rig:
         before = {number: signal.signal(number, lambda *_: rig.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:

@@ -46,7 +46,6 @@ from quell.realtime.supervisor import (
     TRIPPED,
     UNSENT,
     UNSURE,
-    UNWAITED,
     Rules,
     Watch,
     Y,
@@ -60,8 +59,6 @@ from quell.types import Matrix, Vector
 
 # A paced device has so long to send its first measurement; in between it is looked whether somebody wants to stop [ns].
 _FIRST, _LOOK = 2_000_000_000, 20_000_000
-# After so many cycles in which a paced device's measurement was there already, it is looked whether a newer one comes.
-_LOOK_AGAIN = 1000
 
 _MISSED, _OVERRAN, _CLIPPED, _UNSENT, _CHANGED = (
     int(event) for event in (Event.MISSED, Event.OVERRUN, Event.CLIPPED, Event.UNSENT, Event.CHANGED)
@@ -211,17 +208,16 @@ def _measure(line: Any, clock: Any, pace: Pace, counts: NDArray[np.int64], deadl
     if not is_finite(y):
         counts[UNSURE] = 1
         return y, waited, 0
-    if waited > 0:
-        counts[UNSURE] = counts[UNWAITED] = 0
-        return y, waited, min(waited, pace.later)
-    counts[UNWAITED] += 1
-    if counts[UNSURE] != 0 or counts[UNWAITED] >= _LOOK_AGAIN:
-        counts[UNSURE] = counts[UNWAITED] = 0
-        before = now(clock)
-        newer, _ = fetch(line, clock, before + pace.probe)
+    before = now(clock)
+    if waited == 0 and counts[UNSURE] != 0 and before < deadline + pace.probe:
+        counts[UNSURE] = 0
+        newer, _ = fetch(line, clock, deadline + pace.probe)
         waited = now(clock) - before
         if is_finite(newer):
             return newer, waited, min(waited, pace.later)
+    elif waited > 0:
+        counts[UNSURE] = 0
+        return y, waited, min(waited, pace.later)
     return y, waited, -pace.earlier
 
 

@@ -18,8 +18,7 @@ live       u is the last command
 tripped    for ``watchdog`` ticks in a row no fresh, finite command has come: u = 0 until a new session, whatever comes
 =========  ===========================================================================================================================
 
-A hello begins a session, where none is live or waiting; a goodbye ends it. A session whose first command does not come ends after
-``patience`` ticks.
+A hello begins a session, where none is live, nor has been waiting for less than ``patience`` ticks; a goodbye ends it.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ class RigModel(NamedTuple):
     watchdog: int
     """Ticks."""
     patience: int
-    """Ticks."""
+    """Ticks that a session has for its first command before another may take its place."""
     rest: bool
     """Whether each session starts from ``x0``."""
     x: Vector
@@ -156,8 +155,6 @@ def _watch(rig: RigModel, fresh: bool) -> None:
     if counts[STATE] == LIVE and counts[SILENT] >= rig.watchdog:
         counts[STATE] = TRIPPED
         counts[TRIPS] += 1
-    elif counts[STATE] == WAITING and counts[SILENT] >= rig.patience:
-        counts[STATE] = IDLE
     if counts[STATE] != LIVE:
         rig.signals[APPLIED] = 0.0
 
@@ -175,7 +172,7 @@ def _greet(rig: RigModel, time: int) -> bool:
     if not known:
         if not abs(dt - rig.dt) <= 1e-9 * rig.dt:
             state = frames.OTHER_DT
-        elif counts[STATE] == WAITING or counts[STATE] == LIVE:
+        elif counts[STATE] == LIVE or (counts[STATE] == WAITING and counts[SILENT] < rig.patience):
             state = frames.BUSY
         else:
             begins = True

@@ -25,7 +25,7 @@ from quell.realtime.timing import Histogram, tally
 # The log is written so often [s], and has room for so many seconds.
 _WRITE_EVERY = 0.05
 _ROOM = 5.0
-# A session whose first command does not come keeps the rig so long [s]: the loop may have to be compiled.
+# A session whose first command does not come keeps others out for so long [s]: its loop may have to be compiled.
 _PATIENCE = 60.0
 
 

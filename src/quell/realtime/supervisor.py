@@ -156,10 +156,9 @@ class Rules(NamedTuple):
     CLIPPED,  # cycles in which u was not the controller's
     UNSENT,  # commands
     UNSURE,  # whether a measurement may be an old one
-    UNWAITED,  # cycles in a row in which a paced device was not waited for
     TRIPPED,  # whether the device has set u to zero for good
-) = range(17)
-COUNTS = 17
+) = range(16)
+COUNTS = 16
 # Places of Watch.values.
 U, FROM, Y, GAP = range(4)
 VALUES = 4

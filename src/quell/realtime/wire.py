@@ -11,6 +11,8 @@ import secrets
 import time
 from typing import Any, NamedTuple
 
+from numba import typeof
+
 from quell import checks
 from quell.dispatch import compiled, for_types, is_finite, kernel
 from quell.realtime import frames
@@ -70,9 +72,9 @@ def _newest(line: WireLine) -> tuple[float, bool]:
         looked_at += 1
         if not frames.well_formed(frame, size, counters):
             continue
-        if _is_goodbye(line, frame):
+        if _is_ours(line, frame, frames.GOODBYE):
             line.peer.numbers[frames.STATE] |= frames.GONE
-        elif frames.is_news(frame, line.peer):
+        elif not _is_ours(line, frame, frames.WELCOME) and frames.is_news(frame, line.peer):
             y = frame.doubles[3]
             news += 1
     if news > 1:
@@ -84,8 +86,8 @@ def _newest(line: WireLine) -> tuple[float, bool]:
 
 
 @kernel
-def _is_goodbye(line: WireLine, frame: Buffer) -> bool:
-    return frame.bytes[3] == frames.GOODBYE and int(frame.words[1]) == line.peer.numbers[frames.SESSION]
+def _is_ours(line: WireLine, frame: Buffer, kind: int) -> bool:
+    return frame.bytes[3] == kind and int(frame.words[1]) == line.peer.numbers[frames.SESSION]
 
 
 @put.register(WireLine)
@@ -224,7 +226,7 @@ class WireDevice:
             while (left := again - time.monotonic()) > 0.0:
                 await_news(line.link, round(1e9 * left))
                 while (size := receive(line.link, line.inbox)) >= 0:
-                    if not frames.well_formed(line.inbox, size, line.peer.counters) or not self._is_welcome():
+                    if not (frames.well_formed(line.inbox, size, line.peer.counters) and _is_ours(line, line.inbox, frames.WELCOME)):
                         continue
                     refused, dt = int(line.inbox.words[8]), float(line.inbox.doubles[3])
                     if refused & frames.OTHER_DT:
@@ -235,10 +237,6 @@ class WireDevice:
             raise ConnectionError(f"{self.url}: another session is alive there; end it first")
         raise ConnectionError(f"{self.url}: no device answers; {hint}")
 
-    def _is_welcome(self) -> bool:
-        frame = self.line.inbox
-        return frame.bytes[3] == frames.WELCOME and int(frame.words[1]) == self.line.peer.numbers[frames.SESSION]
-
     def _say(self, kind: int, value: float) -> None:
         line = self.line
         session = int(line.peer.numbers[frames.SESSION])
@@ -247,9 +245,10 @@ class WireDevice:
 
     def _fetch(self, seconds: float) -> float:
         """Return the newest measurement, or the first that comes within so many seconds."""
-        if not self._compiled:  # that may take seconds: what has come until then is old
+        if not self._compiled:  # that may take seconds, and is not to be part of a cycle
             self._compiled = True
-            self._call(fetch_one, self._clock, 0)
+            for entry, arguments in ((fetch_one, (self._clock, 0)), (put_one, (0.0,))):
+                for_types(entry, self.line).compile(tuple(map(typeof, (self.line, *arguments))))
         y, _ = self._call(fetch_one, self._clock, time.monotonic_ns() + round(1e9 * seconds))
         return float(y)
 
