@@ -68,7 +68,7 @@ def run_setup(
         return TRIPPED
     scores = judge(run.trajectory, setup)
     _print(console, run)
-    print_judgement(console, f"{setup.title}, times from the scenario's first sample", scores)
+    print_judgement(console, f"{setup.title}: the scenario", scores)
     learned = print_outcome(console, run.trajectory)
     paths = []
     if figures is not None and len(run.trajectory):
