@@ -51,7 +51,7 @@ def over_the_wire(url: str, reference: ql.signals.Signal, seconds: float, option
         *(open_device(url, DT), controller(), reference),
         duration=seconds,
         approach=0.0,
-        safety=Safety(settle=500),
+        safety=Safety(settle=500, hold=15),  # the rig itself may be late now and then; its watchdog has 20 ticks
         spin=options.spin,
         priority=options.priority,
         on_change=lambda change: print(change, flush=True),
