@@ -89,6 +89,8 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
         ("scenario = {reference = {kind = 'step', until = 1.0}}", "scenario.reference: only one of until and then"),
         ("scenario = {duration = 0.0}", "scenario.duration = 0.0: must be finite and greater than zero [s]"),
         ("metrics = {start = 1.0}", "metrics = {'start': 1.0}: must be [[metrics]]"),
+        ("[[metrics]]\nband = 0.0", "metrics[0].band = 0.0: must be finite and greater than zero"),
+        ("[[metrics]]\n[[metrics]]\nstart = 3.0\nstop = 1.0", "metrics[1].start = 3.0, stop = 1.0: start must be less than stop"),
         ("[prefilter]\nkind = 'zv'", "prefilter.omega: missing"),
         ("[plant]\nkind = 'linear'\nnum = [1.0]", "plant: given: num; must be num and den, or A, B and C"),
         ("[plant]\nkind = 'delayed'\nplant = 'two-mass'\ndelay = 0.015", "plant.delay = 0.015 s with dt = 0.01 s: must be a whole number"),

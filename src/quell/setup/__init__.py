@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -127,5 +128,18 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
         controller = builder.attempt("prefilter", (), Prefiltered, controller, prefilter)
     if scenario is not None and plant is not None:
         builder.attempt("scenario", ("disturbances",), scenario.seeded_signals, plant.disturbances)
+    windows = tuple(window.given() for window in described.metrics)
+    for i, window in enumerate(windows):
+        builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
     title = described.title or name.removesuffix(".toml").replace("_", " ")
-    return Setup(name, title, controller, plant, scenario, rig, tuple(window.given() for window in described.metrics), described)
+    return Setup(name, title, controller, plant, scenario, rig, windows, described)
+
+
+def _check_window(start: float = 0.0, stop: float | None = None, target: float | None = None, band: float = 0.002) -> None:
+    """Say before the run what ``Trajectory.metrics`` would say after it."""
+    checks.finite("start", start)
+    if stop is not None:
+        checks.interval("start", start, "stop", stop)
+    if target is not None:
+        checks.finite("target", target)
+    checks.positive("band", band)

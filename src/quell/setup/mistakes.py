@@ -91,5 +91,5 @@ def _path(loc: Sequence[str | int], data: Any, absent: bool) -> str:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = repr(list(value) if isinstance(value, tuple) else value)
     return text if len(text) <= 60 else f"{text[:57]}..."
