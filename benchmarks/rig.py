@@ -3,6 +3,9 @@
     python benchmarks/rig.py                              # 60 s over UDP, on an idle machine
     python benchmarks/rig.py --seconds 10 --wire shm --spin 0.0001
 
+Beside it stands what the machine can do at best: a program in C that sleeps until each deadline and does nothing else (``wakeup.c``), run
+just before. A virtual machine whose processors are lent to others for milliseconds makes both late.
+
 The second part runs the same scenario in process (``simulate``) and over the wire, with the same delay of a sample, and prints the metrics
 of both.
 """
@@ -12,9 +15,14 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
 
 import quell as ql
 from quell.realtime import RigRun, Safety, open_device, run_rig
@@ -58,6 +66,18 @@ def over_the_wire(url: str, reference: ql.signals.Signal, seconds: float, option
     )
 
 
+def floor(seconds: float) -> np.ndarray | None:
+    """Return how late the wake-ups of a program in C are that does nothing else [s]; None without a compiler."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        program = f"{folder}/wakeup"
+        subprocess.run([compiler, "-O2", "-o", program, str(Path(__file__).with_name("wakeup.c"))], check=True)
+        run = subprocess.run([program, str(round(1e9 * DT)), str(round(seconds / DT))], stdout=subprocess.PIPE, text=True, check=True)
+    return 1e-9 * np.array(run.stdout.split(), dtype=float)
+
+
 def main() -> None:
     """Print histograms, counts and metrics."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -67,10 +87,17 @@ def main() -> None:
     parser.add_argument("--priority", type=int, default=50)
     options = parser.parse_args()
     reference = ql.signals.Sinusoid().until(0.5 * options.seconds, then=ql.signals.Step(at=0.5 * options.seconds))
+    late = floor(min(options.seconds, 20.0))
     with rig(options.wire, options.priority) as url:
         run = over_the_wire(url, reference, options.seconds, options)
     print(run.text())
-    print(f"\nno overrun: {run.overruns == 0}; p99.9 of the lateness {1e6 * run.timing.lateness.p999:.0f} µs (at most 500 wanted)\n")
+    print(f"\nno overrun: {run.overruns == 0}; p99.9 of the lateness {1e6 * run.timing.lateness.p999:.0f} µs (at most 500 wanted)")
+    if late is not None:
+        p50, p999 = np.percentile(late, [50.0, 99.9])
+        a_minute = 60.0 / DT * np.mean(late > DT)
+        print(f"the machine at best (C): p50 {1e6 * p50:.0f} µs, p99.9 {1e6 * p999:.0f} µs, max {1e6 * np.max(late):.0f} µs,", end=" ")
+        print(f"{a_minute:.0f} a minute later than a sample; p99.9 of the loop over that {run.timing.lateness.p999 / p999:.2f}")
+    print()
     delayed = ql.plants.delayed(PLANT, delay=DT, dt=DT)
     plain = ql.simulate(delayed, controller(), ql.Scenario(reference, options.seconds))
     if run.completed:

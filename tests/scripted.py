@@ -33,6 +33,8 @@ class Scripted(NamedTuple):
     """What is added to y: NaN where nothing comes."""
     stall: Any
     """How long fetching takes [ns]."""
+    moves: Any
+    """By how many samples the plant has moved on meanwhile, under the last u."""
     refused: Any
     """What ``put`` returns."""
     written: Any
@@ -49,6 +51,8 @@ def _fetch(line: Scripted, clock: Any, until: int) -> tuple[float, int]:
     k = line.at[0]
     line.at[0] += 1
     pass_time(clock, _entry(line.stall, k))
+    for _ in range(_entry(line.moves, k)):
+        advance(line.plant, line.x, line.scratch, 0.0, line.written[line.at[1] - 1], line.w)
     return measure(line.plant, line.x) + _entry(line.y, k), 0
 
 
@@ -70,7 +74,7 @@ class ScriptedDevice:
         self.paced = False
         model = plant.sampled(DT, False)
         x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=float)
-        kinds = {"y": float, "stall": np.int64, "refused": np.int64}
+        kinds = {"y": float, "stall": np.int64, "moves": np.int64, "refused": np.int64}
         told = {name: np.zeros(samples, dtype=kind) for name, kind in kinds.items()}
         for name, script in scripts.items():
             for k, value in script.items():

@@ -152,6 +152,18 @@ def test_a_device_that_sends_nothing_is_not_started() -> None:
     assert np.all(found[:, LOOP_WIDTH - 1] == 0.0)
 
 
+def test_deadlines_that_are_left_out_are_no_blow() -> None:
+    """While the loop stands still for three samples the plant moves on; an observer that knows it goes with it, and finds nothing amiss."""
+    stalled = ScriptedDevice(PLANT, stall={40: 35_000_000}, moves={41: 3})
+    controller = ql.ADRC(ql.ESO.model_based(PLANT, omega_o=12.0, dt=DT), omega_c=1.5, u_min=-3.0, u_max=3.0)
+    found = run(stalled, controller)
+    k = found["K"]
+    assert 3 in np.diff(k) - 1
+    assert np.max(np.abs(np.diff(found["U"][:60]))) > 1e-3
+    f_residual = found.rows[:, found.prepared.books.f_residual]
+    np.testing.assert_allclose(f_residual, 0.0, atol=1e-9)
+
+
 def test_the_reference_slides_from_where_y_is() -> None:
     """With the least jerk, at rest at both ends; derivatives to match; after ``approach`` it is the scenario's own, to the bit."""
     controller = adrc()

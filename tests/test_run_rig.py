@@ -241,6 +241,7 @@ def test_what_real_time_scheduling_is_not_permitted_is_said(monkeypatch: pytest.
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_setaffinity", refuse)
     monkeypatch.setattr("quell.realtime.scheduling._mlockall", lambda flags: -1)
+    monkeypatch.setattr("quell.realtime.scheduling._LATENCY", "/dev/no such file")
     interval = sys.getswitchinterval()
     with quiet_process(50, interpreted=True) as notes:
         assert sys.getswitchinterval() < interval
@@ -248,6 +249,6 @@ def test_what_real_time_scheduling_is_not_permitted_is_said(monkeypatch: pytest.
         enter_real_time(50, 0, notes)
     assert sys.getswitchinterval() == pytest.approx(interval)
     assert gc.isenabled()
-    assert [note.split(" ", 2)[0] for note in notes] == ["memory", "the", "priority"]
-    assert "run as root, or raise ulimit -r to 50" in notes[2]
+    assert [note.split(" ", 2)[0] for note in notes] == ["memory", "processors", "the", "priority"]
+    assert "run as root, or raise ulimit -r to 50" in notes[3]
     assert checked_cpu(None) is None

@@ -43,7 +43,7 @@ class Status(IntFlag):
 
 
 _MESSAGES = {
-    Status.MEASUREMENT_HELD: "The measurement was not finite; the last good one was used instead: look at the sensor.",
+    Status.MEASUREMENT_HELD: "The measurement was not finite; the expected or the last good one was used instead: look at the sensor.",
     Status.REFERENCE_HELD: "The reference was not finite; the last good one was used instead: look at its source.",
     Status.SATURATED: "The control signal lies on u_min or u_max; the observer was told the applied value.",
     Status.RATE_LIMITED: "The control signal moves as fast as rate_limit allows; the observer was told the applied value.",

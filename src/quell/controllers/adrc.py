@@ -162,8 +162,9 @@ class ADRC(HandOver):
 
         With ``feedforward``, r', r'', … may follow [y-unit/s^i]; those not given, or not finite, are zero.
 
-        A value that is not finite is replaced by the last good one, and said in ``estimate.status``. The observer takes the returned
-        value for applied; limits belong in ``u_min``, ``u_max`` and ``rate_limit``, not behind the controller; else see ``applied``.
+        In the place of a measurement that is not finite stands the one that the observer expects, in that of a reference the last good
+        one; ``estimate.status`` says so. The observer takes the returned value for applied; limits belong in ``u_min``, ``u_max`` and
+        ``rate_limit``, not behind the controller; else see ``applied``.
 
         The first call compiles, or loads; ``prepare`` does that beforehand.
 

@@ -24,7 +24,7 @@ from quell.dispatch import is_finite, kernel
 from quell.guard import calm, explain, note, permit, watch
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
 from quell.learners.lag import lag_push
-from quell.observers.base import acting, begin, observe
+from quell.observers.base import acting, begin, expected, observe
 from quell.types import Matrix, Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
@@ -40,7 +40,7 @@ LOOP = 15
     F_LEARNED,  # f_L, as the observer is told
     _F_SHOWN,  # what Δf̂ will show of it
     R,  # last good reference
-    Y,  # last good measurement
+    Y,  # last measurement, or what was expected in the place of one
     STARTED,  # whether there was one
     REFERENCED,  # whether there was a reference
     STATUS,  # of the last sample
@@ -108,6 +108,11 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         loop[STARTED] = 1.0
     else:
         _conclude(design, state, acted)
+        if status & _MEASUREMENT_HELD != 0:
+            # A y that stands still while the plant moves would be taken for a blow; the expected one tells the observer nothing.
+            y = expected(design.eso, state.z, loop[U], loop[F_LEARNED])
+            if is_finite(y):
+                loop[Y] = y
         observe(design.eso, state.z, seen, loop[Y], loop[U], loop[F_LEARNED])
         f_plain = seen[seen.size - 1] + loop[_F_SHOWN]
         watch(design.guard, state.guard, f_plain)

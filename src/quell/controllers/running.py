@@ -61,8 +61,8 @@ class Running:
     def step(self, r: float, y: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
 
-        A value that is not finite is replaced by the last good one, and said in ``status``. The returned value is taken for applied;
-        limits belong in ``u_min``, ``u_max`` and ``rate_limit``, not behind the controller.
+        A value that is not finite is replaced by the last good one, or by what an observer expects, and said in ``status``. The returned
+        value is taken for applied; limits belong in ``u_min``, ``u_max`` and ``rate_limit``, not behind the controller.
 
         The first call compiles, or loads; ``prepare`` does that beforehand.
         """

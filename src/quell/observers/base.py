@@ -2,7 +2,8 @@
 
 An observer is an ``ESO``: an immutable description with ``order`` n, ``b0``, ``omega_o``, ``dt`` and ``model``, a NamedTuple of
 parameters with ``states``, the length of its running state. That is one vector; entry n of it is a summand of the estimated f, so that a
-controller may shift the estimate there. For the type of ``model`` the functions below are registered; ``acting`` only where u is delayed.
+controller may shift the estimate there. For the type of ``model`` the functions below are registered; ``acting`` only where u is delayed,
+``expected`` only where the model has no ``transition``, ``input`` and ``feed`` for the first entries of z.
 """
 
 from __future__ import annotations
@@ -20,6 +21,20 @@ def observe(model: Any, z: Vector, seen: Vector, y: float, u: float, f_learned: 
     ``u`` is the control signal that was applied, ``f_learned`` the share of f that was fed forward, over the sample that ends with ``y``.
     """
     raise TypeError
+
+
+@generic
+def expected(model: Any, z: Vector, u: float, f_learned: float) -> float:
+    """Return the measurement that ``observe`` would find nothing to correct by, for the same ``u`` and ``f_learned``."""
+    raise TypeError
+
+
+@expected.register(object)
+def _first_of_the_forecast(model: Any, z: Vector, u: float, f_learned: float) -> float:
+    total = model.input[0] * u + model.feed[0] * f_learned
+    for j in range(model.feed.size):
+        total += model.transition[0, j] * z[j]
+    return total
 
 
 @generic

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from quell import checks
-from quell.observers.base import acting, begin, observe
+from quell.observers.base import acting, begin, expected, observe
 from quell.types import Vector
 
 # All of them are moved on each sample.
@@ -43,6 +43,11 @@ def _observe(model: DelayedModel, z: Vector, seen: Vector, y: float, u: float, f
         z[i] = z[i - 1]
     z[model.size] = u
     observe(model.inner, z[: model.size], seen, y, arriving, f_learned)
+
+
+@expected.register(DelayedModel)
+def _expected(model: DelayedModel, z: Vector, u: float, f_learned: float) -> float:
+    return expected(model.inner, z, z[z.size - 1], f_learned)
 
 
 @begin.register(DelayedModel)

@@ -2,7 +2,8 @@
 
 Cycle k has the deadline ``origin + k dt``. The loop sleeps until then, by the absolute time, takes the measurement, lets supervisor and
 controller have their say, writes u, and pushes a row to whoever records. A cycle that ends after the next deadline has overrun: the
-deadlines that are past are left out (k jumps), they are never caught up with in a burst.
+deadlines that are past are left out (k jumps), they are never caught up with in a burst. The controller is told of them all the same, as of
+samples without a measurement in which u stayed as it was: so its observer goes on with the plant, and a short stall is no blow to it.
 
 A device with a clock of its own (``paced``) sends a measurement at each of its ticks, and the loop wants to wake when one comes. So the
 grid of deadlines follows: where the measurement had to be waited for, it moves later by as much, a five-hundredth of a sample at
@@ -47,6 +48,7 @@ from quell.realtime.supervisor import (
     UNSENT,
     UNSURE,
     Rules,
+    U,
     Watch,
     Y,
     change,
@@ -124,19 +126,20 @@ def run_cycles(
     origin = 0
     if not finished(watch):
         origin = _first_deadline(line, clock, watch, pace, books.requests)
-    k = 0
+    k = left_out = 0
     while not finished(watch):
         deadline = origin + int(k * pace.period)
         woke = wait_until(clock, deadline)
         lateness = woke - deadline
         slept_over = int(lateness / pace.period)
+        left_out += slept_over
         k += slept_over
         _skip(counts, slept_over)
         y, waited, shift = _measure(line, clock, pace, counts, origin + int(k * pace.period))
         origin += shift
         changes = counts[CHANGES]
         clipped = counts[CLIPPED]
-        u = _steer(design, state, rules, watch, setpoints, books, k, y)
+        u = _steer(design, state, rules, watch, setpoints, books, k, left_out, y)
         fault = put(line, u)
         unsent = fault != 0
         counts[FAILED] = counts[FAILED] + 1 if unsent else 0
@@ -168,6 +171,7 @@ def run_cycles(
         count(books.lateness, lateness)
         count(books.step, step)
         _skip(counts, missed_next)
+        left_out = missed_next
         k += 1 + missed_next
 
 
@@ -222,18 +226,28 @@ def _measure(line: Any, clock: Any, pace: Pace, counts: NDArray[np.int64], deadl
 
 
 @kernel
-def _steer(design: Any, state: Any, rules: Rules, watch: Watch, setpoints: Setpoints, books: Books, k: int, y: float) -> float:
-    """Take a sample of supervisor and controller; return the u to apply, and write reference and report into the row."""
+def _steer(
+    design: Any, state: Any, rules: Rules, watch: Watch, setpoints: Setpoints, books: Books, k: int, left_out: int, y: float
+) -> float:
+    """Take a sample of supervisor and controller; return the u to apply, and write reference and report into the row.
+
+    Of the ``left_out`` deadlines before k the controller is told first, as far as they are not the end of the run.
+    """
     counts, values, row = watch.counts, watch.values, books.row
     judge(rules, watch, k, y, load_acquire(books.requests, 0), setpoints.r.size)
+    first = k - min(left_out, rules.hold)
     if counts[MODE] == RUN and counts[BEGAN] == k:
         take_over(design, state)
         values[GAP] = y - setpoints.r[0]
-    r = _reference(design, state, setpoints, watch, k)
-    wished, f_hat = 0.0, 0.0
+        first = k
     awake = counts[MODE] != STOPPED and is_finite(values[Y])
-    if awake:
-        wished = control(design, state, r, y)
+    r, wished, f_hat = 0.0, 0.0, 0.0
+    for i in range(first, k + 1):
+        r = _reference(design, state, setpoints, watch, i)
+        if awake:
+            wished = control(design, state, r, y if i == k else np.nan)
+            if i < k:
+                applied(design, state, values[U])
     report(design, state, row[LOOP_WIDTH:])
     if books.f_learned >= 0:
         f_hat = row[books.f_learned] + row[books.f_residual]

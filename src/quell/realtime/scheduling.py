@@ -1,4 +1,4 @@
-"""What keeps the loop's thread from being made to wait: priority, a processor of its own, memory that stays, no garbage collector.
+"""What keeps the loop's thread from being made to wait: priority, a processor of its own, memory that stays, processors that do not sleep.
 
 Each is tried; what is refused is said in a sentence, and the run goes on without it.
 """
@@ -16,6 +16,7 @@ from quell import checks
 from quell.realtime.libc import external
 
 _CURRENT_AND_FUTURE = 3
+_LATENCY = "/dev/cpu_dma_latency"
 # An interpreted loop gets the interpreter back after so long [s].
 _SWITCH = 1e-4
 
@@ -41,7 +42,9 @@ def checked_cpu(cpu: int | None) -> int | None:
 
 @contextmanager
 def quiet_process(priority: int, interpreted: bool) -> Iterator[list[str]]:
-    """Around the loop, in the main thread: lock the memory, keep the garbage collector out; yields a list for what is to be told.
+    """Around the loop, in the main thread: lock the memory, keep processors awake and the garbage collector out.
+
+    Yields a list for what is to be told.
 
     With a priority of 0 nothing but the collector is touched.
     """
@@ -53,9 +56,12 @@ def quiet_process(priority: int, interpreted: bool) -> Iterator[list[str]]:
     if interpreted:
         sys.setswitchinterval(_SWITCH)
     locked = priority > 0 and _lock_memory(notes)
+    awake = _stay_awake(notes) if priority > 0 else None
     try:
         yield notes
     finally:
+        if awake is not None:
+            os.close(awake)
         if locked:
             _munlockall()
         sys.setswitchinterval(interval)
@@ -75,6 +81,21 @@ def _lock_memory(notes: list[str]) -> bool:
     else:
         notes.append("memory is locked")
     return not refused
+
+
+def _stay_awake(notes: list[str]) -> int | None:
+    """Ask that no processor goes to a sleep from which it takes time to wake, as long as the file that is returned is open.
+
+    See the Linux kernel's *PM Quality Of Service Interface*: the file takes the longest latency that is tolerated [µs].
+    """
+    try:
+        file = os.open(_LATENCY, os.O_WRONLY)
+        os.write(file, (0).to_bytes(4, sys.byteorder))
+    except OSError as error:
+        notes.append(f"processors may sleep deeply ({error.strerror}): they wake later; run as root, or make {_LATENCY} writable")
+        return None
+    notes.append("processors stay awake")
+    return file
 
 
 def enter_real_time(priority: int, cpu: int | None, notes: list[str]) -> None:
