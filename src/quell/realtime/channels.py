@@ -11,7 +11,7 @@ LOOP_CHANNELS = (
     ("mode", 1),  # state of the supervisor
     ("events", 1),  # Event flags of this cycle
     ("r", 1),
-    ("y", 1),  # what the controller used: the last good one where a sample was missed
+    ("y", 1),  # the last good measurement
     ("y_measured", 1),  # as it came; NaN where it did not
     ("u", 1),  # as applied from this cycle to the next
 )
