@@ -42,7 +42,7 @@ def run_replay(*, record: Path, path: Path | None, json_file: Path | None, figur
     try:
         told = replay(recorded, cast(ADRC, setup.controller))  # what else it may be, replay itself says no to
     except ValueError as error:
-        raise refused(setup.name, "", error, ()) from None
+        raise refused(setup.file, "", error, ()) from None
     console = Console()
     part = _controlled(recorded)
     scores = {name: _score(run, part) for name, run in (("recorded", recorded), ("replayed", told))}

@@ -33,7 +33,7 @@ def run_setup(*, path: Path, json_file: Path | None, figures: Path | None, save:
         try:
             run = simulate(plant, setup.controller, scenario, progress=partial(tell, what))
         except ValueError as error:
-            raise SetupError([f"{setup.name}: {error}"]) from None
+            raise SetupError([f"{setup.file}: {error}"]) from None
     scores = judge(run, setup)
     print_judgement(console, f"{setup.title}: {run.plant}, dt = {run.dt:g} s", scores)
     learned = print_outcome(console, run)

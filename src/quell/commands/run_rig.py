@@ -101,7 +101,7 @@ def _closed(console: Console, setup: Setup, arguments: dict[str, Any], files: li
         device = open_device(url, setup.controller.dt)
         return run_rig(device, setup.controller, setup.scenario, telemetry=sinks, on_change=tell, **options)
     except ValueError as error:
-        raise refused(setup.name, "rig", error, [*arguments]) from None
+        raise refused(setup.file, "rig", error, [*arguments]) from None
     except ConnectionError as error:
         if not began:
             raise

@@ -87,9 +87,8 @@ def excitation(
     ----------
     kind
         * ``"multisine"``: up to 120 lines of one size, logarithmically spread over the band, all with whole numbers of periods: an answer
-        at
-          rest has no leakage. Phases are Schroeder's, then made better by clipping the peaks again and again and keeping the phases that
-          this gives (van der Ouderaa, Schoukens & Renneboog, *IEEE Trans. Instrumentation and Measurement* 37, 1988).
+          at rest has no leakage. Phases are Schroeder's, then made better by clipping the peaks again and again and keeping the phases
+          that this gives (van der Ouderaa, Schoukens & Renneboog, *IEEE Trans. Instrumentation and Measurement* 37, 1988).
         * ``"prbs"``: two values, the least crest factor. Values are held as long as the upper end of the band lets them (there the
           spectrum is 3 dB down), the register is as long as its lower end asks for.
         * ``"chirp"``: a sinusoid that sweeps through the band once, the same time for each octave.

@@ -145,7 +145,7 @@ class Rig:
 
     @property
     def largest(self) -> float:
-        """Largest |command| that came [u-unit], whether it was applied or not."""
+        """Largest ``|command|`` that came [u-unit], whether it was applied or not."""
         return float(self.model.signals[kernels.LARGEST])
 
     @property

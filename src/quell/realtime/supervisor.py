@@ -129,9 +129,9 @@ class Rules(NamedTuple):
     high: float
     """≥ 0."""
     most_error: float
-    """|r − y| [y-unit]."""
+    """Largest ``|r − y|`` [y-unit]."""
     most_f: float
-    """|f̂| [y-unit/s^n]."""
+    """Largest ``|f̂|`` [y-unit/s^n]."""
     hold: int
     ramp: int
     settle: int

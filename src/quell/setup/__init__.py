@@ -31,7 +31,7 @@ class Setup:
 
     Attributes
     ----------
-    name : str
+    file : str
         the file's name.
     title : str
         what tables and figures call it.
@@ -49,7 +49,7 @@ class Setup:
         the file's own tables.
     """
 
-    name: str
+    file: str
     title: str
     controller: Controller
     plant: Plant | None
@@ -72,7 +72,7 @@ class Setup:
             where it has not.
         """
         if getattr(self, table) is None:
-            raise SetupError([f"{self.name}: {table}: missing; give a table [{table}]"])
+            raise SetupError([f"{self.file}: {table}: missing; give a table [{table}]"])
         return getattr(self, table)
 
 
