@@ -61,7 +61,7 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(tmp_path: Path) -
             for scores in outcome["controllers"].values():
                 assert set(scores) >= {"overshoot", "settling_time", "control_variation"}
             assert all(set(claim) >= {"claim", "paper", "measured", "holds"} for claim in outcome["claims"])
-    names = {"position", "control", "learning"}
+    names = {"torsional-position", "torsional-control", "torsional-learning"}
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
     wrong = quell("reproduce", "torsional", "--dt", "0.01", cwd=tmp_path)
     assert wrong.returncode == 2

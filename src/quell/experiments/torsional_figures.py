@@ -49,9 +49,9 @@ def save(result: Result, folder: str | os.PathLike[str], tell: Callable[[str, fl
 
 
 def _figures(result: Result) -> Iterator[tuple[str, Any]]:
-    yield "position", _position(result)
-    yield "control", _control(result)
-    yield "learning", _learning(result.cases[-1])
+    yield "torsional-position", _position(result)
+    yield "torsional-control", _control(result)
+    yield "torsional-learning", _learning(result.cases[-1])
 
 
 def _position(result: Result) -> Any:
