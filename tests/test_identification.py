@@ -443,6 +443,12 @@ def test_records_are_read_with_and_without_names_and_times(tmp_path: Path) -> No
         np.testing.assert_array_equal(record.y, rows[:, 2])
         assert record.dt == pytest.approx(0.1)
         assert record.reference is None
+    german = "t [s];u;y\n" + "\n".join(";".join(f"{value:g}".replace(".", ",") for value in row[:3]) for row in rows)
+    (tmp_path / "german.csv").write_text("\ufeff" + german, encoding="utf-8")
+    (tmp_path / "tabs.csv").write_text(plain.replace(",", "\t"))
+    for record in (read_record(tmp_path / "german.csv", ("t [s]", "u", "y")), read_record(tmp_path / "tabs.csv")):
+        np.testing.assert_array_equal(record.y, rows[:, 2])
+        assert record.dt == pytest.approx(0.1)
     reference = read_record(tmp_path / "plain.csv", ("t", "u", "y", "r")).reference
     assert reference is not None
     np.testing.assert_array_equal(reference, rows[:, 3])
