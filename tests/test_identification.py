@@ -196,6 +196,21 @@ def test_a_reference_frees_a_closed_loop_of_bias() -> None:
     assert np.mean(freed) == pytest.approx(0.6, abs=0.15)
 
 
+def test_in_its_loop_an_unstable_plant_is_found_with_the_reference() -> None:
+    """Its pole is not mirrored, and the report says that it runs away."""
+    dt, plant = 0.01, ql.plants.LinearPlant.of(([2.0], [1.0, -0.3, 0.0]))
+    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=15.0, dt=dt), omega_c=3.0)
+    scenario = ql.Scenario(
+        reference=excitation("prbs", (0.2, 10.0), 60.0, dt).signal,
+        noise=ql.signals.BandLimitedNoise(power=1e-6, sample_time=dt),
+        duration=60.0,
+    )
+    run = ql.simulate(plant, controller, scenario)
+    found = ql.identify(run["u"], run["y_measured"], dt, order=2, reference=run["r"])
+    assert sorted(pole.value.real for pole in found.poles) == pytest.approx([0.0, 0.3], abs=0.02)
+    assert "runs away" in found.shortcomings[0]
+
+
 def test_the_gradient_is_that_of_differences() -> None:
     """All parameters of a structure with integrator, zeros and a second input, against central differences."""
     structure = Structure(3, 1, (1, 0))
@@ -363,6 +378,7 @@ U = np.sign(np.sin(0.05 * np.arange(2000.0) ** 1.1))
         ({"held_out": 0.95}, "held_out = 0.95: must be from 0 to 0.9"),
         ({"held_out": 0.01}, "held_out = 0.01: of 2000 samples these are 20"),
         ({"friction": 1}, "friction = 1: must be True or False"),
+        ({"reference": np.zeros(2000)}, "reference is 0 all through: must move"),
         ({"reference": U[:10]}, "reference has shape (10,): must be a vector of 2000"),
     ],
 )

@@ -106,6 +106,8 @@ def identify(
     checks.vector("y", y, u.size)
     if reference is not None:
         reference = checks.vector("reference", reference, u.size)
+        if np.ptp(reference) == 0.0:
+            raise ValueError(f"reference is {reference[0]:g} all through: must move; without one leave it out")
     dt = checks.positive("dt", dt, "s")
     order = checks.whole("order", order, 1, 8)
     zeros = checks.whole("zeros", zeros, 0, order - 1)
