@@ -156,7 +156,7 @@ class Identified:
         lines += ["", f"constant force {self.bias:.4g} (in units of u)"]
         if self.friction is not None:
             lines += [f"Coulomb friction {self.friction:.4g} (in units of u)"]
-        lines += [f"fit, {name}: {value:.3f} %" for name, value in self.fits.items()]
+        lines += [f"fit, {name}: {percent(value)} %" for name, value in self.fits.items()]
         left = self.residuals
         quantum = (
             f" ({left.rms / self.resolution * math.sqrt(12.0):.3g} times that of rounding to {self.resolution:.3g})"
@@ -176,7 +176,9 @@ class Identified:
 
     def __repr__(self) -> str:
         fit = self.fits.get("held out", self.fits["estimation"])
-        return f"Identified(order={self.den.size - 1}, poles {spell(np.array([p.value for p in self.poles]))} rad/s, fit {fit:.2f} %)"
+        return (
+            f"Identified(order={self.den.size - 1}, poles {spell(np.array([p.value for p in self.poles]))} rad/s, fit {percent(fit, 2)} %)"
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the results for ``quell.files.write_json``: no records, and None for what is not finite."""
@@ -224,6 +226,11 @@ def _root_json(root: Root) -> dict[str, float]:
         "omega": root.omega,
         "damping": root.damping,
     }
+
+
+def percent(fit: float, digits: int = 3) -> str:
+    """Return a fit as text; that of a model which runs away is a large negative number."""
+    return f"{fit:.{digits}f}" if fit > -1e4 else f"{fit:.3g}"
 
 
 def _named(root: Root) -> str:
