@@ -90,6 +90,7 @@ def test_a_setup_is_simulated_printed_written_drawn_and_saved(quell: Callable[..
         ("[guard]\nbond = 1.0", "quell: wrong.toml: guard.bond: unknown; did you mean bound?"),
         ("[guard]\nbound = 'x'\n[learner]\nkind = 'kallman'", "quell: wrong.toml: learner.kind = 'kallman': unknown; did you mean kalman?"),
         ("[guard", "quell: wrong.toml: not TOML"),
+        ("[[metrics]]\nstart = 30.0", "quell: wrong.toml: metrics[2].start = 30: must be less than the scenario's duration, 12 s"),
     ],
 )
 def test_each_mistake_gives_a_line_and_exit_code_two(more: str, message: str, quell: Callable[..., Shown], tmp_path: Path) -> None:

@@ -196,6 +196,21 @@ def test_a_reference_frees_a_closed_loop_of_bias() -> None:
     assert np.mean(freed) == pytest.approx(0.6, abs=0.15)
 
 
+def test_in_its_loop_an_unstable_plant_is_found_with_the_reference() -> None:
+    """Its pole is not mirrored, and the report says that it runs away."""
+    dt, plant = 0.01, ql.plants.LinearPlant.of(([2.0], [1.0, -0.3, 0.0]))
+    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=15.0, dt=dt), omega_c=3.0)
+    scenario = ql.Scenario(
+        reference=excitation("prbs", (0.2, 10.0), 60.0, dt).signal,
+        noise=ql.signals.BandLimitedNoise(power=1e-6, sample_time=dt),
+        duration=60.0,
+    )
+    run = ql.simulate(plant, controller, scenario)
+    found = ql.identify(run["u"], run["y_measured"], dt, order=2, reference=run["r"])
+    assert sorted(pole.value.real for pole in found.poles) == pytest.approx([0.0, 0.3], abs=0.02)
+    assert "runs away" in found.shortcomings[0]
+
+
 def test_the_gradient_is_that_of_differences() -> None:
     """All parameters of a structure with integrator, zeros and a second input, against central differences."""
     structure = Structure(3, 1, (1, 0))
@@ -270,6 +285,64 @@ def test_prediction_beats_simulation_and_both_are_told() -> None:
     assert "white: no" in str(found)
 
 
+@pytest.mark.parametrize("order", [2, 3, 4, 6])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_higher_order_than_the_plants_finds_it_too(order: int, noise: float) -> None:
+    """A lag by a model of up to six poles: it is fitted as well as by one, and the report says which poles no sample shows."""
+    u = excitation("prbs", (0.2, 40.0), 40.0, 0.01, seed=3).u
+    y = answer(([3.0], [1.0, 2.0]), u, 0.01)
+    y = y + noise * np.std(y) * np.random.default_rng(1).standard_normal(y.size)
+    found = ql.identify(u, y, 0.01, order=order)
+    assert found.fits["held out"] > 100.0 * (1.0 - noise) - 0.5
+    assert found.poles[0].value == pytest.approx(-2.0, rel=0.01)
+    assert any("faster than samples show" in text for text in found.shortcomings)
+    assert "NOT: " in str(found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("plant", [([2.0], [1.0, 0.0]), ([2.0], [1.0, 0.0, 0.0])])
+def test_one_integrator_alone_and_two_are_found_in_noise(plant: Any, seed: int) -> None:
+    """With 1 % of noise the poles are put at s = 0, none beside it, where the model might run away."""
+    u = excitation("prbs", (0.2, 40.0), 40.0, 0.01, seed=3).u
+    y = answer(plant, u, 0.01)
+    y = y + 0.01 * np.std(y) * np.random.default_rng(seed).standard_normal(y.size)
+    found = ql.identify(u, y, 0.01, order=len(plant[1]) - 1)
+    assert found.integrators == found.den.size - 1
+    assert found.num[0] == pytest.approx(2.0, rel=0.01)
+    assert found.shortcomings == ()
+
+
+def test_a_slow_lag_is_no_integrator() -> None:
+    """Its pole is many of its deviations from s = 0, also where a sinusoid is all that it was told, or the order is too low."""
+    t = np.arange(4000) * 0.01
+    u = np.sin(t)
+    y = answer(([3.0], [1.0, 2.0]), u, 0.01) + 0.01 * np.random.default_rng(5).standard_normal(t.size)
+    assert ql.identify(u, y, 0.01, order=2).poles[0].value == pytest.approx(-2.0, rel=0.02)
+
+
+def test_the_report_says_what_speaks_against_the_model() -> None:
+    """A pole and a zero that can't be told apart, and a pole in the right half plane, are named; a good model has nothing of it."""
+    u = excitation("prbs", (0.2, 40.0), 40.0, 0.01, seed=3).u
+    noise = 0.005 * np.random.default_rng(4).standard_normal(u.size)
+    y = answer(([3.0], [1.0, 2.0]), u, 0.01) + noise
+    assert ql.identify(u, y, 0.01, order=1).shortcomings == ()
+    found = ql.identify(u, y, 0.01, order=2, zeros=1)
+    assert any("can't be told from a zero" in text for text in found.shortcomings)
+    assert found.integrators == 0
+    astray = ql.identify(u, answer(([3.0], [1.0, -0.1, 0.3]), u, 0.01), 0.01, order=2)
+    assert ["runs away" in text for text in astray.shortcomings] == [True]
+    assert astray.to_json()["shortcomings"] == list(astray.shortcomings)
+
+
+def test_a_record_that_ends_at_rest_is_refused_with_what_to_do() -> None:
+    """On samples where nothing moves no model can be judged; with none held out the step is enough."""
+    u = np.append(0.0, np.ones(1999))
+    y = answer(([3.0], [1.0, 2.0]), u, 0.01)
+    with pytest.raises(ValueError, match=r"held_out = 0\.3: u is 1 all through these samples.*hold fewer out, or none"):
+        ql.identify(u, y, 0.01, order=1)
+    assert ql.identify(u, y, 0.01, order=1, held_out=0.0).poles[0].value == pytest.approx(-2.0, rel=1e-6)
+
+
 def test_the_report_has_all_of_it() -> None:
     """As text, as JSON without gaps, as a picture."""
     found = ql.identify(*twin_record((0.2, 20.0), 2.0), DT, friction=True)
@@ -305,6 +378,7 @@ U = np.sign(np.sin(0.05 * np.arange(2000.0) ** 1.1))
         ({"held_out": 0.95}, "held_out = 0.95: must be from 0 to 0.9"),
         ({"held_out": 0.01}, "held_out = 0.01: of 2000 samples these are 20"),
         ({"friction": 1}, "friction = 1: must be True or False"),
+        ({"reference": np.zeros(2000)}, "reference is 0 all through: must move"),
         ({"reference": U[:10]}, "reference has shape (10,): must be a vector of 2000"),
     ],
 )
@@ -385,6 +459,12 @@ def test_records_are_read_with_and_without_names_and_times(tmp_path: Path) -> No
         np.testing.assert_array_equal(record.y, rows[:, 2])
         assert record.dt == pytest.approx(0.1)
         assert record.reference is None
+    german = "t [s];u;y\n" + "\n".join(";".join(f"{value:g}".replace(".", ",") for value in row[:3]) for row in rows)
+    (tmp_path / "german.csv").write_text("\ufeff" + german, encoding="utf-8")
+    (tmp_path / "tabs.csv").write_text(plain.replace(",", "\t"))
+    for record in (read_record(tmp_path / "german.csv", ("t [s]", "u", "y")), read_record(tmp_path / "tabs.csv")):
+        np.testing.assert_array_equal(record.y, rows[:, 2])
+        assert record.dt == pytest.approx(0.1)
     reference = read_record(tmp_path / "plain.csv", ("t", "u", "y", "r")).reference
     assert reference is not None
     np.testing.assert_array_equal(reference, rows[:, 3])

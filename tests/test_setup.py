@@ -134,6 +134,18 @@ def test_a_file_that_is_none_is_told_apart(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("dt = 0.01\n[plant\n")
     with pytest.raises(SetupError, match=r"bad.toml: not TOML: .*at line 2"):
         load(tmp_path / "bad.toml")
+    (tmp_path / "bytes.toml").write_bytes(b"dt = 0.01 # \xb5s\n")
+    with pytest.raises(SetupError, match=r"^bytes.toml: not TOML: byte 12 is not UTF-8$"):
+        load(tmp_path / "bytes.toml")
+    (tmp_path / "deep.toml").write_text("a = " + "[" * 5000 + "]" * 5000)
+    with pytest.raises(SetupError, match=r"^deep.toml: .*nested too deeply$"):
+        load(tmp_path / "deep.toml")
+
+
+def test_a_mark_of_byte_order_is_no_mistake(tmp_path: Path) -> None:
+    """As some editors put it in front of a text."""
+    (tmp_path / "rig.toml").write_text((EXAMPLES / "two_mass.toml").read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert load(tmp_path / "rig.toml").as_json() == load(EXAMPLES / "two_mass.toml").as_json()
 
 
 def test_every_learner_that_numbers_suffice_for_has_a_kind() -> None:

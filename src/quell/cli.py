@@ -213,7 +213,7 @@ def identify(
     Parameters
     ----------
     data
-        CSV file of the record, with or without a line of names.
+        CSV file of the record, with or without a line of names; commas, semicolons or tabs between.
     order
         Number of poles.
     zeros

@@ -14,7 +14,7 @@ from quell.experiments.figures import made, save_figure
 from quell.files import check_writable
 from quell.identification.design import excitation
 from quell.identification.fitting import identify
-from quell.identification.identified import Identified, Root
+from quell.identification.identified import Identified, Root, percent
 from quell.identification.records import read_record
 
 
@@ -107,7 +107,7 @@ def _print(console: Console, found: Identified, source: str) -> None:
     fits.add_column("%", justify="right")
     for name, value in found.fits.items():
         ahead = f" {found.horizon} samples ahead" if name.endswith("predicted") else ""
-        fits.add_row(name + ahead, f"{value:.3f}")
+        fits.add_row(name + ahead, percent(value))
     console.print(fits)
     rest = told[next(i for i, line in enumerate(told) if line.startswith("constant force")) :]
     console.print(escape("\n".join(line for line in rest if not line.startswith("fit, "))), soft_wrap=True)

@@ -36,8 +36,8 @@ from quell.simulation import Scenario, simulate
 from quell.trajectory import Trajectory
 
 Scores = Mapping[str, float | None]
-# One count of the encoder as a fraction of the move: what an overshoot can be told apart by.
-COUNT = 2.0 / COUNTS
+# One count of the encoder as a fraction of the move: what an overshoot can be told apart by. Overshoots are whole counts but for rounding.
+COUNT = 2.0 / COUNTS * (1.0 + 1e-6)
 
 
 @dataclass(frozen=True)

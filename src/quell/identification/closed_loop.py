@@ -34,7 +34,8 @@ def instrumental(structure: Structure, theta: Vector, v: Matrix, y: Vector, r: V
     """Return the parameters by instrumental variables from ``r`` (N,), begun at ``theta``, for the inputs ``v`` and the output ``y``."""
     converged = False
     for _ in range(_ROUNDS):
-        a = structure.denominator(theta)
+        # A filter has to be stable; the plant, in its loop, need not be.
+        a = structure.denominator(stable(structure, theta))
         known = linear_columns(structure, a, v)
         target, regressors = equation(structure, a, known, y)
         # What answers to neither u nor y is its own instrument.
@@ -48,7 +49,6 @@ def instrumental(structure: Structure, theta: Vector, v: Matrix, y: Vector, r: V
         after = np.linalg.lstsq(left, projected.T @ target, rcond=1e-12)[0] / size
         if not np.all(np.isfinite(after)):
             break
-        after = stable(structure, after)
         moved, theta = float(np.max(np.abs((after - theta) * size)) / np.max(np.abs(theta * size))), after
         if moved < _ENOUGH:
             converged = True

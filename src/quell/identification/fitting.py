@@ -57,7 +57,7 @@ def identify(
         number of zeros, less than n.
     integrators
         how many poles lie at s = 0; by default one is put there where the slowest can't be told from it: it is within three of its
-        standard deviations, or slower than ten times the record.
+        standard deviations, or slower than ten times the record; two, where that holds of two at once.
     delay
         how late u is [s], a whole number of samples; or the smallest and largest to look through, for the best.
     bias
@@ -106,6 +106,8 @@ def identify(
     checks.vector("y", y, u.size)
     if reference is not None:
         reference = checks.vector("reference", reference, u.size)
+        if np.ptp(reference) == 0.0:
+            raise ValueError(f"reference is {reference[0]:g} all through: must move; without one leave it out")
     dt = checks.positive("dt", dt, "s")
     order = checks.whole("order", order, 1, 8)
     zeros = checks.whole("zeros", zeros, 0, order - 1)
@@ -236,4 +238,9 @@ def _split(u: Vector, y: Vector, order: int, zeros: int, friction: bool, held_ou
     for name, value in (("u", u), ("y", y)):
         if np.ptp(value[:held_from]) == 0.0:
             raise ValueError(f"{name} is {value[0]:g} all through the samples for the fit: must move, or nothing can be learned from it")
+        if held_from < u.size and np.ptp(value[held_from:]) == 0.0:
+            raise ValueError(
+                f"held_out = {held_out!r}: {name} is {value[-1]:g} all through these samples, must move to be judged on; "
+                "hold fewer out, or none, or cut the record where it rests"
+            )
     return held_from

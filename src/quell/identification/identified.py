@@ -15,6 +15,8 @@ from quell.observers.canonical import spell
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
+_DEVIATIONS = 3.0
+
 
 class Root(NamedTuple):
     """A pole or a zero; of a conjugate pair both are listed."""
@@ -30,6 +32,11 @@ class Root(NamedTuple):
     def omega(self) -> float:
         """Its size [rad/s]."""
         return abs(self.value)
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the distance to where it really is [rad/s]."""
+        return math.hypot(self.real_std, self.imag_std)
 
     @property
     def damping(self) -> float:
@@ -86,6 +93,24 @@ class Identified:
         return LinearPlant.of((self.num, self.den), name="identified plant")
 
     @property
+    def shortcomings(self) -> tuple[str, ...]:
+        """What speaks against the model, whatever its fit: poles that run away, that no sample shows, or that a zero cancels."""
+        seen = math.pi / self.dt
+        poles, zeros = ([root for root in roots if root.value.imag >= 0.0] for roots in (self.poles, self.zeros))
+        found = [
+            f"the pole at {_named(pole)} runs away; if the plant does not, take a lower order or set integrators"
+            for pole in poles
+            if pole.value.real > 0.0
+        ]
+        for what, roots in (("pole", poles), ("zero", zeros)):
+            fast = [root for root in roots if root.omega > seen]
+            found += [f"the {what} at {_named(root)} is faster than samples show, {seen:.4g} rad/s; take fewer {what}s" for root in fast]
+        for zero in zeros:
+            cancelled = [pole for pole in poles if abs(pole.value - zero.value) <= _DEVIATIONS * (pole.deviation + zero.deviation)]
+            found += [f"the pole at {_named(pole)} can't be told from a zero; take one of each less" for pole in cancelled[:1]]
+        return tuple(found)
+
+    @property
     def t(self) -> Vector:
         """Times of the samples [s]."""
         return np.arange(float(self.y.size)) * self.dt
@@ -131,7 +156,7 @@ class Identified:
         lines += ["", f"constant force {self.bias:.4g} (in units of u)"]
         if self.friction is not None:
             lines += [f"Coulomb friction {self.friction:.4g} (in units of u)"]
-        lines += [f"fit, {name}: {value:.3f} %" for name, value in self.fits.items()]
+        lines += [f"fit, {name}: {percent(value)} %" for name, value in self.fits.items()]
         left = self.residuals
         quantum = (
             f" ({left.rms / self.resolution * math.sqrt(12.0):.3g} times that of rounding to {self.resolution:.3g})"
@@ -143,6 +168,7 @@ class Identified:
             f"white: {'yes' if left.white else 'no'} (zeta = {left.whiteness:.3g}, limit {left.whiteness_limit:.3g}, {left.lags} lags)",
             f"independent of past u: {'yes' if left.independent else 'no'} "
             f"(largest correlation {np.max(np.abs(left.cross_correlation[left.lags :])):.3g}, limit {left.cross_limit:.3g})",
+            *(f"NOT: {text}" for text in self.shortcomings),
         ]
         return "\n".join(lines)
 
@@ -150,7 +176,9 @@ class Identified:
 
     def __repr__(self) -> str:
         fit = self.fits.get("held out", self.fits["estimation"])
-        return f"Identified(order={self.den.size - 1}, poles {spell(np.array([p.value for p in self.poles]))} rad/s, fit {fit:.2f} %)"
+        return (
+            f"Identified(order={self.den.size - 1}, poles {spell(np.array([p.value for p in self.poles]))} rad/s, fit {percent(fit, 2)} %)"
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the results for ``quell.files.write_json``: no records, and None for what is not finite."""
@@ -181,6 +209,7 @@ class Identified:
                 "cross_limit": left.cross_limit,
             },
             "resolution": self.resolution,
+            "shortcomings": self.shortcomings,
             "converged": self.converged,
             "method": self.method,
         }
@@ -197,6 +226,15 @@ def _root_json(root: Root) -> dict[str, float]:
         "omega": root.omega,
         "damping": root.damping,
     }
+
+
+def percent(fit: float, digits: int = 3) -> str:
+    """Return a fit as text; that of a model which runs away is a large negative number."""
+    return f"{fit:.{digits}f}" if fit > -1e4 else f"{fit:.3g}"
+
+
+def _named(root: Root) -> str:
+    return f"{spell(np.array([root.value]))} rad/s"
 
 
 def _row(root: Root) -> str:

@@ -69,16 +69,23 @@ def simulated(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
     """
     structure, theta = fit.structure, fit.found.theta
     if y is None:
-        return free_run(structure, theta, v, own_friction=True)[0]
+        return _kept(free_run(structure, theta, v, own_friction=True)[0])
     theta = theta.copy()
     theta[-structure.order :] = 0.0
     free = chains(structure.denominator(theta), np.zeros((y.size, 0)))[:, :, 0]
     size = lengths(free)
-    predicted = free_run(structure, theta, v)[0]
+    predicted = _kept(free_run(structure, theta, v)[0])
     # With friction the start decides on the sign of the speed, and that on the start.
     for _ in range(_ROUNDS if structure.rubbing else 1):
         theta[-structure.order :] += np.linalg.lstsq(free / size, y - predicted, rcond=1e-12)[0] / size
-        predicted = free_run(structure, theta, v, own_friction=True)[0]
+        predicted = _kept(free_run(structure, theta, v, own_friction=True)[0])
+    return predicted
+
+
+def _kept(predicted: Vector) -> Vector:
+    """Return a simulated output, or say that there is none."""
+    if not np.all(np.isfinite(predicted)):
+        raise ValueError("order: the model that was found runs away when it is simulated; lower the order, or give integrators")
     return predicted
 
 
@@ -114,8 +121,10 @@ def residuals(error: Vector, u: Vector, lags: int) -> Residuals:
     e, v = error - np.mean(error), u - np.mean(u)
     count = e.size
     re, ru, cross = (_correlation(*pair, lags) for pair in ((e, e), (v, v), (e, v)))
-    auto = re[lags:] / re[lags]
-    scale = float(np.sqrt(re[lags] * ru[lags]))
+    # Without any error there is nothing to correlate.
+    power = re[lags] or 1.0
+    auto = re[lags:] / power
+    scale = float(np.sqrt(power * ru[lags]))
     # Correlations beyond the lags looked at count as none.
     variance = max(float(np.sum(re * ru)), 0.0) / scale**2
     return Residuals(

@@ -14,6 +14,7 @@ taken from the scores ψ e themselves, summed over blocks that are longer than e
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -48,7 +49,7 @@ def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: in
     converged = best <= rounding
     near = _linearised(structure, theta, v, y)
     for _ in range(steps):
-        if converged:
+        if converged or not near.finite:
             break
         step = np.linalg.solve(near.hessian + damping * np.eye(theta.size), near.right) / near.size
         value = cost(structure, theta + step, v, y)
@@ -61,6 +62,8 @@ def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: in
             converged = bool(near.right @ np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0] <= _ENOUGH * best * y.size)
             damping = max(10.0 * damping, 1e-8)
         converged = converged or best <= rounding or damping > _GIVE_UP
+    if not near.finite:
+        return Refined(theta, np.full(near.hessian.shape, np.inf), best, False)
     half = np.linalg.pinv(near.hessian, rcond=_RANK, hermitian=True) @ near.scores.T
     return Refined(theta, half @ half.T / np.outer(near.size, near.size), best, converged)
 
@@ -68,6 +71,8 @@ def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: in
 def promised(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
     """Return the mean square of the output error that one step of Gauss and Newton promises, and the parameters after it."""
     near = _linearised(structure, theta, v, y)
+    if not near.finite:
+        return math.inf, theta
     step = np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0]
     return max(near.error - float(near.right @ step), 0.0) / y.size, theta + step / near.size
 
@@ -84,15 +89,21 @@ class _Near(NamedTuple):
     """its sums over blocks."""
     error: float
     """Σ e²."""
+    finite: bool
+    """False of a model that runs away."""
 
 
 def _linearised(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Near:
-    predicted, psi = gradient(structure, theta, v)
-    error = y - predicted
-    hessian = psi.T @ psi
+    with np.errstate(all="ignore"):
+        predicted, psi = gradient(structure, theta, v)
+        error = y - predicted
+        hessian, power = psi.T @ psi, float(error @ error)
+    finite = bool(np.all(np.isfinite(hessian))) and math.isfinite(power)
+    if not finite:
+        error, psi, hessian = np.zeros_like(error), np.zeros_like(psi), np.zeros_like(hessian)
     size = np.sqrt(np.diag(hessian))
     size = np.where(size > 0.0, size, 1.0)
     blocks = min(max(4 * theta.size, 60), y.size)
     edges = np.linspace(0, y.size, blocks + 1).astype(int)
     scores = np.array([error[i:j] @ psi[i:j] for i, j in pairwise(edges)]) / size
-    return _Near(size, hessian / np.outer(size, size), np.sum(scores, axis=0), scores, float(error @ error))
+    return _Near(size, hessian / np.outer(size, size), np.sum(scores, axis=0), scores, power, finite)

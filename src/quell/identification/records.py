@@ -35,7 +35,8 @@ def read_record(path: str | os.PathLike[str], columns: Sequence[str] = ("t", "u"
     Parameters
     ----------
     path
-        the file, with commas between; a first line that is not numbers names the columns.
+        the file, with commas, semicolons or tabs between, as its first line has them; between semicolons or tabs a comma is a decimal
+        point. A first line that is not numbers names the columns.
     columns
         which are time [s], input and output, and if there are four, what was sent into the loop from outside: names where the file has
         them, or numbers from 1 on. With ``dt`` the time is left out.
@@ -86,13 +87,26 @@ def _rows(path: Path, where: str) -> list[tuple[int, list[str]]]:
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{where}: can't be read as a text file ({getattr(error, 'strerror', None) or 'not UTF-8'})") from None
     try:
-        rows = [(number, [cell.strip() for cell in row]) for number, row in enumerate(csv.reader(text.splitlines()), 1)]
+        lines = text.splitlines()
+        between = _separator(next((line for line in lines if line.strip() and not line.startswith("#")), ""))
+        rows = [(number, [cell.strip() for cell in row]) for number, row in enumerate(csv.reader(lines, delimiter=between), 1)]
     except csv.Error as error:
         raise ValueError(f"{where}: is no CSV file ({error})") from None
     rows = [(number, row) for number, row in rows if any(row) and not row[0].startswith("#")]
     if not rows:
         raise ValueError(f"{where}: is empty")
+    if between != ",":
+        rows = [(number, [_with_point(cell) for cell in row]) for number, row in rows]
     return rows
+
+
+def _separator(line: str) -> str:
+    return next((mark for mark in ("\t", ";") if mark in line), ",")
+
+
+def _with_point(cell: str) -> str:
+    pointed = cell.replace(",", ".", 1)
+    return pointed if _is_number(pointed) else cell
 
 
 def _place(where: str, header: list[str] | None, width: int, name: str, role: int) -> int:

@@ -142,7 +142,9 @@ def sampled(A: Matrix, B: Matrix, straight: bool = False) -> Sampled:
     """Sample ``x' = A x + B v`` exactly over a unit of time, ``v`` held, or straight between its samples."""
     n, m = B.shape
     if not straight:
-        phi, (gamma,) = zero_order_hold(A, [B], 1.0)
+        # Of a model that runs away nothing finite is left; whoever asked sees that in its output.
+        with np.errstate(all="ignore"):
+            phi, (gamma,) = zero_order_hold(A, [B], 1.0)
         return Sampled(phi, gamma, np.zeros((n, m)))
     # A straight input is the state of an integrator whose own input, the slope, is held.
     block = np.zeros((n + m, n + m))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,12 @@ _BRIEFLY, _THOROUGHLY = 2, 30
 # A pole within so many of its standard deviations of s = 0, or this much slower than the record is long, is taken for an integrator.
 _DEVIATIONS = 3.0
 _SLOWER = 10.0
+# The same for two poles at a time: as rare of χ² with two degrees of freedom as three deviations are of one.
+_PAIR = 11.8
+# That is to first order. So the mean square of the error may become so much larger by one integrator, by two, and without noise be so
+# much of the output's: signs of friction that are not settled yet make it larger too.
+_AS_GOOD = (30.0, 1.05)
+_ROUNDING = 1e-18
 
 
 class Fit(NamedTuple):
@@ -51,7 +57,11 @@ def fit(u: Vector, y: Vector, order: int, zeros: int, integrators: int | None, l
     degrees = (zeros, *([0] if bias else []), *([max(order - 2, 0)] if friction else []))
     structure = Structure(order, integrators or 0, degrees, (0.0,) if friction else ())
     v = np.column_stack([delayed(u, late[0]), *([np.ones(u.size)] if bias else []), *([measured_sign(y, _HALF_WIDTH)] if friction else [])])
-    found = refined(structure, started(structure, v, y), v, y, _BRIEFLY)
+    starts = started(structure, v, y)
+    steps = _BRIEFLY if len(starts) == 1 else _THOROUGHLY
+    found = min((refined(structure, theta, v, y, steps) for theta in starts), key=lambda one: one.cost)
+    if not np.isfinite(found.cost):
+        raise ValueError(f"order = {order}, zeros = {zeros}: no model was found whose output is finite; lower the order, or scale u and y")
     samples, found, v = _latest(structure, found, u, v, y, late, late[0])
     if integrators is None:
         structure, found = _with_integrator(structure, found, v, y)
@@ -135,17 +145,44 @@ def _latest(
 
 
 def _with_integrator(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Structure, Refined]:
-    """Return the structure with a pole at s = 0, and its parameters, where the slowest pole can't be told from that."""
-    if structure.order == 1 or structure.integrators:
+    """Return the structure with one or two poles at s = 0, and its parameters, where the slowest can't be told from that."""
+    if structure.integrators:
         return structure, found
-    a = structure.denominator(found.theta)
+    a, free, covariance = structure.denominator(found.theta), structure.free, found.covariance
+    # An integrator whose zero can't be told from s = 0 either is none: the two cancel.
+    if structure.degrees[0] and abs(found.theta[free]) < _DEVIATIONS * np.sqrt(covariance[free, free]):
+        return structure, found
     poles = np.roots(np.append(1.0, a[::-1]))
-    slowest = poles[np.argmin(np.abs(poles))]
-    spread = float(np.sqrt(root_covariance(a, found.covariance[: a.size, : a.size], slowest)[0]))
-    if abs(slowest.imag) > 0.0 or not (abs(slowest) * _SLOWER * y.size < 1.0 or abs(slowest) < _DEVIATIONS * spread):
-        return structure, found
-    structure = structure._replace(integrators=1)
-    return structure, refined(structure, found.theta[1:], v, y, _BRIEFLY)
+    slow = poles[np.argsort(np.abs(poles))][:2]
+    for count, limit in ((2, _PAIR), (1, _DEVIATIONS**2)):
+        if count > slow.size or (count == 1 and abs(slow[0].imag) > 0.0):
+            continue
+        if abs(slow[count - 1]) * _SLOWER * y.size < 1.0 or _squares(a, covariance[: a.size, : a.size], slow[:count]) < limit:
+            fewer = structure._replace(integrators=count)
+            without = refined(fewer, found.theta[count:], v, y, _BRIEFLY)
+            if without.cost <= _AS_GOOD[count - 1] * found.cost or without.cost <= _ROUNDING * float(np.mean(y**2)):
+                return fewer, without
+    return structure, found
+
+
+def _squares(a: Vector, covariance: Matrix, roots: Any) -> float:
+    """Return how far from zero the coefficients of the polynomial of one root, or two, are, as the sum of squares in deviations."""
+    slopes = np.array([_slope(a, root) for root in roots])
+    if roots.size == 1:
+        coefficients, slopes = -roots, -slopes
+    else:
+        coefficients = np.array([roots[0] * roots[1], -roots[0] - roots[1]])
+        slopes = np.array([roots[1] * slopes[0] + roots[0] * slopes[1], -slopes[0] - slopes[1]])
+    part = slopes.real @ covariance @ slopes.real.T
+    size = np.sqrt(np.maximum(np.diag(part), 1e-300))
+    away = coefficients.real / size
+    return float(away @ np.linalg.pinv(part / np.outer(size, size), hermitian=True) @ away)
+
+
+def _slope(a: Vector, root: complex) -> Vector:
+    """Return the derivatives of a root of ``p^n + a_{n−1} p^(n−1) + …`` by its ``a``."""
+    found: Vector = -(root ** np.arange(a.size)) / np.polyval(np.polyder(np.append(1.0, a[::-1])), root)
+    return found
 
 
 def root_covariance(a: Vector, covariance: Matrix, root: complex) -> tuple[float, float]:
@@ -153,6 +190,5 @@ def root_covariance(a: Vector, covariance: Matrix, root: complex) -> tuple[float
 
     To first order ``δp = −Σ p^i δa_i / A'(p)``.
     """
-    powers = root ** np.arange(a.size)
-    slope = -powers / np.polyval(np.polyder(np.append(1.0, a[::-1])), root)
+    slope = _slope(a, root)
     return float(slope.real @ covariance @ slope.real), float(slope.imag @ covariance @ slope.imag)

@@ -9,6 +9,9 @@ Data*, 2008, ch. 1). With ``Λ = (p + λ)^n`` it is least squares, whose poles n
 own A for Λ, and its noise-free output ŷ in place of y among the instruments (SRIVC; Young & Jakeman, *Int. J. Control* 31, 1980): then
 the instruments are the gradient of ŷ, and where it comes to rest θ is free of bias by noise. Starting it at several λ makes it find the
 plant whatever its speed.
+
+A model of more poles than the plant has is not found that way: 1/Λ^n leaves little of u, and any poles fit what is left. So the model of
+one pole less, and a fast pole beside it, is tried too.
 """
 
 from __future__ import annotations
@@ -22,14 +25,21 @@ from quell.identification.structure import Structure, gradient, lengths, linear_
 from quell.types import Matrix, Vector
 
 _RATES = 7
+# Where more of the output's power than this is not explained, a lower order may lead to something better.
+_POOR = 1e-3
+# The further pole that a model of lower order is given [1/sample].
+_FURTHER = 10.0
 _ROUNDS = 8
 # Averages are over so much of the filter's time constant at most, and so many to a parameter at least.
 _FINE = 0.1
 _FEWEST = 100
 
 
-def started(structure: Structure, v: Matrix, y: Vector) -> Vector:
-    """Return parameters near those of least output error, for the inputs ``v`` (N, inputs) and the output ``y`` (N,)."""
+def started(structure: Structure, v: Matrix, y: Vector) -> tuple[Vector, ...]:
+    """Return parameters near those of least output error, for the inputs ``v`` (N, inputs) and the output ``y`` (N,).
+
+    Those that leave much unexplained are followed by those of a lower order, with fast poles.
+    """
     tried = [_filtered(structure, v, y, rate) for rate in np.geomspace(min(10.0 / y.size, 1e-2), 0.5, _RATES).tolist()]
     best, theta = min(((cost(structure, theta, v, y), theta) for theta in tried), key=lambda pair: pair[0])
     for _ in range(_ROUNDS):
@@ -38,7 +48,23 @@ def started(structure: Structure, v: Matrix, y: Vector) -> Vector:
         if not value < best * (1.0 - 1e-3):
             break
         best, theta = value, refined
-    return theta
+    if best > _POOR * float(np.var(y)) and structure.order > max(structure.degrees[0] + 1, structure.integrators):
+        lower = structure._replace(
+            order=structure.order - 1, degrees=(structure.degrees[0], *(max(min(d, structure.order - 3), 0) for d in structure.degrees[1:]))
+        )
+        return theta, *(_faster(structure, lower, simpler) for simpler in started(lower, v, y))
+    return (theta,)
+
+
+def _faster(structure: Structure, lower: Structure, theta: Vector) -> Vector:
+    """Return the parameters of the model of one pole less with a fast pole beside it; zeros that it would need and has not are left out."""
+
+    def times(polynomial: Vector) -> Vector:
+        return np.append(0.0, polynomial) + _FURTHER * np.append(polynomial, 0.0)
+
+    a = times(np.append(lower.denominator(theta), 1.0))
+    numerators = [times(row)[: degree + 1] for row, degree in zip(lower.numerators(theta), structure.degrees, strict=True)]
+    return np.concatenate([a[structure.integrators : -1], *numerators, times(lower.start(theta))])
 
 
 def cost(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> float:

@@ -192,7 +192,8 @@ def torsional(
         their Coulomb friction [N m]: assumed. Friction is said to rule free swings of less than 0.04 rad [1]_; 0.01 is a tenth of the
         spring's torque there, and the upper disk, on its bearings alone, is given a tenth of that.
     torque_constant
-        of the motor k_t [N m/A]: about 0.1 [1]_; here such as to give the paper's gain.
+        of the motor k_t [N m/A]: about 0.1 [1]_; here such as to give the paper's gain. ``k_a k_t N`` is then 0.58 N m/V, of which 0.70 is
+        published [2]_.
     amplifier
         its gain k_a [A/V]: about 2 [1]_.
     current_limit

@@ -53,12 +53,15 @@ def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
     """
     name = Path(path).name
     try:
-        with Path(path).open("rb") as file:
-            return name, tomllib.load(file)
+        return name, tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise SetupError([f"{path}: can't be read ({error.strerror})"]) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise SetupError([f"{name}: not TOML: byte {error.start} is not UTF-8"]) from None
+    except tomllib.TOMLDecodeError as error:
         raise SetupError([f"{name}: not TOML: {error}"]) from None
+    except RecursionError:
+        raise SetupError([f"{name}: not a setup: tables or lists are nested too deeply"]) from None
 
 
 def describe(name: str, data: Mapping[str, Any]) -> Description:
