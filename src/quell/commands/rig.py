@@ -8,11 +8,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from quell import checks
 from quell.realtime.devices import listen, plant_named
 from quell.realtime.frames import REFUSALS
 from quell.realtime.scheduling import checked_cpu, checked_priority
-from quell.realtime.server import Rig
+from quell.realtime.server import Rig, checked_seconds
 
 
 def run_rig(
@@ -27,13 +26,13 @@ def run_rig(
     """
     model = plant_named(plant, "--plant")
     if seconds is not None:
-        checks.positive("--seconds", seconds, "s")
+        checked_seconds("--seconds", seconds)
     checked_priority(priority)
     checked_cpu(cpu)
     with closing(listen(device)) as listener, Rig(model, listener=listener, log=log, **settings) as rig:
+        rig.prepare()  # may take a minute the first time, and Ctrl-C ends it
         before = {number: signal.signal(number, lambda *_: rig.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            rig.prepare()
             print(f"{plant} at {listener.url}: {_described(**settings)}", flush=True)
             notes = rig.run(seconds, priority=priority, cpu=cpu)
         finally:
