@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from os import PathLike
 from typing import Any
 
@@ -107,11 +108,14 @@ def run_rig(
             controller=getattr(controller, "name", type(controller).__name__),
         )
         writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
-        _try_out(line)
+        if isinstance(line, PythonLine):
+            line.device.read()  # what it complains of comes before anything else
         loop = Prepared.of(device, controller, points, rules, system_clock(spin), writer.ring)
         writer.urgent = loop.interpreted and priority > 1
         _begin_anew(device)
-        with writer, quiet_process(priority, loop.interpreted) as notes, _signals(loop.requests):
+        writer.header = replace(header, started=time.time_ns())
+        # The signals come first: who is impatient shall not lose the end of the record.
+        with _signals(loop.requests), writer, quiet_process(priority, loop.interpreted) as notes:
             _supervised(loop, controller.dt, priority, cpu, notes, on_change or (lambda change: None))
             device.close()  # before the record is finished, which may take its time
     record = memory.trajectory()
@@ -140,6 +144,9 @@ def _supervised(
     def work() -> None:
         try:
             enter_real_time(priority, cpu, notes)
+            if isinstance(loop.line, PythonLine):
+                # What it has to set up comes before the first cycle, but no sooner: a watchdog that this starts would not wait.
+                loop.line.device.write(0.0)
             loop.run()
         except BaseException as error:
             raised.append(error)
@@ -159,19 +166,12 @@ def _supervised(
             hung = time.monotonic() - moved > max(_HUNG, _HUNG_SAMPLES * dt)
     except BaseException:
         loop.requests[0] = max(int(loop.requests[0]), END)
-        thread.join(_HUNG)
+        thread.join(max(_HUNG, (loop.rules.ramp + _HUNG_SAMPLES) * dt))
         raise
     if hung:
         raise ConnectionError(f"device: read() or write() did not return for {time.monotonic() - moved:.1f} s; it was closed")
     if raised:
         raise raised[0]
-
-
-def _try_out(line: Any) -> None:
-    """Read and write a device that only Python can use once: what it has to set up, or to complain of, comes before the first cycle."""
-    if isinstance(line, PythonLine):
-        line.device.read()
-        line.device.write(0.0)
 
 
 def _begin_anew(device: Any) -> None:
