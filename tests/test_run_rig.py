@@ -111,6 +111,25 @@ def test_ctrl_c_ramps_down_and_what_stood_before_is_put_back() -> None:
     assert gc.isenabled() == collecting
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals that can be closed")
+def test_a_terminal_that_is_closed_ramps_down_unless_nobody_minds() -> None:
+    """SIGHUP is as Ctrl-C; where it is ignored, as by nohup, it stays so."""
+
+    def close_terminal(change: ModeChange) -> None:
+        if change.mode is Mode.RUN:
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert short(Rig(), on_change=close_terminal).completed
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        run = short(Rig(), 60.0, on_change=close_terminal)
+        assert Cause.ASKED in [change.cause for change in run.changes]
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_a_second_ctrl_c_is_zero_at_once() -> None:
     """The ramp, which would take minutes, is cut short."""
     device = Rig()

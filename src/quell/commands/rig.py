@@ -10,6 +10,7 @@ from typing import Any
 
 from quell.realtime.devices import listen, plant_named
 from quell.realtime.frames import REFUSALS
+from quell.realtime.run import ending_signals
 from quell.realtime.scheduling import checked_cpu, checked_priority
 from quell.realtime.server import Rig, checked_seconds
 
@@ -31,7 +32,7 @@ def run_rig(
     checked_cpu(cpu)
     with closing(listen(device)) as listener, Rig(model, listener=listener, log=log, **settings) as rig:
         rig.prepare()  # may take a minute the first time, and Ctrl-C ends it
-        before = {number: signal.signal(number, lambda *_: rig.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, lambda *_: rig.stop()) for number in ending_signals()}
         try:
             print(f"{plant} at {listener.url}: {_described(**settings)}", flush=True)
             notes = rig.run(seconds, priority=priority, cpu=cpu)

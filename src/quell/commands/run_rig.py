@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +20,7 @@ from quell.experiments.figures import save_figure
 from quell.files import check_writable, without_gaps
 from quell.realtime.devices import open_device
 from quell.realtime.outcome import ModeChange, RigRun
-from quell.realtime.run import run_rig
+from quell.realtime.run import ending_signals, run_rig
 from quell.realtime.sinks import LiveSink, file_sink
 from quell.realtime.supervisor import Cause
 from quell.setup import EXAMPLES, Setup, made, read
@@ -96,7 +97,10 @@ def _closed(console: Console, setup: Setup, arguments: dict[str, Any], files: li
         began = True
         console.print(escape(str(change)), soft_wrap=True)
 
-    sinks: list[Any] = [*files, *([] if live is None else [live])]
+    # The port first: where it is taken no file is begun.
+    sinks: list[Any] = [*([] if live is None else [live]), *files]
+    # Until the loop itself minds signals, they are to close the device, as Ctrl-C does.
+    before = {number: signal.signal(number, _terminated) for number in ending_signals() if number != signal.SIGINT}
     try:
         device = open_device(url, setup.controller.dt)
         return run_rig(device, setup.controller, setup.scenario, telemetry=sinks, on_change=tell, **options)
@@ -107,6 +111,13 @@ def _closed(console: Console, setup: Setup, arguments: dict[str, Any], files: li
             raise
         print(f"quell: {error}", file=sys.stderr)
         return None
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _terminated(number: int, frame: Any) -> None:
+    raise SystemExit(128 + number)
 
 
 def changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:

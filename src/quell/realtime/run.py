@@ -51,7 +51,8 @@ def run_rig(
 
     The controller begins with nothing learned, on a state of its own, as in ``simulate``. For ``safety.settle`` samples it watches with u
     at zero and its reference where y is; then it takes over without a bump, and the scenario's time begins. At the end, on Ctrl-C or
-    SIGTERM, and where anything goes wrong, u is ramped to zero; a second Ctrl-C makes it zero at once. The device is closed in any case.
+    SIGTERM, when its terminal is closed, and where anything goes wrong, u is ramped to zero; a second Ctrl-C makes it zero at once. The
+    device is closed in any case.
 
     Parameters
     ----------
@@ -190,9 +191,16 @@ def _sink(place: Any) -> Sink:
     return file_sink(place) if isinstance(place, str | PathLike) else place
 
 
+def ending_signals() -> list[signal.Signals]:
+    """Return the signals that end a program that does not mind them: Ctrl-C, SIGTERM, and SIGHUP, unless that is ignored (nohup)."""
+    hang_up = getattr(signal, "SIGHUP", None)
+    more = [] if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN else [hang_up]
+    return [signal.SIGINT, signal.SIGTERM, *more]
+
+
 @contextmanager
 def _signals(requests: NDArray[Any]) -> Iterator[None]:
-    """Make Ctrl-C and SIGTERM ask the loop to ramp down, and a second one for zero at once; in the main thread only."""
+    """Let what ends other programs ask the loop to ramp down, and a second time for zero at once; in the main thread only."""
 
     def ask(number: int, frame: Any) -> None:
         requests[0] = ZERO if requests[0] == END else max(int(requests[0]), END)
@@ -200,7 +208,7 @@ def _signals(requests: NDArray[Any]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, ask) for number in ending_signals()}
     try:
         yield
     finally:
