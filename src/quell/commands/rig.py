@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from quell.commands.ending import ended_at_once
 from quell.realtime.devices import listen, plant_named
 from quell.realtime.frames import REFUSALS
 from quell.realtime.run import ending_signals
@@ -31,7 +32,8 @@ def run_rig(
     checked_priority(priority)
     checked_cpu(cpu)
     with closing(listen(device)) as listener, Rig(model, listener=listener, log=log, **settings) as rig:
-        rig.prepare()  # may take a minute the first time, and Ctrl-C ends it
+        with ended_at_once(listener.close):  # it may take a minute the first time
+            rig.prepare()
         before = {number: signal.signal(number, lambda *_: rig.stop()) for number in ending_signals()}
         try:
             print(f"{plant} at {listener.url}: {_described(**settings)}", flush=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,13 +13,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from quell.commands.ending import ended_at_once
 from quell.commands.judged import figure_of, judge, print_judgement, print_outcome
 from quell.commands.output import check_places, write_results
 from quell.experiments.figures import save_figure
 from quell.files import check_writable, without_gaps
 from quell.realtime.devices import open_device
 from quell.realtime.outcome import ModeChange, RigRun
-from quell.realtime.run import ending_signals, run_rig
+from quell.realtime.run import run_rig
 from quell.realtime.sinks import LiveSink, file_sink
 from quell.realtime.supervisor import Cause
 from quell.setup import EXAMPLES, Setup, made, read
@@ -99,11 +99,10 @@ def _closed(console: Console, setup: Setup, arguments: dict[str, Any], files: li
 
     # The port first: where it is taken no file is begun.
     sinks: list[Any] = [*([] if live is None else [live]), *files]
-    # Until the loop itself minds signals, they are to close the device, as Ctrl-C does.
-    before = {number: signal.signal(number, _terminated) for number in ending_signals() if number != signal.SIGINT}
     try:
         device = open_device(url, setup.controller.dt)
-        return run_rig(device, setup.controller, setup.scenario, telemetry=sinks, on_change=tell, **options)
+        with ended_at_once(device.close):
+            return run_rig(device, setup.controller, setup.scenario, telemetry=sinks, on_change=tell, **options)
     except ValueError as error:
         raise refused(setup.name, "rig", error, [*arguments]) from None
     except ConnectionError as error:
@@ -111,13 +110,6 @@ def _closed(console: Console, setup: Setup, arguments: dict[str, Any], files: li
             raise
         print(f"quell: {error}", file=sys.stderr)
         return None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _terminated(number: int, frame: Any) -> None:
-    raise SystemExit(128 + number)
 
 
 def changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
