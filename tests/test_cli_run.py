@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -218,3 +221,21 @@ def test_the_examples_are_printed_and_can_be_used(quell: Callable[..., Shown], t
     assert quell("run").err == "quell: setup: missing; must be a TOML file, and quell run --example prints one\n"
     (tmp_path / "short.toml").write_text(SHORT)
     assert quell("run-rig", "short.toml").err == "quell: short.toml: rig: missing; give a table [rig]\n"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_run_that_is_ended_while_it_is_compiled_gives_the_device_free(
+    number: int, code: int, quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, with a line; what stood before minds the signal again."""
+    closed: list[bool] = []
+    device = SimpleNamespace(close=lambda: closed.append(True))
+    monkeypatch.setattr("quell.commands.run_rig.open_device", lambda url, dt: device)
+    monkeypatch.setattr("quell.commands.run_rig.run_rig", lambda *arguments, **options: os.kill(os.getpid(), number))
+    monkeypatch.setattr("quell.commands.ending.os._exit", sys.exit)  # which would end this process
+    before = signal.getsignal(number)
+    (tmp_path / "rig.toml").write_text(RIG)
+    shown = quell("run-rig", "rig.toml", "--no-figures")
+    assert (shown.code, shown.err) == (code, "quell: interrupted\n")
+    assert closed == [True]
+    assert signal.getsignal(number) is before

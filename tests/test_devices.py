@@ -255,6 +255,95 @@ def test_a_session_that_never_begins_gives_way(bench: Callable[..., Bench]) -> N
     assert here.rig.state == "live"
 
 
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(wire: str, bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over UDP a frame may not arrive, in shared memory the hello may take its place: the goodbye is said again, and the rig serves."""
+    here = bench(wire)
+    device, said = here.open(), []
+    say = device._say
+
+    def lossy(kind: int, value: float, session: int) -> None:
+        said.append(kind)
+        if said.count(frames.GOODBYE) != 1 or kind != frames.GOODBYE:
+            say(kind, value, session)
+
+    monkeypatch.setattr(device, "_say", lossy)
+    thread = threading.Thread(target=device.begin_anew)
+    thread.start()
+    while thread.is_alive():
+        here.rig.tick()
+        thread.join(0.002)
+    assert here.rig.state == "waiting"
+    assert here.rig.counters["sessions"] == 2
+    assert said.count(frames.GOODBYE) >= 2
+    here.rig.tick()
+    assert here.rig.model.peer.numbers[frames.SESSION] == device.line.peer.numbers[frames.SESSION]
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_hello_that_is_heard_when_its_loop_has_gone_begins_nothing(wire: str, bench: Callable[..., Bench]) -> None:
+    """The rig was not ready yet, the loop gave up: the next one finds the rig free."""
+    here = bench(wire)
+    with pytest.raises(ConnectionError, match="no device answers"):
+        (UdpDevice if wire == "udp" else SharedDevice)(here.url, DT, 0.1)
+    here.rig.tick(3)
+    assert here.rig.state == "idle"
+
+
+def test_a_rig_that_ends_says_so_at_once(bench: Callable[..., Bench]) -> None:
+    """Not only when it is closed, which may take its time."""
+    here = bench("shm")
+    device = here.open()
+    here.rig.run(5 * DT)
+    device.read()
+    assert device.lost
+
+
+def test_a_rig_with_long_ticks_need_not_be_waited_for(bench: Callable[..., Bench]) -> None:
+    """To be told to stop it does not wait for the next tick."""
+    with closing(listen(url_of("shm"))) as listener, Rig(PLANT, 100.0, listener) as rig:
+        rig.prepare()
+        thread = threading.Thread(target=rig.run)
+        thread.start()
+        while rig.counters["ticks"] == 0:
+            thread.join(0.01)
+        rig.stop()
+        thread.join(50.0)
+        assert not thread.is_alive()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is full")
+def test_a_rig_goes_on_without_its_log_where_the_disk_is_full() -> None:
+    """And says so."""
+    with closing(listen(url_of("shm"))) as listener, Rig(PLANT, DT, listener, log="/dev/full") as rig:
+        notes = rig.run(10 * DT)
+        assert rig.counters["ticks"] == 10
+    assert "the log was given up: No space left on device" in notes
+
+
+def test_a_rig_does_not_hide_what_went_wrong_on_its_thread(bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It comes out of run."""
+    here = bench("shm")
+
+    def serve(most: int, paced: bool) -> None:
+        if paced:
+            raise RuntimeError("broken")
+
+    monkeypatch.setattr(here.rig, "_serve", serve)
+    with pytest.raises(RuntimeError, match="broken"):
+        here.rig.run(1.0)
+    with pytest.raises(ValueError, match="seconds = 1e\\+300: must be at most 1e\\+09 s"):
+        here.rig.run(1e300)
+
+
+def test_an_address_that_cannot_be_reached_is_named() -> None:
+    """Not only its error."""
+    with pytest.raises(ConnectionError, match="udp://255.255.255.255:5005: can't be reached"):
+        UdpDevice("udp://255.255.255.255:5005", DT)
+    with pytest.raises(ValueError, match="the host 'a{70}.com' is not known"):
+        listen(f"udp://{70 * 'a'}.com:5005")
+
+
 def test_what_is_no_number_is_not_applied_nor_a_sign_of_life(bench: Callable[..., Bench]) -> None:
     """The last u holds until the watchdog trips."""
     here = bench("udp", watchdog=4)
@@ -387,13 +476,16 @@ def test_a_port_that_is_taken_is_refused(bench: Callable[..., Bench]) -> None:
         ({"x0": [1.0]}, "x0"),
         ({"log": "/nowhere/x.csv"}, "log = '/nowhere/x.csv'"),
         ({"rest": 1}, "rest"),
+        ({"dt": 1e-9}, "dt = 1e-09 s: must be from 1e-06 to 100 s"),
+        ({"dt": 1e300}, "must be from 1e-06 to 100 s"),
+        ({"watchdog": 10**20}, "watchdog = 1.*: must be a whole number from 1 to 1000000"),
     ],
 )
 def test_a_rig_says_what_is_wrong_with_its_settings(settings: dict[str, Any], message: str) -> None:
     """By name."""
     listener = listen(url_of("shm"))
     with closing(listener), pytest.raises(ValueError, match=message):
-        Rig(PLANT, DT, listener, **settings)
+        Rig(PLANT, **{"dt": DT, "listener": listener} | settings)
 
 
 # What goes wrong ----------------------------------------------------------------------------------------------------------------------

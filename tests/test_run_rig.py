@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import quell as ql
 from quell.realtime import Safety, TwinDevice, load, run_rig
 from quell.realtime.outcome import ModeChange
 from quell.realtime.scheduling import checked_cpu, enter_real_time, quiet_process
+from quell.realtime.sinks import MemorySink
 from quell.realtime.supervisor import Cause, Mode
 
 from .scripted import DT, PLANT, adrc
@@ -109,6 +111,25 @@ def test_ctrl_c_ramps_down_and_what_stood_before_is_put_back() -> None:
     assert gc.isenabled() == collecting
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals that can be closed")
+def test_a_terminal_that_is_closed_ramps_down_unless_nobody_minds() -> None:
+    """SIGHUP is as Ctrl-C; where it is ignored, as by nohup, it stays so."""
+
+    def close_terminal(change: ModeChange) -> None:
+        if change.mode is Mode.RUN:
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert short(Rig(), on_change=close_terminal).completed
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        run = short(Rig(), 60.0, on_change=close_terminal)
+        assert Cause.ASKED in [change.cause for change in run.changes]
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_a_second_ctrl_c_is_zero_at_once() -> None:
     """The ramp, which would take minutes, is cut short."""
     device = Rig()
@@ -121,6 +142,37 @@ def test_a_second_ctrl_c_is_zero_at_once() -> None:
     assert [change.cause for change in run.changes][-2:] == [Cause.ASKED, Cause.AT_ONCE]
     assert device.written[-4:] == [0.0] * 4
     assert device.written[-5] != 0.0
+
+
+def test_who_is_impatient_loses_nothing_of_the_record(tmp_path: Path) -> None:
+    """Ctrl-C while the last rows are written changes nothing, as the run is over."""
+
+    class Slow(MemorySink):
+        def close(self) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+
+    run = short(Rig(), telemetry=[Slow(), tmp_path / "run.csv"])
+    assert run.completed
+    assert len(load(tmp_path / "run.csv")) == len(run.record)
+
+
+def test_nothing_is_written_to_a_device_before_the_loop_can_go_on() -> None:
+    """The first write may start a watchdog: compiling, and whatever else takes its time, is over by then."""
+    happened: list[str] = []
+
+    class Watched(Rig):
+        def write(self, u: float) -> None:
+            happened.append("written")
+            super().write(u)
+
+    class Slow(MemorySink):
+        def open(self, header: Any) -> None:
+            happened.append("opened")
+            super().open(header)
+
+    short(Watched(), telemetry=[Slow()])
+    assert happened[:2] == ["opened", "written"]
 
 
 def test_a_driver_that_fails_leads_to_the_safe_action() -> None:

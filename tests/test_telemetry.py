@@ -474,3 +474,10 @@ def test_the_writer_has_the_priority_that_it_should(urgent: bool, permitted: boo
     with Telemetry(NARROW, [MemorySink()], urgent=urgent) as writer:
         offer(writer, counted(3))
     assert now[0] == (telemetry.os.SCHED_FIFO if urgent and permitted else telemetry.os.SCHED_OTHER)
+
+
+def test_a_table_of_times_alone_is_no_recording(tmp_path: Path) -> None:
+    """It is refused in a line, as any other table is."""
+    (tmp_path / "run.csv").write_text("time\n0.0\n1.0\n")
+    with pytest.raises(ValueError, match="must be a recording by quell, CSV or MCAP: its first line is not the names"):
+        load(tmp_path / "run.csv")

@@ -8,11 +8,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from quell import checks
+from quell.commands.ending import ended_at_once
 from quell.realtime.devices import listen, plant_named
 from quell.realtime.frames import REFUSALS
+from quell.realtime.run import ending_signals
 from quell.realtime.scheduling import checked_cpu, checked_priority
-from quell.realtime.server import Rig
+from quell.realtime.server import Rig, checked_seconds
 
 
 def run_rig(
@@ -27,13 +28,14 @@ def run_rig(
     """
     model = plant_named(plant, "--plant")
     if seconds is not None:
-        checks.positive("--seconds", seconds, "s")
+        checked_seconds("--seconds", seconds)
     checked_priority(priority)
     checked_cpu(cpu)
     with closing(listen(device)) as listener, Rig(model, listener=listener, log=log, **settings) as rig:
-        before = {number: signal.signal(number, lambda *_: rig.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
+        with ended_at_once(listener.close):  # it may take a minute the first time
             rig.prepare()
+        before = {number: signal.signal(number, lambda *_: rig.stop()) for number in ending_signals()}
+        try:
             print(f"{plant} at {listener.url}: {_described(**settings)}", flush=True)
             notes = rig.run(seconds, priority=priority, cpu=cpu)
         finally:

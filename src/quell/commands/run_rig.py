@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from quell.commands.ending import ended_at_once
 from quell.commands.judged import figure_of, judge, print_judgement, print_outcome
 from quell.commands.output import check_places, write_results
 from quell.experiments.figures import save_figure
@@ -96,10 +97,12 @@ def _closed(console: Console, setup: Setup, arguments: dict[str, Any], files: li
         began = True
         console.print(escape(str(change)), soft_wrap=True)
 
-    sinks: list[Any] = [*files, *([] if live is None else [live])]
+    # The port first: where it is taken no file is begun.
+    sinks: list[Any] = [*([] if live is None else [live]), *files]
     try:
         device = open_device(url, setup.controller.dt)
-        return run_rig(device, setup.controller, setup.scenario, telemetry=sinks, on_change=tell, **options)
+        with ended_at_once(device.close):
+            return run_rig(device, setup.controller, setup.scenario, telemetry=sinks, on_change=tell, **options)
     except ValueError as error:
         raise refused(setup.file, "rig", error, [*arguments]) from None
     except ConnectionError as error:

@@ -105,8 +105,8 @@ def read_csv(path: Path) -> tuple[Header, Matrix]:
     lines = text[: text.rfind(b"\n") + 1]
     names = lines[: lines.find(b"\n")].decode("utf-8", errors="replace").strip().split(",")
     body = lines[lines.find(b"\n") + 1 :]
-    if names[0] != "time":
-        raise ValueError("its first line is not the names of a recording's columns, from time on")
+    if names[:2] != ["time", "k"]:
+        raise ValueError("its first line is not the names of a recording's columns, from time and k on")
     try:
         table = np.loadtxt(io.BytesIO(body), delimiter=",", ndmin=2, comments=None) if body else np.empty((0, len(names)))
     except ValueError as error:

@@ -175,7 +175,7 @@ def is_news(frame: Buffer, own: Peer) -> bool:
     counters[SKIPPED] += ahead - 1
     numbers[HEARD] += ahead
     numbers[ANSWERED] = int(frame.words[3])
-    numbers[STATE] = int(frame.words[8])
+    numbers[STATE] = int(frame.words[8]) | (numbers[STATE] & GONE)  # a goodbye may be read before what was sent before it
     counters[ACCEPTED] += 1
     if not is_finite(frame.doubles[3]):
         counters[NOT_FINITE] += 1

@@ -42,6 +42,9 @@ from quell.types import Vector
 IDLE, WAITING, LIVE, TRIPPED = range(4)
 STATES = ("idle", "waiting", "live", "tripped")
 
+# In long ticks it looks so often whether it is to end [ns].
+_LOOK = 100_000_000
+
 # Entries of ``RigModel.counts``: state, ticks without a fresh command, ticks in all, ticks since the plant was at rest, and how often what.
 STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP = range(9)
 # Entries of ``RigModel.signals``: u applied, the newest command of this tick, the largest |command| of all.
@@ -227,6 +230,11 @@ def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
         time = begin
         if paced:
             deadline = begin + int(np.rint(k * period))
+            time = now(clock)
+            while deadline - time > _LOOK and load_acquire(rig.stop, 0) == 0:
+                time = wait_until(clock, time + _LOOK)
+            if load_acquire(rig.stop, 0) != 0:
+                break
             time = wait_until(clock, deadline)
             late = time - deadline
             count(rig.lateness, late)

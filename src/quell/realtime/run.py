@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from os import PathLike
 from typing import Any
 
@@ -50,7 +51,8 @@ def run_rig(
 
     The controller begins with nothing learned, on a state of its own, as in ``simulate``. For ``safety.settle`` samples it watches with u
     at zero and its reference where y is; then it takes over without a bump, and the scenario's time begins. At the end, on Ctrl-C or
-    SIGTERM, and where anything goes wrong, u is ramped to zero; a second Ctrl-C makes it zero at once. The device is closed in any case.
+    SIGTERM, when its terminal is closed, and where anything goes wrong, u is ramped to zero; a second Ctrl-C makes it zero at once. The
+    device is closed in any case.
 
     Parameters
     ----------
@@ -107,11 +109,14 @@ def run_rig(
             controller=getattr(controller, "name", type(controller).__name__),
         )
         writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
-        _try_out(line)
+        if isinstance(line, PythonLine):
+            line.device.read()  # what it complains of comes before anything else
         loop = Prepared.of(device, controller, points, rules, system_clock(spin), writer.ring)
         writer.urgent = loop.interpreted and priority > 1
         _begin_anew(device)
-        with writer, quiet_process(priority, loop.interpreted) as notes, _signals(loop.requests):
+        writer.header = replace(header, started=time.time_ns())
+        # The signals come first: who is impatient shall not lose the end of the record.
+        with _signals(loop.requests), writer, quiet_process(priority, loop.interpreted) as notes:
             _supervised(loop, controller.dt, priority, cpu, notes, on_change or (lambda change: None))
             device.close()  # before the record is finished, which may take its time
     record = memory.trajectory()
@@ -140,6 +145,9 @@ def _supervised(
     def work() -> None:
         try:
             enter_real_time(priority, cpu, notes)
+            if isinstance(loop.line, PythonLine):
+                # What it has to set up comes before the first cycle, but no sooner: a watchdog that this starts would not wait.
+                loop.line.device.write(0.0)
             loop.run()
         except BaseException as error:
             raised.append(error)
@@ -159,19 +167,12 @@ def _supervised(
             hung = time.monotonic() - moved > max(_HUNG, _HUNG_SAMPLES * dt)
     except BaseException:
         loop.requests[0] = max(int(loop.requests[0]), END)
-        thread.join(_HUNG)
+        thread.join(max(_HUNG, (loop.rules.ramp + _HUNG_SAMPLES) * dt))
         raise
     if hung:
         raise ConnectionError(f"device: read() or write() did not return for {time.monotonic() - moved:.1f} s; it was closed")
     if raised:
         raise raised[0]
-
-
-def _try_out(line: Any) -> None:
-    """Read and write a device that only Python can use once: what it has to set up, or to complain of, comes before the first cycle."""
-    if isinstance(line, PythonLine):
-        line.device.read()
-        line.device.write(0.0)
 
 
 def _begin_anew(device: Any) -> None:
@@ -190,9 +191,16 @@ def _sink(place: Any) -> Sink:
     return file_sink(place) if isinstance(place, str | PathLike) else place
 
 
+def ending_signals() -> list[signal.Signals]:
+    """Return the signals that end a program that does not mind them: Ctrl-C, SIGTERM, and SIGHUP, unless that is ignored (nohup)."""
+    hang_up = getattr(signal, "SIGHUP", None)
+    more = [] if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN else [hang_up]
+    return [signal.SIGINT, signal.SIGTERM, *more]
+
+
 @contextmanager
 def _signals(requests: NDArray[Any]) -> Iterator[None]:
-    """Make Ctrl-C and SIGTERM ask the loop to ramp down, and a second one for zero at once; in the main thread only."""
+    """Let what ends other programs ask the loop to ramp down, and a second time for zero at once; in the main thread only."""
 
     def ask(number: int, frame: Any) -> None:
         requests[0] = ZERO if requests[0] == END else max(int(requests[0]), END)
@@ -200,7 +208,7 @@ def _signals(requests: NDArray[Any]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, ask) for number in ending_signals()}
     try:
         yield
     finally:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,6 +28,11 @@ _WRITE_EVERY = 0.05
 _ROOM = 5.0
 # A session whose first command does not come keeps others out for so long [s]: its loop may have to be compiled.
 _PATIENCE = 60.0
+# Sample times that a wire and a clock can make sense of [s], and silence that still counts by the frames' own numbers.
+_SHORTEST, _LONGEST = 1e-6, 100.0
+_MOST_TICKS = 1_000_000
+# Thirty years [s].
+_EVER = 1e9
 
 
 class Listener(Protocol):
@@ -82,10 +88,12 @@ class Rig:
     ) -> None:
         check_part("plant", plant)
         dt = checks.positive("dt", dt, "s")
+        if not _SHORTEST <= dt <= _LONGEST:
+            raise ValueError(f"dt = {dt!r} s: must be from {_SHORTEST:g} to {_LONGEST:g} s")
         if not plant.compiled:
             raise ValueError(f"plant = {plant!r}: must be one that is compiled; this one runs as Python only")
-        _, u_max = checks.interval("-u_max", -u_max, "u_max", u_max)
-        watchdog = checks.whole("watchdog", watchdog, 1)
+        u_max = u_max if u_max == np.inf else checks.positive("u_max", u_max)
+        watchdog = checks.whole("watchdog", watchdog, 1, _MOST_TICKS)
         start = np.zeros(plant.order) if x0 is None else checks.vector("x0", x0, plant.order)
         self.listener = listener
         self.dt = dt
@@ -116,6 +124,7 @@ class Rig:
         self._writer = None if self._file is None else csv.writer(self._file, lineterminator="\n")
         if self._writer is not None:
             self._writer.writerow(kernels.LOG)
+        self._log_failed = ""
         self._clock = system_clock()
         self._open = True
 
@@ -186,14 +195,19 @@ class Rig:
         ValueError
             for arguments out of range.
         """
-        most = -1 if seconds is None else max(round(checks.positive("seconds", seconds, "s") / self.dt), 1)
+        most = -1 if seconds is None else max(round(checked_seconds("seconds", seconds) / self.dt), 1)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
         self.prepare()
+        raised: list[BaseException] = []
         with quiet_process(priority, False) as notes:
 
             def work() -> None:
-                enter_real_time(priority, cpu, notes)
-                self._serve(most, True)
+                try:
+                    enter_real_time(priority, cpu, notes)
+                    self._serve(most, True)
+                    self._part()  # at once: each sample that the loop waits in vain it holds u
+                except BaseException as error:
+                    raised.append(error)
 
             thread = threading.Thread(target=work, name="quell-rig")
             thread.start()
@@ -205,6 +219,10 @@ class Rig:
                 self.stop()
                 thread.join()
                 self._write()
+        if raised:
+            raise raised[0]
+        if self._log_failed:
+            notes.append(self._log_failed)
         return notes
 
     def stop(self) -> None:
@@ -216,16 +234,20 @@ class Rig:
         if not self._open:
             return
         self._open = False
+        self._part()
+        self.listener.close()
+        if self._file is not None:
+            self._write()
+            self._file.close()
+
+    def _part(self) -> None:
+        """Say goodbye, if there is a session."""
         model = self.model
         if model.counts[kernels.STATE] != kernels.IDLE:
             session = int(model.peer.numbers[frames.SESSION])
             frames.write_frame(model.outbox, frames.GOODBYE, session, 0, 0, time.monotonic_ns(), 0.0, frames.GONE)
             send(model.link, model.outbox)
             model.counts[kernels.STATE] = kernels.IDLE
-        self.listener.close()
-        if self._file is not None:
-            self._write()
-            self._file.close()
 
     def __enter__(self) -> Rig:
         return self
@@ -244,10 +266,22 @@ class Rig:
     def _write(self) -> None:
         if self._writer is None or self._file is None or self._file.closed:
             return
-        for row in drain(self.model.log):
-            k, t, session, state, *values = row.tolist()
-            self._writer.writerow([int(k), f"{t:.9g}", int(session), int(state), *map(repr, values)])
-        self._file.flush()
+        try:
+            for row in drain(self.model.log):
+                k, t, session, state, *values = row.tolist()
+                self._writer.writerow([int(k), f"{t:.9g}", int(session), int(state), *map(repr, values)])
+            self._file.flush()
+        except OSError as error:  # a full disk is no reason to leave the loop alone
+            self._log_failed = f"the log was given up: {error.strerror}"
+            with suppress(OSError):
+                self._file.close()
+
+
+def checked_seconds(name: str, seconds: float) -> float:
+    """Return for how long a rig is to run [s]."""
+    if checks.positive(name, seconds, "s") > _EVER:
+        raise ValueError(f"{name} = {seconds!r}: must be at most {_EVER:g} s; leave it out to run until interrupted")
+    return seconds
 
 
 def _opened(path: str | Path) -> Any:

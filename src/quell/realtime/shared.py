@@ -25,6 +25,8 @@ import fcntl
 import mmap
 import os
 import re
+import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -138,15 +140,16 @@ class SharedDevice(WireDevice):
         measurements, commands = _paths(url)
         checks.positive("dt", dt, "s")
         hint = f"start one with: quell rig --device {url}"
-        try:
-            theirs = _Mailbox(measurements)
-        except FileNotFoundError:
-            raise ConnectionError(f"{url}: no device answers; {hint}") from None
-        try:
-            own = _Mailbox(commands)
-        except FileNotFoundError:
-            theirs.close()
-            raise ConnectionError(f"{url}: no device answers; {hint}") from None
+        with ExitStack() as stack:
+            try:
+                theirs = _Mailbox(measurements)
+                stack.callback(theirs.close)
+                own = _Mailbox(commands)
+            except FileNotFoundError:
+                raise ConnectionError(f"{url}: no device answers; {hint}") from None
+            except PermissionError as error:
+                raise ConnectionError(f"{url}: {error.filename} belongs to another user, who has to run the loop as well") from None
+            stack.pop_all()
         self._boxes = own, theirs
         if not own.lock():
             self._free()
@@ -154,6 +157,8 @@ class SharedDevice(WireDevice):
         super().__init__(url, _link(own, theirs), dt, timeout, hint)
 
     def _free(self) -> None:
+        if hasattr(self, "line"):  # there was a goodbye: the device is to see it before the next loop's hello takes its place
+            time.sleep(min(2.0 * self.dt, 0.1))
         for box in self._boxes:
             box.close()
 
@@ -170,11 +175,14 @@ class SharedListener:
     def __init__(self, url: str) -> None:
         paths = _paths(url)
         self.url = url
-        own = _Mailbox(paths[0], make=True)
-        if not own.lock():
-            own.close()
-            raise ValueError(f"device = {url!r}: another rig has this name; give another one, or end that rig")
-        theirs = _Mailbox(paths[1], make=True)
+        try:
+            own = _Mailbox(paths[0], make=True)
+            if not own.lock():
+                own.close()
+                raise ValueError(f"device = {url!r}: another rig has this name; give another one, or end that rig")
+            theirs = _Mailbox(paths[1], make=True)
+        except PermissionError as error:
+            raise ValueError(f"device = {url!r}: {error.filename} belongs to another user; give another name") from None
         self._boxes = own, theirs
         self._paths: tuple[Path, ...] = paths
         self.link = _link(own, theirs)

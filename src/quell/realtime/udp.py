@@ -102,7 +102,11 @@ class UdpDevice(WireDevice):
         if address[1] == 0:
             raise ValueError(f"device = {url!r}: must have a port from 1 to 65535")
         self._socket = _socket(family)
-        self._socket.connect(address)
+        try:
+            self._socket.connect(address)
+        except OSError as error:
+            self._socket.close()
+            raise ConnectionError(f"{url}: can't be reached ({error.strerror})") from None
         super().__init__(url, udp_link(self._socket), dt, timeout, f"start one with: quell rig --device {url}")
 
     def _free(self) -> None:
@@ -152,8 +156,8 @@ def resolved(url: str) -> tuple[int, Any]:
         raise ValueError(f"device = {url!r}: must be udp://HOST:PORT with a port up to 65535, for example udp://127.0.0.1:5005")
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-    except OSError as error:
-        raise ValueError(f"device = {url!r}: the host {host!r} is not known ({error.strerror})") from None
+    except (OSError, UnicodeError) as error:
+        raise ValueError(f"device = {url!r}: the host {host!r} is not known ({getattr(error, 'strerror', 'no such name')})") from None
     return found[0][0], found[0][4]
 
 

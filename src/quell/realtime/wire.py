@@ -137,9 +137,11 @@ class WireDevice:
         self._timeout, self._hint = timeout, hint
         self._compiled = False
         try:
-            self._begin_session(time.monotonic() + timeout, hint)
+            self._begin_session()
         except BaseException:
             self._open = False
+            # A device that hears the hello only later would keep itself free for a loop that has gone.
+            self._say(frames.GOODBYE, 0.0, self._session)
             self._free()
             raise
 
@@ -180,9 +182,12 @@ class WireDevice:
             where no device answers.
         """
         self._check_open()
-        self._say(frames.GOODBYE, 0.0)
+        former = self._session
+        self._say(frames.GOODBYE, 0.0, former)
+        # Where a frame replaces the one before, the device has to look before the hello comes.
+        time.sleep(min(2.0 * self.dt, _HELLO_EVERY))
         frames.start_session(self.line.peer, _new_session())
-        self._begin_session(time.monotonic() + self._timeout, self._hint)
+        self._begin_session(former)
 
     def tick(self, timeout: float = 1.0) -> int:
         """Wait for a measurement that comes now, and return the time at which it came: the system's monotonic clock [ns].
@@ -205,7 +210,7 @@ class WireDevice:
         """Say goodbye, upon which the device sets u to zero; calling it twice does no harm."""
         if self._open:
             self._open = False
-            self._say(frames.GOODBYE, 0.0)
+            self._say(frames.GOODBYE, 0.0, self._session)
             self._free()
 
     def __enter__(self) -> Any:
@@ -218,11 +223,18 @@ class WireDevice:
         """Give the wire free."""
         raise NotImplementedError
 
-    def _begin_session(self, deadline: float, hint: str) -> None:
+    @property
+    def _session(self) -> int:
+        return int(self.line.peer.numbers[frames.SESSION])
+
+    def _begin_session(self, former: int = 0) -> None:
+        """Say hello until there is a welcome; a goodbye to the ``former`` session may have been lost, and is said again."""
         line, refused = self.line, 0
+        apart = max(_HELLO_EVERY, 2.0 * self.dt)
+        deadline = time.monotonic() + max(self._timeout, 2.0 * apart)
         while time.monotonic() < deadline:
-            self._say(frames.HELLO, self.dt)
-            again = time.monotonic() + _HELLO_EVERY
+            self._say(frames.HELLO, self.dt, self._session)
+            again = time.monotonic() + apart
             while (left := again - time.monotonic()) > 0.0:
                 await_news(line.link, round(1e9 * left))
                 while (size := receive(line.link, line.inbox)) >= 0:
@@ -233,13 +245,14 @@ class WireDevice:
                         raise ValueError(f"dt = {self.dt!r} s: the device at {self.url} ticks every {dt!r} s; both must be the same")
                     if refused == 0:
                         return
+                    if former:
+                        self._say(frames.GOODBYE, 0.0, former)
         if refused & frames.BUSY:
-            raise ConnectionError(f"{self.url}: another session is alive there; end it first")
-        raise ConnectionError(f"{self.url}: no device answers; {hint}")
+            raise ConnectionError(f"{self.url}: another session is alive there; end it first; one whose loop was killed ends in a minute")
+        raise ConnectionError(f"{self.url}: no device answers; {self._hint}")
 
-    def _say(self, kind: int, value: float) -> None:
+    def _say(self, kind: int, value: float, session: int) -> None:
         line = self.line
-        session = int(line.peer.numbers[frames.SESSION])
         frames.write_frame(line.outbox, kind, session, 0, 0, time.monotonic_ns(), value, 0)
         send(line.link, line.outbox)
 
