@@ -238,18 +238,20 @@ def main() -> None:
         folder = Path(place)
         rigs = 0
         rig = RigProcess(folder, rigs)
-        warm_up(rig.url)
-        for number in range(options.trials):
-            if rig.process.poll() is not None:
-                rigs += 1
-                rig = RigProcess(folder, rigs)
-            own = folder / str(number)
-            own.mkdir()
-            found = trial(number, rig, own, draw)
-            results.append(found)
-            if found["wrong"]:
-                print(f"{found}", flush=True)
-        rig.end()
+        try:
+            warm_up(rig.url)
+            for number in range(options.trials):
+                if rig.process.poll() is not None:
+                    rigs += 1
+                    rig = RigProcess(folder, rigs)
+                own = folder / str(number)
+                own.mkdir()
+                found = trial(number, rig, own, draw)
+                results.append(found)
+                if found["wrong"]:
+                    print(f"{found}", flush=True)
+        finally:
+            rig.end()
     print(f"{'fault':<20} {'trials':>6}  ended")
     for kind in TROUBLES:
         mine = [found for found in results if found["kind"] == kind]

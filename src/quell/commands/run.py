@@ -28,7 +28,7 @@ def run_setup(*, path: Path, json_file: Path | None, figures: Path | None, save:
     late = [(i, window["start"]) for i, window in enumerate(setup.windows) if window.get("start", 0.0) >= scenario.duration]
     if late:
         rule = f"must be less than the scenario's duration, {scenario.duration:g} s"
-        raise SetupError([f"{setup.name}: metrics[{i}].start = {start:g}: {rule}" for i, start in late])
+        raise SetupError([f"{setup.file}: metrics[{i}].start = {start:g}: {rule}" for i, start in late])
     check_places(json_file, figures)
     if save is not None:
         check_writable(save)

@@ -43,6 +43,7 @@ from quell.realtime.supervisor import (
     RUN,
     SILENT,
     SKIPPED,
+    SLEPT,
     STOPPED,
     TRIPPED,
     UNSENT,
@@ -141,7 +142,7 @@ def run_cycles(
         clipped = counts[CLIPPED]
         u = _steer(design, state, rules, watch, setpoints, books, k, left_out, y)
         fault = put(line, u)
-        unsent = fault != 0
+        unsent = fault == 1
         counts[FAILED] = counts[FAILED] + 1 if unsent else 0
         counts[TRIPPED] = fault > 1
         written = now(clock)
@@ -199,6 +200,7 @@ def _skip(counts: NDArray[np.int64], deadlines: int) -> None:
     """Take note of deadlines that are left out: nothing is known of those samples."""
     counts[SKIPPED] += deadlines
     counts[BLIND] += deadlines
+    counts[SLEPT] += deadlines
     if deadlines > 0:
         counts[UNSURE] = 1
 

@@ -145,6 +145,7 @@ class Rules(NamedTuple):
     SAMPLES,  # good ones in START; done in RAMP and STOPPED
     BEGAN,  # k of the scenario's first sample; −1 before
     BLIND,  # deadlines in a row without a good sample
+    SLEPT,  # those of them that were left out
     AT_LIMIT,  # samples in a row with u at a limit
     IN_A_ROW,  # cycles in a row that overran
     FAILED,  # commands in a row that did not get out
@@ -157,8 +158,8 @@ class Rules(NamedTuple):
     UNSENT,  # commands
     UNSURE,  # whether a measurement may be an old one
     TRIPPED,  # whether the device has set u to zero for good
-) = range(16)
-COUNTS = 16
+) = range(17)
+COUNTS = 17
 # Places of Watch.values.
 U, FROM, Y, GAP = range(4)
 VALUES = 4
@@ -216,7 +217,7 @@ def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, samples: int
     if asked == ZERO and mode != STOPPED:
         change(watch, k, STOPPED, AT_ONCE)
     elif mode <= HOLD:
-        cause = _cause(rules, watch, k, good, asked, samples)
+        cause = _cause(rules, watch, k, asked, samples)
         if cause != NONE:
             change(watch, k, RAMP, cause)
         elif mode == START:
@@ -232,18 +233,18 @@ def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, samples: int
         elif not good and mode == RUN:
             change(watch, k, HOLD, MISSED)
     if good:
-        counts[BLIND] = 0
+        counts[BLIND] = counts[SLEPT] = 0
 
 
 @kernel
-def _cause(rules: Rules, watch: Watch, k: int, good: bool, asked: int, samples: int) -> int:
+def _cause(rules: Rules, watch: Watch, k: int, asked: int, samples: int) -> int:
     """Return why it has to end, as far as that is known before the controller's step."""
     counts = watch.counts
     cause = NONE
     if asked == END:
         cause = ASKED
     elif counts[BLIND] > rules.hold:
-        cause = STALLED if good else LOST
+        cause = STALLED if counts[SLEPT] > rules.hold else LOST
     elif counts[FAILED] > rules.hold:
         cause = UNREACHED
     elif counts[IN_A_ROW] > rules.most_overruns:
