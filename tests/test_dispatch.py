@@ -178,3 +178,25 @@ def test_without_a_place_for_a_cache_everything_works_all_the_same(tmp_path: Pat
     script = "import quell as ql; c = ql.ADRC(ql.ESO.model_free(1, 1.0, 10.0, 0.01), 1.0); print(c.step(1.0, 0.0))"
     shown = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     assert shown.stdout.strip() == "1.0"
+
+
+@dispatch.kernel
+def _told(value: float) -> float:
+    print("it was", value)
+    if value > 2.0:
+        raise ValueError("too much")
+    return value
+
+
+@dispatch.compiled
+def tell(value: float) -> float:
+    """Call a kernel that prints and may raise."""
+    return _told(value) + 1.0
+
+
+def test_a_kernel_prints_and_raises_in_what_it_is_inlined_into(capsys: pytest.CaptureFixture[str]) -> None:
+    """Who looks for a mistake in a learner of their own prints from it: what Numba needs for that is there."""
+    assert tell.uncached(1.0) == 2.0
+    assert capsys.readouterr().out == "it was 1.0\n"
+    with pytest.raises(ValueError, match="too much"):
+        tell.uncached(3.0)

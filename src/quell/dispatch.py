@@ -36,6 +36,8 @@ from numba.core import types as nb_types
 from numba.core.errors import NumbaError
 from numba.extending import overload, register_jitable
 
+from quell.linking import KERNEL_OPTIONS
+
 F = TypeVar("F", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -67,7 +69,7 @@ _FOREIGN: dict[type, str] = {}
 
 def kernel(function: F) -> F:
     """Mark a helper that runs interpreted from Python and compiled from compiled code."""
-    return register_jitable(**OPTIONS)(function)
+    return register_jitable(**OPTIONS, **KERNEL_OPTIONS)(function)
 
 
 def generic(declaration: Callable[P, R]) -> Generic[P, R]:
@@ -103,7 +105,7 @@ def generic(declaration: Callable[P, R]) -> Generic[P, R]:
 
         return add
 
-    overload(call, strict=False, jit_options=dict(OPTIONS))(resolve)
+    overload(call, strict=False, jit_options=OPTIONS | KERNEL_OPTIONS)(resolve)
     call.register = register  # type: ignore[attr-defined]
     call.implementations = table  # type: ignore[attr-defined]
     return cast("Generic[P, R]", call)
