@@ -364,6 +364,9 @@ def main() -> None:
     except (OSError, MemoryError) as error:
         print(f"quell: {type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
+    except ImportError as error:  # an extra is not installed: the message says which
+        print(f"quell: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         print("quell: interrupted", file=sys.stderr)
         sys.exit(130)
