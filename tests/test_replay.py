@@ -13,7 +13,7 @@ import quell as ql
 from quell.controllers.baselines import PID, ZV
 from quell.controllers.prefilter import Prefiltered
 from quell.plants.base import advance, measure
-from quell.realtime.channels import row_channels
+from quell.realtime.channels import Event, row_channels
 from quell.realtime.header import Header
 from quell.realtime.recording import load, trajectory_of
 from quell.realtime.replay import replay
@@ -132,6 +132,18 @@ def test_the_controller_that_is_passed_stays_as_it_is() -> None:
     assert all(np.array_equal(value, before[name]) for name, value in design.state.items())
 
 
+def test_deadlines_that_the_loop_slept_over_are_replayed_as_it_took_them() -> None:
+    """It told its controller of them, as of samples without a measurement."""
+    rig = scripted.run(ScriptedDevice(scripted.PLANT, stall={40: 35_000_000}, moves={41: 3}), reference=1.0)
+    run = trajectory_of(Header(row_channels(scripted.adrc().channels), DT), rig.rows)
+    again = replay(run, scripted.adrc())
+    gaps = run["events"].astype(int) == Event.GAP
+    assert np.count_nonzero(gaps) == 3
+    there = (run["mode"] != Mode.STOPPED) & ~gaps
+    for name in ("x_hat", "f_residual"):
+        np.testing.assert_allclose(again[name][there], run[name][there], rtol=0.0, atol=1e-12 * np.max(np.abs(run[name])))
+
+
 def test_what_can_not_be_replayed_is_refused() -> None:
     """In a line that says what to do."""
     run = simulated(1.0)
@@ -145,6 +157,7 @@ def test_what_can_not_be_replayed_is_refused() -> None:
         (thin, controller(), "run has every 5th sample: .* record_every=1"),
         (run, slow, "controller has dt = 0.02 s: must have that of the run, 0.01 s"),
         (run, ql.ADRC, "controller = .*: must be a controller"),
+        ("run.mcap", controller(), "run = 'run.mcap': must be a Trajectory"),
         (blind, controller(), "run has no finite y_measured"),
         (unknown, controller(), "run has no finite u at 0.3 s"),
     ]:

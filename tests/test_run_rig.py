@@ -256,6 +256,7 @@ def test_a_run_may_be_made_from_another_thread() -> None:
         ({"approach": math.nan}, "approach = nan"),
         ({"duration": None}, "duration = None"),
         ({"telemetry": ["run.txt"]}, "must end in .csv or .mcap"),
+        ({"telemetry": "run.csv"}, "telemetry = 'run.csv': must be a list"),
     ],
 )
 def test_what_is_out_of_range_is_named_and_the_device_closed(options: dict[str, Any], message: str) -> None:

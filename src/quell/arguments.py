@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
-from cyclopts import Token
+from cyclopts import Parameter, Token
 
 
 def whole(kind: Any, tokens: Sequence[Token]) -> int:
@@ -15,3 +16,9 @@ def whole(kind: Any, tokens: Sequence[Token]) -> int:
         return int(text)
     except ValueError:
         raise ValueError(f"{tokens[0].keyword} = {text!r}: must be a whole number") from None
+
+
+Whole = Annotated[int, Parameter(converter=whole)]
+WholeOrNone = Annotated[int | None, Parameter(converter=whole)]
+JsonFile = Annotated[Path | None, Parameter(name="--json")]
+Figures = Annotated[Path | None, Parameter(negative_none="no-")]

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError
 
 from quell import __version__, cli_setups
-from quell.arguments import whole as _whole
+from quell.arguments import Figures, JsonFile, Whole, WholeOrNone
 
 app = App(
     name="quell",
@@ -29,11 +28,11 @@ app.command(reproduce)
 def two_mass(
     *,
     dt: float = 1e-3,
-    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    seed: Whole = 0,
     omega_o: float = 10.0,
     reset: bool = True,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
 ) -> None:
     """Run the two-mass-spring study: MF-ESO, MB-ESO and L-ESO, with every claim judged.
 
@@ -61,9 +60,9 @@ def two_mass(
 def torsional(
     *,
     dt: float = 1e-3,
-    seed: Annotated[int, Parameter(converter=_whole)] = 0,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    seed: Whole = 0,
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
 ) -> None:
     """Run the torsional testbed's experiment on its twin: MF-ESO, MB-ESO and L-ESO at three pairs of bandwidths, with every claim judged.
 
@@ -87,11 +86,11 @@ def torsional(
 def acc(
     *,
     samples: Path | None = None,
-    count: Annotated[int | None, Parameter(converter=_whole)] = None,
+    count: WholeOrNone = None,
     spread: float | None = None,
-    seed: Annotated[int | None, Parameter(converter=_whole)] = None,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    seed: WholeOrNone = None,
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
 ) -> None:
     """Run the ACC robust-control benchmark: published designs and ours, each one fixed controller for a thousand uncertain plants.
 
@@ -119,12 +118,12 @@ def acc(
 @app.command(name="stress")
 def stress(
     *,
-    runs: Annotated[int, Parameter(converter=_whole)] = 600,
-    honest: Annotated[int, Parameter(converter=_whole)] = 100,
-    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    runs: Whole = 600,
+    honest: Whole = 100,
+    seed: Whole = 0,
     guard: bool = True,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
 ) -> None:
     """Put the guard on trial: hostile learners and an honest one in random loops, each beside plain MF-ESO.
 
@@ -157,9 +156,9 @@ def compare(
     k: float = 1.0,
     dt: float = 1e-3,
     u_max: float = float("inf"),
-    seed: Annotated[int, Parameter(converter=_whole)] = 0,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    seed: Whole = 0,
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
 ) -> None:
     """Compare controllers, designed for m1 = m2 = k = 1, on two masses and a spring: a step, a force on the load, noise.
 
@@ -195,18 +194,18 @@ def compare(
 def identify(
     data: Path,
     *,
-    order: Annotated[int, Parameter(converter=_whole)] = 4,
-    zeros: Annotated[int, Parameter(converter=_whole)] = 0,
-    integrators: Annotated[int | None, Parameter(converter=_whole)] = None,
+    order: Whole = 4,
+    zeros: Whole = 0,
+    integrators: WholeOrNone = None,
     columns: str = "",
     dt: float | None = None,
     delay: float = 0.0,
     max_delay: float | None = None,
     friction: bool = False,
     held_out: float = 0.3,
-    horizon: Annotated[int, Parameter(converter=_whole)] = 10,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    horizon: Whole = 10,
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
 ) -> None:
     """Fit a continuous transfer function to recorded input and output.
 
@@ -269,7 +268,7 @@ def excite(
     dt: float = 1e-3,
     u_min: float = -1.0,
     u_max: float = 1.0,
-    seed: Annotated[int, Parameter(converter=_whole)] = 0,
+    seed: Whole = 0,
 ) -> None:
     """Design an input that excites a band within limits, for quell identify, and write it as CSV.
 
@@ -305,13 +304,13 @@ def rig(
     device: str,
     plant: str = "torsional",
     dt: float = 1e-3,
-    watchdog: Annotated[int, Parameter(converter=_whole)] = 20,
+    watchdog: Whole = 20,
     u_max: float = float("inf"),
     rest: bool = True,
     seconds: float | None = None,
     log: Path | None = None,
-    priority: Annotated[int, Parameter(converter=_whole)] = 50,
-    cpu: Annotated[int | None, Parameter(converter=_whole)] = None,
+    priority: Whole = 50,
+    cpu: WholeOrNone = None,
 ) -> None:
     """Be the device at the other end of a wire: a simulated plant with a clock and a watchdog of its own, until interrupted.
 

@@ -8,15 +8,15 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from quell.arguments import whole
+from quell.arguments import Figures, JsonFile, WholeOrNone
 
 
 def run(
     setup: Path | None = None,
     *,
     example: Annotated[bool, Parameter(negative="")] = False,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
     save: Path | None = None,
 ) -> None:
     """Simulate what a setup file describes: a plant, a controller, what happens to them.
@@ -53,12 +53,12 @@ def run_rig(
     omega_c: float | None = None,
     omega_o: float | None = None,
     spin: float | None = None,
-    priority: Annotated[int | None, Parameter(converter=whole)] = None,
+    priority: WholeOrNone = None,
     mcap: Path | None = None,
     csv: Path | None = None,
-    live: Annotated[int | None, Parameter(converter=whole)] = None,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    live: WholeOrNone = None,
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
     save: Path | None = None,
 ) -> None:
     """Run a setup in real time around a device, for instance the twin that `quell rig` is.
@@ -120,8 +120,8 @@ def replay(
     record: Path,
     setup: Path | None = None,
     *,
-    json: Annotated[Path | None, Parameter(name="--json")] = None,
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures"),
+    json: JsonFile = None,
+    figures: Figures = Path("quell-figures"),
     save: Path | None = None,
 ) -> None:
     """Let a setup's observer and learner follow a recorded run: what they would have known, and what u the controller would have wished.

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from quell.realtime.run import ending_signals
+from quell.realtime.ending import handled
 
 
 @contextmanager
@@ -24,9 +23,5 @@ def ended_at_once(close: Callable[[], Any]) -> Iterator[None]:
         print("quell: interrupted", file=sys.stderr, flush=True)
         os._exit(128 + number)
 
-    before = {number: signal.signal(number, end) for number in ending_signals()}
-    try:
+    with handled(end):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

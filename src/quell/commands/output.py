@@ -28,7 +28,7 @@ class Tell(Protocol):
         """Show it."""
 
 
-def check_places(json_file: Path | None, figures: Path | None) -> None:
+def check_places(json_file: Path | None, figures: Path | None, record: Path | None = None) -> None:
     """Say what can't be written to before the work is done; make the folder.
 
     Raises
@@ -36,8 +36,9 @@ def check_places(json_file: Path | None, figures: Path | None) -> None:
     ValueError
         for a file that can't be written, or a folder that can't be made.
     """
-    if json_file is not None:
-        check_writable(json_file)
+    for file in (json_file, record):
+        if file is not None:
+            check_writable(file)
     if figures is not None:
         made(figures)
 

@@ -15,7 +15,6 @@ from quell import metrics
 from quell.commands.judged import figure_of, print_outcome
 from quell.commands.output import check_places, write_results
 from quell.controllers import ADRC
-from quell.files import check_writable
 from quell.plotting import draw
 from quell.realtime.channels import Event
 from quell.realtime.recording import load as load_record
@@ -35,9 +34,7 @@ def run_replay(*, record: Path, path: Path | None, json_file: Path | None, figur
         for a record or a setup that can't be read, or that do not fit together.
     """
     setup = load(EXAMPLES / "torsional_rig.toml" if path is None else path)
-    check_places(json_file, figures)
-    if save is not None:
-        check_writable(save)
+    check_places(json_file, figures, save)
     recorded = load_record(record)
     try:
         told = replay(recorded, cast(ADRC, setup.controller))  # what else it may be, replay itself says no to
@@ -51,8 +48,8 @@ def run_replay(*, record: Path, path: Path | None, json_file: Path | None, figur
     if gaps.size:
         first = recorded.t[gaps[0]]
         console.print(
-            f"{gaps.size} of {len(recorded)} samples were skipped by the loop and are filled in, the first at {first:.3f} s: from there on "
-            "a replay is not what the loop did, sample by sample.",
+            f"{gaps.size} of {len(recorded)} samples were skipped by the loop, the first at {first:.3f} s: to the replay, as to the loop, "
+            "they are samples without a measurement.",
             soft_wrap=True,
         )
     differs = metrics.rms((told["u_wished"] - told["u"])[part])

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import signal
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from quell.commands.ending import ended_at_once
 from quell.realtime.devices import listen, plant_named
+from quell.realtime.ending import handled
 from quell.realtime.frames import REFUSALS
-from quell.realtime.run import ending_signals
 from quell.realtime.scheduling import checked_cpu, checked_priority
 from quell.realtime.server import Rig, checked_seconds
 
@@ -34,13 +33,9 @@ def run_rig(
     with closing(listen(device)) as listener, Rig(model, listener=listener, log=log, **settings) as rig:
         with ended_at_once(listener.close):  # it may take a minute the first time
             rig.prepare()
-        before = {number: signal.signal(number, lambda *_: rig.stop()) for number in ending_signals()}
-        try:
+        with handled(lambda *_: rig.stop()):
             print(f"{plant} at {listener.url}: {_described(**settings)}", flush=True)
             notes = rig.run(seconds, priority=priority, cpu=cpu)
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
     _tell(rig)
     for note in notes:
         print(note)

@@ -10,7 +10,6 @@ from rich.markup import escape
 
 from quell.commands.judged import figure_of, judge, print_judgement, print_outcome
 from quell.commands.output import check_places, progress, write_results
-from quell.files import check_writable
 from quell.setup import SetupError, load
 from quell.simulation import simulate
 
@@ -29,9 +28,7 @@ def run_setup(*, path: Path, json_file: Path | None, figures: Path | None, save:
     if late:
         rule = f"must be less than the scenario's duration, {scenario.duration:g} s"
         raise SetupError([f"{setup.file}: metrics[{i}].start = {start:g}: {rule}" for i, start in late])
-    check_places(json_file, figures)
-    if save is not None:
-        check_writable(save)
+    check_places(json_file, figures, save)
     console = Console()
     with progress(console, what := "simulating (the first run compiles for some seconds)") as tell:
         try:

@@ -17,7 +17,8 @@ from quell.commands.ending import ended_at_once
 from quell.commands.judged import figure_of, judge, print_judgement, print_outcome
 from quell.commands.output import check_places, write_results
 from quell.experiments.figures import save_figure
-from quell.files import check_writable, without_gaps
+from quell.files import without_gaps
+from quell.realtime import csv_file
 from quell.realtime.devices import open_device
 from quell.realtime.outcome import ModeChange, RigRun
 from quell.realtime.run import run_rig
@@ -54,9 +55,7 @@ def run_setup(
     name, data = read(EXAMPLES / "torsional_rig.toml" if path is None else path)
     setup = made(name, changed(data, changes))
     scenario, arguments = setup.needed("scenario"), dict(setup.needed("rig"))
-    check_places(json_file, figures)
-    if save is not None:
-        check_writable(save)
+    check_places(json_file, figures, save)
     files = [*map(Path, arguments.pop("telemetry", ())), *telemetry]
     for file in files:
         check_new(file)
@@ -130,9 +129,7 @@ def check_new(file: Path) -> None:
         for another suffix than ``.mcap`` and ``.csv``, a file that is there, and a place that can't be written to.
     """
     file_sink(file)
-    if file.exists():
-        raise ValueError(f"path = {str(file)!r}: there is such a file; recordings are not overwritten: move it, or choose another name")
-    check_writable(file)
+    csv_file.check_new(file)
 
 
 def exit_code(run: RigRun) -> int:

@@ -9,13 +9,12 @@ little harsher than the original.
 
 from __future__ import annotations
 
-import csv
 import os
-from pathlib import Path
 
 import numpy as np
 
 from quell import checks
+from quell.files import csv_rows, read_text
 from quell.plants import CubicSpringPlant, LinearPlant, lagged_two_mass_spring
 from quell.types import Matrix, Vector
 
@@ -95,17 +94,10 @@ def read(path: str | os.PathLike[str]) -> Matrix:
         where the file can't be read, a column is missing, or a value is no number or out of range; it names line and column.
     """
     where = f"samples = {os.fspath(path)!r}"
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{where}: can't be read as a text file ({getattr(error, 'strerror', None) or 'not UTF-8'})") from None
-    try:
-        rows = [(number, row) for number, row in enumerate(csv.reader(text.splitlines()), 1) if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise ValueError(f"{where}: is no CSV file ({error})") from None
+    rows = csv_rows(read_text(path, where), where)
     if len(rows) < 2:
         raise ValueError(f"{where}: must have a line of column names and at least one sample")
-    header = [cell.strip().lstrip("\\") for cell in rows[0][1]]
+    header = [cell.lstrip("\\") for cell in rows[0][1]]
     places = [_place(where, header, j) for j in range(6)]
     return np.array([[_value(where, number, row, place, j) for j, place in enumerate(places)] for number, row in rows[1:]])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -53,4 +54,26 @@ def save_figure(figure: Any, where: Path, name: str) -> list[Path]:
             with written_atomically(path) as part:
                 figure.savefig(part, dpi=130, metadata={"Date": None} if suffix == "svg" else None)
             written.append(path)
+    return written
+
+
+def save_all(
+    figures: Iterable[tuple[str, Any]], count: int, folder: str | os.PathLike[str], tell: Callable[[str, float], None]
+) -> list[Path]:
+    """Write ``count`` figures with their names, in the studies' style, into ``folder``, made if need be; return the paths.
+
+    Raises
+    ------
+    ValueError
+        where the folder can't be made.
+    """
+    import matplotlib
+
+    where = made(folder)
+    written = []
+    with matplotlib.rc_context({"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}):
+        for i, (name, figure) in enumerate(figures):
+            tell("figures", i / count)
+            written += save_figure(figure, where, name)
+    tell("figures", 1.0)
     return written

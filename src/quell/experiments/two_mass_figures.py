@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.experiments.figures import STYLES, blank, label_of, made, save_figure
+from quell.experiments.figures import STYLES, blank, label_of, save_all
 from quell.experiments.gradient_range import HORIZON, Trial
 from quell.experiments.two_mass_spring import END, FORCE_AT, L1, MB, MF, STEP_AT, L
 from quell.experiments.two_mass_study import Result
@@ -37,16 +37,7 @@ def save(result: Result, folder: str | os.PathLike[str], tell: Callable[[str, fl
     ValueError
         where the folder can't be made.
     """
-    import matplotlib
-
-    where = made(folder)
-    written = []
-    with matplotlib.rc_context({"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}):
-        for i, (name, figure) in enumerate(_figures(result)):
-            tell("figures", i / 4)
-            written += save_figure(figure, where, name)
-    tell("figures", 1.0)
-    return written
+    return save_all(_figures(result), 4, folder, tell)
 
 
 def _figures(result: Result) -> Iterator[tuple[str, Any]]:

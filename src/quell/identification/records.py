@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.files import csv_rows, read_text
 from quell.types import Vector
 
 # Times may be this much of a sample off the grid, as rounded ones are.
@@ -82,17 +82,9 @@ def read_record(path: str | os.PathLike[str], columns: Sequence[str] = ("t", "u"
 
 
 def _rows(path: Path, where: str) -> list[tuple[int, list[str]]]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{where}: can't be read as a text file ({getattr(error, 'strerror', None) or 'not UTF-8'})") from None
-    try:
-        lines = text.splitlines()
-        between = _separator(next((line for line in lines if line.strip() and not line.startswith("#")), ""))
-        rows = [(number, [cell.strip() for cell in row]) for number, row in enumerate(csv.reader(lines, delimiter=between), 1)]
-    except csv.Error as error:
-        raise ValueError(f"{where}: is no CSV file ({error})") from None
-    rows = [(number, row) for number, row in rows if any(row) and not row[0].startswith("#")]
+    text = read_text(path, where)
+    between = _separator(next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), ""))
+    rows = [(number, row) for number, row in csv_rows(text, where, between) if not row[0].startswith("#")]
     if not rows:
         raise ValueError(f"{where}: is empty")
     if between != ",":

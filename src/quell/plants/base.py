@@ -36,6 +36,33 @@ class Plant(Protocol):
         """Return the parameters for a sample time ``dt`` [s]; with ``interpret``, such that Python can run and debug them."""
 
 
+class Around:
+    """What a plant that is put around another one has of that one."""
+
+    plant: Any
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return int(self.plant.order)
+
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbance inputs; they act as ever."""
+        return int(self.plant.disturbances)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the driver can run it compiled."""
+        return bool(self.plant.compiled)
+
+
+def check_plant(plant: Any, example: str) -> None:
+    """Check that ``plant`` is one; the message names an ``example``."""
+    if isinstance(plant, type) or not hasattr(plant, "sampled"):
+        raise ValueError(f"plant = {plant!r}: must be a plant, for example {example}")
+
+
 @generic
 def measure(plant: Any, x: Vector) -> float:
     """Return the output y for the state ``x`` (n,)."""

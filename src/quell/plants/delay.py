@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from quell import checks
-from quell.plants.base import Plant, advance, measure
+from quell.plants.base import Around, Plant, advance, check_plant, measure
 from quell.types import Vector
 
 
@@ -39,7 +39,7 @@ def _advance(plant: DelayedPlantModel, x: Vector, scratch: Vector, t: float, u: 
 
 
 @dataclass(frozen=True, eq=False)
-class DelayedPlant:
+class DelayedPlant(Around):
     """A plant whose control signal arrives ``samples`` samples of ``dt`` [s] late; make it with ``delayed``."""
 
     plant: Any
@@ -55,16 +55,6 @@ class DelayedPlant:
     def order(self) -> int:
         """Number of states, the u under way included."""
         return int(self.plant.order) + self.samples
-
-    @property
-    def disturbances(self) -> int:
-        """Number of disturbance inputs; they act at once."""
-        return int(self.plant.disturbances)
-
-    @property
-    def compiled(self) -> bool:
-        """Whether the driver can run it compiled."""
-        return bool(self.plant.compiled)
 
     def sampled(self, dt: float, interpret: bool = False) -> DelayedPlantModel:
         """Return the parameters for the sample time ``dt`` [s] that it was made for."""
@@ -97,8 +87,7 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
     >>> late.order
     6
     """
-    if isinstance(plant, type) or not hasattr(plant, "sampled"):
-        raise ValueError(f"plant = {plant!r}: must be a plant, for example quell.plants.two_mass_spring()")
+    check_plant(plant, "quell.plants.two_mass_spring()")
     checks.positive("delay", delay, "s")
     samples = checks.samples("delay", delay, checks.positive("dt", dt, "s"))
     return DelayedPlant(plant, samples, float(dt))

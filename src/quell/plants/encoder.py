@@ -14,7 +14,7 @@ import numpy as np
 
 from quell import checks
 from quell.dispatch import kernel
-from quell.plants.base import Plant, advance, measure
+from quell.plants.base import Around, Plant, advance, check_plant, measure
 from quell.types import Vector
 
 
@@ -44,7 +44,7 @@ def _advance(plant: EncodedPlantModel, x: Vector, scratch: Vector, t: float, u: 
 
 
 @dataclass(frozen=True, eq=False)
-class EncodedPlant:
+class EncodedPlant(Around):
     """A plant whose output [rad] an encoder of ``counts`` a turn measures; make it with ``encoded``."""
 
     plant: Any
@@ -59,21 +59,6 @@ class EncodedPlant:
     def name(self) -> str:
         """What tables and plots call it."""
         return f"{self.plant.name}, {self.counts} counts a turn"
-
-    @property
-    def order(self) -> int:
-        """Number of states."""
-        return int(self.plant.order)
-
-    @property
-    def disturbances(self) -> int:
-        """Number of disturbance inputs."""
-        return int(self.plant.disturbances)
-
-    @property
-    def compiled(self) -> bool:
-        """Whether the driver can run it compiled."""
-        return bool(self.plant.compiled)
 
     def sampled(self, dt: float, interpret: bool = False) -> EncodedPlantModel:
         """Return the parameters for a sample time ``dt`` [s]."""
@@ -102,6 +87,5 @@ def encoded(plant: Plant, counts: int) -> EncodedPlant:
     >>> round(seen.resolution, 7)
     0.0003927
     """
-    if isinstance(plant, type) or not hasattr(plant, "sampled"):
-        raise ValueError(f"plant = {plant!r}: must be a plant, for example quell.plants.torsional_identified()")
+    check_plant(plant, "quell.plants.torsional_identified()")
     return EncodedPlant(plant, checks.whole("counts", counts, 1))

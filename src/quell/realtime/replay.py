@@ -28,9 +28,9 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     """Let a controller follow a recorded run.
 
     It starts with nothing learned, on a state of its own, as in ``simulate``. Through the controller that made the run, its estimates come
-    out again, to rounding, as long as no deadline was skipped: those that were are samples without measurement here, while the controller
-    on the rig knew nothing of them. Derivatives of the reference are not recorded: a controller with feedforward is given none, which
-    shows in ``u_wished`` alone.
+    out again, to rounding. Deadlines that were skipped are samples without measurement, as they were to the controller on the rig, which
+    was told of ``Safety.hold`` of them at once, no more: where it skipped more the run ended, and its last estimates differ. Derivatives
+    of the reference are not recorded: a controller with feedforward is given none, which shows in ``u_wished`` alone.
 
     Parameters
     ----------
@@ -50,10 +50,12 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     Raises
     ------
     ValueError
-        for a run that lacks r, y, y_measured or u or does not have all samples, one without a single measurement, another sample time,
-        and ``u_before`` for a controller that is no ADRC.
+        for what is no Trajectory, a run that lacks r, y, y_measured or u or does not have all samples, one without a single measurement,
+        another sample time, and ``u_before`` for a controller that is no ADRC.
     """
     check_part("controller", controller)
+    if not isinstance(run, Trajectory):
+        raise ValueError(f"run = {run!r}: must be a Trajectory, for example quell.realtime.load('run.mcap')")
     r, y, measured, u = (np.ascontiguousarray(run[name]) for name in ("r", "y", "y_measured", "u"))
     if run.every != 1:
         raise ValueError(f"run has every {run.every}th sample: a replay needs all of them; record with record_every=1")

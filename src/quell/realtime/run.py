@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from os import PathLike
 from typing import Any
@@ -17,6 +16,7 @@ from quell.driver import check_part
 from quell.realtime.channels import row_channels
 from quell.realtime.clock import system_clock
 from quell.realtime.device import Device, PythonLine, line_of
+from quell.realtime.ending import handled
 from quell.realtime.header import Header
 from quell.realtime.outcome import ModeChange, RigRun, scenario_part, tally_of, told, unkept
 from quell.realtime.prepared import Prepared, scenario_of, setpoints
@@ -108,6 +108,8 @@ def run_rig(
             device=getattr(device, "name", type(device).__name__),
             controller=getattr(controller, "name", type(controller).__name__),
         )
+        if isinstance(telemetry, str | PathLike):
+            raise ValueError(f"telemetry = {str(telemetry)!r}: must be a list of files and sinks, be it of one")
         writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
         if isinstance(line, PythonLine):
             line.device.read()  # what it complains of comes before anything else
@@ -191,13 +193,6 @@ def _sink(place: Any) -> Sink:
     return file_sink(place) if isinstance(place, str | PathLike) else place
 
 
-def ending_signals() -> list[signal.Signals]:
-    """Return the signals that end a program that does not mind them: Ctrl-C, SIGTERM, and SIGHUP, unless that is ignored (nohup)."""
-    hang_up = getattr(signal, "SIGHUP", None)
-    more = [] if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN else [hang_up]
-    return [signal.SIGINT, signal.SIGTERM, *more]
-
-
 @contextmanager
 def _signals(requests: NDArray[Any]) -> Iterator[None]:
     """Let what ends other programs ask the loop to ramp down, and a second time for zero at once; in the main thread only."""
@@ -208,10 +203,5 @@ def _signals(requests: NDArray[Any]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, ask) for number in ending_signals()}
-    try:
+    with handled(ask):
         yield
-    finally:
-        for number, handler in before.items():
-            with suppress(TypeError):  # one that Python did not install
-                signal.signal(number, handler)
