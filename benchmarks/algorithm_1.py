@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 
 DT, HORIZON = 0.01, 1000.0
 
@@ -20,8 +20,14 @@ DT, HORIZON = 0.01, 1000.0
 def run(rate: float, with_u: bool) -> tuple[float, np.ndarray, float]:
     """Return when the run ended, θ shortly before (at 99 % of it), and the effective gain (b0 + θ_u)/b0 then."""
     settings = study.Settings(dt=DT)
-    observer, scenario = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT).model, study.scenario(settings)
-    plant, law = ql.plants.two_mass_spring().sampled(DT), study.controllers(settings)[study.MF].parameters.law
+    observer, scenario = (
+        ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT).model,
+        study.scenario(settings),
+    )
+    plant, law = (
+        ql.plants.two_mass_spring().sampled(DT),
+        study.controllers(settings)[study.MF].parameters.law,
+    )
     t = np.arange(round(HORIZON / DT)) * DT
     r, w2, noise = scenario.reference(t), scenario.disturbances[1](t), scenario.noise(t)
     x, z, theta, u, learned = np.zeros(4), np.zeros(5), np.zeros(6), 0.0, 0.0
@@ -41,17 +47,29 @@ def run(rate: float, with_u: bool) -> tuple[float, np.ndarray, float]:
         u = law[0] * (r[k] - z[0]) - law[1:] @ z[1:4] - learned - z[4]
         x = plant.transition @ x + plant.input * u + plant.disturbance[:, 1] * w2[k]
         history.append(theta)
-    return t[k], history[int(0.99 * len(history)) - 1], 1.0 + history[int(0.99 * len(history)) - 1][4]
+    return (
+        t[k],
+        history[int(0.99 * len(history)) - 1],
+        1.0 + history[int(0.99 * len(history)) - 1][4],
+    )
 
 
 def main() -> None:
     """Print both cases for several rates."""
-    table = Table("rate · batch / dt [1/s]", "features", "lasts [s]", "θ at 99 % of that", "(b0 + θ_u)/b0")
+    table = Table(
+        "rate · batch / dt [1/s]", "features", "lasts [s]", "θ at 99 % of that", "(b0 + θ_u)/b0"
+    )
     for rate in (0.01, 0.03, 0.1, 0.3):
         for with_u in (True, False):
             ended, theta, gain = run(rate, with_u)
             lasts = f"{ended:.0f}" if ended < HORIZON - 1.0 else f"all {HORIZON:.0f}"
-            table.add_row(f"{rate:g}", "x̂, u, 1" if with_u else "x̂, 1", lasts, np.array2string(theta, precision=2), f"{gain:.2f}")
+            table.add_row(
+                f"{rate:g}",
+                "x̂, u, 1" if with_u else "x̂, 1",
+                lasts,
+                np.array2string(theta, precision=2),
+                f"{gain:.2f}",
+            )
     Console().print(table)
 
 

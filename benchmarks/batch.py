@@ -19,7 +19,9 @@ import quell as ql
 
 def main() -> None:
     """Print runs a second, and the ratio to a loop over ``simulate``."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--runs", type=int, default=1000)
     runs = parser.parse_args().runs
     rng = np.random.default_rng(0)
@@ -34,7 +36,9 @@ def main() -> None:
     )
     plants = ql.plants.batch(ql.plants.two_mass_spring, m1=m1, m2=m2, k=k)
     result = ql.simulate(plants, controller, scenario)
-    print(f"{runs} runs of {scenario.duration:g} s at {controller.dt * 1e3:g} ms, {np.count_nonzero(result.diverged)} diverged")
+    print(
+        f"{runs} runs of {scenario.duration:g} s at {controller.dt * 1e3:g} ms, {np.count_nonzero(result.diverged)} diverged"
+    )
     # By the clock on the wall, since threads are to be judged.
     candidates = (
         lambda: ql.plants.batch(ql.plants.two_mass_spring, m1=m1, m2=m2, k=k),
@@ -42,10 +46,19 @@ def main() -> None:
         lambda: ql.simulate(plants, controller, scenario, workers=1),
         lambda: [ql.simulate(plant, controller, scenario) for plant in plants],
     )
-    times = np.min([[timeit.timeit(candidate, number=1) for candidate in candidates] for _ in range(5)], axis=0).tolist()
-    labels = ("making the plants", f"batch on all {os.cpu_count()} cores", "batch on one core", "loop over simulate")
+    times = np.min(
+        [[timeit.timeit(candidate, number=1) for candidate in candidates] for _ in range(5)], axis=0
+    ).tolist()
+    labels = (
+        "making the plants",
+        f"batch on all {os.cpu_count()} cores",
+        "batch on one core",
+        "loop over simulate",
+    )
     for label, time in zip(labels, times, strict=True):
-        print(f"{label:24s} {time:7.3f} s {runs / time:9.0f} runs/s {times[-1] / time:7.1f} × the loop")
+        print(
+            f"{label:24s} {time:7.3f} s {runs / time:9.0f} runs/s {times[-1] / time:7.1f} × the loop"
+        )
 
 
 if __name__ == "__main__":

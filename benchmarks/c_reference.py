@@ -14,18 +14,31 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 
 SOURCE = Path(__file__).with_name("reference.c")
 
 
-def c_reference(folder: Path, settings: study.Settings, duration: float = study.END) -> Callable[[bool], np.ndarray]:
+def c_reference(
+    folder: Path, settings: study.Settings, duration: float = study.END
+) -> Callable[[bool], np.ndarray]:
     """Build ``reference.c``; return a function that runs the study's L-ESO in it, and returns the log where it is to be recorded.
 
     Design and noise are made here, so that running takes no longer than the loop does.
     """
     library = folder / "reference.so"
-    command = ["gcc", "-O3", "-march=native", "-std=gnu11", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-lm"]
+    command = [
+        "gcc",
+        "-O3",
+        "-march=native",
+        "-std=gnu11",
+        "-shared",
+        "-fPIC",
+        "-o",
+        str(library),
+        str(SOURCE),
+        "-lm",
+    ]
     subprocess.run(command, check=True)
     run = ctypes.CDLL(str(library)).run
     run.restype = ctypes.c_double
@@ -42,17 +55,34 @@ def c_reference(folder: Path, settings: study.Settings, duration: float = study.
             kalman.lag.taps,
             kalman.scale[:4],
             kalman.threshold,
-            [kalman.walk[-1], kalman.forget, kalman.lag_time, kalman.prior[0], kalman.fastest, kalman.f_noise],
+            [
+                kalman.walk[-1],
+                kalman.forget,
+                kalman.lag_time,
+                kalman.prior[0],
+                kalman.fastest,
+                kalman.f_noise,
+            ],
         ]
     )
     samples, hold = round(duration / settings.dt) + 1, round(0.01 / settings.dt)
-    noise = study.scenario(settings).noise.seeded(settings.seed)(np.arange(samples // hold + 1) * 0.01)
+    noise = study.scenario(settings).noise.seeded(settings.seed)(
+        np.arange(samples // hold + 1) * 0.01
+    )
 
     def reference(record: bool) -> np.ndarray:
         log = np.empty((samples, 22) if record else 0)
         run(
-            *(numbers.ctypes.data_as(pointer), ctypes.c_size_t(samples), ctypes.c_double(study.STEP_AT)),
-            *(noise.ctypes.data_as(pointer), ctypes.c_size_t(hold), log.ctypes.data_as(pointer) if record else None),
+            *(
+                numbers.ctypes.data_as(pointer),
+                ctypes.c_size_t(samples),
+                ctypes.c_double(study.STEP_AT),
+            ),
+            *(
+                noise.ctypes.data_as(pointer),
+                ctypes.c_size_t(hold),
+                log.ctypes.data_as(pointer) if record else None,
+            ),
         )
         return log
 
@@ -79,7 +109,9 @@ def show(rows: Sequence[dict[str, object]], file: Path | None, title: str | None
     """Print a table, and write its rows to ``file`` where there is one."""
     table = Table("what", "measured", "bar", "times", title=title)
     for line in rows:
-        table.add_row(str(line["what"]), f"{line['ratio']:.2f}", str(line["bar"]), str(line["times"]))
+        table.add_row(
+            str(line["what"]), f"{line['ratio']:.2f}", str(line["bar"]), str(line["times"])
+        )
     Console().print(table)
     if file:
         file.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -33,20 +33,34 @@ import numpy as np
 import quell as ql
 from quell.files import without_gaps, write_json
 from quell.realtime import Safety, load, open_device, run_rig
-from quell.realtime.faults import KINDS, Fault, Relay
-from quell.realtime.rig import LIVE, LOG
-from quell.realtime.supervisor import FLUSH, Cause, Mode
+from quell.realtime.loop.supervisor import FLUSH, Cause, Mode
+from quell.realtime.rig.fault_injection import KINDS, Fault, Relay
+from quell.realtime.rig.kernel import LIVE, LOG
 
 DT, WATCHDOG, LIMIT = 1e-3, 20, 5.0
 SECONDS = 1.5
 SAFETY = Safety(hold=5, ramp=50, settle=100, most_error=3.0)
-TROUBLES = (*KINDS, "stall the loop", "stall the rig", "kill the loop", "kill the rig", "interrupt the loop")
+TROUBLES = (
+    *KINDS,
+    "stall the loop",
+    "stall the rig",
+    "kill the loop",
+    "kill the rig",
+    "interrupt the loop",
+)
 
 
 def controller() -> ql.ADRC:
     """Return an L-ESO that often lies at its limits, as the reference is too quick for it."""
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=40.0, dt=DT)
-    return ql.ADRC(observer, omega_c=4.0, learner=ql.learners.Kalman(), guard=ql.Guard(), u_min=-LIMIT, u_max=LIMIT)
+    return ql.ADRC(
+        observer,
+        omega_c=4.0,
+        learner=ql.learners.Kalman(),
+        guard=ql.Guard(),
+        u_min=-LIMIT,
+        u_max=LIMIT,
+    )
 
 
 class RigProcess:
@@ -54,9 +68,23 @@ class RigProcess:
 
     def __init__(self, folder: Path, number: int) -> None:
         self.log = folder / f"rig-{number}.csv"
-        command = [sys.executable, "-m", "quell.cli", "rig", "--device", "udp://127.0.0.1:0", "--plant", "two-mass", "--dt", str(DT)]
+        command = [
+            sys.executable,
+            "-m",
+            "quell.cli.app",
+            "rig",
+            "--device",
+            "udp://127.0.0.1:0",
+            "--plant",
+            "two-mass",
+            "--dt",
+            str(DT),
+        ]
         self.process = subprocess.Popen(
-            [*command, "--watchdog", str(WATCHDOG), "--log", str(self.log)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [*command, "--watchdog", str(WATCHDOG), "--log", str(self.log)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().partition(" at ")[2].partition(": ")[0]
@@ -70,9 +98,13 @@ class RigProcess:
             text = file.read()
         whole = text[: text.rfind("\n") + 1]
         self._seen += len(whole.encode())
-        return np.array([[float(part) for part in line.split(",")] for line in whole.splitlines() if line[0].isdigit()]).reshape(
-            -1, len(LOG)
-        )
+        return np.array(
+            [
+                [float(part) for part in line.split(",")]
+                for line in whole.splitlines()
+                if line[0].isdigit()
+            ]
+        ).reshape(-1, len(LOG))
 
     def end(self) -> None:
         """End it."""
@@ -84,14 +116,35 @@ def loop(url: str, folder: Path) -> None:
     """Be the loop's process."""
     device = open_device(url, DT)
     files = [folder / "run.csv", folder / "run.mcap"]
-    run = run_rig(device, controller(), ql.signals.Sinusoid(omega=3.0), duration=SECONDS, safety=SAFETY, approach=0.2, telemetry=files)
-    told = {"changes": [(change.t, change.mode, change.cause) for change in run.changes], "tally": run.tally._asdict()}
-    write_json(folder / "run.json", told | {"completed": run.completed, "verdict": run.verdict, "notes": list(run.notes)})
+    run = run_rig(
+        device,
+        controller(),
+        ql.signals.Sinusoid(omega=3.0),
+        duration=SECONDS,
+        safety=SAFETY,
+        approach=0.2,
+        telemetry=files,
+    )
+    told = {
+        "changes": [(change.t, change.mode, change.cause) for change in run.changes],
+        "tally": run.tally._asdict(),
+    }
+    write_json(
+        folder / "run.json",
+        told | {"completed": run.completed, "verdict": run.verdict, "notes": list(run.notes)},
+    )
 
 
 def warm_up(url: str) -> None:
     """Compile or load what every trial needs, once; they are forked from here."""
-    run_rig(open_device(url, DT), controller(), ql.signals.Sinusoid(omega=3.0), duration=0.2, safety=SAFETY, approach=0.2)
+    run_rig(
+        open_device(url, DT),
+        controller(),
+        ql.signals.Sinusoid(omega=3.0),
+        duration=0.2,
+        safety=SAFETY,
+        approach=0.2,
+    )
 
 
 def trial(number: int, rig: RigProcess, folder: Path, draw: random.Random) -> dict[str, Any]:
@@ -100,7 +153,13 @@ def trial(number: int, rig: RigProcess, folder: Path, draw: random.Random) -> di
     first, many = draw.randint(150, 1200), max(round(500 ** draw.random()), 1)
     towards, late = draw.choice(("loop", "rig")), draw.randint(1, 10)
     faults = [Fault(kind, towards, first, many, late)] if kind in KINDS else []
-    about = {"trial": number, "kind": kind, "towards": towards if faults else "", "at": first, "length": many}
+    about = {
+        "trial": number,
+        "kind": kind,
+        "towards": towards if faults else "",
+        "at": first,
+        "length": many,
+    }
     rig.rows()
     with Relay("udp://127.0.0.1:0", rig.url, faults, seed=number) as relay:
         pid = os.fork()
@@ -117,7 +176,9 @@ def trial(number: int, rig: RigProcess, folder: Path, draw: random.Random) -> di
         _, status = os.waitpid(pid, 0)
     log = rig.rows()
     dead_rig = rig.process.poll() is not None
-    return about | judged(folder, log, loop_killed=killed and os.WIFSIGNALED(status), rig_killed=dead_rig)
+    return about | judged(
+        folder, log, loop_killed=killed and os.WIFSIGNALED(status), rig_killed=dead_rig
+    )
 
 
 def disturb(kind: str, pid: int, rig: RigProcess, relay: Relay, first: int, many: int) -> bool:
@@ -125,7 +186,9 @@ def disturb(kind: str, pid: int, rig: RigProcess, relay: Relay, first: int, many
     if kind in KINDS:
         return False
     deadline = time.monotonic() + 20.0
-    while relay.passed["rig"] < first and time.monotonic() < deadline:  # so many commands have gone by
+    while (
+        relay.passed["rig"] < first and time.monotonic() < deadline
+    ):  # so many commands have gone by
         time.sleep(0.001)
     whom = rig.process.pid if kind.endswith("the rig") else pid
     if kind.startswith("stall"):
@@ -152,7 +215,11 @@ def judged(folder: Path, log: np.ndarray, *, loop_killed: bool, rig_killed: bool
         wrong.append(f"the loop raised {(folder / 'error.txt').read_text(encoding='utf-8')}")
     else:
         told = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        found["ended"] = Cause(told["changes"][-2][2]).name if len(told["changes"]) > 1 else Cause(told["changes"][-1][2]).name
+        found["ended"] = (
+            Cause(told["changes"][-2][2]).name
+            if len(told["changes"]) > 1
+            else Cause(told["changes"][-1][2]).name
+        )
         for path in files:
             judge_record(path, told, wrong)
     return found
@@ -166,7 +233,9 @@ def judge_wire(log: np.ndarray, rig_killed: bool) -> list[str]:
     if came.size == 0:
         wrong.append("no command came at all")
     if np.any(np.abs(came) > LIMIT) or np.any(np.abs(u) > LIMIT) or not np.all(np.isfinite(u)):
-        wrong.append(f"u of {max(np.max(np.abs(came), initial=0.0), np.max(np.abs(u))):g} on the wire")
+        wrong.append(
+            f"u of {max(np.max(np.abs(came), initial=0.0), np.max(np.abs(u))):g} on the wire"
+        )
     if np.any(u[state != LIVE] != 0.0):
         wrong.append("u was not zero without a live session")
     silent = 0
@@ -178,7 +247,9 @@ def judge_wire(log: np.ndarray, rig_killed: bool) -> list[str]:
     if not rig_killed and (log.shape[0] == 0 or u[-1] != 0.0 or state[-1] == LIVE):
         wrong.append("u did not end at zero")
     session = log[:, LOG.index("session")]
-    if any(np.any(np.diff(state[(session == one) & (state >= LIVE)]) < 0) for one in np.unique(session)):
+    if any(
+        np.any(np.diff(state[(session == one) & (state >= LIVE)]) < 0) for one in np.unique(session)
+    ):
         wrong.append("a tripped session came back to life")
     return wrong
 
@@ -186,7 +257,9 @@ def judge_wire(log: np.ndarray, rig_killed: bool) -> list[str]:
 def judge_loss(path: Path, log: np.ndarray, wrong: list[str]) -> float:
     """Return how much of a killed loop's last commands its record lacks [s]."""
     command = log[:, LOG.index("command")]
-    commands = int(np.flatnonzero(np.isfinite(command))[-1] - np.flatnonzero(np.isfinite(command))[0])
+    commands = int(
+        np.flatnonzero(np.isfinite(command))[-1] - np.flatnonzero(np.isfinite(command))[0]
+    )
     try:
         last = load(path)["k"][-1]
     except ValueError as error:
@@ -208,8 +281,13 @@ def judge_record(path: Path, told: dict[str, Any], wrong: list[str]) -> None:
         wrong.append(f"{path.name}: u beyond its limits")
     if mode[-1] != Mode.STOPPED or u[-1] != 0.0:
         wrong.append(f"{path.name}: did not end at zero")
-    if len(record) - np.count_nonzero(record["events"].astype(int) >> 16 & 1) != told["tally"]["cycles"]:
-        wrong.append(f"{path.name}: {told['tally']['cycles']} cycles, {len(record)} rows with gaps filled")
+    if (
+        len(record) - np.count_nonzero(record["events"].astype(int) >> 16 & 1)
+        != told["tally"]["cycles"]
+    ):
+        wrong.append(
+            f"{path.name}: {told['tally']['cycles']} cycles, {len(record)} rows with gaps filled"
+        )
     blind = 0
     for k in range(len(record)):
         blind = 0 if good[k] else blind + 1
@@ -219,7 +297,9 @@ def judge_record(path: Path, told: dict[str, Any], wrong: list[str]) -> None:
     down = np.flatnonzero(mode >= Mode.RAMP)
     if np.any(np.diff(mode[down]) < 0) or np.any(mode[down[0] :] < Mode.RAMP):
         wrong.append(f"{path.name}: it went on after it had begun to stop")
-    if down.size > SAFETY.ramp + FLUSH + 1 + np.count_nonzero(record["events"][down].astype(int) >> 16 & 1):
+    if down.size > SAFETY.ramp + FLUSH + 1 + np.count_nonzero(
+        record["events"][down].astype(int) >> 16 & 1
+    ):
         wrong.append(f"{path.name}: it took {down.size} samples to stop")
     if np.any(np.diff(np.abs(u[down])) > 1e-12):
         wrong.append(f"{path.name}: u grew on its way to zero")
@@ -227,7 +307,9 @@ def judge_record(path: Path, told: dict[str, Any], wrong: list[str]) -> None:
 
 def main() -> None:
     """Run the trials, print how they ended."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
@@ -255,7 +337,10 @@ def main() -> None:
     print(f"{'fault':<20} {'trials':>6}  ended")
     for kind in TROUBLES:
         mine = [found for found in results if found["kind"] == kind]
-        ends = ", ".join(f"{name} {count}" for name, count in Counter(found["ended"] for found in mine).most_common())
+        ends = ", ".join(
+            f"{name} {count}"
+            for name, count in Counter(found["ended"] for found in mine).most_common()
+        )
         print(f"{kind:<20} {len(mine):>6}  {ends}")
     lost = [part for found in results for part in found.get("lost", ())]
     if lost:

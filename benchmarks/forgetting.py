@@ -10,7 +10,7 @@ from rich.table import Table
 
 import quell as ql
 from quell import signals
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 
 TRAINED = 90.0
 
@@ -23,7 +23,9 @@ def main() -> None:
         controller = study.controller(settings, learner=learner)
         for lasts in (0.0, 300.0, 900.0, 3000.0):
             step_at = TRAINED + lasts + 110.0
-            load = signals.Constant(0.0).until(TRAINED, then=signals.Sinusoid(omega=0.3, start=TRAINED))
+            load = signals.Constant(0.0).until(
+                TRAINED, then=signals.Sinusoid(omega=0.3, start=TRAINED)
+            )
             scenario = ql.Scenario(
                 reference=signals.Sinusoid().until(step_at, then=signals.Step(at=step_at)),
                 disturbances=(0.0, load.until(TRAINED + lasts, then=0.0) if lasts else 0.0),
@@ -33,7 +35,12 @@ def main() -> None:
             )
             run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=10)
             found, theta = run.metrics(step_at), run["theta"][run.window(step_at, step_at + 1.0)][0]
-            cells = (f"{theta[0]:.2f}", f"{theta[2]:.2f}", f"{found['overshoot']:.5f}", f"{found['settling_time']:.1f}")
+            cells = (
+                f"{theta[0]:.2f}",
+                f"{theta[2]:.2f}",
+                f"{found['overshoot']:.5f}",
+                f"{found['settling_time']:.1f}",
+            )
             table.add_row(name, f"{lasts:g}", *cells)
     Console().print(table)
 

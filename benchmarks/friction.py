@@ -35,7 +35,10 @@ MOVE = s.Trapezoid(distance=1.0, duration=1.5, start=0.5)
 REFERENCES = {
     "two sinusoids": 0.5 * s.Sinusoid(omega=1.0) + 0.3 * s.Sinusoid(omega=2.3),
     "moves to and fro": sum(
-        ((-1.0) ** k * s.Trapezoid(distance=1.0, duration=1.5, start=0.5 + 3.0 * k) for k in range(1, 40)),
+        (
+            (-1.0) ** k * s.Trapezoid(distance=1.0, duration=1.5, start=0.5 + 3.0 * k)
+            for k in range(1, 40)
+        ),
         start=MOVE,
     ),
 }
@@ -46,9 +49,13 @@ LEARNERS: dict[str, Any] = {
     "NLMS (linear)": ql.learners.NLMS(),
     "RLS, RBF(40)": ql.learners.RLS(State() + RBF(40) + Bias()),
     "NLMS, RBF(40)": ql.learners.NLMS(features=State() + RBF(40) + Bias()),
-    "RLS, RandomFourier(40, 0.3)": ql.learners.RLS(State() + RandomFourier(40, length=0.3) + Bias()),
+    "RLS, RandomFourier(40, 0.3)": ql.learners.RLS(
+        State() + RandomFourier(40, length=0.3) + Bias()
+    ),
     "RLS, Polynomial + Friction": ql.learners.RLS(State() + Polynomial() + Friction() + Bias()),
-    "NLMS, Polynomial + Friction": ql.learners.NLMS(features=State() + Polynomial() + Friction() + Bias()),
+    "NLMS, Polynomial + Friction": ql.learners.NLMS(
+        features=State() + Polynomial() + Friction() + Bias()
+    ),
     "MLP": ql.learners.MLP(),
     "GaussianProcess": ql.learners.GaussianProcess(),
     "GaussianProcess(length=0.3)": ql.learners.GaussianProcess(length=0.3),
@@ -82,7 +89,9 @@ def main() -> None:
             took = (time.perf_counter() - start) / run.t.size * 1e9
             errors[label] = (rms_error(run, TRAINED), took)
         for label, (error, took) in errors.items():
-            table.add_row(label, f"{error:.6f}", f"{error / errors['Kalman (linear)'][0]:.2f}", f"{took:.0f}")
+            table.add_row(
+                label, f"{error:.6f}", f"{error / errors['Kalman (linear)'][0]:.2f}", f"{took:.0f}"
+            )
         Console().print(table)
 
 

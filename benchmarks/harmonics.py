@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 import quell as ql
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 from quell.learners import Harmonic
 from quell.signals import Signal, Sinusoid
 
@@ -38,15 +38,26 @@ def peaks(learner: ql.learners.Learner | None, omegas: Sequence[float]) -> tuple
         rest_at=paper.rest_at,
         seed=paper.seed,
     )
-    run = ql.simulate(ql.plants.two_mass_spring(), study.controller(settings, learner=learner), scenario, record_every=10)
+    run = ql.simulate(
+        ql.plants.two_mass_spring(),
+        study.controller(settings, learner=learner),
+        scenario,
+        record_every=10,
+    )
     away = np.abs(run["y"] - 1.0)
-    first, last = (float(away[run.window(at, at + END - JUDGED_AT)].max()) for at in (JUDGED_AT, END + 200.0))
+    first, last = (
+        float(away[run.window(at, at + END - JUDGED_AT)].max()) for at in (JUDGED_AT, END + 200.0)
+    )
     return (math.nan, math.nan) if run.diverged else (first, last)
 
 
 def main() -> None:
     """Print a table for one sinusoid, and one for two."""
-    one = Table("starts at [rad/s]", "peak 60 s after the load, MF-ESO/500", title="one sinusoid, π/10 rad/s")
+    one = Table(
+        "starts at [rad/s]",
+        "peak 60 s after the load, MF-ESO/500",
+        title="one sinusoid, π/10 rad/s",
+    )
     plain = peaks(None, (0.1 * math.pi,))
     for start in (0.1, 0.2, 0.3, 0.5, 1.0, 1.5, 2.0, 3.0):
         found = peaks(Harmonic(omegas=(start,)), (0.1 * math.pi,))
@@ -60,9 +71,22 @@ def main() -> None:
         "the same, 300 s after",
         title="two sinusoids of 1 N: peak 60 s after the load came, over MF-ESO's",
     )
-    for omegas in ((0.2, 0.4), (0.2, 0.6), (0.3, 0.6), (0.4, 0.8), (0.4, 1.3), (0.7, 1.4), (0.3, 0.4), (0.5, 0.7), (0.6, 0.8)):
+    for omegas in (
+        (0.2, 0.4),
+        (0.2, 0.6),
+        (0.3, 0.6),
+        (0.4, 0.8),
+        (0.4, 1.3),
+        (0.7, 1.4),
+        (0.3, 0.4),
+        (0.5, 0.7),
+        (0.6, 0.8),
+    ):
         plain = peaks(None, omegas)
-        shares = [peaks(learner, omegas) for learner in (ql.learners.Kalman(), Harmonic(), Harmonic(count=2))]
+        shares = [
+            peaks(learner, omegas)
+            for learner in (ql.learners.Kalman(), Harmonic(), Harmonic(count=2))
+        ]
         two.add_row(
             ", ".join(f"{omega:g}" for omega in omegas),
             f"{plain[0]:.3f}",

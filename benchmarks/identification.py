@@ -45,9 +45,15 @@ def records() -> dict[str, tuple[Any, Any]]:
     ):
         record = excited(TWIN, excitation(kind, band, 60.0, DT, low, high))
         found[name] = record.u, record.y
-    found["closed loop: multisine to 40 rad/s, ±3 rad"] = closed_loop(excitation("multisine", (0.3, 40.0), 60.0, DT, -3.0, 3.0).signal)
-    found["closed loop: PRBS to 10 rad/s, ±π/2"] = closed_loop(excitation("prbs", (0.3, 10.0), 60.0, DT, -np.pi / 2, np.pi / 2).signal)
-    found["closed loop: (π/2) sin(π t/2)"] = closed_loop(ql.signals.Sinusoid(0.5 * np.pi, 0.5 * np.pi))
+    found["closed loop: multisine to 40 rad/s, ±3 rad"] = closed_loop(
+        excitation("multisine", (0.3, 40.0), 60.0, DT, -3.0, 3.0).signal
+    )
+    found["closed loop: PRBS to 10 rad/s, ±π/2"] = closed_loop(
+        excitation("prbs", (0.3, 10.0), 60.0, DT, -np.pi / 2, np.pi / 2).signal
+    )
+    found["closed loop: (π/2) sin(π t/2)"] = closed_loop(
+        ql.signals.Sinusoid(0.5 * np.pi, 0.5 * np.pi)
+    )
     return found
 
 
@@ -70,11 +76,15 @@ def judged(found: Identified) -> dict[str, float]:
 
 def main() -> None:
     """Run all and print one table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     arguments = parser.parse_args()
     rows = []
-    print(f"{'record':44} friction  time [s]  CPU [s]  slow [%]  resonance [%]  its damping [%]  held out [%]")
+    print(
+        f"{'record':44} friction  time [s]  CPU [s]  slow [%]  resonance [%]  its damping [%]  held out [%]"
+    )
     for name, (u, y) in records().items():
         for friction in (True, False):
             taken, used = [], []
@@ -83,7 +93,13 @@ def main() -> None:
                 found = ql.identify(u, y, DT, friction=friction)
                 taken.append(time.perf_counter() - began)
                 used.append(time.process_time() - before)
-            row = {"record": name, "friction": friction, "seconds": min(taken[1:]), "cpu": min(used[1:]), **judged(found)}
+            row = {
+                "record": name,
+                "friction": friction,
+                "seconds": min(taken[1:]),
+                "cpu": min(used[1:]),
+                **judged(found),
+            }
             rows.append(row)
             print(
                 f"{name:44} {'yes' if friction else 'no':8} {row['seconds']:9.2f} {row['cpu']:8.2f} "

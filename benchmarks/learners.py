@@ -21,10 +21,10 @@ from c_reference import best, c_reference, row, show
 
 import quell as ql
 from quell.controllers.base import control
-from quell.dispatch import compiled, for_types
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 from quell.features import RBF, Bias, Input, RandomFourier, State
-from quell.learners.model import infer, learn
+from quell.kernels.dispatch import compiled, for_types
+from quell.learners.online.model import infer, learn
 
 TRIALS = 11
 DURATION = 60.0
@@ -94,7 +94,9 @@ class PythonLms:
 
 LEARNERS: dict[str, Any] = {
     "none": ql.learners.NoLearner(),
-    "BatchGradient (Algorithm 1)": ql.learners.BatchGradient(study.gradient_rate(SETTINGS), study.GRADIENT_BATCH),
+    "BatchGradient (Algorithm 1)": ql.learners.BatchGradient(
+        study.gradient_rate(SETTINGS), study.GRADIENT_BATCH
+    ),
     "NLMS": ql.learners.NLMS(),
     "RLS": ql.learners.RLS(),
     "Kalman": ql.learners.Kalman(),
@@ -113,7 +115,9 @@ GUARDED = ("Kalman", "Harmonic")
 
 def law(learner: Any, guard: ql.Guard | None = None) -> ql.ADRC:
     """Return the study's controller around a learner."""
-    return ql.ADRC(study.controller(SETTINGS).observer, SETTINGS.omega_c, learner=learner, guard=guard)
+    return ql.ADRC(
+        study.controller(SETTINGS).observer, SETTINGS.omega_c, learner=learner, guard=guard
+    )
 
 
 def with_one_tap(controller: ql.ADRC) -> ql.ADRC:
@@ -161,7 +165,14 @@ def learners(rows: list[dict[str, object]]) -> None:
         c, *ours = best(lambda: reference(False), *map(loop, laws.values()), trials=TRIALS)
     for name, took in zip(laws, ours, strict=True):
         bar = "≤ 2" if name == "Kalman" else ""
-        rows.append(row(f"closed loop, {name} / C with Kalman", took / c, bar, nanoseconds(took, c, of="loop sample")))
+        rows.append(
+            row(
+                f"closed loop, {name} / C with Kalman",
+                took / c,
+                bar,
+                nanoseconds(took, c, of="loop sample"),
+            )
+        )
 
 
 def guard(rows: list[dict[str, object]]) -> None:
@@ -181,7 +192,14 @@ def guard(rows: list[dict[str, object]]) -> None:
                 ("exact lag filter / one tap", learner, bare, ""),
                 ("guard and exact lag filter / neither", both, bare, ""),
             ):
-                rows.append(row(f"{what}, {name}: {label}", one / other, bar, nanoseconds(one, other, of=what)))
+                rows.append(
+                    row(
+                        f"{what}, {name}: {label}",
+                        one / other,
+                        bar,
+                        nanoseconds(one, other, of=what),
+                    )
+                )
 
 
 def from_python(rows: list[dict[str, object]]) -> None:
@@ -199,14 +217,21 @@ def from_python(rows: list[dict[str, object]]) -> None:
         return call
 
     for name in GUARDED:
-        both, learner = best(*(stepping_from_python(law(LEARNERS[name], guard)) for guard in (ql.Guard(), None)), trials=TRIALS)
+        both, learner = best(
+            *(stepping_from_python(law(LEARNERS[name], guard)) for guard in (ql.Guard(), None)),
+            trials=TRIALS,
+        )
         times = nanoseconds(both, learner, of="controller.step")
-        rows.append(row(f"controller.step, {name}: with guard / without", both / learner, "≤ 1.4", times))
+        rows.append(
+            row(f"controller.step, {name}: with guard / without", both / learner, "≤ 1.4", times)
+        )
 
 
 def main() -> None:
     """Run all and print one table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []

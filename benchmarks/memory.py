@@ -10,12 +10,14 @@ import resource
 import time
 
 import quell as ql
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 
 
 def main() -> None:
     """Run the loop with the Kalman learner for a long time, recording every 10 000th sample."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--samples", type=float, default=1e8)
     samples = int(parser.parse_args().samples)
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
@@ -32,7 +34,9 @@ def main() -> None:
     run = ql.simulate(plant, controller, scenario, record_every=10_000)
     took = time.perf_counter() - began
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{samples:.0e} samples in {took:.1f} s ({took / samples * 1e9:.0f} ns each), {len(run)} rows recorded")
+    print(
+        f"{samples:.0e} samples in {took:.1f} s ({took / samples * 1e9:.0f} ns each), {len(run)} rows recorded"
+    )
     print(f"memory: {before:.0f} MB before, {after - before:.0f} MB more at the most (bar: 200 MB)")
 
 

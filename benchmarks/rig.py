@@ -34,15 +34,35 @@ PLANT = ql.plants.two_mass_spring()
 def controller() -> ql.ADRC:
     """L-ESO on the two-mass-spring system, as in the paper's simulation."""
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT)
-    return ql.ADRC(observer, omega_c=1.0, learner=ql.learners.Kalman(), guard=ql.Guard(), u_min=-20.0, u_max=20.0)
+    return ql.ADRC(
+        observer,
+        omega_c=1.0,
+        learner=ql.learners.Kalman(),
+        guard=ql.Guard(),
+        u_min=-20.0,
+        u_max=20.0,
+    )
 
 
 @contextlib.contextmanager
 def rig(wire: str, priority: int) -> Iterator[str]:
     """Start ``quell rig`` as a process of its own; yield its URL, and print what it says when it ends."""
     url = "udp://127.0.0.1:0" if wire == "udp" else f"shm://quell-benchmark-{os.getpid()}"
-    command = [sys.executable, "-m", "quell.cli", "rig", "--device", url, "--plant", "two-mass", "--dt", str(DT)]
-    process = subprocess.Popen([*command, "--priority", str(priority)], stdout=subprocess.PIPE, text=True)
+    command = [
+        sys.executable,
+        "-m",
+        "quell.cli.app",
+        "rig",
+        "--device",
+        url,
+        "--plant",
+        "two-mass",
+        "--dt",
+        str(DT),
+    ]
+    process = subprocess.Popen(
+        [*command, "--priority", str(priority)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     try:
         first = process.stdout.readline()
@@ -53,13 +73,17 @@ def rig(wire: str, priority: int) -> Iterator[str]:
         process.wait()
 
 
-def over_the_wire(url: str, reference: ql.signals.Signal, seconds: float, options: argparse.Namespace) -> RigRun:
+def over_the_wire(
+    url: str, reference: ql.signals.Signal, seconds: float, options: argparse.Namespace
+) -> RigRun:
     """Run at the rig."""
     return run_rig(
         *(open_device(url, DT), controller(), reference),
         duration=seconds,
         approach=0.0,
-        safety=Safety(settle=500, hold=15),  # the rig itself may be late now and then; its watchdog has 20 ticks
+        safety=Safety(
+            settle=500, hold=15
+        ),  # the rig itself may be late now and then; its watchdog has 20 ticks
         spin=options.spin,
         priority=options.priority,
         on_change=lambda change: print(change, flush=True),
@@ -73,30 +97,48 @@ def floor(seconds: float) -> np.ndarray | None:
         return None
     with tempfile.TemporaryDirectory() as folder:
         program = f"{folder}/wakeup"
-        subprocess.run([compiler, "-O2", "-o", program, str(Path(__file__).with_name("wakeup.c"))], check=True)
-        run = subprocess.run([program, str(round(1e9 * DT)), str(round(seconds / DT))], stdout=subprocess.PIPE, text=True, check=True)
+        subprocess.run(
+            [compiler, "-O2", "-o", program, str(Path(__file__).with_name("wakeup.c"))], check=True
+        )
+        run = subprocess.run(
+            [program, str(round(1e9 * DT)), str(round(seconds / DT))],
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
     return 1e-9 * np.array(run.stdout.split(), dtype=float)
 
 
 def main() -> None:
     """Print histograms, counts and metrics."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--wire", choices=("udp", "shm"), default="udp")
     parser.add_argument("--spin", type=float, default=0.0)
     parser.add_argument("--priority", type=int, default=50)
     options = parser.parse_args()
-    reference = ql.signals.Sinusoid().until(0.5 * options.seconds, then=ql.signals.Step(at=0.5 * options.seconds))
+    reference = ql.signals.Sinusoid().until(
+        0.5 * options.seconds, then=ql.signals.Step(at=0.5 * options.seconds)
+    )
     late = floor(min(options.seconds, 20.0))
     with rig(options.wire, options.priority) as url:
         run = over_the_wire(url, reference, options.seconds, options)
     print(run.text())
-    print(f"\nno overrun: {run.overruns == 0}; p99.9 of the lateness {1e6 * run.timing.lateness.p999:.0f} µs (at most 500 wanted)")
+    print(
+        f"\nno overrun: {run.overruns == 0}; p99.9 of the lateness {1e6 * run.timing.lateness.p999:.0f} µs (at most 500 wanted)"
+    )
     if late is not None:
         p50, p999 = np.percentile(late, [50.0, 99.9])
         a_minute = 60.0 / DT * np.mean(late > DT)
-        print(f"the machine at best (C): p50 {1e6 * p50:.0f} µs, p99.9 {1e6 * p999:.0f} µs, max {1e6 * np.max(late):.0f} µs,", end=" ")
-        print(f"{a_minute:.0f} a minute later than a sample; p99.9 of the loop over that {run.timing.lateness.p999 / p999:.2f}")
+        print(
+            f"the machine at best (C): p50 {1e6 * p50:.0f} µs, p99.9 {1e6 * p999:.0f} µs, max {1e6 * np.max(late):.0f} µs,",
+            end=" ",
+        )
+        print(
+            f"{a_minute:.0f} a minute later than a sample; p99.9 of the loop over that {run.timing.lateness.p999 / p999:.2f}"
+        )
     print()
     delayed = ql.plants.delayed(PLANT, delay=DT, dt=DT)
     plain = ql.simulate(delayed, controller(), ql.Scenario(reference, options.seconds))

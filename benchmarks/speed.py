@@ -18,7 +18,7 @@ import numpy as np
 from c_reference import best, c_reference, row, show
 
 import quell as ql
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 
 TRIALS = 15
 SAMPLES = round(study.END / study.Settings().dt) + 1
@@ -45,17 +45,36 @@ def against_c(rows: list[dict[str, object]]) -> None:
             lambda: ql.simulate(plant, controller, scenario, record_every=SAMPLES),
             trials=TRIALS,
         )
-    for label, c, ours in (("every sample recorded", c_all, ours_all), ("nothing recorded", c_bare, ours_bare)):
-        rows.append(row(f"closed loop, Kalman learner, {label}: quell / C", ours / c, "≤ 2", f"{each(ours, c)}, apart by {apart:.0e}"))
+    for label, c, ours in (
+        ("every sample recorded", c_all, ours_all),
+        ("nothing recorded", c_bare, ours_bare),
+    ):
+        rows.append(
+            row(
+                f"closed loop, Kalman learner, {label}: quell / C",
+                ours / c,
+                "≤ 2",
+                f"{each(ours, c)}, apart by {apart:.0e}",
+            )
+        )
 
 
 def algorithm_1(rows: list[dict[str, object]]) -> None:
     """Time Algorithm 1 with a small and a large batch."""
     settings, plant = study.Settings(), ql.plants.two_mass_spring()
     scenario = study.scenario(settings)
-    small, large = (study.controller(settings, learner=ql.learners.BatchGradient(1e-5 / n, n)) for n in (10, 10_000))
-    few, many = best(lambda: ql.simulate(plant, small, scenario), lambda: ql.simulate(plant, large, scenario), trials=TRIALS)
-    rows.append(row("Algorithm 1: batch of 10 000 / batch of 10", many / few, "≤ 1.3", each(many, few)))
+    small, large = (
+        study.controller(settings, learner=ql.learners.BatchGradient(1e-5 / n, n))
+        for n in (10, 10_000)
+    )
+    few, many = best(
+        lambda: ql.simulate(plant, small, scenario),
+        lambda: ql.simulate(plant, large, scenario),
+        trials=TRIALS,
+    )
+    rows.append(
+        row("Algorithm 1: batch of 10 000 / batch of 10", many / few, "≤ 1.3", each(many, few))
+    )
 
 
 def one_call(rows: list[dict[str, object]]) -> None:
@@ -70,7 +89,9 @@ def one_call(rows: list[dict[str, object]]) -> None:
         u, other = ours.step(1.0, y), float(theirs(y, before, 1.0))
         assert abs(u - other) < 1e-9, (u, other)
         y, speed, before = y + 0.01 * speed, speed + 0.01 * (2.0 * u - 0.5 * speed), u
-    learned = ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, 1e-3), omega_c=1.0, learner=ql.learners.Kalman())
+    learned = ql.ADRC(
+        ql.ESO.model_free(4, 1.0, 10.0, 1e-3), omega_c=1.0, learner=ql.learners.Kalman()
+    )
     learned.prepare()
     calls = 20_000
     empty, plain, kalman, peer = (
@@ -86,7 +107,9 @@ def one_call(rows: list[dict[str, object]]) -> None:
     peer = 10 * peer - empty
     plain, kalman = plain - empty, kalman - empty
     for label, took in (("order 2, no learner", plain), ("order 4, Kalman learner", kalman)):
-        rows.append(row(f"step() from Python, {label}: µs", took * 1e6, "≤ 1", f"{took * 1e9:.0f} ns"))
+        rows.append(
+            row(f"step() from Python, {label}: µs", took * 1e6, "≤ 1", f"{took * 1e9:.0f} ns")
+        )
     times = f"{peer * 1e9:.0f} / {plain * 1e9:.0f} ns, same outputs"
     rows.append(row("one call, second order: pyadrc / quell", peer / plain, "> 1", times))
 
@@ -108,13 +131,20 @@ def against_python_control(rows: list[dict[str, object]]) -> None:
         corrected = z + design.eso.gain * (inputs[1] - z[0])
         return design.law[0] * inputs[0] - gains @ corrected
 
-    eso = ct.nlsys(update, output, inputs=["r", "y"], outputs=["u"], states=5, dt=settings.dt, name="eso")
+    eso = ct.nlsys(
+        update, output, inputs=["r", "y"], outputs=["u"], states=5, dt=settings.dt, name="eso"
+    )
     matrices = (sampled.transition, sampled.input[:, None], sampled.output[None, :], 0.0)
     masses = ct.ss(*matrices, settings.dt, inputs=["u"], outputs=["y"], name="masses")
     loop = ct.interconnect([masses, eso], inputs=["r"], outputs=["y"])
     t = np.arange(samples) * settings.dt
     scenario = ql.Scenario(reference=1.0, duration=t[-1])
-    apart = np.max(np.abs(ct.input_output_response(loop, t, np.ones(samples)).outputs - ql.simulate(plant, law, scenario)["y"]))
+    apart = np.max(
+        np.abs(
+            ct.input_output_response(loop, t, np.ones(samples)).outputs
+            - ql.simulate(plant, law, scenario)["y"]
+        )
+    )
     assert apart < 1e-9, f"quell and python-control differ by {apart}"
     (theirs,) = best(lambda: ct.input_output_response(loop, t, np.ones(samples)), trials=3)
     longer = ql.Scenario(reference=1.0, duration=100.0)
@@ -127,7 +157,9 @@ def against_python_control(rows: list[dict[str, object]]) -> None:
 
 def main() -> None:
     """Run all benchmarks and print one table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []

@@ -31,8 +31,12 @@ def main() -> None:
     bare = best([*python, "pass"], 7)
     rows = [
         ("import quell", best([*python, "import quell"], 7) - bare, 0.3),
-        ("quell --help", best([sys.executable, "-m", "quell.cli", "--help"], 7), 0.6),
-        ("quell reproduce two-mass, cache warm, with figures", best([sys.executable, "-m", "quell.cli", "reproduce", "two-mass"], 4), 5.0),
+        ("quell --help", best([sys.executable, "-m", "quell.cli.app", "--help"], 7), 0.6),
+        (
+            "quell reproduce two-mass, cache warm, with figures",
+            best([sys.executable, "-m", "quell.cli.app", "reproduce", "two-mass"], 4),
+            5.0,
+        ),
     ]
     table = Table("what", "measured [s]", "bar [s]")
     for what, took, bar in rows:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 
 COLUMNS = ("overshoot", "settling_time", "disturbance_peak", "control_variation")
 
@@ -22,9 +22,15 @@ def main() -> None:
             found = []
             for seed in range(10):
                 settings = study.Settings(dt=dt, seed=seed, reset=reset)
-                run = study.simulate(study.two_mass_spring(), study.controllers(settings)[name], study.scenario(settings))
+                run = study.simulate(
+                    study.two_mass_spring(),
+                    study.controllers(settings)[name],
+                    study.scenario(settings),
+                )
                 found.append(study.score(run))
-            ranges = [f"{min(s[c] for s in found):.5g} – {max(s[c] for s in found):.5g}" for c in COLUMNS]
+            ranges = [
+                f"{min(s[c] for s in found):.5g} – {max(s[c] for s in found):.5g}" for c in COLUMNS
+            ]
             table.add_row(f"{dt:g}", name if reset else f"{name}, no reset", *ranges)
     Console().print(table)
 

@@ -17,14 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from quell.realtime.channels import row_channels
-from quell.realtime.header import Header
-from quell.realtime.recording import load
-from quell.realtime.ring import push
-from quell.realtime.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
-from quell.realtime.telemetry import Telemetry
+from quell.realtime.telemetry.channels import row_channels
+from quell.realtime.telemetry.header import Header
+from quell.realtime.telemetry.load import load
+from quell.realtime.telemetry.ring import push
+from quell.realtime.telemetry.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
+from quell.realtime.telemetry.telemetry import Telemetry
 
-CHANNELS = row_channels((("x_hat", 4), ("f_residual", 1), ("f_learned", 1), ("status", 1), ("theta", 9)))
+CHANNELS = row_channels(
+    (("x_hat", 4), ("f_residual", 1), ("f_learned", 1), ("status", 1), ("theta", 9))
+)
 
 
 def rows_like_a_loops(count: int) -> np.ndarray:
@@ -38,7 +40,12 @@ def rows_like_a_loops(count: int) -> np.ndarray:
 def cost(folder: Path) -> None:
     """Print what a row costs the writer."""
     rows = rows_like_a_loops(20_000)
-    for sink in (MemorySink(), CsvSink(folder / "cost.csv"), McapSink(folder / "cost.mcap"), LiveSink(0)):
+    for sink in (
+        MemorySink(),
+        CsvSink(folder / "cost.csv"),
+        McapSink(folder / "cost.mcap"),
+        LiveSink(0),
+    ):
         sink.open(Header(CHANNELS, 1e-3))
         started = time.process_time()
         for first in range(0, len(rows), 10):
@@ -47,7 +54,9 @@ def cost(folder: Path) -> None:
         took = time.process_time() - started
         sink.close()
         size = sink.path.stat().st_size / len(rows) if hasattr(sink, "path") else 0
-        print(f"{type(sink).__name__:10s} {took / len(rows) * 1e6:6.2f} µs a row of {rows.shape[1]}, {size:4.0f} bytes")
+        print(
+            f"{type(sink).__name__:10s} {took / len(rows) * 1e6:6.2f} µs a row of {rows.shape[1]}, {size:4.0f} bytes"
+        )
 
 
 def lateness(folder: Path, seconds: float) -> None:
@@ -58,7 +67,11 @@ def lateness(folder: Path, seconds: float) -> None:
         "no sink": [],
         "csv": [CsvSink(folder / "late.csv")],
         "mcap": [McapSink(folder / "late.mcap")],
-        "csv, mcap, live": [CsvSink(folder / "all.csv"), McapSink(folder / "all.mcap"), LiveSink(0)],
+        "csv, mcap, live": [
+            CsvSink(folder / "all.csv"),
+            McapSink(folder / "all.mcap"),
+            LiveSink(0),
+        ],
     }
     for name, sinks in kinds.items():
         late = np.empty(len(rows))
@@ -71,7 +84,9 @@ def lateness(folder: Path, seconds: float) -> None:
                 push(telemetry.ring, row)
             in_front(False)
         shares = np.percentile(late, [50, 99, 99.9, 100]) * 1e6
-        print(f"{name:16s} wakes up late by p50 {shares[0]:.0f}, p99 {shares[1]:.0f}, p99.9 {shares[2]:.0f}, most {shares[3]:.0f} µs")
+        print(
+            f"{name:16s} wakes up late by p50 {shares[0]:.0f}, p99 {shares[1]:.0f}, p99.9 {shares[2]:.0f}, most {shares[3]:.0f} µs"
+        )
 
 
 def in_front(wanted: bool) -> None:
@@ -102,7 +117,10 @@ def killed(folder: Path, trials: int = 8) -> None:
         lost: dict[str, list[float]] = {".csv": [], ".mcap": []}
         for trial in range(trials):
             paths = [folder / f"killed-{dt}-{trial}{suffix}" for suffix in lost]
-            process = subprocess.Popen([sys.executable, __file__, "produce", str(dt), *map(str, paths)], stdout=subprocess.PIPE)
+            process = subprocess.Popen(
+                [sys.executable, __file__, "produce", str(dt), *map(str, paths)],
+                stdout=subprocess.PIPE,
+            )
             assert process.stdout is not None
             process.stdout.read(8)
             time.sleep(1.5 + rng.random())

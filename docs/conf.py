@@ -11,7 +11,13 @@ project = "quell"
 author = "The quell developers"
 copyright = "2026, the quell developers"
 release = version = quell.__version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx-mathjax-offline"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx-mathjax-offline",
+]
 html_theme = "pydata_sphinx_theme"
 html_title = "quell"
 html_theme_options = {"show_prev_next": False, "secondary_sidebar_items": ["page-toc"]}

@@ -25,7 +25,9 @@ for k in range(4000):
     u = controller.step(r=0.5, y=measured)
     if controller.estimate.status is ql.Status.MEASUREMENT_HELD and k == 2000:
         print(controller.estimate.status.message)
-    speed += DT * (60.0 * u - 3.0 * speed - 4.0 * math.sin(angle))  # b0 is 50, the motor's gain is 60
+    speed += DT * (
+        60.0 * u - 3.0 * speed - 4.0 * math.sin(angle)
+    )  # b0 is 50, the motor's gain is 60
     angle += DT * speed
 print(f"angle {angle:.4f} rad, disturbance {controller.estimate.f:.2f} rad/s²")
 

@@ -12,12 +12,18 @@ def pendulum(t, x, u, w):
 
 plant = ql.plants.NonlinearPlant(pendulum, order=2, output=[1.0, 0.0], substeps=2, name="pendulum")
 scenario = ql.Scenario(
-    reference=ql.signals.Sinusoid(amplitude=0.8, omega=2.0).until(20.0, then=ql.signals.Constant(0.5)),
+    reference=ql.signals.Sinusoid(amplitude=0.8, omega=2.0).until(
+        20.0, then=ql.signals.Constant(0.5)
+    ),
     disturbances=(ql.signals.Sinusoid(amplitude=3.0, omega=1.5, start=25.0),),
     duration=60.0,
 )
 for learner in (None, ql.learners.Kalman()):
-    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=8.0, omega_o=25.0, dt=2e-3), omega_c=8.0, learner=learner)
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=2, b0=8.0, omega_o=25.0, dt=2e-3), omega_c=8.0, learner=learner
+    )
     run = ql.simulate(plant, controller, scenario)
     loaded = run.metrics(start=30.0)
-    print(f"{'L-ESO ' if learner else 'MF-ESO'}: error under load, largest {loaded['peak_error']:.4f} rad, RMS {loaded['rms']:.4f} rad")
+    print(
+        f"{'L-ESO ' if learner else 'MF-ESO'}: error under load, largest {loaded['peak_error']:.4f} rad, RMS {loaded['rms']:.4f} rad"
+    )

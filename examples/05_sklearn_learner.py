@@ -27,9 +27,13 @@ free = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
 ideal = ql.simulate(free, ql.ADRC(observer, omega_c=4.0), scenario)
 
 # Without momentum: pairs that follow each other resemble each other.
-network = MLPRegressor(hidden_layer_sizes=(16,), activation="tanh", solver="sgd", learning_rate_init=0.05, momentum=0.0)
+network = MLPRegressor(
+    hidden_layer_sizes=(16,), activation="tanh", solver="sgd", learning_rate_init=0.05, momentum=0.0
+)
 for learner in (None, ql.learners.SklearnModel(network, period=10)):
     run = ql.simulate(plant, ql.ADRC(observer, omega_c=4.0, learner=learner), scenario)
     last = run.window(40.0, 60.0)
     deviation = np.sqrt(np.mean((run["y"] - ideal["y"])[last] ** 2))
-    print(f"{'MLPRegressor' if learner else 'no learner':>12}: RMS deviation from the ideal loop {deviation:.4f}. {run.message}")
+    print(
+        f"{'MLPRegressor' if learner else 'no learner':>12}: RMS deviation from the ideal loop {deviation:.4f}. {run.message}"
+    )

@@ -66,7 +66,11 @@ scenario = ql.Scenario(
     noise=ql.signals.BandLimitedNoise(power=1e-12, sample_time=0.01),
     duration=80.0,
 )
-ideal = ql.simulate(free, ql.ADRC(observer, omega_c=1.0), ql.Scenario(reference=scenario.reference, duration=scenario.duration))
+ideal = ql.simulate(
+    free,
+    ql.ADRC(observer, omega_c=1.0),
+    ql.Scenario(reference=scenario.reference, duration=scenario.duration),
+)
 for name, learner, guard in (
     ("no learner", None, None),
     ("liar, no guard", Online(Liar()), None),
@@ -76,7 +80,11 @@ for name, learner, guard in (
     controller = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard)
     run = ql.simulate(plant, controller, scenario)
     error = np.sqrt(np.mean((run["y"] - ideal["y"][: len(run)]) ** 2))
-    print(f"{name:>14}: RMS deviation from the ideal loop {error:.3g} m, over {run.t[-1]:.0f} s. {run.message}")
+    print(
+        f"{name:>14}: RMS deviation from the ideal loop {error:.3g} m, over {run.t[-1]:.0f} s. {run.message}"
+    )
     if guard:
         now = controller.read(run.final_state)
-        print(f"{'':16}Authority {run['authority'].max():.2f} at most, {now.authority:.2f} at the end. {now.reason.message}")
+        print(
+            f"{'':16}Authority {run['authority'].max():.2f} at most, {now.authority:.2f} at the end. {now.reason.message}"
+        )

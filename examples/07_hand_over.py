@@ -4,7 +4,9 @@ import quell as ql
 
 DT = 2e-3
 WEIGHT, HELD = -3.0, 3.0  # a load, and the control signal that holds it
-controller = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=40.0, dt=DT), omega_c=4.0, u_min=-10.0, u_max=10.0)
+controller = ql.ADRC(
+    ql.ESO.model_free(order=2, b0=2.0, omega_o=40.0, dt=DT), omega_c=4.0, u_min=-10.0, u_max=10.0
+)
 height = speed = largest_jump = 0.0
 u = HELD
 

@@ -114,8 +114,20 @@ class Rack:
                 if task.left <= 0.0 and not task.expired:
                     task.expired = True
                     card = self.cards[task.device]
-                    card.volts.update({name: value for name, value in task.expires.items() if name.startswith("ao")})
-                    card.levels.update({name: value for name, value in task.expires.items() if not name.startswith("ao")})
+                    card.volts.update(
+                        {
+                            name: value
+                            for name, value in task.expires.items()
+                            if name.startswith("ao")
+                        }
+                    )
+                    card.levels.update(
+                        {
+                            name: value
+                            for name, value in task.expires.items()
+                            if not name.startswith("ao")
+                        }
+                    )
 
     # What the functions have in common.
 
@@ -172,7 +184,11 @@ class Rack:
         out._obj.value = {0x1272: 24, 0x1923: 5, 0x2F22: 0}[attribute]
 
     def DAQmxGetExtendedErrorInfo(self, out, size):
-        self._say(f"{_SAYS[self.error]}\n\nTask Name: _unnamedTask<0>\n\nStatus Code: {self.error}", out, size)
+        self._say(
+            f"{_SAYS[self.error]}\n\nTask Name: _unnamedTask<0>\n\nStatus Code: {self.error}",
+            out,
+            size,
+        )
 
     def DAQmxGetTaskAttribute(self, handle, attribute, out, size):
         assert attribute == 0x1276, "only the task's name is asked for"
@@ -187,7 +203,9 @@ class Rack:
     def DAQmxClearTask(self, handle):
         del self.tasks[handle.value]
 
-    def DAQmxCreateCIAngEncoderChan(self, handle, counter, name, decoding, zidx, zidx_val, phase, units, pulses, initial, scale):
+    def DAQmxCreateCIAngEncoderChan(
+        self, handle, counter, name, decoding, zidx, zidx_val, phase, units, pulses, initial, scale
+    ):
         assert (decoding, units, zidx) == (EncoderType.X_4.value, AngleUnits.TICKS.value, False)
         self._claim(self._task(handle), counter, "counter")
 
@@ -209,7 +227,9 @@ class Rack:
         self._card(task)
         if self._is_taken(task):
             raise DriverError(RESERVED)
-        if task.kind == "watchdog" and any(other.device == task.device and other.running for other in self.tasks.values()):
+        if task.kind == "watchdog" and any(
+            other.device == task.device and other.running for other in self.tasks.values()
+        ):
             raise DriverError(-201477)
         task.running = True
         if task.kind == "counter":
@@ -231,7 +251,9 @@ class Rack:
         card.volts[task.channel] = min(math.floor(value / step + 0.5), (1 << 15) - 1) * step
         card.history.append((task.channel, value))
 
-    def DAQmxWriteDigitalLines(self, handle, samples, auto_start, timeout, layout, values, written, reserved):
+    def DAQmxWriteDigitalLines(
+        self, handle, samples, auto_start, timeout, layout, values, written, reserved
+    ):
         task = self._writable(handle, auto_start)
         assert samples == 1
         assert values.shape == (1,)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import quell as ql
-from quell.realtime.channels import LOOP_CHANNELS, row_channels
-from quell.realtime.header import Header
+from quell.realtime.telemetry.channels import LOOP_CHANNELS, row_channels
+from quell.realtime.telemetry.header import Header
 from quell.types import Matrix
 
 DT = 0.01
@@ -41,4 +41,11 @@ def rows_of(run: ql.Trajectory, design: ql.ADRC) -> Matrix:
 
 def header_of(run: ql.Trajectory, design: ql.ADRC) -> Header:
     """What a loop would have said of it."""
-    return Header(row_channels(design.channels), run.dt, design.features, device="a lift", controller="ADRC", units={"y": "m"})
+    return Header(
+        row_channels(design.channels),
+        run.dt,
+        design.features,
+        device="a lift",
+        controller="ADRC",
+        units={"y": "m"},
+    )

@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import quell as ql
-from quell.dispatch import kernel
+from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
-from quell.realtime.channels import row_channels
-from quell.realtime.clock import pass_time, virtual_clock
-from quell.realtime.device import fetch, put
-from quell.realtime.prepared import Prepared, scenario_of, setpoints
-from quell.realtime.ring import drain, ring
-from quell.realtime.safety import Safety
+from quell.realtime.devices.base import fetch, put
+from quell.realtime.loop.prepared import Prepared, scenario_of, setpoints
+from quell.realtime.loop.safety import Safety
+from quell.realtime.system.clock import pass_time, virtual_clock
+from quell.realtime.telemetry.channels import row_channels
+from quell.realtime.telemetry.ring import drain, ring
 
 DT = 0.01
 
@@ -70,7 +70,9 @@ def _put(line: Scripted, u: float) -> int:
 class ScriptedDevice:
     """The line as a device; scripts as dictionaries from sample to value."""
 
-    def __init__(self, plant: Any, *, samples: int = 3000, x0: Any = None, **scripts: dict[int, Any]) -> None:
+    def __init__(
+        self, plant: Any, *, samples: int = 3000, x0: Any = None, **scripts: dict[int, Any]
+    ) -> None:
         self.paced = False
         model = plant.sampled(DT, False)
         x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=float)
@@ -80,7 +82,15 @@ class ScriptedDevice:
             for k, value in script.items():
                 told[name][k] = value
         room = np.full(samples, math.nan)
-        self.line = Scripted(model, x, np.zeros(6 * plant.order), np.zeros(plant.disturbances), np.zeros(2, np.int64), **told, written=room)
+        self.line = Scripted(
+            model,
+            x,
+            np.zeros(6 * plant.order),
+            np.zeros(plant.disturbances),
+            np.zeros(2, np.int64),
+            **told,
+            written=room,
+        )
 
     @property
     def written(self) -> Any:
@@ -104,7 +114,11 @@ PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0]
 
 def adrc(**options: Any) -> ql.ADRC:
     """A controller for ``PLANT``."""
-    return ql.ADRC(ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT), omega_c=1.5, **{"u_min": -3.0, "u_max": 3.0} | options)
+    return ql.ADRC(
+        ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT),
+        omega_c=1.5,
+        **{"u_min": -3.0, "u_max": 3.0} | options,
+    )
 
 
 class Outcome(NamedTuple):
@@ -116,7 +130,7 @@ class Outcome(NamedTuple):
 
     def __getitem__(self, name: Any) -> Any:
         """Return a column of the rows."""
-        from quell.realtime import channels
+        from quell.realtime.telemetry import channels
 
         return self.rows[:, getattr(channels, name)]
 
@@ -136,9 +150,19 @@ def run(
     """Run a loop around a scripted device to its end; settle in ten samples, where nothing else is said."""
     controller = adrc() if controller is None else controller
     width = sum(width for _, width in row_channels(controller.channels))
-    points = setpoints(scenario_of(reference, duration), DT, getattr(controller, "derivatives", 0), approach)
+    points = setpoints(
+        scenario_of(reference, duration), DT, getattr(controller, "derivatives", 0), approach
+    )
     rules = Safety(**{"settle": 10} | safety).rules(controller)
-    prepared = Prepared.of(device, controller, points, rules, virtual_clock(late), ring(4096, width), interpret=interpret)
+    prepared = Prepared.of(
+        device,
+        controller,
+        points,
+        rules,
+        virtual_clock(late),
+        ring(4096, width),
+        interpret=interpret,
+    )
     prepared.requests[0] = asked
     prepared.run()
     return Outcome(prepared, drain(prepared.books.ring), device)

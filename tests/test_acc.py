@@ -15,14 +15,16 @@ from scipy.integrate import solve_ivp
 import quell as ql
 from quell.analysis import analyse, linear_law
 from quell.analysis.laws import closed_loop_matrix
-from quell.cli import app
-from quell.commands.acc import _print_cases
-from quell.experiments import acc, acc_designs, acc_samples
-from quell.experiments.acc_cases import CaseResult, study_cases
-from quell.experiments.acc_criteria import interval, judge
-from quell.experiments.acc_designs import DT, MB, MF, PUBLISHED, L, designs
-from quell.experiments.acc_loops import unstable
-from quell.experiments.acc_published import judge_published
+from quell.cli.app import app
+from quell.cli.commands.acc import _print_cases
+from quell.experiments.acc import designs as acc_designs
+from quell.experiments.acc import samples as acc_samples
+from quell.experiments.acc import study as acc
+from quell.experiments.acc.cases import CaseResult, study_cases
+from quell.experiments.acc.criteria import interval, judge
+from quell.experiments.acc.designs import DT, MB, MF, PUBLISHED, L, designs
+from quell.experiments.acc.loops import unstable
+from quell.experiments.acc.published import judge_published
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
 
@@ -45,9 +47,17 @@ def test_the_cubic_plant_obeys_its_equations_to_second_order_in_dt() -> None:
 
     def rate(t: float, x: np.ndarray) -> list[float]:
         force = k * (x[0] - x[1]) + k_cubic * (x[0] - x[1]) ** 3
-        return [x[2], x[3], (-force + effectiveness * x[4] + 0.1) / m1, (force - 0.05) / m2, (0.3 - x[4]) / lag]
+        return [
+            x[2],
+            x[3],
+            (-force + effectiveness * x[4] + 0.1) / m1,
+            (force - 0.05) / m2,
+            (0.3 - x[4]) / lag,
+        ]
 
-    exact = solve_ivp(rate, (0.0, 5.0), [0.0, 0.0, 0.0, 1.0 / m2, 0.0], method="LSODA", rtol=1e-12, atol=1e-13).y[:, -1]
+    exact = solve_ivp(
+        rate, (0.0, 5.0), [0.0, 0.0, 0.0, 1.0 / m2, 0.0], method="LSODA", rtol=1e-12, atol=1e-13
+    ).y[:, -1]
     coarse, fine = (np.max(np.abs(run_by_hand(dt, 5.0, 0.3) - exact)) for dt in (0.05, 0.005))
     assert 60.0 < coarse / fine < 140.0
     assert np.max(np.abs(run_by_hand(DT, 5.0, 0.3) - exact)) < 2e-5
@@ -55,7 +65,10 @@ def test_the_cubic_plant_obeys_its_equations_to_second_order_in_dt() -> None:
 
 def test_without_its_cubic_part_the_spring_makes_a_linear_plant() -> None:
     """And with hardly any the two are the same."""
-    linear, almost = lagged_two_mass_spring(lag=0.02), lagged_two_mass_spring(lag=0.02, k_cubic=1e-9)
+    linear, almost = (
+        lagged_two_mass_spring(lag=0.02),
+        lagged_two_mass_spring(lag=0.02, k_cubic=1e-9),
+    )
     assert isinstance(linear, ql.plants.LinearPlant)
     what = ql.Scenario(duration=5.0, x0=[0.0, 0.0, 0.0, 1.0, 0.0])
     one, other = (ql.simulate(plant, designs()[MF], what)["y"] for plant in (linear, almost))
@@ -65,37 +78,62 @@ def test_without_its_cubic_part_the_spring_makes_a_linear_plant() -> None:
 @pytest.mark.parametrize("argument", ["m1", "m2", "k", "effectiveness", "lag"])
 def test_what_must_be_positive_in_the_plant_is_named(argument: str) -> None:
     """One line with argument and value."""
-    with pytest.raises(ValueError, match=rf"{argument} = -1.0: must be finite and greater than zero"):
+    with pytest.raises(
+        ValueError, match=rf"{argument} = -1.0: must be finite and greater than zero"
+    ):
         lagged_two_mass_spring(**{argument: -1.0})
 
 
 def test_samples_are_read_by_name_whatever_their_order(tmp_path: Path) -> None:
     """Names as published, or ours; further columns and blank lines are left alone."""
-    (tmp_path / "a.csv").write_text("\\theta_1,\\theta_2,\\theta_3,\\theta_4,\\theta_5,\\theta_6\n1,2,3,-4,5,6\n")
-    (tmp_path / "b.csv").write_text("tau, note, lambda, k_nonlin, k_lin, m2, m1\n6,x,5,-4,3,2,1\n\n")
+    (tmp_path / "a.csv").write_text(
+        "\\theta_1,\\theta_2,\\theta_3,\\theta_4,\\theta_5,\\theta_6\n1,2,3,-4,5,6\n"
+    )
+    (tmp_path / "b.csv").write_text(
+        "tau, note, lambda, k_nonlin, k_lin, m2, m1\n6,x,5,-4,3,2,1\n\n"
+    )
     for name in ("a.csv", "b.csv"):
-        np.testing.assert_array_equal(acc_samples.read(tmp_path / name), [[1.0, 2.0, 3.0, -4.0, 5.0, 6.0]])
+        np.testing.assert_array_equal(
+            acc_samples.read(tmp_path / name), [[1.0, 2.0, 3.0, -4.0, 5.0, 6.0]]
+        )
 
 
 @pytest.mark.parametrize(
     ("text", "told"),
     [
         ("m1,m2,k_lin,lambda,tau\n1,1,1,1,0.01\n", r"column k_nonlin \(or theta_4\) is missing"),
-        ("m1,m1,m2,k_lin,k_nonlin,lambda,tau\n1,1,1,1,0,1,0.01\n", r"column m1 \(or theta_1\) is there more than once"),
-        (HEADER + "1,1,1,0,1,0.01\n1,-0.5,1,0,1,0.01\n", r"line 3: m2 = -0.5: must be finite and greater than zero \[kg\]"),
-        (HEADER + "1,1,1,0,1,0\n", r"line 2: tau = 0.0: must be finite and greater than zero \[s\]"),
+        (
+            "m1,m1,m2,k_lin,k_nonlin,lambda,tau\n1,1,1,1,0,1,0.01\n",
+            r"column m1 \(or theta_1\) is there more than once",
+        ),
+        (
+            HEADER + "1,1,1,0,1,0.01\n1,-0.5,1,0,1,0.01\n",
+            r"line 3: m2 = -0.5: must be finite and greater than zero \[kg\]",
+        ),
+        (
+            HEADER + "1,1,1,0,1,0\n",
+            r"line 2: tau = 0.0: must be finite and greater than zero \[s\]",
+        ),
         (HEADER + "1,1,1,nan,1,0.01\n", r"line 2: k_nonlin = nan: must be a finite number"),
         (HEADER + "1,1,stiff,0,1,0.01\n", r"line 2: k_lin = 'stiff': must be a number"),
         (HEADER + "1,1,1\n", r"line 2: k_nonlin = '': must be a number"),
-        (HEADER + "1,1,1,0,1,1e-300\n", r"line 2: tau = 1e-300: must be between 1e-09 and 1e[+]06, is the unit right"),
-        (HEADER + "1,1,1e200,0,1,0.01\n", r"line 2: k_lin = 1e[+]200: must be between 1e-06 and 1e[+]06"),
+        (
+            HEADER + "1,1,1,0,1,1e-300\n",
+            r"line 2: tau = 1e-300: must be between 1e-09 and 1e[+]06, is the unit right",
+        ),
+        (
+            HEADER + "1,1,1e200,0,1,0.01\n",
+            r"line 2: k_lin = 1e[+]200: must be between 1e-06 and 1e[+]06",
+        ),
         (HEADER + "1,1,1_0,0,1,0.01\n", r"line 2: k_lin = '1_0': must be a number"),
         (HEADER + "1" * 200_000 + ",1,1,0,1,0.01\n", "is no CSV file .field larger"),
         (HEADER, "at least one sample"),
         ("", "at least one sample"),
     ],
 )
-def test_each_mistake_in_a_file_of_samples_has_an_error_of_its_own(tmp_path: Path, text: str, told: str) -> None:
+def test_each_mistake_in_a_file_of_samples_has_an_error_of_its_own(
+    tmp_path: Path, text: str, told: str
+) -> None:
     """It names file, line and column."""
     (tmp_path / "bad.csv").write_text(text)
     with pytest.raises(ValueError, match=rf"samples = .*bad.csv'.*{told}"):
@@ -109,7 +147,9 @@ def test_drawn_samples_are_of_the_published_kind_and_repeatable() -> None:
     small, wide = acc_samples.generated(2000), acc_samples.generated(2000, 3.0)
     np.testing.assert_array_equal(small, acc_samples.generated(2000))
     assert np.any(small != acc_samples.generated(2000, seed=1))
-    np.testing.assert_allclose(np.median(small, axis=0), [1.017, 1.008, 1.012, 0.019, 0.999, 0.0079], atol=0.01)
+    np.testing.assert_allclose(
+        np.median(small, axis=0), [1.017, 1.008, 1.012, 0.019, 0.999, 0.0079], atol=0.01
+    )
     assert np.corrcoef(small[:, 2], small[:, 3])[0, 1] > 0.7
     np.testing.assert_allclose(np.log(wide[:, 0]), 3.0 * np.log(small[:, 0]))
     np.testing.assert_allclose(wide[:, 3], 3.0 * small[:, 3])
@@ -122,8 +162,24 @@ def test_drawn_samples_are_of_the_published_kind_and_repeatable() -> None:
 def test_a_plant_fails_for_any_of_four_reasons_and_passes_on_the_limits() -> None:
     """Late |y|, |u| at any time, a run that ended early, a loop that is unstable; early |y| is free."""
     t = np.array([0.0, 14.99, 15.0, 20.0])
-    y = np.array([[9.0, 9.0, 0.1, -0.1], [0.0, 0.0, 0.0, 0.101], [0.0] * 4, [0.0, 0.0, np.nan, np.nan], [0.0] * 4])
-    u = np.array([[0.5, -0.5, 0.0, 0.0], [0.0] * 4, [0.0, -0.51, 0.0, 0.0], [0.0, 0.0, np.nan, np.nan], [0.0] * 4])
+    y = np.array(
+        [
+            [9.0, 9.0, 0.1, -0.1],
+            [0.0, 0.0, 0.0, 0.101],
+            [0.0] * 4,
+            [0.0, 0.0, np.nan, np.nan],
+            [0.0] * 4,
+        ]
+    )
+    u = np.array(
+        [
+            [0.5, -0.5, 0.0, 0.0],
+            [0.0] * 4,
+            [0.0, -0.51, 0.0, 0.0],
+            [0.0, 0.0, np.nan, np.nan],
+            [0.0] * 4,
+        ]
+    )
     found = judge(t, y, u, np.array([False, False, False, False, True]))
     assert found.fails.tolist() == [False, True, True, True, True]
     row = found.to_json()
@@ -142,7 +198,9 @@ def test_the_law_of_a_controller_is_the_one_it_runs() -> None:
     plant, controller = lagged_two_mass_spring(lag=0.02), designs(most_u=1e3)[MF]
     run = ql.simulate(plant, controller, ql.Scenario(duration=5.0, x0=[0.0, 0.0, 0.0, 1e-3, 0.0]))
     sampled, law = plant.sampled(DT), linear_law(controller)
-    loop = closed_loop_matrix(sampled.transition, sampled.input, sampled.output, law, law.A + np.outer(law.B_u, law.C))
+    loop = closed_loop_matrix(
+        sampled.transition, sampled.input, sampled.output, law, law.A + np.outer(law.B_u, law.C)
+    )
     x = np.zeros(loop.shape[0])
     x[3] = 1e-3
     for y in run["y"]:
@@ -163,14 +221,20 @@ def test_every_controller_of_the_benchmark_has_margins() -> None:
         assert 0.1 < low < 1.0 < high
 
 
-def test_ours_fail_less_than_the_published_on_drawn_plants_without_and_with_the_cubic_spring() -> None:
+def test_ours_fail_less_than_the_published_on_drawn_plants_without_and_with_the_cubic_spring() -> (
+    None
+):
     """On 60 plants three times as uncertain: the published 40 % and more, ours less than half of the best of them."""
     samples = acc_samples.generated(60, 3.0, seed=5)
     for cubic in (False, True):
-        published = min(np.mean(judge_published(design, samples, cubic).fails) for design in PUBLISHED.values())
+        published = min(
+            np.mean(judge_published(design, samples, cubic).fails) for design in PUBLISHED.values()
+        )
         assert published > 0.4
         for name in (MF, MB, L):
-            assert np.mean(acc.judge_sampled(designs()[name], samples, cubic).fails) < 0.5 * published
+            assert (
+                np.mean(acc.judge_sampled(designs()[name], samples, cubic).fails) < 0.5 * published
+            )
 
 
 def test_the_original_design_cases_are_met() -> None:
@@ -193,12 +257,16 @@ def test_a_case_that_is_lost_is_called_unstable_and_one_that_does_not_settle_nev
     console = Console(file=io.StringIO(), width=120)
     _print_cases(console, SimpleNamespace(cases={MB: lost}))  # type: ignore[arg-type]
     rows = [line for line in console.file.getvalue().splitlines() if line.strip()]  # type: ignore[attr-defined]
-    told = {line.split(":")[0].strip() + line.split()[-1] for line in rows if line.strip()[0] in "13"}
+    told = {
+        line.split(":")[0].strip() + line.split()[-1] for line in rows if line.strip()[0] in "13"
+    }
     assert {"1never", "112.0", "3unstable"} <= told
     assert "3never" not in told
 
 
-def test_the_command_writes_what_programs_read(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_what_programs_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The keys are fixed, rates lie in their intervals; without the baselines, whose loops would be compiled for this alone."""
     monkeypatch.setattr(acc_designs, "BASELINES", {})
     (tmp_path / "few.csv").write_text(HEADER + "1,1,1,0.1,1,0.01\n0.9,1.1,0.95,-0.1,0.9,0.02\n")
@@ -206,7 +274,14 @@ def test_the_command_writes_what_programs_read(tmp_path: Path, capsys: pytest.Ca
     with pytest.raises(SystemExit, match="0"):
         app(["reproduce", "acc", "--samples", str(tmp_path / "few.csv"), *where])
     found = json.loads((tmp_path / "out.json").read_text())
-    names = {"published nominal", "published SP1(0.05)", "published SP2", "MF-ESO", "MB-ESO", "L-ESO"}
+    names = {
+        "published nominal",
+        "published SP1(0.05)",
+        "published SP2",
+        "MF-ESO",
+        "MB-ESO",
+        "L-ESO",
+    }
     for spring in ("linear", "cubic"):
         assert set(found[spring]) >= names
         for row in found[spring].values():
@@ -215,7 +290,17 @@ def test_the_command_writes_what_programs_read(tmp_path: Path, capsys: pytest.Ca
     assert found["runs_per_second"] > 0.0
     assert "published SP2" in capsys.readouterr().out
     with pytest.raises(ValueError, match="must exist"):
-        app(["reproduce", "acc", "--samples", str(tmp_path / "few.csv"), "--json", str(tmp_path / "no" / "out.json"), "--no-figures"])
+        app(
+            [
+                "reproduce",
+                "acc",
+                "--samples",
+                str(tmp_path / "few.csv"),
+                "--json",
+                str(tmp_path / "no" / "out.json"),
+                "--no-figures",
+            ]
+        )
 
 
 def test_a_sweep_of_the_cubic_part_may_go_through_zero() -> None:
@@ -226,8 +311,17 @@ def test_a_sweep_of_the_cubic_part_may_go_through_zero() -> None:
 
 def test_samples_are_read_or_drawn(tmp_path: Path) -> None:
     """Not both."""
-    from quell.commands.acc import reproduce_acc
+    from quell.cli.commands.acc import reproduce_acc
 
     (tmp_path / "a.csv").write_text(HEADER + "1,1,1,0,1,0.01\n")
-    with pytest.raises(ValueError, match="--samples reads plants, --count, --spread and --seed are for drawing"):
-        reproduce_acc(samples=tmp_path / "a.csv", count=5, spread=None, seed=None, json_file=None, figures=None)
+    with pytest.raises(
+        ValueError, match="--samples reads plants, --count, --spread and --seed are for drawing"
+    ):
+        reproduce_acc(
+            samples=tmp_path / "a.csv",
+            count=5,
+            spread=None,
+            seed=None,
+            json_file=None,
+            figures=None,
+        )

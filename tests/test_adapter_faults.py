@@ -16,7 +16,16 @@ import pytest
 import quell as ql
 from quell.types import Status
 
-from .contracts.python_models import CHAIN, SHORT, Broken, LeastMeanSquares, Sleeper, has, jax_mlp, law
+from .contracts.python_models import (
+    CHAIN,
+    SHORT,
+    Broken,
+    LeastMeanSquares,
+    Sleeper,
+    has,
+    jax_mlp,
+    law,
+)
 
 PythonModel = ql.learners.PythonModel
 
@@ -56,7 +65,9 @@ def test_a_late_model_is_told_of_and_not_waited_for() -> None:
         ("2", "one finite number"),
     ],
 )
-def test_a_model_that_fails_is_said_to_and_the_loop_goes_on(then: Any, says: str, budget: float | None, interpret: bool) -> None:
+def test_a_model_that_fails_is_said_to_and_the_loop_goes_on(
+    then: Any, says: str, budget: float | None, interpret: bool
+) -> None:
     """Nothing leaves the callback, the output stays a number near where it was, and the reason is kept."""
     learner = PythonModel(Broken(5, then), budget=budget)
     with pytest.warns(RuntimeWarning, match="learner Broken raised"):
@@ -74,7 +85,11 @@ def test_a_model_starts_anew_after_a_failure_and_is_left_alone_after_three_in_a_
     with pytest.warns(RuntimeWarning):
         run = ql.simulate(CHAIN, law(again), ql.Scenario(ql.signals.Sinusoid(), duration=10.0))
     assert "left alone" not in again.last_problem
-    assert run["status"][-1] in (0, Status.LEARNER_FAILED, Status.LEARNER_FAILED | Status.OVERFLOWED)
+    assert run["status"][-1] in (
+        0,
+        Status.LEARNER_FAILED,
+        Status.LEARNER_FAILED | Status.OVERFLOWED,
+    )
 
     controller = law(never)  # tried, and found good
     never._source.well = 0
@@ -86,7 +101,9 @@ def test_a_model_starts_anew_after_a_failure_and_is_left_alone_after_three_in_a_
     np.testing.assert_array_equal(run["f_learned"][-1000:], 0.0)
 
 
-def test_where_warnings_are_errors_a_failure_still_stays_inside(capsys: pytest.CaptureFixture[str]) -> None:
+def test_where_warnings_are_errors_a_failure_still_stays_inside(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """The text goes to stderr then."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -119,7 +136,9 @@ try:
 except KeyboardInterrupt:
     print("interrupted")
 """
-    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120)
+    shown = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120
+    )
     assert shown.stdout.strip() == "interrupted"
 
 
@@ -128,15 +147,39 @@ except KeyboardInterrupt:
     [
         (lambda: PythonModel(3.0), r"model = 3.0: must be an object with learn"),
         (lambda: PythonModel(LeastMeanSquares), "must be an object with learn"),
-        (lambda: PythonModel(LeastMeanSquares(), period=0), "period = 0: must be a whole number of at least 1"),
-        (lambda: PythonModel(LeastMeanSquares(), budget=0.0), "budget = 0.0: must be finite and greater than zero"),
-        (lambda: PythonModel(LeastMeanSquares(), features=3), "features = 3: must be made of blocks"),
-        (lambda: PythonModel(_with_lock()), "LeastMeanSquares: must be something copy.deepcopy can copy"),
-        (lambda: law(PythonModel(Broken(0, np.zeros(2)))), "Broken: predict fails .* one finite number"),
+        (
+            lambda: PythonModel(LeastMeanSquares(), period=0),
+            "period = 0: must be a whole number of at least 1",
+        ),
+        (
+            lambda: PythonModel(LeastMeanSquares(), budget=0.0),
+            "budget = 0.0: must be finite and greater than zero",
+        ),
+        (
+            lambda: PythonModel(LeastMeanSquares(), features=3),
+            "features = 3: must be made of blocks",
+        ),
+        (
+            lambda: PythonModel(_with_lock()),
+            "LeastMeanSquares: must be something copy.deepcopy can copy",
+        ),
+        (
+            lambda: law(PythonModel(Broken(0, np.zeros(2)))),
+            "Broken: predict fails .* one finite number",
+        ),
         (lambda: law(PythonModel(Broken(0, None))), "Broken: predict fails .* one finite number"),
-        (lambda: law(PythonModel(Broken(0, math.nan))), "Broken: predict fails .* one finite number"),
-        (lambda: law(PythonModel(Broken(0, KeyError("x")))), r"Broken: predict fails .* KeyError.*2 features \(x1, x2\)"),
-        (lambda: law(PythonModel(LeastMeanSquares(), features=ql.features.State(3))), "count = 3: a plant of order 2"),
+        (
+            lambda: law(PythonModel(Broken(0, math.nan))),
+            "Broken: predict fails .* one finite number",
+        ),
+        (
+            lambda: law(PythonModel(Broken(0, KeyError("x")))),
+            r"Broken: predict fails .* KeyError.*2 features \(x1, x2\)",
+        ),
+        (
+            lambda: law(PythonModel(LeastMeanSquares(), features=ql.features.State(3))),
+            "count = 3: a plant of order 2",
+        ),
         (lambda: ql.learners.SklearnModel(LeastMeanSquares()), "must have partial_fit and predict"),
         (lambda: ql.learners.RiverModel(LeastMeanSquares()), "must have learn_one and predict_one"),
     ],
@@ -159,24 +202,32 @@ def test_mistakes_with_torch_are_named() -> None:
     import torch
 
     for module in (torch.nn.Linear(5, 1), torch.nn.Linear(2, 2)):
-        with pytest.raises(ValueError, match=r"Linear: learn fails on a trial .* 2 features \(x1, x2\)"):
+        with pytest.raises(
+            ValueError, match=r"Linear: learn fails on a trial .* 2 features \(x1, x2\)"
+        ):
             law(ql.learners.TorchModel(module))
     with pytest.raises(ValueError, match="must be on the parameters of the module"):
-        ql.learners.TorchModel(torch.nn.Linear(2, 1), torch.optim.SGD(torch.nn.Linear(2, 1).parameters(), lr=0.1))
+        ql.learners.TorchModel(
+            torch.nn.Linear(2, 1), torch.optim.SGD(torch.nn.Linear(2, 1).parameters(), lr=0.1)
+        )
     with pytest.raises(ValueError, match=r"must be a torch.nn.Module"):
         ql.learners.TorchModel(LeastMeanSquares())
     with pytest.raises(ValueError, match="must be a torch optimiser"):
         ql.learners.TorchModel(torch.nn.Linear(2, 1), 0.1)
 
 
-@pytest.mark.skipif(not has("jax", "equinox", "optax"), reason="jax, equinox or optax is not installed")
+@pytest.mark.skipif(
+    not has("jax", "equinox", "optax"), reason="jax, equinox or optax is not installed"
+)
 def test_mistakes_with_jax_are_named() -> None:
     """A wrong width, two outputs, something that is no module."""
     import equinox
     import jax
 
     for sizes in ((5, "scalar"), (2, 2)):
-        with pytest.raises(ValueError, match=r"Linear: learn fails on a trial .* 2 features \(x1, x2\)"):
+        with pytest.raises(
+            ValueError, match=r"Linear: learn fails on a trial .* 2 features \(x1, x2\)"
+        ):
             law(ql.learners.JaxModel(equinox.nn.Linear(*sizes, key=jax.random.key(0))))
     with pytest.raises(ValueError, match=r"must be an equinox.Module"):
         ql.learners.JaxModel(LeastMeanSquares())
@@ -186,7 +237,10 @@ def test_mistakes_with_jax_are_named() -> None:
 
 def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """The error says what to install."""
-    for module, extra, make in (("torch", "torch", ql.learners.TorchModel), ("jax", "jax", ql.learners.JaxModel)):
+    for module, extra, make in (
+        ("torch", "torch", ql.learners.TorchModel),
+        ("jax", "jax", ql.learners.JaxModel),
+    ):
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(ImportError, match=rf"pip install 'quell\[{extra}\]'"):
             make(object())

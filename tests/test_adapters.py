@@ -18,7 +18,18 @@ import quell as ql
 from quell.learners.adapters.instances import INSTANCES, finite_number
 from quell.types import Status
 
-from .contracts.python_models import CHAIN, HARD_SPRING, OBSERVER, SHORT, Counter, LeastMeanSquares, has, law, python_learners, torch_mlp
+from .contracts.python_models import (
+    CHAIN,
+    HARD_SPRING,
+    OBSERVER,
+    SHORT,
+    Counter,
+    LeastMeanSquares,
+    has,
+    law,
+    python_learners,
+    torch_mlp,
+)
 
 PythonModel = ql.learners.PythonModel
 LEARNERS = python_learners()
@@ -26,8 +37,15 @@ LEARNERS = python_learners()
 
 def deviation(learner: Any) -> float:
     """RMS deviation of y from the ideal loop, from 40 s to 60 s."""
-    scenario = ql.Scenario(reference=ql.signals.Sinusoid(omega=1.5), duration=60.0, noise=ql.signals.BandLimitedNoise(1e-10, 0.01))
-    ideal, run = ql.simulate(CHAIN, law(None), scenario), ql.simulate(HARD_SPRING, law(learner), scenario)
+    scenario = ql.Scenario(
+        reference=ql.signals.Sinusoid(omega=1.5),
+        duration=60.0,
+        noise=ql.signals.BandLimitedNoise(1e-10, 0.01),
+    )
+    ideal, run = (
+        ql.simulate(CHAIN, law(None), scenario),
+        ql.simulate(HARD_SPRING, law(learner), scenario),
+    )
     assert Status.LEARNER_FAILED not in run.status
     window = run.window(40.0, 60.0)
     return float(np.sqrt(np.mean((run["y"] - ideal["y"])[window] ** 2)))
@@ -47,20 +65,31 @@ def test_what_a_linear_model_learns_has_no_lag_bias(library: str, form: str) -> 
         pytest.skip(f"{library} is not installed")
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-6.0, -1.0]], [0.0, 1.0], [1.0, 0.0])
     scale = np.array([1.0, 2.0, 10.0, 8.0])
-    make: dict[str, Any] = {"none": lambda: (PythonModel(LeastMeanSquares(), scale=scale), lambda m: m.theta)}
+    make: dict[str, Any] = {
+        "none": lambda: (PythonModel(LeastMeanSquares(), scale=scale), lambda m: m.theta)
+    }
     if library == "sklearn":
         from sklearn.linear_model import SGDRegressor
 
         estimator = SGDRegressor(learning_rate="constant", eta0=0.1, alpha=0.0, fit_intercept=False)
-        make["sklearn"] = lambda: (ql.learners.SklearnModel(estimator, scale=scale), lambda m: m.coef_)
+        make["sklearn"] = lambda: (
+            ql.learners.SklearnModel(estimator, scale=scale),
+            lambda m: m.coef_,
+        )
     if library == "river":
         from river import linear_model, optim
 
         regression = linear_model.LinearRegression(optimizer=optim.SGD(0.05), intercept_lr=0.0)
-        make["river"] = lambda: (ql.learners.RiverModel(regression, scale=scale), lambda m: [m.weights[0], m.weights[1]])
+        make["river"] = lambda: (
+            ql.learners.RiverModel(regression, scale=scale),
+            lambda m: [m.weights[0], m.weights[1]],
+        )
     learner, read = make[library]()
     observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=15.0, dt=5e-3, form=form)
-    scenario = ql.Scenario(reference=ql.signals.Sinusoid(omega=1.0) + ql.signals.Sinusoid(0.3, omega=1.7), duration=120.0)
+    scenario = ql.Scenario(
+        reference=ql.signals.Sinusoid(omega=1.0) + ql.signals.Sinusoid(0.3, omega=1.7),
+        duration=120.0,
+    )
     run = ql.simulate(plant, ql.ADRC(observer, omega_c=4.0, learner=learner), scenario)
     theta = np.array(read(learner.trained(run.final_state.learner))) * scale[3] / scale[:2]
     np.testing.assert_allclose(theta, [-6.0, -1.0], rtol=0.02, atol=0.05)
@@ -75,19 +104,25 @@ def test_the_model_is_called_once_a_period_with_all_pairs_since() -> None:
     """The first call has one pair, each other a period's."""
     for period in (1, 7):
         learner = PythonModel(Counter(), period=period)
-        run = ql.simulate(CHAIN, law(learner), ql.Scenario(reference=ql.signals.Sinusoid(), duration=3.0))
+        run = ql.simulate(
+            CHAIN, law(learner), ql.Scenario(reference=ql.signals.Sinusoid(), duration=3.0)
+        )
         batches = learner.trained(run.final_state.learner).batches
         assert set(batches[1:]) == {period}
         assert batches[0] == 1
         design = learner.design(OBSERVER, 4.0)
-        assert len(batches) == math.ceil((len(run) - 2 - design.online.watch - design.online.delay) / period)
+        assert len(batches) == math.ceil(
+            (len(run) - 2 - design.online.watch - design.online.delay) / period
+        )
         assert len(np.unique(run["f_learned"])) <= len(batches) + 1
 
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_the_loop_of_ones_own_is_the_simulated_loop(name: str) -> None:
     """``controller.step`` gives what ``simulate`` gives."""
-    run = ql.simulate(HARD_SPRING, law(LEARNERS[name]), ql.Scenario(reference=ql.signals.Sinusoid(), duration=2.0))
+    run = ql.simulate(
+        HARD_SPRING, law(LEARNERS[name]), ql.Scenario(reference=ql.signals.Sinusoid(), duration=2.0)
+    )
     controller = law(LEARNERS[name])
     u = [controller.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]
     # The two entry points are compiled apart, and may fuse otherwise.
@@ -110,7 +145,9 @@ def test_an_optimiser_of_torch_is_copied_with_its_module(kind: str) -> None:
 
     module = torch_mlp()
     before = copy.deepcopy(module.state_dict())
-    learner = ql.learners.TorchModel(module, getattr(torch.optim, kind)(module.parameters(), lr=0.01), steps=2)
+    learner = ql.learners.TorchModel(
+        module, getattr(torch.optim, kind)(module.parameters(), lr=0.01), steps=2
+    )
     run = ql.simulate(HARD_SPRING, law(learner), SHORT)
     after = learner.trained(run.final_state.learner).state_dict()
     assert all(torch.equal(before[key], value) for key, value in module.state_dict().items())
@@ -156,8 +193,13 @@ def test_a_state_that_does_not_fit_changes_nothing() -> None:
     for k in range(300):
         controller.step(0.5, 0.01 * k)
     before = controller.state
-    with pytest.raises(ValueError, match="state of LeastMeanSquares: must be what controller.state gave"):
-        controller.state = {**{name: 0.0 * array for name, array in before.items() if array.dtype != object}, "learner.model": 3.0}
+    with pytest.raises(
+        ValueError, match="state of LeastMeanSquares: must be what controller.state gave"
+    ):
+        controller.state = {
+            **{name: 0.0 * array for name, array in before.items() if array.dtype != object},
+            "learner.model": 3.0,
+        }
     for name, array in controller.state.items():
         if array.dtype != object:
             np.testing.assert_array_equal(array, before[name])
@@ -193,7 +235,9 @@ def test_nothing_is_left_behind(budget: float | None) -> None:
     assert threading.active_count() <= threads
 
 
-@pytest.mark.parametrize("value", [1.5, np.float32(1.5), np.array([1.5]), np.array([[1.5]]), np.array(1.5)])
+@pytest.mark.parametrize(
+    "value", [1.5, np.float32(1.5), np.array([1.5]), np.array([[1.5]]), np.array(1.5)]
+)
 def test_one_number_may_come_in_any_form(value: Any) -> None:
     """As libraries return it."""
     assert finite_number(value) == 1.5

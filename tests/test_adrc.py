@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.law import law_gains
+from quell.controllers.adrc.law import law_gains
 from quell.observers.eso import ESO
 from quell.plants.base import advance, measure
 
@@ -20,7 +20,11 @@ OBSERVER = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=0.01)
 
 def by_hand(controller: ql.ADRC, plant: object, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Close a loop of one's own around ``step``; return y and u."""
-    model, x, scratch = plant.sampled(controller.dt), np.zeros(plant.order), np.zeros(6 * plant.order)
+    model, x, scratch = (
+        plant.sampled(controller.dt),
+        np.zeros(plant.order),
+        np.zeros(6 * plant.order),
+    )
     ys, us = np.zeros(r.size), np.zeros(r.size)
     for k in range(r.size):
         ys[k] = measure(model, x)
@@ -47,12 +51,18 @@ def test_a_known_plant_answers_a_step_as_the_ideal_loop_does() -> None:
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
 
 
-@pytest.mark.parametrize("learner", [None, ql.learners.Kalman(), ql.learners.BatchGradient(rate=1e-5)])
+@pytest.mark.parametrize(
+    "learner", [None, ql.learners.Kalman(), ql.learners.BatchGradient(rate=1e-5)]
+)
 def test_a_loop_of_ones_own_is_the_simulated_loop(learner: object) -> None:
     """``step`` sample by sample gives the trajectory of ``simulate``, to the rounding of the plant's own arithmetic."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.4]], [0.0, 2.0], [1.0, 0.0])
-    controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=learner, u_min=-1.5, u_max=2.0, rate_limit=20.0)
-    run = ql.simulate(plant, controller, ql.Scenario(reference=ql.signals.Sinusoid(omega=2.0), duration=5.0))
+    controller = ql.ADRC(
+        OBSERVER, omega_c=3.0, learner=learner, u_min=-1.5, u_max=2.0, rate_limit=20.0
+    )
+    run = ql.simulate(
+        plant, controller, ql.Scenario(reference=ql.signals.Sinusoid(omega=2.0), duration=5.0)
+    )
     y, u = by_hand(controller, plant, run["r"])
     np.testing.assert_allclose(y, run["y"], atol=1e-11)
     np.testing.assert_allclose(u, run["u"], atol=1e-11)
@@ -63,7 +73,9 @@ def test_the_control_signal_respects_magnitude_and_rate() -> None:
     """At every sample; the status says which limit holds."""
     controller = ql.ADRC(OBSERVER, omega_c=1.0, u_min=-0.5, u_max=1.0, rate_limit=3.0)
     plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 2.0], [1.0, 0.0])
-    run = ql.simulate(plant, controller, ql.Scenario(reference=ql.signals.Step(at=1.0, height=3.0), duration=15.0))
+    run = ql.simulate(
+        plant, controller, ql.Scenario(reference=ql.signals.Step(at=1.0, height=3.0), duration=15.0)
+    )
     assert run["u"].min() >= -0.5
     assert run["u"].max() <= 1.0
     assert np.max(np.abs(np.diff(run["u"]))) <= 3.0 * 0.01 + 1e-12
@@ -76,7 +88,9 @@ def test_saturation_does_not_wind_up_the_observer() -> None:
     """It is told the applied u: after 50 s against a wall of a limit, f is still estimated right, and release is immediate."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 2.0], [1.0, 0.0])
     controller = ql.ADRC(OBSERVER, omega_c=3.0, u_min=-0.4, u_max=0.4)
-    scenario = ql.Scenario(reference=ql.signals.Constant(5.0).until(50.0, then=ql.signals.Constant(0.3)), duration=60.0)
+    scenario = ql.Scenario(
+        reference=ql.signals.Constant(5.0).until(50.0, then=ql.signals.Constant(0.3)), duration=60.0
+    )
     run = ql.simulate(plant, controller, scenario)
     at_limit = run.window(40.0, 50.0)
     np.testing.assert_allclose(run["u"][at_limit], 0.4)
@@ -89,15 +103,25 @@ def test_a_plant_with_half_or_twice_the_nominal_gain_still_settles() -> None:
     """b0 off by a factor of two either way: the total disturbance takes it up."""
     for b in (1.0, 4.0):
         plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, b], [1.0, 0.0])
-        run = ql.simulate(plant, ql.ADRC(OBSERVER, omega_c=3.0), ql.Scenario(reference=1.0, duration=20.0))
+        run = ql.simulate(
+            plant, ql.ADRC(OBSERVER, omega_c=3.0), ql.Scenario(reference=1.0, duration=20.0)
+        )
         assert run["y"][-1] == pytest.approx(1.0, abs=1e-4)
 
 
 def test_a_negative_gain_and_a_plant_of_order_one_are_served() -> None:
     """Neither sign nor order is special."""
     plant = ql.plants.LinearPlant([[-2.0]], [-3.0], [1.0])
-    controller = ql.ADRC(ESO.model_free(order=1, b0=-3.0, omega_o=20.0, dt=0.01), omega_c=2.0, learner=ql.learners.Kalman())
-    run = ql.simulate(plant, controller, ql.Scenario(reference=1.0, duration=10.0, disturbances=(ql.signals.Step(at=5.0),)))
+    controller = ql.ADRC(
+        ESO.model_free(order=1, b0=-3.0, omega_o=20.0, dt=0.01),
+        omega_c=2.0,
+        learner=ql.learners.Kalman(),
+    )
+    run = ql.simulate(
+        plant,
+        controller,
+        ql.Scenario(reference=1.0, duration=10.0, disturbances=(ql.signals.Step(at=5.0),)),
+    )
     assert run["y"][run.window(4.9, 5.0)][-1] == pytest.approx(1.0, abs=1e-3)
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-3)
 
@@ -126,7 +150,9 @@ def test_samples_that_are_lost_while_the_plant_moves_are_no_blow(delay: float) -
         plant = ql.plants.delayed(plant, delay, 0.01)
     runs = []
     for lost in ((), (40, 41, 42)):
-        controller = ql.ADRC(ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=0.01, delay=delay), omega_c=3.0)
+        controller = ql.ADRC(
+            ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=0.01, delay=delay), omega_c=3.0
+        )
         model, x, scratch = plant.sampled(0.01), np.zeros(plant.order), np.zeros(6 * plant.order)
         run = []
         for k in range(200):
@@ -166,7 +192,11 @@ def test_a_controller_can_be_copied_and_sent_to_another_process(used: bool) -> N
     if used:
         for k in range(50):
             controller.step(1.0, 0.01 * k)
-    for other in (copy.copy(controller), copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))):
+    for other in (
+        copy.copy(controller),
+        copy.deepcopy(controller),
+        pickle.loads(pickle.dumps(controller)),
+    ):
         mine = controller.state
         assert other.step(1.0, 0.7) == ql.ADRC.step(copy.deepcopy(controller), 1.0, 0.7)
         for name, array in controller.state.items():
@@ -185,7 +215,13 @@ def test_the_observer_waits_for_its_first_good_measurement() -> None:
 
 def test_no_learner_however_mad_gets_a_bad_number_to_the_output() -> None:
     """Where the wish is no number the last control signal holds, the status says so, and the loop begins anew."""
-    controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.BatchGradient(rate=1e300, batch=1), u_min=-1.0, u_max=1.0)
+    controller = ql.ADRC(
+        OBSERVER,
+        omega_c=3.0,
+        learner=ql.learners.BatchGradient(rate=1e300, batch=1),
+        u_min=-1.0,
+        u_max=1.0,
+    )
     statuses = set()
     for k in range(400):
         u = controller.step(1.0, math.sin(0.1 * k))
@@ -195,8 +231,12 @@ def test_no_learner_however_mad_gets_a_bad_number_to_the_output() -> None:
     assert any(ql.Status.OVERFLOWED in status for status in statuses)
 
 
-@pytest.mark.parametrize("learner", [None, ql.learners.Kalman(u=True), ql.learners.BatchGradient(rate=1e-4, batch=7)])
-def test_a_saved_state_goes_on_without_a_trace(learner: object, tmp_path: Path, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(
+    "learner", [None, ql.learners.Kalman(u=True), ql.learners.BatchGradient(rate=1e-4, batch=7)]
+)
+def test_a_saved_state_goes_on_without_a_trace(
+    learner: object, tmp_path: Path, rng: np.random.Generator
+) -> None:
     """Through a file without pickle, into another controller: the same bits from there on."""
     one, other = (ql.ADRC(OBSERVER, omega_c=3.0, learner=learner) for _ in range(2))
     y = np.cumsum(rng.normal(size=200)) * 0.01
@@ -240,20 +280,49 @@ def test_the_estimate_says_what_is_known() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ql.ADRC(OBSERVER, omega_c=-1.0), "omega_c = -1.0: must be finite and greater than zero"),
-        (lambda: ql.ADRC(OBSERVER, omega_c=1.0, u_min=1.0, u_max=1.0), "u_min = 1.0, u_max = 1.0: u_min must be less than u_max"),
-        (lambda: ql.ADRC(OBSERVER, omega_c=1.0, u_min=math.nan), "u_min = nan, u_max = inf: u_min must be less than u_max"),
-        (lambda: ql.ADRC(OBSERVER, omega_c=1.0, rate_limit=0.0), "rate_limit = 0.0: must be finite and greater than zero"),
-        (lambda: ql.ADRC("eso", omega_c=1.0), "observer = 'eso': must be an ESO"),
-        (lambda: ql.ADRC(OBSERVER, omega_c=1.0, learner=ql.learners.Kalman), "learner = .*: must be a learner, for example"),
-        (lambda: ql.ADRC(OBSERVER, omega_c=1e300), "omega_c = 1e[+]300 rad/s: its power 2 must be a number"),
         (
-            lambda: setattr(ql.ADRC(OBSERVER, omega_c=1.0), "state", ql.ADRC(OBSERVER, omega_c=1.0).state | {"z": "x"}),
+            lambda: ql.ADRC(OBSERVER, omega_c=-1.0),
+            "omega_c = -1.0: must be finite and greater than zero",
+        ),
+        (
+            lambda: ql.ADRC(OBSERVER, omega_c=1.0, u_min=1.0, u_max=1.0),
+            "u_min = 1.0, u_max = 1.0: u_min must be less than u_max",
+        ),
+        (
+            lambda: ql.ADRC(OBSERVER, omega_c=1.0, u_min=math.nan),
+            "u_min = nan, u_max = inf: u_min must be less than u_max",
+        ),
+        (
+            lambda: ql.ADRC(OBSERVER, omega_c=1.0, rate_limit=0.0),
+            "rate_limit = 0.0: must be finite and greater than zero",
+        ),
+        (lambda: ql.ADRC("eso", omega_c=1.0), "observer = 'eso': must be an ESO"),
+        (
+            lambda: ql.ADRC(OBSERVER, omega_c=1.0, learner=ql.learners.Kalman),
+            "learner = .*: must be a learner, for example",
+        ),
+        (
+            lambda: ql.ADRC(OBSERVER, omega_c=1e300),
+            "omega_c = 1e[+]300 rad/s: its power 2 must be a number",
+        ),
+        (
+            lambda: setattr(
+                ql.ADRC(OBSERVER, omega_c=1.0),
+                "state",
+                ql.ADRC(OBSERVER, omega_c=1.0).state | {"z": "x"},
+            ),
             r"state\['z'\]: must be an array of numbers",
         ),
-        (lambda: setattr(ql.ADRC(OBSERVER, omega_c=1.0), "state", {}), r"state has \[\]: must have"),
         (
-            lambda: setattr(ql.ADRC(OBSERVER, omega_c=1.0), "state", ql.ADRC(OBSERVER, omega_c=1.0).state | {"z": np.zeros(9)}),
+            lambda: setattr(ql.ADRC(OBSERVER, omega_c=1.0), "state", {}),
+            r"state has \[\]: must have",
+        ),
+        (
+            lambda: setattr(
+                ql.ADRC(OBSERVER, omega_c=1.0),
+                "state",
+                ql.ADRC(OBSERVER, omega_c=1.0).state | {"z": np.zeros(9)},
+            ),
             r"state\['z'\] has shape \(9,\): must have \(3,\)",
         ),
     ],

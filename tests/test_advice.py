@@ -12,12 +12,23 @@ import pytest
 import quell as ql
 from quell import analysis
 from quell.controllers import warn_if_unwise
-from quell.controllers.unwise import sampling_findings
+from quell.controllers.design_checks import sampling_findings
 
 
-def adrc(omega_o: float, omega_c: float, dt: float, order: int = 2, form: str = "current", **limits: float) -> ql.ADRC:
+def adrc(
+    omega_o: float,
+    omega_c: float,
+    dt: float,
+    order: int = 2,
+    form: str = "current",
+    **limits: float,
+) -> ql.ADRC:
     """Return a controller for b0/s^n."""
-    return ql.ADRC(ql.ESO.model_free(order=order, b0=1.0, omega_o=omega_o, dt=dt, form=form), omega_c=omega_c, **limits)
+    return ql.ADRC(
+        ql.ESO.model_free(order=order, b0=1.0, omega_o=omega_o, dt=dt, form=form),
+        omega_c=omega_c,
+        **limits,
+    )
 
 
 def ideal(order: int) -> tuple[list[float], list[float]]:
@@ -28,11 +39,15 @@ def ideal(order: int) -> tuple[list[float], list[float]]:
 @pytest.mark.filterwarnings("ignore::quell.DesignWarning")
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 @pytest.mark.parametrize(("form", "limit"), [("current", 1.0), ("predictor", 0.3)])
-def test_the_limit_of_sampling_is_where_it_costs_a_sixth_of_the_margin(order: int, form: str, limit: float) -> None:
+def test_the_limit_of_sampling_is_where_it_costs_a_sixth_of_the_margin(
+    order: int, form: str, limit: float
+) -> None:
     """At the limit 5 to 17 % of the modulus margin are lost; at twice the limit twice as much and more."""
     for ratio in (3.0, 10.0):
         fast, at_limit, beyond = (
-            analysis.analyse(ideal(order), adrc(x / 1e-3, x / 1e-3 / ratio, 1e-3, order, form)).margins.modulus
+            analysis.analyse(
+                ideal(order), adrc(x / 1e-3, x / 1e-3 / ratio, 1e-3, order, form)
+            ).margins.modulus
             for x in (0.01, limit, 2.0 * limit)
         )
         assert 0.05 < 1.0 - at_limit / fast < 0.17
@@ -45,7 +60,12 @@ def test_beyond_the_law_s_limit_loops_are_lost() -> None:
     for order in (3, 4):
         for form in ("current", "predictor"):
             for x, stable in ((0.5, True), (0.7, False)):
-                assert analysis.analyse(ideal(order), adrc(x / 0.01, x / 0.01, 0.01, order, form)).stable is stable
+                assert (
+                    analysis.analyse(
+                        ideal(order), adrc(x / 0.01, x / 0.01, 0.01, order, form)
+                    ).stable
+                    is stable
+                )
 
 
 def test_a_slow_sample_time_is_warned_of_with_its_number() -> None:
@@ -54,10 +74,15 @@ def test_a_slow_sample_time_is_warned_of_with_its_number() -> None:
     def design(observer: ql.ESO, omega_c: float) -> None:
         warn_if_unwise(observer, omega_c)
 
-    with pytest.warns(ql.DesignWarning, match=r"omega_o \* dt = 1\.4 is above 1.*0\.00714 s or faster.*to 100 rad/s") as caught:
+    with pytest.warns(
+        ql.DesignWarning,
+        match=r"omega_o \* dt = 1\.4 is above 1.*0\.00714 s or faster.*to 100 rad/s",
+    ) as caught:
         design(adrc(140.0, 10.0, 0.01).observer, 10.0)
     assert caught[0].filename == __file__
-    with pytest.warns(ql.DesignWarning, match=r"omega_o \* dt = 0\.5 is above 0\.3.*take the current form"):
+    with pytest.warns(
+        ql.DesignWarning, match=r"omega_o \* dt = 0\.5 is above 0\.3.*take the current form"
+    ):
         design(adrc(50.0, 10.0, 0.01, form="predictor").observer, 10.0)
     with pytest.warns(ql.DesignWarning, match=r"omega_c \* dt = 0\.6 is above 0\.5"):
         design(adrc(90.0, 60.0, 0.01).observer, 60.0)
@@ -73,12 +98,21 @@ def test_noise_is_judged_by_the_range_of_u() -> None:
     controller = adrc(40.0, 4.0, 1e-3, u_min=-2.0, u_max=2.0)
     (finding,) = analysis.advise(controller, noise_std=1e-3)
     noise = 1e-3 * np.random.default_rng(1).normal(size=40_001)
-    run = ql.simulate(plant, controller, ql.Scenario(noise=ql.signals.Samples(np.arange(noise.size) * 1e-3, noise), duration=40.0))
+    run = ql.simulate(
+        plant,
+        controller,
+        ql.Scenario(noise=ql.signals.Samples(np.arange(noise.size) * 1e-3, noise), duration=40.0),
+    )
     assert finding.subject == "noise"
     assert finding.value == pytest.approx(np.std(run["u"][2000:]) / 4.0, rel=0.05)
     assert finding.value > finding.limit
     lower = float(str(finding).split("lower omega_o to about ")[1].split()[0])
-    assert analysis.advise(adrc(0.98 * lower, 0.098 * lower, 1e-3, u_min=-2.0, u_max=2.0), noise_std=1e-3) == []
+    assert (
+        analysis.advise(
+            adrc(0.98 * lower, 0.098 * lower, 1e-3, u_min=-2.0, u_max=2.0), noise_std=1e-3
+        )
+        == []
+    )
     assert analysis.advise(adrc(40.0, 4.0, 1e-3), noise_std=1e-3) == []
 
 
@@ -87,11 +121,16 @@ def test_a_lag_is_judged_by_what_it_leaves_of_the_margins() -> None:
     controller = adrc(40.0, 4.0, 1e-3)
     assert analysis.advise(controller, actuator_lag=1e-3) == []
     (finding,) = analysis.advise(controller, actuator_lag=0.02)
-    before, after = (analysis.analyse(ideal(2), controller, actuator_lag=lag).margins for lag in (0.0, 0.02))
+    before, after = (
+        analysis.analyse(ideal(2), controller, actuator_lag=lag).margins for lag in (0.0, 0.02)
+    )
     assert finding.subject == "lag"
     assert (finding.value, finding.limit) == pytest.approx((after.modulus, 0.8 * before.modulus))
     cost = math.degrees(math.atan(0.02 * before.phase_omega))
-    assert f"an actuator lag of 20 ms, {cost:.1f}° at the crossover of {before.phase_omega:.3g} rad/s, leaves" in str(finding)
+    assert (
+        f"an actuator lag of 20 ms, {cost:.1f}° at the crossover of {before.phase_omega:.3g} rad/s, leaves"
+        in str(finding)
+    )
     assert f"a phase margin of {after.phase:.1f}° of {before.phase:.1f}°" in str(finding)
 
 
@@ -125,14 +164,20 @@ WITH_ZEROS = ql.ESO.model_based(SPRING, omega_o=40.0, dt=1e-3)
         (WITH_ZEROS, SPRING),
         (ql.ESO.model_based(SPRING, omega_o=40.0, dt=1e-3, b0=1.0), ([1.0, 3.0], SPRING[1])),
         (
-            ql.ESO.model_based(([[0.0, 1.0], [-4.0, -0.4]], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]), omega_o=20.0, dt=1e-3),
+            ql.ESO.model_based(
+                ([[0.0, 1.0], [-4.0, -0.4]], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]),
+                omega_o=20.0,
+                dt=1e-3,
+            ),
             ([1.0, 1.4], [1.0, 0.4, 4.0]),
         ),
         (ql.ESO.model_free(order=2, b0=3.0, omega_o=20.0, dt=1e-3), ([3.0], [1.0, 0.0, 0.0])),
     ],
     ids=["zeros", "zeros and a b0", "a channel for f", "a chain"],
 )
-def test_without_a_plant_it_is_the_one_that_the_observer_assumes(observer: ql.ESO, plant: tuple[list[float], list[float]]) -> None:
+def test_without_a_plant_it_is_the_one_that_the_observer_assumes(
+    observer: ql.ESO, plant: tuple[list[float], list[float]]
+) -> None:
     """Zeros, b0 and all: nothing but the lag is found, and that with the numbers of the plant itself."""
     controller = ql.ADRC(observer, omega_c=4.0)
     assert analysis.advise(controller) == []
@@ -147,13 +192,17 @@ def test_a_delay_that_the_observer_knows_of_is_in_the_plant_that_it_assumes() ->
     """It is no news; what it takes of the margin is found. Another delay comes on top of it."""
 
     def controller(omega_c: float) -> ql.ADRC:
-        return ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01, delay=0.2), omega_c=omega_c)
+        return ql.ADRC(
+            ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01, delay=0.2), omega_c=omega_c
+        )
 
     calm, hasty = controller(0.5), controller(2.0)
     assert analysis.advise(calm) == []
     margin = analysis.advise(hasty)[-1]
     assert margin.subject == "margin"
-    assert margin.value == pytest.approx(analysis.analyse(ideal(2), hasty, delay=0.2).margins.modulus)
+    assert margin.value == pytest.approx(
+        analysis.analyse(ideal(2), hasty, delay=0.2).margins.modulus
+    )
     (lag,) = analysis.advise(calm, delay=0.1)
     assert lag.subject == "lag"
     assert lag.value == pytest.approx(analysis.analyse(ideal(2), calm, delay=0.3).margins.modulus)
@@ -176,7 +225,9 @@ def test_herbst_s_rules_are_rounded_up() -> None:
 
 def test_a_loop_with_a_model_and_a_fast_observer_settles_when_asked() -> None:
     """To 1 %, for a plant of order 3."""
-    plant = ql.plants.LinearPlant([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, -2.0, -1.5]], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    plant = ql.plants.LinearPlant(
+        [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, -2.0, -1.5]], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
+    )
     controller = ql.ADRC(ql.ESO.model_based(plant, omega_o=60.0, dt=1e-3), ql.omega_c_for(4.0, 3))
     run = ql.simulate(plant, controller, ql.Scenario(reference=1.0, duration=10.0))
     assert run.metrics(target=1.0, band=0.02)["settling_time"] == pytest.approx(4.0, rel=0.01)

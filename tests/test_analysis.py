@@ -16,7 +16,7 @@ import quell as ql
 from quell import analysis
 from quell.analysis.frozen import Frozen
 from quell.analysis.sampled import sampled_plant
-from quell.controllers.linear import LinearLaw
+from quell.controllers.linear.linear import LinearLaw
 from quell.learners.base import NoLearnerMemory, predict
 
 PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.4]], [0.0, 2.0], [1.0, 0.0])
@@ -49,7 +49,15 @@ def chain(order: int) -> ql.plants.LinearPlant:
     return ql.plants.LinearPlant(A, 1.3 * np.eye(order)[-1], np.eye(order)[0])
 
 
-def adrc(order: int, form: str = "current", *, model: bool = False, learner: Any = None, dt: float = 0.01, **limits: float) -> ql.ADRC:
+def adrc(
+    order: int,
+    form: str = "current",
+    *,
+    model: bool = False,
+    learner: Any = None,
+    dt: float = 0.01,
+    **limits: float,
+) -> ql.ADRC:
     """Return a controller for ``chain``."""
     observer = (
         ql.ESO.model_based(chain(order), omega_o=12.0, dt=dt, form=form)
@@ -62,23 +70,36 @@ def adrc(order: int, form: str = "current", *, model: bool = False, learner: Any
 def integrator(gain: float, dt: float) -> Any:
     """Return a controller of proportional action."""
     nothing = np.zeros(0)
-    return SimpleNamespace(dt=dt, law=LinearLaw(np.zeros((0, 0)), nothing, nothing, nothing, nothing, gain, -gain))
+    return SimpleNamespace(
+        dt=dt, law=LinearLaw(np.zeros((0, 0)), nothing, nothing, nothing, nothing, gain, -gain)
+    )
 
 
 CASES = [
     (order, form, model, learner)
     for order in (1, 2, 3, 4)
     for form in ("current", "predictor")
-    for model, learner in ((False, None), (True, None), (False, Held(LEARNED)), (False, Held(LEARNED, 0.1, 0.3)))
+    for model, learner in (
+        (False, None),
+        (True, None),
+        (False, Held(LEARNED)),
+        (False, Held(LEARNED, 0.1, 0.3)),
+    )
 ]
 
 
 @pytest.mark.parametrize(("order", "form", "model", "learner"), CASES)
-def test_exported_systems_answer_as_the_simulated_loop_does(order: int, form: str, model: bool, learner: Any) -> None:
+def test_exported_systems_answer_as_the_simulated_loop_does(
+    order: int, form: str, model: bool, learner: Any
+) -> None:
     """To 1e-9 of the answer: the closed loop, and python-control's own interconnection of plant and both degrees of freedom."""
     controller = adrc(order, form, model=model, learner=learner)
     run = ql.simulate(
-        chain(order), controller, ql.Scenario(reference=1.0, duration=12.0, disturbances=(ql.signals.Step(height=0.5, at=6.0),))
+        chain(order),
+        controller,
+        ql.Scenario(
+            reference=1.0, duration=12.0, disturbances=(ql.signals.Step(height=0.5, at=6.0),)
+        ),
     )
     loop = analysis.analyse(chain(order), controller)
     w = np.array(run["w"][:, 0])
@@ -87,8 +108,12 @@ def test_exported_systems_answer_as_the_simulated_loop_does(order: int, form: st
         return control.forced_response(system, run.t, source).outputs
 
     for target in ("y", "u"):
-        told = answer(loop.system(f"r → {target}"), run["r"]) + answer(loop.system(f"w1 → {target}"), w)
-        np.testing.assert_allclose(told, run[target], rtol=0.0, atol=1e-9 * np.max(np.abs(run[target])))
+        told = answer(loop.system(f"r → {target}"), run["r"]) + answer(
+            loop.system(f"w1 → {target}"), w
+        )
+        np.testing.assert_allclose(
+            told, run[target], rtol=0.0, atol=1e-9 * np.max(np.abs(run[target]))
+        )
     P, C_r, C_y = (loop.system(name) for name in ("P", "C_r", "C_y"))
     told = answer(control.feedback(P, C_y) * C_r, run["r"]) + answer(control.feedback(P, C_y), w)
     np.testing.assert_allclose(told, run["y"], rtol=0.0, atol=1e-9)
@@ -116,7 +141,11 @@ def test_transfer_functions_answer_as_the_simulated_loop_does(order: int) -> Non
 def test_a_law_does_what_the_controller_does_at_its_limits_too(form: str, learner: Any) -> None:
     """It is told the applied u, as the observer is: fed with the run's y and u, it wishes what the controller applied or had cut."""
     controller = adrc(3, form, learner=learner, u_min=-1.0, u_max=1.6)
-    run = ql.simulate(chain(3), controller, ql.Scenario(reference=ql.signals.Sinusoid(amplitude=2.0, omega=1.0), duration=10.0))
+    run = ql.simulate(
+        chain(3),
+        controller,
+        ql.Scenario(reference=ql.signals.Sinusoid(amplitude=2.0, omega=1.0), duration=10.0),
+    )
     law = analysis.linear_law(controller)
     assert np.any(run["u"] == 1.6)
     assert np.any(run["u"] == -1.0)
@@ -173,7 +202,9 @@ def test_margins_are_those_of_python_control(plant: Any) -> None:
     assert m.modulus == pytest.approx(modulus, rel=1e-4)
     disk, _, disk_phase = control.disk_margins(L, omega)
     assert (m.disk, m.disk_phase) == pytest.approx((disk, disk_phase), rel=1e-3)
-    np.testing.assert_allclose(loop.response("L", omega), L(np.exp(1j * omega * loop.dt)), rtol=1e-6)
+    np.testing.assert_allclose(
+        loop.response("L", omega), L(np.exp(1j * omega * loop.dt)), rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("plant", [chain(3), ql.plants.two_mass_spring()])
@@ -181,7 +212,9 @@ def test_the_range_of_b_ends_where_a_pole_reaches_the_unit_circle(plant: Any) ->
     """Found from crossings of the negative real axis; found again by bisection on the eigenvalues."""
     loop = analysis.analyse(plant, adrc(plant.order))
     b = 1.3 if plant.order == 3 else 1.0  # b0 is 1
-    assert (loop.b_range[0] == 0.0) is (plant.order == 3)  # which is stable without control, the other is not
+    assert (loop.b_range[0] == 0.0) is (
+        plant.order == 3
+    )  # which is stable without control, the other is not
     for end, outwards in zip(loop.b_range, (0.01, 100.0), strict=True):
         if end == 0.0:
             continue
@@ -189,7 +222,9 @@ def test_the_range_of_b_ends_where_a_pole_reaches_the_unit_circle(plant: Any) ->
         for _ in range(60):
             middle = math.sqrt(inside * outside)
             eigenvalues = 1.0 + np.linalg.eigvals(loop.closed_loop_matrix(middle))
-            inside, outside = (middle, outside) if np.all(np.abs(eigenvalues) < 1.0) else (inside, middle)
+            inside, outside = (
+                (middle, outside) if np.all(np.abs(eigenvalues) < 1.0) else (inside, middle)
+            )
         assert end == pytest.approx(inside * b, rel=1e-7)
 
 
@@ -213,12 +248,18 @@ def test_where_b_can_not_be_compared_with_b0_the_range_is_in_gains_of_the_plant(
         loop = analysis.analyse(plant, adrc(2))
         assert loop.b_over_b0 is None
         assert loop.b_range == loop.margins.gain
-        assert f"stable for a gain from {loop.b_range[0]:.3g} to {loop.b_range[1]:.3g} times what it is" in loop.summary()
+        assert (
+            f"stable for a gain from {loop.b_range[0]:.3g} to {loop.b_range[1]:.3g} times what it is"
+            in loop.summary()
+        )
         axes = analysis.plot_margins_over_time([0.0], [loop])
         assert axes[2].get_ylabel() == "gain for which\nit is stable"
     known = analysis.analyse(PLANT, adrc(2))
     assert known.b_range == pytest.approx([2.0 * gain for gain in known.margins.gain])
-    assert analysis.plot_margins_over_time([0.0], [known])[2].get_ylabel() == "b/b0 for which\nit is stable"
+    assert (
+        analysis.plot_margins_over_time([0.0], [known])[2].get_ylabel()
+        == "b/b0 for which\nit is stable"
+    )
     plt.close("all")
 
 
@@ -255,7 +296,9 @@ def test_an_actuator_lag_is_a_part_of_the_plant() -> None:
     """The same margins come from a plant that has the lag in its transfer function."""
     controller = adrc(2)
     told = analysis.analyse(([2.0], [1.0, 0.4, 3.0]), controller, actuator_lag=0.05).margins
-    built_in = analysis.analyse(([2.0], np.polymul([0.05, 1.0], [1.0, 0.4, 3.0])), controller).margins
+    built_in = analysis.analyse(
+        ([2.0], np.polymul([0.05, 1.0], [1.0, 0.4, 3.0])), controller
+    ).margins
     np.testing.assert_allclose(np.hstack([*told]), np.hstack([*built_in]), rtol=1e-6)
 
 
@@ -264,7 +307,12 @@ def test_plants_of_every_kind_are_the_same_plant() -> None:
     model = control.tf([2.0], [1.0, 0.4, 3.0])
     space = control.ss(PLANT.A, PLANT.B, PLANT.C, 0.0)
     expected = analysis.analyse(PLANT, adrc(2)).margins
-    for plant in (model, space, ([2.0], [1.0, 0.4, 3.0]), control.sample_system(space, 0.01, method="zoh")):
+    for plant in (
+        model,
+        space,
+        ([2.0], [1.0, 0.4, 3.0]),
+        control.sample_system(space, 0.01, method="zoh"),
+    ):
         found = analysis.analyse(plant, adrc(2)).margins
         np.testing.assert_allclose(np.hstack([*found]), np.hstack([*expected]), rtol=1e-6)
 
@@ -274,7 +322,9 @@ def test_noise_moves_u_as_much_as_is_said(rng: np.random.Generator) -> None:
     controller = adrc(2)
     noise = rng.normal(size=200_001)
     loop = analysis.analyse(chain(2), controller)
-    scenario = ql.Scenario(noise=ql.signals.Samples(np.arange(noise.size) * 0.01, noise), duration=2000.0)
+    scenario = ql.Scenario(
+        noise=ql.signals.Samples(np.arange(noise.size) * 0.01, noise), duration=2000.0
+    )
     run = ql.simulate(chain(2), controller, scenario)
     assert np.std(run["u"][1000:]) == pytest.approx(loop.noise_to_control, rel=0.01)
     omega = np.geomspace(1.0, math.pi / 0.01, 5000)
@@ -291,14 +341,21 @@ def test_responses_are_those_of_the_exported_systems() -> None:
     loop = analysis.analyse(PLANT, adrc(2))
     omega = np.array([0.1, 1.0, 10.0, 100.0])
     for name in ("P", "C_r", "C_y", "L", "S", "T", "PS", "CS", "closed_loop"):
-        np.testing.assert_allclose(loop.system(name)(np.exp(1j * omega * 0.01)), loop.response(name, omega), rtol=1e-8)
+        np.testing.assert_allclose(
+            loop.system(name)(np.exp(1j * omega * 0.01)), loop.response(name, omega), rtol=1e-8
+        )
 
 
 def test_an_unstable_loop_has_no_margins() -> None:
     """They are zero, not those of a formula that presumes stability; and it says so."""
     loop = analysis.analyse(([-1.0], [1.0, 0.0, 0.0]), adrc(2))
     assert not loop.stable
-    assert (loop.margins.phase, loop.margins.modulus, loop.margins.delay, loop.margins.gain) == (0.0, 0.0, 0.0, (1.0, 1.0))
+    assert (loop.margins.phase, loop.margins.modulus, loop.margins.delay, loop.margins.gain) == (
+        0.0,
+        0.0,
+        0.0,
+        (1.0, 1.0),
+    )
     assert loop.noise_to_control == math.inf
     assert "unstable" in repr(loop)
 
@@ -310,7 +367,9 @@ TRAINING = ql.Scenario(
 )
 
 
-@pytest.mark.parametrize("learner", [ql.learners.Kalman(), ql.learners.Kalman(u=True), ql.learners.Harmonic()])
+@pytest.mark.parametrize(
+    "learner", [ql.learners.Kalman(), ql.learners.Kalman(u=True), ql.learners.Harmonic()]
+)
 def test_what_the_record_says_of_a_learner_is_what_its_state_says(learner: Any) -> None:
     """For learners that are linear in state and u, θ is the gain, whatever they call the bias or add as a feedforward."""
     controller = adrc(2, learner=learner)
@@ -323,11 +382,16 @@ def test_what_the_record_says_of_a_learner_is_what_its_state_says(learner: Any) 
 
 def test_a_guard_s_authority_scales_what_is_fed_back() -> None:
     """At 8 s the learner is only half heard."""
-    controller = ql.ADRC(adrc(2).observer, omega_c=2.0, learner=ql.learners.Kalman(), guard=ql.Guard(time=10.0))
+    controller = ql.ADRC(
+        adrc(2).observer, omega_c=2.0, learner=ql.learners.Kalman(), guard=ql.Guard(time=10.0)
+    )
     run = ql.simulate(chain(2), controller, TRAINING)
     authority = run["authority"]
     half = int(np.flatnonzero((authority > 0.1) & (authority < 0.9))[0])
-    np.testing.assert_allclose(analysis.frozen(controller, run, run.t[half]).gain[:2], authority[half] * run["theta"][half, :2])
+    np.testing.assert_allclose(
+        analysis.frozen(controller, run, run.t[half]).gain[:2],
+        authority[half] * run["theta"][half, :2],
+    )
     assert not np.any(analysis.frozen(controller, run, 0.0).gain)
 
 
@@ -335,10 +399,16 @@ def test_a_network_is_what_it_is_for_small_motions() -> None:
     """Its gains are the slope of its own prediction, and asking for them leaves it as it was."""
     controller = adrc(2, learner=ql.learners.MLP(hidden=4))
     run = ql.simulate(chain(2), controller, TRAINING)
-    memory, before = run.final_state.learner, [array.copy() for array in run.final_state.learner.model]
+    memory, before = (
+        run.final_state.learner,
+        [array.copy() for array in run.final_state.learner.model],
+    )
     gain = analysis.frozen(controller, run).gain
     seen, small = run.final_state.seen, np.array([1e-5, -2e-5, 0.0])
-    moved = [predict(controller.parameters.learner, memory, seen + sign * small, 0.0)[0] for sign in (1.0, -1.0)]
+    moved = [
+        predict(controller.parameters.learner, memory, seen + sign * small, 0.0)[0]
+        for sign in (1.0, -1.0)
+    ]
     assert 0.5 * (moved[0] - moved[1]) == pytest.approx(gain @ small, rel=1e-5)
     assert np.any(gain != 0.0)
     for array, old in zip(memory.model, before, strict=True):
@@ -352,7 +422,9 @@ def test_a_learner_that_knows_the_plant_leaves_the_poles_of_the_design() -> None
     loop = analysis.analyse(chain(2), adrc(2, learner=Held([-1.0, -2.0], 0.0, 0.3), dt=1e-4))
     observer = np.array([[-36.0, 1.0, 0.0], [-1.0 - 432.0, -2.0, 1.0], [-1728.0, 0.0, 0.0]])
     poles = loop.s_poles[np.isfinite(loop.s_poles)]
-    np.testing.assert_allclose(np.poly(poles), np.polymul([1.0, 4.0, 4.0], np.poly(observer)), rtol=5e-3)
+    np.testing.assert_allclose(
+        np.poly(poles), np.polymul([1.0, 4.0, 4.0], np.poly(observer)), rtol=5e-3
+    )
 
 
 def test_margins_over_time_are_those_of_each_instant() -> None:
@@ -360,7 +432,9 @@ def test_margins_over_time_are_those_of_each_instant() -> None:
     controller = adrc(2, learner=ql.learners.Kalman())
     run = ql.simulate(chain(2), controller, TRAINING, record_every=10)
     times = [1.0, 7.0, 20.0]
-    recorded, again = (analysis.loops_over_time(chain(2), controller, source, times) for source in (run, TRAINING))
+    recorded, again = (
+        analysis.loops_over_time(chain(2), controller, source, times) for source in (run, TRAINING)
+    )
     modulus = [loop.margins.modulus for loop in recorded]
     np.testing.assert_allclose(modulus, [loop.margins.modulus for loop in again], rtol=1e-7)
     assert modulus[0] != pytest.approx(modulus[2], rel=1e-3)
@@ -387,16 +461,31 @@ def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
     for message, call in (
         ("linearised first", lambda: analysis.analyse(pendulum, adrc(2))),
         ("biproper", lambda: analysis.analyse(([1.0, 1.0], [1.0, 2.0]), adrc(2))),
-        ("may not follow the input at once", lambda: analysis.analyse(control.ss(-1.0, 1.0, 1.0, 1.0), adrc(2))),
+        (
+            "may not follow the input at once",
+            lambda: analysis.analyse(control.ss(-1.0, 1.0, 1.0, 1.0), adrc(2)),
+        ),
         ("controller's dt", lambda: analysis.analyse(control.ss(0.5, 1.0, 1.0, 0.0, 0.5), adrc(2))),
-        ("whole samples", lambda: analysis.analyse(control.ss(0.5, 1.0, 1.0, 0.0, 0.01), adrc(2), delay=0.005)),
+        (
+            "whole samples",
+            lambda: analysis.analyse(control.ss(0.5, 1.0, 1.0, 0.0, 0.01), adrc(2), delay=0.005),
+        ),
         ("at most 200 samples", lambda: analysis.analyse(PLANT, adrc(2), delay=3.0)),
         ("must be an ADRC", lambda: analysis.analyse(PLANT, "adrc")),
-        ("MLP has no coefficients to record; pass the scenario to loops_over_time,", lambda: analysis.frozen(controller, run, 3.0)),
-        ("a time of the record", lambda: analysis.frozen(adrc(2, learner=ql.learners.Kalman()), other, 30.0)),
+        (
+            "MLP has no coefficients to record; pass the scenario to loops_over_time,",
+            lambda: analysis.frozen(controller, run, 3.0),
+        ),
+        (
+            "a time of the record",
+            lambda: analysis.frozen(adrc(2, learner=ql.learners.Kalman()), other, 30.0),
+        ),
         ("a run of this controller", lambda: analysis.frozen(controller, other, 3.0)),
         ("asked once a period", lambda: analysis.analyse(PLANT, outside)),
-        ("a Trajectory or a Scenario", lambda: analysis.loops_over_time(PLANT, controller, None, [1.0])),
+        (
+            "a Trajectory or a Scenario",
+            lambda: analysis.loops_over_time(PLANT, controller, None, [1.0]),
+        ),
         ("must be one of", lambda: analysis.analyse(PLANT, adrc(2)).response("Q", [1.0])),
         ("source = 'w2'", lambda: analysis.analyse(PLANT, adrc(2)).system("w2 → y")),
     ):
@@ -414,7 +503,9 @@ def test_a_feature_that_is_not_linear_needs_more_than_its_coefficient() -> None:
     assert np.any(analysis.frozen(controller, run).gain != 0.0)
 
 
-def test_without_python_control_all_but_its_systems_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_python_control_all_but_its_systems_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """And the error says which extra brings it."""
     real = importlib.import_module
 
@@ -435,17 +526,23 @@ def test_pictures_show_what_was_calculated() -> None:
     plt = importlib.import_module("matplotlib.pyplot")
     loop = analysis.analyse(PLANT, adrc(2))
     top, low = analysis.plot_bode(loop)
-    np.testing.assert_allclose(top.lines[0].get_ydata(), np.abs(loop.response("L", loop.omega[:-1])))
+    np.testing.assert_allclose(
+        top.lines[0].get_ydata(), np.abs(loop.response("L", loop.omega[:-1]))
+    )
     assert f"{loop.margins.phase:.0f}°" in [text.get_text() for text in low.texts]
     four = analysis.plot_gang_of_four(loop)
-    np.testing.assert_allclose(four[3].lines[0].get_ydata(), np.abs(loop.response("CS", loop.omega)))
+    np.testing.assert_allclose(
+        four[3].lines[0].get_ydata(), np.abs(loop.response("CS", loop.omega))
+    )
     omegas = [5.0, 10.0]
 
     def make(omega_o: float) -> ql.ADRC:
         return ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=omega_o, dt=0.01), omega_c=2.0)
 
     axes = analysis.plot_margins_against_omega_o(PLANT, make, omegas)
-    assert axes[1].lines[0].get_ydata()[1] == pytest.approx(analysis.analyse(PLANT, make(10.0)).margins.phase)
+    assert axes[1].lines[0].get_ydata()[1] == pytest.approx(
+        analysis.analyse(PLANT, make(10.0)).margins.phase
+    )
     axes = analysis.plot_margins_over_time([0.0, 1.0], [loop, loop], plt.subplots(3)[1])
     assert axes[0].lines[0].get_ydata()[0] == loop.margins.modulus
     with pytest.raises(ValueError, match="must be 2 matplotlib axes, got 3"):
@@ -462,6 +559,8 @@ def test_a_prefilter_is_not_in_the_loop() -> None:
 
 def test_a_response_at_a_pole_is_refused_by_its_frequency() -> None:
     """An integrator has none at 0 rad/s."""
-    loop = ql.analysis.analyse(([1.0], [1.0, 0.0]), ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 0.01), 2.0))
+    loop = ql.analysis.analyse(
+        ([1.0], [1.0, 0.0]), ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 0.01), 2.0)
+    )
     with pytest.raises(ValueError, match=r"omega = \[0.0\] rad/s: the response is infinite"):
         loop.response("P", [0.0])

@@ -13,7 +13,7 @@ import quell as ql
 from quell.features.base import Features, unit, write
 from quell.guard import Reason
 from quell.learners.base import adapt, commit, predict, restart
-from quell.learners.model import infer, learn
+from quell.learners.online.model import infer, learn
 from quell.types import Status
 
 from .contracts.python_models import CHAIN, OBSERVER, Broken, law
@@ -42,7 +42,10 @@ def passive(model: Any, memory: Any, features: Any, target: float) -> None:
 
 
 def model_with(
-    infers: Callable[..., Any] | None = quiet, learns: Callable[..., Any] | None = passive, memory: Any = None, design: Any = None
+    infers: Callable[..., Any] | None = quiet,
+    learns: Callable[..., Any] | None = passive,
+    memory: Any = None,
+    design: Any = None,
 ) -> Any:
     """A model called Mine, with parameters of a type of its own."""
 
@@ -69,23 +72,68 @@ def raises(*arguments: Any) -> Any:
 
 
 MODELS: dict[str, tuple[Callable[[], Any], str]] = {
-    "a vector": (lambda: model_with(lambda m, s, x: 2.0 * x), r"Mine: infer returns ndarray of shape \(3,\): must return one number"),
-    "a tuple": (lambda: model_with(lambda m, s, x: (1.0, 2.0)), r"Mine: infer returns tuple of shape \(2,\): must return one number"),
-    "nothing": (lambda: model_with(lambda m, s, x: None), "Mine: infer returns NoneType: must return one number"),
-    "text": (lambda: model_with(lambda m, s, x: "1.0"), "Mine: infer returns str: must return one number"),
-    "infer raises": (lambda: model_with(raises), r"Mine: infer fails with KeyError: 'nothing here'; it is shown 3 features"),
+    "a vector": (
+        lambda: model_with(lambda m, s, x: 2.0 * x),
+        r"Mine: infer returns ndarray of shape \(3,\): must return one number",
+    ),
+    "a tuple": (
+        lambda: model_with(lambda m, s, x: (1.0, 2.0)),
+        r"Mine: infer returns tuple of shape \(2,\): must return one number",
+    ),
+    "nothing": (
+        lambda: model_with(lambda m, s, x: None),
+        "Mine: infer returns NoneType: must return one number",
+    ),
+    "text": (
+        lambda: model_with(lambda m, s, x: "1.0"),
+        "Mine: infer returns str: must return one number",
+    ),
+    "infer raises": (
+        lambda: model_with(raises),
+        r"Mine: infer fails with KeyError: 'nothing here'; it is shown 3 features",
+    ),
     "learn raises": (lambda: model_with(quiet, raises), "Mine: learn fails with KeyError"),
-    "too many features": (lambda: model_with(lambda m, s, x: x[7]), r"Mine: infer fails with IndexError.*of shape \(3,\)"),
-    "arguments": (lambda: model_with(lambda m, s: 1.0), "Mine: infer fails with TypeError.*arguments"),
-    "no infer": (lambda: model_with(None), r"Mine: nothing is registered for infer .*@infer.register\(MineDesign\)"),
-    "no learn": (lambda: model_with(quiet, None), r"Mine: nothing is registered for learn .*@learn.register\(MineDesign\)"),
-    "design raises": (lambda: model_with(design=raises), r"Mine.design\(3, 0.005\) fails with KeyError"),
-    "design": (lambda: model_with(design=lambda: {"rate": 1.0}), "Mine.design.* returns dict: must return a NamedTuple"),
+    "too many features": (
+        lambda: model_with(lambda m, s, x: x[7]),
+        r"Mine: infer fails with IndexError.*of shape \(3,\)",
+    ),
+    "arguments": (
+        lambda: model_with(lambda m, s: 1.0),
+        "Mine: infer fails with TypeError.*arguments",
+    ),
+    "no infer": (
+        lambda: model_with(None),
+        r"Mine: nothing is registered for infer .*@infer.register\(MineDesign\)",
+    ),
+    "no learn": (
+        lambda: model_with(quiet, None),
+        r"Mine: nothing is registered for learn .*@learn.register\(MineDesign\)",
+    ),
+    "design raises": (
+        lambda: model_with(design=raises),
+        r"Mine.design\(3, 0.005\) fails with KeyError",
+    ),
+    "design": (
+        lambda: model_with(design=lambda: {"rate": 1.0}),
+        "Mine.design.* returns dict: must return a NamedTuple",
+    ),
     "memory raises": (lambda: model_with(memory=raises), r"Mine.memory\(...\) fails with KeyError"),
-    "a dictionary": (lambda: model_with(memory=lambda: {"weight": 0.0}), "Mine.memory returns dict: must return a NamedTuple of arrays"),
-    "lists": (lambda: model_with(memory=lambda: Lists(np.zeros(1), [1.0])), "Mine.memory has history, list: .* must be arrays"),
-    "a number": (lambda: model_with(memory=lambda: Memory(0.0)), "Mine.memory has weight, float: .* must be arrays"),
-    "objects": (lambda: model_with(memory=lambda: Memory(np.array([None]))), "Mine.memory has weight, array of object"),
+    "a dictionary": (
+        lambda: model_with(memory=lambda: {"weight": 0.0}),
+        "Mine.memory returns dict: must return a NamedTuple of arrays",
+    ),
+    "lists": (
+        lambda: model_with(memory=lambda: Lists(np.zeros(1), [1.0])),
+        "Mine.memory has history, list: .* must be arrays",
+    ),
+    "a number": (
+        lambda: model_with(memory=lambda: Memory(0.0)),
+        "Mine.memory has weight, float: .* must be arrays",
+    ),
+    "objects": (
+        lambda: model_with(memory=lambda: Memory(np.array([None]))),
+        "Mine.memory has weight, array of object",
+    ),
 }
 
 
@@ -132,8 +180,14 @@ def looks_up(model: Any, memory: Any, features: Any, target: float) -> None:
 @pytest.mark.parametrize(
     ("learns", "message"),
     [
-        (takes_memory, r"^Mine.learn \(for MineDesign\) allocates memory \(.*zeros.*use loops over numbers and arrays that are there"),
-        (assigns_a_slice, r"^Mine.learn \(for MineDesign\) allocates memory .*slices that are assigned to"),
+        (
+            takes_memory,
+            r"^Mine.learn \(for MineDesign\) allocates memory \(.*zeros.*use loops over numbers and arrays that are there",
+        ),
+        (
+            assigns_a_slice,
+            r"^Mine.learn \(for MineDesign\) allocates memory .*slices that are assigned to",
+        ),
         (looks_up, r"^Mine.learn \(for MineDesign\) (can not be compiled|allocates)"),
     ],
 )
@@ -150,7 +204,10 @@ def test_what_compiled_code_can_not_do_is_named(learns: Callable[..., Any], mess
 
 
 def block_with(
-    writes: Callable[..., Any] | None, names: Any = ("a", "b"), units: Callable[..., Any] | None = None, design: Any = None
+    writes: Callable[..., Any] | None,
+    names: Any = ("a", "b"),
+    units: Callable[..., Any] | None = None,
+    design: Any = None,
 ) -> Any:
     """A block of features called Own."""
 
@@ -189,19 +246,35 @@ def three(features: Any, x: Any, u: float, out: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "around", [lambda block: ql.learners.Online(model_with(), block), lambda block: ql.learners.RLS(ql.features.Bias() + block)]
+    "around",
+    [
+        lambda block: ql.learners.Online(model_with(), block),
+        lambda block: ql.learners.RLS(ql.features.Bias() + block),
+    ],
 )
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: block_with(None), r"Own: nothing is registered for write .*@write.register\(OwnDesign\)"),
+        (
+            lambda: block_with(None),
+            r"Own: nothing is registered for write .*@write.register\(OwnDesign\)",
+        ),
         (lambda: block_with(raises), "Own: write fails with KeyError"),
-        (lambda: block_with(one), r"Own: write leaves features \[1\] unwritten; .*room for 2 features"),
+        (
+            lambda: block_with(one),
+            r"Own: write leaves features \[1\] unwritten; .*room for 2 features",
+        ),
         (lambda: block_with(three), "Own: write fails with IndexError"),
         (lambda: block_with(both, units=raises), "Own: unit fails with KeyError"),
-        (lambda: block_with(both, names="ab"), "Own.names.* must return a tuple with a name for each"),
+        (
+            lambda: block_with(both, names="ab"),
+            "Own.names.* must return a tuple with a name for each",
+        ),
         (lambda: block_with(both, design=raises), r"Own.design\(2\) fails with KeyError"),
-        (lambda: block_with(both, design=list), "Own.design.* returns list: must return a NamedTuple"),
+        (
+            lambda: block_with(both, design=list),
+            "Own.design.* returns list: must return a NamedTuple",
+        ),
     ],
 )
 def test_features_that_do_not_fit_are_named(make: Any, message: str, around: Any) -> None:
@@ -212,11 +285,15 @@ def test_features_that_do_not_fit_are_named(make: Any, message: str, around: Any
 
 def test_features_of_ones_own_that_fit_are_taken() -> None:
     """And learned from."""
-    run = ql.simulate(CHAIN, law(ql.learners.RLS(block_with(both))), ql.Scenario(ql.signals.Sinusoid(), 0.5))
+    run = ql.simulate(
+        CHAIN, law(ql.learners.RLS(block_with(both))), ql.Scenario(ql.signals.Sinusoid(), 0.5)
+    )
     assert run.features == ("a", "b")
 
 
-def learner_with(missing: tuple[str, ...] = (), says: Any = (0.0, 0.0), width: int = 1, memory: Any = None) -> Any:
+def learner_with(
+    missing: tuple[str, ...] = (), says: Any = (0.0, 0.0), width: int = 1, memory: Any = None
+) -> Any:
     """A learner called Whole, without the functions that are ``missing``."""
 
     class WholeDesign(NamedTuple):
@@ -237,7 +314,13 @@ def learner_with(missing: tuple[str, ...] = (), says: Any = (0.0, 0.0), width: i
     def theta(learner: Any, memory: Any, theta: Any) -> None:
         theta[0] = 0.0
 
-    functions = {adapt: nothing, commit: nothing, restart: nothing, predict: lambda *all: says, ql.learners.base.coefficients: theta}
+    functions = {
+        adapt: nothing,
+        commit: nothing,
+        restart: nothing,
+        predict: lambda *all: says,
+        ql.learners.base.coefficients: theta,
+    }
     for function, implementation in functions.items():
         if function.__name__ not in missing:  # type: ignore[attr-defined]
             function.register(WholeDesign)(implementation)
@@ -247,12 +330,27 @@ def learner_with(missing: tuple[str, ...] = (), says: Any = (0.0, 0.0), width: i
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: learner_with(("adapt", "restart")), r"Whole: nothing is registered for adapt, restart .*@adapt.register\(WholeDesign\)"),
-        (lambda: learner_with(says=1.0), r"Whole: predict returns 1.0: must return \(constant, slope\)"),
-        (lambda: learner_with(says=(1.0, np.zeros(2))), r"Whole: predict, slope, returns ndarray of shape \(2,\): must return one number"),
-        (lambda: learner_with(width=0), "Whole: coefficients fails with IndexError.*it has 0 names"),
+        (
+            lambda: learner_with(("adapt", "restart")),
+            r"Whole: nothing is registered for adapt, restart .*@adapt.register\(WholeDesign\)",
+        ),
+        (
+            lambda: learner_with(says=1.0),
+            r"Whole: predict returns 1.0: must return \(constant, slope\)",
+        ),
+        (
+            lambda: learner_with(says=(1.0, np.zeros(2))),
+            r"Whole: predict, slope, returns ndarray of shape \(2,\): must return one number",
+        ),
+        (
+            lambda: learner_with(width=0),
+            "Whole: coefficients fails with IndexError.*it has 0 names",
+        ),
         (lambda: learner_with(memory=lambda: Memory([0.0])), "Whole.memory has weight, list"),
-        (lambda: learner_with(memory=lambda: Memory(np.zeros(1, dtype=int))), "Whole.memory has weight, array of int64: .* float64"),
+        (
+            lambda: learner_with(memory=lambda: Memory(np.zeros(1, dtype=int))),
+            "Whole.memory has weight, array of int64: .* float64",
+        ),
     ],
 )
 def test_a_learner_that_does_not_fit_is_named(make: Any, message: str) -> None:
@@ -293,7 +391,12 @@ def _learn(model: ExplodesDesign, memory: Memory, features: Any, target: float) 
     memory.weight[0] += 1.0
 
 
-SCENARIO = ql.Scenario(ql.signals.Sinusoid(omega=1.5), duration=8.0, disturbances=(), noise=ql.signals.BandLimitedNoise(1e-12, 0.01))
+SCENARIO = ql.Scenario(
+    ql.signals.Sinusoid(omega=1.5),
+    duration=8.0,
+    disturbances=(),
+    noise=ql.signals.BandLimitedNoise(1e-12, 0.01),
+)
 
 
 @pytest.mark.parametrize("then", [math.inf, -math.inf, math.nan, 1e300, -1e12, 1e5])
@@ -302,7 +405,10 @@ def test_a_model_that_explodes_is_cut_off(then: float) -> None:
     run = ql.simulate(CHAIN, law(ql.learners.Online(Explodes(then)), guard=ql.Guard()), SCENARIO)
     plain = ql.simulate(CHAIN, law(None), SCENARIO)
     late = run.t > 3.0
-    assert np.sqrt(np.mean((run["y"] - run["r"])[late] ** 2)) <= 1.001 * np.sqrt(np.mean((plain["y"] - plain["r"])[late] ** 2)) + 1e-9
+    assert (
+        np.sqrt(np.mean((run["y"] - run["r"])[late] ** 2))
+        <= 1.001 * np.sqrt(np.mean((plain["y"] - plain["r"])[late] ** 2)) + 1e-9
+    )
     reasons = set(run["reason"][late].astype(int))
     assert (Status.LEARNER_CUT in run.status) == (not math.isfinite(then))
     assert (Reason.EXPLODED if math.isfinite(then) else Reason.NOT_FINITE) in reasons

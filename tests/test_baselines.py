@@ -10,9 +10,19 @@ import pytest
 
 import quell as ql
 from quell.controllers import LinearController, Prefiltered
-from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio, Shaper, equivalent_pid
+from quell.controllers.baselines import (
+    LQG,
+    PID,
+    ZV,
+    ZVD,
+    Notch,
+    NotchPID,
+    ResonanceRatio,
+    Shaper,
+    equivalent_pid,
+)
 from quell.controllers.baselines.observer_law import stationary_gain
-from quell.discretize import gramian
+from quell.lti.discretize import gramian
 from quell.observers.eso import continuous_gain
 
 TWO_MASS = ql.plants.two_mass_spring()
@@ -24,14 +34,21 @@ def loop_poles(controller: LinearController, plant: ql.plants.LinearPlant) -> np
     law, model, dt = controller.law, plant.sampled(controller.dt), controller.dt
     A, B_y = law.A + np.outer(law.B_u, law.C), law.B_y + law.B_u * law.D_y
     through = np.outer(model.input, model.output) * law.D_y
-    matrix = np.block([[model.transition + through, np.outer(model.input, law.C)], [np.outer(B_y, model.output), A]])
+    matrix = np.block(
+        [
+            [model.transition + through, np.outer(model.input, law.C)],
+            [np.outer(B_y, model.output), A],
+        ]
+    )
     return np.log(np.linalg.eigvals(matrix).astype(complex)) / dt
 
 
 def at(controller: PID, omega: float) -> tuple[complex, complex]:
     """Responses of a PID controller in continuous time, from r and from y."""
     numerators, denominator = controller.polynomials()
-    return tuple(complex(np.polyval(n, 1j * omega) / np.polyval(denominator, 1j * omega)) for n in numerators)  # type: ignore[return-value]
+    return tuple(
+        complex(np.polyval(n, 1j * omega) / np.polyval(denominator, 1j * omega)) for n in numerators
+    )  # type: ignore[return-value]
 
 
 # PID ------------------------------------------------------------------------------------------------------------------------------
@@ -51,7 +68,9 @@ def test_a_pid_controller_is_its_equation() -> None:
 def test_simc_makes_the_loop_that_skogestad_says() -> None:
     """A lag with PI: the loop's time constant is τ_c where no delay is; his example E1 (K_c = 5.5, τ_I = 0.8); the series form."""
     lag = ql.plants.LinearPlant([[-0.5]], [1.0], [1.0])  # gain 2, time constant 2 s
-    run = ql.simulate(lag, PID.simc(2.0, 2.0, 0.0, tau_c=0.8, dt=1e-3), ql.Scenario(reference=1.0, duration=4.0))
+    run = ql.simulate(
+        lag, PID.simc(2.0, 2.0, 0.0, tau_c=0.8, dt=1e-3), ql.Scenario(reference=1.0, duration=4.0)
+    )
     np.testing.assert_allclose(run["y"], 1.0 - np.exp(-run.t / 0.8), atol=2e-3)
     # 1/((s + 1)(0.2 s + 1)), by the half rule τ1 = 1.1 and θ = 0.1.
     first = PID.simc(1.0, 1.1, 0.1, dt=1e-3)
@@ -59,7 +78,9 @@ def test_simc_makes_the_loop_that_skogestad_says() -> None:
     # e^(−0.18 s) / ((1.22 s + 1)(0.22 s + 1)) with τ_c = θ: K_c = 1.22/0.36, τ_I = min(1.22, 1.44), τ_D = 0.22.
     tuned = PID.simc(1.0, 1.22, 0.18, 0.22, dt=1e-3)
     series = 1.22 / 0.36
-    assert (tuned.kp, tuned.ki, tuned.kd) == pytest.approx((series * (1 + 0.22 / 1.22), series / 1.22, series * 0.22))
+    assert (tuned.kp, tuned.ki, tuned.kd) == pytest.approx(
+        (series * (1 + 0.22 / 1.22), series / 1.22, series * 0.22)
+    )
 
 
 def test_simc_for_a_double_integrator_is_stable_with_its_delay() -> None:
@@ -76,13 +97,18 @@ def test_a_linear_adrc_is_a_filtered_pid_controller(order: int) -> None:
     adrc = ql.ADRC(ql.ESO.model_free(order, b0=2.5, omega_o=7.0, dt=1e-3), omega_c=1.3)
     k, size = adrc.parameters.law, order + 1
     gains = np.append(k, 1.0) / 2.5
-    A = np.diag(np.ones(order), 1) - np.outer(continuous_gain(np.zeros(order), 7.0), np.eye(size)[0])
+    A = np.diag(np.ones(order), 1) - np.outer(
+        continuous_gain(np.zeros(order), 7.0), np.eye(size)[0]
+    )
     B = np.zeros(size)
     B[order - 1] = 2.5
     closed = A - np.outer(B, gains)
     pid = equivalent_pid(adrc)
     for omega in (0.01, 0.3, 5.0, 100.0):
-        inner = -np.linalg.solve(1j * omega * np.eye(size) - closed, np.c_[B * gains[0], continuous_gain(np.zeros(order), 7.0)])
+        inner = -np.linalg.solve(
+            1j * omega * np.eye(size) - closed,
+            np.c_[B * gains[0], continuous_gain(np.zeros(order), 7.0)],
+        )
         from_r, from_y = gains @ inner
         assert at(pid, omega) == pytest.approx((gains[0] + from_r, from_y), rel=1e-12)
 
@@ -110,7 +136,9 @@ def test_a_notch_is_as_deep_and_wide_as_it_says() -> None:
     plain, notched = PID(2.0, 1.0, dt=0.2), NotchPID(notch, 2.0, 1.0, dt=0.2)
     assert abs(at(notched, 3.0)[1] / at(plain, 3.0)[1]) == pytest.approx(0.02)
     for omega in (3.0 * 0.86, 3.0 * 1.16):
-        assert abs(at(notched, omega)[1] / at(plain, omega)[1]) == pytest.approx(math.sqrt(0.5), abs=0.02)
+        assert abs(at(notched, omega)[1] / at(plain, omega)[1]) == pytest.approx(
+            math.sqrt(0.5), abs=0.02
+        )
     low = at(notched, 0.01)[1] / at(plain, 0.01)[1]
     assert -np.angle(low) / 0.01 == pytest.approx(notch.delay, rel=1e-3)
     law = notched.law
@@ -122,7 +150,12 @@ def test_a_notch_is_as_deep_and_wide_as_it_says() -> None:
 def test_a_notch_keeps_a_resonance_from_being_driven() -> None:
     """A soft drive whose PI loop the resonance makes unstable: with the notch it is stable."""
     resonant = ql.plants.LinearPlant(
-        np.block([[np.array([[-0.5]]), np.zeros((1, 2))], [np.array([[0.0], [100.0]]), np.array([[0.0, 1.0], [-100.0, -0.2]])]]),
+        np.block(
+            [
+                [np.array([[-0.5]]), np.zeros((1, 2))],
+                [np.array([[0.0], [100.0]]), np.array([[0.0, 1.0], [-100.0, -0.2]])],
+            ]
+        ),
         [1.0, 0.0, 0.0],
         [0.0, 1.0, 0.0],
     )
@@ -146,7 +179,9 @@ def test_the_gains_of_lqg_are_those_of_python_control() -> None:
     L = control.dlqe(mine.model.F, np.eye(5), mine.model.H[None], W, [[50.0]])[0]
     # python-control's gain is the predictor's, F L, or the current one, by its version.
     theirs = np.asarray(L)[:, 0]
-    best = min((mine.L, mine.model.F @ mine.L), key=lambda gain: float(np.max(np.abs(gain - theirs))))
+    best = min(
+        (mine.L, mine.model.F @ mine.L), key=lambda gain: float(np.max(np.abs(gain - theirs)))
+    )
     np.testing.assert_allclose(best, theirs, rtol=1e-6)
 
 
@@ -158,13 +193,19 @@ def test_the_bandwidths_of_lqg_are_its_poles_radii_on_a_chain_of_integrators() -
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: LQG(TWO_MASS, 1.0, 5.0, 0.01, u_min=-2.0, u_max=2.0), lambda: ResonanceRatio(omega_o=5.0, dt=0.01)]
+    "make",
+    [
+        lambda: LQG(TWO_MASS, 1.0, 5.0, 0.01, u_min=-2.0, u_max=2.0),
+        lambda: ResonanceRatio(omega_o=5.0, dt=0.01),
+    ],
 )
 def test_the_disturbance_state_takes_out_a_constant_force_wherever_it_acts(make: object) -> None:
     """On either mass, and with a plant that is not quite the model."""
     plant = ql.plants.two_mass_spring(m1=1.1, k=1.1)
     for forces in ((0.3, 0.0), (0.0, 0.3)):
-        run = ql.simulate(plant, make(), ql.Scenario(reference=1.0, disturbances=forces, duration=150.0))  # type: ignore[operator]
+        run = ql.simulate(
+            plant, make(), ql.Scenario(reference=1.0, disturbances=forces, duration=150.0)
+        )  # type: ignore[operator]
         assert run["y"][-1] == pytest.approx(1.0, abs=1e-3)
 
 
@@ -172,11 +213,15 @@ def test_the_disturbance_state_takes_out_a_constant_force_wherever_it_acts(make:
 
 
 @pytest.mark.parametrize(("m1", "m2", "k"), [(1.0, 1.0, 1.0), (2.0, 0.5, 3.0)])
-def test_at_a_ratio_of_root_five_all_poles_lie_at_the_antiresonance(m1: float, m2: float, k: float) -> None:
+def test_at_a_ratio_of_root_five_all_poles_lie_at_the_antiresonance(
+    m1: float, m2: float, k: float
+) -> None:
     """``(s + ω_a)⁴``: the state feedback in continuous time."""
     plant = ql.plants.two_mass_spring(m1, m2, k)
     K = ResonanceRatio(m1, m2, k, omega_o=20.0, dt=1e-3).K
-    np.testing.assert_allclose(np.poly(plant.A - plant.B @ K[None]), np.poly([-math.sqrt(k / m2)] * 4), rtol=1e-9)
+    np.testing.assert_allclose(
+        np.poly(plant.A - plant.B @ K[None]), np.poly([-math.sqrt(k / m2)] * 4), rtol=1e-9
+    )
 
 
 def test_the_load_sees_a_motor_of_another_inertia() -> None:
@@ -195,7 +240,9 @@ def test_either_mass_may_be_measured(measured: str) -> None:
     c1 = float(measured == "motor")
     plant = ql.plants.two_mass_spring(c1=c1, c2=1.0 - c1)
     controller = ResonanceRatio(omega_o=10.0, dt=1e-3, measured=measured)
-    run = ql.simulate(plant, controller, ql.Scenario(reference=1.0, disturbances=(0.0, 0.2), duration=60.0))
+    run = ql.simulate(
+        plant, controller, ql.Scenario(reference=1.0, disturbances=(0.0, 0.2), duration=60.0)
+    )
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-4)
     poles = loop_poles(controller, plant)
     assert np.max(poles.real) < -0.3
@@ -207,12 +254,16 @@ def test_either_mass_may_be_measured(measured: str) -> None:
 
 @pytest.mark.parametrize(("omega", "zeta"), [(1.4, 0.0), (5.0, 0.05), (2.0, 0.4)])
 @pytest.mark.parametrize("shaper", [ZV, ZVD])
-def test_a_shaper_leaves_no_vibration_of_its_mode(shaper: object, omega: float, zeta: float) -> None:
+def test_a_shaper_leaves_no_vibration_of_its_mode(
+    shaper: object, omega: float, zeta: float
+) -> None:
     """In the formula, and in a mode that is driven by the shaped reference, after the last impulse."""
     made = shaper(omega, zeta)  # type: ignore[operator]
     assert made.residual(omega, zeta) < 1e-12
     assert math.fsum(made.amplitudes) == pytest.approx(1.0)
-    mode = ql.plants.LinearPlant([[0.0, 1.0], [-(omega**2), -2.0 * zeta * omega]], [0.0, omega**2], [1.0, 0.0])
+    mode = ql.plants.LinearPlant(
+        [[0.0, 1.0], [-(omega**2), -2.0 * zeta * omega]], [0.0, omega**2], [1.0, 0.0]
+    )
     follow = Prefiltered(PID(0.0, setpoint=[0.0, 1.0, 0.0], dt=1e-3), made)  # u = r_shaped
     run = ql.simulate(mode, follow, ql.Scenario(reference=1.0, duration=made.times[-1] + 3.0))
     assert run["r_shaped"][-1] == pytest.approx(1.0)
@@ -224,7 +275,9 @@ def test_how_much_a_wrong_frequency_leaves_is_as_published() -> None:
     omega, off = 2.0, 1.1
     assert ZV(omega).residual(off * omega) == pytest.approx(abs(math.cos(0.5 * math.pi * off)))
     assert ZVD(omega).residual(off * omega) == pytest.approx(math.cos(0.5 * math.pi * off) ** 2)
-    mode = ql.plants.LinearPlant([[0.0, 1.0], [-((off * omega) ** 2), 0.0]], [0.0, (off * omega) ** 2], [1.0, 0.0])
+    mode = ql.plants.LinearPlant(
+        [[0.0, 1.0], [-((off * omega) ** 2), 0.0]], [0.0, (off * omega) ** 2], [1.0, 0.0]
+    )
     for made in (ZV(omega), ZVD(omega)):
         follow = Prefiltered(PID(0.0, setpoint=[0.0, 1.0, 0.0], dt=1e-3), made)
         run = ql.simulate(mode, follow, ql.Scenario(reference=1.0, duration=10.0))
@@ -234,11 +287,15 @@ def test_how_much_a_wrong_frequency_leaves_is_as_published() -> None:
 
 def test_a_delay_between_samples_is_split() -> None:
     """A ramp behind it is late by exactly that; a step takes two samples."""
-    shaped = Prefiltered(PID(1.0, setpoint=[0.0, 1.0, 0.0], dt=0.1), Shaper((0.0, 0.23), (0.4, 0.6)))
+    shaped = Prefiltered(
+        PID(1.0, setpoint=[0.0, 1.0, 0.0], dt=0.1), Shaper((0.0, 0.23), (0.4, 0.6))
+    )
     u = [shaped.step(0.1 * k, 0.0) for k in range(20)]
     assert u[19] == pytest.approx(1.9 - 0.6 * 0.23)
     shaped.reset()
-    np.testing.assert_allclose([shaped.step(1.0, 0.0) for _ in range(5)], [0.4, 0.4, 0.4 + 0.6 * 0.7, 1.0, 1.0])
+    np.testing.assert_allclose(
+        [shaped.step(1.0, 0.0) for _ in range(5)], [0.4, 0.4, 0.4 + 0.6 * 0.7, 1.0, 1.0]
+    )
 
 
 # Mistakes -------------------------------------------------------------------------------------------------------------------------
@@ -255,33 +312,61 @@ WASHED_OUT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [0.0,
         (lambda: PID(1.0, dt=0.1, tf=(-1.0, 0.0)), "f1 and f2 must not be negative"),
         (lambda: PID(1.0, dt=0.1, tt=-1.0), "tt = -1.0: must be finite and greater than zero"),
         (lambda: PID(1.0, dt=0.1, setpoint=[]), "setpoint = ..: must be a polynomial in s"),
-        (lambda: PID(1.0, dt=0.1, setpoint=[1.0, 0.0, 0.0]), "is of degree 1, den of degree 0: C.s. must be proper"),
-        (lambda: PID(math.nan, dt=0.1), "kp = nan: must be a finite number"),
-        (lambda: PID.simc(1.0, 1.0, 0.0, dt=0.1), "theta, or tau_c, = 0.0: must be finite and greater than zero"),
-        (lambda: equivalent_pid("adrc"), "controller = 'adrc': must be an ADRC"),
-        (lambda: equivalent_pid(ql.ADRC(ql.ESO.model_free(3, 1.0, 10.0, 0.01), 1.0)), "controller is of order 3: must be of order 1"),
-        (lambda: equivalent_pid(ql.ADRC(ql.ESO.model_based(LAG, 10.0, 0.01), 1.0)), "controller has an observer that knows a model"),
         (
-            lambda: equivalent_pid(ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, feedforward=True)),
+            lambda: PID(1.0, dt=0.1, setpoint=[1.0, 0.0, 0.0]),
+            "is of degree 1, den of degree 0: C.s. must be proper",
+        ),
+        (lambda: PID(math.nan, dt=0.1), "kp = nan: must be a finite number"),
+        (
+            lambda: PID.simc(1.0, 1.0, 0.0, dt=0.1),
+            "theta, or tau_c, = 0.0: must be finite and greater than zero",
+        ),
+        (lambda: equivalent_pid("adrc"), "controller = 'adrc': must be an ADRC"),
+        (
+            lambda: equivalent_pid(ql.ADRC(ql.ESO.model_free(3, 1.0, 10.0, 0.01), 1.0)),
+            "controller is of order 3: must be of order 1",
+        ),
+        (
+            lambda: equivalent_pid(ql.ADRC(ql.ESO.model_based(LAG, 10.0, 0.01), 1.0)),
+            "controller has an observer that knows a model",
+        ),
+        (
+            lambda: equivalent_pid(
+                ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, feedforward=True)
+            ),
             "controller has feedforward: a PID controller has no derivatives",
         ),
         (
-            lambda: equivalent_pid(ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, learner=ql.learners.Kalman())),
+            lambda: equivalent_pid(
+                ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, learner=ql.learners.Kalman())
+            ),
             "controller has a learner, Kalman",
         ),
         (lambda: Notch.at(0.0), "omega = 0.0: must be finite and greater than zero"),
         (lambda: Notch.at(1.0, depth=1.0), "depth = 1.0: must be below 1"),
         (lambda: NotchPID(1.0, 1.0, dt=0.1), "notch = 1.0: must be from quell.baselines.Notch.at"),
-        (lambda: NotchPID(Notch.at(40.0), 1.0, dt=0.1), "notch at 40.0 rad/s with dt = 0.1 s: must be below pi/dt"),
+        (
+            lambda: NotchPID(Notch.at(40.0), 1.0, dt=0.1),
+            "notch at 40.0 rad/s with dt = 0.1 s: must be below pi/dt",
+        ),
         (lambda: LQG("plant", 1.0, 5.0, 0.01), "plant = 'plant': must be a linear plant"),
-        (lambda: LQG(HIDDEN, 1.0, 5.0, 0.01), "plant is not stabilisable from u: its mode at s = 1"),
+        (
+            lambda: LQG(HIDDEN, 1.0, 5.0, 0.01),
+            "plant is not stabilisable from u: its mode at s = 1",
+        ),
         (lambda: LQG(BLIND, 1.0, 5.0, 0.01), "plant is not detectable from y: its mode at s = 1"),
         (lambda: LQG(WASHED_OUT, 1.0, 5.0, 0.01), "plant has a zero at s = 0"),
         (lambda: LQG(LAG, 1.0, 5.0, 0.01, Q=np.eye(3)), r"Q has shape \(3, 3\)"),
         (lambda: LQG(LAG, 0.0, 5.0, 0.01), "omega_c = 0.0"),
-        (lambda: LQG(control.ss(LAG.A, LAG.B, LAG.C, 0.0, 0.1), 1.0, 5.0, 0.01), "plant has a sample time, dt = 0.1"),
+        (
+            lambda: LQG(control.ss(LAG.A, LAG.B, LAG.C, 0.0, 0.1), 1.0, 5.0, 0.01),
+            "plant has a sample time, dt = 0.1",
+        ),
         (lambda: ResonanceRatio(omega_o=5.0, dt=0.01, ratio=1.0), "ratio = 1.0: must be above 1"),
-        (lambda: ResonanceRatio(omega_o=5.0, dt=0.01, measured="x2"), "measured = 'x2': must be one of load, motor"),
+        (
+            lambda: ResonanceRatio(omega_o=5.0, dt=0.01, measured="x2"),
+            "measured = 'x2': must be one of load, motor",
+        ),
         (lambda: ResonanceRatio(m1=0.0, omega_o=5.0, dt=0.01), "m1 = 0.0"),
         (lambda: ZV(0.0), "omega = 0.0"),
         (lambda: ZVD(1.0, 1.0), "zeta = 1.0: must be below 1"),

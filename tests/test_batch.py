@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell import driver
 from quell.plants import PlantBatch, batch, two_mass_spring
+from quell.simulation import driver
 
 MASSES = np.array([0.9, 1.0, 1.1])
 PLANTS = batch(two_mass_spring, m1=MASSES, k=1.0)
@@ -20,7 +20,9 @@ SHORT = ql.Scenario(1.0, duration=1.0)
 
 def controller(**options: object) -> ql.ADRC:
     """A model-based ADRC, at 10 ms."""
-    return ql.ADRC(ql.ESO.model_based(two_mass_spring(), omega_o=10.0, dt=0.01), omega_c=1.0, **options)
+    return ql.ADRC(
+        ql.ESO.model_based(two_mass_spring(), omega_o=10.0, dt=0.01), omega_c=1.0, **options
+    )
 
 
 def diverging() -> ql.ADRC:
@@ -39,7 +41,9 @@ def as_it_is() -> ql.ADRC:
 
 
 @pytest.mark.parametrize("learner", [None, ql.learners.Kalman()])
-def test_each_run_of_a_batch_is_the_run_alone(learner: object, two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_run_of_a_batch_is_the_run_alone(
+    learner: object, two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Bit for bit, in all channels, with rests, noise, a thinned record, and stretches of any length."""
     law = controller(learner=learner, guard=ql.Guard())
     monkeypatch.setattr(driver, "_BLOCK", 1001)
@@ -80,7 +84,9 @@ def test_only_what_is_asked_for_is_recorded() -> None:
 def test_a_run_that_diverges_ends_alone() -> None:
     """The others go on; it is NaN from its end, which is where exp(rate t) passes the limit."""
     rates = np.array([0.0, 5.0, 0.1, 20.0])
-    runs = ql.simulate(batch(growth, rate=rates), as_it_is(), ql.Scenario(duration=4.0, x0=[1.0]), limit=100.0)
+    runs = ql.simulate(
+        batch(growth, rate=rates), as_it_is(), ql.Scenario(duration=4.0, x0=[1.0]), limit=100.0
+    )
     np.testing.assert_array_equal(runs.diverged, [False, True, False, True])
     np.testing.assert_array_equal(runs.status & ql.Status.DIVERGED != 0, runs.diverged)
     for i in (1, 3):
@@ -99,7 +105,11 @@ def test_a_run_that_diverges_ends_alone() -> None:
 
 def test_metrics_are_arrays_that_miss_what_ended_before() -> None:
     """Each entry is that of the run alone; what diverged before the window is NaN."""
-    runs = ql.simulate([two_mass_spring()] * 3, [controller(), diverging(), controller(u_max=0.1)], ql.Scenario(1.0, duration=60.0))
+    runs = ql.simulate(
+        [two_mass_spring()] * 3,
+        [controller(), diverging(), controller(u_max=0.1)],
+        ql.Scenario(1.0, duration=60.0),
+    )
     np.testing.assert_array_equal(runs.diverged, [False, True, False])
     found = runs.metrics(50.0, target=1.0)
     assert all(values.shape == (3,) for values in found.values())
@@ -125,12 +135,16 @@ def test_any_part_of_the_loop_may_differ_from_run_to_run() -> None:
     tuned = [controller(), controller(u_max=0.5)]
     runs = ql.simulate(two_mass_spring(), tuned, SHORT)
     assert runs.parameters == {}
-    np.testing.assert_array_equal(runs["u"][1], ql.simulate(two_mass_spring(), tuned[1], SHORT)["u"])
+    np.testing.assert_array_equal(
+        runs["u"][1], ql.simulate(two_mass_spring(), tuned[1], SHORT)["u"]
+    )
     noise = ql.signals.BandLimitedNoise(power=1e-6, sample_time=0.01)
     noisy = ql.Scenario(1.0, duration=1.0, noise=noise)
     same = ql.simulate(PLANTS, controller(), noisy, record="all")
     np.testing.assert_array_equal(same["y_measured"][0, 0], same["y_measured"][2, 0])
-    other = ql.simulate(PLANTS, controller(), [replace(noisy, seed=i) for i in range(3)], record="all")
+    other = ql.simulate(
+        PLANTS, controller(), [replace(noisy, seed=i) for i in range(3)], record="all"
+    )
     assert len(set(other["y_measured"][:, 0].tolist())) == 3
     alone = ql.simulate(PLANTS[2], controller(), replace(noisy, seed=2))
     np.testing.assert_array_equal(other.run(2).log, alone.log)
@@ -148,10 +162,14 @@ def test_a_controller_that_feeds_derivatives_forward_may_be_one_of_a_batch() -> 
 
 def test_scenarios_of_a_batch_may_rest_at_different_times() -> None:
     """Each run is still the run alone."""
-    scenarios = [replace(SHORT, rest_at=times, x0=[0.0, 0.1, 0.0, 0.0]) for times in ((), (0.3,), (0.5, 0.7))]
+    scenarios = [
+        replace(SHORT, rest_at=times, x0=[0.0, 0.1, 0.0, 0.0]) for times in ((), (0.3,), (0.5, 0.7))
+    ]
     runs = ql.simulate(PLANTS, controller(), scenarios, record="all", record_every=4)
     for i, scenario in enumerate(scenarios):
-        np.testing.assert_array_equal(runs.run(i).log, ql.simulate(PLANTS[i], controller(), scenario, record_every=4).log)
+        np.testing.assert_array_equal(
+            runs.run(i).log, ql.simulate(PLANTS[i], controller(), scenario, record_every=4).log
+        )
 
 
 def test_nonlinear_plants_run_in_batches_compiled_and_as_python() -> None:
@@ -166,9 +184,16 @@ def test_nonlinear_plants_run_in_batches_compiled_and_as_python() -> None:
         def python_rate(t, x, u, w):  # type: ignore[no-untyped-def]
             return x[1], u + strength * math.exp(x[0]) + 0.0 * len(str(odd))
 
-        return ql.plants.NonlinearPlant(rate if compilable else python_rate, order=2, name="pendulum")
+        return ql.plants.NonlinearPlant(
+            rate if compilable else python_rate, order=2, name="pendulum"
+        )
 
-    law = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=2.0, u_min=-5.0, u_max=5.0)
+    law = ql.ADRC(
+        ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01),
+        omega_c=2.0,
+        u_min=-5.0,
+        u_max=5.0,
+    )
     compiled = ql.simulate([pendulum(s, True) for s in (0.1, 500.0)], law, SHORT)
     with pytest.warns(UserWarning, match="can't be compiled"):
         python = ql.simulate([pendulum(s, False) for s in (0.1, 500.0)], law, SHORT)
@@ -180,7 +205,12 @@ def test_nonlinear_plants_run_in_batches_compiled_and_as_python() -> None:
 
 def test_parameters_of_a_batch_are_arrays_and_read_only() -> None:
     """A number counts for every plant; a part of a batch keeps its part of them."""
-    assert (len(PLANTS), PLANTS.order, PLANTS.disturbances, PLANTS.name) == (3, 4, 2, "two-mass-spring")
+    assert (len(PLANTS), PLANTS.order, PLANTS.disturbances, PLANTS.name) == (
+        3,
+        4,
+        2,
+        "two-mass-spring",
+    )
     np.testing.assert_array_equal(PLANTS.parameters["k"], [1.0, 1.0, 1.0])
     np.testing.assert_array_equal(PLANTS[1].A, two_mass_spring(m1=1.0).A)
     part = PLANTS[1:]
@@ -197,7 +227,12 @@ def test_parameters_of_a_batch_are_arrays_and_read_only() -> None:
 def test_progress_is_told_and_ends_at_one() -> None:
     """Shares grow, from job to job."""
     shares: list[float] = []
-    ql.simulate(batch(two_mass_spring, m1=np.linspace(0.9, 1.1, 50)), controller(), SHORT, progress=shares.append)
+    ql.simulate(
+        batch(two_mass_spring, m1=np.linspace(0.9, 1.1, 50)),
+        controller(),
+        SHORT,
+        progress=shares.append,
+    )
     assert shares == sorted(shares)
     assert len(shares) > 1
     assert shares[-1] == 1.0
@@ -210,7 +245,9 @@ def test_a_saved_batch_is_loaded_back_whole(tmp_path: Path) -> None:
         return ql.plants.LinearPlant([[r]], [k], [1.0], name="lag")
 
     plants = batch(lag, r=np.array([0.1, 9.0]), k=1e-9)
-    runs = ql.simulate(plants, as_it_is(), ql.Scenario(duration=1.0, x0=[1.0]), limit=100.0, record=("y", "x"))
+    runs = ql.simulate(
+        plants, as_it_is(), ql.Scenario(duration=1.0, x0=[1.0]), limit=100.0, record=("y", "x")
+    )
     assert list(runs.diverged) == [False, True]
     data = runs.to_xarray()
     assert dict(data.sizes) == {"run": 2, "time": 101, "x_index": 1}
@@ -221,8 +258,16 @@ def test_a_saved_batch_is_loaded_back_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.log, runs.log)
     for name in ("status", "ended", "limit", "lengths", "t", "diverged"):
         np.testing.assert_array_equal(getattr(again, name), getattr(runs, name))
-    assert (again.channels, again.plant, again.message, again.features) == (runs.channels, runs.plant, runs.message, runs.features)
-    assert {name: list(values) for name, values in again.parameters.items()} == {"r": [0.1, 9.0], "k": [1e-9, 1e-9]}
+    assert (again.channels, again.plant, again.message, again.features) == (
+        runs.channels,
+        runs.plant,
+        runs.message,
+        runs.features,
+    )
+    assert {name: list(values) for name, values in again.parameters.items()} == {
+        "r": [0.1, 9.0],
+        "k": [1e-9, 1e-9],
+    }
     runs.run(0).save(tmp_path / "one.nc")
     with pytest.raises(ValueError, match="it was not written by BatchTrajectory.save"):
         ql.BatchTrajectory.load(tmp_path / "one.nc")
@@ -232,7 +277,11 @@ def test_a_saved_batch_is_loaded_back_whole(tmp_path: Path) -> None:
 
 def test_parameters_may_be_called_as_channels_and_coordinates_are(tmp_path: Path) -> None:
     """They are told apart by a prefix."""
-    runs = ql.simulate(batch(lambda limit, time, run: growth(limit), limit=[0.1, 0.2], time=1.0, run=3), as_it_is(), SHORT)
+    runs = ql.simulate(
+        batch(lambda limit, time, run: growth(limit), limit=[0.1, 0.2], time=1.0, run=3),
+        as_it_is(),
+        SHORT,
+    )
     runs.save(tmp_path / "runs.nc")
     again = ql.BatchTrajectory.load(tmp_path / "runs.nc")
     assert set(again.parameters) == {"limit", "time", "run"}
@@ -258,50 +307,117 @@ def test_a_plot_has_two_axes_and_draws_into_given_ones(law: ql.ADRC) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: batch(two_mass_spring, m1=[1.0, 2.0], m2=[1.0, 1.0, 1.0]), "m1 has 2 entries, m2 3: must be numbers or vectors of one"),
+        (
+            lambda: batch(two_mass_spring, m1=[1.0, 2.0], m2=[1.0, 1.0, 1.0]),
+            "m1 has 2 entries, m2 3: must be numbers or vectors of one",
+        ),
         (lambda: batch(two_mass_spring, m1=[]), "m1 has 0 entries"),
-        (lambda: batch(two_mass_spring, m1=[1.0, 1.0, -1.0]), r"run 2: m1 = -1.0: must be finite and greater than zero \[kg\]"),
-        (lambda: batch(two_mass_spring, m3=[1.0]), "parameters = m3: the factory can't be called with them: .*'m3'"),
-        (lambda: batch(two_mass_spring, m1=np.ones((2, 2))), r"m1 has shape \(2, 2\): must be a number or a vector of numbers"),
-        (lambda: batch(two_mass_spring, m1=[1.0, [2.0]]), "m1: must be a number or a vector of numbers"),
-        (lambda: batch(two_mass_spring, m1="heavy"), "m1: must be a number or a vector of numbers, one for each run, got .heavy"),
+        (
+            lambda: batch(two_mass_spring, m1=[1.0, 1.0, -1.0]),
+            r"run 2: m1 = -1.0: must be finite and greater than zero \[kg\]",
+        ),
+        (
+            lambda: batch(two_mass_spring, m3=[1.0]),
+            "parameters = m3: the factory can't be called with them: .*'m3'",
+        ),
+        (
+            lambda: batch(two_mass_spring, m1=np.ones((2, 2))),
+            r"m1 has shape \(2, 2\): must be a number or a vector of numbers",
+        ),
+        (
+            lambda: batch(two_mass_spring, m1=[1.0, [2.0]]),
+            "m1: must be a number or a vector of numbers",
+        ),
+        (
+            lambda: batch(two_mass_spring, m1="heavy"),
+            "m1: must be a number or a vector of numbers, one for each run, got .heavy",
+        ),
         (
             lambda: ql.simulate([growth(0.0), two_mass_spring()], controller(), SHORT),
             r"plant\[1\] has order 4, plant\[0\] 1: must be the same",
         ),
         (
-            lambda: PlantBatch([growth(0.0), ql.plants.NonlinearPlant(lambda t, x, u, w: (u,), order=1)]),
+            lambda: PlantBatch(
+                [growth(0.0), ql.plants.NonlinearPlant(lambda t, x, u, w: (u,), order=1)]
+            ),
             r"plant\[1\] has kind NonlinearPlant, plant\[0\] LinearPlant",
         ),
-        (lambda: PlantBatch([growth(0.0)], {"rate": [1.0, 2.0]}), r"parameters\['rate'\] has shape \(2,\): must be \(1,\)"),
-        (lambda: ql.simulate([], controller(), SHORT), "plant has no entries: a batch must have at least one run"),
-        (lambda: ql.simulate([two_mass_spring(), 3.0], controller(), SHORT), r"plant\[1\] = 3.0: must be a plant, for example"),
-        (lambda: ql.simulate(PLANTS, [controller()] * 2, SHORT), "controller has 2 entries, plant 3: must be one for all runs, or one"),
-        (lambda: ql.simulate(PLANTS, controller(), [SHORT, SHORT, 1.0]), r"scenario\[2\] = 1.0: must be a quell.Scenario"),
+        (
+            lambda: PlantBatch([growth(0.0)], {"rate": [1.0, 2.0]}),
+            r"parameters\['rate'\] has shape \(2,\): must be \(1,\)",
+        ),
+        (
+            lambda: ql.simulate([], controller(), SHORT),
+            "plant has no entries: a batch must have at least one run",
+        ),
+        (
+            lambda: ql.simulate([two_mass_spring(), 3.0], controller(), SHORT),
+            r"plant\[1\] = 3.0: must be a plant, for example",
+        ),
+        (
+            lambda: ql.simulate(PLANTS, [controller()] * 2, SHORT),
+            "controller has 2 entries, plant 3: must be one for all runs, or one",
+        ),
+        (
+            lambda: ql.simulate(PLANTS, controller(), [SHORT, SHORT, 1.0]),
+            r"scenario\[2\] = 1.0: must be a quell.Scenario",
+        ),
         (
             lambda: ql.simulate(PLANTS, controller(), [SHORT, SHORT, replace(SHORT, duration=2.0)]),
             r"scenario\[2\] has duration = 2.0 s, scenario\[0\] 1.0 s: must be the same in all runs",
         ),
         (
-            lambda: ql.simulate(PLANTS, [controller(), controller(), controller(learner=ql.learners.Kalman())], SHORT),
+            lambda: ql.simulate(
+                PLANTS,
+                [controller(), controller(), controller(learner=ql.learners.Kalman())],
+                SHORT,
+            ),
             r"controller\[2\] has channels = .*: must be the same; run them as two batches",
         ),
         (
-            lambda: ql.simulate(PLANTS[:2], [controller(), ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, 0.02), 1.0)], SHORT),
+            lambda: ql.simulate(
+                PLANTS[:2],
+                [controller(), ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, 0.02), 1.0)],
+                SHORT,
+            ),
             r"controller\[1\] has dt = 0.02, controller\[0\] 0.01: must be the same",
         ),
         (
             lambda: ql.simulate(PLANTS, controller(), SHORT, record=["y", "z"]),
             "record = 'z': must be one of r, y, y_measured, u, w, x, x_hat",
         ),
-        (lambda: ql.simulate(PLANTS, controller(), SHORT, record=[]), r"record = \[\]: must name at least one channel"),
-        (lambda: ql.simulate(PLANTS, controller(), SHORT, workers=0), "workers = 0: must be a whole number of at least 1"),
-        (lambda: ql.simulate(PLANTS[0], controller(), SHORT, workers=2), "workers = 2: is for a batch"),
-        (lambda: ql.simulate(PLANTS[0], controller(), SHORT, record=("y",)), r"record = \('y',\): is for a batch"),
-        (lambda: ql.simulate(PLANTS, controller(), replace(SHORT, x0=[1.0])), r"x0 has shape \(1,\): must be a vector of 4"),
-        (lambda: ql.simulate(PLANTS, controller(), SHORT).run(3), "i = 3: must be a whole number from 0 to 2"),
-        (lambda: ql.simulate(PLANTS, controller(), SHORT)["x"], "channel = 'x': must be one of r, y, u"),
-        (lambda: ql.simulate(PLANTS, controller(), SHORT).plot([None]), "axes: must be two matplotlib axes, got 1"),
+        (
+            lambda: ql.simulate(PLANTS, controller(), SHORT, record=[]),
+            r"record = \[\]: must name at least one channel",
+        ),
+        (
+            lambda: ql.simulate(PLANTS, controller(), SHORT, workers=0),
+            "workers = 0: must be a whole number of at least 1",
+        ),
+        (
+            lambda: ql.simulate(PLANTS[0], controller(), SHORT, workers=2),
+            "workers = 2: is for a batch",
+        ),
+        (
+            lambda: ql.simulate(PLANTS[0], controller(), SHORT, record=("y",)),
+            r"record = \('y',\): is for a batch",
+        ),
+        (
+            lambda: ql.simulate(PLANTS, controller(), replace(SHORT, x0=[1.0])),
+            r"x0 has shape \(1,\): must be a vector of 4",
+        ),
+        (
+            lambda: ql.simulate(PLANTS, controller(), SHORT).run(3),
+            "i = 3: must be a whole number from 0 to 2",
+        ),
+        (
+            lambda: ql.simulate(PLANTS, controller(), SHORT)["x"],
+            "channel = 'x': must be one of r, y, u",
+        ),
+        (
+            lambda: ql.simulate(PLANTS, controller(), SHORT).plot([None]),
+            "axes: must be two matplotlib axes, got 1",
+        ),
     ],
 )
 def test_a_mistake_is_named(make: object, message: str) -> None:

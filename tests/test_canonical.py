@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.learners.lag import lag_of
-from quell.observers import canonical
+from quell.lti import canonical
 from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
@@ -24,7 +24,9 @@ from quell.observers.placement import place
 def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:
     """Return the transfer function ``num/den`` as a plant in coordinates that nobody would choose."""
     A, B, C, _ = scipy.signal.tf2ss(num, den)
-    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=A.shape))[0] @ np.diag(10.0 ** np.linspace(-1.0, 2.0, len(A)))
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=A.shape))[0] @ np.diag(
+        10.0 ** np.linspace(-1.0, 2.0, len(A))
+    )
     back = np.linalg.inv(turn)
     return ql.plants.LinearPlant(turn @ A @ back, turn @ B, C @ back)
 
@@ -37,7 +39,12 @@ NUM, DEN = 3.0 * np.poly([-0.8, -2.0]), np.poly([0.3, -0.4 + 1.0j, -0.4 - 1.0j, 
     [
         hidden(NUM, DEN),
         (hidden(NUM, DEN).A, hidden(NUM, DEN).B, hidden(NUM, DEN).C),
-        (hidden(NUM, DEN).A, hidden(NUM, DEN).B, 7.0 * hidden(NUM, DEN).B[:, 0], hidden(NUM, DEN).C[0]),
+        (
+            hidden(NUM, DEN).A,
+            hidden(NUM, DEN).B,
+            7.0 * hidden(NUM, DEN).B[:, 0],
+            hidden(NUM, DEN).C[0],
+        ),
         (NUM, DEN),
         ([0.0, *(2.0 * NUM)], 2.0 * DEN),
         control.tf(NUM, DEN),
@@ -55,7 +62,9 @@ def test_a_plant_is_the_same_however_it_is_given(plant: Any) -> None:
     assert (found.degree, found.f_degree) == (2, 2)
     np.testing.assert_allclose(found.zeros, [-2.0, -0.8], rtol=1e-7)
     markov = [3.0, 3.0 * 2.8 - 3.0 * DEN[1]]  # long division by hand
-    np.testing.assert_allclose(found.B, [0.0, *markov, 3.0 * 1.6 - DEN[1] * markov[1] - DEN[2] * 3.0], rtol=1e-7)
+    np.testing.assert_allclose(
+        found.B, [0.0, *markov, 3.0 * 1.6 - DEN[1] * markov[1] - DEN[2] * 3.0], rtol=1e-7
+    )
     np.testing.assert_allclose(found.E, found.B / 3.0, rtol=1e-7)
 
 
@@ -71,8 +80,12 @@ def test_the_zeros_are_those_of_the_numerator(seed: int, n: int) -> None:
     np.testing.assert_allclose(np.poly(found.zeros), np.poly(zeros), atol=1e-5)
     companion = np.diag(np.ones(n - 1), 1)
     companion[-1] = -found.a
-    np.testing.assert_allclose(found.S @ plant.A, companion @ found.S, atol=1e-5 * np.max(np.abs(found.S)))
-    np.testing.assert_allclose(found.S @ plant.B[:, 0], found.B, atol=1e-7 * np.max(np.abs(found.B)))
+    np.testing.assert_allclose(
+        found.S @ plant.A, companion @ found.S, atol=1e-5 * np.max(np.abs(found.S))
+    )
+    np.testing.assert_allclose(
+        found.S @ plant.B[:, 0], found.B, atol=1e-7 * np.max(np.abs(found.B))
+    )
 
 
 def error_polynomial(observer: ESO) -> np.ndarray:
@@ -91,7 +104,9 @@ def error_polynomial(observer: ESO) -> np.ndarray:
     dt=st.sampled_from([1e-4, 1e-3, 1e-2]),
     omega_o=st.sampled_from([5.0, 50.0]),
 )
-def test_zeros_move_no_pole_of_the_observer(n: int, count: int, seed: int, dt: float, omega_o: float) -> None:
+def test_zeros_move_no_pole_of_the_observer(
+    n: int, count: int, seed: int, dt: float, omega_o: float
+) -> None:
     """With one to three zeros, up to eight states, down to 0.1 ms: the polynomial is (z − β)^N."""
     rng = np.random.default_rng(seed)
     zeros, poles = -rng.uniform(0.3, 5.0, min(count, n - 1)), -rng.uniform(0.0, 3.0, n)
@@ -110,7 +125,9 @@ def test_poles_may_differ_and_be_complex(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(np.poly(np.eye(4) - error), np.poly(rises).real, atol=1e-12)
 
 
-def estimates(observer: ESO, plant: ql.plants.LinearPlant, f: float, samples: int = 4000) -> tuple[np.ndarray, np.ndarray, float]:
+def estimates(
+    observer: ESO, plant: ql.plants.LinearPlant, f: float, samples: int = 4000
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Drive a plant, from a state that is not zero, with a chirp and a constant disturbance; return the true and the estimated end."""
     model = plant.sampled(observer.dt)
     u = np.sin(np.cumsum(np.linspace(0.0, 3.0, samples)) * observer.dt)
@@ -155,9 +172,17 @@ def test_a_record_is_mapped_like_a_sample() -> None:
     """(samples, n) as well as (n,); and a wrong shape is named."""
     observer = ESO.model_based(hidden(NUM, DEN), omega_o=20.0, dt=1e-3)
     record = np.random.default_rng(3).normal(size=(7, 4))
-    np.testing.assert_allclose(observer.states_of(record)[3], observer.states_of(record[3]), rtol=1e-12)
-    np.testing.assert_allclose(observer.plant.S @ observer.states_of(record[3]), record[3], atol=1e-9 * np.max(np.abs(record)))
-    with pytest.raises(ValueError, match=r"x_hat has shape \(3,\): the last axis must have the 4 states"):
+    np.testing.assert_allclose(
+        observer.states_of(record)[3], observer.states_of(record[3]), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        observer.plant.S @ observer.states_of(record[3]),
+        record[3],
+        atol=1e-9 * np.max(np.abs(record)),
+    )
+    with pytest.raises(
+        ValueError, match=r"x_hat has shape \(3,\): the last axis must have the 4 states"
+    ):
         observer.states_of([1.0, 2.0, 3.0])
 
 
@@ -175,7 +200,9 @@ def test_the_loop_of_a_plant_with_zeros_steps_as_if_it_had_none(num: Any, den: A
     controller = ql.ADRC(ESO.model_based(plant, omega_o=20.0, dt=dt), omega_c=omega_c)
     run = ql.simulate(plant, controller, ql.Scenario(1.0, 20.0, (ql.signals.Step(at=10.0),)))
     y, t = run["y"].ravel(), run.t
-    rest = sum((omega_c * t) ** k / math.factorial(k) for k in range(controller.observer.degree)) * np.exp(-omega_c * t)
+    rest = sum(
+        (omega_c * t) ** k / math.factorial(k) for k in range(controller.observer.degree)
+    ) * np.exp(-omega_c * t)
     before = t < 10.0
     assert np.max(np.abs(y - 1.0 + rest)[before]) < 2e-3
     assert 0.003 < np.max(np.abs(y[~before] - 1.0)) < 0.2
@@ -224,21 +251,45 @@ BESIDE = ql.plants.two_mass_spring(c1=1.0, c2=0.0)
 @pytest.mark.parametrize(
     ("plant", "E", "message"),
     [
-        ((np.diag([-1.0, -2.0]), [1.0, 1.0], [1.0, 0.0]), None, "not observable from y: .* has rank 1, not 2 .*smallest over largest"),
-        (TWO_MASS, 1, r"invariant zeros to y \(assumption 3\), ±1j rad/s, its relative degree is 2 and not 4; leave E out"),
+        (
+            (np.diag([-1.0, -2.0]), [1.0, 1.0], [1.0, 0.0]),
+            None,
+            "not observable from y: .* has rank 1, not 2 .*smallest over largest",
+        ),
+        (
+            TWO_MASS,
+            1,
+            r"invariant zeros to y \(assumption 3\), ±1j rad/s, its relative degree is 2 and not 4; leave E out",
+        ),
         ((np.diag([-1.0, -2.0]), [1.0, 1.0], [0.0, 0.0], [1.0, 1.0]), None, "E is zero"),
         ((np.eye(2), [1.0, 0.0], [0.0, 1.0], [1.0, 0.0]), None, "not observable"),
         (([[0.0, 1.0], [0.0, 0.0]], [0.0, 0.0], [1.0, 0.0]), None, "b = 0: u does not reach y"),
-        (([1.0, 0.0, 1.0], [1.0, 1.0]), None, "improper: its numerator has degree 2, its denominator 1"),
-        (control.tf([1.0, 0.5], [1.0, 1.0]), None, "biproper: numerator and denominator have degree 1"),
+        (
+            ([1.0, 0.0, 1.0], [1.0, 1.0]),
+            None,
+            "improper: its numerator has degree 2, its denominator 1",
+        ),
+        (
+            control.tf([1.0, 0.5], [1.0, 1.0]),
+            None,
+            "biproper: numerator and denominator have degree 1",
+        ),
         (([0.0], [1.0, 1.0]), None, "numerator is zero"),
         (([1.0], [2.0]), None, "denominator has degree 0"),
         ((["one"], [1.0, 1.0]), None, "numerator: must be an array of numbers"),
         (([1.0], [1.0, math.nan]), None, "denominator: entry"),
-        (control.tf([[[1.0], [1.0]]], [[[1.0, 1.0], [1.0, 2.0]]]), None, r"\(1, 2\) outputs and inputs"),
+        (
+            control.tf([[[1.0], [1.0]]], [[[1.0, 1.0], [1.0, 2.0]]]),
+            None,
+            r"\(1, 2\) outputs and inputs",
+        ),
         (([1.0], [1.0, 1.0]), [1.0], "E: only a plant with states"),
         ((np.zeros((1, 1)), [1.0], [1.0], [1.0]), [1.0], "E is given twice"),
-        (control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]), 0, "E = 0: this plant has no disturbance inputs of its own"),
+        (
+            control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]),
+            0,
+            "E = 0: this plant has no disturbance inputs of its own",
+        ),
         (TWO_MASS, 2, "E = 2: must be a whole number from 0 to 1"),
         (TWO_MASS, [1.0, 0.0], r"E has shape \(2, 1\): must be a matrix of shape \(4, 1\)"),
         ((1.0, 2.0, 3.0, 4.0, 5.0), None, "must be a linear plant"),
@@ -252,26 +303,41 @@ def test_what_is_wrong_with_a_plant_is_said(plant: Any, E: Any, message: str) ->
 
 def test_a_zero_at_the_origin_hides_a_constant_disturbance() -> None:
     """It leaves no trace in y, so no ESO can find it."""
-    with pytest.raises(ValueError, match=r"zero at s = 0 \(zeros from u: 0 rad/s\): a constant f leaves no trace"):
+    with pytest.raises(
+        ValueError, match=r"zero at s = 0 \(zeros from u: 0 rad/s\): a constant f leaves no trace"
+    ):
         ESO.model_based(([1.0, 0.0], [1.0, 1.0, 1.0]), omega_o=10.0, dt=1e-3)
 
 
-@pytest.mark.parametrize(("plant", "zeros"), [(([-1.0, 2.0], [1.0, 1.0, 1.0]), "2"), (BESIDE, "±1j")])
-def test_zeros_that_must_not_be_cancelled_are_refused_by_the_law_not_by_the_observer(plant: Any, zeros: str) -> None:
+@pytest.mark.parametrize(
+    ("plant", "zeros"), [(([-1.0, 2.0], [1.0, 1.0, 1.0]), "2"), (BESIDE, "±1j")]
+)
+def test_zeros_that_must_not_be_cancelled_are_refused_by_the_law_not_by_the_observer(
+    plant: Any, zeros: str
+) -> None:
     """An estimate is there to be had; a controller that inverts the plant is not."""
     observer = ESO.model_based(plant, omega_o=10.0, dt=1e-3)
-    with pytest.raises(ValueError, match=f"zeros from u at {zeros} rad/s, not in the left half plane"):
+    with pytest.raises(
+        ValueError, match=f"zeros from u at {zeros} rad/s, not in the left half plane"
+    ):
         ql.ADRC(observer, omega_c=1.0)
 
 
 def test_the_condition_says_how_near_a_plant_is_to_unobservable() -> None:
     """Two states that are seen with almost the same dynamics."""
-    near, far = (canonical((np.diag([-1.0, -1.0 - gap]), [1.0, 2.0], [1.0, 1.0])).condition for gap in (1e-6, 1.0))
+    near, far = (
+        canonical((np.diag([-1.0, -1.0 - gap]), [1.0, 2.0], [1.0, 1.0])).condition
+        for gap in (1e-6, 1.0)
+    )
     assert far < 10.0 < 1e5 < near
 
 
-@pytest.mark.parametrize("zeros", [[-0.1], [-0.5 + 1.0j, -0.5 - 1.0j], [-0.3, -4.0], [-300.0, -1.0]])
-def test_with_its_poles_at_the_zeros_the_observer_shows_f_as_if_there_were_none(zeros: list[complex]) -> None:
+@pytest.mark.parametrize(
+    "zeros", [[-0.1], [-0.5 + 1.0j, -0.5 - 1.0j], [-0.3, -4.0], [-300.0, -1.0]]
+)
+def test_with_its_poles_at_the_zeros_the_observer_shows_f_as_if_there_were_none(
+    zeros: list[complex],
+) -> None:
     """What it shows of f needs as many lags as it has poles at β, of gain one together; a zero faster than omega_o is not kept."""
     plant = (np.poly(zeros).real, np.poly([-1.0, -0.3, 0.5, 0.0]))
     observer = ESO.model_based(plant, omega_o=20.0, dt=2e-3, keep_zeros=True)

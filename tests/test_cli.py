@@ -12,7 +12,13 @@ import pytest
 
 def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own."""
-    return subprocess.run([sys.executable, "-m", "quell.cli", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "quell.cli.app", *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def test_help_and_version_answer(tmp_path: Path) -> None:
@@ -26,7 +32,17 @@ def test_help_and_version_answer(tmp_path: Path) -> None:
 
 def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
     """Tables, JSON in its fixed form, figures as PNG and SVG; without a terminal."""
-    shown = quell("reproduce", "two-mass", "--dt", "0.01", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)
+    shown = quell(
+        "reproduce",
+        "two-mass",
+        "--dt",
+        "0.01",
+        "--json",
+        "out.json",
+        "--figures",
+        "pictures",
+        cwd=tmp_path,
+    )
     assert shown.returncode == 0, shown.stderr
     assert "What the paper claims" in shown.stdout
     assert "nan" not in shown.stdout.lower()
@@ -36,43 +52,93 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
         "MF-ESO", "MB-ESO", "L-ESO", "L-ESO (Algorithm 1)", "MF-ESO (3x bandwidth)", "MB-ESO (3x bandwidth)",
     ]  # fmt: skip
     for scores in result["controllers"].values():
-        assert set(scores) >= {"overshoot", "settling_time", "disturbance_peak", "disturbance_rms", "control_variation"}
+        assert set(scores) >= {
+            "overshoot",
+            "settling_time",
+            "disturbance_peak",
+            "disturbance_rms",
+            "control_variation",
+        }
         assert all(isinstance(value, float) for value in scores.values())
     for claim in result["claims"]:
         assert set(claim) >= {"claim", "paper", "measured", "holds"}
     assert result["settings"]["dt"] == 0.01
     names = {"position", "control", "learning", "algorithm-1"}
-    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
+        f"{n}.{s}" for n in names for s in ("png", "svg")
+    }
 
 
 @pytest.mark.xdist_group("torsional")
 def test_the_torsional_experiment_is_printed_written_and_drawn(tmp_path: Path) -> None:
     """Tables, JSON in the study's form with one entry a pair of bandwidths, figures; without a terminal."""
-    shown = quell("reproduce", "torsional", "--dt", "0.002", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)
+    shown = quell(
+        "reproduce",
+        "torsional",
+        "--dt",
+        "0.002",
+        "--json",
+        "out.json",
+        "--figures",
+        "pictures",
+        cwd=tmp_path,
+    )
     assert shown.returncode == 0, shown.stderr
     assert "nan" not in shown.stdout.lower()
     assert "…" not in shown.stdout, "a column is cut"
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["settings"]["dt"] == 0.002
-    assert [(case["omega_c"], case["omega_o"]) for case in result["cases"]] == [(90.0, 40.0), (40.0, 90.0), (20.0, 90.0)]
+    assert [(case["omega_c"], case["omega_o"]) for case in result["cases"]] == [
+        (90.0, 40.0),
+        (40.0, 90.0),
+        (20.0, 90.0),
+    ]
     for case in result["cases"]:
         for outcome in (case, case["linear"]):
-            assert list(outcome["controllers"]) == ["MF-ESO", "MB-ESO", "L-ESO", "MB-ESO (10 % off)", "L-ESO (guarded)"]
+            assert list(outcome["controllers"]) == [
+                "MF-ESO",
+                "MB-ESO",
+                "L-ESO",
+                "MB-ESO (10 % off)",
+                "L-ESO (guarded)",
+            ]
             for scores in outcome["controllers"].values():
                 assert set(scores) >= {"overshoot", "settling_time", "control_variation"}
-            assert all(set(claim) >= {"claim", "paper", "measured", "holds"} for claim in outcome["claims"])
+            assert all(
+                set(claim) >= {"claim", "paper", "measured", "holds"} for claim in outcome["claims"]
+            )
     names = {"torsional-position", "torsional-control", "torsional-learning"}
-    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in names for s in ("png", "svg")}
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
+        f"{n}.{s}" for n in names for s in ("png", "svg")
+    }
     wrong = quell("reproduce", "torsional", "--dt", "0.01", cwd=tmp_path)
     assert wrong.returncode == 2
-    assert wrong.stderr.strip() == "quell: dt = 0.01: must be from 0.0001 to 0.002 s, as the loops have up to 90 rad/s"
+    assert (
+        wrong.stderr.strip()
+        == "quell: dt = 0.01: must be from 0.0001 to 0.002 s, as the loops have up to 90 rad/s"
+    )
 
 
 def test_the_guards_trial_is_printed_written_and_drawn(tmp_path: Path) -> None:
     """A table a line a kind, JSON, and a figure as PNG and SVG; without a terminal."""
-    shown = quell("stress", "--runs", "12", "--honest", "2", "--seed", "4", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)
+    shown = quell(
+        "stress",
+        "--runs",
+        "12",
+        "--honest",
+        "2",
+        "--seed",
+        "4",
+        "--json",
+        "out.json",
+        "--figures",
+        "pictures",
+        cwd=tmp_path,
+    )
     assert shown.returncode == 0, shown.stderr
-    assert all(kind in shown.stdout for kind in ("opposite sign", "turncoat", "all adversaries", "honest"))
+    assert all(
+        kind in shown.stdout for kind in ("opposite sign", "turncoat", "all adversaries", "honest")
+    )
     assert "…" not in shown.stdout, "a column is cut"
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["settings"]["seed"] == 4
@@ -96,7 +162,9 @@ def test_the_guards_trial_is_printed_written_and_drawn(tmp_path: Path) -> None:
         (("--colour", "red"), "colour"),
     ],
 )
-def test_a_mistake_gives_one_line_and_exit_code_two(arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
+def test_a_mistake_gives_one_line_and_exit_code_two(
+    arguments: tuple[str, ...], message: str, tmp_path: Path
+) -> None:
     """No traceback, nothing written."""
     shown = quell("reproduce", "two-mass", *arguments, cwd=tmp_path)
     assert shown.returncode == 2
@@ -119,7 +187,12 @@ def test_an_old_result_outlives_a_run_that_fails(tmp_path: Path) -> None:
 def test_importing_quell_imports_nothing_heavy() -> None:
     """Numba, scipy, xarray, matplotlib and python-control come when they are used."""
     code = "import sys, quell; print([m for m in ('numba', 'scipy', 'xarray', 'matplotlib', 'control', 'numpy') if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        == "[]"
+    )
 
 
 def test_simulating_imports_neither_plots_nor_files() -> None:
@@ -128,7 +201,12 @@ def test_simulating_imports_neither_plots_nor_files() -> None:
         "import sys, quell as ql; ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0); ql.Trajectory; ql.simulate;"
         "print([m for m in ('xarray', 'matplotlib', 'control', 'rich', 'pydantic') if m in sys.modules])"
     )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        == "[]"
+    )
 
 
 def test_every_public_name_can_be_had() -> None:

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import pytest
 
 import quell as ql
-from quell import cli
-from quell.commands.run_rig import exit_code
-from quell.realtime.supervisor import Cause
+from quell.cli import app as cli
+from quell.cli.commands.run_rig import exit_code
+from quell.realtime.loop.supervisor import Cause
 from quell.setup import EXAMPLES, load
 
 SHORT = """
@@ -53,7 +53,9 @@ class Shown(NamedTuple):
 
 
 @pytest.fixture
-def quell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Shown]:
+def quell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Shown]:
     """Run the command in this process, in a folder of its own."""
 
     def run(*arguments: str) -> Shown:
@@ -62,7 +64,9 @@ def quell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
         code = 0
         try:
             with monkeypatch.context() as quietly:
-                quietly.setattr(cli, "app", partial(cli.app, list(arguments)))  # told apart from the runner's own arguments
+                quietly.setattr(
+                    cli, "app", partial(cli.app, list(arguments))
+                )  # told apart from the runner's own arguments
                 cli.main()
         except SystemExit as ended:
             code = int(ended.code or 0)
@@ -71,10 +75,14 @@ def quell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     return run
 
 
-def test_a_setup_is_simulated_printed_written_drawn_and_saved(quell: Callable[..., Shown], tmp_path: Path) -> None:
+def test_a_setup_is_simulated_printed_written_drawn_and_saved(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """What is written is what ``simulate`` gives for what the file describes."""
     (tmp_path / "short.toml").write_text(SHORT)
-    shown = quell("run", "short.toml", "--json", "out.json", "--figures", "pictures", "--save", "run.nc")
+    shown = quell(
+        "run", "short.toml", "--json", "out.json", "--figures", "pictures", "--save", "run.nc"
+    )
     assert shown.code == 0, shown.err
     assert "A short run: two-mass-spring, dt = 0.01 s" in shown.out
     setup = load(tmp_path / "short.toml")
@@ -82,7 +90,10 @@ def test_a_setup_is_simulated_printed_written_drawn_and_saved(quell: Callable[..
     saved = ql.Trajectory.load(tmp_path / "run.nc")
     assert (saved.log == run.log).all()
     result = json.loads((tmp_path / "out.json").read_text())
-    assert [(score["start"], score["stop"]) for score in result["metrics"]] == [(0.0, 8.0), (8.0, 12.0)]
+    assert [(score["start"], score["stop"]) for score in result["metrics"]] == [
+        (0.0, 8.0),
+        (8.0, 12.0),
+    ]
     assert result["metrics"][1]["rms"] == run.metrics(8.0)["rms"]
     assert result["setup"]["observer"]["omega_o"] == 10.0
     assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"short.png", "short.svg"}
@@ -92,12 +103,20 @@ def test_a_setup_is_simulated_printed_written_drawn_and_saved(quell: Callable[..
     ("more", "message"),
     [
         ("[guard]\nbond = 1.0", "quell: wrong.toml: guard.bond: unknown; did you mean bound?"),
-        ("[guard]\nbound = 'x'\n[learner]\nkind = 'kallman'", "quell: wrong.toml: learner.kind = 'kallman': unknown; did you mean kalman?"),
+        (
+            "[guard]\nbound = 'x'\n[learner]\nkind = 'kallman'",
+            "quell: wrong.toml: learner.kind = 'kallman': unknown; did you mean kalman?",
+        ),
         ("[guard", "quell: wrong.toml: not TOML"),
-        ("[[metrics]]\nstart = 30.0", "quell: wrong.toml: metrics[2].start = 30: must be less than the scenario's duration, 12 s"),
+        (
+            "[[metrics]]\nstart = 30.0",
+            "quell: wrong.toml: metrics[2].start = 30: must be less than the scenario's duration, 12 s",
+        ),
     ],
 )
-def test_each_mistake_gives_a_line_and_exit_code_two(more: str, message: str, quell: Callable[..., Shown], tmp_path: Path) -> None:
+def test_each_mistake_gives_a_line_and_exit_code_two(
+    more: str, message: str, quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """No traceback, no figure, no file."""
     (tmp_path / "wrong.toml").write_text(SHORT + more)
     shown = quell("run", "wrong.toml", "--json", "out.json")
@@ -109,7 +128,9 @@ def test_each_mistake_gives_a_line_and_exit_code_two(more: str, message: str, qu
 
 def test_a_run_that_diverges_says_so(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """Windows that it did not reach have no metrics; it is no mistake in the file, and the exit code is zero."""
-    (tmp_path / "wild.toml").write_text(SHORT.replace("b0 = 1.0", "b0 = -1.0").replace("start = 8.0", "start = 11.5"))
+    (tmp_path / "wild.toml").write_text(
+        SHORT.replace("b0 = 1.0", "b0 = -1.0").replace("start = 8.0", "start = 11.5")
+    )
     shown = quell("run", "wild.toml", "--json", "out.json", "--no-figures")
     assert shown.code == 0, shown.err
     result = json.loads((tmp_path / "out.json").read_text())
@@ -143,24 +164,45 @@ duration = 0.5
 def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """From a twin in this process to tables, JSON, figures and a recording, and from that through the controller once more."""
     (tmp_path / "rig.toml").write_text(RIG)
-    places = ("--json", "out.json", "--figures", "pictures", "--mcap", "run.mcap", "--csv", "run.csv", "--save", "run.nc")
+    places = (
+        "--json",
+        "out.json",
+        "--figures",
+        "pictures",
+        "--mcap",
+        "run.mcap",
+        "--csv",
+        "run.csv",
+        "--save",
+        "run.nc",
+    )
     shown = quell("run-rig", "rig.toml", "--seconds", "0.3", "--omega-c", "1.5", *places)
     assert shown.code == 0, shown.err
-    for told in ("the scenario is over", "p99.9", "lateness", "overruns", "ordinary scheduling, as asked for by priority 0"):
+    for told in (
+        "the scenario is over",
+        "p99.9",
+        "lateness",
+        "overruns",
+        "ordinary scheduling, as asked for by priority 0",
+    ):
         assert told in shown.out
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["completed"]
     assert result["setup"]["controller"]["omega_c"] == 1.5
     assert result["tally"]["cycles"] > 40
     assert set(result["timing"]["lateness"]) == {"p50", "p99", "p99.9", "max"}
-    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {f"{n}.{s}" for n in ("rig", "timing") for s in ("png", "svg")}
+    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {
+        f"{n}.{s}" for n in ("rig", "timing") for s in ("png", "svg")
+    }
     run = ql.Trajectory.load(tmp_path / "run.nc")
     assert run.ended == pytest.approx(0.3)
     again = quell("replay", "run.mcap", "rig.toml", "--json", "replay.json", "--no-figures")
     assert again.code == 0, again.err
     replayed = json.loads((tmp_path / "replay.json").read_text())
     assert set(replayed["scores"]) == {"recorded", "replayed"}
-    assert quell("replay", "run.mcap", "rig.toml", "--no-figures").out.startswith(again.out.split("Results")[0])
+    assert quell("replay", "run.mcap", "rig.toml", "--no-figures").out.startswith(
+        again.out.split("Results")[0]
+    )
     twice = quell("run-rig", "rig.toml", "--mcap", "run.mcap")
     assert (twice.code, twice.err) == (
         2,
@@ -184,28 +226,59 @@ def test_each_way_to_end_has_its_exit_code() -> None:
     """0 for a run to its end, 130 where it was asked to stop, by whatever signal, 3 for all else."""
 
     def ended(cause: Cause) -> int:
-        run = SimpleNamespace(completed=cause is Cause.OVER, changes=(SimpleNamespace(cause=cause), SimpleNamespace(cause=Cause.RAMPED)))
+        run = SimpleNamespace(
+            completed=cause is Cause.OVER,
+            changes=(SimpleNamespace(cause=cause), SimpleNamespace(cause=Cause.RAMPED)),
+        )
         return exit_code(run)  # type: ignore[arg-type]
 
     assert ended(Cause.OVER) == 0
     assert {ended(cause) for cause in (Cause.ASKED, Cause.AT_ONCE)} == {130}
-    assert {ended(cause) for cause in (Cause.LOST, Cause.STALLED, Cause.ERROR, Cause.F_HAT, Cause.SILENT, Cause.WATCHDOG)} == {3}
+    assert {
+        ended(cause)
+        for cause in (
+            Cause.LOST,
+            Cause.STALLED,
+            Cause.ERROR,
+            Cause.F_HAT,
+            Cause.SILENT,
+            Cause.WATCHDOG,
+        )
+    } == {3}
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("settle = 10", "settle = 0", "rig.safety.settle = 0: must be a whole number of at least 1"),
+        (
+            "settle = 10",
+            "settle = 0",
+            "rig.safety.settle = 0: must be a whole number of at least 1",
+        ),
         ("settle = 10", "setle = 10", "rig.safety.setle: unknown; did you mean settle?"),
-        ("twin:two-mass", "twin:two-masses", "rig.device = 'two-masses': must be one of torsional, torsional-identified, two-mass"),
+        (
+            "twin:two-mass",
+            "twin:two-masses",
+            "rig.device = 'two-masses': must be one of torsional, torsional-identified, two-mass",
+        ),
         ("twin:two-mass", "tcp://x", "rig.device = 'tcp://x': must be like udp://"),
-        ("priority = 0", "priority = 100", "rig.priority = 100: must be a whole number from 0 to 99"),
+        (
+            "priority = 0",
+            "priority = 100",
+            "rig.priority = 100: must be a whole number from 0 to 99",
+        ),
         ("u_max = 2.0", "", "rig: u_min = -2.0, u_max = inf: must be finite for a real device"),
         ("[scenario]", "[prefilter]\nkind = 'zv'\n[scenario]", "prefilter.omega: missing"),
-        ("duration = 0.5", "duration = 0.5\nrest_at = [0.2]", "rig: rest_at = (0.2,): a plant of metal can't be put back to rest"),
+        (
+            "duration = 0.5",
+            "duration = 0.5\nrest_at = [0.2]",
+            "rig: rest_at = (0.2,): a plant of metal can't be put back to rest",
+        ),
     ],
 )
-def test_what_no_rig_can_be_run_with_is_told(old: str, new: str, message: str, quell: Callable[..., Shown], tmp_path: Path) -> None:
+def test_what_no_rig_can_be_run_with_is_told(
+    old: str, new: str, message: str, quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """Before the loop begins, with the file and the key in front."""
     (tmp_path / "rig.toml").write_text(RIG.replace(old, new))
     shown = quell("run-rig", "rig.toml", "--no-figures")
@@ -214,26 +287,41 @@ def test_what_no_rig_can_be_run_with_is_told(old: str, new: str, message: str, q
     assert len(shown.err.splitlines()) == 1
 
 
-def test_the_examples_are_printed_and_can_be_used(quell: Callable[..., Shown], tmp_path: Path) -> None:
+def test_the_examples_are_printed_and_can_be_used(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """To be changed and run; without a file there is nothing to simulate."""
     for command, name in (("run", "two_mass.toml"), ("run-rig", "torsional_rig.toml")):
         assert quell(command, "--example").out == (EXAMPLES / name).read_text()
     assert load(EXAMPLES / "torsional_rig.toml").rig["device"] == "udp://127.0.0.1:5005"
-    assert quell("run").err == "quell: setup: missing; must be a TOML file, and quell run --example prints one\n"
+    assert (
+        quell("run").err
+        == "quell: setup: missing; must be a TOML file, and quell run --example prints one\n"
+    )
     (tmp_path / "short.toml").write_text(SHORT)
-    assert quell("run-rig", "short.toml").err == "quell: short.toml: rig: missing; give a table [rig]\n"
+    assert (
+        quell("run-rig", "short.toml").err
+        == "quell: short.toml: rig: missing; give a table [rig]\n"
+    )
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_run_that_is_ended_while_it_is_compiled_gives_the_device_free(
-    number: int, code: int, quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    number: int,
+    code: int,
+    quell: Callable[..., Shown],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """At once, with a line; what stood before minds the signal again."""
     closed: list[bool] = []
     device = SimpleNamespace(close=lambda: closed.append(True))
-    monkeypatch.setattr("quell.commands.run_rig.open_device", lambda url, dt: device)
-    monkeypatch.setattr("quell.commands.run_rig.run_rig", lambda *arguments, **options: os.kill(os.getpid(), number))
-    monkeypatch.setattr("quell.commands.ending.os._exit", sys.exit)  # which would end this process
+    monkeypatch.setattr("quell.cli.commands.run_rig.open_device", lambda url, dt: device)
+    monkeypatch.setattr(
+        "quell.cli.commands.run_rig.run_rig",
+        lambda *arguments, **options: os.kill(os.getpid(), number),
+    )
+    monkeypatch.setattr("quell.cli.interrupt.os._exit", sys.exit)  # which would end this process
     before = signal.getsignal(number)
     (tmp_path / "rig.toml").write_text(RIG)
     shown = quell("run-rig", "rig.toml", "--no-figures")
@@ -249,7 +337,9 @@ sys.modules["serial"] = None
 from quell.cli import main
 sys.argv = ["quell", "run-rig", "--device", "serial:///dev/none", "--no-figures"]
 main()"""
-    tried = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    tried = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert tried.returncode == 2
     assert tried.stderr.startswith("quell: pyserial is needed")
     assert tried.stderr.count("\n") == 1

@@ -12,37 +12,54 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.cli import app
-from quell.experiments import compare, compare_figure
-from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
+from quell.cli.app import app
+from quell.experiments.compare import figures as compare_figure
+from quell.experiments.compare import study as compare
+from quell.experiments.compare.study import FORCE, FORCE_AT, Benchmark
 
 LAG = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
 
 
 def test_any_controllers_on_any_plant_are_judged_alike() -> None:
     """Each run is that of ``simulate``; the scores are what closed forms say: PI that cancels the lag leaves a lag of 1/4 s."""
-    scenario = ql.Scenario(reference=1.0, disturbances=(ql.signals.Step(at=5.0, height=0.5),), duration=10.0)
+    scenario = ql.Scenario(
+        reference=1.0, disturbances=(ql.signals.Step(at=5.0, height=0.5),), duration=10.0
+    )
     some = {
         "PI": ql.baselines.PID(4.0, 4.0, dt=1e-3),
         "ADRC": ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 0.005), 4.0),
         "P": ql.baselines.PID(1.0, dt=1e-3),
     }
     result = compare.compare(LAG, some, scenario, load_at=5.0)
-    np.testing.assert_array_equal(result.runs["ADRC"].log, ql.simulate(LAG, some["ADRC"], scenario).log)
+    np.testing.assert_array_equal(
+        result.runs["ADRC"].log, ql.simulate(LAG, some["ADRC"], scenario).log
+    )
     pi = result.scores["PI"]
     assert pi["overshoot"] == pytest.approx(0.0, abs=1e-9)
     assert pi["settling_time"] == pytest.approx(-math.log(0.02) / 4.0, abs=5e-3)
     # A load through s/((s + 1)(s + 4)): its peak under 0.5.
     peak_at = math.log(4.0) / 3.0
-    assert pi["disturbance_peak"] == pytest.approx(0.5 / 3.0 * (math.exp(-peak_at) - math.exp(-4.0 * peak_at)), rel=1e-3)
+    assert pi["disturbance_peak"] == pytest.approx(
+        0.5 / 3.0 * (math.exp(-peak_at) - math.exp(-4.0 * peak_at)), rel=1e-3
+    )
     assert result.scores["P"]["settling_time"] is None
     assert result.scores["P"]["disturbance_peak"] == pytest.approx(0.5, abs=1e-2)
-    assert set(result.to_json()["controllers"]["P"]) >= {"overshoot", "settling_time", "rms", "control_variation", "status", "diverged"}
+    assert set(result.to_json()["controllers"]["P"]) >= {
+        "overshoot",
+        "settling_time",
+        "rms",
+        "control_variation",
+        "status",
+        "diverged",
+    }
 
 
 def test_a_run_that_diverges_is_shown_as_one() -> None:
     """No number where there is none; the others are judged as ever, and the figure is drawn."""
-    some = {"wrong sign": ql.baselines.PID(-40.0, dt=0.01), "right": ql.baselines.PID(4.0, 4.0, dt=0.01)}
+    some = {
+        "wrong sign": ql.baselines.PID(-40.0, dt=0.01),
+        "right": ql.baselines.PID(4.0, 4.0, dt=0.01),
+    }
     result = compare.compare(LAG, some, ql.Scenario(reference=1.0, duration=5.0))
     assert result.runs["wrong sign"].diverged
     assert set(result.scores["wrong sign"].values()) == {None}
@@ -71,10 +88,22 @@ def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (lambda: compare.compare(LAG, {}, ql.Scenario()), "controllers is empty: must have at least one"),
-        (lambda: compare.compare(LAG, {"P": 1}, ql.Scenario(), load_at=11.0), "load_at = 11.0: must lie within .0, duration = 10.0."),
-        (lambda: compare.compare(LAG, {"P": 1}, ql.Scenario()), "controller = 1: must be a controller"),
-        (lambda: compare.controller("pdi", 0.01), "controllers: 'pdi' must be one of mf-eso, mb-eso"),
+        (
+            lambda: compare.compare(LAG, {}, ql.Scenario()),
+            "controllers is empty: must have at least one",
+        ),
+        (
+            lambda: compare.compare(LAG, {"P": 1}, ql.Scenario(), load_at=11.0),
+            "load_at = 11.0: must lie within .0, duration = 10.0.",
+        ),
+        (
+            lambda: compare.compare(LAG, {"P": 1}, ql.Scenario()),
+            "controller = 1: must be a controller",
+        ),
+        (
+            lambda: compare.controller("pdi", 0.01),
+            "controllers: 'pdi' must be one of mf-eso, mb-eso",
+        ),
         (lambda: compare.controller("zv+zv+pid", 0.01), "controllers: 'zv.zv.pid' must be one of"),
         (lambda: Benchmark(dt=0.2), "dt = 0.2: must be at most 0.1 s"),
         (lambda: Benchmark(u_max=0.0), "u_max = 0.0: must be greater than zero"),
@@ -90,7 +119,13 @@ def test_a_mistake_is_named(wrong: object, message: str) -> None:
 
 def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own."""
-    return subprocess.run([sys.executable, "-m", "quell.cli", "compare", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "quell.cli.app", "compare", *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
@@ -104,7 +139,11 @@ def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
         app(["compare", "--k", "0.5", "--dt", "0.01", "--controllers", ",".join(names), *where])
     shown = capsys.readouterr().out
     assert "…" not in shown, "a column is cut"
-    lines = {line.split()[0]: line.split() for line in shown.splitlines() if line.split() and line.split()[0] in names}
+    lines = {
+        line.split()[0]: line.split()
+        for line in shown.splitlines()
+        if line.split() and line.split()[0] in names
+    }
     assert list(lines) == names
     assert "[%]" in shown
     assert "[m]" in shown, "a unit is taken for markup"
@@ -112,21 +151,45 @@ def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     assert lines["pi-notch"][-1] == "unstable"
     assert lines["pid"][-1] == "ok"
     assert "diverged" in lines["lqg"]
-    stable = {name: told["stable"] for name, told in json.loads((tmp_path / "out.json").read_text())["controllers"].items()}
-    assert stable == {name: name == "pid" for name in names} | {"resonance-ratio": lines["resonance-ratio"][-1] == "ok"}
+    stable = {
+        name: told["stable"]
+        for name, told in json.loads((tmp_path / "out.json").read_text())["controllers"].items()
+    }
+    assert stable == {name: name == "pid" for name in names} | {
+        "resonance-ratio": lines["resonance-ratio"][-1] == "ok"
+    }
 
 
 def test_the_comparison_is_printed_written_and_drawn(tmp_path: Path) -> None:
     """A table a line a controller, JSON, a figure as PNG and SVG; a mistake is one line, and nothing is written."""
     shown = quell(
-        "--dt", "0.01", "--k", "1.2", "--u-max", "1", "--controllers", "lqg, pid", "--json", "out.json", "--figures", "p", cwd=tmp_path
+        "--dt",
+        "0.01",
+        "--k",
+        "1.2",
+        "--u-max",
+        "1",
+        "--controllers",
+        "lqg, pid",
+        "--json",
+        "out.json",
+        "--figures",
+        "p",
+        cwd=tmp_path,
     )
     assert shown.returncode == 0, shown.stderr
     assert "lqg" in shown.stdout
     assert "…" not in shown.stdout, "a column is cut"
     assert "nan" not in shown.stdout.lower()
     result = json.loads((tmp_path / "out.json").read_text())
-    assert result["settings"] == {"m1": 1.0, "m2": 1.0, "k": 1.2, "dt": 0.01, "seed": 0, "u_max": 1.0}
+    assert result["settings"] == {
+        "m1": 1.0,
+        "m2": 1.0,
+        "k": 1.2,
+        "dt": 0.01,
+        "seed": 0,
+        "u_max": 1.0,
+    }
     assert list(result["controllers"]) == ["lqg", "pid"]
     assert {p.name for p in (tmp_path / "p").iterdir()} == {"compare.png", "compare.svg"}
     wrong = quell("--controllers", "lqg,nonsense", "--json", "other.json", cwd=tmp_path)

@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.dispatch import interpreted
-from quell.realtime import frames
-from quell.realtime.clock import system_clock, virtual_clock
-from quell.realtime.device import Device, PythonLine, fetch, line_of, put
-from quell.realtime.devices import listen, open_device
-from quell.realtime.faults import KINDS, Fault, Relay, Spoiler, random_faults
-from quell.realtime.rig import serve
-from quell.realtime.server import Rig
-from quell.realtime.shared import SharedDevice
-from quell.realtime.twin import TwinDevice
-from quell.realtime.udp import UdpDevice
+from quell.kernels.dispatch import interpreted
+from quell.realtime.devices.base import Device, PythonLine, fetch, line_of, put
+from quell.realtime.devices.registry import listen, open_device
+from quell.realtime.devices.twin import TwinDevice
+from quell.realtime.rig.fault_injection import KINDS, Fault, Relay, Spoiler, random_faults
+from quell.realtime.rig.kernel import serve
+from quell.realtime.rig.server import Rig
+from quell.realtime.system.clock import system_clock, virtual_clock
+from quell.realtime.wire import frames
+from quell.realtime.wire.shared_memory import SharedDevice
+from quell.realtime.wire.udp import UdpDevice
 
 DT = 0.01
 PLANT = ql.plants.two_mass_spring()
@@ -38,7 +38,15 @@ def url_of(wire: str) -> str:
     return "udp://127.0.0.1:0" if wire == "udp" else f"shm://test-{uuid.uuid4().hex}"
 
 
-def packed(kind: int, number: int, answers: int, value: float, *, session: int = 0x5EED0001, version: int = 1) -> bytes:
+def packed(
+    kind: int,
+    number: int,
+    answers: int,
+    value: float,
+    *,
+    session: int = 0x5EED0001,
+    version: int = 1,
+) -> bytes:
     """Return a frame, made without the package."""
     head = struct.pack("<2sBBIIIqdI", b"QL", version, kind, session, number, answers, 0, value, 0)
     return head + struct.pack("<I", zlib.crc32(head))
@@ -53,13 +61,23 @@ class Bench:
         self.rig.prepare()
         self.url = self.rig.listener.url
 
-    def open(self, url: str = "", dt: float = DT, timeout: float = 30.0, meanwhile: Callable[[], Any] = lambda: None) -> Any:
+    def open(
+        self,
+        url: str = "",
+        dt: float = DT,
+        timeout: float = 30.0,
+        meanwhile: Callable[[], Any] = lambda: None,
+    ) -> Any:
         """Return a device; the rig ticks until it is open, or has failed."""
         made: list[Any] = []
 
         def work() -> None:
             try:
-                made.append((UdpDevice if self.url.startswith("udp") else SharedDevice)(url or self.url, dt, timeout))
+                made.append(
+                    (UdpDevice if self.url.startswith("udp") else SharedDevice)(
+                        url or self.url, dt, timeout
+                    )
+                )
             except Exception as error:
                 made.append(error)
 
@@ -105,10 +123,14 @@ def bench() -> Iterator[Callable[..., Bench]]:
 # In process ---------------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("plant", [PLANT, ql.plants.delayed(PLANT, 2 * DT, DT)], ids=lambda plant: plant.name)
+@pytest.mark.parametrize(
+    "plant", [PLANT, ql.plants.delayed(PLANT, 2 * DT, DT)], ids=lambda plant: plant.name
+)
 def test_the_twin_in_process_is_the_simulated_plant(plant: Any) -> None:
     """Bit for bit: what it measures is what the simulation has measured under the same u."""
-    controller = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT), omega_c=1.0, u_min=-3.0, u_max=3.0)
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT), omega_c=1.0, u_min=-3.0, u_max=3.0
+    )
     run = ql.simulate(plant, controller, ql.Scenario(reference=1.0, duration=5.0))
     twin = TwinDevice(plant, DT)
     assert isinstance(twin, Device)
@@ -129,7 +151,10 @@ def test_a_twin_of_a_plant_in_python_is_used_through_python() -> None:
             assert interpret
             return PLANT.sampled(dt)
 
-    slow, quick = TwinDevice(Slow(), DT, x0=[0.1, 0.2, 0.0, 0.0]), TwinDevice(PLANT, DT, x0=[0.1, 0.2, 0.0, 0.0])
+    slow, quick = (
+        TwinDevice(Slow(), DT, x0=[0.1, 0.2, 0.0, 0.0]),
+        TwinDevice(PLANT, DT, x0=[0.1, 0.2, 0.0, 0.0]),
+    )
     assert isinstance(line_of(slow), PythonLine)
     for _ in range(20):
         assert slow.read() == pytest.approx(quick.read(), rel=1e-12)
@@ -181,8 +206,12 @@ def test_a_controller_over_the_wire_does_as_in_the_simulation(bench: Callable[..
     """To the last digits: they hang on how the controller was compiled."""
     here = bench("udp")
     device = here.open()
-    controller = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT), omega_c=1.0, u_min=-3.0, u_max=3.0)
-    run = ql.simulate(ql.plants.delayed(PLANT, DT, DT), controller, ql.Scenario(reference=1.0, duration=5.0))
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT), omega_c=1.0, u_min=-3.0, u_max=3.0
+    )
+    run = ql.simulate(
+        ql.plants.delayed(PLANT, DT, DT), controller, ql.Scenario(reference=1.0, duration=5.0)
+    )
     measured = here.cycle(device, lambda y: controller.step(1.0, y), run["y"].size)
     assert np.max(np.abs(run["y"])) > 0.3
     np.testing.assert_allclose(measured, run["y"], atol=1e-10)
@@ -256,7 +285,9 @@ def test_a_session_that_never_begins_gives_way(bench: Callable[..., Bench]) -> N
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(wire: str, bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(
+    wire: str, bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Over UDP a frame may not arrive, in shared memory the hello may take its place: the goodbye is said again, and the rig serves."""
     here = bench(wire)
     device, said = here.open(), []
@@ -281,7 +312,9 @@ def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(wire: str, bench: Call
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_a_hello_that_is_heard_when_its_loop_has_gone_begins_nothing(wire: str, bench: Callable[..., Bench]) -> None:
+def test_a_hello_that_is_heard_when_its_loop_has_gone_begins_nothing(
+    wire: str, bench: Callable[..., Bench]
+) -> None:
     """The rig was not ready yet, the loop gave up: the next one finds the rig free."""
     here = bench(wire)
     with pytest.raises(ConnectionError, match="no device answers"):
@@ -315,13 +348,18 @@ def test_a_rig_with_long_ticks_need_not_be_waited_for(bench: Callable[..., Bench
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is full")
 def test_a_rig_goes_on_without_its_log_where_the_disk_is_full() -> None:
     """And says so."""
-    with closing(listen(url_of("shm"))) as listener, Rig(PLANT, DT, listener, log="/dev/full") as rig:
+    with (
+        closing(listen(url_of("shm"))) as listener,
+        Rig(PLANT, DT, listener, log="/dev/full") as rig,
+    ):
         notes = rig.run(10 * DT)
         assert rig.counters["ticks"] == 10
     assert "the log was given up: No space left on device" in notes
 
 
-def test_a_rig_does_not_hide_what_went_wrong_on_its_thread(bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rig_does_not_hide_what_went_wrong_on_its_thread(
+    bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It comes out of run."""
     here = bench("shm")
 
@@ -376,7 +414,9 @@ def test_the_rig_has_a_limit_of_its_own(bench: Callable[..., Bench], tmp_path: P
 
 
 @pytest.mark.parametrize("rest", [True, False])
-def test_a_session_starts_from_rest_or_where_the_last_one_ended(rest: bool, bench: Callable[..., Bench]) -> None:
+def test_a_session_starts_from_rest_or_where_the_last_one_ended(
+    rest: bool, bench: Callable[..., Bench]
+) -> None:
     """As was asked for."""
     here = bench("shm", rest=rest)
     device = here.open()
@@ -491,7 +531,9 @@ def test_a_rig_says_what_is_wrong_with_its_settings(settings: dict[str, Any], me
 # What goes wrong ----------------------------------------------------------------------------------------------------------------------
 
 
-def test_garbage_is_counted_and_changes_nothing(bench: Callable[..., Bench], rng: np.random.Generator) -> None:
+def test_garbage_is_counted_and_changes_nothing(
+    bench: Callable[..., Bench], rng: np.random.Generator
+) -> None:
     """At the rig, from real sockets: the loop does not notice."""
     here = bench("udp")
     device = here.open()
@@ -506,7 +548,11 @@ def test_garbage_is_counted_and_changes_nothing(bench: Callable[..., Bench], rng
         other,
         packed(9, 1, 1, 0.0, session=77),
     ]
-    foreign += [packed(frames.GOODBYE, 0, 0, 0.0, session=77), packed(frames.HELLO, 0, 0, DT, session=0), packed(1, 1, 1, 0.0, version=3)]
+    foreign += [
+        packed(frames.GOODBYE, 0, 0, 0.0, session=77),
+        packed(frames.HELLO, 0, 0, DT, session=0),
+        packed(1, 1, 1, 0.0, version=3),
+    ]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for _ in range(5):
             for data in foreign:
@@ -534,7 +580,10 @@ def test_a_session_that_is_over_does_not_come_back(bench: Callable[..., Bench]) 
     host, _, port = here.url.removeprefix("udp://").partition(":")
     before = here.rig.counters["session"]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as late:
-        for data in (packed(frames.HELLO, 0, 0, DT, session=session), packed(frames.COMMAND, 9, 3, 5.0, session=session)):
+        for data in (
+            packed(frames.HELLO, 0, 0, DT, session=session),
+            packed(frames.COMMAND, 9, 3, 5.0, session=session),
+        ):
             late.sendto(data, (host, int(port)))
     here.rig.tick()
     assert here.rig.state == "idle"
@@ -587,7 +636,9 @@ def test_a_fault_does_what_its_name_says(fault: Fault, expected: list[int]) -> N
     """Frames one to six go in; hello passes, and is not counted."""
     spoiler = Spoiler([fault], "rig")
     assert spoiler.frames(packed(frames.HELLO, 0, 0, DT)) == [packed(frames.HELLO, 0, 0, DT)]
-    out = [frame for k in range(1, 7) for frame in spoiler.frames(packed(frames.COMMAND, k, k, 0.0))]
+    out = [
+        frame for k in range(1, 7) for frame in spoiler.frames(packed(frames.COMMAND, k, k, 0.0))
+    ]
     assert [struct.unpack_from("<I", frame, 8)[0] for frame in out] == expected
 
 
@@ -622,7 +673,9 @@ def test_random_plans_have_all_kinds_and_are_the_same_again() -> None:
     assert {fault.kind for fault in plan} == set(KINDS)
 
 
-def test_through_a_relay_every_fault_is_counted_and_no_wrong_number_gets_through(bench: Callable[..., Bench]) -> None:
+def test_through_a_relay_every_fault_is_counted_and_no_wrong_number_gets_through(
+    bench: Callable[..., Bench],
+) -> None:
     """Both ways; what was lost is missed, what was spoiled is refused, and the rig applies nothing that was not commanded."""
     here = bench("udp", watchdog=30)
     plan = [

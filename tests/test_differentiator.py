@@ -7,9 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quell.controllers.differentiator import TrackingDesign, TrackingDifferentiator, TrackingMemory, fhan
-from quell.controllers.prefilter import prefilter
-from quell.dispatch import compiled, interpreted
+from quell.controllers.prefilters.differentiator import (
+    TrackingDesign,
+    TrackingDifferentiator,
+    TrackingMemory,
+    fhan,
+)
+from quell.controllers.prefilters.prefilter import prefilter
+from quell.kernels.dispatch import compiled, interpreted
 from quell.types import Matrix, Vector
 
 
@@ -21,7 +26,9 @@ def follow(design: TrackingDesign, memory: TrackingMemory, r: Vector, v: Matrix)
         v[k, 1] = memory.v[1]
 
 
-def profile(acceleration: float, dt: float, r: np.ndarray, horizon: float | None = None) -> np.ndarray:
+def profile(
+    acceleration: float, dt: float, r: np.ndarray, horizon: float | None = None
+) -> np.ndarray:
     """Return v_1 and v_2 for a reference, from rest at zero."""
     differentiator, v = TrackingDifferentiator(acceleration, horizon), np.empty((r.size, 2))
     design = differentiator.design(dt)
@@ -29,8 +36,14 @@ def profile(acceleration: float, dt: float, r: np.ndarray, horizon: float | None
     return v
 
 
-@given(size=st.floats(0.01, 100.0), acceleration=st.floats(0.1, 100.0), dt=st.sampled_from([1e-3, 1e-2]))
-def test_a_step_is_followed_in_the_least_time_without_overshoot(size: float, acceleration: float, dt: float) -> None:
+@given(
+    size=st.floats(0.01, 100.0),
+    acceleration=st.floats(0.1, 100.0),
+    dt=st.sampled_from([1e-3, 1e-2]),
+)
+def test_a_step_is_followed_in_the_least_time_without_overshoot(
+    size: float, acceleration: float, dt: float
+) -> None:
     """Half the way at +r_0, half at −r_0: ``2 √(size/r_0)``, and four samples more at the most; beyond r it goes by r_0 h² at the most."""
     shortest = 2.0 * np.sqrt(size / acceleration)
     v = profile(acceleration, dt, np.full(round(1.5 * shortest / dt) + 40, size))
@@ -52,7 +65,9 @@ def test_the_second_output_is_the_derivative_of_the_first() -> None:
 def test_a_longer_horizon_filters_noise() -> None:
     """The derivative of a noisy reference: ten samples of horizon let a third of it through, or less."""
     noisy = 1e-3 * np.random.default_rng(2).normal(size=5000)
-    rough, smooth = (float(np.std(profile(20.0, 1e-3, noisy, horizon)[:, 1])) for horizon in (None, 1e-2))
+    rough, smooth = (
+        float(np.std(profile(20.0, 1e-3, noisy, horizon)[:, 1])) for horizon in (None, 1e-2)
+    )
     assert smooth < 0.33 * rough
 
 
@@ -67,9 +82,15 @@ def test_it_is_a_kernel_and_the_same_interpreted() -> None:
 
 @pytest.mark.parametrize(
     ("acceleration", "horizon", "dt", "message"),
-    [(0.0, None, 0.01, "acceleration = 0.0"), (1.0, -1.0, 0.01, "horizon = -1.0"), (1.0, 0.005, 0.01, "at least a sample")],
+    [
+        (0.0, None, 0.01, "acceleration = 0.0"),
+        (1.0, -1.0, 0.01, "horizon = -1.0"),
+        (1.0, 0.005, 0.01, "at least a sample"),
+    ],
 )
-def test_bad_input_is_named(acceleration: float, horizon: float | None, dt: float, message: str) -> None:
+def test_bad_input_is_named(
+    acceleration: float, horizon: float | None, dt: float, message: str
+) -> None:
     """Argument, value and rule."""
     with pytest.raises(ValueError, match=message):
         TrackingDifferentiator(acceleration, horizon).design(dt)

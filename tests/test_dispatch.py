@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numba.core.errors import NumbaError
 
-from quell import dispatch
+from quell.kernels import dispatch
 
 
 class Circle(NamedTuple):
@@ -63,7 +63,11 @@ def test_the_type_of_the_first_argument_chooses_the_implementation() -> None:
 
 def test_compiled_and_interpreted_code_agree() -> None:
     """The same functions give the same numbers both ways."""
-    assert total(Circle(1.0), Square(3.0)) == dispatch.interpreted(total)(Circle(1.0), Square(3.0)) == 21.0
+    assert (
+        total(Circle(1.0), Square(3.0))
+        == dispatch.interpreted(total)(Circle(1.0), Square(3.0))
+        == 21.0
+    )
 
 
 def test_a_type_without_implementation_is_named_in_the_error() -> None:
@@ -96,7 +100,11 @@ def count_corners(one: Any, other: Any) -> int:
 
 def test_what_is_registered_for_object_serves_all_types_without_their_own() -> None:
     """Compiled and interpreted alike."""
-    assert count_corners(Circle(1.0), Square(1.0)) == dispatch.interpreted(count_corners)(Circle(1.0), Square(1.0)) == 4
+    assert (
+        count_corners(Circle(1.0), Square(1.0))
+        == dispatch.interpreted(count_corners)(Circle(1.0), Square(1.0))
+        == 4
+    )
 
 
 def test_a_second_call_with_the_same_types_does_not_compile_again() -> None:
@@ -113,7 +121,9 @@ def test_compiled_code_cannot_allocate() -> None:
         allocates(np.ones(3))
 
 
-def test_the_cache_lies_where_numba_is_told_and_is_named_after_the_sources(monkeypatch: Any, tmp_path: Any) -> None:
+def test_the_cache_lies_where_numba_is_told_and_is_named_after_the_sources(
+    monkeypatch: Any, tmp_path: Any
+) -> None:
     """``NUMBA_CACHE_DIR`` is respected; the name holds a hash, so that an edit starts a new cache."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     path = dispatch.cache_path.__wrapped__()
@@ -166,7 +176,11 @@ print(abs(runs[0]["y"] - runs[1]["y"]).max() < 1e-9, runs[0]["y"][-1])
         (tmp_path / "mine.py").write_text(module.replace("RATE", rate))
         environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
         command = [sys.executable, "-c", script]
-        shown.append(subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout.split())
+        shown.append(
+            subprocess.run(
+                command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+            ).stdout.split()
+        )
     assert [agree for agree, _ in shown] == ["True", "True"]
     assert shown[0][1] != shown[1][1]
 
@@ -176,7 +190,9 @@ def test_without_a_place_for_a_cache_everything_works_all_the_same(tmp_path: Pat
     (tmp_path / "file").write_text("")
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "file" / "cache")}
     script = "import quell as ql; c = ql.ADRC(ql.ESO.model_free(1, 1.0, 10.0, 0.01), 1.0); print(c.step(1.0, 0.0))"
-    shown = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    shown = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
     assert shown.stdout.strip() == "1.0"
 
 
@@ -194,7 +210,9 @@ def tell(value: float) -> float:
     return _told(value) + 1.0
 
 
-def test_a_kernel_prints_and_raises_in_what_it_is_inlined_into(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_kernel_prints_and_raises_in_what_it_is_inlined_into(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Who looks for a mistake in a learner of their own prints from it: what Numba needs for that is there."""
     assert tell.uncached(1.0) == 2.0
     assert capsys.readouterr().out == "it was 1.0\n"

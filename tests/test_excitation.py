@@ -42,15 +42,23 @@ def test_a_prbs_is_held_starts_and_can_begin_elsewhere() -> None:
     t = np.arange(400) * 0.025
     values = signal(t)
     assert np.all(values[t < 1.0 - 1e-9] == 0.0)
-    np.testing.assert_array_equal(values[40:].reshape(-1, 4), np.repeat(values[40::4], 4).reshape(-1, 4))
-    np.testing.assert_array_equal(s.PRBS(2.0, 5, 0.1, 1.0, seed=3)(t[40:200]), signal(t[40:200] + 0.3))
+    np.testing.assert_array_equal(
+        values[40:].reshape(-1, 4), np.repeat(values[40::4], 4).reshape(-1, 4)
+    )
+    np.testing.assert_array_equal(
+        s.PRBS(2.0, 5, 0.1, 1.0, seed=3)(t[40:200]), signal(t[40:200] + 0.3)
+    )
     np.testing.assert_array_equal(signal(t[40:] + signal.period), values[40:])
     assert np.all(signal.derivative()(t) == 0.0)
 
 
 def test_a_multisine_has_the_lines_it_names_and_no_others() -> None:
     """Over a whole period its spectrum is the amplitudes and phases given; its derivative is ω times as large."""
-    lines, amplitudes, phases = np.array([2, 5, 9]), np.array([1.0, 0.5, 2.0]), np.array([0.1, 1.0, -2.0])
+    lines, amplitudes, phases = (
+        np.array([2, 5, 9]),
+        np.array([1.0, 0.5, 2.0]),
+        np.array([0.1, 1.0, -2.0]),
+    )
     count, base = 256, 0.3
     signal = s.Multisine(lines * base, amplitudes, phases)
     t = np.arange(count) * 2.0 * math.pi / base / count
@@ -58,7 +66,11 @@ def test_a_multisine_has_the_lines_it_names_and_no_others() -> None:
     expected = np.zeros(count // 2 + 1, dtype=complex)
     expected[lines] = -1j * amplitudes * np.exp(1j * phases)
     np.testing.assert_allclose(spectrum, expected, atol=1e-12)
-    np.testing.assert_allclose(signal.derivative()(t[1:-1]), (signal(t[1:-1] + 1e-6) - signal(t[1:-1] - 1e-6)) / 2e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        signal.derivative()(t[1:-1]),
+        (signal(t[1:-1] + 1e-6) - signal(t[1:-1] - 1e-6)) / 2e-6,
+        atol=1e-6,
+    )
     assert np.all(s.Multisine(lines * base, start=5.0)(t[t < 4.9]) == 0.0)
 
 
@@ -77,7 +89,9 @@ def test_a_logarithmic_chirp_gives_each_octave_the_same_time() -> None:
     crossings = t[1:][(wave[:-1] < 0.0) & (wave[1:] >= 0.0)]
     middle = 0.5 * (crossings[1:] + crossings[:-1])
     np.testing.assert_allclose(2.0 * np.pi / np.diff(crossings), chirp.omega(middle), rtol=0.02)
-    np.testing.assert_allclose(chirp.omega([0.0, 5.0, 10.0, 20.0, 30.0]), [2.0, 4.0, 8.0, 32.0, 32.0])
+    np.testing.assert_allclose(
+        chirp.omega([0.0, 5.0, 10.0, 20.0, 30.0]), [2.0, 4.0, 8.0, 32.0, 32.0]
+    )
 
 
 @pytest.mark.parametrize("kind", ["multisine", "prbs", "chirp"])
@@ -101,7 +115,10 @@ def test_a_design_has_its_power_in_the_band(kind: str) -> None:
     spectrum = np.abs(np.fft.rfft(design.u[:count] - design.u[:count].mean())) ** 2
     omega = 2.0 * math.pi * np.fft.rfftfreq(count, design.dt)
     inside = (omega > design.band[0] * 0.999) & (omega < design.band[1] * 1.001)
-    assert np.sum(spectrum[inside]) / np.sum(spectrum) > {"multisine": 0.999, "prbs": 0.71, "chirp": 0.9}[kind]
+    assert (
+        np.sum(spectrum[inside]) / np.sum(spectrum)
+        > {"multisine": 0.999, "prbs": 0.71, "chirp": 0.9}[kind]
+    )
 
 
 def test_a_prbs_is_within_3_db_over_its_band() -> None:
@@ -116,10 +133,19 @@ def test_a_prbs_is_within_3_db_over_its_band() -> None:
 
 def test_what_can_not_be_had_is_said() -> None:
     """Too slow for the duration, too fast for the sampling, one period only."""
-    assert any("not 0.05" in text for text in excitation("prbs", (0.05, 50.0), 20.0, 1e-3).shortcomings)
-    assert any("3 dB down" in text for text in excitation("prbs", (1.0, 300.0), 20.0, 0.01).shortcomings)
-    assert any("one period" in text for text in excitation("multisine", (0.5, 50.0), 20.0, 1e-3).shortcomings)
-    assert any("octave" in text for text in excitation("chirp", (0.5, 50.0), 20.0, 1e-3).shortcomings)
+    assert any(
+        "not 0.05" in text for text in excitation("prbs", (0.05, 50.0), 20.0, 1e-3).shortcomings
+    )
+    assert any(
+        "3 dB down" in text for text in excitation("prbs", (1.0, 300.0), 20.0, 0.01).shortcomings
+    )
+    assert any(
+        "one period" in text
+        for text in excitation("multisine", (0.5, 50.0), 20.0, 1e-3).shortcomings
+    )
+    assert any(
+        "octave" in text for text in excitation("chirp", (0.5, 50.0), 20.0, 1e-3).shortcomings
+    )
     assert excitation("prbs", (1.0, 50.0), 20.0, 1e-3).shortcomings == ()
 
 
@@ -135,11 +161,17 @@ def test_a_design_is_written_as_csv(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("noise", (1.0, 50.0), 20.0, 1e-3), "kind = 'noise': must be one of multisine, prbs, chirp"),
+        (
+            ("noise", (1.0, 50.0), 20.0, 1e-3),
+            "kind = 'noise': must be one of multisine, prbs, chirp",
+        ),
         (("prbs", (50.0, 1.0), 20.0, 1e-3), "band = (50.0, 1.0): must rise"),
         (("prbs", (1.0, 4000.0), 20.0, 1e-3), "below pi / dt"),
         (("chirp", (1.0, 50.0), 0.01, 1e-3), "duration = 0.01 s: must be at least"),
-        (("chirp", (1.0, 50.0), 20.0, 1e-3, 1.0, -1.0), "u_min = 1.0, u_max = -1.0: u_min must be less"),
+        (
+            ("chirp", (1.0, 50.0), 20.0, 1e-3, 1.0, -1.0),
+            "u_min = 1.0, u_max = -1.0: u_min must be less",
+        ),
         (("prbs", (1.0, 50.0), 20.0, 0.0), "dt = 0.0: must be finite and greater than zero"),
     ],
 )

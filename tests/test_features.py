@@ -77,7 +77,9 @@ def test_a_unit_undoes_the_scale(name: str, rng: np.random.Generator) -> None:
     block, scale = BLOCKS[name], 2.0 ** rng.integers(-5, 5, size=5)
     units = np.zeros(len(block.names(3)))
     unit(block.design(3), scale, units)
-    np.testing.assert_allclose(written(block, STATE / scale[:3], U / scale[3]), units * written(block), rtol=1e-12)
+    np.testing.assert_allclose(
+        written(block, STATE / scale[:3], U / scale[3]), units * written(block), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", BLOCKS)
@@ -92,7 +94,9 @@ def test_a_polynomial_has_all_monomials() -> None:
     block = Polynomial(3, states=(1, 2))
     assert block.names(3) == ("x1^2", "x1 x2", "x2^2", "x1^3", "x1^2 x2", "x1 x2^2", "x2^3")
     a, b = STATE[:2]
-    np.testing.assert_allclose(written(block), [a * a, a * b, b * b, a**3, a * a * b, a * b * b, b**3], rtol=1e-14)
+    np.testing.assert_allclose(
+        written(block), [a * a, a * b, b * b, a**3, a * a * b, a * b * b, b**3], rtol=1e-14
+    )
     assert len(Polynomial(4).names(3)) == math.comb(3 + 4, 4) - 1 - 3
 
 
@@ -101,7 +105,9 @@ def test_friction_reverses_with_the_velocity() -> None:
     block = Friction(width=0.1, sign=True)
     assert block.names(2) == ("tanh(x2/0.1)", "sign(x2)")
     for velocity in (-2.0, -0.05, 0.0, 0.05):
-        np.testing.assert_allclose(written(block, np.array([9.0, velocity])), [np.tanh(velocity / 0.1), np.sign(velocity)])
+        np.testing.assert_allclose(
+            written(block, np.array([9.0, velocity])), [np.tanh(velocity / 0.1), np.sign(velocity)]
+        )
 
 
 def test_random_fourier_features_approximate_a_gaussian_kernel(rng: np.random.Generator) -> None:
@@ -141,11 +147,17 @@ def test_blocks_are_joined_in_order() -> None:
 def test_a_custom_feature_runs_in_the_loop_and_through_a_copy() -> None:
     """Its address is made anew where a controller is copied or sent."""
     features = Custom(halves, ("half", "product")) + Bias()
-    controller = ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), omega_c=1.0, learner=ql.learners.NLMS(features=features))
+    controller = ql.ADRC(
+        ql.ESO.model_free(2, 1.0, 10.0, 0.01),
+        omega_c=1.0,
+        learner=ql.learners.NLMS(features=features),
+    )
     for k in range(200):
         controller.step(1.0, math.sin(0.05 * k))
     other = pickle.loads(pickle.dumps(controller))
-    assert [controller.step(1.0, 0.1 * k) for k in range(50)] == [other.step(1.0, 0.1 * k) for k in range(50)]
+    assert [controller.step(1.0, 0.1 * k) for k in range(50)] == [
+        other.step(1.0, 0.1 * k) for k in range(50)
+    ]
     assert list(controller.estimate.theta) == ["half", "product", "bias"]
 
 
@@ -164,7 +176,10 @@ class Callable:
         (lambda: Polynomial(states=(1, 1)), r"states = \(1, 1\): a state may be named once"),
         (lambda: Polynomial(states=()), r"states = \(\): must be a tuple of the numbers of states"),
         (lambda: Polynomial(states=(0,)), r"states\[0\] = 0: must be a whole number of at least 1"),
-        (lambda: Polynomial(states=(3,)).design(2), r"states = \(3,\): a plant of order 2 has no state 3"),
+        (
+            lambda: Polynomial(states=(3,)).design(2),
+            r"states = \(3,\): a plant of order 2 has no state 3",
+        ),
         (lambda: Friction(width=0.0), "width = 0.0: must be finite and greater than zero"),
         (lambda: Friction(sign=1), "sign = 1: must be True or False"),
         (lambda: Friction().design(1), r"states = \(2,\): a plant of order 1 has no state 2"),
@@ -173,15 +188,30 @@ class Callable:
         (lambda: RandomFourier(seed=-1), "seed = -1: must be a whole number of at least 0"),
         (lambda: RBF(count=0), "count = 0: must be a whole number of at least 1"),
         (lambda: RBF(3, centers=[[0.0]]), "count and centers: give one of them"),
-        (lambda: RBF(centers=[[0.0]]).design(2), r"centers has shape \(1, 1\): must be a matrix of shape \(any, 2\)"),
+        (
+            lambda: RBF(centers=[[0.0]]).design(2),
+            r"centers has shape \(1, 1\): must be a matrix of shape \(any, 2\)",
+        ),
         (lambda: RBF(width=math.nan), "width = nan: must be finite and greater than zero"),
         (lambda: Custom(3, ("a",)), "function = 3: must be a function"),
         (lambda: Custom(halves, ()), r"names = \(\): must be a tuple with a name for each feature"),
         (lambda: Custom(halves, ("a", "a")), r"names = \('a', 'a'\): each must be there once"),
-        (lambda: Custom(halves, ("a",)).design(2), r"function returns shape \(2,\): must return a tuple of 1 numbers"),
-        (lambda: Custom(lambda x: (x[0],), ("a",)).design(2), r"function\(zeros\(2\), 0.0\) fails with TypeError"),
-        (lambda: Custom(Callable(), ("a",)).design(2), "function can't be compiled by Numba: .* it must be a plain function"),
-        (lambda: Custom(lambda x, u: (float(str(x[0])),), ("a",)).design(2), "function can't be compiled by Numba"),
+        (
+            lambda: Custom(halves, ("a",)).design(2),
+            r"function returns shape \(2,\): must return a tuple of 1 numbers",
+        ),
+        (
+            lambda: Custom(lambda x: (x[0],), ("a",)).design(2),
+            r"function\(zeros\(2\), 0.0\) fails with TypeError",
+        ),
+        (
+            lambda: Custom(Callable(), ("a",)).design(2),
+            "function can't be compiled by Numba: .* it must be a plain function",
+        ),
+        (
+            lambda: Custom(lambda x, u: (float(str(x[0])),), ("a",)).design(2),
+            "function can't be compiled by Numba",
+        ),
         (lambda: Input() + State(), r"Input\(\) must be the last of the blocks"),
     ],
 )

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell import dispatch
-from quell.foreign import call, evaluate
+from quell.kernels import dispatch
+from quell.kernels.function_pointers import call, evaluate
 
 _POINTER = ctypes.POINTER(ctypes.c_double)
 SEEN: list[tuple[int, float]] = []

@@ -14,9 +14,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quell.dispatch import compiled, interpreted
-from quell.realtime import frames
-from quell.realtime.frames import COMMAND, GOODBYE, MEASUREMENT, accept, buffer, compose, crc32, peer, told
+from quell.kernels.dispatch import compiled, interpreted
+from quell.realtime.wire import frames
+from quell.realtime.wire.frames import (
+    COMMAND,
+    GOODBYE,
+    MEASUREMENT,
+    accept,
+    buffer,
+    compose,
+    crc32,
+    peer,
+    told,
+)
 
 SESSION = 0x5EED0001
 PAGE = Path(__file__).parents[1] / "docs" / "wire.md"
@@ -37,9 +47,29 @@ def _crc32(data: Any, size: int) -> int:
     return crc32(data, size)
 
 
-def packed(kind: int, number: int, answers: int, value: float, *, session: int = SESSION, version: int = 1, state: int = 0) -> bytes:
+def packed(
+    kind: int,
+    number: int,
+    answers: int,
+    value: float,
+    *,
+    session: int = SESSION,
+    version: int = 1,
+    state: int = 0,
+) -> bytes:
     """Return a frame, made without the package."""
-    head = struct.pack("<2sBBIIIqdI", b"QL", version, kind, session, number % 2**32, answers % 2**32, 123_456_789, value, state)
+    head = struct.pack(
+        "<2sBBIIIqdI",
+        b"QL",
+        version,
+        kind,
+        session,
+        number % 2**32,
+        answers % 2**32,
+        123_456_789,
+        value,
+        state,
+    )
     return head + struct.pack("<I", zlib.crc32(head))
 
 
@@ -72,7 +102,9 @@ def test_a_frame_is_what_the_table_says(entry: Any) -> None:
     assert out.bytes[:40].tobytes() == packed(MEASUREMENT, 7, 41, -1.5, state=1)
 
 
-@pytest.mark.skipif(not PAGE.exists(), reason="the pages are in the repository, not in what is built of it")
+@pytest.mark.skipif(
+    not PAGE.exists(), reason="the pages are in the repository, not in what is built of it"
+)
 def test_the_frame_on_the_page_is_one() -> None:
     """The example in hexadecimal is accepted as what the page says it is."""
     (block,) = re.findall(r"```text\n((?:[0-9a-f]{2}[ \n])+)```", PAGE.read_text(encoding="utf-8"))
@@ -91,7 +123,12 @@ def test_news_is_accepted_once_and_in_order(entry: Any) -> None:
     assert offered(own, packed(MEASUREMENT, 5, 0, 0.2), entry)
     assert not offered(own, packed(MEASUREMENT, 5, 0, 0.2), entry)
     assert not offered(own, packed(MEASUREMENT, 4, 0, 0.2), entry)
-    assert {name: n for name, n in told(own.counters).items() if n} == {"accepted": 2, "skipped": 3, "duplicated": 1, "reordered": 1}
+    assert {name: n for name, n in told(own.counters).items() if n} == {
+        "accepted": 2,
+        "skipped": 3,
+        "duplicated": 1,
+        "reordered": 1,
+    }
 
 
 def test_numbers_go_on_behind_the_largest() -> None:
@@ -114,7 +151,10 @@ def test_numbers_go_on_behind_the_largest() -> None:
         (packed(COMMAND, 1, 100, 0.0) + b"\0", "malformed"),
         (packed(COMMAND, 1, 100, 0.0) * 2, "malformed"),
         (b"XL" + packed(COMMAND, 1, 100, 0.0)[2:], "malformed"),
-        (packed(COMMAND, 1, 100, 0.0)[:24] + bytes(8) + packed(COMMAND, 1, 100, 1.0)[32:], "malformed"),
+        (
+            packed(COMMAND, 1, 100, 0.0)[:24] + bytes(8) + packed(COMMAND, 1, 100, 1.0)[32:],
+            "malformed",
+        ),
         (packed(COMMAND, 1, 100, 0.0, version=2), "version"),
         (packed(MEASUREMENT, 1, 100, 0.0), "kind"),
         (packed(77, 1, 100, 0.0), "kind"),
@@ -173,12 +213,22 @@ def test_a_wrong_byte_is_found(place: int, wrong: int) -> None:
     answers=st.integers(0, 2**32 - 1),
     value=st.floats(),
 )
-def test_what_is_accepted_obeys_all_rules(kind: int, version: int, session: int, number: int, answers: int, value: float) -> None:
+def test_what_is_accepted_obeys_all_rules(
+    kind: int, version: int, session: int, number: int, answers: int, value: float
+) -> None:
     """Well-formed frames of any content, against the rules written down a second time."""
     own = peer(COMMAND, SESSION, 20)
     own.numbers[frames.SENT], own.numbers[frames.HEARD] = 1000, 2**31
-    taken = offered(own, packed(kind, number, answers, value, session=session, version=version), _accept)
-    assert taken == (kind == COMMAND and version == 1 and session == SESSION and number > 2**31 and 980 <= answers <= 1000)
+    taken = offered(
+        own, packed(kind, number, answers, value, session=session, version=version), _accept
+    )
+    assert taken == (
+        kind == COMMAND
+        and version == 1
+        and session == SESSION
+        and number > 2**31
+        and 980 <= answers <= 1000
+    )
     assert sum(told(own.counters)[name] for name in ("accepted", *frames.REFUSALS)) == 1
 
 

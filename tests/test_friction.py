@@ -32,15 +32,23 @@ def error(name: str) -> float:
 
     s = ql.signals
     plant = ql.plants.NonlinearPlant(stage, order=2, substeps=4)
-    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=30.0, dt=2e-3), omega_c=OMEGA_C, learner=LEARNERS[name])
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=2, b0=2.0, omega_o=30.0, dt=2e-3),
+        omega_c=OMEGA_C,
+        learner=LEARNERS[name],
+    )
     reference = 0.5 * s.Sinusoid(omega=1.0) + 0.3 * s.Sinusoid(omega=2.3)
-    run = ql.simulate(plant, controller, ql.Scenario(reference, 60.0, noise=s.BandLimitedNoise(1e-12, 0.01)))
+    run = ql.simulate(
+        plant, controller, ql.Scenario(reference, 60.0, noise=s.BandLimitedNoise(1e-12, 0.01))
+    )
     ideal = signal.lsim(([OMEGA_C**2], [1.0, 2.0 * OMEGA_C, OMEGA_C**2]), run["r"], run.t)[1]
     return float(np.sqrt(np.mean((run["y"] - ideal)[run.t >= 20.0] ** 2)))
 
 
 @pytest.mark.parametrize(("name", "at_most"), [("MLP", 0.7), ("RBF", 0.7), ("friction", 0.25)])
-def test_a_nonlinear_learner_rejects_friction_better_than_a_linear_one(name: str, at_most: float) -> None:
+def test_a_nonlinear_learner_rejects_friction_better_than_a_linear_one(
+    name: str, at_most: float
+) -> None:
     """And a linear one better than none."""
     assert error("linear") < error("none")
     assert error(name) <= at_most * error("linear")

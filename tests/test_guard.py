@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.experiments.adversaries import (
+from quell.experiments.stress.adversaries import (
     CONSTANT,
     DELAYED,
     EXPONENTIAL,
@@ -23,7 +23,7 @@ from quell.experiments.adversaries import (
     Adversary,
     Turncoat,
 )
-from quell.experiments.random_loops import Loop
+from quell.experiments.stress.random_loops import Loop
 from quell.guard import note, permit, watch
 from quell.learners.lag import lag_of, lag_push
 from quell.types import Status
@@ -64,7 +64,9 @@ def test_a_hostile_learner_does_no_harm(name: str) -> None:
     """The loop is about as good as MF-ESO under load, whatever the learner says."""
     every = round(0.02 / LOOP.dt)
     plain = ql.simulate(LOOP.plant, LOOP.controller(), LOOP.scenario, record_every=every)
-    run = ql.simulate(LOOP.plant, LOOP.controller(HOSTILE[name], ql.Guard()), LOOP.scenario, record_every=every)
+    run = ql.simulate(
+        LOOP.plant, LOOP.controller(HOSTILE[name], ql.Guard()), LOOP.scenario, record_every=every
+    )
     assert not run.diverged
     assert error(run) <= 1.1 * error(plain)
 
@@ -74,7 +76,11 @@ def test_an_honest_learner_is_heard() -> None:
     every = round(0.02 / LOOP.dt)
     plain, free, guarded = (
         ql.simulate(LOOP.plant, LOOP.controller(learner, guard), LOOP.scenario, record_every=every)
-        for learner, guard in ((None, None), (ql.learners.Harmonic(), None), (ql.learners.Harmonic(), ql.Guard()))
+        for learner, guard in (
+            (None, None),
+            (ql.learners.Harmonic(), None),
+            (ql.learners.Harmonic(), ql.Guard()),
+        )
     )
     assert guarded["authority"][0] == 0.0
     assert guarded["authority"][guarded.window(140.0, 150.0)].min() > 0.99
@@ -85,7 +91,9 @@ def test_an_honest_learner_is_heard() -> None:
 def test_a_learner_without_authority_leaves_the_loop_as_it_is_without() -> None:
     """Not about: to the bit."""
     scenario = dataclasses.replace(LOOP.scenario, duration=20.0)
-    silenced = ql.simulate(LOOP.plant, LOOP.controller(Adversary(MULTIPLE, -1.0), ql.Guard()), scenario)
+    silenced = ql.simulate(
+        LOOP.plant, LOOP.controller(Adversary(MULTIPLE, -1.0), ql.Guard()), scenario
+    )
     plain = ql.simulate(LOOP.plant, LOOP.controller(), scenario)
     assert np.all(silenced["authority"] == 0.0)
     np.testing.assert_array_equal(silenced["u"], plain["u"])
@@ -200,7 +208,11 @@ def test_the_unit_of_y_does_not_matter_to_the_guard(unit: float) -> None:
         plant = ql.plants.two_mass_spring(c2=size)
         observer = ql.ESO.model_free(order=4, b0=size, omega_o=10.0, dt=5e-3)
         controller = ql.ADRC(observer, 1.0, learner=ql.learners.Kalman(), guard=ql.Guard())
-        scenario = ql.Scenario(size * ql.signals.Sinusoid(), 40.0, noise=ql.signals.BandLimitedNoise(1e-12 * size**2, 0.01))
+        scenario = ql.Scenario(
+            size * ql.signals.Sinusoid(),
+            40.0,
+            noise=ql.signals.BandLimitedNoise(1e-12 * size**2, 0.01),
+        )
         found.append(ql.simulate(plant, controller, scenario, limit=1e9)["authority"])
     np.testing.assert_allclose(found[0], found[1], atol=1e-3)
     assert found[0][-1] == 1.0
@@ -209,7 +221,9 @@ def test_the_unit_of_y_does_not_matter_to_the_guard(unit: float) -> None:
 def test_a_guard_counts_for_nothing_where_there_is_no_learner() -> None:
     """It has nothing to guard: the same loop."""
     scenario = ql.Scenario(1.0, 5.0)
-    plain, guarded = (ql.simulate(PLANT, law(None, guard), scenario) for guard in (None, ql.Guard()))
+    plain, guarded = (
+        ql.simulate(PLANT, law(None, guard), scenario) for guard in (None, ql.Guard())
+    )
     np.testing.assert_array_equal(plain["u"], guarded["u"])
 
 
@@ -231,7 +245,10 @@ def test_mistakes_are_named(make: object, message: str) -> None:
 @pytest.mark.parametrize("learner", [None, ql.learners.Kalman(), ql.learners.Harmonic(state=False)])
 def test_a_measurement_beyond_all_numbers_is_got_over(bad: float, learner: object) -> None:
     """After it the guarded loop goes on as the one without a guard does."""
-    controllers = [ql.ADRC(OBSERVER, 1.0, learner=learner, guard=guard, u_min=-20.0, u_max=20.0) for guard in (None, ql.Guard())]
+    controllers = [
+        ql.ADRC(OBSERVER, 1.0, learner=learner, guard=guard, u_min=-20.0, u_max=20.0)
+        for guard in (None, ql.Guard())
+    ]
     for k in range(4000):
         y = bad if k == 1000 else 0.3 * math.sin(0.004 * k)
         for controller in controllers:
@@ -249,8 +266,20 @@ def test_a_bad_measurement_does_not_open_the_bounds() -> None:
     """A learner that turns after one sample that was off by a kilometre does little more harm than MF-ESO suffers itself."""
     errors = []
     for learner in (None, Turncoat(ql.learners.Kalman(), 50.0, 10.0)):
-        controller = ql.ADRC(OBSERVER, 1.0, learner=learner, guard=ql.Guard() if learner else None, u_min=-20.0, u_max=20.0)
+        controller = ql.ADRC(
+            OBSERVER,
+            1.0,
+            learner=learner,
+            guard=ql.Guard() if learner else None,
+            u_min=-20.0,
+            u_max=20.0,
+        )
         glitch = ql.signals.Step(1000.0, at=45.0) - ql.signals.Step(1000.0, at=45.005)
-        run = ql.simulate(PLANT, controller, ql.Scenario(ql.signals.Sinusoid(), 120.0, noise=glitch), record_every=4)
+        run = ql.simulate(
+            PLANT,
+            controller,
+            ql.Scenario(ql.signals.Sinusoid(), 120.0, noise=glitch),
+            record_every=4,
+        )
         errors.append(np.max(np.abs(run["y"][run.window(60.0, 120.0)])))
     assert errors[1] < 3.0 * errors[0] + 1.0, errors

@@ -89,7 +89,9 @@ def test_manual_operation_and_back_makes_no_bump() -> None:
         wished = controller.track(1.0, rig.y, u)
         assert controller.estimate.u == u
         rig.apply(u)
-    assert controller.estimate.f == pytest.approx(2.0 * LOAD - controller.estimate.x[0] - 0.6 * controller.estimate.x[1], abs=0.05)
+    assert controller.estimate.f == pytest.approx(
+        2.0 * LOAD - controller.estimate.x[0] - 0.6 * controller.estimate.x[1], abs=0.05
+    )
     bumpy = copy.deepcopy(controller)
     jump = abs(bumpy.step(1.0, rig.y) - u)
     assert jump > 1.0
@@ -142,7 +144,10 @@ def test_a_model_that_comes_later_changes_nothing_at_rest() -> None:
     """From model-free to model-based and back: part of f becomes the model's."""
     rig, controller = Rig((0.5, 0.0)), ql.ADRC(OBSERVER, omega_c=3.0)
     controller.start(0.5, 3.25)
-    for observer, f in ((ESO.model_based(PLANT, omega_o=20.0, dt=DT), 2.0 * LOAD), (OBSERVER, 2.0 * LOAD - 0.5)):
+    for observer, f in (
+        (ESO.model_based(PLANT, omega_o=20.0, dt=DT), 2.0 * LOAD),
+        (OBSERVER, 2.0 * LOAD - 0.5),
+    ):
         controller.retune(observer=observer)
         for _ in range(50):
             rig.apply(controller.step(0.5, rig.y))
@@ -230,12 +235,14 @@ def test_derivatives_are_fed_forward_in_manual_operation_too() -> None:
         u = one.step(r, r, v, a)
         assert other.track(r, r, u, v, a) == u
     before = one.estimate.u
-    assert one.increment(0.9, 0.9, 0.1, 0.2) == pytest.approx(other.step(0.9, 0.9, 0.1, 0.2) - before)
+    assert one.increment(0.9, 0.9, 0.1, 0.2) == pytest.approx(
+        other.step(0.9, 0.9, 0.1, 0.2) - before
+    )
 
 
 def test_retuning_does_not_compile_again() -> None:
     """The types stay, so the step stays."""
-    from quell.controllers.handle import bound_control
+    from quell.controllers.compiled_step import bound_control
 
     controller = ql.ADRC(OBSERVER, omega_c=2.0)
     controller.step(1.0, 0.0)
@@ -272,7 +279,12 @@ def test_an_actuator_that_did_otherwise_is_believed() -> None:
     ends = {}
     for name in ("own", "told", "untold"):
         rig = Rig()
-        controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman(u=True), u_max=3.6 if name == "own" else math.inf)
+        controller = ql.ADRC(
+            OBSERVER,
+            omega_c=3.0,
+            learner=ql.learners.Kalman(u=True),
+            u_max=3.6 if name == "own" else math.inf,
+        )
         ys = []
         for k in range(700):
             u = controller.step(2.0 if k < 400 else 0.4, rig.y)
@@ -290,7 +302,9 @@ def test_the_reference_fed_forward_is_followed_without_lag() -> None:
     """Y = r up to the observer's error, where the lag without derivatives is 2/omega_c."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0])
     observer = ESO.model_based(plant, omega_o=40.0, dt=1e-3)
-    scenario = ql.Scenario(reference=ql.signals.SmoothMove(distance=1.0, duration=2.0, smoothness=3), duration=4.0)
+    scenario = ql.Scenario(
+        reference=ql.signals.SmoothMove(distance=1.0, duration=2.0, smoothness=3), duration=4.0
+    )
     errors = []
     for feedforward in (False, True):
         run = ql.simulate(plant, ql.ADRC(observer, omega_c=3.0, feedforward=feedforward), scenario)
@@ -305,7 +319,10 @@ def test_derivatives_reach_a_loop_of_ones_own() -> None:
     controller = ql.ADRC(OBSERVER, omega_c=3.0, feedforward=True)
     run = ql.simulate(PLANT, controller, ql.Scenario(reference=move, duration=3.0))
     speed, acceleration = move.derivative(), move.derivative().derivative()
-    u = [controller.step(r, y, v, a) for r, y, v, a in zip(run["r"], run["y"], speed(run.t), acceleration(run.t), strict=True)]
+    u = [
+        controller.step(r, y, v, a)
+        for r, y, v, a in zip(run["r"], run["y"], speed(run.t), acceleration(run.t), strict=True)
+    ]
     np.testing.assert_allclose(u, run["u"], atol=1e-10)
 
 
@@ -317,10 +334,19 @@ def test_derivatives_reach_a_loop_of_ones_own() -> None:
         (lambda c: c.applied(math.nan), "u = nan: must be a finite number"),
         (lambda c: c.hand_over(), "hand_over: there was no sample yet"),
         (lambda c: c.retune(omega_c=0.0), "omega_c = 0.0: must be finite and greater than zero"),
-        (lambda c: c.retune(observer=ESO.model_free(3, 1.0, 20.0, DT)), "observer has order = 3, the present one 2"),
-        (lambda c: c.retune(observer=ESO.model_free(2, 2.0, 20.0, 0.02)), "observer has dt = 0.02, the present one 0.01"),
+        (
+            lambda c: c.retune(observer=ESO.model_free(3, 1.0, 20.0, DT)),
+            "observer has order = 3, the present one 2",
+        ),
+        (
+            lambda c: c.retune(observer=ESO.model_free(2, 2.0, 20.0, 0.02)),
+            "observer has dt = 0.02, the present one 0.01",
+        ),
         (lambda c: c.retune(observer="eso"), "observer = 'eso': must be an ESO"),
-        (lambda c: c.step(1.0, 0.0, 1.0), "step was given 1 derivatives of the reference: make the controller with feedforward=True"),
+        (
+            lambda c: c.step(1.0, 0.0, 1.0),
+            "step was given 1 derivatives of the reference: make the controller with feedforward=True",
+        ),
     ],
 )
 def test_a_mistake_is_named_and_changes_nothing(make: object, message: str) -> None:

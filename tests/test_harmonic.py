@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.learners.oscillators import Oscillators, retune, turn_phases
+from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
 
 
 def test_a_turning_pair_retunes_its_oscillator_by_how_much_it_turns() -> None:
@@ -41,7 +41,11 @@ def test_phases_turn_at_their_frequency() -> None:
 @pytest.mark.parametrize("truth", [0.4, 1.2])
 def test_an_unknown_frequency_is_found_and_the_load_rejected(start: float, truth: float) -> None:
     """From far below or above, within a minute."""
-    controller = ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, 5e-3), omega_c=1.0, learner=ql.learners.Harmonic(omegas=(start,)))
+    controller = ql.ADRC(
+        ql.ESO.model_free(4, 1.0, 10.0, 5e-3),
+        omega_c=1.0,
+        learner=ql.learners.Harmonic(omegas=(start,)),
+    )
     scenario = ql.Scenario(
         reference=ql.signals.Sinusoid().until(40.0, then=ql.signals.Step(at=40.0)),
         disturbances=(0.0, ql.signals.Sinusoid(omega=truth, start=60.0)),
@@ -49,7 +53,12 @@ def test_an_unknown_frequency_is_found_and_the_load_rejected(start: float, truth
         duration=140.0,
     )
     run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=4)
-    plain = ql.simulate(ql.plants.two_mass_spring(), ql.ADRC(controller.observer, omega_c=1.0), scenario, record_every=4)
+    plain = ql.simulate(
+        ql.plants.two_mass_spring(),
+        ql.ADRC(controller.observer, omega_c=1.0),
+        scenario,
+        record_every=4,
+    )
     assert run.final_state.learner.omega[0] == pytest.approx(truth, rel=0.01)
     late = run.window(130.0, 140.0)
     assert np.max(np.abs(run["y"][late] - 1.0)) < 0.02 * np.max(np.abs(plain["y"][late] - 1.0))
@@ -61,7 +70,18 @@ def test_frequencies_start_apart_and_stay_within_their_limits() -> None:
     learner = ql.learners.Harmonic(count=3, u=True)
     design = learner.design(observer, 2.0)
     np.testing.assert_allclose(design.oscillators.omega, [2.0, 0.6, 0.18])
-    assert learner.feature_names(2) == ("x1", "x2", "bias", "sin1", "cos1", "sin2", "cos2", "sin3", "cos3", "u")
+    assert learner.feature_names(2) == (
+        "x1",
+        "x2",
+        "bias",
+        "sin1",
+        "cos1",
+        "sin2",
+        "cos2",
+        "sin3",
+        "cos3",
+        "u",
+    )
     assert design.scale.size == 10
     assert (design.oscillators.low, design.oscillators.high) == (0.04, 10.0)
 
@@ -86,4 +106,6 @@ def test_mistakes_are_named(options: dict[str, object], message: str) -> None:
 def test_a_start_outside_of_the_limits_is_refused() -> None:
     """Not clipped without a word."""
     with pytest.raises(ValueError, match=r"omegas = \(50.0,\) rad/s: must lie within limits"):
-        ql.ADRC(ql.ESO.model_free(2, 1.0, 20.0, 1e-2), 1.0, learner=ql.learners.Harmonic(omegas=(50.0,)))
+        ql.ADRC(
+            ql.ESO.model_free(2, 1.0, 20.0, 1e-2), 1.0, learner=ql.learners.Harmonic(omegas=(50.0,))
+        )

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.cli import app
+from quell.cli.app import app
 from quell.identification import Identified, excitation, excited, frequency_response, read_record
 from quell.identification.search import root_covariance
 from quell.identification.structure import Structure, gradient, output
@@ -35,9 +35,14 @@ def answer(plant: Any, u: np.ndarray, dt: float, quantum: float = 0.0) -> np.nda
 
 
 @cache
-def twin_record(band: tuple[float, float], amplitude: float, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def twin_record(
+    band: tuple[float, float], amplitude: float, offset: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return u and y of the twin with all its friction and quantisation, driven open loop by a PRBS for 60 s at 1 kHz."""
-    record = excited(ql.plants.torsional(), excitation("prbs", band, 60.0, DT, offset - amplitude, offset + amplitude))
+    record = excited(
+        ql.plants.torsional(),
+        excitation("prbs", band, 60.0, DT, offset - amplitude, offset + amplitude),
+    )
     return record.u, record.y
 
 
@@ -47,7 +52,9 @@ def twin_loop() -> tuple[np.ndarray, np.ndarray]:
     reference = excitation("multisine", (0.3, 40.0), 60.0, DT, -3.0, 3.0).signal
     observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=DT)
     controller = ql.ADRC(observer, omega_c=20.0, u_min=-5.0, u_max=5.0)
-    run = ql.simulate(ql.plants.torsional(), controller, ql.Scenario(reference=reference, duration=60.0))
+    run = ql.simulate(
+        ql.plants.torsional(), controller, ql.Scenario(reference=reference, duration=60.0)
+    )
     return run["u"], run["y_measured"]
 
 
@@ -138,7 +145,9 @@ def test_friction_of_a_single_inertia_is_found() -> None:
         y[k] = position
         for _ in range(fine):
             after = speed + dt / fine * (5.0 * force - 0.8 * speed)
-            speed = after - np.clip(after, -dt / fine, dt / fine)  # friction of 1.0, which stops what it can
+            speed = after - np.clip(
+                after, -dt / fine, dt / fine
+            )  # friction of 1.0, which stops what it can
             position += dt / fine * speed
     found = ql.identify(u, y, dt, order=2, friction=True)
     assert found.poles[1].value.real == pytest.approx(-0.8, rel=0.02)
@@ -149,7 +158,11 @@ def test_friction_of_a_single_inertia_is_found() -> None:
 @pytest.mark.parametrize("friction", [False, True])
 def test_the_delay_is_found(friction: bool) -> None:
     """Of up to 20 samples, by itself."""
-    u, y = twin_record((0.2, 20.0), 2.0) if friction else (excitation("prbs", (0.2, 60.0), 30.0, DT).u, np.zeros(0))
+    u, y = (
+        twin_record((0.2, 20.0), 2.0)
+        if friction
+        else (excitation("prbs", (0.2, 60.0), 30.0, DT).u, np.zeros(0))
+    )
     y = y if friction else answer(TESTBED, u, DT, QUANTUM)
     late = np.concatenate([np.zeros(7), y[:-7]])
     found = ql.identify(u, late, DT, delay=(0.0, 0.02), friction=friction, held_out=0.2)
@@ -237,7 +250,9 @@ def test_the_deviation_of_a_root_is_its_derivative() -> None:
         covariance = np.zeros((2, 2))
         covariance[i, i] = 1.0
         real, imag = root_covariance(a, covariance, root)
-        assert (np.sqrt(real), np.sqrt(imag)) == pytest.approx((abs(shift.real), abs(shift.imag)), rel=1e-4, abs=1e-8)
+        assert (np.sqrt(real), np.sqrt(imag)) == pytest.approx(
+            (abs(shift.real), abs(shift.imag)), rel=1e-4, abs=1e-8
+        )
 
 
 def test_the_result_is_a_plant_for_an_observer() -> None:
@@ -247,7 +262,9 @@ def test_the_result_is_a_plant_for_an_observer() -> None:
     scenario = ql.Scenario(reference=ql.signals.Trapezoid(np.pi, 2.0), duration=5.0)
     ends = []
     for model in (found.plant, twin.linear):
-        controller = ql.ADRC(ql.ESO.model_based(model, omega_o=90.0, dt=DT), omega_c=20.0, u_min=-5.0, u_max=5.0)
+        controller = ql.ADRC(
+            ql.ESO.model_based(model, omega_o=90.0, dt=DT), omega_c=20.0, u_min=-5.0, u_max=5.0
+        )
         ends.append(ql.simulate(twin, controller, scenario)["y"])
     assert abs(ends[0][-1] - np.pi) < 0.01
     assert np.max(np.abs(ends[0] - ends[1])) < 0.01
@@ -258,7 +275,9 @@ def test_an_excited_plant_is_told_the_design() -> None:
     design = excitation("prbs", (0.5, 60.0), 10.0, 0.005)
     record = excited(ql.plants.LinearPlant.of(([2.0], [1.0, 0.6, 9.0])), design)
     np.testing.assert_allclose(record.u, design.u, atol=1e-12)
-    np.testing.assert_allclose(record.y, answer(([2.0], [1.0, 0.6, 9.0]), design.u, 0.005), atol=1e-10)
+    np.testing.assert_allclose(
+        record.y, answer(([2.0], [1.0, 0.6, 9.0]), design.u, 0.005), atol=1e-10
+    )
 
 
 def test_the_empirical_response_is_the_plants_and_says_where_it_is_not() -> None:
@@ -269,7 +288,12 @@ def test_the_empirical_response_is_the_plants_and_says_where_it_is_not() -> None
     empirical = found.empirical(segments=4)
     good = (empirical.coherence > 0.99) & (empirical.omega > 1.0) & (empirical.omega < 50.0)
     assert np.count_nonzero(good) > 20
-    assert np.quantile(np.abs(empirical.response[good] / found.response(empirical.omega[good]) - 1.0), 0.9) < 0.1
+    assert (
+        np.quantile(
+            np.abs(empirical.response[good] / found.response(empirical.omega[good]) - 1.0), 0.9
+        )
+        < 0.1
+    )
     noise = np.random.default_rng(1).standard_normal(u.size)
     assert np.median(frequency_response(u, noise, 0.005).coherence) < 0.4
 
@@ -316,7 +340,9 @@ def test_a_slow_lag_is_no_integrator() -> None:
     """Its pole is many of its deviations from s = 0, also where a sinusoid is all that it was told, or the order is too low."""
     t = np.arange(4000) * 0.01
     u = np.sin(t)
-    y = answer(([3.0], [1.0, 2.0]), u, 0.01) + 0.01 * np.random.default_rng(5).standard_normal(t.size)
+    y = answer(([3.0], [1.0, 2.0]), u, 0.01) + 0.01 * np.random.default_rng(5).standard_normal(
+        t.size
+    )
     assert ql.identify(u, y, 0.01, order=2).poles[0].value == pytest.approx(-2.0, rel=0.02)
 
 
@@ -338,19 +364,37 @@ def test_a_record_that_ends_at_rest_is_refused_with_what_to_do() -> None:
     """On samples where nothing moves no model can be judged; with none held out the step is enough."""
     u = np.append(0.0, np.ones(1999))
     y = answer(([3.0], [1.0, 2.0]), u, 0.01)
-    with pytest.raises(ValueError, match=r"held_out = 0\.3: u is 1 all through these samples.*hold fewer out, or none"):
+    with pytest.raises(
+        ValueError,
+        match=r"held_out = 0\.3: u is 1 all through these samples.*hold fewer out, or none",
+    ):
         ql.identify(u, y, 0.01, order=1)
-    assert ql.identify(u, y, 0.01, order=1, held_out=0.0).poles[0].value == pytest.approx(-2.0, rel=1e-6)
+    assert ql.identify(u, y, 0.01, order=1, held_out=0.0).poles[0].value == pytest.approx(
+        -2.0, rel=1e-6
+    )
 
 
 def test_the_report_has_all_of_it() -> None:
     """As text, as JSON without gaps, as a picture."""
     found = ql.identify(*twin_record((0.2, 20.0), 2.0), DT, friction=True)
-    for part in ("G(s) =", "pole [rad/s]", "constant force", "Coulomb friction", "fit, held out:", "white:", "independent of past u"):
+    for part in (
+        "G(s) =",
+        "pole [rad/s]",
+        "constant force",
+        "Coulomb friction",
+        "fit, held out:",
+        "white:",
+        "independent of past u",
+    ):
         assert part in str(found)
     told = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert told["poles"][1]["real"] == pytest.approx(found.poles[1].value.real)
-    assert set(told["fits"]) == {"estimation", "estimation, predicted", "held out", "held out, predicted"}
+    assert set(told["fits"]) == {
+        "estimation",
+        "estimation, predicted",
+        "held out",
+        "held out, predicted",
+    }
     axes = found.plot()
     assert len(axes) == 7
     plt.close(axes[0].figure)
@@ -368,7 +412,10 @@ U = np.sign(np.sin(0.05 * np.arange(2000.0) ** 1.1))
         ({"u": np.append(U[:-1], np.nan)}, "u: entry (1999,) is nan"),
         ({"y": U[:-1]}, "y has shape (1999,): must be a vector of 2000"),
         ({"u": np.ones(2000)}, "u is 1 all through the samples for the fit: must move"),
-        ({"u": U[:60], "y": U[:60]}, "u has 60 samples, 42 of them for the fit: must have at least"),
+        (
+            {"u": U[:60], "y": U[:60]},
+            "u has 60 samples, 42 of them for the fit: must have at least",
+        ),
         ({"dt": -1.0}, "dt = -1.0: must be finite and greater than zero"),
         ({"order": 0}, "order = 0: must be a whole number from 1 to 8"),
         ({"zeros": 2}, "zeros = 2: must be a whole number from 0 to 1"),
@@ -394,13 +441,32 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
     """Tables, JSON and a figure from a file; the same numbers as the function."""
     u = excitation("prbs", (0.5, 30.0), 20.0, 0.01).u
     y = answer(([2.0], [1.0, 0.6, 9.0]), u, 0.01)
-    np.savetxt(tmp_path / "data.csv", np.column_stack([np.arange(u.size) * 0.01, u, y]), delimiter=",", header="t,u,y", comments="")
-    shown = quell("identify", "data.csv", "--order", "2", "--json", "out.json", "--figures", "pictures", cwd=tmp_path)
+    np.savetxt(
+        tmp_path / "data.csv",
+        np.column_stack([np.arange(u.size) * 0.01, u, y]),
+        delimiter=",",
+        header="t,u,y",
+        comments="",
+    )
+    shown = quell(
+        "identify",
+        "data.csv",
+        "--order",
+        "2",
+        "--json",
+        "out.json",
+        "--figures",
+        "pictures",
+        cwd=tmp_path,
+    )
     assert shown.returncode == 0, shown.stderr
     assert all(part in shown.stdout for part in ("Poles and zeros", "Fit (NRMSE)", "white:"))
     told = json.loads((tmp_path / "out.json").read_text())
     assert told["den"] == pytest.approx([1.0, 0.6, 9.0], rel=1e-6)
-    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {"identified.png", "identified.svg"}
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
+        "identified.png",
+        "identified.svg",
+    }
 
 
 def test_the_commands_refuse_in_a_line_and_design(
@@ -409,11 +475,17 @@ def test_the_commands_refuse_in_a_line_and_design(
     """What is wrong with a file is a line; an excitation is told and written."""
     monkeypatch.chdir(tmp_path)
     Path("data.csv").write_text("t,u,y\n" + GOOD)
-    with pytest.raises(ValueError, match="column z is missing; the first line names t, u, y; say which with --columns"):
+    with pytest.raises(
+        ValueError,
+        match="column z is missing; the first line names t, u, y; say which with --columns",
+    ):
         app(["identify", "data.csv", "--columns", "t,u,z"], result_action="return_value")
     with pytest.raises(ValueError, match="band = .*must rise"):
         app(["excite", "u.csv", "--low", "70"], result_action="return_value")
-    app(["excite", "u.csv", "--high", "30", "--dt", "0.01", "--duration", "20"], result_action="return_value")
+    app(
+        ["excite", "u.csv", "--high", "30", "--dt", "0.01", "--duration", "20"],
+        result_action="return_value",
+    )
     assert "PRBS of" in capsys.readouterr().out
     assert read_record("u.csv", ("t", "u", "1")).u.size == 2000
 
@@ -424,9 +496,24 @@ def test_the_commands_refuse_in_a_line_and_design(
         ("", ("t", "u", "y"), None, "is empty"),
         ("t,u\n" + GOOD, ("t", "u", "y"), None, "column y is missing; the first line names t, u"),
         ("t,u,y\n0,1\n" + GOOD, ("t", "u", "y"), None, "line 2: y = '': must be a number"),
-        ("t,u,y\n" + GOOD.replace("0.5,2,0", "0.5,nan,0"), ("t", "u", "y"), None, "line 7: u = nan: must be finite"),
-        (GOOD.replace("0.5,2,0", "0.5,x,0"), ("t", "u", "y"), None, "line 6: u = 'x': must be a number"),
-        (GOOD.replace("0.5,2,0\n", ""), ("t", "u", "y"), None, "line 6: t rises by 0.2 s where samples are 0.1"),
+        (
+            "t,u,y\n" + GOOD.replace("0.5,2,0", "0.5,nan,0"),
+            ("t", "u", "y"),
+            None,
+            "line 7: u = nan: must be finite",
+        ),
+        (
+            GOOD.replace("0.5,2,0", "0.5,x,0"),
+            ("t", "u", "y"),
+            None,
+            "line 6: u = 'x': must be a number",
+        ),
+        (
+            GOOD.replace("0.5,2,0\n", ""),
+            ("t", "u", "y"),
+            None,
+            "line 6: t rises by 0.2 s where samples are 0.1",
+        ),
         (GOOD.replace("0.5,2,0", "0.55,2,0"), ("t", "u", "y"), None, "must be evenly sampled"),
         ("0,1,2\n1,2,3", ("t", "u", "y"), None, "has 2 samples; must have at least 8"),
         (GOOD, ("t", "u"), None, "columns = 't,u': must be t,u,y or t,u,y,r"),
@@ -446,10 +533,14 @@ def test_a_record_that_is_none_is_refused_with_its_line(
 
 def test_records_are_read_with_and_without_names_and_times(tmp_path: Path) -> None:
     """By name in any order, by place, by number, with a sample time in place of times, with a reference."""
-    rows = np.column_stack([np.arange(20) * 0.1, np.arange(20) % 3, np.arange(20) % 5, np.arange(20) % 2])
+    rows = np.column_stack(
+        [np.arange(20) * 0.1, np.arange(20) % 3, np.arange(20) % 5, np.arange(20) % 2]
+    )
     plain = "\n".join(",".join(f"{value:g}" for value in row) for row in rows)
     (tmp_path / "plain.csv").write_text(plain)
-    (tmp_path / "named.csv").write_text("# a rig\ny, u, t\n" + "\n".join(f"{row[2]:g},{row[1]:g},{row[0]:g}" for row in rows))
+    (tmp_path / "named.csv").write_text(
+        "# a rig\ny, u, t\n" + "\n".join(f"{row[2]:g},{row[1]:g},{row[0]:g}" for row in rows)
+    )
     for record in (
         read_record(tmp_path / "plain.csv"),
         read_record(tmp_path / "named.csv"),
@@ -459,10 +550,15 @@ def test_records_are_read_with_and_without_names_and_times(tmp_path: Path) -> No
         np.testing.assert_array_equal(record.y, rows[:, 2])
         assert record.dt == pytest.approx(0.1)
         assert record.reference is None
-    german = "t [s];u;y\n" + "\n".join(";".join(f"{value:g}".replace(".", ",") for value in row[:3]) for row in rows)
+    german = "t [s];u;y\n" + "\n".join(
+        ";".join(f"{value:g}".replace(".", ",") for value in row[:3]) for row in rows
+    )
     (tmp_path / "german.csv").write_text("\ufeff" + german, encoding="utf-8")
     (tmp_path / "tabs.csv").write_text(plain.replace(",", "\t"))
-    for record in (read_record(tmp_path / "german.csv", ("t [s]", "u", "y")), read_record(tmp_path / "tabs.csv")):
+    for record in (
+        read_record(tmp_path / "german.csv", ("t [s]", "u", "y")),
+        read_record(tmp_path / "tabs.csv"),
+    ):
         np.testing.assert_array_equal(record.y, rows[:, 2])
         assert record.dt == pytest.approx(0.1)
     reference = read_record(tmp_path / "plain.csv", ("t", "u", "y", "r")).reference

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.learners.base import adapt, commit, predict, restart
-from quell.learners.gradient import outputs
+from quell.learners.gradient.gradient import outputs
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
@@ -26,7 +26,9 @@ LINEAR = {
     "half gain": ESO.model_free(3, 2.0, 15.0, 2e-3, half_gain=True),
     "half gain, predictor": ESO.model_free(3, 2.0, 15.0, 2e-3, half_gain=True, form="predictor"),
     "Kalman": ESO.kalman(3, 2.0, 2e-3, noise_variance=1e-6, drift=10.0),
-    "Kalman, predictor": ESO.kalman(3, 2.0, 2e-3, noise_variance=1e-6, drift=10.0, form="predictor"),
+    "Kalman, predictor": ESO.kalman(
+        3, 2.0, 2e-3, noise_variance=1e-6, drift=10.0, form="predictor"
+    ),
     "cascade": ESO.cascade(3, 2.0, 15.0, 2e-3, levels=3, ratio=1.5),
     "delay": ESO.model_free(3, 2.0, 15.0, 2e-3, delay=0.01),
     "cascade with delay": ESO.cascade(3, 2.0, 15.0, 2e-3, delay=0.01),
@@ -41,7 +43,9 @@ LINEAR = {
     model=st.booleans(),
     seed=st.integers(0, 100),
 )
-def test_the_lag_filter_is_the_observers_own_shadow(order: int, dt: float, form: str, model: bool, seed: int) -> None:
+def test_the_lag_filter_is_the_observers_own_shadow(
+    order: int, dt: float, form: str, model: bool, seed: int
+) -> None:
     """Against the definition: the full observer, fed y = 0 and the input through Γ_f, for a thousand samples."""
     rng = np.random.default_rng(seed)
     observer = (
@@ -68,7 +72,9 @@ def test_a_constant_passes_the_lag_filter_unchanged(order: int) -> None:
 
 
 @pytest.mark.parametrize("name", LINEAR)
-def test_what_a_plain_eso_would_have_estimated_is_known_exactly(name: str, rng: np.random.Generator) -> None:
+def test_what_a_plain_eso_would_have_estimated_is_known_exactly(
+    name: str, rng: np.random.Generator
+) -> None:
     """``Δf̂ + f_L^F`` is the plain ESO's estimate from the same y and u, whatever was fed forward; for every linear form."""
     observer = LINEAR[name]
     lag = lag_of(observer)
@@ -111,10 +117,14 @@ def literal_algorithm_1(seen: np.ndarray, u: np.ndarray, rate: float, batch: int
 
 
 @pytest.mark.parametrize("batch", [1, 2, 7, 50])
-def test_algorithm_1_by_sliding_sums_is_algorithm_1_as_printed(batch: int, rng: np.random.Generator) -> None:
+def test_algorithm_1_by_sliding_sums_is_algorithm_1_as_printed(
+    batch: int, rng: np.random.Generator
+) -> None:
     """The same θ at every sample, and the same third buffer at the end."""
     seen, u = rng.normal(size=(200, 4)), rng.normal(size=200)
-    learner = ql.learners.BatchGradient(rate=1e-3, batch=batch).design(ESO.model_free(order=3, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
+    learner = ql.learners.BatchGradient(rate=1e-3, batch=batch).design(
+        ESO.model_free(order=3, b0=1.0, omega_o=10.0, dt=1e-2), 1.0
+    )
     memory = ql.learners.BatchGradient(rate=1e-3, batch=batch).memory(learner)
     expected = literal_algorithm_1(seen, u, 1e-3, batch)
     for row, before, theta in zip(seen, u, expected, strict=True):
@@ -166,7 +176,9 @@ def test_without_a_walk_the_kalman_learner_is_ridge_regression(rng: np.random.Ge
         memory.filtered[:] = row
         adapt(design, memory, np.zeros(5), 1.0, 0.0, target)
     weight = observer.dt / design.lag_time  # R = τ E[ε²], with E[ε²] held at 1
-    ridge = np.linalg.solve(np.eye(4) / 9.0 + weight * features.T @ features, weight * features.T @ targets)
+    ridge = np.linalg.solve(
+        np.eye(4) / 9.0 + weight * features.T @ features, weight * features.T @ targets
+    )
     np.testing.assert_allclose(memory.theta, ridge, atol=1e-10)
 
 
@@ -187,25 +199,39 @@ def test_the_bias_follows_with_its_bandwidth_whatever_the_sample_time(dt: float)
 def test_the_kalman_learner_finds_the_plant(two_mass_scenario: ql.Scenario) -> None:
     """After 20 s of sin t it knows f = −2 y'' of the benchmark, from noisy y alone, and the prior does not matter."""
     for prior in (3.0, 100.0):
-        controller = ql.ADRC(ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=2e-3), omega_c=1.0, learner=ql.learners.Kalman(prior=prior))
+        controller = ql.ADRC(
+            ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=2e-3),
+            omega_c=1.0,
+            learner=ql.learners.Kalman(prior=prior),
+        )
         run = ql.simulate(ql.plants.two_mass_spring(), controller, two_mass_scenario)
         learned = run["theta"][run.window(19.0, 20.0)][-1]
         # For y = sin t, x3 = −x1 and x4 = −x2: two sums are certain at once, the rest only through the transient.
-        np.testing.assert_allclose([learned[2] - learned[0], learned[3] - learned[1], learned[4]], [-2.0, 0.0, 0.0], atol=0.05)
+        np.testing.assert_allclose(
+            [learned[2] - learned[0], learned[3] - learned[1], learned[4]],
+            [-2.0, 0.0, 0.0],
+            atol=0.05,
+        )
         np.testing.assert_allclose(learned, [0.0, 0.0, -2.0, 0.0, 0.0], atol=0.4)
 
 
 def test_the_kalman_learner_finds_a_wrong_gain() -> None:
     """With u among its features and enough excitation, b0 + θ_u is the plant's gain, though b0 was half of it."""
     s = ql.signals
-    excitation = s.Chirp(omega_start=0.2, omega_end=3.0, duration=60.0) + 0.5 * s.Sinusoid(omega=1.7)
+    excitation = s.Chirp(omega_start=0.2, omega_end=3.0, duration=60.0) + 0.5 * s.Sinusoid(
+        omega=1.7
+    )
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.5]], [0.0, 2.0], [1.0, 0.0])
     controller = ql.ADRC(
         ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=5e-3),
         omega_c=4.0,
-        learner=ql.learners.Kalman(u=True, bias=True, bias_bandwidth=0.05, gain_interval=(0.3, 3.0)),
+        learner=ql.learners.Kalman(
+            u=True, bias=True, bias_bandwidth=0.05, gain_interval=(0.3, 3.0)
+        ),
     )
-    run = ql.simulate(plant, controller, ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-10, 0.01)))
+    run = ql.simulate(
+        plant, controller, ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-10, 0.01))
+    )
     theta = controller.read(run.final_state).theta
     assert 1.0 + theta["u"] == pytest.approx(2.0, rel=0.05)
     assert theta["x1"] == pytest.approx(-3.0, rel=0.1)
@@ -228,7 +254,11 @@ def test_the_effective_gain_stays_in_its_interval(rng: np.random.Generator) -> N
 
 def test_rounding_is_not_data() -> None:
     """At rest and without noise the learner stays where it is: nothing winds up."""
-    controller = ql.ADRC(ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2), omega_c=1.0, learner=ql.learners.Kalman())
+    controller = ql.ADRC(
+        ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2),
+        omega_c=1.0,
+        learner=ql.learners.Kalman(),
+    )
     scenario = ql.Scenario(reference=1.0, x0=[1.0, 1.0, 0.0, 0.0], duration=1000.0)
     run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=100)
     assert np.max(np.abs(run["theta"])) < 1e-3
@@ -238,9 +268,15 @@ def test_rounding_is_not_data() -> None:
 def test_what_was_learned_is_kept_through_hours_of_rest() -> None:
     """At rest the features are noise and teach nothing: after three hours the next step is what it was."""
     s = ql.signals
-    controller = ql.ADRC(ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2), omega_c=1.0, learner=ql.learners.Kalman())
+    controller = ql.ADRC(
+        ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2),
+        omega_c=1.0,
+        learner=ql.learners.Kalman(),
+    )
     reference = s.Sinusoid().until(110.0, then=s.Step(at=110.0) + s.Step(at=10_000.0))
-    scenario = ql.Scenario(reference, duration=10_040.0, noise=s.BandLimitedNoise(power=1e-12, sample_time=0.01))
+    scenario = ql.Scenario(
+        reference, duration=10_040.0, noise=s.BandLimitedNoise(power=1e-12, sample_time=0.01)
+    )
     run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=10)
     np.testing.assert_allclose(run["theta"][-1][:4], [0.0, 0.0, -2.0, 0.0], atol=0.1)
     assert run.metrics(10_000.0, target=2.0)["overshoot"] < 1e-3
@@ -255,7 +291,9 @@ def test_at_rest_a_learner_is_as_quiet_as_no_learner(order: int, power: float) -
     observer = ESO.model_free(order=order, b0=1.0, omega_o=30.0, dt=2e-3)
     scenario = ql.Scenario(1.0, duration=300.0, noise=ql.signals.BandLimitedNoise(power, 0.01))
     plain, learned = (
-        ql.simulate(plant, ql.ADRC(observer, omega_c=1.0, learner=learner), scenario, record_every=5)
+        ql.simulate(
+            plant, ql.ADRC(observer, omega_c=1.0, learner=learner), scenario, record_every=5
+        )
         for learner in (None, ql.learners.Kalman())
     )
     late = plain.window(200.0, 300.0)
@@ -269,13 +307,21 @@ def test_where_nothing_is_left_to_learn_nothing_is_learned(order: int, u: bool) 
     A = np.diag(np.ones(order - 1), 1)
     plant = ql.plants.LinearPlant(A, np.eye(order)[-1], np.eye(order)[0])
     s = ql.signals
-    scenario = ql.Scenario(s.Sinusoid().until(60.0, then=s.Sinusoid(omega=0.5)).until(120.0, then=2.0), 160.0, (s.Step(at=140.0),))
-    controller = ql.ADRC(ESO.model_free(order, 1.0, 10.0, 5e-3), omega_c=1.0, learner=ql.learners.Kalman(u=u))
+    scenario = ql.Scenario(
+        s.Sinusoid().until(60.0, then=s.Sinusoid(omega=0.5)).until(120.0, then=2.0),
+        160.0,
+        (s.Step(at=140.0),),
+    )
+    controller = ql.ADRC(
+        ESO.model_free(order, 1.0, 10.0, 5e-3), omega_c=1.0, learner=ql.learners.Kalman(u=u)
+    )
     run = ql.simulate(plant, controller, scenario)
     assert not run.diverged
     assert np.max(np.abs(run["theta"][run.t < 140.0])) < 0.1
     covariance = run.final_state.learner.covariance
-    assert np.min(np.linalg.eigvalsh(0.5 * (covariance + covariance.T))) > -1e-9 * np.max(np.abs(covariance))
+    assert np.min(np.linalg.eigvalsh(0.5 * (covariance + covariance.T))) > -1e-9 * np.max(
+        np.abs(covariance)
+    )
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
@@ -284,8 +330,16 @@ def test_the_unit_of_y_does_not_matter(unit: float, two_mass_scenario: ql.Scenar
     found = []
     for size in (1.0, unit):
         plant = ql.plants.two_mass_spring(c2=size)
-        scenario = ql.Scenario(size * ql.signals.Sinusoid(), 20.0, noise=ql.signals.BandLimitedNoise(1e-12 * size**2, 0.01))
-        controller = ql.ADRC(ESO.model_free(order=4, b0=size, omega_o=10.0, dt=5e-3), omega_c=1.0, learner=ql.learners.Kalman())
+        scenario = ql.Scenario(
+            size * ql.signals.Sinusoid(),
+            20.0,
+            noise=ql.signals.BandLimitedNoise(1e-12 * size**2, 0.01),
+        )
+        controller = ql.ADRC(
+            ESO.model_free(order=4, b0=size, omega_o=10.0, dt=5e-3),
+            omega_c=1.0,
+            learner=ql.learners.Kalman(),
+        )
         run = ql.simulate(plant, controller, scenario, limit=1e9)
         found.append(run["theta"][-1][:4])
     np.testing.assert_allclose(found[0], found[1], atol=1e-4)
@@ -296,7 +350,9 @@ def test_a_load_that_comes_before_anything_was_learned_is_taken_by_the_bias() ->
     scenario = ql.Scenario(1.0, 40.0, disturbances=(0.0, ql.signals.Step(at=10.0)))
     plain, learned = (
         ql.simulate(
-            ql.plants.two_mass_spring(), ql.ADRC(ESO.model_free(4, 1.0, 10.0, 5e-3), omega_c=1.0, learner=learner), scenario
+            ql.plants.two_mass_spring(),
+            ql.ADRC(ESO.model_free(4, 1.0, 10.0, 5e-3), omega_c=1.0, learner=learner),
+            scenario,
         ).metrics(10.0, target=1.0)
         for learner in (None, ql.learners.Kalman())
     )
@@ -314,7 +370,11 @@ def test_a_first_motion_out_of_friction_does_not_settle_what_is_learned(scale: f
     plant = ql.plants.NonlinearPlant(pendulum, order=2, substeps=2)
     scenario = ql.Scenario(ql.signals.Trapezoid(distance=2.0, duration=1.5, start=0.5), 5.0)
     plain, learned = (
-        ql.simulate(plant, ql.ADRC(ESO.model_free(2, 8.0, 40.0, 2e-3), omega_c=10.0, learner=learner), scenario).metrics()
+        ql.simulate(
+            plant,
+            ql.ADRC(ESO.model_free(2, 8.0, 40.0, 2e-3), omega_c=10.0, learner=learner),
+            scenario,
+        ).metrics()
         for learner in (None, ql.learners.Kalman())
     )
     assert learned["rms"] <= plain["rms"]
@@ -338,7 +398,9 @@ def test_the_learner_watches_before_it_learns() -> None:
     np.testing.assert_array_equal(memory.theta, before)
 
 
-@pytest.mark.parametrize("learner", [ql.learners.Kalman(u=True), ql.learners.BatchGradient(batch=4)])
+@pytest.mark.parametrize(
+    "learner", [ql.learners.Kalman(u=True), ql.learners.BatchGradient(batch=4)]
+)
 def test_a_learner_that_left_the_range_of_numbers_begins_anew(learner: object) -> None:
     """Restarting keeps what was learned, but not where it is no number."""
     design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
@@ -356,20 +418,37 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew(learner: object) -
     ("make", "message"),
     [
         (lambda: ql.learners.Kalman(state=False, bias=False), "at least one feature must be left"),
-        (lambda: ql.learners.Kalman(bias_bandwidth=-1.0), "bias_bandwidth = -1.0: must be finite and not negative"),
+        (
+            lambda: ql.learners.Kalman(bias_bandwidth=-1.0),
+            "bias_bandwidth = -1.0: must be finite and not negative",
+        ),
         (lambda: ql.learners.Kalman(state=2), "state = 2: must be True or False"),
         (
-            lambda: ql.learners.Kalman(state_bandwidth=[0.1, 0.2]).design(ESO.model_free(3, 1.0, 10.0, 0.01), 1.0),
+            lambda: ql.learners.Kalman(state_bandwidth=[0.1, 0.2]).design(
+                ESO.model_free(3, 1.0, 10.0, 0.01), 1.0
+            ),
             r"state_bandwidth has shape \(2,\): must be a vector of 3",
         ),
-        (lambda: ql.learners.Kalman(frequency=0.0), "frequency = 0.0: must be finite and greater than zero"),
-        (lambda: ql.learners.Kalman(prior=math.inf), "prior = inf: must be finite and greater than zero"),
+        (
+            lambda: ql.learners.Kalman(frequency=0.0),
+            "frequency = 0.0: must be finite and greater than zero",
+        ),
+        (
+            lambda: ql.learners.Kalman(prior=math.inf),
+            "prior = inf: must be finite and greater than zero",
+        ),
         (
             lambda: ql.learners.Kalman(gain_interval=(1.2, 2.0)),
             r"gain_interval = \(1.2, 2.0\): must be \(low, high\) with 0 < low <= 1 <= high",
         ),
-        (lambda: ql.learners.BatchGradient(rate=-1e-3), "rate = -0.001: must be finite and not negative"),
-        (lambda: ql.learners.BatchGradient(batch=0), "batch = 0: must be a whole number of at least 1"),
+        (
+            lambda: ql.learners.BatchGradient(rate=-1e-3),
+            "rate = -0.001: must be finite and not negative",
+        ),
+        (
+            lambda: ql.learners.BatchGradient(batch=0),
+            "batch = 0: must be a whole number of at least 1",
+        ),
     ],
 )
 def test_a_mistake_is_named(make: object, message: str) -> None:

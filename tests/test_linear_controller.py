@@ -10,7 +10,7 @@ import pytest
 
 import quell as ql
 from quell.controllers import LinearController, LinearLaw, Prefiltered
-from quell.controllers.transfer import anti_windup, as_state_space, realised, tustin
+from quell.controllers.linear.transfer import anti_windup, as_state_space, realised, tustin
 
 from .contracts.python_models import LeastMeanSquares
 
@@ -21,7 +21,9 @@ def response(law: LinearLaw, omega: float, dt: float) -> tuple[complex, complex]
     """Frequency responses from r and from y to u, without limits."""
     A, z = law.A + np.outer(law.B_u, law.C), np.exp(1j * omega * dt)
     inner = np.linalg.inv(z * np.eye(law.C.size) - A)
-    return tuple(law.C @ inner @ (B + law.B_u * D) + D for B, D in ((law.B_r, law.D_r), (law.B_y, law.D_y)))  # type: ignore[return-value]
+    return tuple(
+        law.C @ inner @ (B + law.B_u * D) + D for B, D in ((law.B_r, law.D_r), (law.B_y, law.D_y))
+    )  # type: ignore[return-value]
 
 
 def poly(num: list[float], den: list[float], s: complex) -> complex:
@@ -47,7 +49,10 @@ def test_tustin_gives_c_at_the_warped_frequency_however_far_apart_its_poles_are(
 def test_prewarping_is_exact_where_it_is_asked_for() -> None:
     """At that frequency, not beside it."""
     num, den = [1.0, 0.2, 25.0], [1.0, 5.0, 25.0]
-    plain, warped = (LinearController.from_transfer_function(num, den, dt=0.1, prewarp=w).law for w in (None, 6.0))
+    plain, warped = (
+        LinearController.from_transfer_function(num, den, dt=0.1, prewarp=w).law
+        for w in (None, 6.0)
+    )
     expected = poly(num, den, 6.0j)
     assert response(warped, 6.0, 0.1)[0] == pytest.approx(expected, rel=1e-10)
     assert abs(response(plain, 6.0, 0.1)[0] - expected) > 0.01
@@ -59,7 +64,9 @@ def test_python_control_samples_the_same(method: str) -> None:
     system = control.tf([2.0, 1.0, 0.5], [1.0, 3.0, 2.0, 0.0])
     theirs = control.sample_system(system, 0.05, method=method)
     for ours in (system, control.ss(system)):
-        law = LinearController.from_transfer_function(ours, dt=0.05, method=method, feedback="output").law
+        law = LinearController.from_transfer_function(
+            ours, dt=0.05, method=method, feedback="output"
+        ).law
         for omega in (0.01, 1.0, 30.0):
             from_r, from_y = response(law, omega, 0.05)
             assert from_r == 0.0
@@ -72,7 +79,9 @@ def test_a_realisation_serves_both_inputs_with_the_states_of_one() -> None:
     A, B, C, through = realised([T, S], D)
     assert A.shape == (3, 3)
     for s in (0.1j, 2.0 + 1.0j):
-        np.testing.assert_allclose((C @ np.linalg.solve(s * np.eye(3) - A, B) + through)[0], [poly(T, D, s), poly(S, D, s)])
+        np.testing.assert_allclose(
+            (C @ np.linalg.solve(s * np.eye(3) - A, B) + through)[0], [poly(T, D, s), poly(S, D, s)]
+        )
     gain = LinearController.from_transfer_function([2.0], [4.0], dt=0.1)
     assert gain.law.C.size == 0
     assert gain.step(3.0, 1.0) == 1.0
@@ -86,19 +95,30 @@ def test_anti_windup_moves_the_integrator_and_nothing_else() -> None:
     kept = np.sort(np.linalg.eigvals(A).real)
     np.testing.assert_allclose(moved, np.sort([*kept[:2], 0.9]), rtol=1e-9)
     twice = tustin(as_state_space([1.0, 0.5], [1.0, 2.0, 0.0, 0.0]), 0.01)
-    left = np.linalg.eigvals(twice[0] - np.outer(anti_windup(twice[0], twice[2][0], 0.9), twice[2][0]))
-    np.testing.assert_allclose(np.poly(left), np.poly([0.9, 0.9, (1 - 0.01) / (1 + 0.01)]), rtol=1e-9)
+    left = np.linalg.eigvals(
+        twice[0] - np.outer(anti_windup(twice[0], twice[2][0], 0.9), twice[2][0])
+    )
+    np.testing.assert_allclose(
+        np.poly(left), np.poly([0.9, 0.9, (1 - 0.01) / (1 + 0.01)]), rtol=1e-9
+    )
 
 
 def test_an_integrator_does_not_wind_up() -> None:
     """After 40 s against a limit it leaves it at once when the reference comes back; without B_u it stays for many seconds."""
     reference = ql.signals.Constant(5.0).until(40.0, then=ql.signals.Constant(0.5))
     scenario = ql.Scenario(reference=reference, duration=60.0)
-    controller = LinearController.from_transfer_function([1.0, 2.0], [1.0, 0.0], dt=0.01, u_min=-1.0, u_max=1.0)
+    controller = LinearController.from_transfer_function(
+        [1.0, 2.0], [1.0, 0.0], dt=0.01, u_min=-1.0, u_max=1.0
+    )
     law = controller.law
     A = law.A + np.outer(law.B_u, law.C)
-    naive = law._replace(A=A, B_r=law.B_r + law.B_u * law.D_r, B_y=law.B_y + law.B_u * law.D_y, B_u=0.0 * law.B_u)
-    run, wound = (ql.simulate(LAG, c, scenario) for c in (controller, LinearController(naive, 0.01, u_min=-1.0, u_max=1.0)))
+    naive = law._replace(
+        A=A, B_r=law.B_r + law.B_u * law.D_r, B_y=law.B_y + law.B_u * law.D_y, B_u=0.0 * law.B_u
+    )
+    run, wound = (
+        ql.simulate(LAG, c, scenario)
+        for c in (controller, LinearController(naive, 0.01, u_min=-1.0, u_max=1.0))
+    )
     after = run.window(40.0, 41.0)
     assert run["u"][after.start] == pytest.approx(0.5, abs=0.02)  # back-calculated: I = 1, P = −0.5
     assert np.all(wound["u"][wound.window(40.0, 50.0)] == 1.0)
@@ -122,14 +142,19 @@ def test_a_loop_that_rests_anywhere_goes_on_resting(controller: LinearController
 
 def test_a_law_without_integrator_starts_at_its_own_rest() -> None:
     """A lead filter on −y: its state is at rest, and u what it makes of y."""
-    controller = LinearController.from_transfer_function([1.0, 2.0], [0.1, 1.0], dt=0.01, feedback="output")
+    controller = LinearController.from_transfer_function(
+        [1.0, 2.0], [0.1, 1.0], dt=0.01, feedback="output"
+    )
     assert [controller.step(0.0, 3.0) for _ in range(3)] == pytest.approx([-6.0] * 3)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_bad_sample_is_held(bad: float) -> None:
     """As if the last good one had come again, and said so."""
-    one, other = (LinearController.from_transfer_function([2.0, 1.0], [0.1, 1.0, 0.0], dt=0.01) for _ in range(2))
+    one, other = (
+        LinearController.from_transfer_function([2.0, 1.0], [0.1, 1.0, 0.0], dt=0.01)
+        for _ in range(2)
+    )
     for y in (0.1, 0.2):
         one.step(1.0, y)
         other.step(1.0, y)
@@ -141,7 +166,9 @@ def test_a_bad_sample_is_held(bad: float) -> None:
 
 def test_nothing_happens_before_a_first_good_measurement_nor_without_reference() -> None:
     """Then it begins at rest there."""
-    controller = LinearController.from_transfer_function([2.0, 1.0], [1.0, 0.0], dt=0.01, u_min=0.5, u_max=2.0)
+    controller = LinearController.from_transfer_function(
+        [2.0, 1.0], [1.0, 0.0], dt=0.01, u_min=0.5, u_max=2.0
+    )
     assert controller.step(5.0, math.nan) == 0.5
     controller = LinearController.from_transfer_function([2.0, 1.0], [1.0, 0.0], dt=0.01)
     assert controller.step(math.nan, 4.0) == 0.0
@@ -150,7 +177,9 @@ def test_nothing_happens_before_a_first_good_measurement_nor_without_reference()
 
 def test_an_overflow_starts_afresh() -> None:
     """U holds, the status says it."""
-    controller = LinearController.from_transfer_function([1e200, 0.0], [1.0, 1.0], dt=0.01, u_max=1.0, u_min=-1.0)
+    controller = LinearController.from_transfer_function(
+        [1e200, 0.0], [1.0, 1.0], dt=0.01, u_max=1.0, u_min=-1.0
+    )
     controller.step(1.0, 0.0)
     assert controller.step(1e200, 0.0) == 1.0
     assert ql.Status.OVERFLOWED in controller.status
@@ -180,7 +209,10 @@ def test_a_prefilter_serves_adrc_with_a_learner() -> None:
     """Channels, coefficients and the estimate are ADRC's; a constant prefilter changes nothing."""
     adrc = ql.ADRC(ql.ESO.model_free(2, 2.0, 20.0, 0.01), 3.0, learner=ql.learners.NLMS())
     scenario = ql.Scenario(reference=ql.signals.Sinusoid(), duration=0.6)
-    plain, shaped = (ql.simulate(LAG, c, scenario, interpret=True) for c in (adrc, Prefiltered(adrc, ql.baselines.Shaper((0.0,), (1.0,)))))
+    plain, shaped = (
+        ql.simulate(LAG, c, scenario, interpret=True)
+        for c in (adrc, Prefiltered(adrc, ql.baselines.Shaper((0.0,), (1.0,))))
+    )
     np.testing.assert_array_equal(plain["u"], shaped["u"])
     np.testing.assert_array_equal(shaped["r_shaped"], shaped["r"])
     np.testing.assert_array_equal(plain["theta"], shaped["theta"])
@@ -191,12 +223,16 @@ def test_a_prefilter_serves_adrc_with_a_learner() -> None:
 def test_a_prefilter_keeps_what_a_python_learner_keeps(monkeypatch: pytest.MonkeyPatch) -> None:
     """What lies outside of the arrays is in the state, by name, and comes back."""
     learner = ql.learners.PythonModel(LeastMeanSquares())
-    shaped = Prefiltered(ql.ADRC(ql.ESO.model_free(2, 2.0, 20.0, 0.01), 3.0, learner=learner), ql.baselines.ZV(3.0))
+    shaped = Prefiltered(
+        ql.ADRC(ql.ESO.model_free(2, 2.0, 20.0, 0.01), 3.0, learner=learner), ql.baselines.ZV(3.0)
+    )
     outside = [name for name, value in shaped.state.items() if value.dtype == object]
     assert outside
     assert all(name.startswith("controller.learner.") for name in outside)
     recalled: list[object] = []
-    monkeypatch.setattr(learner, "recall", lambda memory, snapshots: recalled.append(set(snapshots)))
+    monkeypatch.setattr(
+        learner, "recall", lambda memory, snapshots: recalled.append(set(snapshots))
+    )
     shaped.state = shaped.state
     assert recalled == [{name.removeprefix("controller.learner.") for name in outside}]
 
@@ -208,27 +244,69 @@ make = LinearController.from_transfer_function
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (lambda: LinearController("law", 0.1), "law = 'law': must be a quell.controllers.LinearLaw"),
-        (lambda: LinearController(LAW._replace(C=np.ones(3)), 0.1), r"law.C has shape \(3,\): must be a vector of 2"),
-        (lambda: LinearController(LAW._replace(D_y=math.nan), 0.1), "law.D_y = nan: must be a finite number"),
+        (
+            lambda: LinearController("law", 0.1),
+            "law = 'law': must be a quell.controllers.LinearLaw",
+        ),
+        (
+            lambda: LinearController(LAW._replace(C=np.ones(3)), 0.1),
+            r"law.C has shape \(3,\): must be a vector of 2",
+        ),
+        (
+            lambda: LinearController(LAW._replace(D_y=math.nan), 0.1),
+            "law.D_y = nan: must be a finite number",
+        ),
         (lambda: LinearController(LAW, 0.0), "dt = 0.0: must be finite and greater than zero"),
         (lambda: LinearController(LAW, 0.1, u_min=1.0, u_max=0.0), "u_min = 1.0, u_max = 0.0"),
-        (lambda: make([1.0, 0.0], [1.0], 0.1), "is of degree 1, den of degree 0: C.s. must be proper"),
-        (lambda: make([1.0], [0.0], 0.1), "den = .0.0.: must not be zero"),
-        (lambda: make(3.0, dt=0.1), "num = 3.0: must be a polynomial, with den, or a control.TransferFunction"),
-        (lambda: make(control.tf([1.0], [1.0, 0.5], 0.1), dt=0.1), "transfer function has a sample time, dt = 0.1"),
-        (lambda: make([1.0], [1.0, 1.0], 0.1, method="euler"), "method = 'euler': must be one of tustin, zoh"),
-        (lambda: make([1.0], [1.0, 1.0], 0.1, method="zoh", prewarp=1.0), "prewarp = 1.0: goes with method = 'tustin' only"),
-        (lambda: make([1.0], [1.0, 1.0], 0.1, prewarp=40.0), "prewarp = 40.0 rad/s with dt = 0.1 s: must be below pi/dt"),
-        (lambda: make([1.0], [1.0, 1.0], 0.1, feedback="y"), "feedback = 'y': must be one of error, output"),
-        (lambda: make([1.0], [1.0, 0.0], 0.1, tracking_time=0.0), "tracking_time = 0.0: must be finite and greater than zero"),
-        (lambda: make([1.0], [1.0, 0.0]), "dt = None: must be a number"),
-        (lambda: Prefiltered("pid", ql.baselines.ZV(1.0)), "controller = 'pid': must be a controller"),
         (
-            lambda: Prefiltered(ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, feedforward=True), ql.baselines.ZV(1.0)),
+            lambda: make([1.0, 0.0], [1.0], 0.1),
+            "is of degree 1, den of degree 0: C.s. must be proper",
+        ),
+        (lambda: make([1.0], [0.0], 0.1), "den = .0.0.: must not be zero"),
+        (
+            lambda: make(3.0, dt=0.1),
+            "num = 3.0: must be a polynomial, with den, or a control.TransferFunction",
+        ),
+        (
+            lambda: make(control.tf([1.0], [1.0, 0.5], 0.1), dt=0.1),
+            "transfer function has a sample time, dt = 0.1",
+        ),
+        (
+            lambda: make([1.0], [1.0, 1.0], 0.1, method="euler"),
+            "method = 'euler': must be one of tustin, zoh",
+        ),
+        (
+            lambda: make([1.0], [1.0, 1.0], 0.1, method="zoh", prewarp=1.0),
+            "prewarp = 1.0: goes with method = 'tustin' only",
+        ),
+        (
+            lambda: make([1.0], [1.0, 1.0], 0.1, prewarp=40.0),
+            "prewarp = 40.0 rad/s with dt = 0.1 s: must be below pi/dt",
+        ),
+        (
+            lambda: make([1.0], [1.0, 1.0], 0.1, feedback="y"),
+            "feedback = 'y': must be one of error, output",
+        ),
+        (
+            lambda: make([1.0], [1.0, 0.0], 0.1, tracking_time=0.0),
+            "tracking_time = 0.0: must be finite and greater than zero",
+        ),
+        (lambda: make([1.0], [1.0, 0.0]), "dt = None: must be a number"),
+        (
+            lambda: Prefiltered("pid", ql.baselines.ZV(1.0)),
+            "controller = 'pid': must be a controller",
+        ),
+        (
+            lambda: Prefiltered(
+                ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, feedforward=True),
+                ql.baselines.ZV(1.0),
+            ),
             "controller has feedforward, and Shaper knows no derivatives",
         ),
-        (lambda: Prefiltered(ql.baselines.PID(1.0, dt=0.1), 3), "prefilter = 3: must be a prefilter"),
+        (
+            lambda: Prefiltered(ql.baselines.PID(1.0, dt=0.1), 3),
+            "prefilter = 3: must be a prefilter",
+        ),
     ],
 )
 def test_a_mistake_is_named(wrong: object, message: str) -> None:

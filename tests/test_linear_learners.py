@@ -11,14 +11,16 @@ import pytest
 import quell as ql
 from quell.features import RBF, Bias, Friction, Input, Polynomial, State
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.nlms import NlmsMemory, NlmsRule
-from quell.learners.regression import improve, renew
-from quell.learners.rls import RlsMemory, RlsRule
+from quell.learners.regression.nlms import NlmsMemory, NlmsRule
+from quell.learners.regression.regression import improve, renew
+from quell.learners.regression.rls import RlsMemory, RlsRule
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)
 
 
-def rls(size: int, noise: float = 2.0, forget: float = 0.0, prior: float = 9.0) -> tuple[RlsRule, RlsMemory]:
+def rls(
+    size: int, noise: float = 2.0, forget: float = 0.0, prior: float = 9.0
+) -> tuple[RlsRule, RlsMemory]:
     """A rule and its state."""
     return RlsRule(noise, forget, prior), RlsMemory(prior * np.eye(size), np.zeros(size))
 
@@ -37,7 +39,9 @@ def test_rls_without_forgetting_is_ridge_regression(rng: np.random.Generator) ->
     rule, memory = rls(4)
     theta = taught(rule, memory, features, targets)
     information = np.eye(4) / rule.prior + features.T @ features / rule.noise
-    np.testing.assert_allclose(theta, np.linalg.solve(information, features.T @ targets / rule.noise), atol=1e-11)
+    np.testing.assert_allclose(
+        theta, np.linalg.solve(information, features.T @ targets / rule.noise), atol=1e-11
+    )
     np.testing.assert_allclose(memory.covariance, np.linalg.inv(information), atol=1e-11)
 
 
@@ -53,7 +57,9 @@ def test_rls_forgets_along_what_it_sees_and_nowhere_else() -> None:
         assert across @ memory.covariance @ across == pytest.approx(9.0, rel=1e-12)
     for _ in range(5000):
         improve(rule, memory, np.zeros(2), direction, 0.0, 1.0)
-    assert direction @ memory.covariance @ direction / rule.noise == pytest.approx(0.01 / 0.99, rel=1e-6)
+    assert direction @ memory.covariance @ direction / rule.noise == pytest.approx(
+        0.01 / 0.99, rel=1e-6
+    )
 
 
 def test_rls_follows_what_drifts_in_its_memory_time(rng: np.random.Generator) -> None:
@@ -83,9 +89,13 @@ def test_nlms_projects_on_what_it_sees(rng: np.random.Generator) -> None:
     """With the step 1 and no regularisation the new θ explains the sample, and is the nearest that does (Haykin, section 7.1)."""
     features, theta = rng.normal(size=5), rng.normal(size=5)
     before = theta.copy()
-    improve(NlmsRule(1.0, 0.0), NlmsMemory(np.zeros(0)), theta, features, 2.0 - theta @ features, 1.0)
+    improve(
+        NlmsRule(1.0, 0.0), NlmsMemory(np.zeros(0)), theta, features, 2.0 - theta @ features, 1.0
+    )
     assert theta @ features == pytest.approx(2.0, rel=1e-12)
-    np.testing.assert_allclose(theta - before, features * ((theta - before) @ features) / (features @ features), atol=1e-12)
+    np.testing.assert_allclose(
+        theta - before, features * ((theta - before) @ features) / (features @ features), atol=1e-12
+    )
 
 
 def test_nlms_learns_at_its_rate_whatever_the_sample_time() -> None:
@@ -98,7 +108,9 @@ def test_nlms_learns_at_its_rate_whatever_the_sample_time() -> None:
         assert 1.0 - theta @ [size, size] == pytest.approx(math.exp(-1.0), rel=0.02)
 
 
-def loop(learner: Any, duration: float = 40.0, unit: float = 1.0) -> tuple[ql.Trajectory, dict[str, float]]:
+def loop(
+    learner: Any, duration: float = 40.0, unit: float = 1.0
+) -> tuple[ql.Trajectory, dict[str, float]]:
     """A run with a mass on a spring that stiffens, with friction and a weight: f = −2 y − 0.5 y³ − tanh(y'/0.3) + 0.7, b = 1.5."""
 
     def mass(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
@@ -109,14 +121,24 @@ def loop(learner: Any, duration: float = 40.0, unit: float = 1.0) -> tuple[ql.Tr
     plant = ql.plants.NonlinearPlant(mass, order=2)
     reference = unit * (s.Sinusoid(0.8) + s.Sinusoid(0.5, omega=2.3))
     controller = ql.ADRC(OBSERVER, omega_c=4.0, learner=learner)
-    run = ql.simulate(plant, controller, ql.Scenario(reference, duration, noise=s.BandLimitedNoise(1e-12 * unit**2, 0.01)), limit=1e12)
+    run = ql.simulate(
+        plant,
+        controller,
+        ql.Scenario(reference, duration, noise=s.BandLimitedNoise(1e-12 * unit**2, 0.01)),
+        limit=1e12,
+    )
     return run, controller.read(run.final_state).theta
 
 
 @pytest.mark.parametrize("unit", [2.0**-17, 1.0, 2.0**17])  # scales are powers of two
 def test_coefficients_are_in_the_plants_units(unit: float) -> None:
     """What is learned is the plant, whatever the unit of y."""
-    _, theta = loop(ql.learners.RLS(State() + Polynomial(3, states=(1,)) + Friction(width=0.15) + Bias(), frequency=1.0), unit=unit)
+    _, theta = loop(
+        ql.learners.RLS(
+            State() + Polynomial(3, states=(1,)) + Friction(width=0.15) + Bias(), frequency=1.0
+        ),
+        unit=unit,
+    )
     assert theta["x1"] == pytest.approx(-2.0, abs=0.15)
     assert theta["x1^3"] * unit**2 == pytest.approx(-0.5, abs=0.1)
     assert theta["tanh(x2/0.15)"] / unit == pytest.approx(-1.0, abs=0.15)
@@ -142,11 +164,17 @@ def test_the_effective_gain_stays_in_its_interval(make: Any, rng: np.random.Gene
 def test_a_wrong_gain_is_found() -> None:
     """With u among the features and enough excitation, b0 + θ_u is the plant's gain."""
     s = ql.signals
-    excitation = s.Chirp(omega_start=0.2, omega_end=3.0, duration=60.0) + 0.5 * s.Sinusoid(omega=1.7)
+    excitation = s.Chirp(omega_start=0.2, omega_end=3.0, duration=60.0) + 0.5 * s.Sinusoid(
+        omega=1.7
+    )
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.5]], [0.0, 2.0], [1.0, 0.0])
     learner = ql.learners.RLS(State() + Bias() + Input(), gain_interval=(0.3, 3.0))
-    controller = ql.ADRC(ql.ESO.model_free(order=2, b0=1.2, omega_o=20.0, dt=5e-3), omega_c=4.0, learner=learner)
-    run = ql.simulate(plant, controller, ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-12, 0.01)))
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=2, b0=1.2, omega_o=20.0, dt=5e-3), omega_c=4.0, learner=learner
+    )
+    run = ql.simulate(
+        plant, controller, ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-12, 0.01))
+    )
     assert 1.2 + controller.read(run.final_state).theta["u"] == pytest.approx(2.0, rel=0.05)
 
 
@@ -169,7 +197,9 @@ def test_a_scale_that_grows_changes_no_prediction(rng: np.random.Generator) -> N
     coefficients(design, memory, again)
     np.testing.assert_allclose(again, theta, rtol=1e-12)
     np.testing.assert_allclose(memory.filtered / memory.units, shown, rtol=1e-12)
-    np.testing.assert_allclose(predict(design, memory, np.array([0.3, -0.4, 0.0]), 0.2), before, rtol=1e-12)
+    np.testing.assert_allclose(
+        predict(design, memory, np.array([0.3, -0.4, 0.0]), 0.2), before, rtol=1e-12
+    )
 
 
 def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
@@ -193,14 +223,35 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
     ("make", "message"),
     [
         (lambda: ql.learners.NLMS(rate=0.0), "rate = 0.0: must be finite and greater than zero"),
-        (lambda: ql.learners.NLMS(regularisation=0.0), "regularisation = 0.0: must be finite and greater than zero"),
-        (lambda: ql.learners.NLMS(features="x1"), "features = 'x1': must be made of blocks from quell.features"),
-        (lambda: ql.learners.RLS(memory_time=-1.0), "memory_time = -1.0: must be greater than zero"),
-        (lambda: ql.learners.RLS(prior=math.inf), "prior = inf: must be finite and greater than zero"),
+        (
+            lambda: ql.learners.NLMS(regularisation=0.0),
+            "regularisation = 0.0: must be finite and greater than zero",
+        ),
+        (
+            lambda: ql.learners.NLMS(features="x1"),
+            "features = 'x1': must be made of blocks from quell.features",
+        ),
+        (
+            lambda: ql.learners.RLS(memory_time=-1.0),
+            "memory_time = -1.0: must be greater than zero",
+        ),
+        (
+            lambda: ql.learners.RLS(prior=math.inf),
+            "prior = inf: must be finite and greater than zero",
+        ),
         (lambda: ql.learners.RLS(scale=[1.0, 0.0]), r"scale = \[1.0, 0.0\]: must be positive"),
-        (lambda: ql.learners.RLS(scale=[1.0, 2.0]).design(OBSERVER, 1.0), r"scale has shape \(2,\): must be a vector of 4"),
-        (lambda: ql.learners.RLS(gain_interval=(1.2, 2.0)), r"gain_interval = \(1.2, 2.0\): must be \(low, high\) with 0 < low <= 1"),
-        (lambda: ql.learners.RLS(RBF(states=(4,))).design(OBSERVER, 1.0), r"states = \(4,\): a plant of order 2 has no state 4"),
+        (
+            lambda: ql.learners.RLS(scale=[1.0, 2.0]).design(OBSERVER, 1.0),
+            r"scale has shape \(2,\): must be a vector of 4",
+        ),
+        (
+            lambda: ql.learners.RLS(gain_interval=(1.2, 2.0)),
+            r"gain_interval = \(1.2, 2.0\): must be \(low, high\) with 0 < low <= 1",
+        ),
+        (
+            lambda: ql.learners.RLS(RBF(states=(4,))).design(OBSERVER, 1.0),
+            r"states = \(4,\): a plant of order 2 has no state 4",
+        ),
     ],
 )
 def test_a_mistake_is_named(make: Any, message: str) -> None:

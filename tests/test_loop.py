@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.controllers.running import named_arrays
-from quell.dispatch import compilations
-from quell.realtime.channels import LOOP_WIDTH, Event, row_channels
-from quell.realtime.clock import now, pass_time, virtual_clock
-from quell.realtime.device import PythonLine, fetch, put
-from quell.realtime.loop import run_cycles
-from quell.realtime.prepared import Prepared, scenario_of, setpoints, sliding
-from quell.realtime.ring import drain, ring
-from quell.realtime.safety import Safety
-from quell.realtime.supervisor import OVERRUNS, Cause, changes
-from quell.realtime.timing import BINS, Histogram, count, tally
+from quell.kernels.dispatch import compilations
+from quell.realtime.devices.base import PythonLine, fetch, put
+from quell.realtime.loop.loop import run_cycles
+from quell.realtime.loop.prepared import Prepared, scenario_of, setpoints, sliding
+from quell.realtime.loop.safety import Safety
+from quell.realtime.loop.supervisor import OVERRUNS, Cause, changes
+from quell.realtime.system.clock import now, pass_time, virtual_clock
+from quell.realtime.system.histogram import BINS, Histogram, count, tally
+from quell.realtime.telemetry.channels import LOOP_WIDTH, Event, row_channels
+from quell.realtime.telemetry.ring import drain, ring
 
 from .scripted import DT, PLANT, ScriptedDevice, adrc, run
 
@@ -60,7 +60,11 @@ def _fetch(line: Ticking, clock: Any, until: int) -> tuple[float, int]:
 
 def _newest(line: Ticking, time: int) -> int:
     last = int(time / line.period)
-    came = [k for k in range(max(last - 50, 0), last + 1) if int(k * line.period) + line.late[min(k, line.late.size - 1)] <= time]
+    came = [
+        k
+        for k in range(max(last - 50, 0), last + 1)
+        if int(k * line.period) + line.late[min(k, line.late.size - 1)] <= time
+    ]
     return came[-1] if came else -1
 
 
@@ -74,7 +78,9 @@ class TickingDevice:
 
     paced = True
 
-    def __init__(self, period: float, late: dict[int, int] | None = None, samples: int = 30_000) -> None:
+    def __init__(
+        self, period: float, late: dict[int, int] | None = None, samples: int = 30_000
+    ) -> None:
         delays = np.zeros(samples, dtype=np.int64)
         for k, value in (late or {}).items():
             delays[k] = value
@@ -93,7 +99,10 @@ class TickingDevice:
 
 
 FLAT = ql.controllers.LinearController(
-    ql.controllers.LinearLaw(*[np.zeros(s) for s in ((0, 0), 0, 0, 0, 0)], 0.0, 0.0), DT, u_min=-1, u_max=1
+    ql.controllers.LinearLaw(*[np.zeros(s) for s in ((0, 0), 0, 0, 0, 0)], 0.0, 0.0),
+    DT,
+    u_min=-1,
+    u_max=1,
 )
 
 
@@ -103,7 +112,15 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
     width = sum(width for _, width in row_channels(FLAT.channels))
     rows = ring(40_000, width)
     rules = Safety(**{"settle": 1} | safety).rules(FLAT)
-    loop = Prepared.of(device, FLAT, setpoints(scenario_of(0.0, duration), DT, 0, 0.0), rules, clock, rows, interpret=True)
+    loop = Prepared.of(
+        device,
+        FLAT,
+        setpoints(scenario_of(0.0, duration), DT, 0, 0.0),
+        rules,
+        clock,
+        rows,
+        interpret=True,
+    )
     loop.run()
     return drain(rows), loop
 
@@ -155,7 +172,9 @@ def test_a_device_that_sends_nothing_is_not_started() -> None:
 def test_deadlines_that_are_left_out_are_no_blow() -> None:
     """While the loop stands still for three samples the plant moves on; an observer that knows it goes with it, and finds nothing amiss."""
     stalled = ScriptedDevice(PLANT, stall={40: 35_000_000}, moves={41: 3})
-    controller = ql.ADRC(ql.ESO.model_based(PLANT, omega_o=12.0, dt=DT), omega_c=1.5, u_min=-3.0, u_max=3.0)
+    controller = ql.ADRC(
+        ql.ESO.model_based(PLANT, omega_o=12.0, dt=DT), omega_c=1.5, u_min=-3.0, u_max=3.0
+    )
     found = run(stalled, controller)
     k = found["K"]
     assert 3 in np.diff(k) - 1
@@ -169,16 +188,26 @@ def test_the_reference_slides_from_where_y_is() -> None:
     controller = adrc()
     fed = ql.ADRC(controller.observer, 1.5, feedforward=True, u_min=-3.0, u_max=3.0)
     reference = ql.signals.Sinusoid(omega=1.0)
-    outcome = run(ScriptedDevice(PLANT, x0=[0.0, 0.0], y=dict.fromkeys(range(3000), 0.5)), fed, reference, approach=1.0, interpret=True)
+    outcome = run(
+        ScriptedDevice(PLANT, x0=[0.0, 0.0], y=dict.fromkeys(range(3000), 0.5)),
+        fed,
+        reference,
+        approach=1.0,
+        interpret=True,
+    )
     r = outcome["R"][10:311]
     t = np.arange(301) * DT
     assert r[0] == 0.5
     np.testing.assert_array_equal(r[100:], np.sin(t)[100:])
     tau = t[:100]
-    np.testing.assert_allclose(r[:100], np.sin(tau) + 0.5 * (1.0 - (10 * tau**3 - 15 * tau**4 + 6 * tau**5)), atol=1e-12)
+    np.testing.assert_allclose(
+        r[:100], np.sin(tau) + 0.5 * (1.0 - (10 * tau**3 - 15 * tau**4 + 6 * tau**5)), atol=1e-12
+    )
     slide = sliding(1e-4, 1.0, 3)
     for i in range(3):
-        np.testing.assert_allclose(np.gradient(slide[:, i], 1e-4)[2:-2], slide[2:-2, i + 1], atol=2e-5)
+        np.testing.assert_allclose(
+            np.gradient(slide[:, i], 1e-4)[2:-2], slide[2:-2, i + 1], atol=2e-5
+        )
     assert slide[0].tolist() == [1.0, 0.0, 0.0, -60.0]
     assert abs(slide[-1, 0]) < 1e-10
     assert sliding(DT, 0.0, 2).shape == (0, 3)
@@ -250,7 +279,10 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
     controller = adrc()
     before = controller.state
     device = ScriptedDevice(PLANT)
-    rules, points = Safety(settle=10).rules(controller), setpoints(scenario_of(1.0, 1.0), DT, 0, 0.0)
+    rules, points = (
+        Safety(settle=10).rules(controller),
+        setpoints(scenario_of(1.0, 1.0), DT, 0, 0.0),
+    )
     width = sum(width for _, width in row_channels(controller.channels))
     loop = Prepared.of(device, controller, points, rules, virtual_clock(), ring(4096, width))
     assert device.line.at.tolist() == [0, 0]
@@ -273,7 +305,9 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
         (ql.Scenario(1.0, 1e6), None, "must be at most 1e\\+07 samples"),
     ],
 )
-def test_a_course_that_can_not_be_run_is_refused(scenario: Any, duration: float | None, message: str) -> None:
+def test_a_course_that_can_not_be_run_is_refused(
+    scenario: Any, duration: float | None, message: str
+) -> None:
     """Before anything moves."""
     with pytest.raises(ValueError, match=message):
         setpoints(scenario_of(scenario, duration), DT, 0, 1.0)
@@ -302,7 +336,9 @@ def test_a_histograms_percentiles_are_those_of_what_was_counted(durations: list[
     ordered = sorted(durations)
     for percent in (1.0, 50.0, 99.0, 99.9, 100.0):
         exact = 1e-9 * ordered[math.ceil(percent / 100.0 * len(ordered) - 1e-9) - 1]
-        assert exact - 1e-15 <= histogram.percentile(percent) <= exact * (1.0 + 1.0 / 32.0) + 1.001e-9
+        assert (
+            exact - 1e-15 <= histogram.percentile(percent) <= exact * (1.0 + 1.0 / 32.0) + 1.001e-9
+        )
 
 
 def test_a_histogram_tells_and_shows_itself() -> None:
@@ -311,8 +347,18 @@ def test_a_histogram_tells_and_shows_itself() -> None:
     for duration in [20_000] * 990 + [300_000] * 10:
         count(counts, duration)
     histogram = Histogram.of(counts)
-    assert histogram.text("lateness").splitlines()[0].startswith("lateness: p50 20.5 µs, p99 20.5 µs, p99.9 300 µs, max 300 µs of 1000")
-    assert [int(line.split()[4]) for line in histogram.text().splitlines()[1:]] == [990, 0, 0, 0, 10]
+    assert (
+        histogram.text("lateness")
+        .splitlines()[0]
+        .startswith("lateness: p50 20.5 µs, p99 20.5 µs, p99.9 300 µs, max 300 µs of 1000")
+    )
+    assert [int(line.split()[4]) for line in histogram.text().splitlines()[1:]] == [
+        990,
+        0,
+        0,
+        0,
+        10,
+    ]
     ax = histogram.plot()
     assert ax.get_xlabel() == "duration [µs]"
     empty = Histogram.of(tally())

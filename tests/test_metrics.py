@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from quell import metrics
+from quell.records import metrics
 
 T = np.linspace(0.0, 40.0, 400_001)
 FIRST = 1.0 - np.exp(-T)
@@ -31,13 +31,17 @@ def test_overshoot_is_zero_where_the_target_is_not_passed() -> None:
 def test_settling_time_of_a_first_order_step_is_minus_log_of_the_band() -> None:
     """``exp(−t) = band`` at ``t = −ln band``."""
     for band in (0.02, 0.002):
-        assert metrics.settling_time(T, FIRST, 1.0, band) == pytest.approx(-math.log(band), abs=2e-4)
+        assert metrics.settling_time(T, FIRST, 1.0, band) == pytest.approx(
+            -math.log(band), abs=2e-4
+        )
 
 
 def test_settling_time_counts_from_the_first_sample_and_may_be_zero_or_nan() -> None:
     """The window sets the origin; never leaving gives 0, not arriving NaN."""
     late = slice(10_000, None)
-    assert metrics.settling_time(T[late], FIRST[late], 1.0, 0.02) == pytest.approx(-math.log(0.02) - 1.0, abs=2e-4)
+    assert metrics.settling_time(T[late], FIRST[late], 1.0, 0.02) == pytest.approx(
+        -math.log(0.02) - 1.0, abs=2e-4
+    )
     assert metrics.settling_time(T, np.ones_like(T), 1.0) == 0.0
     assert math.isnan(metrics.settling_time(T[:100], FIRST[:100], 1.0))
 
@@ -71,11 +75,17 @@ def test_variation_of_a_sinusoid_is_four_amplitudes_a_period() -> None:
 @pytest.mark.parametrize(
     ("measure", "message"),
     [
-        (lambda: metrics.settling_time(T[:3], np.array([0.0, 1.0, np.nan]), 1.0), "a value that is not finite at sample 2"),
+        (
+            lambda: metrics.settling_time(T[:3], np.array([0.0, 1.0, np.nan]), 1.0),
+            "a value that is not finite at sample 2",
+        ),
         (lambda: metrics.rms(np.zeros(0)), "must be a vector of at least one sample"),
         (lambda: metrics.iae(T, T[1:]), "t has 400001 samples, the record 400000"),
         (lambda: metrics.overshoot(T, 1.0, initial=1.0), "there is no move to overshoot"),
-        (lambda: metrics.settling_time(T, T, 1.0, band=0.0), "band = 0.0: must be finite and greater than zero"),
+        (
+            lambda: metrics.settling_time(T, T, 1.0, band=0.0),
+            "band = 0.0: must be finite and greater than zero",
+        ),
     ],
 )
 def test_a_mistake_is_named(measure: object, message: str) -> None:

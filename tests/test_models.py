@@ -11,7 +11,7 @@ import scipy.signal
 
 import quell as ql
 from quell.analysis import analyse
-from quell.models import leading_gain
+from quell.lti.models import leading_gain
 from quell.plants import LinearPlant, two_mass_spring
 
 NUM, DEN = [2.0, 3.0], [1.0, 1.5, 4.0, 0.5]
@@ -39,14 +39,29 @@ def forms() -> dict[str, Any]:
 @pytest.mark.parametrize("form", forms())
 def test_every_form_is_taken_everywhere_and_is_the_same_plant(form: str) -> None:
     """Observer, loop, state feedback and run agree with those of the plant made by hand from its companion matrix."""
-    model, by_hand = forms()[form], LinearPlant([[0, 1, 0], [0, 0, 1], [-0.5, -4.0, -1.5]], [0, 0, 1.0], [3.0, 2.0, 0])
+    model, by_hand = (
+        forms()[form],
+        LinearPlant([[0, 1, 0], [0, 0, 1], [-0.5, -4.0, -1.5]], [0, 0, 1.0], [3.0, 2.0, 0]),
+    )
     found = ql.canonical(model)
     np.testing.assert_allclose([*found.a, found.b], [0.5, 4.0, 1.5, 2.0], rtol=1e-9)
-    np.testing.assert_allclose(ql.ESO.model_based(model, 20.0, 1e-2).a, ql.ESO.model_based(by_hand, 20.0, 1e-2).a, rtol=1e-9)
+    np.testing.assert_allclose(
+        ql.ESO.model_based(model, 20.0, 1e-2).a,
+        ql.ESO.model_based(by_hand, 20.0, 1e-2).a,
+        rtol=1e-9,
+    )
     omega = np.geomspace(0.01, 100.0, 50)
-    np.testing.assert_allclose(analyse(model, LAW).response("L", omega), analyse(by_hand, LAW).response("L", omega), rtol=1e-7)
+    np.testing.assert_allclose(
+        analyse(model, LAW).response("L", omega),
+        analyse(by_hand, LAW).response("L", omega),
+        rtol=1e-7,
+    )
     one, other = (ql.baselines.LQG(plant, 1.0, 5.0, 0.01) for plant in (model, by_hand))
-    np.testing.assert_allclose([one.N, *np.linalg.eigvals(one.law.A)], [other.N, *np.linalg.eigvals(other.law.A)], rtol=1e-5)
+    np.testing.assert_allclose(
+        [one.N, *np.linalg.eigvals(one.law.A)],
+        [other.N, *np.linalg.eigvals(other.law.A)],
+        rtol=1e-5,
+    )
     run, expected = ql.simulate(model, LAW, STEP), ql.simulate(by_hand, LAW, STEP)
     np.testing.assert_allclose(run["y"], expected["y"], atol=1e-10)
 
@@ -71,9 +86,16 @@ def test_a_fast_pole_costs_no_digits_of_slow_zeros() -> None:
     zeros, poles, dt = np.array([-0.1, -0.2]), np.array([-1.0, -2.0, -3.0, -1e4]), LAW.dt
     omega = np.geomspace(1e-3, 100.0, 30)
     z = np.exp(1j * omega * dt)
-    residues = [np.prod(pole - zeros) / np.prod(pole - np.delete(poles, i)) for i, pole in enumerate(poles)]
-    exact = sum(r * np.expm1(p * dt) / p / (z - np.exp(p * dt)) for r, p in zip(residues, poles, strict=True))
-    np.testing.assert_allclose(analyse((np.poly(zeros), np.poly(poles)), LAW).response("P", omega), exact, rtol=1e-11)
+    residues = [
+        np.prod(pole - zeros) / np.prod(pole - np.delete(poles, i)) for i, pole in enumerate(poles)
+    ]
+    exact = sum(
+        r * np.expm1(p * dt) / p / (z - np.exp(p * dt))
+        for r, p in zip(residues, poles, strict=True)
+    )
+    np.testing.assert_allclose(
+        analyse((np.poly(zeros), np.poly(poles)), LAW).response("P", omega), exact, rtol=1e-11
+    )
 
 
 def test_a_plant_stays_as_it_is_and_a_channel_replaces_its_own() -> None:
@@ -82,8 +104,13 @@ def test_a_plant_stays_as_it_is_and_a_channel_replaces_its_own() -> None:
     assert LinearPlant.of(plant) is plant
     np.testing.assert_array_equal(LinearPlant.of(plant, E=1).E, plant.E[:, 1:])
     matrices = (plant.A, plant.B, plant.C)
-    np.testing.assert_array_equal(LinearPlant.of(matrices, E=[0, 0, 0, 2.0]).E, [[0], [0], [0], [2.0]])
-    assert ql.canonical(([[0.0, 1.0], [-4.0, -0.4]], [1.0, 1.0], [1.0, 0.0]), E=[0.0, 1.0]).f_degree == 2
+    np.testing.assert_array_equal(
+        LinearPlant.of(matrices, E=[0, 0, 0, 2.0]).E, [[0], [0], [0], [2.0]]
+    )
+    assert (
+        ql.canonical(([[0.0, 1.0], [-4.0, -0.4]], [1.0, 1.0], [1.0, 0.0]), E=[0.0, 1.0]).f_degree
+        == 2
+    )
     np.testing.assert_array_equal(LinearPlant.of(matrices).E, plant.B)
     assert LinearPlant.of((NUM, DEN), name="axis").name == "axis"
 
@@ -104,7 +131,9 @@ def test_a_sampled_system_is_analysed_at_the_controllers_sample_time() -> None:
     plant = control.tf(NUM, DEN)
     expected, omega = analyse(plant, LAW), np.geomspace(0.1, 300.0, 40)
     for sampled in (control.c2d(plant, 0.01), control.ss(control.c2d(plant, 0.01))):
-        np.testing.assert_allclose(analyse(sampled, LAW).response("L", omega), expected.response("L", omega), rtol=1e-5)
+        np.testing.assert_allclose(
+            analyse(sampled, LAW).response("L", omega), expected.response("L", omega), rtol=1e-5
+        )
 
 
 def test_the_leading_gain_is_the_first_markov_parameter() -> None:
@@ -115,7 +144,10 @@ def test_the_leading_gain_is_the_first_markov_parameter() -> None:
         assert found is not None
         assert found[1] == 4
         assert found[0] == pytest.approx(3.0 / 8.0 * scale**4, rel=1e-12)
-    assert leading_gain(np.diag([-1.0, -2.0]), np.array([[1.0], [0.0]]), np.array([[0.0, 1.0]])) is None
+    assert (
+        leading_gain(np.diag([-1.0, -2.0]), np.array([[1.0], [0.0]]), np.array([[0.0, 1.0]]))
+        is None
+    )
 
 
 A2, B2, C2 = [[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0]
@@ -124,14 +156,23 @@ A2, B2, C2 = [[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0]
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        ((A2, B2, C2, [[0.0]]), r"C, the last of four, has shape \(1, 1\): four entries are \(A, B, E, C\), not \(A, B, C, D\)"),
-        (([[-1.0]], [1.0], [1.0], [0.0]), r"C, the last of four, is zero: four entries are \(A, B, E, C\)"),
+        (
+            (A2, B2, C2, [[0.0]]),
+            r"C, the last of four, has shape \(1, 1\): four entries are \(A, B, E, C\), not \(A, B, C, D\)",
+        ),
+        (
+            ([[-1.0]], [1.0], [1.0], [0.0]),
+            r"C, the last of four, is zero: four entries are \(A, B, E, C\)",
+        ),
         (([1.0, 1.0], [1.0, 2.0]), "transfer function is biproper"),
         (([1.0, 0.0, 1.0], [1.0, 2.0]), "transfer function is improper"),
         (([0.0], [1.0, 2.0]), "numerator is zero"),
         (scipy.signal.ZerosPolesGain([-1.0], [-2.0], 1.0), "transfer function is biproper"),
         (scipy.signal.StateSpace(-1.0, 1.0, 1.0, 1.0), "D = .*: must be zero"),
-        (scipy.signal.TransferFunction([1.0], [1.0, 0.5], dt=0.1), "plant has a sample time.*0.1: must be"),
+        (
+            scipy.signal.TransferFunction([1.0], [1.0, 0.5], dt=0.1),
+            "plant has a sample time.*0.1: must be",
+        ),
         ((1.0, 2.0, 3.0, 4.0, 5.0), "plant = .*: must be a linear plant"),
     ],
 )

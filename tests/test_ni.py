@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.realtime.clock import virtual_clock
-from quell.realtime.device import Device, fetch, line_of
-from quell.realtime.ni import NiDevice, ni_device
-from quell.realtime.twin import TwinDevice
+from quell.realtime.devices.base import Device, fetch, line_of
+from quell.realtime.devices.ni import NiDevice, ni_device
+from quell.realtime.devices.twin import TwinDevice
+from quell.realtime.system.clock import virtual_clock
 
 from . import scripted
 from .daqmx_standin import Card, Rack
@@ -113,7 +113,9 @@ def test_u_comes_out_in_volts_and_is_cut_at_its_limits(rack):
 def test_a_u_that_is_no_number_is_zero_on_the_card(rack, device):
     """And said."""
     device.write(3.0)
-    with pytest.raises(ValueError, match="u = nan: must be a finite number; the output is zero now"):
+    with pytest.raises(
+        ValueError, match="u = nan: must be a finite number; the output is zero now"
+    ):
         device.write(math.nan)
     assert rack.cards["Dev2"].volts["ao0"] == 0.0
 
@@ -127,13 +129,18 @@ def test_the_output_is_zero_before_and_after(rack):
     device.write(5.0)
     device.close()
     device.close()
-    assert card.history[2:] == [("port0/line0", True), ("ao0", 5.0), ("port0/line0", False), ("ao0", 0.0)]
+    assert card.history[2:] == [
+        ("port0/line0", True),
+        ("ao0", 5.0),
+        ("port0/line0", False),
+        ("ao0", 0.0),
+    ]
 
 
 def test_the_output_is_zero_when_python_ends():
     """Also where nobody closed the device: here the program ends by an exception."""
     program = (
-        "from quell.realtime.ni import NiDevice\n"
+        "from quell.realtime.devices.ni import NiDevice\n"
         "from tests.daqmx_standin import Card, Rack; from nidaqmx._lib import lib_importer as library\n"
         "import atexit\n"
         "rack = Rack(Dev1=Card(counters=1), Dev2=Card(outputs=1))\n"
@@ -143,7 +150,11 @@ def test_the_output_is_zero_when_python_ends():
         "raise SystemExit(1)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1]
+        [sys.executable, "-W", "error", "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[1],
     )
     assert done.stdout.strip() == "[('ao0', 0.0), ('ao0', 4.0), ('ao0', 0.0)] {}", done.stderr
 
@@ -154,7 +165,14 @@ def test_the_heartbeat_changes_its_level_at_each_write(rack):
     for _ in range(4):
         device.write(0.0)
     device.close()
-    assert [level for name, level in rack.cards["Dev2"].history if name == "port0/line3"] == [False, True, False, True, False, False]
+    assert [level for name, level in rack.cards["Dev2"].history if name == "port0/line3"] == [
+        False,
+        True,
+        False,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_the_card_s_watchdog_stops_the_motor_when_the_loop_does_not_write(rack):
@@ -171,7 +189,9 @@ def test_the_card_s_watchdog_stops_the_motor_when_the_loop_does_not_write(rack):
     assert not rack.cards["Dev3"].levels["port0/line0"]
     with pytest.raises(OSError, match="-200678.*the loop came too late; reset the card"):
         device.write(2.0)
-    with pytest.warns(RuntimeWarning, match="Dev3/ao0 can't be set to zero, switch the amplifier off"):
+    with pytest.warns(
+        RuntimeWarning, match="Dev3/ao0 can't be set to zero, switch the amplifier off"
+    ):
         device.close()
 
 
@@ -185,17 +205,25 @@ def test_a_watchdog_that_never_began_is_closed_like_any(rack):
 
 def test_a_card_without_watchdog_is_refused_in_words_that_help(rack):
     """The PCI-6221 has none."""
-    with pytest.raises(ValueError, match=r"watchdog = 0.1 s: .*-200662: this card has none .*heartbeat"):
+    with pytest.raises(
+        ValueError, match=r"watchdog = 0.1 s: .*-200662: this card has none .*heartbeat"
+    ):
         NiDevice("Dev1/ctr0", "Dev2/ao0", watchdog=0.1)
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ({"counter": "Dev9/ctr0"}, r"counter = 'Dev9/ctr0': .*-200220: the names of the cards that are there"),
+        (
+            {"counter": "Dev9/ctr0"},
+            r"counter = 'Dev9/ctr0': .*-200220: the names of the cards that are there",
+        ),
         ({"counter": "Dev1/ctr7"}, r"counter = 'Dev1/ctr7': .*-200170: counters are called like"),
         ({"output": "Dev1/ao0"}, r"output = 'Dev1/ao0' from -10 to 10 V: .*-200170"),
-        ({"volts": 2.0}, r"output = 'Dev2/ao0' from -20 to 20 V: .*-200077: take limits within the range"),
+        (
+            {"volts": 2.0},
+            r"output = 'Dev2/ao0' from -20 to 20 V: .*-200077: take limits within the range",
+        ),
         ({"enable": "Dev2/port9/line0"}, r"enable = 'Dev2/port9/line0': .*-200170"),
         ({"counts": 0}, "counts = 0: must be a whole number"),
         ({"ratio": 0.0}, "ratio = 0.0: must not be zero"),
@@ -237,7 +265,9 @@ def test_without_a_driver_one_line_says_where_to_get_it(monkeypatch):
         monkeypatch.setattr(library, name, None)
     monkeypatch.setattr("nidaqmx._lib.find_library", lambda name: None)
     monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(OSError, match="Could not find an installation of NI-DAQmx.*python -m nidaqmx installdriver") as caught:
+    with pytest.raises(
+        OSError, match="Could not find an installation of NI-DAQmx.*python -m nidaqmx installdriver"
+    ) as caught:
         NiDevice("Dev1/ctr0", "Dev2/ao0")
     assert "\n" not in str(caught.value)
 
@@ -304,8 +334,12 @@ def test_a_loop_through_the_cards_is_the_simulated_loop(rack):
     dt = 1e-3
     observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=dt)
     controller = ql.ADRC(observer, omega_c=20.0, u_min=-5, u_max=5)
-    scenario = ql.Scenario(reference=ql.signals.Sinusoid(amplitude=math.pi / 2, omega=math.pi / 2), duration=0.5)
-    ideal = ql.simulate(ql.plants.torsional(counts=16000, dac_bits=16), controller, scenario, interpret=True)
+    scenario = ql.Scenario(
+        reference=ql.signals.Sinusoid(amplitude=math.pi / 2, omega=math.pi / 2), duration=0.5
+    )
+    ideal = ql.simulate(
+        ql.plants.torsional(counts=16000, dac_bits=16), controller, scenario, interpret=True
+    )
 
     twin = TwinDevice(ql.plants.torsional(counts=None, dac_bits=None), dt)
     y, u = np.empty(len(ideal)), np.empty(len(ideal))
@@ -326,7 +360,12 @@ class Shaft:
     """The device, and what it moves: a sample passes with each write."""
 
     def __init__(self, rack, device, plant):
-        self.rack, self.device, self.twin, self.samples = rack, device, TwinDevice(plant, scripted.DT), 0
+        self.rack, self.device, self.twin, self.samples = (
+            rack,
+            device,
+            TwinDevice(plant, scripted.DT),
+            0,
+        )
         self.close = device.close
 
     def read(self):

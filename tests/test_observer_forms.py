@@ -11,7 +11,7 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 import quell as ql
-from quell.discretize import zero_order_hold
+from quell.lti.discretize import zero_order_hold
 from quell.observers.base import acting, begin, observe
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
@@ -21,13 +21,17 @@ from quell.observers.response import response
 DT = 5e-3
 
 
-def run_observer(observer: ESO, y: np.ndarray, u: np.ndarray, f_learned: np.ndarray | None = None) -> np.ndarray:
+def run_observer(
+    observer: ESO, y: np.ndarray, u: np.ndarray, f_learned: np.ndarray | None = None
+) -> np.ndarray:
     """Feed records through an observer; return what it hands out, (samples, N)."""
     z, seen = np.zeros(observer.states), np.zeros(observer.order + 1)
     begin(observer.model, z, seen, y[0])
     out = [seen.copy()]
     for k in range(1, y.size):
-        observe(observer.model, z, seen, y[k], u[k - 1], 0.0 if f_learned is None else f_learned[k - 1])
+        observe(
+            observer.model, z, seen, y[k], u[k - 1], 0.0 if f_learned is None else f_learned[k - 1]
+        )
         out.append(seen.copy())
     return np.array(out)
 
@@ -43,7 +47,9 @@ def records(rng: np.random.Generator, samples: int = 800) -> tuple[np.ndarray, n
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
-def test_the_reduced_form_is_the_reduced_order_observer(order: int, rng: np.random.Generator) -> None:
+def test_the_reduced_form_is_the_reduced_order_observer(
+    order: int, rng: np.random.Generator
+) -> None:
     """Luenberger's: y is taken as it is, and w = (x_2 … f) estimated from what y does not explain."""
     b0, omega_o = 2.0, 15.0
     y, u = records(rng)
@@ -52,7 +58,9 @@ def test_the_reduced_form_is_the_reduced_order_observer(order: int, rng: np.rand
     A, B = np.diag(np.ones(order), 1), np.zeros((order + 1, 1))
     B[order - 1] = b0
     phi, (gamma,) = zero_order_hold(A, [B], DT)
-    K = control.acker(phi[1:, 1:].T, phi[:1, 1:].T, np.full(order, math.exp(-omega_o * DT))).reshape(-1, 1)
+    K = control.acker(
+        phi[1:, 1:].T, phi[:1, 1:].T, np.full(order, math.exp(-omega_o * DT))
+    ).reshape(-1, 1)
     w = np.zeros((order, 1))
     for k in range(1, y.size):
         surprise = y[k] - phi[0, 0] * y[k - 1] - phi[:1, 1:] @ w - gamma[0] * u[k - 1]
@@ -65,7 +73,10 @@ def test_half_gain_is_half_of_the_bandwidth_design_and_less_noise() -> None:
     """Exactly L/2, and stable. Noise in f̂ falls to 0.7 of what it was at first order; from the fifth on nothing is gained."""
     noise = []
     for order in range(1, 9):
-        full, half = (ESO.model_free(order=order, b0=1.0, omega_o=20.0, dt=DT, half_gain=half) for half in (False, True))
+        full, half = (
+            ESO.model_free(order=order, b0=1.0, omega_o=20.0, dt=DT, half_gain=half)
+            for half in (False, True)
+        )
         np.testing.assert_array_equal(half.model.gain, 0.5 * full.model.gain)
         assert np.max(np.abs(poles(half))) < 1.0
         noise.append(math.sqrt(noise_gains(half)[-1] / noise_gains(full)[-1]))
@@ -76,14 +87,20 @@ def test_half_gain_is_half_of_the_bandwidth_design_and_less_noise() -> None:
 
 @pytest.mark.parametrize("order", [1, 2, 5, 8])
 @pytest.mark.parametrize("dt", [1e-3, 1e-2])
-def test_kalman_gains_for_a_drifting_f_put_the_poles_in_a_butterworth_pattern(order: int, dt: float) -> None:
+def test_kalman_gains_for_a_drifting_f_put_the_poles_in_a_butterworth_pattern(
+    order: int, dt: float
+) -> None:
     """Symmetric root locus of a chain of integrators: radius ``(drift/(noise dt))^(1/2N)``, which is also omega_o."""
     radius, noise, size = 12.0, 1e-6, order + 1
-    observer = ESO.kalman(order, 1.0, dt, noise_variance=noise, drift=noise * dt * radius ** (2 * size))
+    observer = ESO.kalman(
+        order, 1.0, dt, noise_variance=noise, drift=noise * dt * radius ** (2 * size)
+    )
     found = np.log(poles(observer).astype(complex)) / dt
     angles = np.pi + (np.arange(size) - (size - 1) / 2) * np.pi / size
     wanted = radius * np.exp(1j * angles)
-    np.testing.assert_allclose(np.poly(found / radius).real, np.poly(wanted / radius).real, rtol=1e-3)
+    np.testing.assert_allclose(
+        np.poly(found / radius).real, np.poly(wanted / radius).real, rtol=1e-3
+    )
     assert observer.omega_o == pytest.approx(radius, rel=1e-4)
 
 
@@ -99,8 +116,12 @@ def test_kalman_gains_are_those_of_python_control(order: int) -> None:
     for t in times:
         E = zero_order_hold(A, [], t)[0]
         Q += E @ np.diag([0.0] * (order - 1) + [jitter, drift]) @ E.T * dt / 2000
-    gain, _, _ = control.dlqe(observer.model.transition, np.eye(size), np.eye(1, size), Q, np.array([[noise]]))
-    np.testing.assert_allclose(observer.model.transition @ observer.model.gain, gain[:, 0], rtol=1e-5)
+    gain, _, _ = control.dlqe(
+        observer.model.transition, np.eye(size), np.eye(1, size), Q, np.array([[noise]])
+    )
+    np.testing.assert_allclose(
+        observer.model.transition @ observer.model.gain, gain[:, 0], rtol=1e-5
+    )
 
 
 def test_no_gain_near_the_kalman_gain_estimates_f_with_less_variance() -> None:
@@ -112,7 +133,11 @@ def test_no_gain_near_the_kalman_gain_estimates_f_with_less_variance() -> None:
 
     def variance(gain: np.ndarray) -> float:
         keep = np.eye(2) - np.outer(gain, [1.0, 0.0])
-        return float(solve_discrete_lyapunov(keep @ phi, keep @ Q @ keep.T + noise * np.outer(gain, gain))[1, 1])
+        return float(
+            solve_discrete_lyapunov(keep @ phi, keep @ Q @ keep.T + noise * np.outer(gain, gain))[
+                1, 1
+            ]
+        )
 
     best = variance(L)
     for change in ([1.1, 1.0], [0.9, 1.0], [1.0, 1.1], [1.0, 0.9]):
@@ -123,14 +148,18 @@ def test_a_cascade_of_one_level_is_the_plain_observer(rng: np.random.Generator) 
     """The limit case, bit by bit."""
     y, u = records(rng)
     plain = run_observer(ESO.model_free(order=3, b0=2.0, omega_o=20.0, dt=DT), y, u)
-    np.testing.assert_array_equal(run_observer(ESO.cascade(3, 2.0, 20.0, DT, levels=1), y, u), plain)
+    np.testing.assert_array_equal(
+        run_observer(ESO.cascade(3, 2.0, 20.0, DT, levels=1), y, u), plain
+    )
 
 
 def test_the_levels_of_a_cascade_have_the_poles_they_were_given() -> None:
     """What one level tells the next does not come back: (z − β_1)^N (z − β_2)^N (z − β_3)^N."""
     observer = ESO.cascade(1, 1.0, 40.0, DT, levels=3, ratio=2.0)
     wanted = np.repeat(np.exp(-np.array([10.0, 20.0, 40.0]) * DT), 2)
-    np.testing.assert_allclose(np.poly(poles(observer) - 1.0), np.poly(wanted - 1.0), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        np.poly(poles(observer) - 1.0), np.poly(wanted - 1.0), rtol=1e-6, atol=1e-12
+    )
 
 
 def test_a_cascade_finds_a_ramp_of_f_without_lag() -> None:
@@ -149,17 +178,24 @@ def rejection_and_noise(observer: ESO) -> tuple[float, float]:
     """Return the largest answer of y to a step of the load, and the standard deviation of u that white noise makes."""
 
     def run(noise: Any) -> ql.Trajectory:
-        scenario = ql.Scenario(disturbances=(5.0 * ql.signals.Step(at=2.0),), noise=noise, duration=8.0, seed=3)
+        scenario = ql.Scenario(
+            disturbances=(5.0 * ql.signals.Step(at=2.0),), noise=noise, duration=8.0, seed=3
+        )
         return ql.simulate(PLANT, ql.ADRC(observer, omega_c=3.0), scenario)
 
     quiet, noisy = run(0.0), run(ql.signals.BandLimitedNoise(1e-6 * observer.dt, observer.dt))
-    return float(np.max(np.abs(quiet["y"]))), float(np.std((noisy["u"] - quiet["u"])[quiet.t > 1.0]))
+    return float(np.max(np.abs(quiet["y"]))), float(
+        np.std((noisy["u"] - quiet["u"])[quiet.t > 1.0])
+    )
 
 
 def test_a_cascade_rejects_the_same_load_with_half_the_noise_in_u() -> None:
     """The claim of Łakomy & Madonski, measured: ratio 3 against the plain ESO of the same bandwidth."""
     plain, cascade = ESO.model_free(2, 1.5, 30.0, 1e-3), ESO.cascade(2, 1.5, 30.0, 1e-3, ratio=3.0)
-    (peak, noise), (cascade_peak, cascade_noise) = rejection_and_noise(plain), rejection_and_noise(cascade)
+    (peak, noise), (cascade_peak, cascade_noise) = (
+        rejection_and_noise(plain),
+        rejection_and_noise(cascade),
+    )
     assert cascade_peak < peak
     assert cascade_noise < 0.6 * noise
 
@@ -180,13 +216,18 @@ def test_fal_is_odd_continuous_and_linear_near_zero() -> None:
     assert fal(-3.0, 1.0, 0.1) == -3.0
 
 
-def test_the_nonlinear_observer_with_powers_of_one_is_the_linear_one(rng: np.random.Generator) -> None:
+def test_the_nonlinear_observer_with_powers_of_one_is_the_linear_one(
+    rng: np.random.Generator,
+) -> None:
     """And with any powers, as long as its error stays within delta; beyond, it is another."""
     y, u = records(rng)
     linear = run_observer(ESO.model_free(2, 2.0, 20.0, DT), y, u)
     for delta, alpha in ((1e-9, np.ones(3)), (1e3, None)):
         np.testing.assert_allclose(
-            run_observer(ESO.nonlinear(2, 2.0, 20.0, DT, delta=delta, alpha=alpha), y, u), linear, rtol=1e-9, atol=1e-9
+            run_observer(ESO.nonlinear(2, 2.0, 20.0, DT, delta=delta, alpha=alpha), y, u),
+            linear,
+            rtol=1e-9,
+            atol=1e-9,
         )
     other = run_observer(ESO.nonlinear(2, 2.0, 20.0, DT, delta=1e-3), y, u)
     assert np.max(np.abs(other - linear)) > 1.0
@@ -204,7 +245,11 @@ def test_the_nonlinear_observer_is_hans_for_short_samples() -> None:
         for k in range(1, t.size):
             e = z[0] - y[k - 1]
             z = z + dt * np.array(
-                [z[1] - beta[0] * e, z[2] + u[k - 1] - beta[1] * fal(e, alpha[1], delta), -beta[2] * fal(e, alpha[2], delta)]
+                [
+                    z[1] - beta[0] * e,
+                    z[2] + u[k - 1] - beta[1] * fal(e, alpha[1], delta),
+                    -beta[2] * fal(e, alpha[2], delta),
+                ]
             )
         errors.append(abs(run_observer(observer, y, u)[-1, 2] - z[2]) / np.abs(z[2]))
     assert errors[0] < 0.1
@@ -222,13 +267,17 @@ def test_the_nonlinear_observer_answers_an_outlier_gently() -> None:
 
 
 @pytest.mark.parametrize("late", [1, 7])
-def test_an_observer_behind_a_delay_is_the_plain_one_fed_the_u_of_then(late: int, rng: np.random.Generator) -> None:
+def test_an_observer_behind_a_delay_is_the_plain_one_fed_the_u_of_then(
+    late: int, rng: np.random.Generator
+) -> None:
     """Sample by sample; and it says which u acts."""
     y, u = records(rng)
     shifted = np.concatenate([np.zeros(late), u[:-late]])
     options: dict[str, Any] = {"order": 2, "b0": 2.0, "omega_o": 20.0, "dt": DT}
     late_one = ESO.model_free(**options, delay=late * DT)
-    np.testing.assert_array_equal(run_observer(late_one, y, u), run_observer(ESO.model_free(**options), y, shifted))
+    np.testing.assert_array_equal(
+        run_observer(late_one, y, u), run_observer(ESO.model_free(**options), y, shifted)
+    )
     z, seen = np.zeros(late_one.states), np.zeros(3)
     begin(late_one.model, z, seen, 0.0)
     for k in range(1, 30):
@@ -237,11 +286,19 @@ def test_an_observer_behind_a_delay_is_the_plain_one_fed_the_u_of_then(late: int
         observe(late_one.model, z, seen, y[k], u[k - 1], 0.0)
 
 
-@pytest.mark.filterwarnings("ignore::quell.DesignWarning")  # a delay of that size is unwise, and said to be
+@pytest.mark.filterwarnings(
+    "ignore::quell.DesignWarning"
+)  # a delay of that size is unwise, and said to be
 def test_a_known_delay_saves_a_loop_that_swings_without() -> None:
     """With u 0.2 s late at omega_o = 20 rad/s the plain observer works against its own u; the one that knows the delay settles."""
-    plant = ql.plants.delayed(ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [1.0, 0.0]), delay=0.2, dt=0.01)
-    scenario = ql.Scenario(reference=1.0, disturbances=(0.5 * ql.signals.Step(at=15.0),), duration=30.0)
+    plant = ql.plants.delayed(
+        ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [1.0, 0.0]),
+        delay=0.2,
+        dt=0.01,
+    )
+    scenario = ql.Scenario(
+        reference=1.0, disturbances=(0.5 * ql.signals.Step(at=15.0),), duration=30.0
+    )
     swing = []
     for delay in (0.0, 0.2):
         observer = ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01, delay=delay)
@@ -253,11 +310,21 @@ def test_a_known_delay_saves_a_loop_that_swings_without() -> None:
 
 def test_a_delayed_plant_is_the_plant_with_the_u_of_then() -> None:
     """Its own states are those of the plant; behind them stand the u under way, the newest first."""
-    run = ql.simulate(ql.plants.delayed(PLANT, 0.03, 0.01), ql.ADRC(ESO.model_free(2, 1.5, 10.0, 0.01), 1.0), ql.Scenario(1.0, 2.0))
-    np.testing.assert_array_equal(run["x"][4:, 2:], np.column_stack([run["u"][3:-1], run["u"][2:-2], run["u"][1:-3]]))
+    run = ql.simulate(
+        ql.plants.delayed(PLANT, 0.03, 0.01),
+        ql.ADRC(ESO.model_free(2, 1.5, 10.0, 0.01), 1.0),
+        ql.Scenario(1.0, 2.0),
+    )
+    np.testing.assert_array_equal(
+        run["x"][4:, 2:], np.column_stack([run["u"][3:-1], run["u"][2:-2], run["u"][1:-3]])
+    )
     model = PLANT.sampled(0.01)
     for k in range(3, 100):
-        np.testing.assert_allclose(run["x"][k + 1, :2], model.transition @ run["x"][k, :2] + model.input * run["u"][k - 3], rtol=1e-12)
+        np.testing.assert_allclose(
+            run["x"][k + 1, :2],
+            model.transition @ run["x"][k, :2] + model.input * run["u"][k - 3],
+            rtol=1e-12,
+        )
 
 
 def test_a_learner_finds_the_gain_of_a_delayed_plant() -> None:
@@ -265,7 +332,11 @@ def test_a_learner_finds_the_gain_of_a_delayed_plant() -> None:
     plant = ql.plants.delayed(ql.plants.LinearPlant([[-1.0]], [1.4], [1.0]), delay=0.05, dt=0.01)
     observer = ESO.model_free(order=1, b0=1.0, omega_o=20.0, dt=0.01, delay=0.05)
     controller = ql.ADRC(observer, omega_c=2.0, learner=ql.learners.Kalman(u=True))
-    run = ql.simulate(plant, controller, ql.Scenario(ql.signals.Sinusoid(omega=1.0) + ql.signals.Sinusoid(omega=2.7), duration=80.0))
+    run = ql.simulate(
+        plant,
+        controller,
+        ql.Scenario(ql.signals.Sinusoid(omega=1.0) + ql.signals.Sinusoid(omega=2.7), duration=80.0),
+    )
     theta = dict(zip(controller.features, run["theta"][-1], strict=True))
     assert theta["u"] == pytest.approx(0.4, abs=0.04)
     assert theta["x1"] == pytest.approx(-1.0, abs=0.1)
@@ -310,9 +381,15 @@ def test_learners_that_must_tell_noise_from_motion_refuse_the_reduced_form(learn
 def test_a_guarded_learner_serves_other_forms(name: str) -> None:
     """The loop ends where it should, and the learner has found the spring."""
     controller = ql.ADRC(FORMS[name], omega_c=2.0, learner=ql.learners.Kalman(), guard=ql.Guard())
-    run = ql.simulate(PLANT, controller, ql.Scenario(ql.signals.Sinusoid(omega=1.5).until(40.0, then=1.0), duration=60.0))
+    run = ql.simulate(
+        PLANT,
+        controller,
+        ql.Scenario(ql.signals.Sinusoid(omega=1.5).until(40.0, then=1.0), duration=60.0),
+    )
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
-    assert dict(zip(controller.features, run["theta"][-1], strict=True))["x1"] == pytest.approx(-2.0, abs=0.2)
+    assert dict(zip(controller.features, run["theta"][-1], strict=True))["x1"] == pytest.approx(
+        -2.0, abs=0.2
+    )
 
 
 def test_time_scales_are_those_of_the_poles() -> None:
@@ -336,7 +413,14 @@ def test_a_hand_over_is_bumpless_in_every_form(name: str) -> None:
         x = model.transition @ x + model.input * u
 
 
-@pytest.mark.parametrize("extra", [{"learner": ql.learners.Kalman()}, {"learner": ql.learners.BatchGradient()}, {"guard": ql.Guard()}])
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {"learner": ql.learners.Kalman()},
+        {"learner": ql.learners.BatchGradient()},
+        {"guard": ql.Guard()},
+    ],
+)
 def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any]) -> None:
     """It has no exact lag, and the error says so."""
     with pytest.raises(ValueError, match="no exact lag"):
@@ -346,14 +430,23 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ESO.model_free(2, 1.0, 10.0, 0.01, delay=0.014), r"delay = 0.014 s with dt = 0.01 s: .* 0.01 and 0.02 s"),
+        (
+            lambda: ESO.model_free(2, 1.0, 10.0, 0.01, delay=0.014),
+            r"delay = 0.014 s with dt = 0.01 s: .* 0.01 and 0.02 s",
+        ),
         (lambda: ESO.model_free(2, 1.0, 10.0, 0.01, delay=-1.0), "delay = -1.0"),
-        (lambda: ESO.model_free(2, 1.0, 10.0, 0.01, half_gain=True, form="reduced"), "half_gain = True"),
+        (
+            lambda: ESO.model_free(2, 1.0, 10.0, 0.01, half_gain=True, form="reduced"),
+            "half_gain = True",
+        ),
         (lambda: ESO.model_free(2, 1.0, 10.0, 0.01, half_gain=1), "half_gain = 1"),  # type: ignore[arg-type]
         (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, levels=0), "levels = 0"),
         (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, ratio=0.0), "ratio = 0.0"),
         (lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=0.0, drift=1.0), "noise_variance = 0.0"),
-        (lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-30, drift=1e30), "no steady-state gain|must be below pi"),
+        (
+            lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-30, drift=1e30),
+            "no steady-state gain|must be below pi",
+        ),
         (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.0), "delta = 0.0"),
         (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.1, alpha=(1.0, 0.5, 1.5)), "alpha = "),
         (lambda: ql.plants.delayed(PLANT, 0.0, 0.01), "delay = 0.0"),

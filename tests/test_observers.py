@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.observers import canonical, continuous_gain
+from quell.lti import canonical
+from quell.observers import continuous_gain
 from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
 
@@ -29,13 +30,17 @@ def error_polynomial(observer: ESO) -> np.ndarray:
     return np.poly(error - np.eye(size))
 
 
-@given(order=st.integers(1, 8), dt=st.sampled_from([1e-4, 1e-3, 1e-2]), omega_o=st.floats(1.0, 100.0))
+@given(
+    order=st.integers(1, 8), dt=st.sampled_from([1e-4, 1e-3, 1e-2]), omega_o=st.floats(1.0, 100.0)
+)
 def test_all_poles_lie_at_exp_minus_omega_o_dt(order: int, dt: float, omega_o: float) -> None:
     """For every order, sample time and bandwidth: the polynomial is (z − β)^N."""
     observer = ESO.model_free(order=order, b0=1.0, omega_o=omega_o, dt=dt)
     rise = -math.expm1(-omega_o * dt)
     wanted = np.array([math.comb(order + 1, i) * rise**i for i in range(order + 2)])
-    np.testing.assert_allclose(error_polynomial(observer), wanted, rtol=1e-7, atol=1e-13 * wanted.max())
+    np.testing.assert_allclose(
+        error_polynomial(observer), wanted, rtol=1e-7, atol=1e-13 * wanted.max()
+    )
 
 
 @given(
@@ -68,7 +73,15 @@ def test_the_fifth_gain_of_the_papers_table_is_wrong() -> None:
     For a = −2 and omega_o = 10 the printed gain puts the slowest pole at −2.8.
     """
     a, w = -2.0, 10.0
-    printed = np.array([5 * w, a + 10 * w**2, 5 * a * w + 10 * w**3, a**2 + 10 * a * w**2 + 5 * w**4, 5 * a**2 * w + 10 * a * w**3 + w**5])
+    printed = np.array(
+        [
+            5 * w,
+            a + 10 * w**2,
+            5 * a * w + 10 * w**3,
+            a**2 + 10 * a * w**2 + 5 * w**4,
+            5 * a**2 * w + 10 * a * w**3 + w**5,
+        ]
+    )
     right = np.array([*printed[:4], w**5])
     A = np.diag(np.ones(4), 1)
     A[3, 2] = a
@@ -109,7 +122,9 @@ def test_a_constant_disturbance_is_estimated_without_error() -> None:
     observer = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=dt)
     t = np.arange(400) * dt
     u, f = np.sin(t), 3.0
-    plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 2.0], [1.0, 0.0], [[0.0], [1.0]]).sampled(dt)
+    plant = ql.plants.LinearPlant(
+        [[0.0, 1.0], [0.0, 0.0]], [0.0, 2.0], [1.0, 0.0], [[0.0], [1.0]]
+    ).sampled(dt)
     x = np.zeros((t.size, 2))
     for k in range(t.size - 1):
         x[k + 1] = plant.transition @ x[k] + plant.input * u[k] + plant.disturbance[:, 0] * f
@@ -129,10 +144,18 @@ def test_what_is_learned_is_not_estimated_again() -> None:
 def test_the_predictor_form_is_the_current_form_a_sample_late(rng: np.random.Generator) -> None:
     """Φ times what the current form knew, plus the input's effect: the same poles, y a sample later."""
     y, u = rng.normal(size=50), rng.normal(size=50)
-    current, predictor = (ESO.model_free(order=3, b0=1.5, omega_o=8.0, dt=0.01, form=form) for form in ("current", "predictor"))
-    now, before = run_observer(current, y, u, np.zeros(50)), run_observer(predictor, y, u, np.zeros(50))
+    current, predictor = (
+        ESO.model_free(order=3, b0=1.5, omega_o=8.0, dt=0.01, form=form)
+        for form in ("current", "predictor")
+    )
+    now, before = (
+        run_observer(current, y, u, np.zeros(50)),
+        run_observer(predictor, y, u, np.zeros(50)),
+    )
     model = current.model
-    np.testing.assert_allclose(before[1:], now[:-1] @ model.transition.T + np.outer(u[:-1], model.input), atol=1e-12)
+    np.testing.assert_allclose(
+        before[1:], now[:-1] @ model.transition.T + np.outer(u[:-1], model.input), atol=1e-12
+    )
 
 
 def test_the_observer_starts_at_the_first_measurement() -> None:
@@ -161,7 +184,9 @@ def test_the_canonical_form_does_not_depend_on_the_coordinates(a: list[float], s
     A = np.diag(np.ones(n - 1), 1)
     A[-1] = -np.array(a)
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))[0]
-    hidden = ql.plants.LinearPlant(turn @ A @ turn.T, turn @ np.eye(n)[-1] * 3.0, np.eye(n)[0] @ turn.T)
+    hidden = ql.plants.LinearPlant(
+        turn @ A @ turn.T, turn @ np.eye(n)[-1] * 3.0, np.eye(n)[0] @ turn.T
+    )
     found = canonical(hidden)
     np.testing.assert_allclose(found.a, a, atol=1e-6)
     assert found.b == pytest.approx(3.0)
@@ -180,7 +205,10 @@ UNOBSERVABLE = ql.plants.LinearPlant(np.diag([-1.0, -2.0]), [1.0, 1.0], [1.0, 0.
         ({"omega_o": -1.0}, "omega_o = -1.0: must be finite and greater than zero"),
         ({"omega_o": math.nan}, "omega_o = nan: must be finite and greater than zero"),
         ({"dt": 0.0}, "dt = 0.0: must be finite and greater than zero"),
-        ({"omega_o": 4000.0}, r"omega_o = 4000.0 rad/s with dt = 0.001 s: omega_o \* dt = 4 must be below pi"),
+        (
+            {"omega_o": 4000.0},
+            r"omega_o = 4000.0 rad/s with dt = 0.001 s: omega_o \* dt = 4 must be below pi",
+        ),
         ({"b0": 0.0}, "b0 = 0.0: must not be zero"),
         ({"b0": math.inf}, "b0 = inf: must be a finite number"),
         ({"form": "euler"}, "form = 'euler': must be one of current, predictor"),
@@ -195,10 +223,16 @@ def test_a_mistake_in_a_model_free_design_is_named(change: dict[str, object], me
 @pytest.mark.parametrize(
     ("plant", "message"),
     [
-        (UNOBSERVABLE, "plant is not observable from y: its observability matrix has rank 1, not 2"),
+        (
+            UNOBSERVABLE,
+            "plant is not observable from y: its observability matrix has rank 1, not 2",
+        ),
         (control.tf([1.0], [1.0, 2.0], 0.1), "plant has a sample time, dt = 0.1"),
         (control.ss([[-1.0]], [[1.0]], [[1.0]], [[1.0]]), "D = .*: must be zero"),
-        (control.ss(np.eye(2), np.eye(2), np.eye(2), 0.0), r"B has shape \(2, 2\): must be a matrix of shape \(2, 1\)"),
+        (
+            control.ss(np.eye(2), np.eye(2), np.eye(2), 0.0),
+            r"B has shape \(2, 2\): must be a matrix of shape \(2, 1\)",
+        ),
         (([1.0], 0.0), "b = 0.0: must not be zero"),
         (([-1e12], 1.0), "dt = 0.001 s: too long .* for the plant's fastest pole of 1e[+]12 rad/s"),
         (([(math.pi / 1e-3) ** 2, 0.0], 1.0), "sampled, the model cannot be observed"),

@@ -12,10 +12,10 @@ import quell as ql
 from quell.features import Bias, State
 from quell.learners.base import adapt, commit, predict, restart
 from quell.learners.lag import group_delay, lag_memory, lag_of, lag_push
-from quell.learners.model import infer, learn
-from quell.learners.network import Network
-from quell.learners.process import Process
-from quell.learners.rls import RlsRule, least_squares_gain
+from quell.learners.online.gaussian_process import Process
+from quell.learners.online.model import infer, learn
+from quell.learners.online.network import Network
+from quell.learners.regression.rls import RlsRule, least_squares_gain
 from quell.observers.eso import FORMS
 from quell.types import Matrix, Vector
 
@@ -46,7 +46,11 @@ class Plain:
 
     def memory(self, parameters: PlainRule) -> PlainMemory:
         """Return the state."""
-        return PlainMemory(np.zeros(parameters.features), 1e6 * np.eye(parameters.features), np.zeros(parameters.features))
+        return PlainMemory(
+            np.zeros(parameters.features),
+            1e6 * np.eye(parameters.features),
+            np.zeros(parameters.features),
+        )
 
 
 @infer.register(PlainRule)
@@ -59,7 +63,9 @@ def _infer(model: PlainRule, memory: PlainMemory, features: Vector) -> float:
 
 @learn.register(PlainRule)
 def _learn(model: PlainRule, memory: PlainMemory, features: Vector, target: float) -> None:
-    step = (target - infer(model, memory, features)) * least_squares_gain(model.rule, memory.covariance, memory.gain, features, 1.0)
+    step = (target - infer(model, memory, features)) * least_squares_gain(
+        model.rule, memory.covariance, memory.gain, features, 1.0
+    )
     for i in range(features.size):
         memory.theta[i] += step * memory.gain[i]
 
@@ -74,7 +80,13 @@ def learned(delay: int | None) -> np.ndarray:
     lag, chain, shown = lag_of(OBSERVER), np.zeros((1, 3)), 0.0
     for k in range(20_000):
         t = k * OBSERVER.dt
-        seen = np.array([math.sin(0.8 * t) + 0.5 * math.sin(1.5 * t), 0.8 * math.cos(0.8 * t) + 0.75 * math.cos(1.5 * t), 0.0])
+        seen = np.array(
+            [
+                math.sin(0.8 * t) + 0.5 * math.sin(1.5 * t),
+                0.8 * math.cos(0.8 * t) + 0.75 * math.cos(1.5 * t),
+                0.0,
+            ]
+        )
         adapt(design, memory, seen, seen[0] + 1e-9, 0.0, shown)
         commit(design, memory, seen, 0.0, 0.0)
         shown = lag_push(lag, chain, 0, -3.0 * seen[0] - 0.4 * seen[1] + 0.5)
@@ -115,7 +127,18 @@ def fitted(model: Any, samples: int, rng: np.random.Generator) -> tuple[Any, Any
     for _ in range(samples):
         x = rng.uniform(-1.0, 1.0, 2)
         learn(design, memory, x, surface(x) + 0.02 * rng.normal())
-    return design, memory, math.sqrt(np.mean([(infer(design, memory, x) - surface(x)) ** 2 for x in rng.uniform(-0.9, 0.9, (500, 2))]))
+    return (
+        design,
+        memory,
+        math.sqrt(
+            np.mean(
+                [
+                    (infer(design, memory, x) - surface(x)) ** 2
+                    for x in rng.uniform(-0.9, 0.9, (500, 2))
+                ]
+            )
+        ),
+    )
 
 
 def test_a_network_fits_a_nonlinear_function(rng: np.random.Generator) -> None:
@@ -168,7 +191,9 @@ def test_a_process_is_a_gaussian_process_while_its_budget_lasts(rng: np.random.G
         return np.exp(-np.sum((a[:, None] - b[None]) ** 2, axis=2) / (2.0 * 0.2**2))
 
     points = rng.uniform(-1.0, 1.0, (20, 2))
-    expected = kernel(points, grid) @ np.linalg.solve(kernel(grid, grid) + design.noise * np.eye(25), targets)
+    expected = kernel(points, grid) @ np.linalg.solve(
+        kernel(grid, grid) + design.noise * np.eye(25), targets
+    )
     np.testing.assert_allclose([infer(design, memory, x) for x in points], expected, atol=1e-9)
 
 
@@ -179,8 +204,12 @@ def test_a_process_with_a_budget_of_one_still_works(rng: np.random.Generator) ->
     assert all(np.all(np.isfinite(array)) for array in memory)
 
 
-@pytest.mark.parametrize("learner", [ql.learners.MLP(every=5), ql.learners.GaussianProcess(every=5)])
-def test_a_model_can_learn_from_every_so_many_th_sample(learner: Any, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(
+    "learner", [ql.learners.MLP(every=5), ql.learners.GaussianProcess(every=5)]
+)
+def test_a_model_can_learn_from_every_so_many_th_sample(
+    learner: Any, rng: np.random.Generator
+) -> None:
     """And stays as it is in between."""
     design = learner.design(OBSERVER, 1.0)
     memory = learner.memory(design)
@@ -216,14 +245,23 @@ def test_what_a_model_learned_is_kept_unless_it_is_no_number(rng: np.random.Gene
         (lambda: ql.learners.Online(3), "model = 3: must have design"),
         (lambda: ql.learners.Online(Plain(), "x1"), "features = 'x1': must be made of blocks"),
         (lambda: ql.learners.Online(Plain(), scale=[-1.0]), r"scale = \[-1.0\]: must be positive"),
-        (lambda: ql.learners.Online(Plain(), bias_bandwidth=-1.0), "bias_bandwidth = -1.0: must be finite and not negative"),
+        (
+            lambda: ql.learners.Online(Plain(), bias_bandwidth=-1.0),
+            "bias_bandwidth = -1.0: must be finite and not negative",
+        ),
         (lambda: ql.learners.MLP(0), "hidden = 0: must be a whole number of at least 1"),
         (lambda: ql.learners.MLP(memory_time=0.0), "memory_time = 0.0: must be greater than zero"),
         (lambda: ql.learners.MLP(noise=0.0), "noise = 0.0: must be finite and greater than zero"),
         (lambda: ql.learners.MLP(every=0), "every = 0: must be a whole number of at least 1"),
         (lambda: ql.learners.MLP(seed=-1), "seed = -1: must be a whole number of at least 0"),
-        (lambda: ql.learners.GaussianProcess(0), "budget = 0: must be a whole number of at least 1"),
-        (lambda: ql.learners.GaussianProcess(length=0.0), "length = 0.0: must be finite and greater than zero"),
+        (
+            lambda: ql.learners.GaussianProcess(0),
+            "budget = 0: must be a whole number of at least 1",
+        ),
+        (
+            lambda: ql.learners.GaussianProcess(length=0.0),
+            "length = 0.0: must be finite and greater than zero",
+        ),
         (lambda: ql.learners.BatchGradient(features=3), "features = 3: must be made of blocks"),
     ],
 )

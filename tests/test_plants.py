@@ -16,7 +16,9 @@ from quell.plants.base import advance, measure
 from quell.plants.nonlinear import CompiledNonlinear, PythonNonlinear
 
 
-def stepped(plant: object, dt: float, samples: int, x0: object, u: float = 0.0, w: object = ()) -> np.ndarray:
+def stepped(
+    plant: object, dt: float, samples: int, x0: object, u: float = 0.0, w: object = ()
+) -> np.ndarray:
     """Advance a plant by hand, interpreted."""
     model = plant.sampled(dt)
     x, scratch = np.array(x0, dtype=float), np.zeros(6 * len(x0))
@@ -33,7 +35,9 @@ def test_a_linear_plant_is_sampled_exactly(rng: np.random.Generator) -> None:
         both = np.hstack([B[:, None], E])
         phi, gamma, *_ = cont2discrete((A, both, np.eye(n), np.zeros_like(both)), 0.05)
         np.testing.assert_allclose(model.transition, phi, atol=1e-13)
-        np.testing.assert_allclose(np.hstack([model.input[:, None], model.disturbance]), gamma, atol=1e-13)
+        np.testing.assert_allclose(
+            np.hstack([model.input[:, None], model.disturbance]), gamma, atol=1e-13
+        )
 
 
 def test_the_two_mass_spring_obeys_newton(rng: np.random.Generator) -> None:
@@ -55,7 +59,9 @@ def test_the_two_mass_spring_keeps_its_energy() -> None:
         return 0.5 * (x[2] ** 2 + 2.0 * x[3] ** 2 + 3.0 * (x[0] - x[1]) ** 2)
 
     x0 = np.array([1.0, -0.5, 0.3, 0.2])
-    assert energy(stepped(plant, 0.01, 10_000, x0, w=(0.0, 0.0))) == pytest.approx(energy(x0), rel=1e-10)
+    assert energy(stepped(plant, 0.01, 10_000, x0, w=(0.0, 0.0))) == pytest.approx(
+        energy(x0), rel=1e-10
+    )
 
 
 def pendulum(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
@@ -65,9 +71,23 @@ def pendulum(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, f
 
 def test_a_nonlinear_plant_follows_its_equation_with_order_four() -> None:
     """Against scipy's integrator; halving the sub-step divides the error by about 16."""
-    truth = solve_ivp(lambda t, x: pendulum(t, x, 0.3, [0.2]), (0.0, 4.0), [1.0, 0.0], rtol=1e-12, atol=1e-12).y[:, -1]
+    truth = solve_ivp(
+        lambda t, x: pendulum(t, x, 0.3, [0.2]), (0.0, 4.0), [1.0, 0.0], rtol=1e-12, atol=1e-12
+    ).y[:, -1]
     errors = [
-        np.max(np.abs(stepped(ql.plants.NonlinearPlant(pendulum, order=2, substeps=n), 0.4, 10, (1.0, 0.0), 0.3, (0.2,)) - truth))
+        np.max(
+            np.abs(
+                stepped(
+                    ql.plants.NonlinearPlant(pendulum, order=2, substeps=n),
+                    0.4,
+                    10,
+                    (1.0, 0.0),
+                    0.3,
+                    (0.2,),
+                )
+                - truth
+            )
+        )
         for n in (1, 2, 4)
     ]
     assert errors[0] < 1e-2
@@ -79,9 +99,16 @@ def test_a_nonlinear_plant_with_a_linear_equation_is_the_linear_plant() -> None:
     """The limit case: the same run, to the accuracy of Runge-Kutta."""
     linear = ql.plants.two_mass_spring()
     A, B, E = linear.A, linear.B[:, 0], linear.E
-    plant = ql.plants.NonlinearPlant(lambda t, x, u, w: A @ x + B * u + E @ w, order=4, output=[0.0, 1.0, 0.0, 0.0], disturbances=2)
+    plant = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: A @ x + B * u + E @ w,
+        order=4,
+        output=[0.0, 1.0, 0.0, 0.0],
+        disturbances=2,
+    )
     controller = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2), omega_c=1.0)
-    scenario = ql.Scenario(reference=1.0, duration=20.0, disturbances=(0.0, ql.signals.Step(at=10.0)))
+    scenario = ql.Scenario(
+        reference=1.0, duration=20.0, disturbances=(0.0, ql.signals.Step(at=10.0))
+    )
     one, other = (ql.simulate(p, controller, scenario) for p in (linear, plant))
     np.testing.assert_allclose(one["y"], other["y"], atol=1e-8)
 
@@ -107,8 +134,12 @@ def test_functions_that_return_tuples_lists_or_arrays_are_compiled() -> None:
 def test_a_function_numba_cannot_compile_runs_as_python_and_says_so() -> None:
     """Slow, but right, and with the reason."""
     table = {"stiffness": 4.0}
-    plant = ql.plants.NonlinearPlant(lambda t, x, u, w: [x[1], u - table.get("stiffness") * x[0]], order=2, name="spring")
-    with pytest.warns(UserWarning, match="spring: f or output can't be compiled and runs as Python"):
+    plant = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: [x[1], u - table.get("stiffness") * x[0]], order=2, name="spring"
+    )
+    with pytest.warns(
+        UserWarning, match="spring: f or output can't be compiled and runs as Python"
+    ):
         assert not plant.compiled
     controller = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=4.0)
     with warnings.catch_warnings():
@@ -155,20 +186,50 @@ def test_methods_and_callable_objects_are_served_too() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ql.plants.two_mass_spring(m1=-1.0), "m1 = -1.0: must be finite and greater than zero"),
+        (
+            lambda: ql.plants.two_mass_spring(m1=-1.0),
+            "m1 = -1.0: must be finite and greater than zero",
+        ),
         (lambda: ql.plants.two_mass_spring(k=0.0), "k = 0.0: must be finite and greater than zero"),
         (lambda: ql.plants.two_mass_spring(c2=0.0), "nothing is measured"),
-        (lambda: ql.plants.LinearPlant(np.eye(2), [1.0], [1.0, 0.0]), r"B has shape \(1, 1\): must be a matrix of shape \(2, 1\)"),
-        (lambda: ql.plants.LinearPlant(np.zeros((2, 3)), [1.0, 0.0], [1.0, 0.0]), r"A has shape \(2, 3\)"),
+        (
+            lambda: ql.plants.LinearPlant(np.eye(2), [1.0], [1.0, 0.0]),
+            r"B has shape \(1, 1\): must be a matrix of shape \(2, 1\)",
+        ),
+        (
+            lambda: ql.plants.LinearPlant(np.zeros((2, 3)), [1.0, 0.0], [1.0, 0.0]),
+            r"A has shape \(2, 3\)",
+        ),
         (lambda: ql.plants.LinearPlant([[np.nan]], [1.0], [1.0]), r"A: entry \(0, 0\) is nan"),
-        (lambda: ql.plants.LinearPlant(np.eye(1), [1.0], [1.0]).sampled(0.0), "dt = 0.0: must be finite and greater than zero"),
-        (lambda: ql.plants.NonlinearPlant(pendulum, order=3), r"f returns shape \(2,\): must return the 3 derivatives"),
-        (lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=[1.0]), r"output has shape \(1,\)"),
-        (lambda: ql.plants.NonlinearPlant(pendulum, order=2, substeps=0), "substeps = 0: must be a whole number of at least 1"),
+        (
+            lambda: ql.plants.LinearPlant(np.eye(1), [1.0], [1.0]).sampled(0.0),
+            "dt = 0.0: must be finite and greater than zero",
+        ),
+        (
+            lambda: ql.plants.NonlinearPlant(pendulum, order=3),
+            r"f returns shape \(2,\): must return the 3 derivatives",
+        ),
+        (
+            lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=[1.0]),
+            r"output has shape \(1,\)",
+        ),
+        (
+            lambda: ql.plants.NonlinearPlant(pendulum, order=2, substeps=0),
+            "substeps = 0: must be a whole number of at least 1",
+        ),
         (lambda: ql.plants.NonlinearPlant(3.0, order=2), r"f = 3.0: must be a function"),
-        (lambda: ql.plants.NonlinearPlant(lambda t, x: x, order=2), r"f\(0.0, zeros, 0.0, zeros\) fails with TypeError"),
-        (lambda: ql.plants.NonlinearPlant(lambda t, x, u, w: (x[5], u), order=2), "fails with IndexError"),
-        (lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=lambda x: x), r"output\(x\) must return one number"),
+        (
+            lambda: ql.plants.NonlinearPlant(lambda t, x: x, order=2),
+            r"f\(0.0, zeros, 0.0, zeros\) fails with TypeError",
+        ),
+        (
+            lambda: ql.plants.NonlinearPlant(lambda t, x, u, w: (x[5], u), order=2),
+            "fails with IndexError",
+        ),
+        (
+            lambda: ql.plants.NonlinearPlant(pendulum, order=2, output=lambda x: x),
+            r"output\(x\) must return one number",
+        ),
     ],
 )
 def test_a_mistake_is_named(make: object, message: str) -> None:

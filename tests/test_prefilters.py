@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.prefilter import prefilter, settle, slopes
+from quell.controllers.prefilters.prefilter import prefilter, settle, slopes
 
 DT = 0.01
 
@@ -32,8 +32,14 @@ def test_a_reference_model_answers_a_step_in_closed_form(order: int) -> None:
     omega = 3.0
     found = followed(ql.controllers.ReferenceModel(omega, order), np.ones(400))
     x = omega * DT * np.arange(1, 401)
-    np.testing.assert_allclose(found[:, 0], 1.0 - np.exp(-x) * sum(x**k / math.factorial(k) for k in range(order)), atol=1e-12)
-    np.testing.assert_allclose(found[:, 1], omega * x ** (order - 1) * np.exp(-x) / math.factorial(order - 1), atol=1e-10)
+    np.testing.assert_allclose(
+        found[:, 0],
+        1.0 - np.exp(-x) * sum(x**k / math.factorial(k) for k in range(order)),
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(
+        found[:, 1], omega * x ** (order - 1) * np.exp(-x) / math.factorial(order - 1), atol=1e-10
+    )
 
 
 def test_each_derivative_is_the_slope_of_the_one_before() -> None:
@@ -41,18 +47,25 @@ def test_each_derivative_is_the_slope_of_the_one_before() -> None:
     found = followed(ql.controllers.ReferenceModel(3.0, 4), np.ones(400))
     for i in range(4):
         slope = (found[2:, i] - found[:-2, i]) / (2 * DT)
-        np.testing.assert_allclose(slope, found[1:-1, i + 1], atol=5e-3 * np.max(np.abs(found[:, i + 1])))
+        np.testing.assert_allclose(
+            slope, found[1:-1, i + 1], atol=5e-3 * np.max(np.abs(found[:, i + 1]))
+        )
 
 
 def test_a_loop_that_feeds_forward_answers_as_its_reference_model() -> None:
     """Whatever omega_c is: two degrees of freedom. Without derivatives the loop's own lag is added."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0])
     observer = ql.ESO.model_based(plant, omega_o=40.0, dt=1e-3)
-    model, scenario = ql.controllers.ReferenceModel(3.0, 2), ql.Scenario(reference=1.0, duration=4.0)
+    model, scenario = (
+        ql.controllers.ReferenceModel(3.0, 2),
+        ql.Scenario(reference=1.0, duration=4.0),
+    )
     wanted, errors = None, {}
     for omega_c in (2.0, 8.0):
         for feedforward in (False, True):
-            law = ql.controllers.Prefiltered(ql.ADRC(observer, omega_c, feedforward=feedforward), model)
+            law = ql.controllers.Prefiltered(
+                ql.ADRC(observer, omega_c, feedforward=feedforward), model
+            )
             run = ql.simulate(plant, law, scenario)
             wanted = 1.0 - np.exp(-3.0 * run.t) * (1.0 + 3.0 * run.t)
             errors[omega_c, feedforward] = np.max(np.abs(run["y"] - wanted))
@@ -64,9 +77,18 @@ def test_a_loop_that_feeds_forward_answers_as_its_reference_model() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ql.controllers.ReferenceModel(0.0), "omega = 0.0: must be finite and greater than zero"),
-        (lambda: ql.controllers.ReferenceModel(1.0, 9), "order = 9: must be a whole number from 1 to 8"),
-        (lambda: ql.controllers.ReferenceModel(200.0).design(0.01), "omega [*] dt = 2 must be at most 1"),
+        (
+            lambda: ql.controllers.ReferenceModel(0.0),
+            "omega = 0.0: must be finite and greater than zero",
+        ),
+        (
+            lambda: ql.controllers.ReferenceModel(1.0, 9),
+            "order = 9: must be a whole number from 1 to 8",
+        ),
+        (
+            lambda: ql.controllers.ReferenceModel(200.0).design(0.01),
+            "omega [*] dt = 2 must be at most 1",
+        ),
     ],
 )
 def test_a_mistake_is_named(make: object, message: str) -> None:

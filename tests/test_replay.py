@@ -11,14 +11,14 @@ import pytest
 
 import quell as ql
 from quell.controllers.baselines import PID, ZV
-from quell.controllers.prefilter import Prefiltered
+from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.plants.base import advance, measure
-from quell.realtime.channels import Event, row_channels
-from quell.realtime.header import Header
-from quell.realtime.recording import load, trajectory_of
-from quell.realtime.replay import replay
-from quell.realtime.sinks import CsvSink, McapSink
-from quell.realtime.supervisor import Mode
+from quell.realtime.loop.replay import replay
+from quell.realtime.loop.supervisor import Mode
+from quell.realtime.telemetry.channels import Event, row_channels
+from quell.realtime.telemetry.header import Header
+from quell.realtime.telemetry.load import load, trajectory_of
+from quell.realtime.telemetry.sinks import CsvSink, McapSink
 from tests import scripted
 from tests.recordings import DT, OBSERVER, PLANT, controller, header_of, rows_of, simulated
 from tests.scripted import ScriptedDevice
@@ -28,7 +28,13 @@ from tests.test_telemetry import recorded
 def check_same_estimates(again: ql.Trajectory, run: ql.Trajectory, tolerance: float = 0.0) -> None:
     """Compare what the controller knew, against its size."""
     for name in {"x_hat", "f_residual", "f_learned", "theta", "authority"} & set(run.names):
-        np.testing.assert_allclose(again[name], run[name], rtol=0.0, atol=tolerance * np.max(np.abs(run[name])), err_msg=name)
+        np.testing.assert_allclose(
+            again[name],
+            run[name],
+            rtol=0.0,
+            atol=tolerance * np.max(np.abs(run[name])),
+            err_msg=name,
+        )
 
 
 @pytest.mark.parametrize("options", [{}, {"u_min": -0.3, "u_max": 0.4}], ids=["free", "limited"])
@@ -71,7 +77,9 @@ def test_a_run_of_the_loop_is_replayed_from_its_first_cycle_to_its_last() -> Non
     again = replay(run, scripted.adrc())
     awake = run["mode"] != Mode.STOPPED
     for name in ("x_hat", "f_residual"):
-        np.testing.assert_allclose(again[name][awake], run[name][awake], rtol=0.0, atol=1e-12 * np.max(np.abs(run[name])))
+        np.testing.assert_allclose(
+            again[name][awake], run[name][awake], rtol=0.0, atol=1e-12 * np.max(np.abs(run[name]))
+        )
     ruled = run["mode"] == Mode.RUN
     assert {int(mode) for mode in run["mode"]} == set(Mode)
     np.testing.assert_allclose(again["u_wished"][ruled], run["u"][ruled], rtol=0.0, atol=1e-12)
@@ -99,10 +107,15 @@ def test_a_start_under_load_is_replayed_when_the_load_is_told() -> None:
 def test_another_observer_sees_what_happened() -> None:
     """Sample by sample what ``step`` and ``applied`` give; a quicker observer follows f more closely than a slow one."""
     run = simulated()
-    other, by_hand = (ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT), omega_c=5.0) for _ in range(2))
+    other, by_hand = (
+        ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT), omega_c=5.0)
+        for _ in range(2)
+    )
     again = replay(run, other)
     for k in range(300):
-        assert by_hand.step(run["r"][k], run["y_measured"][k]) == pytest.approx(again["u_wished"][k], rel=1e-9, abs=1e-12)
+        assert by_hand.step(run["r"][k], run["y_measured"][k]) == pytest.approx(
+            again["u_wished"][k], rel=1e-9, abs=1e-12
+        )
         np.testing.assert_allclose(by_hand.estimate.x, again["x_hat"][k], rtol=1e-9, atol=1e-12)
         by_hand.applied(run["u"][k])
     f = -1.0 * run["x"][:, 0] - 0.6 * run["x"][:, 1]
@@ -110,7 +123,9 @@ def test_another_observer_sees_what_happened() -> None:
     error = {}
     for omega_o in (10.0, 40.0):
         observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=omega_o, dt=DT)
-        error[omega_o] = np.sqrt(np.mean((replay(run, ql.ADRC(observer, omega_c=3.0))["f_hat"] - f)[late] ** 2))
+        error[omega_o] = np.sqrt(
+            np.mean((replay(run, ql.ADRC(observer, omega_c=3.0))["f_hat"] - f)[late] ** 2)
+        )
     assert error[40.0] < 0.5 * error[10.0]
 
 
@@ -134,20 +149,26 @@ def test_the_controller_that_is_passed_stays_as_it_is() -> None:
 
 def test_deadlines_that_the_loop_slept_over_are_replayed_as_it_took_them() -> None:
     """It told its controller of them, as of samples without a measurement."""
-    rig = scripted.run(ScriptedDevice(scripted.PLANT, stall={40: 35_000_000}, moves={41: 3}), reference=1.0)
+    rig = scripted.run(
+        ScriptedDevice(scripted.PLANT, stall={40: 35_000_000}, moves={41: 3}), reference=1.0
+    )
     run = trajectory_of(Header(row_channels(scripted.adrc().channels), DT), rig.rows)
     again = replay(run, scripted.adrc())
     gaps = run["events"].astype(int) == Event.GAP
     assert np.count_nonzero(gaps) == 3
     there = (run["mode"] != Mode.STOPPED) & ~gaps
     for name in ("x_hat", "f_residual"):
-        np.testing.assert_allclose(again[name][there], run[name][there], rtol=0.0, atol=1e-12 * np.max(np.abs(run[name])))
+        np.testing.assert_allclose(
+            again[name][there], run[name][there], rtol=0.0, atol=1e-12 * np.max(np.abs(run[name]))
+        )
 
 
 def test_what_can_not_be_replayed_is_refused() -> None:
     """In a line that says what to do."""
     run = simulated(1.0)
-    thin = ql.simulate(PLANT, controller(), ql.Scenario(reference=1.0, duration=1.0), record_every=5)
+    thin = ql.simulate(
+        PLANT, controller(), ql.Scenario(reference=1.0, duration=1.0), record_every=5
+    )
     slow = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=2 * DT), omega_c=3.0)
     blind = trajectory_of(header_of(run, controller()), rows_of(run, controller()))
     blind.log[:, 7] = np.nan

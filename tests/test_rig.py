@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell.commands.rig import run_rig
-from quell.realtime.devices import listen, open_device
+from quell.cli.commands.rig import run_rig
+from quell.realtime.devices.registry import listen, open_device
 
 # A tick so long that a machine with much else to do still keeps the session alive.
 DT = 0.01
@@ -25,8 +25,22 @@ SETTINGS = {"dt": DT, "watchdog": 20, "u_max": 1.0, "rest": True}
 @contextmanager
 def rig(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Start a rig; yield it and what it says when it is ready."""
-    command = [sys.executable, "-m", "quell.cli", "rig", "--plant", "two-mass", "--dt", str(DT), "--priority", "0", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "quell.cli.app",
+        "rig",
+        "--plant",
+        "two-mass",
+        "--dt",
+        str(DT),
+        "--priority",
+        "0",
+        *arguments,
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         try:
             yield process, str(process.stdout and process.stdout.readline())
         finally:
@@ -45,7 +59,9 @@ def exchanged(device: Any, count: int) -> list[float]:
 def test_a_rig_runs_until_it_is_told_to_end_and_says_how_it_went(tmp_path: Path) -> None:
     """One line when it is ready, its counts at the end, exit code 0; and each tick in the log."""
     log = tmp_path / "wire.csv"
-    with rig("--device", "udp://127.0.0.1:0", "--log", str(log), "--u-max", "0.5", "--watchdog", "200") as (process, ready):
+    with rig(
+        "--device", "udp://127.0.0.1:0", "--log", str(log), "--u-max", "0.5", "--watchdog", "200"
+    ) as (process, ready):
         assert ready.startswith("two-mass at udp://127.0.0.1:")
         url = ready.split()[2].rstrip(":")
         with open_device(url, DT) as device:
@@ -87,7 +103,10 @@ def test_a_rig_that_is_killed_is_noticed_and_replaced() -> None:
 def test_a_loop_that_is_killed_leaves_u_at_zero(tmp_path: Path) -> None:
     """The watchdog sees to it, within the ticks it was given; the next loop is served."""
     log = tmp_path / "wire.csv"
-    with rig("--device", "udp://127.0.0.1:0", "--log", str(log), "--watchdog", "30") as (process, ready):
+    with rig("--device", "udp://127.0.0.1:0", "--log", str(log), "--watchdog", "30") as (
+        process,
+        ready,
+    ):
         url = ready.split()[2].rstrip(":")
         loop = f"""
 import os, signal
@@ -98,13 +117,17 @@ for _ in range(5):
     device.write(1.0)
 os.kill(os.getpid(), signal.SIGKILL)
 """
-        assert subprocess.run([sys.executable, "-c", loop], check=False).returncode == -signal.SIGKILL
+        assert (
+            subprocess.run([sys.executable, "-c", loop], check=False).returncode == -signal.SIGKILL
+        )
         with open_device(url, DT) as device:
             exchanged(device, 3)
         process.send_signal(signal.SIGINT)
         assert "ended by the watchdog: 1" in process.communicate(timeout=60)[0]
     rows = np.genfromtxt(log, delimiter=",", names=True)
-    last = np.flatnonzero(np.isfinite(rows["command"]) & (rows["session"] == rows["session"][rows["session"] > 0][0]))[-1]
+    last = np.flatnonzero(
+        np.isfinite(rows["command"]) & (rows["session"] == rows["session"][rows["session"] > 0][0])
+    )[-1]
     assert np.all(rows["u"][last : last + 30] == 1.0)
     assert rows["u"][last + 30] == 0.0
     assert rows["state"][last + 30] == 3
@@ -130,7 +153,9 @@ def test_bad_input_is_a_line_and_exit_code_2() -> None:
         ({"settings": SETTINGS | {"watchdog": 0}}, "watchdog = 0"),
     ],
 )
-def test_what_is_wrong_is_named(changed: dict[str, Any], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_is_named(
+    changed: dict[str, Any], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Nothing is printed that would look like a rig."""
     given = {
         "device": "udp://127.0.0.1:0",
@@ -149,5 +174,16 @@ def test_what_is_wrong_is_named(changed: dict[str, Any], message: str, capsys: p
 
 def test_a_port_that_is_taken_is_named() -> None:
     """The second rig does not start."""
-    with closing(listen("udp://127.0.0.1:0")) as first, pytest.raises(ValueError, match="can't listen there"):
-        run_rig(device=first.url, plant="two-mass", settings=SETTINGS, seconds=1.0, log=None, priority=0, cpu=None)
+    with (
+        closing(listen("udp://127.0.0.1:0")) as first,
+        pytest.raises(ValueError, match="can't listen there"),
+    ):
+        run_rig(
+            device=first.url,
+            plant="two-mass",
+            settings=SETTINGS,
+            seconds=1.0,
+            log=None,
+            priority=0,
+            cpu=None,
+        )

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell.dispatch import compiled, interpreted
-from quell.realtime.ring import drain, dropped, push, ring, waiting
+from quell.kernels.dispatch import compiled, interpreted
+from quell.realtime.telemetry.ring import drain, dropped, push, ring, waiting
 
 WIDTH = 7
 
@@ -47,12 +47,16 @@ def test_rows_come_out_in_order_as_they_went_in(produce: Any) -> None:
     for start in (0, 8, 16):
         produce(shared, np.empty(WIDTH), 5)
         assert waiting(shared) == 5
-        np.testing.assert_array_equal(drain(shared), np.repeat(np.arange(5.0)[:, None], WIDTH, axis=1))
+        np.testing.assert_array_equal(
+            drain(shared), np.repeat(np.arange(5.0)[:, None], WIDTH, axis=1)
+        )
         assert waiting(shared) == 0, start
     assert drain(shared).shape == (0, WIDTH)
 
 
-@pytest.mark.parametrize("attempt", [_try_all, interpreted(_try_all)], ids=["compiled", "interpreted"])
+@pytest.mark.parametrize(
+    "attempt", [_try_all, interpreted(_try_all)], ids=["compiled", "interpreted"]
+)
 def test_a_full_ring_drops_the_newest_rows_and_counts_them(attempt: Any) -> None:
     """The producer never waits; what it could not say is known by number."""
     shared = ring(4, WIDTH)
@@ -89,7 +93,10 @@ def test_a_producer_that_never_waits_is_told_of_every_row_it_lost() -> None:
     assert np.all(np.diff(rows[:, 0]) > 0)
 
 
-@pytest.mark.parametrize(("capacity", "width", "named"), [(0, 3, "capacity = 0"), (3, 0, "width = 0"), (2.5, 3, "capacity = 2.5")])
+@pytest.mark.parametrize(
+    ("capacity", "width", "named"),
+    [(0, 3, "capacity = 0"), (3, 0, "width = 0"), (2.5, 3, "capacity = 2.5")],
+)
 def test_a_ring_without_room_is_refused(capacity: Any, width: Any, named: str) -> None:
     """The message names the argument and its value."""
     with pytest.raises(ValueError, match=named):

@@ -17,10 +17,10 @@ import pytest
 
 import quell as ql
 from quell.realtime import Safety, TwinDevice, load, run_rig
-from quell.realtime.outcome import ModeChange
-from quell.realtime.scheduling import checked_cpu, enter_real_time, quiet_process
-from quell.realtime.sinks import MemorySink
-from quell.realtime.supervisor import Cause, Mode
+from quell.realtime.loop.outcome import ModeChange
+from quell.realtime.loop.supervisor import Cause, Mode
+from quell.realtime.system.scheduling import checked_cpu, enter_real_time, quiet_process
+from quell.realtime.telemetry.sinks import MemorySink
 
 from .scripted import DT, PLANT, adrc
 
@@ -54,7 +54,13 @@ class Rig:
 
 def short(device: Any, duration: float = 0.3, **options: Any) -> Any:
     """Run something short."""
-    return run_rig(device, adrc(), 1.0, duration=duration, **{"safety": PATIENT, "priority": 0, "approach": 0.0} | options)
+    return run_rig(
+        device,
+        adrc(),
+        1.0,
+        duration=duration,
+        **{"safety": PATIENT, "priority": 0, "approach": 0.0} | options,
+    )
 
 
 def test_a_run_from_end_to_end(tmp_path: Path) -> None:
@@ -138,7 +144,12 @@ def test_a_second_ctrl_c_is_zero_at_once() -> None:
         if change.mode in (Mode.RUN, Mode.RAMP):
             os.kill(os.getpid(), signal.SIGTERM)
 
-    run = short(device, 60.0, on_change=interrupt, safety=Safety(settle=5, hold=10_000, most_overruns=10_000, ramp=100_000))
+    run = short(
+        device,
+        60.0,
+        on_change=interrupt,
+        safety=Safety(settle=5, hold=10_000, most_overruns=10_000, ramp=100_000),
+    )
     assert [change.cause for change in run.changes][-2:] == [Cause.ASKED, Cause.AT_ONCE]
     assert device.written[-4:] == [0.0] * 4
     assert device.written[-5] != 0.0
@@ -193,8 +204,8 @@ def test_a_driver_that_fails_leads_to_the_safe_action() -> None:
 
 def test_a_driver_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """It does not come back from a call: the device is closed from outside."""
-    monkeypatch.setattr("quell.realtime.run._HUNG", 0.2)
-    monkeypatch.setattr("quell.realtime.run._HUNG_SAMPLES", 1.0)
+    monkeypatch.setattr("quell.realtime.loop.run._HUNG", 0.2)
+    monkeypatch.setattr("quell.realtime.loop.run._HUNG_SAMPLES", 1.0)
     release = threading.Event()
 
     class Hanging(Rig):
@@ -259,7 +270,9 @@ def test_a_run_may_be_made_from_another_thread() -> None:
         ({"telemetry": "run.csv"}, "telemetry = 'run.csv': must be a list"),
     ],
 )
-def test_what_is_out_of_range_is_named_and_the_device_closed(options: dict[str, Any], message: str) -> None:
+def test_what_is_out_of_range_is_named_and_the_device_closed(
+    options: dict[str, Any], message: str
+) -> None:
     """Nothing was written, and the caller need not clean up."""
     device = Rig()
     with pytest.raises(ValueError, match=message):
@@ -270,9 +283,13 @@ def test_what_is_out_of_range_is_named_and_the_device_closed(options: dict[str, 
 
 def test_a_device_of_another_sample_time_is_refused() -> None:
     """As is what is no device, and what is no controller."""
-    with pytest.raises(ValueError, match=r"device has dt = 0.02 s, the controller 0.01 s: must be the same"):
+    with pytest.raises(
+        ValueError, match=r"device has dt = 0.02 s, the controller 0.01 s: must be the same"
+    ):
         short(TwinDevice(PLANT, 0.02))
-    with pytest.raises(ValueError, match=r"device = 3: must have read\(\), write\(u\) and close\(\)"):
+    with pytest.raises(
+        ValueError, match=r"device = 3: must have read\(\), write\(u\) and close\(\)"
+    ):
         short(3)
     with pytest.raises(ValueError, match="controller = 3: must be a controller"):
         run_rig(Rig(), 3, 1.0, duration=1.0)
@@ -280,12 +297,16 @@ def test_a_device_of_another_sample_time_is_refused() -> None:
 
 def test_the_scenarios_own_disturbances_are_left_to_the_rig() -> None:
     """A scenario made for simulation can be run as it is; that is said."""
-    scenario = ql.Scenario(1.0, 0.1, disturbances=(1.0,), noise=ql.signals.BandLimitedNoise(1e-6, DT))
+    scenario = ql.Scenario(
+        1.0, 0.1, disturbances=(1.0,), noise=ql.signals.BandLimitedNoise(1e-6, DT)
+    )
     run = run_rig(Rig(), adrc(), scenario, safety=PATIENT, priority=0)
     assert any("left to the rig" in note for note in run.notes)
 
 
-def test_what_real_time_scheduling_is_not_permitted_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_real_time_scheduling_is_not_permitted_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """In a sentence each, with what to do; the run goes on."""
 
     def refuse(*_: Any) -> None:
@@ -293,8 +314,8 @@ def test_what_real_time_scheduling_is_not_permitted_is_said(monkeypatch: pytest.
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_setaffinity", refuse)
-    monkeypatch.setattr("quell.realtime.scheduling._mlockall", lambda flags: -1)
-    monkeypatch.setattr("quell.realtime.scheduling._LATENCY", "/dev/no such file")
+    monkeypatch.setattr("quell.realtime.system.scheduling._mlockall", lambda flags: -1)
+    monkeypatch.setattr("quell.realtime.system.scheduling._LATENCY", "/dev/no such file")
     interval = sys.getswitchinterval()
     with quiet_process(50, interpreted=True) as notes:
         assert sys.getswitchinterval() < interval

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.plants.base import advance, measure
-from quell.realtime import cobs, frames
-from quell.realtime.clock import system_clock
-from quell.realtime.link import await_news, receive, send
-from quell.realtime.serial_line import FRAME_BITS, SerialDevice, SerialListener, serial_link
-from quell.realtime.server import Rig
+from quell.realtime.rig.server import Rig
+from quell.realtime.system.clock import system_clock
+from quell.realtime.wire import cobs, frames
+from quell.realtime.wire.link import await_news, receive, send
+from quell.realtime.wire.serial_line import FRAME_BITS, SerialDevice, SerialListener, serial_link
 
 pytest.importorskip("serial")
 DT = 1e-3
@@ -77,7 +77,11 @@ def test_a_run_of_254_bytes_has_a_code_of_its_own():
     assert encoded(run + b"\xff") == b"\xff" + run + b"\2\xff\0"
 
 
-@given(st.one_of(st.binary(max_size=600), st.lists(st.sampled_from([0, 1, 255]), max_size=600).map(bytes)))
+@given(
+    st.one_of(
+        st.binary(max_size=600), st.lists(st.sampled_from([0, 1, 255]), max_size=600).map(bytes)
+    )
+)
 def test_what_is_encoded_is_decoded(data):
     """For any bytes: none inside is zero, no more than one in 254 is added, and a plain decoder finds the same."""
     packet = encoded(data)
@@ -180,7 +184,9 @@ def test_garbage_between_frames_costs_at_most_the_frame_behind_it(wire, garbage)
     assert wire.accepted(peer) == [1.0, 2.0, 3.0, 4.0]
 
 
-FAULTS = st.tuples(st.integers(0, 41), st.sampled_from(["lost", "inserted", "changed"]), st.integers(0, 255))
+FAULTS = st.tuples(
+    st.integers(0, 41), st.sampled_from(["lost", "inserted", "changed"]), st.integers(0, 255)
+)
 
 
 @given(st.lists(FAULTS, min_size=1, max_size=4))
@@ -221,7 +227,11 @@ def test_a_packet_that_is_too_long_is_counted_once_and_forgotten(wire):
 
 def test_a_frame_that_did_not_fit_does_not_spoil_the_next(wire):
     """When nobody reads, the line fills up; what was cut short there is ended by a zero."""
-    peer, own, out = frames.peer(frames.COMMAND, 7, 50), frames.peer(frames.MEASUREMENT, 7, 50), frames.buffer()
+    peer, own, out = (
+        frames.peer(frames.COMMAND, 7, 50),
+        frames.peer(frames.MEASUREMENT, 7, 50),
+        frames.buffer(),
+    )
     sent, failed = 0, False
     while not failed:
         frames.compose(out, own, frames.COMMAND, 0, float(sent + 1), 0)
@@ -270,7 +280,12 @@ def await_command(rig):
 def test_a_loop_over_the_line_is_the_loop_on_the_delayed_plant(rig):
     """What the wires cost is one sample: u acts from the tick after the one whose y it answers."""
     plant = ql.plants.delayed(ql.plants.two_mass_spring(), DT, DT)
-    model, x, scratch, still = plant.sampled(DT, True), np.zeros(plant.order), np.zeros(plant.order), np.zeros(plant.disturbances)
+    model, x, scratch, still = (
+        plant.sampled(DT, True),
+        np.zeros(plant.order),
+        np.zeros(plant.order),
+        np.zeros(plant.disturbances),
+    )
     with opened(rig) as device:
         while device.line.peer.numbers[frames.HEARD] < rig.model.peer.numbers[frames.SENT]:
             device.read()
@@ -333,9 +348,17 @@ def test_nobody_at_the_other_end_is_said_so():
 
 def test_a_frame_must_fit_into_a_sample():
     """420 bits at 115200 baud are 3.6 ms: too long for 1 ms; for 5 ms it fits, but not there and back."""
-    with pytest.raises(ValueError, match="a frame takes 3.65 ms at 115200 baud: too long for a sample; take at least 420000 baud"):
+    with pytest.raises(
+        ValueError,
+        match="a frame takes 3.65 ms at 115200 baud: too long for a sample; take at least 420000 baud",
+    ):
         SerialDevice("serial:///dev/null?baud=115200", DT)
-    with pytest.warns(ql.DesignWarning, match="u acts a sample later than it might; from 168000 baud on"), pytest.raises(ValueError):
+    with (
+        pytest.warns(
+            ql.DesignWarning, match="u acts a sample later than it might; from 168000 baud on"
+        ),
+        pytest.raises(ValueError),
+    ):
         SerialDevice("serial:///dev/null?baud=115200", 5e-3)
 
 
@@ -379,7 +402,9 @@ def test_a_port_that_is_not_ours_is_said_so(monkeypatch):
 def test_other_systems_are_told_what_to_do(monkeypatch):
     """The line is read through functions that only Linux has."""
     monkeypatch.setattr("sys.platform", "win32")
-    with pytest.raises(ValueError, match="serial lines are for Linux; elsewhere give run_rig a device of your own"):
+    with pytest.raises(
+        ValueError, match="serial lines are for Linux; elsewhere give run_rig a device of your own"
+    ):
         SerialDevice("serial://COM3", DT)
 
 

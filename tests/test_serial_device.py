@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from quell.realtime.serial_line import SerialDevice
+from quell.realtime.wire.serial_line import SerialDevice
 
 pytest.importorskip("serial")
 COMPILER = shutil.which("cc")
@@ -25,7 +25,9 @@ def program(tmp_path_factory):
         pytest.skip("there is no C compiler here, or no examples")
     path = tmp_path_factory.mktemp("c") / "device"
     flags = ["-std=c11", "-D_GNU_SOURCE", "-O1", "-Wall", "-Wextra", "-Werror", "-DQUELL_HOST"]
-    done = subprocess.run([COMPILER, *flags, "-o", path, SOURCE, "-lm"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [COMPILER, *flags, "-o", path, SOURCE, "-lm"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return path
 
@@ -34,7 +36,9 @@ class Board:
     """The program, which simulates y' = u; its ticks come when they are asked for."""
 
     def __init__(self, program):
-        self.process = subprocess.Popen([program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         self.url = self.process.stdout.readline().strip()
 
     def step(self, what):
@@ -52,7 +56,9 @@ class Board:
                 device = SerialDevice(self.url, dt, timeout=30.0)
             finally:
                 heard.result()
-        with suppress(ConnectionError):  # nothing ticks yet: but what a first call compiles is there then
+        with suppress(
+            ConnectionError
+        ):  # nothing ticks yet: but what a first call compiles is there then
             device.tick(timeout=1e-3)
         return device
 

@@ -12,8 +12,8 @@ import pytest
 
 import quell as ql
 from quell.setup import EXAMPLES, SetupError, load, made
-from quell.setup.kinds import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
 from quell.setup.reference import keys, markdown
+from quell.setup.registry import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
 
 BASE = """
 dt = 0.01
@@ -36,7 +36,11 @@ def setup(more: str = "", *, without: tuple[str, ...] = ()) -> Any:
         del data[key]
     for key, value in tomllib.loads(more).items():
         old = data.get(key)
-        alike = isinstance(value, dict) and isinstance(old, dict) and value.get("kind", old.get("kind")) == old.get("kind")
+        alike = (
+            isinstance(value, dict)
+            and isinstance(old, dict)
+            and value.get("kind", old.get("kind")) == old.get("kind")
+        )
         data[key] = old | value if alike else value
     return made("rig.toml", data)
 
@@ -55,9 +59,14 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
     )
     assert read.scenario == scenario
     ours = ql.simulate(read.plant, read.controller, read.scenario)
-    theirs = ql.simulate(plant, ql.ADRC(observer, omega_c=1.2, learner=ql.learners.Kalman()), scenario)
+    theirs = ql.simulate(
+        plant, ql.ADRC(observer, omega_c=1.2, learner=ql.learners.Kalman()), scenario
+    )
     np.testing.assert_array_equal(ours.log, theirs.log)
-    assert [ours.metrics(**window) for window in read.windows] == [theirs.metrics(60.0, 90.0), theirs.metrics(90.0)]
+    assert [ours.metrics(**window) for window in read.windows] == [
+        theirs.metrics(60.0, 90.0),
+        theirs.metrics(90.0),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -66,35 +75,77 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
         ("[observer]\nomega_0 = 1.0", "observer.omega_0: unknown; did you mean omega_o?"),
         ("[controler]\nomega_c = 1.0", "controler: unknown; did you mean controller?"),
         ("[plant]\nmass = 1.0", "plant.mass: unknown; must be one of kind, m1, m2, k, c1, c2"),
-        ("[observer]\nkind = 'model-fre'", "observer.kind = 'model-fre': unknown; did you mean model-free?"),
+        (
+            "[observer]\nkind = 'model-fre'",
+            "observer.kind = 'model-fre': unknown; did you mean model-free?",
+        ),
         ("learner = 'kallman'", "learner.kind = 'kallman': unknown; did you mean kalman?"),
         ("learner = 3", "learner = 3: must be a table"),
-        ("[observer]\nomega_o = -1.0", "observer.omega_o = -1.0: must be finite and greater than zero [rad/s]"),
+        (
+            "[observer]\nomega_o = -1.0",
+            "observer.omega_o = -1.0: must be finite and greater than zero [rad/s]",
+        ),
         ("[observer]\norder = 4.5", "observer.order = 4.5: must be a whole number"),
         ("[observer]\nb0 = 'one'", "observer.b0 = 'one': must be a number"),
         ("[controller]\nfeedforward = 1", "controller.feedforward = 1: must be true or false"),
         ("[controller]\nomega_c = true", "controller.omega_c = True: must be a number"),
         ("[observer]\ndt = 0.01", "observer.dt: unknown; dt has its place at the top of the file"),
-        ("[controller]\nlearner = 'rls'", "controller.learner: unknown; [learner] is a table of its own"),
+        (
+            "[controller]\nlearner = 'rls'",
+            "controller.learner: unknown; [learner] is a table of its own",
+        ),
         ("dt = -1.0", "dt = -1.0: must be finite and greater than zero [s]"),
-        ("[learner]\nkind = 'kalman'\nstate_bandwidth = 'x'", "learner.state_bandwidth = 'x': must be a number or a list"),
-        ("[learner]\nkind = 'rls'\nfeatures = ['state', 'inputs']", "learner.features[1].kind = 'inputs': unknown; did you mean input?"),
-        ("[learner]\nkind = 'rls'\nfeatures = ['input', 'state']", "learner.features: features: Input() must be the last"),
+        (
+            "[learner]\nkind = 'kalman'\nstate_bandwidth = 'x'",
+            "learner.state_bandwidth = 'x': must be a number or a list",
+        ),
+        (
+            "[learner]\nkind = 'rls'\nfeatures = ['state', 'inputs']",
+            "learner.features[1].kind = 'inputs': unknown; did you mean input?",
+        ),
+        (
+            "[learner]\nkind = 'rls'\nfeatures = ['input', 'state']",
+            "learner.features: features: Input() must be the last",
+        ),
         (
             "[learner]\nkind = 'rls'\nfeatures = [{kind = 'polynomial', degree = 1}]",
             "learner.features[0].degree = 1: must be a whole number of at least 2",
         ),
-        ("scenario = {disturbances = [{kind = 'step', hight = 1.0}]}", "scenario.disturbances[0].hight: unknown; did you mean height?"),
-        ("scenario = {disturbances = [0.0, 0.0, 1.0]}", "scenario.disturbances has 3 signals: the plant has 2 disturbance inputs"),
-        ("scenario = {reference = {kind = 'step', until = 1.0}}", "scenario.reference: only one of until and then"),
-        ("scenario = {duration = 0.0}", "scenario.duration = 0.0: must be finite and greater than zero [s]"),
+        (
+            "scenario = {disturbances = [{kind = 'step', hight = 1.0}]}",
+            "scenario.disturbances[0].hight: unknown; did you mean height?",
+        ),
+        (
+            "scenario = {disturbances = [0.0, 0.0, 1.0]}",
+            "scenario.disturbances has 3 signals: the plant has 2 disturbance inputs",
+        ),
+        (
+            "scenario = {reference = {kind = 'step', until = 1.0}}",
+            "scenario.reference: only one of until and then",
+        ),
+        (
+            "scenario = {duration = 0.0}",
+            "scenario.duration = 0.0: must be finite and greater than zero [s]",
+        ),
         ("metrics = {start = 1.0}", "metrics = {'start': 1.0}: must be [[metrics]]"),
         ("[[metrics]]\nband = 0.0", "metrics[0].band = 0.0: must be finite and greater than zero"),
-        ("[[metrics]]\n[[metrics]]\nstart = 3.0\nstop = 1.0", "metrics[1].start = 3.0, stop = 1.0: start must be less than stop"),
+        (
+            "[[metrics]]\n[[metrics]]\nstart = 3.0\nstop = 1.0",
+            "metrics[1].start = 3.0, stop = 1.0: start must be less than stop",
+        ),
         ("[prefilter]\nkind = 'zv'", "prefilter.omega: missing"),
-        ("[plant]\nkind = 'linear'\nnum = [1.0]", "plant: given: num; must be num and den, or A, B and C"),
-        ("[plant]\nkind = 'delayed'\nplant = 'two-mass'\ndelay = 0.015", "plant.delay = 0.015 s with dt = 0.01 s: must be a whole number"),
-        ("[controller]\nkind = 'pid'\nkp = 1.0", "observer: a controller of the kind pid has no use for it"),
+        (
+            "[plant]\nkind = 'linear'\nnum = [1.0]",
+            "plant: given: num; must be num and den, or A, B and C",
+        ),
+        (
+            "[plant]\nkind = 'delayed'\nplant = 'two-mass'\ndelay = 0.015",
+            "plant.delay = 0.015 s with dt = 0.01 s: must be a whole number",
+        ),
+        (
+            "[controller]\nkind = 'pid'\nkp = 1.0",
+            "observer: a controller of the kind pid has no use for it",
+        ),
     ],
 )
 def test_a_mistake_gives_a_line_with_file_key_and_rule(text: str, message: str) -> None:
@@ -129,7 +180,9 @@ def test_what_is_missing_is_named() -> None:
 
 def test_a_file_that_is_none_is_told_apart(tmp_path: Path) -> None:
     """Not there, or not TOML: with the place."""
-    with pytest.raises(SetupError, match=r"nowhere.toml: can't be read \(No such file or directory\)"):
+    with pytest.raises(
+        SetupError, match=r"nowhere.toml: can't be read \(No such file or directory\)"
+    ):
         load(tmp_path / "nowhere.toml")
     (tmp_path / "bad.toml").write_text("dt = 0.01\n[plant\n")
     with pytest.raises(SetupError, match=r"bad.toml: not TOML: .*at line 2"):
@@ -144,13 +197,23 @@ def test_a_file_that_is_none_is_told_apart(tmp_path: Path) -> None:
 
 def test_a_mark_of_byte_order_is_no_mistake(tmp_path: Path) -> None:
     """As some editors put it in front of a text."""
-    (tmp_path / "rig.toml").write_text((EXAMPLES / "two_mass.toml").read_text(encoding="utf-8"), encoding="utf-8-sig")
+    (tmp_path / "rig.toml").write_text(
+        (EXAMPLES / "two_mass.toml").read_text(encoding="utf-8"), encoding="utf-8-sig"
+    )
     assert load(tmp_path / "rig.toml").as_json() == load(EXAMPLES / "two_mass.toml").as_json()
 
 
 def test_every_learner_that_numbers_suffice_for_has_a_kind() -> None:
     """Discovered, not listed: all public ones whose parameters have defaults, and each is built from its name alone."""
-    assert set(LEARNERS) >= {"kalman", "harmonic", "nlms", "rls", "batch-gradient", "gaussian-process", "mlp"}
+    assert set(LEARNERS) >= {
+        "kalman",
+        "harmonic",
+        "nlms",
+        "rls",
+        "batch-gradient",
+        "gaussian-process",
+        "mlp",
+    }
     for kind, table in LEARNERS.items():
         learner = setup(f"learner = '{kind}'").controller.learner
         assert type(learner) is table.make
@@ -159,11 +222,19 @@ def test_every_learner_that_numbers_suffice_for_has_a_kind() -> None:
 
 def test_tables_take_what_their_calls_take() -> None:
     """Numbers, texts and lists reach the constructor under the names they have in Python."""
-    learner = setup("[learner]\nkind = 'harmonic'\ncount = 2\nomegas = [0.5, 1.5]\nlimits = [0.1, 3.0]").controller.learner
+    learner = setup(
+        "[learner]\nkind = 'harmonic'\ncount = 2\nomegas = [0.5, 1.5]\nlimits = [0.1, 3.0]"
+    ).controller.learner
     assert learner == ql.learners.Harmonic(count=2, omegas=(0.5, 1.5), limits=(0.1, 3.0))
-    learner = setup("[learner]\nkind = 'rls'\nfeatures = ['state', {kind = 'polynomial', degree = 2}, 'input']").controller.learner
-    assert repr(learner.features) == repr(ql.features.State() + ql.features.Polynomial(2) + ql.features.Input())
-    guarded = setup("learner = 'kalman'\nguard = {time = 5.0}\n[prefilter]\nkind = 'zvd'\nomega = 1.4").controller
+    learner = setup(
+        "[learner]\nkind = 'rls'\nfeatures = ['state', {kind = 'polynomial', degree = 2}, 'input']"
+    ).controller.learner
+    assert repr(learner.features) == repr(
+        ql.features.State() + ql.features.Polynomial(2) + ql.features.Input()
+    )
+    guarded = setup(
+        "learner = 'kalman'\nguard = {time = 5.0}\n[prefilter]\nkind = 'zvd'\nomega = 1.4"
+    ).controller
     assert guarded.prefilter == ql.baselines.ZVD(1.4)
     assert guarded.controller.guard == ql.Guard(time=5.0)
 
@@ -188,7 +259,10 @@ def test_signals_add_up_and_follow_each_other() -> None:
         ("kind = 'pid'\nkp = 2.0\nu_max = 3.0", ql.baselines.PID),
         ("kind = 'pid-simc'\ngain = 1.0\ntau1 = 2.0\ntheta = 0.1\nb = 0.5", ql.baselines.PID),
         ("kind = 'pid-simc-double-integrator'\ngain = 1.0\ntheta = 0.1", ql.baselines.PID),
-        ("kind = 'notch-pid'\nkp = 1.0\nnotch = {omega = 1.4, depth = 0.05}", ql.baselines.NotchPID),
+        (
+            "kind = 'notch-pid'\nkp = 1.0\nnotch = {omega = 1.4, depth = 0.05}",
+            ql.baselines.NotchPID,
+        ),
         ("kind = 'lqg'\nomega_c = 1.0\nomega_o = 10.0\nu_max = 3.0", ql.baselines.LQG),
         ("kind = 'resonance-ratio'\nomega_o = 10.0", ql.baselines.ResonanceRatio),
     ],
@@ -204,9 +278,13 @@ def test_a_model_is_the_files_plant_or_its_own() -> None:
     """Of a plant with friction the observer is designed for the linear part; a delay is of the loop's samples."""
     default = setup("[observer]\nkind = 'model-based'\nomega_o = 9.0").controller.observer
     np.testing.assert_allclose(default.a, [0.0, 0.0, 2.0, 0.0], atol=1e-12)
-    own = setup("[observer]\nkind = 'model-based'\nomega_o = 9.0\nplant = {kind = 'two-mass', k = 2.0}").controller.observer
+    own = setup(
+        "[observer]\nkind = 'model-based'\nomega_o = 9.0\nplant = {kind = 'two-mass', k = 2.0}"
+    ).controller.observer
     np.testing.assert_allclose(own.a, [0.0, 0.0, 4.0, 0.0], atol=1e-12)
-    rough = setup("plant = 'torsional'\n[observer]\nkind = 'model-based'\nomega_o = 40.0", without=("plant",))
+    rough = setup(
+        "plant = 'torsional'\n[observer]\nkind = 'model-based'\nomega_o = 40.0", without=("plant",)
+    )
     assert rough.controller.observer.order == 4
     late = setup("[plant]\nkind = 'delayed'\ndelay = 0.03\nplant = {kind = 'two-mass', m2 = 0.5}")
     assert late.plant.samples == 3

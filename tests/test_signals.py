@@ -30,7 +30,9 @@ def test_a_step_begins_at_its_sample() -> None:
 
 def test_a_ramp_rises_between_start_and_stop() -> None:
     """Slope times the time since the start, held afterwards."""
-    np.testing.assert_allclose(s.Ramp(slope=2.0, start=1.0, stop=3.0)([0.0, 1.0, 2.0, 3.0, 9.0]), [0.0, 0.0, 2.0, 4.0, 4.0])
+    np.testing.assert_allclose(
+        s.Ramp(slope=2.0, start=1.0, stop=3.0)([0.0, 1.0, 2.0, 3.0, 9.0]), [0.0, 0.0, 2.0, 4.0, 4.0]
+    )
 
 
 def test_a_sinusoid_is_a_sine_from_its_start() -> None:
@@ -51,7 +53,9 @@ def test_a_chirp_has_the_frequency_it_names_at_both_ends() -> None:
 
 
 @given(distance=st.floats(-5.0, 5.0), duration=st.floats(0.5, 5.0), share=st.floats(0.05, 0.5))
-def test_a_trapezoid_starts_and_ends_at_rest_and_covers_its_distance(distance: float, duration: float, share: float) -> None:
+def test_a_trapezoid_starts_and_ends_at_rest_and_covers_its_distance(
+    distance: float, duration: float, share: float
+) -> None:
     """Its speed is continuous, its largest is distance/(duration − ramp)."""
     ramp = share * duration
     move = s.Trapezoid(distance=distance, duration=duration, ramp_time=ramp, start=1.0)
@@ -60,8 +64,13 @@ def test_a_trapezoid_starts_and_ends_at_rest_and_covers_its_distance(distance: f
     speed = np.gradient(position, t)
     assert position[0] == 0.0
     assert position[-1] == pytest.approx(distance)
-    assert np.max(np.abs(speed)) == pytest.approx(abs(distance) / (duration - ramp), rel=1e-3, abs=1e-9)
-    assert np.max(np.abs(np.diff(speed))) <= 1.01 * abs(distance) / (duration - ramp) / ramp * (t[1] - t[0]) + 1e-9
+    assert np.max(np.abs(speed)) == pytest.approx(
+        abs(distance) / (duration - ramp), rel=1e-3, abs=1e-9
+    )
+    assert (
+        np.max(np.abs(np.diff(speed)))
+        <= 1.01 * abs(distance) / (duration - ramp) / ramp * (t[1] - t[0]) + 1e-9
+    )
 
 
 def test_signals_add_subtract_and_scale() -> None:
@@ -77,14 +86,21 @@ def test_pieces_switch_at_their_times() -> None:
     pieces = s.Switched((3.0, 6.0), (s.Constant(1.0), s.Sinusoid(), s.Constant(-1.0)))
     expected = np.where(T < 3.0 - 1e-9, 1.0, np.where(T < 6.0 - 1e-9, np.sin(T), -1.0))
     np.testing.assert_allclose(pieces(T), expected)
-    np.testing.assert_allclose(s.Constant(1.0).until(3.0, then=s.Sinusoid()).until(6.0, then=s.Constant(-1.0))(T), expected)
+    np.testing.assert_allclose(
+        s.Constant(1.0).until(3.0, then=s.Sinusoid()).until(6.0, then=s.Constant(-1.0))(T), expected
+    )
 
 
 def test_recorded_samples_are_interpolated_or_held() -> None:
     """Both ways go through the samples; the ends hold."""
     times, values = [0.0, 1.0, 3.0], [0.0, 2.0, -2.0]
-    np.testing.assert_allclose(s.Samples(times, values)([-1.0, 0.5, 1.0, 2.0, 9.0]), [0.0, 1.0, 2.0, 0.0, -2.0])
-    np.testing.assert_allclose(s.Samples(times, values, hold="previous")([-1.0, 0.5, 1.0, 2.9, 3.0]), [0.0, 0.0, 2.0, 2.0, -2.0])
+    np.testing.assert_allclose(
+        s.Samples(times, values)([-1.0, 0.5, 1.0, 2.0, 9.0]), [0.0, 1.0, 2.0, 0.0, -2.0]
+    )
+    np.testing.assert_allclose(
+        s.Samples(times, values, hold="previous")([-1.0, 0.5, 1.0, 2.9, 3.0]),
+        [0.0, 0.0, 2.0, 2.0, -2.0],
+    )
 
 
 def test_noise_has_the_variance_power_over_sample_time_and_is_held() -> None:
@@ -98,7 +114,9 @@ def test_noise_has_the_variance_power_over_sample_time_and_is_held() -> None:
     assert abs(np.corrcoef(draws[1:], draws[:-1])[0, 1]) < 0.02
 
 
-@given(cuts=st.lists(st.integers(1, 99_999), max_size=6), dt=st.sampled_from([1e-3, 7e-4, 1e-2, 0.033]))
+@given(
+    cuts=st.lists(st.integers(1, 99_999), max_size=6), dt=st.sampled_from([1e-3, 7e-4, 1e-2, 0.033])
+)
 def test_noise_does_not_depend_on_how_time_is_cut(cuts: list[int], dt: float) -> None:
     """The same bits come out in pieces of any size, in any order."""
     t = np.arange(100_000) * dt
@@ -131,19 +149,33 @@ def test_every_kind_is_made_by_its_name() -> None:
     """The names of scenario files give the same signals as the classes."""
     assert s.make("sinusoid", omega=2.0) == s.Sinusoid(omega=2.0)
     for kind, cls in s.KINDS.items():
-        assert isinstance(s.make(kind, times=[0.0], values=[1.0]) if kind == "samples" else s.make(kind), cls)
+        assert isinstance(
+            s.make(kind, times=[0.0], values=[1.0]) if kind == "samples" else s.make(kind), cls
+        )
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: s.make("sine"), "signal = 'sine': must be one of constant, step, ramp"),
-        (lambda: s.make("sinusoid", frequency=1.0), "parameter of signal 'sinusoid' = 'frequency': must be one of amplitude"),
+        (
+            lambda: s.make("sinusoid", frequency=1.0),
+            "parameter of signal 'sinusoid' = 'frequency': must be one of amplitude",
+        ),
         (lambda: s.Step(at=np.nan), "at = nan: must be a finite number"),
         (lambda: s.Sinusoid(omega="fast"), "omega = 'fast': must be a number"),
-        (lambda: s.Trapezoid(duration=-1.0), "duration = -1.0: must be finite and greater than zero"),
-        (lambda: s.Trapezoid(duration=1.0, ramp_time=0.6), r"ramp_time = 0.6: must be in \(0, duration / 2 = 0.5\]"),
-        (lambda: s.Samples([0.0, 0.0], [1.0, 2.0]), "times: must hold at least one sample and increase"),
+        (
+            lambda: s.Trapezoid(duration=-1.0),
+            "duration = -1.0: must be finite and greater than zero",
+        ),
+        (
+            lambda: s.Trapezoid(duration=1.0, ramp_time=0.6),
+            r"ramp_time = 0.6: must be in \(0, duration / 2 = 0.5\]",
+        ),
+        (
+            lambda: s.Samples([0.0, 0.0], [1.0, 2.0]),
+            "times: must hold at least one sample and increase",
+        ),
         (lambda: s.Samples([0.0, 1.0], [1.0]), r"values has shape \(1,\): must be a vector of 2"),
         (lambda: s.Samples([0.0], [np.nan]), r"values: entry \(0,\) is nan"),
         (lambda: s.Switched((1.0,), (s.Step(),)), "there must be one piece more than times"),
@@ -193,7 +225,11 @@ def test_a_derivative_is_the_slope_of_the_signal(signal: s.Signal) -> None:
 def test_a_smooth_move_has_the_derivatives_it_promises() -> None:
     """M of them are continuous, zero at both ends; the move of m = 2 is the minimum-jerk polynomial 10σ³ − 15σ⁴ + 6σ⁵."""
     sigma = np.linspace(0.0, 1.0, 101)
-    np.testing.assert_allclose(s.SmoothMove(1.0, 1.0, smoothness=2)(sigma), 10 * sigma**3 - 15 * sigma**4 + 6 * sigma**5, atol=1e-14)
+    np.testing.assert_allclose(
+        s.SmoothMove(1.0, 1.0, smoothness=2)(sigma),
+        10 * sigma**3 - 15 * sigma**4 + 6 * sigma**5,
+        atol=1e-14,
+    )
     move = s.SmoothMove(distance=-3.0, duration=2.0, smoothness=4, start=1.0)
     assert move([0.0, 1.0, 2.0, 3.0, 9.0]).tolist() == pytest.approx([0.0, 0.0, -1.5, -3.0, -3.0])
     for _ in range(4):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell import driver
+from quell.simulation import driver
 
 PLANT = ql.plants.two_mass_spring()
 
@@ -24,15 +24,21 @@ def test_the_same_seed_gives_the_same_bits(two_mass_scenario: ql.Scenario) -> No
     assert np.any(ql.simulate(PLANT, controller(), other)["y_measured"] != runs[0]["y_measured"])
 
 
-def test_the_block_size_leaves_no_trace(two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_block_size_leaves_no_trace(
+    two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Signals are made in pieces, the record is one."""
     whole = ql.simulate(PLANT, controller(), two_mass_scenario)
     monkeypatch.setattr(driver, "_BLOCK", 77)
-    np.testing.assert_array_equal(ql.simulate(PLANT, controller(), two_mass_scenario).log, whole.log)
+    np.testing.assert_array_equal(
+        ql.simulate(PLANT, controller(), two_mass_scenario).log, whole.log
+    )
 
 
 @pytest.mark.parametrize("every", [2, 10, 333])
-def test_a_thinned_record_holds_every_so_many_th_sample(two_mass_scenario: ql.Scenario, every: int) -> None:
+def test_a_thinned_record_holds_every_so_many_th_sample(
+    two_mass_scenario: ql.Scenario, every: int
+) -> None:
     """And no more memory than that."""
     whole = ql.simulate(PLANT, controller(), two_mass_scenario)
     thin = ql.simulate(PLANT, controller(), two_mass_scenario, record_every=every)
@@ -43,7 +49,9 @@ def test_a_thinned_record_holds_every_so_many_th_sample(two_mass_scenario: ql.Sc
 
 def test_the_loop_starts_from_rest_when_the_scenario_says_so() -> None:
     """Plant at x0, observer at its first measurement, θ as learned."""
-    scenario = ql.Scenario(reference=ql.signals.Sinusoid(), duration=30.0, x0=[0.1, 0.1, 0.0, 0.0], rest_at=(20.0,))
+    scenario = ql.Scenario(
+        reference=ql.signals.Sinusoid(), duration=30.0, x0=[0.1, 0.1, 0.0, 0.0], rest_at=(20.0,)
+    )
     run = ql.simulate(PLANT, controller(learner=ql.learners.Kalman()), scenario)
     k = run.window(20.0, 20.1).start
     np.testing.assert_array_equal(run["x"][k], [0.1, 0.1, 0.0, 0.0])
@@ -121,27 +129,63 @@ def test_the_last_sample_is_there_whatever_the_sample_time() -> None:
     plant = ql.plants.LinearPlant([[0.0]], [1.0], [1.0])
     for dt in (0.1, 0.3, 1e-3 / 3.0, 7e-4):
         law = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=1.0, dt=dt), omega_c=1.0)
-        assert len(ql.simulate(plant, law, ql.Scenario(1.0, duration=3000 * dt), record_every=100)) == 31
+        assert (
+            len(ql.simulate(plant, law, ql.Scenario(1.0, duration=3000 * dt), record_every=100))
+            == 31
+        )
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ql.Scenario(duration=-1.0), "duration = -1.0: must be finite and greater than zero"),
-        (lambda: ql.Scenario(duration=10.0, rest_at=(5.0, 3.0)), r"rest_at = \(5.0, 3.0\): must increase"),
+        (
+            lambda: ql.Scenario(duration=-1.0),
+            "duration = -1.0: must be finite and greater than zero",
+        ),
+        (
+            lambda: ql.Scenario(duration=10.0, rest_at=(5.0, 3.0)),
+            r"rest_at = \(5.0, 3.0\): must increase",
+        ),
         (lambda: ql.Scenario(duration=10.0, rest_at=(10.0,)), "must increase and lie within"),
         (lambda: ql.Scenario(seed=-1), "seed = -1: must be a whole number"),
-        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(x0=[1.0])), r"x0 has shape \(1,\): must be a vector of 4"),
-        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(disturbances=(0, 0, 0))), "disturbances has 3 signals: the plant has 2"),
-        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(), record_every=0), "record_every = 0: must be a whole number"),
-        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(), limit=-1.0), "limit = -1.0: must be finite and greater"),
+        (
+            lambda: ql.simulate(PLANT, controller(), ql.Scenario(x0=[1.0])),
+            r"x0 has shape \(1,\): must be a vector of 4",
+        ),
+        (
+            lambda: ql.simulate(PLANT, controller(), ql.Scenario(disturbances=(0, 0, 0))),
+            "disturbances has 3 signals: the plant has 2",
+        ),
+        (
+            lambda: ql.simulate(PLANT, controller(), ql.Scenario(), record_every=0),
+            "record_every = 0: must be a whole number",
+        ),
+        (
+            lambda: ql.simulate(PLANT, controller(), ql.Scenario(), limit=-1.0),
+            "limit = -1.0: must be finite and greater",
+        ),
         (lambda: ql.Scenario(reference="sine"), "reference = 'sine': must be a number"),
-        (lambda: ql.simulate(None, controller(), ql.Scenario()), "plant = None: must be a plant, for example"),
-        (lambda: ql.simulate(PLANT, ql.ADRC, ql.Scenario()), "controller = .*: must be a controller, for example"),
+        (
+            lambda: ql.simulate(None, controller(), ql.Scenario()),
+            "plant = None: must be a plant, for example",
+        ),
+        (
+            lambda: ql.simulate(PLANT, ql.ADRC, ql.Scenario()),
+            "controller = .*: must be a controller, for example",
+        ),
         (lambda: ql.simulate(PLANT, controller(), 3.0), "scenario = 3.0: must be a quell.Scenario"),
-        (lambda: ql.Scenario(disturbances=1.0), "disturbances = 1.0: must be a sequence of signals or numbers"),
-        (lambda: ql.Scenario(disturbances=(0.0, "wind")), r"disturbances\[1\] = 'wind': must be a number"),
-        (lambda: ql.simulate(PLANT, controller(), ql.Scenario(duration=1e15)), "duration = 1000000000000000.0 s with dt = 0.005 s"),
+        (
+            lambda: ql.Scenario(disturbances=1.0),
+            "disturbances = 1.0: must be a sequence of signals or numbers",
+        ),
+        (
+            lambda: ql.Scenario(disturbances=(0.0, "wind")),
+            r"disturbances\[1\] = 'wind': must be a number",
+        ),
+        (
+            lambda: ql.simulate(PLANT, controller(), ql.Scenario(duration=1e15)),
+            "duration = 1000000000000000.0 s with dt = 0.005 s",
+        ),
     ],
 )
 def test_a_mistake_is_named(make: object, message: str) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.experiments import adversaries, random_loops, stress
+from quell.experiments.stress import adversaries, random_loops
+from quell.experiments.stress import study as stress
 
 
 def test_without_a_guard_the_trial_is_lost() -> None:
@@ -56,13 +57,20 @@ def test_every_kind_of_adversary_runs_as_it_was_drawn(kind: str, rng: np.random.
     loop = random_loops.draw(1, rng)[0]
     one, other = (adversaries.draw(kind, rng) for _ in range(2))
     assert repr(one) != repr(other)
-    run = ql.simulate(loop.plant, loop.controller(one, ql.Guard()), ql.Scenario(ql.signals.Sinusoid(), 2.0))
+    run = ql.simulate(
+        loop.plant, loop.controller(one, ql.Guard()), ql.Scenario(ql.signals.Sinusoid(), 2.0)
+    )
     assert not run.diverged
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [((-1, 0, 0), "runs = -1"), ((0, 0, 0), "at least one must be positive"), ((1, 0, -1), "seed = -1"), ((1, 0.5, 0), "honest = 0.5")],
+    [
+        ((-1, 0, 0), "runs = -1"),
+        ((0, 0, 0), "at least one must be positive"),
+        ((1, 0, -1), "seed = -1"),
+        ((1, 0.5, 0), "honest = 0.5"),
+    ],
 )
 def test_mistakes_are_named(arguments: tuple[int, int, int], message: str) -> None:
     """Argument, value, rule."""

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 import quell as ql
 from quell.controllers.base import applied, control, report
 from quell.realtime import Safety
-from quell.realtime.channels import Event
-from quell.realtime.outcome import told
-from quell.realtime.supervisor import BEGAN, END, FLUSH, ZERO, Cause, Mode, changes
+from quell.realtime.loop.outcome import told
+from quell.realtime.loop.supervisor import BEGAN, END, FLUSH, ZERO, Cause, Mode, changes
+from quell.realtime.telemetry.channels import Event
 
 from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
 
@@ -26,7 +26,10 @@ MISS = math.nan
 
 def modes(outcome: Outcome) -> list[tuple[int, Mode, Cause]]:
     """Return when which mode began, and why."""
-    return [(round(change.t / DT), change.mode, change.cause) for change in told(changes(outcome.prepared.watch), DT)]
+    return [
+        (round(change.t / DT), change.mode, change.cause)
+        for change in told(changes(outcome.prepared.watch), DT)
+    ]
 
 
 def check_ramped(outcome: Outcome, k: int, ramp: int = RAMP) -> None:
@@ -35,7 +38,9 @@ def check_ramped(outcome: Outcome, k: int, ramp: int = RAMP) -> None:
     first = int(np.flatnonzero(outcome["K"] == k)[0])
     before = u[first - 1]
     assert before != 0.0
-    np.testing.assert_allclose(u[first : first + ramp], before * (1.0 - np.arange(1, ramp + 1) / ramp), atol=1e-12)
+    np.testing.assert_allclose(
+        u[first : first + ramp], before * (1.0 - np.arange(1, ramp + 1) / ramp), atol=1e-12
+    )
     assert np.all(u[first + ramp :] == 0.0)
     assert len(u) == first + ramp + FLUSH + 1
     assert np.all(outcome["MODE"][first + ramp - 1 :] == Mode.STOPPED)
@@ -43,7 +48,10 @@ def check_ramped(outcome: Outcome, k: int, ramp: int = RAMP) -> None:
 
 def check_ended_by(outcome: Outcome, k: int, cause: Cause) -> None:
     """At cycle ``k``, for this reason, the ramp began, and ended as it should."""
-    assert modes(outcome)[-2:] == [(k, Mode.RAMP, cause), (int(outcome["K"][-1]) - FLUSH - 1, Mode.STOPPED, Cause.RAMPED)]
+    assert modes(outcome)[-2:] == [
+        (k, Mode.RAMP, cause),
+        (int(outcome["K"][-1]) - FLUSH - 1, Mode.STOPPED, Cause.RAMPED),
+    ]
     check_ramped(outcome, k)
 
 
@@ -55,7 +63,8 @@ def test_nothing_happens_where_nothing_goes_wrong() -> None:
     np.testing.assert_array_equal(outcome["U"][mine], run_["u"])
     np.testing.assert_array_equal(outcome["Y"][mine], run_["y"])
     np.testing.assert_array_equal(
-        outcome.rows[mine, 9:], np.column_stack([run_["x_hat"], run_["f_residual"], run_["f_learned"], run_["status"]])
+        outcome.rows[mine, 9:],
+        np.column_stack([run_["x_hat"], run_["f_residual"], run_["f_learned"], run_["status"]]),
     )
     assert modes(outcome)[0] == (SETTLE, Mode.RUN, Cause.SETTLED)
     check_ended_by(outcome, SETTLE + len(run_), Cause.OVER)
@@ -64,8 +73,15 @@ def test_nothing_happens_where_nothing_goes_wrong() -> None:
 
 def test_plain_python_does_what_compiled_code_does() -> None:
     """Through misses, a stall, a device that is not reached, and a trip: the same modes, the same numbers."""
-    scripts: dict[str, Any] = {"y": {60: MISS, 61: MISS, 200: 1.0}, "stall": {100: 3 * SAMPLE}, "refused": {80: 1}}
-    compiled, plain = (run(ScriptedDevice(PLANT, **scripts), interpret=interpret, most_error=1.1) for interpret in (False, True))
+    scripts: dict[str, Any] = {
+        "y": {60: MISS, 61: MISS, 200: 1.0},
+        "stall": {100: 3 * SAMPLE},
+        "refused": {80: 1},
+    }
+    compiled, plain = (
+        run(ScriptedDevice(PLANT, **scripts), interpret=interpret, most_error=1.1)
+        for interpret in (False, True)
+    )
     assert modes(compiled) == modes(plain)
     assert len(modes(compiled)) == 5
     np.testing.assert_allclose(plain.rows, compiled.rows, rtol=1e-12, atol=1e-12)
@@ -80,9 +96,14 @@ def test_a_few_missed_samples_hold_u(value: float, missed: int) -> None:
     assert np.all(u[60 : 60 + missed] == u[59])
     assert u[60 + missed] != u[59]
     assert np.all(outcome["Y"][60 : 60 + missed] == outcome["Y"][59])
-    assert modes(outcome)[1:3] == [(60, Mode.HOLD, Cause.MISSED), (60 + missed, Mode.RUN, Cause.BACK)]
+    assert modes(outcome)[1:3] == [
+        (60, Mode.HOLD, Cause.MISSED),
+        (60 + missed, Mode.RUN, Cause.BACK),
+    ]
     assert np.all(outcome["EVENTS"].astype(int)[60 : 60 + missed] & Event.MISSED)
-    assert outcome["Y"][SETTLE + 300] == pytest.approx(run(ScriptedDevice(PLANT))["Y"][SETTLE + 300], abs=0.05)
+    assert outcome["Y"][SETTLE + 300] == pytest.approx(
+        run(ScriptedDevice(PLANT))["Y"][SETTLE + 300], abs=0.05
+    )
 
 
 @pytest.mark.parametrize("value", [MISS, math.inf])
@@ -94,7 +115,9 @@ def test_one_missed_sample_too_many_ramps_u_down(value: float) -> None:
 
 def test_a_device_that_never_comes_back_is_lost() -> None:
     """As above, and the ramp needs no measurement."""
-    check_ended_by(run(ScriptedDevice(PLANT, y=dict.fromkeys(range(60, 3000), MISS))), 60 + HOLD, Cause.LOST)
+    check_ended_by(
+        run(ScriptedDevice(PLANT, y=dict.fromkeys(range(60, 3000), MISS))), 60 + HOLD, Cause.LOST
+    )
 
 
 def test_a_stall_skips_deadlines_and_never_catches_up() -> None:
@@ -122,7 +145,10 @@ def test_a_stall_of_too_many_samples_ramps_u_down() -> None:
     """The first cycle after it begins the ramp: what the plant did meanwhile nobody knows."""
     outcome = run(ScriptedDevice(PLANT, stall={60: (HOLD + 1) * SAMPLE + 1}))
     check_ended_by(outcome, 60 + HOLD + 2, Cause.STALLED)
-    assert not any(cause is Cause.STALLED for _, _, cause in modes(run(ScriptedDevice(PLANT, stall={60: HOLD * SAMPLE + 1}))))
+    assert not any(
+        cause is Cause.STALLED
+        for _, _, cause in modes(run(ScriptedDevice(PLANT, stall={60: HOLD * SAMPLE + 1})))
+    )
 
 
 def test_one_cycle_after_the_other_that_overruns_ramps_u_down() -> None:
@@ -138,13 +164,21 @@ def test_a_device_that_is_not_reached_too_often_is_given_up() -> None:
     few = run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 60 + HOLD), 1)))
     assert modes(few)[1][2] is Cause.OVER
     assert np.sum(few["EVENTS"].astype(int) & Event.UNSENT > 0) == HOLD
-    check_ended_by(run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 3000), 1))), 60 + HOLD + 1, Cause.UNREACHED)
+    check_ended_by(
+        run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 3000), 1))),
+        60 + HOLD + 1,
+        Cause.UNREACHED,
+    )
 
 
 @pytest.mark.parametrize("fault", [2, 3])
 def test_a_device_that_has_set_u_to_zero_itself_ends_the_run(fault: int) -> None:
     """At the sample after it said so: the controller would be working on a plant that does not listen."""
-    check_ended_by(run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 3000), fault))), 61, Cause.WATCHDOG)
+    check_ended_by(
+        run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 3000), fault))),
+        61,
+        Cause.WATCHDOG,
+    )
 
 
 def test_a_tracking_error_beyond_its_limit_trips() -> None:
@@ -167,7 +201,10 @@ def test_a_u_that_stays_at_its_limit_trips() -> None:
     check_ended_by(outcome, SETTLE + 30, Cause.SATURATED)
     assert np.max(np.abs(outcome["U"])) == 0.5
     assert np.all(outcome["EVENTS"].astype(int)[SETTLE + 1 : SETTLE + 30] & Event.CLIPPED)
-    assert modes(run(ScriptedDevice(PLANT), most_saturated=30, u_min=-1.4, u_max=1.4))[1][2] is Cause.OVER
+    assert (
+        modes(run(ScriptedDevice(PLANT), most_saturated=30, u_min=-1.4, u_max=1.4))[1][2]
+        is Cause.OVER
+    )
 
 
 class Broken(NamedTuple):
@@ -216,7 +253,10 @@ def test_a_u_that_is_no_number_is_never_written() -> None:
 
 def test_asked_to_stop_it_ramps_and_asked_again_it_is_zero_at_once() -> None:
     """Before it took over, there is nothing to ramp."""
-    assert modes(run(ScriptedDevice(PLANT), asked=END)) == [(0, Mode.RAMP, Cause.ASKED), (0, Mode.STOPPED, Cause.RAMPED)]
+    assert modes(run(ScriptedDevice(PLANT), asked=END)) == [
+        (0, Mode.RAMP, Cause.ASKED),
+        (0, Mode.STOPPED, Cause.RAMPED),
+    ]
     assert modes(run(ScriptedDevice(PLANT), asked=ZERO)) == [(0, Mode.STOPPED, Cause.AT_ONCE)]
 
 
@@ -237,7 +277,9 @@ def test_a_device_that_stutters_never_starts() -> None:
 
 faults = st.fixed_dictionaries(
     {
-        "y": st.dictionaries(st.integers(0, 120), st.sampled_from([MISS, math.inf, -1e300, 50.0]), max_size=40),
+        "y": st.dictionaries(
+            st.integers(0, 120), st.sampled_from([MISS, math.inf, -1e300, 50.0]), max_size=40
+        ),
         "stall": st.dictionaries(st.integers(0, 120), st.integers(0, 20 * SAMPLE), max_size=10),
         "refused": st.dictionaries(st.integers(0, 120), st.integers(1, 3), max_size=10),
     }
@@ -246,7 +288,9 @@ faults = st.fixed_dictionaries(
 
 @settings(max_examples=200)
 @given(scripts=faults)
-def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(scripts: dict[str, dict[int, Any]]) -> None:
+def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(
+    scripts: dict[str, dict[int, Any]],
+) -> None:
     """Random drops, bursts, nonsense, stalls, refusals: the modes go one way, the ramp only shrinks u, the last commands are zeros."""
     outcome = run(ScriptedDevice(PLANT, **scripts), duration=1.0)
     u, mode = outcome.device.written, outcome["MODE"]
@@ -268,7 +312,10 @@ def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(scripts: 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"u_min": 1.0, "u_max": 2.0}, "u_min = 1.0, u_max = 2.0: zero, which is what u goes to where something fails, must lie within"),
+        (
+            {"u_min": 1.0, "u_max": 2.0},
+            "u_min = 1.0, u_max = 2.0: zero, which is what u goes to where something fails, must lie within",
+        ),
         ({"u_min": 2.0, "u_max": 1.0}, "u_min must be less than u_max"),
         ({"most_error": 0.0}, "most_error = 0.0: must be finite and greater than zero"),
         ({"most_f": math.nan}, "most_f = nan"),
@@ -286,7 +333,9 @@ def test_what_is_out_of_range_is_named(options: dict[str, Any], message: str) ->
 def test_without_limits_of_u_no_loop_is_closed() -> None:
     """They come from the controller, from the safety, or from both: then the narrower ones hold."""
     bare = ql.ADRC(ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT), omega_c=1.5)
-    with pytest.raises(ValueError, match="u_min = -inf, u_max = inf: must be finite for a real device"):
+    with pytest.raises(
+        ValueError, match="u_min = -inf, u_max = inf: must be finite for a real device"
+    ):
         Safety().rules(bare)
     assert Safety(u_min=-1.0, u_max=2.0).rules(bare)[:2] == (-1.0, 2.0)
     assert Safety(u_min=-9.0, u_max=2.0).rules(adrc())[:2] == (-3.0, 2.0)

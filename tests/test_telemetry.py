@@ -18,12 +18,12 @@ import pytest
 import websockets
 
 import quell as ql
-from quell.realtime.channels import EVENTS, LOOP_WIDTH, Y_MEASURED, Event, K, row_channels
-from quell.realtime.header import Header
-from quell.realtime.recording import load, trajectory_of
-from quell.realtime.ring import push
-from quell.realtime.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
-from quell.realtime.telemetry import Telemetry
+from quell.realtime.telemetry.channels import EVENTS, LOOP_WIDTH, Y_MEASURED, Event, K, row_channels
+from quell.realtime.telemetry.header import Header
+from quell.realtime.telemetry.load import load, trajectory_of
+from quell.realtime.telemetry.ring import push
+from quell.realtime.telemetry.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
+from quell.realtime.telemetry.telemetry import Telemetry
 from quell.types import Matrix
 from tests.recordings import DT, controller, header_of, rows_of, simulated
 
@@ -72,7 +72,9 @@ def counted(count: int, width: int = LOOP_WIDTH + 1) -> Matrix:
 
 
 @pytest.mark.parametrize("suffix", ["csv", "mcap"])
-def test_a_run_comes_back_to_the_last_bit(run: ql.Trajectory, header: Header, rows: Matrix, suffix: str, tmp_path: Path) -> None:
+def test_a_run_comes_back_to_the_last_bit(
+    run: ql.Trajectory, header: Header, rows: Matrix, suffix: str, tmp_path: Path
+) -> None:
     """Simulate, record, load: channels, bits, features, sample time, metrics."""
     path = tmp_path / f"run.{suffix}"
     recorded(header, rows, file_sink(path))
@@ -90,14 +92,25 @@ def test_a_run_comes_back_to_the_last_bit(run: ql.Trajectory, header: Header, ro
 def test_numbers_at_the_ends_of_the_range_come_back(suffix: str, tmp_path: Path) -> None:
     """The largest, the smallest, infinities, minus zero and NaN, also in the first row, which CSV writes without exponents."""
     rows = counted(8)
-    rows[:, Y_MEASURED] = [5e-324, 1.7976931348623157e308, -np.inf, np.inf, np.nan, -0.0, 0.1 + 0.2, -1e-5]
+    rows[:, Y_MEASURED] = [
+        5e-324,
+        1.7976931348623157e308,
+        -np.inf,
+        np.inf,
+        np.nan,
+        -0.0,
+        0.1 + 0.2,
+        -1e-5,
+    ]
     rows[:, Y_MEASURED + 1] = rows[::-1, Y_MEASURED]
     path = tmp_path / f"run.{suffix}"
     recorded(NARROW, rows, file_sink(path))
     assert load(path).log.tobytes() == rows.tobytes()
 
 
-def test_a_trajectory_of_a_recording_is_saved_as_any_other(header: Header, rows: Matrix, tmp_path: Path) -> None:
+def test_a_trajectory_of_a_recording_is_saved_as_any_other(
+    header: Header, rows: Matrix, tmp_path: Path
+) -> None:
     """NetCDF has the loop's channels too, with their units."""
     run = trajectory_of(header, rows)
     run.save(tmp_path / "run.nc")
@@ -120,18 +133,26 @@ def test_skipped_deadlines_are_filled_in() -> None:
     assert run.ended == pytest.approx(5 * DT)
 
 
-def test_a_csv_file_is_a_line_of_names_and_lines_of_numbers(header: Header, rows: Matrix, tmp_path: Path) -> None:
+def test_a_csv_file_is_a_line_of_names_and_lines_of_numbers(
+    header: Header, rows: Matrix, tmp_path: Path
+) -> None:
     """Time comes first; the first line has no exponents, which some readers take for text."""
     recorded(header, rows, CsvSink(tmp_path / "run.csv"))
     names, first, *_ = (tmp_path / "run.csv").read_text().splitlines()
-    assert names.startswith("time,k,lateness,step_time,mode,events,r,y,y_measured,u,x_hat[0],x_hat[1],f_residual,")
+    assert names.startswith(
+        "time,k,lateness,step_time,mode,events,r,y,y_measured,u,x_hat[0],x_hat[1],f_residual,"
+    )
     assert "e" not in first
     table = np.loadtxt(tmp_path / "run.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(table[:, 0], np.arange(len(rows)) * DT)
 
 
-@pytest.mark.parametrize("dt", [1e-3, 1.0 / 3.0, 0.1, 1.0 / 44100.0, 2.2675736961451248e-05 * (1 + 2**-52)])
-def test_a_csv_file_without_its_header_still_knows_its_sample_time(dt: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "dt", [1e-3, 1.0 / 3.0, 0.1, 1.0 / 44100.0, 2.2675736961451248e-05 * (1 + 2**-52)]
+)
+def test_a_csv_file_without_its_header_still_knows_its_sample_time(
+    dt: float, tmp_path: Path
+) -> None:
     """To the last bit, from the column of times."""
     rows = counted(1000)
     recorded(Header(NARROW.channels, dt=dt), rows, CsvSink(tmp_path / "run.csv"))
@@ -142,7 +163,9 @@ def test_a_csv_file_without_its_header_still_knows_its_sample_time(dt: float, tm
     assert run.dt == pytest.approx(dt, rel=1e-15)
 
 
-def test_a_message_is_what_its_definition_says(header: Header, rows: Matrix, tmp_path: Path) -> None:
+def test_a_message_is_what_its_definition_says(
+    header: Header, rows: Matrix, tmp_path: Path
+) -> None:
     """Read field by field as ROS 2 lays plain CDR out, from nothing but the definition in the file."""
     from mcap.reader import make_reader
 
@@ -151,7 +174,11 @@ def test_a_message_is_what_its_definition_says(header: Header, rows: Matrix, tmp
         found = list(make_reader(file).iter_messages(topics=["/loop"]))
     assert len(found) == len(rows)
     schema, channel, message = found[17]
-    assert (schema.name, schema.encoding, channel.message_encoding) == ("quell/msg/Cycle", "ros2msg", "cdr")
+    assert (schema.name, schema.encoding, channel.message_encoding) == (
+        "quell/msg/Cycle",
+        "ros2msg",
+        "cdr",
+    )
     assert message.log_time == header.started + round(17 * DT * 1e9)
     told, at = {}, 4
     for line in schema.data.decode().splitlines():
@@ -166,7 +193,9 @@ def test_a_message_is_what_its_definition_says(header: Header, rows: Matrix, tmp
 
 
 @pytest.mark.parametrize("suffix", ["csv", "mcap"])
-def test_a_file_cut_short_anywhere_is_readable_up_to_there(suffix: str, tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_file_cut_short_anywhere_is_readable_up_to_there(
+    suffix: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
     """Whole rows, the first ones, or one line that says there is none."""
     sink, rows = file_sink(tmp_path / f"run.{suffix}"), counted(400)
     sink.open(NARROW)
@@ -259,7 +288,9 @@ class Broken(MemorySink):
         raise OSError(28, "No space left on device")
 
 
-def test_a_sink_that_fails_is_closed_and_reported_and_the_others_go_on(header: Header, rows: Matrix) -> None:
+def test_a_sink_that_fails_is_closed_and_reported_and_the_others_go_on(
+    header: Header, rows: Matrix
+) -> None:
     """One line says which, and why."""
     broken, kept = Broken(), MemorySink()
     with Telemetry(header, [broken, kept]) as telemetry:
@@ -271,7 +302,9 @@ def test_a_sink_that_fails_is_closed_and_reported_and_the_others_go_on(header: H
 
 
 @pytest.mark.parametrize("suffix", ["csv", "mcap"])
-def test_a_full_disk_ends_a_recording_and_nothing_else(header: Header, rows: Matrix, suffix: str, tmp_path: Path) -> None:
+def test_a_full_disk_ends_a_recording_and_nothing_else(
+    header: Header, rows: Matrix, suffix: str, tmp_path: Path
+) -> None:
     """The limit on the size of a file stands for the disk; what was written before can be read."""
     sink, kept = file_sink(tmp_path / f"run.{suffix}"), MemorySink()
     telemetry = Telemetry(header, [sink, kept])
@@ -343,7 +376,9 @@ def test_a_writer_that_does_not_end_is_given_up() -> None:
         (lambda folder: McapSink(folder), "must be a file"),
     ],
 )
-def test_what_can_not_be_written_is_refused_before_the_loop_starts(make: Any, rule: str, tmp_path: Path) -> None:
+def test_what_can_not_be_written_is_refused_before_the_loop_starts(
+    make: Any, rule: str, tmp_path: Path
+) -> None:
     """In one line; and what was opened before it is closed."""
     for suffix in ("csv", "mcap"):
         (tmp_path / f"old.{suffix}").write_text("precious")
@@ -367,15 +402,21 @@ def test_other_suffixes_and_lazy_writers_are_refused() -> None:
 
 
 @pytest.mark.parametrize("module", ["foxglove", "mcap"])
-def test_a_missing_package_is_named_with_the_extra_that_brings_it(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_named_with_the_extra_that_brings_it(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In one line, before the loop starts."""
     recorded(NARROW, counted(3), McapSink(tmp_path / "run.mcap"))
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match=r'pip install "quell\[telemetry\]"'):
-        load(tmp_path / "run.mcap") if module == "mcap" else McapSink(tmp_path / "other.mcap").open(NARROW)
+        load(tmp_path / "run.mcap") if module == "mcap" else McapSink(tmp_path / "other.mcap").open(
+            NARROW
+        )
 
 
-def test_files_that_are_no_recordings_are_refused_in_one_line(run: ql.Trajectory, tmp_path: Path) -> None:
+def test_files_that_are_no_recordings_are_refused_in_one_line(
+    run: ql.Trajectory, tmp_path: Path
+) -> None:
     """Text, tables of something else, a NetCDF record, an empty file, a folder, no file, an MCAP file of others, broken rows."""
     import foxglove
 
@@ -384,8 +425,12 @@ def test_files_that_are_no_recordings_are_refused_in_one_line(run: ql.Trajectory
     (tmp_path / "table.csv").write_text("time,a,b\n0,1,2\n")
     (tmp_path / "names.csv").write_text("time," + ",".join(NARROW.columns) + "\n")
     line = ",".join(["0.0"] * (NARROW.width + 1))
-    (tmp_path / "short.csv").write_text((tmp_path / "names.csv").read_text() + f"{line}\n0,1\n{line}\n")
-    (tmp_path / "twice.csv").write_text((tmp_path / "names.csv").read_text() + f"0.01,1.0{line[7:]}\n" * 2)
+    (tmp_path / "short.csv").write_text(
+        (tmp_path / "names.csv").read_text() + f"{line}\n0,1\n{line}\n"
+    )
+    (tmp_path / "twice.csv").write_text(
+        (tmp_path / "names.csv").read_text() + f"0.01,1.0{line[7:]}\n" * 2
+    )
     (tmp_path / "noise.mcap").write_bytes(b"\x89MCAP0\r\n" + np.random.default_rng(1).bytes(5000))
     run.save(tmp_path / "run.nc")
     context = foxglove.Context()
@@ -401,11 +446,17 @@ def test_files_that_are_no_recordings_are_refused_in_one_line(run: ql.Trajectory
 
 async def _watch(url: str, wanted: int, begin: Any) -> tuple[dict[str, Any], list[bytes]]:
     """Subscribe to all there is, as a Foxglove viewer does; call ``begin`` then; return the channel and so many messages."""
-    async with websockets.connect(url, subprotocols=["foxglove.sdk.v1", "foxglove.websocket.v1"]) as socket:  # type: ignore[list-item]
+    async with websockets.connect(
+        url, subprotocols=["foxglove.sdk.v1", "foxglove.websocket.v1"]
+    ) as socket:  # type: ignore[list-item]
         while (told := json.loads(await socket.recv()))["op"] != "advertise":
             pass
         channel = told["channels"][0]
-        await socket.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]}))
+        await socket.send(
+            json.dumps(
+                {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]}
+            )
+        )
         messages: list[bytes] = []
         while len(messages) < wanted:
             begin()
@@ -436,7 +487,11 @@ def test_a_viewer_sees_rows_at_a_rate_it_can_follow_and_no_event_is_lost() -> No
         channel, messages = asyncio.run(asyncio.wait_for(_watch(live.url, 5, send), 60))
     finally:
         live.close()
-    assert (channel["topic"], channel["encoding"], channel["schemaEncoding"]) == ("/loop", "cdr", "ros2msg")
+    assert (channel["topic"], channel["encoding"], channel["schemaEncoding"]) == (
+        "/loop",
+        "cdr",
+        "ros2msg",
+    )
     seen = np.array([np.frombuffer(message[13 + 4 :], dtype="<f8") for message in messages])
     np.testing.assert_array_equal(np.diff(seen[:, K]), 20.0)
     np.testing.assert_array_equal(seen[:, EVENTS], np.where(seen[:, K] == 0, 1.0, 5.0))
@@ -448,7 +503,9 @@ def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
     first.open(NARROW)
     port = int(first.url.rpartition(":")[2])
     try:
-        with pytest.raises(ValueError, match=f"port = {port}: can't listen there .* choose another port"):
+        with pytest.raises(
+            ValueError, match=f"port = {port}: can't listen there .* choose another port"
+        ):
             LiveSink(port=port).open(NARROW)
     finally:
         first.close()
@@ -456,9 +513,11 @@ def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
 
 @pytest.mark.parametrize("permitted", [True, False])
 @pytest.mark.parametrize("urgent", [True, False])
-def test_the_writer_has_the_priority_that_it_should(urgent: bool, permitted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_writer_has_the_priority_that_it_should(
+    urgent: bool, permitted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The lowest real-time priority for a loop in Python, where that is permitted; else none, even where it inherits one."""
-    from quell.realtime import telemetry
+    from quell.realtime.telemetry import telemetry
 
     now = [telemetry.os.SCHED_RR]
 
@@ -479,5 +538,8 @@ def test_the_writer_has_the_priority_that_it_should(urgent: bool, permitted: boo
 def test_a_table_of_times_alone_is_no_recording(tmp_path: Path) -> None:
     """It is refused in a line, as any other table is."""
     (tmp_path / "run.csv").write_text("time\n0.0\n1.0\n")
-    with pytest.raises(ValueError, match="must be a recording by quell, CSV or MCAP: its first line is not the names"):
+    with pytest.raises(
+        ValueError,
+        match="must be a recording by quell, CSV or MCAP: its first line is not the names",
+    ):
         load(tmp_path / "run.csv")

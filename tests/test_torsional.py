@@ -10,17 +10,25 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import quell as ql
-from quell.dispatch import compiled
-from quell.experiments import torsional as study
-from quell.experiments.claims import Claim
+from quell.experiments.common.claims import Claim
+from quell.experiments.torsional import setup as study
+from quell.kernels.dispatch import compiled
 from quell.plants.base import advance, measure
 
 DT = 1e-3
-IDEAL: dict[str, Any] = {"lower_coulomb": 0.0, "upper_coulomb": 0.0, "dac_bits": None, "counts": None, "current_limit": 1e6}
+IDEAL: dict[str, Any] = {
+    "lower_coulomb": 0.0,
+    "upper_coulomb": 0.0,
+    "dac_bits": None,
+    "counts": None,
+    "current_limit": 1e6,
+}
 
 
 @compiled
-def sample_by_sample(model: Any, x: Any, scratch: Any, u: Any, w: Any, states: Any, outputs: Any) -> None:
+def sample_by_sample(
+    model: Any, x: Any, scratch: Any, u: Any, w: Any, states: Any, outputs: Any
+) -> None:
     """Run a plant outside of a loop, as a rig does."""
     for k in range(u.size):
         outputs[k] = measure(model, x)
@@ -29,7 +37,9 @@ def sample_by_sample(model: Any, x: Any, scratch: Any, u: Any, w: Any, states: A
         advance(model, x, scratch, 0.0, u[k], w)
 
 
-def record(plant: Any, u: Any, x0: Any = None, dt: float = DT, w: Any = (0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+def record(
+    plant: Any, u: Any, x0: Any = None, dt: float = DT, w: Any = (0.0, 0.0)
+) -> tuple[np.ndarray, np.ndarray]:
     """Return states and outputs before each sample of ``u``."""
     u, w = np.array(u, dtype=float), np.array(w)[: plant.disturbances]
     states, outputs = np.empty((u.size, plant.order)), np.empty(u.size)
@@ -55,7 +65,9 @@ def test_it_obeys_newton(rng: np.random.Generator) -> None:
     shaft = 2.0 * (x[0] - x[1]) + 0.003 * (x[2] - x[3])
     lower = (2.0 * 0.1 * 1.5 * u - shaft - 0.02 * x[2] + w[0]) / (0.01 + 4.0 * 1e-4)
     upper = (shaft - 0.001 * x[3] + w[1]) / 0.002
-    np.testing.assert_allclose(twin.A @ x + twin.B[:, 0] * u + twin.E @ w, [x[2], x[3], lower, upper])
+    np.testing.assert_allclose(
+        twin.A @ x + twin.B[:, 0] * u + twin.E @ w, [x[2], x[3], lower, upper]
+    )
 
 
 def test_its_defaults_are_the_identified_plant() -> None:
@@ -66,8 +78,13 @@ def test_its_defaults_are_the_identified_plant() -> None:
     assert abs(coefficients[4]) < 1e-9
     gain = float((twin.C @ np.linalg.matrix_power(twin.A, 3) @ twin.B)[0, 0])
     assert gain == pytest.approx(4.6e4, rel=1e-4)
-    np.testing.assert_allclose(np.poly(identified.A), [1.0, 1.901, 1683.0, 1812.0, 0.1032], rtol=1e-10)
-    response = [complex((p.C @ np.linalg.solve(10j * np.eye(4) - p.A, p.B))[0, 0]) for p in (twin, identified)]
+    np.testing.assert_allclose(
+        np.poly(identified.A), [1.0, 1.901, 1683.0, 1812.0, 0.1032], rtol=1e-10
+    )
+    response = [
+        complex((p.C @ np.linalg.solve(10j * np.eye(4) - p.A, p.B))[0, 0])
+        for p in (twin, identified)
+    ]
     assert response[0] == pytest.approx(response[1], rel=2e-4)
 
 
@@ -86,7 +103,13 @@ def test_a_free_disk_stops_when_and_where_coulomb_says() -> None:
     """Both disks turning as one, without viscous friction: ``ω0² J / 2C`` further, after ``ω0 J / C``."""
     inertia, coulomb, speed = np.array([0.0192, 0.0019]), 0.02, 3.0
     each = coulomb * inertia / inertia.sum()  # decelerates both alike, so the shaft stays straight
-    twin = ql.plants.torsional(lower_viscous=0.0, upper_viscous=0.0, lower_coulomb=each[0], upper_coulomb=each[1], counts=None)
+    twin = ql.plants.torsional(
+        lower_viscous=0.0,
+        upper_viscous=0.0,
+        lower_coulomb=each[0],
+        upper_coulomb=each[1],
+        counts=None,
+    )
     states, _ = record(twin, np.zeros(5000), [0.0, 0.0, speed, speed])
     time = speed * inertia.sum() / coulomb
     assert states[int(time / DT) - 2, 2] > 0.0
@@ -105,7 +128,12 @@ def test_it_sticks_below_its_breakaway_torque_and_moves_above() -> None:
 
 def test_it_sticks_under_a_torque_on_the_disk_too() -> None:
     """The disturbance inputs are torques [N m] on the lower and the upper disk."""
-    for w, sticks in (((0.0099, 0.0), True), ((0.0, 0.00099), True), ((0.0103, 0.0), False), ((0.0, 0.0013), False)):
+    for w, sticks in (
+        ((0.0099, 0.0), True),
+        ((0.0, 0.00099), True),
+        ((0.0103, 0.0), False),
+        ((0.0, 0.0013), False),
+    ):
         states, _ = record(ql.plants.torsional(), np.zeros(3000), w=w)
         assert (np.max(np.abs(states[-1])) < 1e-9) == sticks, w
 
@@ -131,15 +159,29 @@ def test_its_friction_agrees_with_an_independent_solution() -> None:
         dx[3] -= 0.001 / 0.0019 * math.tanh(x[3] / 1e-3)
         return dx
 
-    exact = solve_ivp(rate, (0.0, (samples - 1) * DT), np.zeros(4), method="LSODA", max_step=DT, rtol=1e-7, atol=1e-10)
+    exact = solve_ivp(
+        rate,
+        (0.0, (samples - 1) * DT),
+        np.zeros(4),
+        method="LSODA",
+        max_step=DT,
+        rtol=1e-7,
+        atol=1e-10,
+    )
     states, _ = record(twin, u)
-    np.testing.assert_allclose(states[-1, :2], exact.y[:2, -1], atol=2e-3 * np.max(np.abs(exact.y[:2])))
+    np.testing.assert_allclose(
+        states[-1, :2], exact.y[:2, -1], atol=2e-3 * np.max(np.abs(exact.y[:2]))
+    )
 
 
 def test_halving_the_sample_time_changes_little() -> None:
     """Sub-steps are of one length, whatever dt: stops are found within one of them."""
-    rough, _ = record(ql.plants.torsional(), np.repeat(0.1 * np.sin(5.0 * np.arange(400) * 5e-3), 1), dt=5e-3)
-    fine, _ = record(ql.plants.torsional(), np.repeat(0.1 * np.sin(5.0 * np.arange(400) * 5e-3), 5), dt=1e-3)
+    rough, _ = record(
+        ql.plants.torsional(), np.repeat(0.1 * np.sin(5.0 * np.arange(400) * 5e-3), 1), dt=5e-3
+    )
+    fine, _ = record(
+        ql.plants.torsional(), np.repeat(0.1 * np.sin(5.0 * np.arange(400) * 5e-3), 5), dt=1e-3
+    )
     np.testing.assert_allclose(rough, fine[::5], atol=1e-9)
 
 
@@ -158,9 +200,13 @@ def test_any_plant_can_have_an_encoder() -> None:
     states, y = record(plain, u)
     seen_states, seen = record(ql.plants.encoded(plain, 16_000), u)
     np.testing.assert_array_equal(states, seen_states)
-    np.testing.assert_allclose(seen, np.floor(y * 16_000 / math.tau + 0.5) * math.tau / 16_000, atol=1e-15)
+    np.testing.assert_allclose(
+        seen, np.floor(y * 16_000 / math.tau + 0.5) * math.tau / 16_000, atol=1e-15
+    )
     bare, x0 = ql.plants.torsional(counts=None), [0.1, 0.2, 0.3, 0.4]
-    np.testing.assert_array_equal(record(ql.plants.encoded(bare, 16_000), u, x0)[1], record(ql.plants.torsional(), u, x0)[1])
+    np.testing.assert_array_equal(
+        record(ql.plants.encoded(bare, 16_000), u, x0)[1], record(ql.plants.torsional(), u, x0)[1]
+    )
 
 
 def test_the_converter_has_steps_and_a_range() -> None:
@@ -168,15 +214,25 @@ def test_the_converter_has_steps_and_a_range() -> None:
     twin = ql.plants.torsional(**IDEAL | {"dac_bits": 8})
     step = 20.0 / 256
     assert twin.step == step
-    for u, applied in ((0.49 * step, 0.0), (0.51 * step, step), (-3.4 * step, -3.0 * step), (50.0, 10.0), (-50.0, -10.0)):
-        np.testing.assert_allclose(record(twin, [u, 0.0])[0][1], record(twin.linear, [applied, 0.0])[0][1], atol=1e-15)
+    for u, applied in (
+        (0.49 * step, 0.0),
+        (0.51 * step, step),
+        (-3.4 * step, -3.0 * step),
+        (50.0, 10.0),
+        (-50.0, -10.0),
+    ):
+        np.testing.assert_allclose(
+            record(twin, [u, 0.0])[0][1], record(twin.linear, [applied, 0.0])[0][1], atol=1e-15
+        )
 
 
 def test_the_current_is_limited() -> None:
     """Beyond ``i_max / k_a`` volts the torque grows no more."""
     twin = ql.plants.torsional(**IDEAL | {"current_limit": 3.0})
     assert twin.u_max == 1.5
-    np.testing.assert_allclose(record(twin, [9.0, 0.0])[0][1], record(twin.linear, [1.5, 0.0])[0][1], rtol=1e-12)
+    np.testing.assert_allclose(
+        record(twin, [9.0, 0.0])[0][1], record(twin.linear, [1.5, 0.0])[0][1], rtol=1e-12
+    )
 
 
 def test_u_can_be_late(rng: np.random.Generator) -> None:
@@ -199,7 +255,10 @@ def test_u_can_be_late(rng: np.random.Generator) -> None:
         ({"dac_bits": 1}, "dac_bits = 1: must be a whole number from 2 to 32"),
         ({"counts": 0}, "counts = 0: must be a whole number of at least 1"),
         ({"late": 0.5}, "late = 0.5: must be a whole number"),
-        ({"current_limit": float("nan")}, "current_limit = nan: must be finite and greater than zero"),
+        (
+            {"current_limit": float("nan")},
+            "current_limit = nan: must be finite and greater than zero",
+        ),
     ],
 )
 def test_a_wrong_parameter_is_named(wrong: dict[str, Any], message: str) -> None:
@@ -218,13 +277,19 @@ def test_only_a_plant_can_have_an_encoder() -> None:
 
 def test_a_figure_is_judged_against_anothers() -> None:
     """At most the other's, equal is enough; where the other has none there is nothing to exceed; what was not reached does not hold."""
-    judged = [Claim.at_most("a", "best", *values).holds for values in ((1.0, 1.0), (1.1, 1.0), (1.0, None), (None, 1.0))]
+    judged = [
+        Claim.at_most("a", "best", *values).holds
+        for values in ((1.0, 1.0), (1.1, 1.0), (1.0, None), (None, 1.0))
+    ]
     assert judged == [True, False, True, False]
 
 
 def test_a_record_that_ends_early_has_no_score() -> None:
     """Rather None than the figures of a part."""
-    law, course = study.controllers(study.Settings(), 20.0, 90.0)[study.MF], study.scenarios(study.Settings(), study.LINEAR)[0]
+    law, course = (
+        study.controllers(study.Settings(), 20.0, 90.0)[study.MF],
+        study.scenarios(study.Settings(), study.LINEAR)[0],
+    )
     early = ql.simulate(study.plant(study.LINEAR), law, course, limit=1.0)
     assert early.diverged
     assert set(study.score(early).values()) == {None}
@@ -232,7 +297,10 @@ def test_a_record_that_ends_early_has_no_score() -> None:
 
 def test_the_starts_lie_between_two_edges_and_follow_the_seed() -> None:
     """Half a count to either side, both disks alike; the same seed, the same starts."""
-    starts = {seed: [course.x0 for course in study.scenarios(study.Settings(seed=seed), study.FRICTION)] for seed in (0, 1)}
+    starts = {
+        seed: [course.x0 for course in study.scenarios(study.Settings(seed=seed), study.FRICTION)]
+        for seed in (0, 1)
+    }
     again = [course.x0 for course in study.scenarios(study.Settings(), study.FRICTION)]
     np.testing.assert_array_equal(starts[0], again)
     assert np.any(np.array(starts[0]) != np.array(starts[1]))

@@ -9,14 +9,20 @@ import pytest
 
 import quell as ql
 from quell.files import written_atomically
-from quell.plotting import thinned
+from quell.records.plotting import thinned
 
 
 @pytest.fixture(scope="module")
 def run() -> ql.Trajectory:
     """A step with the Kalman learner, and a force after 10 s."""
-    controller = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=5e-3), omega_c=1.0, learner=ql.learners.Kalman())
-    scenario = ql.Scenario(reference=1.0, duration=20.0, disturbances=(0.0, ql.signals.Step(at=10.0)))
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=5e-3),
+        omega_c=1.0,
+        learner=ql.learners.Kalman(),
+    )
+    scenario = ql.Scenario(
+        reference=1.0, duration=20.0, disturbances=(0.0, ql.signals.Step(at=10.0))
+    )
     return ql.simulate(ql.plants.two_mass_spring(), controller, scenario)
 
 
@@ -32,7 +38,9 @@ def test_channels_are_read_by_name_with_their_shapes(run: ql.Trajectory) -> None
 
 def test_an_unknown_channel_is_named_and_the_known_ones_listed(run: ql.Trajectory) -> None:
     """A ``ValueError`` with the choice."""
-    with pytest.raises(ValueError, match="channel = 'position': must be one of r, y, y_measured, u, w, x, x_hat"):
+    with pytest.raises(
+        ValueError, match="channel = 'position': must be one of r, y, y_measured, u, w, x, x_hat"
+    ):
         run["position"]
 
 
@@ -64,7 +72,13 @@ def test_metrics_judge_the_window_as_a_step(run: ql.Trajectory) -> None:
 def test_the_record_becomes_a_labelled_dataset(run: ql.Trajectory) -> None:
     """With time, units, feature names and what happened."""
     data = run.to_xarray()
-    assert dict(data.sizes) == {"time": len(run), "w_index": 2, "x_index": 4, "x_hat_index": 4, "theta_index": 5}
+    assert dict(data.sizes) == {
+        "time": len(run),
+        "w_index": 2,
+        "x_index": 4,
+        "x_hat_index": 4,
+        "theta_index": 5,
+    }
     np.testing.assert_array_equal(data["y"].values, run["y"])
     assert list(data["theta_index"].values) == ["x1", "x2", "x3", "x4", "bias"]
     assert data["time"].attrs["units"] == "s"
@@ -81,13 +95,20 @@ def test_a_saved_record_is_loaded_back_whole(run: ql.Trajectory, tmp_path: Path)
     for name in run.names:
         np.testing.assert_array_equal(again[name], run[name])
     np.testing.assert_array_equal(again.t, run.t)
-    assert (again.status, again.ended, again.plant, again.features) == (run.status, run.ended, run.plant, run.features)
+    assert (again.status, again.ended, again.plant, again.features) == (
+        run.status,
+        run.ended,
+        run.plant,
+        run.features,
+    )
 
 
 def test_an_empty_record_is_saved_too(tmp_path: Path) -> None:
     """That of a run which diverged at once."""
     controller = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=5e-3), omega_c=1.0)
-    nothing = ql.simulate(ql.plants.two_mass_spring(), controller, ql.Scenario(x0=[0.0, 9.0, 0.0, 0.0]), limit=1.0)
+    nothing = ql.simulate(
+        ql.plants.two_mass_spring(), controller, ql.Scenario(x0=[0.0, 9.0, 0.0, 0.0]), limit=1.0
+    )
     assert len(nothing) == 0
     nothing.save(tmp_path / "nothing.nc")
     again = ql.Trajectory.load(tmp_path / "nothing.nc")
@@ -150,5 +171,10 @@ def test_a_thinned_line_keeps_its_extremes_and_ends(rng: np.random.Generator) ->
     t, values = np.arange(100_003.0), rng.normal(size=100_003)
     few_t, few = thinned(t, values)
     assert few_t.size < 2200
-    assert (few.min(), few.max(), few_t[0], few_t[-1]) == (values.min(), values.max(), 0.0, 100_002.0)
+    assert (few.min(), few.max(), few_t[0], few_t[-1]) == (
+        values.min(),
+        values.max(),
+        0.0,
+        100_002.0,
+    )
     np.testing.assert_array_equal(values[few_t.astype(int)], few)

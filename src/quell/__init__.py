@@ -24,44 +24,46 @@ if TYPE_CHECKING:
         features,
         identification,
         learners,
-        metrics,
         observers,
         plants,
         realtime,
         setup,
         signals,
     )
-    from quell.batch_record import BatchTrajectory
     from quell.controllers import baselines
-    from quell.controllers.adrc import ADRC
+    from quell.controllers.adrc.adrc import ADRC
+    from quell.controllers.adrc.estimate import Estimate
     from quell.controllers.bandwidth import omega_c_for
-    from quell.controllers.estimate import Estimate
     from quell.guard import Guard, Reason
-    from quell.identification.fitting import identify
-    from quell.observers.canonical import canonical
+    from quell.identification.identify import identify
+    from quell.lti.canonical import canonical
     from quell.observers.eso import ESO
-    from quell.simulation import Scenario, simulate
-    from quell.trajectory import Trajectory
+    from quell.records import metrics
+    from quell.records.batch_trajectory import BatchTrajectory
+    from quell.records.trajectory import Trajectory
+    from quell.simulation.scenario import Scenario
+    from quell.simulation.simulate import simulate
     from quell.types import DesignWarning, Status
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "ADRC": "quell.controllers.adrc",
+    "ADRC": "quell.controllers.adrc.adrc",
     "DesignWarning": "quell.types",
-    "BatchTrajectory": "quell.batch_record",
+    "BatchTrajectory": "quell.records.batch_trajectory",
     "ESO": "quell.observers.eso",
-    "Estimate": "quell.controllers.estimate",
+    "Estimate": "quell.controllers.adrc.estimate",
     "Guard": "quell.guard",
     "Reason": "quell.guard",
-    "Scenario": "quell.simulation",
+    "Scenario": "quell.simulation.scenario",
     "Status": "quell.types",
-    "Trajectory": "quell.trajectory",
-    "canonical": "quell.observers.canonical",
-    "identify": "quell.identification.fitting",
+    "Trajectory": "quell.records.trajectory",
+    "canonical": "quell.lti.canonical",
+    "identify": "quell.identification.identify",
     "omega_c_for": "quell.controllers.bandwidth",
-    "simulate": "quell.simulation",
+    "simulate": "quell.simulation.simulate",
 }
+_ELSEWHERE = {"baselines": "quell.controllers.baselines", "metrics": "quell.records.metrics"}
 _ROOMS = (
     "analysis",
     "baselines",
@@ -113,7 +115,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOME:
         value = getattr(importlib.import_module(_HOME[name]), name)
     elif name in _ROOMS:
-        value = importlib.import_module("quell.controllers.baselines" if name == "baselines" else f"quell.{name}")
+        value = importlib.import_module(_ELSEWHERE.get(name, f"quell.{name}"))
     else:
         raise AttributeError(f"module 'quell' has no attribute {name!r}")
     globals()[name] = value

@@ -23,7 +23,9 @@ def positive(name: str, value: Any, unit: str = "") -> float:
     """Return ``value`` as a float above zero."""
     number = _number(name, value)
     if not (math.isfinite(number) and number > 0.0):
-        raise ValueError(f"{name} = {value!r}: must be finite and greater than zero{unit and f' [{unit}]'}")
+        raise ValueError(
+            f"{name} = {value!r}: must be finite and greater than zero{unit and f' [{unit}]'}"
+        )
     return number
 
 
@@ -39,7 +41,9 @@ def non_negative(name: str, value: Any, unit: str = "") -> float:
     """Return ``value`` as a float of at least zero."""
     number = _number(name, value)
     if not (math.isfinite(number) and number >= 0.0):
-        raise ValueError(f"{name} = {value!r}: must be finite and not negative{unit and f' [{unit}]'}")
+        raise ValueError(
+            f"{name} = {value!r}: must be finite and not negative{unit and f' [{unit}]'}"
+        )
     return number
 
 
@@ -53,7 +57,11 @@ def nonzero(name: str, value: Any, why: str) -> float:
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
     """Return ``value`` as an int between ``least`` and ``most``."""
-    rule = f"must be a whole number of at least {least}" if most is None else f"must be a whole number from {least} to {most}"
+    rule = (
+        f"must be a whole number of at least {least}"
+        if most is None
+        else f"must be a whole number from {least} to {most}"
+    )
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f"{name} = {value!r}: {rule}")
     if value < least or (most is not None and value > most):
@@ -72,7 +80,9 @@ def interval(low_name: str, low: Any, high_name: str, high: Any) -> tuple[float,
     """Return two limits in order; either may be infinite, neither NaN."""
     low_value, high_value = _number(low_name, low), _number(high_name, high)
     if not low_value < high_value:
-        raise ValueError(f"{low_name} = {low!r}, {high_name} = {high!r}: {low_name} must be less than {high_name}")
+        raise ValueError(
+            f"{low_name} = {low!r}, {high_name} = {high!r}: {low_name} must be less than {high_name}"
+        )
     return low_value, high_value
 
 
@@ -120,7 +130,11 @@ def matrix(name: str, value: Any, rows: int | None = None, columns: int | None =
     """Return ``value`` as a finite, contiguous float matrix of the shape asked for."""
     array = _array(name, value)
     wanted = f"({'any' if rows is None else rows}, {'any' if columns is None else columns})"
-    if array.ndim != 2 or (rows is not None and array.shape[0] != rows) or (columns is not None and array.shape[1] != columns):
+    if (
+        array.ndim != 2
+        or (rows is not None and array.shape[0] != rows)
+        or (columns is not None and array.shape[1] != columns)
+    ):
         raise ValueError(f"{name} has shape {array.shape}: must be a matrix of shape {wanted}")
     return array
 
@@ -156,8 +170,12 @@ def _array(name: str, value: Any) -> Vector:
     try:
         array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: must be an array of numbers, got {type(value).__name__}") from None
+        raise ValueError(
+            f"{name}: must be an array of numbers, got {type(value).__name__}"
+        ) from None
     if not np.all(np.isfinite(array)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name}: entry {where} is {float(array[where])!r}; every entry must be finite")
+        raise ValueError(
+            f"{name}: entry {where} is {float(array[where])!r}; every entry must be finite"
+        )
     return array

@@ -51,7 +51,10 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
         as ``check_writable``, and for a number that is not finite.
     """
     with written_atomically(path) as part:
-        part.write_text(json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+        part.write_text(
+            json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n",
+            encoding="utf-8",
+        )
 
 
 def read_text(path: str | os.PathLike[str], where: str) -> str:
@@ -59,13 +62,18 @@ def read_text(path: str | os.PathLike[str], where: str) -> str:
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{where}: can't be read as a text file ({getattr(error, 'strerror', None) or 'not UTF-8'})") from None
+        raise ValueError(
+            f"{where}: can't be read as a text file ({getattr(error, 'strerror', None) or 'not UTF-8'})"
+        ) from None
 
 
 def csv_rows(text: str, where: str, between: str = ",") -> list[tuple[int, list[str]]]:
     """Return number and stripped cells of each line that is not empty; a ``ValueError`` that begins with ``where`` where it is no CSV."""
     try:
-        rows = [(number, [cell.strip() for cell in row]) for number, row in enumerate(csv.reader(text.splitlines(), delimiter=between), 1)]
+        rows = [
+            (number, [cell.strip() for cell in row])
+            for number, row in enumerate(csv.reader(text.splitlines(), delimiter=between), 1)
+        ]
     except csv.Error as error:
         raise ValueError(f"{where}: is no CSV file ({error})") from None
     return [(number, row) for number, row in rows if any(row)]

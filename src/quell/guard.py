@@ -41,7 +41,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.dispatch import generic, is_finite, kernel
+from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -93,7 +93,9 @@ _MESSAGES = {
     Reason.NOT_FINITE: "The learner's output is not a number; it was cut off, begins anew and has to prove itself again.",
 }
 
-_TRUST, _UNPROVEN, _TOO_LOUD, _OUT, _TOO_FAST, _EXPLODED, _NOT_FINITE = (int(reason) for reason in Reason)
+_TRUST, _UNPROVEN, _TOO_LOUD, _OUT, _TOO_FAST, _EXPLODED, _NOT_FINITE = (
+    int(reason) for reason in Reason
+)
 
 
 @generic
@@ -103,7 +105,9 @@ def watch(guard: Any, memory: Any, f_plain: float) -> None:
 
 
 @generic
-def permit(guard: Any, memory: Any, f_plain: float, constant: float, slope: float, u_before: float) -> tuple[float, float, bool]:
+def permit(
+    guard: Any, memory: Any, f_plain: float, constant: float, slope: float, u_before: float
+) -> tuple[float, float, bool]:
     """Return what is left of the learner's ``constant + slope · u``, and whether it was cut off because it is not finite."""
     raise TypeError
 
@@ -147,7 +151,12 @@ def _watch_nothing(guard: UnguardedDesign, memory: UnguardedMemory, f_plain: flo
 
 @permit.register(UnguardedDesign)
 def _permit_all(
-    guard: UnguardedDesign, memory: UnguardedMemory, f_plain: float, constant: float, slope: float, u_before: float
+    guard: UnguardedDesign,
+    memory: UnguardedMemory,
+    f_plain: float,
+    constant: float,
+    slope: float,
+    u_before: float,
 ) -> tuple[float, float, bool]:
     return constant, slope, False
 
@@ -235,7 +244,12 @@ def _watch(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
 
 @permit.register(GuardDesign)
 def _permit(
-    guard: GuardDesign, memory: GuardMemory, f_plain: float, constant: float, slope: float, u_before: float
+    guard: GuardDesign,
+    memory: GuardMemory,
+    f_plain: float,
+    constant: float,
+    slope: float,
+    u_before: float,
 ) -> tuple[float, float, bool]:
     record, moment = memory.record, memory.moment
     output = constant + slope * u_before
@@ -255,7 +269,11 @@ def _permit(
     held = output
     if not inside:
         reason = _OUT
-        held = min(max(output, f_plain - bound), f_plain + bound) * max(_FADE - away / max(bound, _TINY), 0.0) / (_FADE - 1.0)
+        held = (
+            min(max(output, f_plain - bound), f_plain + bound)
+            * max(_FADE - away / max(bound, _TINY), 0.0)
+            / (_FADE - 1.0)
+        )
     wished, change = authority * held, guard.fastest * moment[_USUAL]
     permitted = min(max(wished, moment[_LAST] - change), moment[_LAST] + change)
     permitted = min(max(permitted, min(f_plain - bound, 0.0)), max(f_plain + bound, 0.0))

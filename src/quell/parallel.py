@@ -13,7 +13,11 @@ from typing import Any
 _LIMITING = threading.Lock()
 
 
-def in_parallel(jobs: Iterable[Callable[[], Any]], tell: Callable[[float], None] | None = None, workers: int | None = None) -> list[Any]:
+def in_parallel(
+    jobs: Iterable[Callable[[], Any]],
+    tell: Callable[[float], None] | None = None,
+    workers: int | None = None,
+) -> list[Any]:
     """Run jobs on all cores, or in so many threads, and return their results in order; compiled loops release the interpreter.
 
     ``tell`` is called with the share that is done. Where a job fails, or the run is interrupted, those not yet begun are dropped.

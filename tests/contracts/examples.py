@@ -15,13 +15,15 @@ import numpy as np
 import quell as ql
 from quell import learners as learner_room
 from quell.features import RBF, Bias, Input, Polynomial, RandomFourier, State
-from quell.learners.model import infer, learn
+from quell.learners.online.model import infer, learn
 from quell.observers.eso import ESO, FORMS
 
 from .python_models import python_learners
 
 PLANTS: dict[str, Any] = {
-    "delayed": ql.plants.delayed(ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), delay=0.02, dt=0.01),
+    "delayed": ql.plants.delayed(
+        ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), delay=0.02, dt=0.01
+    ),
     "encoded": ql.plants.encoded(ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), counts=16_000),
     "torsional": ql.plants.torsional(late=2),
     "TorsionalPlant": ql.plants.torsional(dac_bits=None, counts=None),
@@ -29,8 +31,12 @@ PLANTS: dict[str, Any] = {
     "two_mass_spring": ql.plants.two_mass_spring(),
     "CubicSpringPlant": ql.plants.lagged_two_mass_spring(k_cubic=0.3),
     "lagged_two_mass_spring": ql.plants.lagged_two_mass_spring(),
-    "LinearPlant": ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]]),
-    "NonlinearPlant": ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u + w[0] - math.sin(x[0]) - 0.1 * x[1]), order=2),
+    "LinearPlant": ql.plants.LinearPlant(
+        [[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]]
+    ),
+    "NonlinearPlant": ql.plants.NonlinearPlant(
+        lambda t, x, u, w: (x[1], u + w[0] - math.sin(x[0]) - 0.1 * x[1]), order=2
+    ),
 }
 CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
 
@@ -95,7 +101,9 @@ LEARNERS: dict[str, Any] = (
         "RLS with u": ql.learners.RLS(State() + Polynomial() + Bias() + Input()),
         "RLS on radial features": ql.learners.RLS(State() + RBF(16) + Bias()),
         "NLMS on random features": ql.learners.NLMS(features=RandomFourier(20)),
-        "gradient on radial features": ql.learners.BatchGradient(features=RBF(16, states=(1,)) + Bias()),
+        "gradient on radial features": ql.learners.BatchGradient(
+            features=RBF(16, states=(1,)) + Bias()
+        ),
     }
     | PYTHON_LEARNERS
 )
@@ -104,13 +112,20 @@ OBSERVERS: dict[str, ESO] = {
     f"{kind}, order {order}, {form}": (
         ESO.model_free(order=order, b0=1.5, omega_o=12.0, dt=0.01, form=form)
         if kind == "model-free"
-        else ESO.model_based(([2.0, 0.3, 1.0, 0.5, 0.2, 0.1, 0.3, 0.4][:order], 1.5), omega_o=12.0, dt=0.01, form=form)
+        else ESO.model_based(
+            ([2.0, 0.3, 1.0, 0.5, 0.2, 0.1, 0.3, 0.4][:order], 1.5),
+            omega_o=12.0,
+            dt=0.01,
+            form=form,
+        )
     )
     for kind in ("model-free", "model-based")
     for order in (1, 2, 4, 8)
     for form in FORMS
 } | {
-    "model-based, order 3, with a zero": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), omega_o=12.0, dt=0.01),
+    "model-based, order 3, with a zero": ESO.model_based(
+        ([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), omega_o=12.0, dt=0.01
+    ),
     "half gain": ESO.model_free(2, 1.5, 12.0, 0.01, half_gain=True),
     "Kalman": ESO.kalman(2, 1.5, 0.01, noise_variance=1e-6, drift=3e-2),
     "cascade": ESO.cascade(2, 1.5, 12.0, 0.01),

@@ -13,7 +13,9 @@ import numpy as np
 import quell as ql
 
 HARD_SPRING = ql.plants.NonlinearPlant(
-    lambda t, x, u, w: (x[1], u + w[0] - 6.0 * x[0] - 8.0 * x[0] ** 3 - 1.5 * x[1] * abs(x[1])), order=2, name="hard spring"
+    lambda t, x, u, w: (x[1], u + w[0] - 6.0 * x[0] - 8.0 * x[0] ** 3 - 1.5 * x[1] * abs(x[1])),
+    order=2,
+    name="hard spring",
 )
 CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
 OBSERVER = ql.ESO.model_free(order=2, b0=1.0, omega_o=15.0, dt=5e-3)
@@ -92,7 +94,9 @@ def torch_mlp(hidden: int = 16) -> Any:
     import torch
 
     torch.manual_seed(0)
-    return torch.nn.Sequential(torch.nn.Linear(2, hidden), torch.nn.Tanh(), torch.nn.Linear(hidden, 1)).double()
+    return torch.nn.Sequential(
+        torch.nn.Linear(2, hidden), torch.nn.Tanh(), torch.nn.Linear(hidden, 1)
+    ).double()
 
 
 def jax_mlp(hidden: int = 16) -> Any:
@@ -110,18 +114,30 @@ def python_learners() -> dict[str, Any]:
         from sklearn.linear_model import SGDRegressor
         from sklearn.neural_network import MLPRegressor
 
-        found["SGDRegressor"] = ql.learners.SklearnModel(SGDRegressor(learning_rate="constant", eta0=0.05))
-        mlp = MLPRegressor(hidden_layer_sizes=(16,), activation="tanh", solver="sgd", learning_rate_init=0.05, momentum=0.0)
+        found["SGDRegressor"] = ql.learners.SklearnModel(
+            SGDRegressor(learning_rate="constant", eta0=0.05)
+        )
+        mlp = MLPRegressor(
+            hidden_layer_sizes=(16,),
+            activation="tanh",
+            solver="sgd",
+            learning_rate_init=0.05,
+            momentum=0.0,
+        )
         found["MLPRegressor"] = ql.learners.SklearnModel(mlp)
     if has("river"):
         from river import linear_model, optim, preprocessing
 
-        pipeline = preprocessing.StandardScaler() | linear_model.LinearRegression(optimizer=optim.SGD(0.05))
+        pipeline = preprocessing.StandardScaler() | linear_model.LinearRegression(
+            optimizer=optim.SGD(0.05)
+        )
         found["river pipeline"] = ql.learners.RiverModel(pipeline)
     if has("torch"):
         import torch
 
-        found["torch MLP"] = ql.learners.TorchModel(torch_mlp(), functools.partial(torch.optim.SGD, lr=0.1))
+        found["torch MLP"] = ql.learners.TorchModel(
+            torch_mlp(), functools.partial(torch.optim.SGD, lr=0.1)
+        )
     if has("jax", "equinox", "optax"):
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
         found["Equinox MLP"] = ql.learners.JaxModel(jax_mlp())

@@ -14,12 +14,12 @@ import quell as ql
 from quell import plants as plant_room
 from quell.controllers.base import control
 from quell.controllers.running import named_arrays as _named_arrays
-from quell.dispatch import compiled, for_types, interpreted
-from quell.driver import run_block
+from quell.kernels.dispatch import compiled, for_types, interpreted
 from quell.learners.base import adapt, coefficients, commit, predict
 from quell.observers.base import begin, observe
 from quell.observers.delay import without_delay
 from quell.plants.base import advance, measure
+from quell.simulation.driver import run_block
 
 from .examples import CHAIN, LEARNERS, OBSERVERS, PLANTS, PYTHON_LEARNERS
 
@@ -37,7 +37,9 @@ SHORT = dataclasses.replace(SCENARIO, duration=1.5, rest_at=(1.2,))
 
 def law_for(plant: Any, **options: Any) -> ql.ADRC:
     """A controller for a plant of its order."""
-    return ql.ADRC(ql.ESO.model_free(order=plant.order, b0=1.5, omega_o=12.0, dt=0.01), omega_c=1.5, **options)
+    return ql.ADRC(
+        ql.ESO.model_free(order=plant.order, b0=1.5, omega_o=12.0, dt=0.01), omega_c=1.5, **options
+    )
 
 
 def check_run(plant: Any, controller: ql.ADRC, scenario: ql.Scenario = SCENARIO) -> None:
@@ -55,7 +57,11 @@ def check_run(plant: Any, controller: ql.ADRC, scenario: ql.Scenario = SCENARIO)
 
 def flat(parameters: Any) -> list[Any]:
     """Return the fields of a NamedTuple, at any depth."""
-    return [leaf for field in parameters for leaf in (flat(field) if isinstance(field, tuple) else [field])]
+    return [
+        leaf
+        for field in parameters
+        for leaf in (flat(field) if isinstance(field, tuple) else [field])
+    ]
 
 
 def test_every_plant_has_an_example() -> None:
@@ -104,7 +110,9 @@ def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state
         truth = extended.transition @ truth + extended.input * u
         observe(model, z, seen, truth[0], u, 0.0)
     scale = 12.0 ** -np.arange(size)
-    np.testing.assert_allclose(seen * scale, truth * scale, rtol=1e-5, atol=1e-5 * np.max(np.abs(truth * scale)))
+    np.testing.assert_allclose(
+        seen * scale, truth * scale, rtol=1e-5, atol=1e-5 * np.max(np.abs(truth * scale))
+    )
     for one, other in zip(flat(model), flat(before), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -116,7 +124,9 @@ def test_an_observer_runs_the_same_again_and_interpreted(name: str) -> None:
     companion = np.diag(np.ones(observer.order - 1), 1)
     companion[-1] = -observer.a
     ends = np.eye(observer.order)
-    check_run(ql.plants.LinearPlant(companion, 1.5 * ends[-1], ends[0]), ql.ADRC(observer, omega_c=1.0))
+    check_run(
+        ql.plants.LinearPlant(companion, 1.5 * ends[-1], ends[0]), ql.ADRC(observer, omega_c=1.0)
+    )
 
 
 # Other features for the same learner: what they do compiled is seen below, without a loop, which takes long to compile.
@@ -160,7 +170,9 @@ def test_a_learner_changes_only_its_memory(name: str, rng: np.random.Generator) 
 def test_a_learner_names_its_coefficients(name: str) -> None:
     """Each once, and as many as it writes."""
     learner = LEARNERS[name]
-    for order in (2,) if name in PYTHON_LEARNERS else (1, 4):  # a network has inputs of its own, here two
+    for order in (
+        (2,) if name in PYTHON_LEARNERS else (1, 4)
+    ):  # a network has inputs of its own, here two
         design = learner.design(OBSERVERS[f"model-free, order {order}, current"], 1.0)
         names = learner.feature_names(order)
         theta = np.full(len(names) + 1, np.nan)
@@ -173,7 +185,9 @@ def test_a_learner_names_its_coefficients(name: str) -> None:
 def test_a_learner_stays_bounded_without_excitation(name: str) -> None:
     """A constant reference for 1e5 samples: nothing winds up, drifts or leaves the numbers."""
     controller = law_for(CHAIN, learner=LEARNERS[name])
-    scenario = ql.Scenario(reference=0.5, duration=1000.0, noise=ql.signals.BandLimitedNoise(1e-10, 0.01))
+    scenario = ql.Scenario(
+        reference=0.5, duration=1000.0, noise=ql.signals.BandLimitedNoise(1e-10, 0.01)
+    )
     run = ql.simulate(CHAIN, controller, scenario, record_every=100)
     assert not run.diverged
     assert np.max(np.abs(run["y"][run.t > 100.0] - 0.5)) < 1e-2
@@ -197,8 +211,14 @@ def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.
     learner, samples = LEARNERS[name], 20_000 if name in PYTHON_LEARNERS else 100_000
     design = learner.design(OBSERVERS["model-free, order 2, current"], 1.0)
     # From rest to wild and back, in blocks, with spikes.
-    size = np.repeat(10.0 ** rng.uniform(-6.0, 3.0, 100), samples // 100) * np.where(rng.random(samples) < 1e-3, 1e3, 1.0)
-    seen, u, f = rng.normal(size=(samples, 3)) * size[:, None], rng.normal(size=samples) * size, rng.normal(size=samples) * size
+    size = np.repeat(10.0 ** rng.uniform(-6.0, 3.0, 100), samples // 100) * np.where(
+        rng.random(samples) < 1e-3, 1e3, 1.0
+    )
+    seen, u, f = (
+        rng.normal(size=(samples, 3)) * size[:, None],
+        rng.normal(size=samples) * size,
+        rng.normal(size=samples) * size,
+    )
     y = seen[:, 0] + 1e-3 * size * rng.normal(size=samples)
     said = []
     for _ in range(2):
@@ -218,7 +238,9 @@ def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
     def step(law: ql.ADRC, y: float) -> float:
         return control(law.parameters, law._state, 0.5, y)
 
-    one, other = (law_for(CHAIN, learner=LEARNERS[name], guard=ql.Guard(time=0.5)) for _ in range(2))
+    one, other = (
+        law_for(CHAIN, learner=LEARNERS[name], guard=ql.Guard(time=0.5)) for _ in range(2)
+    )
     ys = (np.sin(0.02 * np.arange(500)) + 0.1 * np.sin(0.31 * np.arange(500))).tolist()
     for y in ys[:400]:
         step(one, y)
@@ -234,7 +256,11 @@ def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
 def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
     """The loop is stable and ends where it should."""
     observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01, form=form)
-    run = ql.simulate(CHAIN, ql.ADRC(observer, omega_c=1.5, learner=LEARNERS[name]), ql.Scenario(reference=1.0, duration=20.0))
+    run = ql.simulate(
+        CHAIN,
+        ql.ADRC(observer, omega_c=1.5, learner=LEARNERS[name]),
+        ql.Scenario(reference=1.0, duration=20.0),
+    )
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
 
 

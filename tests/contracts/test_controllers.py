@@ -15,8 +15,8 @@ from numba.core.runtime import _nrt_python, rtsys
 import quell as ql
 from quell import controllers as room
 from quell.controllers import baselines as baseline_room
+from quell.controllers.adrc.law import F_LEARNED, U
 from quell.controllers.base import take_over
-from quell.controllers.law import F_LEARNED, U
 from quell.controllers.running import named_arrays
 from quell.observers.base import expected
 
@@ -29,14 +29,20 @@ LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
 PID = baseline_room.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT, **LIMITS)
 CONTROLLERS: dict[str, Any] = {
     "ADRC": ql.ADRC(ESO, 1.5, **LIMITS),
-    "LinearController": room.LinearController.from_transfer_function([2.0, 3.0], [1.0, 0.0], dt=DT, **LIMITS),
+    "LinearController": room.LinearController.from_transfer_function(
+        [2.0, 3.0], [1.0, 0.0], dt=DT, **LIMITS
+    ),
     "PID": PID,
     "NotchPID": baseline_room.NotchPID(baseline_room.Notch.at(9.0), 2.0, 1.0, dt=DT, **LIMITS),
     "LQG": baseline_room.LQG(CHAIN, 3.0, 12.0, DT, **LIMITS),
     "ResonanceRatio": baseline_room.ResonanceRatio(omega_o=5.0, dt=DT, **LIMITS),
     "Prefiltered": room.Prefiltered(PID, baseline_room.ZVD(3.0, 0.1)),
-    "Prefiltered, Han's": room.Prefiltered(ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.TrackingDifferentiator(2.0)),
-    "Prefiltered feedforward": room.Prefiltered(ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.ReferenceModel(3.0)),
+    "Prefiltered, Han's": room.Prefiltered(
+        ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.TrackingDifferentiator(2.0)
+    ),
+    "Prefiltered feedforward": room.Prefiltered(
+        ql.ADRC(ESO, 1.5, feedforward=True, **LIMITS), room.ReferenceModel(3.0)
+    ),
     "Prefiltered ADRC": room.Prefiltered(ql.ADRC(ESO, 1.5, **LIMITS), baseline_room.ZV(3.0)),
 }
 PLANTS = {"ResonanceRatio": ql.plants.two_mass_spring()}
@@ -51,7 +57,9 @@ def test_every_controller_has_an_example() -> None:
     found = {
         thing.__name__
         for thing in public
-        if inspect.isclass(thing) and hasattr(thing, "initial_state") and not getattr(thing, "_is_protocol", False)
+        if inspect.isclass(thing)
+        and hasattr(thing, "initial_state")
+        and not getattr(thing, "_is_protocol", False)
     }
     assert found == {type(example).__name__ for example in CONTROLLERS.values()}
 
@@ -66,11 +74,17 @@ def test_a_controller_runs_the_same_again_and_interpreted(name: str) -> None:
 def test_a_step_at_a_time_is_the_simulated_run(name: str) -> None:
     """``step`` with what was measured gives the u of ``simulate``, bit for bit, and the same state."""
     controller = copy.deepcopy(CONTROLLERS[name])
-    run = ql.simulate(PLANTS.get(name, CHAIN), controller, ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise))
+    run = ql.simulate(
+        PLANTS.get(name, CHAIN),
+        controller,
+        ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise),
+    )
     u = [controller.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]
     np.testing.assert_allclose(u, run["u"], rtol=0.0, atol=1e-12)
     for label, array in named_arrays(run.final_state).items():
-        np.testing.assert_allclose(controller.state[label], array, rtol=1e-9, atol=1e-12, err_msg=label)
+        np.testing.assert_allclose(
+            controller.state[label], array, rtol=1e-9, atol=1e-12, err_msg=label
+        )
 
 
 def awaited(controller: Any, y: float) -> float:
@@ -88,7 +102,10 @@ def test_a_bad_sample_is_held_and_limits_hold(name: str) -> None:
     one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
     r, y, before = 0.0, 0.0, 0.0
     for bad_r, bad_y in zip(REFERENCE, MEASURED, strict=True):
-        r, y = bad_r if math.isfinite(bad_r) else r, bad_y if math.isfinite(bad_y) else awaited(other, y)
+        r, y = (
+            bad_r if math.isfinite(bad_r) else r,
+            bad_y if math.isfinite(bad_y) else awaited(other, y),
+        )
         u = one.step(bad_r, bad_y)
         assert -2.0 <= u <= 3.0
         assert abs(u - before) <= 60.0 * DT + 1e-12
@@ -107,7 +124,9 @@ def test_a_controller_that_is_told_of_limits_is_one_that_has_them(name: str) -> 
         u = told.step(math.sin(0.03 * k), y)
         told.applied(min(max(u, -0.5), 0.4))
         lie += not -0.5 <= u <= 0.4
-        assert min(max(u, -0.5), 0.4) == pytest.approx(own.step(math.sin(0.03 * k), y), rel=1e-9, abs=1e-9)
+        assert min(max(u, -0.5), 0.4) == pytest.approx(
+            own.step(math.sin(0.03 * k), y), rel=1e-9, abs=1e-9
+        )
     assert lie > 10
 
 

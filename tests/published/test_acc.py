@@ -10,15 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quell.experiments import acc, acc_samples
-from quell.experiments.acc_designs import PUBLISHED, designs
-from quell.experiments.acc_published import judge_published
+from quell.experiments.acc import samples as acc_samples
+from quell.experiments.acc import study as acc
+from quell.experiments.acc.designs import PUBLISHED, designs
+from quell.experiments.acc.published import judge_published
 
 SAMPLES = Path(__file__).resolve().parents[3] / "shared" / "benchmarks" / "acc" / "theta_small.csv"
-pytestmark = pytest.mark.skipif(not SAMPLES.is_file(), reason=f"the published samples are not at {SAMPLES}")
+pytestmark = pytest.mark.skipif(
+    not SAMPLES.is_file(), reason=f"the published samples are not at {SAMPLES}"
+)
 
 
-@pytest.mark.parametrize(("name", "rate"), [("published nominal", 0.625), ("published SP1(0.05)", 0.865), ("published SP2", 0.047)])
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [("published nominal", 0.625), ("published SP1(0.05)", 0.865), ("published SP2", 0.047)],
+)
 def test_the_published_designs_fail_as_often_as_listed(name: str, rate: float) -> None:
     """To the last of 1000 plants, strictly read, with a horizon of 25 s."""
     found = judge_published(PUBLISHED[name], acc_samples.read(SAMPLES), cubic=False, duration=25.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.law import law_gains
+from quell.controllers.adrc.law import law_gains
 
 OMEGA_O = 20.0
 
@@ -26,7 +26,11 @@ def predictor(order: int, dt: float) -> list[float]:
     beta = math.exp(-OMEGA_O * dt)
     if order == 1:
         return [2.0 * (1.0 - beta), (1.0 - beta) ** 2 / dt]
-    return [3.0 * (1.0 - beta), (1.0 - beta) ** 2 * (5.0 + beta) / (2.0 * dt), (1.0 - beta) ** 3 / dt**2]
+    return [
+        3.0 * (1.0 - beta),
+        (1.0 - beta) ** 2 * (5.0 + beta) / (2.0 * dt),
+        (1.0 - beta) ** 3 / dt**2,
+    ]
 
 
 @pytest.mark.parametrize("half_gain", [False, True])
@@ -36,9 +40,13 @@ def test_observer_gains_are_the_published_ones(order: int, dt: float, half_gain:
     """Both forms, and half of them (Herbst, Hempel, Göhrt & Streif 2020); the predictor's gain is Φ L in the form used here."""
     share = 0.5 if half_gain else 1.0
     options = {"order": order, "b0": 1.0, "omega_o": OMEGA_O, "dt": dt, "half_gain": half_gain}
-    np.testing.assert_allclose(ql.ESO.model_free(**options).model.gain, np.multiply(share, current(order, dt)), rtol=1e-12)
+    np.testing.assert_allclose(
+        ql.ESO.model_free(**options).model.gain, np.multiply(share, current(order, dt)), rtol=1e-12
+    )
     model = ql.ESO.model_free(**options, form="predictor").model
-    np.testing.assert_allclose(model.transition @ model.gain, np.multiply(share, predictor(order, dt)), rtol=1e-12)
+    np.testing.assert_allclose(
+        model.transition @ model.gain, np.multiply(share, predictor(order, dt)), rtol=1e-12
+    )
 
 
 def test_controller_gains_are_the_published_ones() -> None:
@@ -58,5 +66,7 @@ def test_half_of_the_bandwidth_design_solves_a_riccati_equation() -> None:
     for order in (1, 2, 3):
         A, b = np.diag(np.ones(order - 1), 1), np.eye(order)[-1:].T
         omega = 3.0
-        P = solve_continuous_are(A + 0.5 * omega * np.eye(order), b, np.zeros((order, order)), np.array([[0.5]]))
+        P = solve_continuous_are(
+            A + 0.5 * omega * np.eye(order), b, np.zeros((order, order)), np.array([[0.5]])
+        )
         np.testing.assert_allclose((b.T @ P)[0], 0.5 * law_gains(order, omega), rtol=1e-6)

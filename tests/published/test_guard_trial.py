@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.experiments import stress
-from quell.experiments import two_mass_spring as study
+from quell.experiments.stress import study as stress
+from quell.experiments.two_mass_spring import setup as study
 from quell.parallel import in_parallel
 
 SETTINGS = study.Settings()
@@ -49,7 +49,9 @@ def late_peaks(learners: list[object], guard: ql.Guard | None, scenario: ql.Scen
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=SETTINGS.dt)
 
     def peak(learner: object) -> float:
-        controller = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard if learner else None)
+        controller = ql.ADRC(
+            observer, omega_c=1.0, learner=learner, guard=guard if learner else None
+        )
         run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=10)
         return float(np.max(np.abs(run["y"][run.window(210.0, 250.1)] - 1.0)))
 
@@ -59,15 +61,23 @@ def late_peaks(learners: list[object], guard: ql.Guard | None, scenario: ql.Scen
 
 @pytest.mark.xdist_group("trial")
 @pytest.mark.parametrize("guard", [None, ql.Guard()])
-def test_a_load_of_unknown_frequency_is_rejected_to_a_five_hundredth(guard: ql.Guard | None) -> None:
+def test_a_load_of_unknown_frequency_is_rejected_to_a_five_hundredth(
+    guard: ql.Guard | None,
+) -> None:
     """The paper's scenario, from any start."""
-    learners = [ql.learners.Harmonic(omegas=(start,)) for start in (0.1, 0.17, 0.3, 0.55, 1.0, 1.7, 3.0)]
+    learners = [
+        ql.learners.Harmonic(omegas=(start,)) for start in (0.1, 0.17, 0.3, 0.55, 1.0, 1.7, 3.0)
+    ]
     assert np.max(late_peaks(learners, guard, study.scenario(SETTINGS))) <= 1.0 / 500.0
 
 
 @pytest.mark.xdist_group("trial")
-@pytest.mark.parametrize(("slow", "fast", "size"), [(0.1 * np.pi, 0.8, 0.5), (0.3, 1.3, 1.0), (0.27, 0.69, 0.9)])
-def test_two_sinusoids_and_a_step_are_rejected_to_a_fiftieth(slow: float, fast: float, size: float) -> None:
+@pytest.mark.parametrize(
+    ("slow", "fast", "size"), [(0.1 * np.pi, 0.8, 0.5), (0.3, 1.3, 1.0), (0.27, 0.69, 0.9)]
+)
+def test_two_sinusoids_and_a_step_are_rejected_to_a_fiftieth(
+    slow: float, fast: float, size: float
+) -> None:
     """Frequencies a factor of two and more apart; docs/theory has what closer ones do."""
     at = study.FORCE_AT
     load = SINE(omega=slow, start=at) + SINE(size, fast, start=at) + 0.5 * ql.signals.Step(at=at)
@@ -82,8 +92,12 @@ def test_algorithm_1_is_harmless_at_any_rate_behind_the_guard() -> None:
 
     def rms(rate: float | None) -> float:
         learner = None if rate is None else ql.learners.BatchGradient(rate)
-        controller = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=None if rate is None else ql.Guard())
+        controller = ql.ADRC(
+            observer, omega_c=1.0, learner=learner, guard=None if rate is None else ql.Guard()
+        )
         return study.score(study.quick_run(SETTINGS, controller))["rms_from_step"]
 
-    plain, *found = in_parallel([partial(rms, rate) for rate in (None, *10.0 ** np.arange(-7.0, 0.5, 0.5))])
+    plain, *found = in_parallel(
+        [partial(rms, rate) for rate in (None, *10.0 ** np.arange(-7.0, 0.5, 0.5))]
+    )
     assert max(found) <= 1.1 * plain

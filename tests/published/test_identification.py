@@ -32,7 +32,12 @@ def test_nfoursid_finds_the_same_pole_and_gain(record: tuple[np.ndarray, np.ndar
     pandas = pytest.importorskip("pandas")
     nfoursid = pytest.importorskip("nfoursid.nfoursid")
     u, y = record
-    peer = nfoursid.NFourSID(pandas.DataFrame({"u": u, "y": y}), output_columns=["y"], input_columns=["u"], num_block_rows=20)
+    peer = nfoursid.NFourSID(
+        pandas.DataFrame({"u": u, "y": y}),
+        output_columns=["y"],
+        input_columns=["u"],
+        num_block_rows=20,
+    )
     peer.subspace_identification()
     theirs, _ = peer.system_identification(rank=2)
     found = ql.identify(u, y, DT, order=2, held_out=0.0)
@@ -54,4 +59,6 @@ def test_jax_sysid_finds_the_same_pole(record: tuple[np.ndarray, np.ndarray]) ->
     peer.loss(rho_x0=1e-6, rho_th=1e-8)
     peer.optimization(lbfgs_epochs=2000)
     peer.fit(y[:, None], u[:, None])
-    assert abs(continuous(np.asarray(peer.ssdata()[0])) - ql.identify(u, y, DT, order=2).poles[0].value) < 0.01 * abs(POLE)
+    assert abs(
+        continuous(np.asarray(peer.ssdata()[0])) - ql.identify(u, y, DT, order=2).poles[0].value
+    ) < 0.01 * abs(POLE)

@@ -7,25 +7,38 @@ from functools import cache
 
 import pytest
 
-from quell.experiments import torsional as study
-from quell.simulation import simulate
+from quell.experiments.torsional import setup as study
+from quell.simulation.simulate import simulate
 
 SEEDS = range(2)
 SLOW = (20.0, 90.0)
 
 
 @cache
-def median(name: str, kind: str, seed: int, case: tuple[float, float] = SLOW, starts: int = 3) -> dict[str, float]:
+def median(
+    name: str, kind: str, seed: int, case: tuple[float, float] = SLOW, starts: int = 3
+) -> dict[str, float]:
     """Run a controller from some starts; return the medians of its scores."""
     settings = study.Settings(seed=seed)
     controller, plant = study.controllers(settings, *case)[name], study.plant(kind)
-    found = [study.score(simulate(plant, controller, course)) for course in study.scenarios(settings, kind)[:starts]]
-    return {key: statistics.median(score[key] for score in found) for key in ("overshoot", "settling_time", "control_variation")}
+    found = [
+        study.score(simulate(plant, controller, course))
+        for course in study.scenarios(settings, kind)[:starts]
+    ]
+    return {
+        key: statistics.median(score[key] for score in found)
+        for key in ("overshoot", "settling_time", "control_variation")
+    }
 
 
-@pytest.mark.parametrize(("name", "overshoot", "settling"), [(study.MF, 0.0066, 3.84), (study.MB, 0.0001, 2.26), (study.L, 0.0003, 2.26)])
+@pytest.mark.parametrize(
+    ("name", "overshoot", "settling"),
+    [(study.MF, 0.0066, 3.84), (study.MB, 0.0001, 2.26), (study.L, 0.0003, 2.26)],
+)
 @pytest.mark.xdist_group("torsional")
-def test_the_reference_figures_of_the_linear_plant_are_met(name: str, overshoot: float, settling: float) -> None:
+def test_the_reference_figures_of_the_linear_plant_are_met(
+    name: str, overshoot: float, settling: float
+) -> None:
     """Within a count and a half of the encoder, and 20 ms."""
     for seed in SEEDS:
         found = median(name, study.LINEAR, seed)

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from quell.experiments import two_mass_spring as study
+from quell.experiments.two_mass_spring import setup as study
 
 DTS = (1e-3, 2e-3, 5e-3, 1e-2)
 SEEDS = range(10)
@@ -20,13 +20,17 @@ SEEDS = range(10)
 def scores(name: str, dt: float, seed: int, reset: bool = True) -> dict[str, float]:
     """Run one controller of the study and score it."""
     settings = study.Settings(dt=dt, seed=seed, reset=reset)
-    run = study.simulate(study.two_mass_spring(), study.controllers(settings)[name], study.scenario(settings))
+    run = study.simulate(
+        study.two_mass_spring(), study.controllers(settings)[name], study.scenario(settings)
+    )
     return dict(study.score(run))
 
 
 @pytest.mark.parametrize("dt", DTS)
 @pytest.mark.xdist_group("study")
-def test_mf_eso_overshoots_by_four_and_a_half_per_mille_and_settles_in_16_6_seconds(dt: float) -> None:
+def test_mf_eso_overshoots_by_four_and_a_half_per_mille_and_settles_in_16_6_seconds(
+    dt: float,
+) -> None:
     """Paper: 5 ‰ and 16 s. The bar of 0.004 for the overshoot is missed at dt = 10 ms, where it is 0.00399 at every seed."""
     least = 0.004 if dt < 1e-2 else 0.0039
     for seed in SEEDS:
@@ -48,7 +52,9 @@ def test_mb_eso_does_not_overshoot_and_settles_in_12_seconds(dt: float) -> None:
 @pytest.mark.parametrize("reset", [True, False])
 @pytest.mark.parametrize("dt", DTS)
 @pytest.mark.xdist_group("study")
-def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_bandwidth(dt: float, reset: bool) -> None:
+def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_bandwidth(
+    dt: float, reset: bool
+) -> None:
     """Without overshoot, in 12.3 s, with no more control activity than MF-ESO's by a tenth; with and without the reset."""
     for seed in SEEDS:
         found = scores(study.L, dt, seed, reset)
@@ -68,7 +74,9 @@ def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_band
     ],
 )
 @pytest.mark.xdist_group("study")
-def test_the_reference_figures_are_met(name: str, overshoot: float, settling: float, peak: float, variation: float) -> None:
+def test_the_reference_figures_are_met(
+    name: str, overshoot: float, settling: float, peak: float, variation: float
+) -> None:
     """docs/theory, to the digits it gives; the control variation to 2 %, as it depends on the noise's seed."""
     found = scores(name, 1e-3, 0)
     assert found["overshoot"] == pytest.approx(overshoot, abs=0.0001)
@@ -80,11 +88,15 @@ def test_the_reference_figures_are_met(name: str, overshoot: float, settling: fl
 @pytest.mark.xdist_group("study")
 def test_without_the_reset_mf_eso_has_the_rms_error_of_the_reference() -> None:
     """docs/theory: 0.178 m over [110, 250] s."""
-    assert scores(study.MF, 1e-3, 0, reset=False)["rms_from_step"] == pytest.approx(0.178, abs=0.001)
+    assert scores(study.MF, 1e-3, 0, reset=False)["rms_from_step"] == pytest.approx(
+        0.178, abs=0.001
+    )
 
 
 @pytest.mark.xdist_group("study")
-def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_whatever_the_batch() -> None:
+def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_whatever_the_batch() -> (
+    None
+):
     """Rates above about 2e-5 per 1 ms sample diverge once the disturbance starts; the batch size does not matter."""
     for batch in (1, 10, 1000):
         for rate, stable in ((0.01, True), (0.03, False)):
@@ -99,5 +111,9 @@ def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_wha
 def test_what_is_learned_is_the_plant() -> None:
     """θ after training is (0, 0, −2, 0), to 0.06."""
     settings = study.Settings()
-    run = study.simulate(study.two_mass_spring(), study.controllers(settings)[study.L], study.scenario(settings))
-    np.testing.assert_allclose(run["theta"][run.window(109.0, 110.0)][-1][:4], [0.0, 0.0, -2.0, 0.0], atol=0.06)
+    run = study.simulate(
+        study.two_mass_spring(), study.controllers(settings)[study.L], study.scenario(settings)
+    )
+    np.testing.assert_allclose(
+        run["theta"][run.window(109.0, 110.0)][-1][:4], [0.0, 0.0, -2.0, 0.0], atol=0.06
+    )

@@ -6,8 +6,13 @@ from quell.analysis.laws import linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
 from quell.analysis.over_time import loops_over_omega_o, loops_over_time
-from quell.analysis.plots import plot_bode, plot_gang_of_four, plot_margins_against_omega_o, plot_margins_over_time
-from quell.controllers.unwise import Finding
+from quell.analysis.plots import (
+    plot_bode,
+    plot_gang_of_four,
+    plot_margins_against_omega_o,
+    plot_margins_over_time,
+)
+from quell.controllers.design_checks import Finding
 
 __all__ = [
     "Finding",

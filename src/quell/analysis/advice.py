@@ -9,7 +9,7 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
-from quell.controllers.unwise import Finding, sampling_findings
+from quell.controllers.design_checks import Finding, sampling_findings
 from quell.plants.linear import LinearPlant
 
 # RMS of u, as a share of its range: six standard deviations are then 30 % of it.
@@ -61,16 +61,26 @@ def advise(
     observer, known_delay = getattr(controller, "observer", None), 0.0
     if plant is None:
         if observer is None:
-            raise ValueError("plant = None: this controller does not say which plant it is made for; give one")
+            raise ValueError(
+                "plant = None: this controller does not say which plant it is made for; give one"
+            )
         plant, known_delay = _assumed_plant(observer)
-    actuator_lag, delay = checks.non_negative("actuator_lag", actuator_lag, "s"), checks.non_negative("delay", delay, "s")
+    actuator_lag, delay = (
+        checks.non_negative("actuator_lag", actuator_lag, "s"),
+        checks.non_negative("delay", delay, "s"),
+    )
     found = [] if observer is None else sampling_findings(observer, controller.omega_c)
     loop = analyse(plant, controller, at=at, delay=known_delay)
     if not loop.stable:
-        return [*found, _unstable(loop, "with this plant", "check b0, raise omega_o or lower omega_c")]
+        return [
+            *found,
+            _unstable(loop, "with this plant", "check b0, raise omega_o or lower omega_c"),
+        ]
     found += _judge_margin(loop, observer)
     if actuator_lag > 0.0 or delay > 0.0:
-        late = analyse(plant, controller, at=at, delay=known_delay + delay, actuator_lag=actuator_lag)
+        late = analyse(
+            plant, controller, at=at, delay=known_delay + delay, actuator_lag=actuator_lag
+        )
         found += _judge_lag(loop, late, actuator_lag, delay)
         loop = late
     if noise_std is not None and loop.stable:
@@ -83,20 +93,29 @@ def _assumed_plant(observer: Any) -> tuple[LinearPlant, float]:
     known = observer.plant
     A = np.diag(np.ones(observer.order - 1), 1)
     A[-1] = -known.a
-    plant = LinearPlant(A, known.B * (observer.b0 / known.b), np.eye(observer.order)[0], known.E[:, None])
+    plant = LinearPlant(
+        A, known.B * (observer.b0 / known.b), np.eye(observer.order)[0], known.E[:, None]
+    )
     return plant, observer.dt * getattr(observer.model, "samples", 0)
 
 
 def _unstable(loop: LoopAnalysis, when: str, what_to_do: str) -> Finding:
     size = float(max(abs(loop.poles)))
-    return Finding("stability", size, 1.0, f"the loop is unstable {when}, with a pole at |z| = {size:.6g}: {what_to_do}")
+    return Finding(
+        "stability",
+        size,
+        1.0,
+        f"the loop is unstable {when}, with a pole at |z| = {size:.6g}: {what_to_do}",
+    )
 
 
 def _judge_margin(loop: LoopAnalysis, observer: Any) -> list[Finding]:
     margins = loop.margins
     if margins.modulus >= _LEAST_MODULUS:
         return []
-    what_to_do = "detune it" if observer is None else "raise omega_o (noise permitting) or lower omega_c"
+    what_to_do = (
+        "detune it" if observer is None else "raise omega_o (noise permitting) or lower omega_c"
+    )
     return [
         Finding(
             *("margin", margins.modulus, _LEAST_MODULUS),
@@ -106,7 +125,9 @@ def _judge_margin(loop: LoopAnalysis, observer: Any) -> list[Finding]:
     ]
 
 
-def _judge_lag(loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, delay: float) -> list[Finding]:
+def _judge_lag(
+    loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, delay: float
+) -> list[Finding]:
     parts = (("an actuator lag", actuator_lag), ("a delay", delay))
     cause = " and ".join(f"{what} of {1e3 * time:.3g} ms" for what, time in parts if time > 0.0)
     if not late.stable:
@@ -144,8 +165,12 @@ def _judge_noise(loop: LoopAnalysis, controller: Any, noise: float) -> list[Find
     what_to_do = "lower the gains"
     if hasattr(controller, "omega_c"):
         # Noise in f̂ grows with the power n + 1/2 of omega_o.
-        lower = controller.observer.omega_o * (_NOISE / share) ** (1.0 / (controller.observer.order + 0.5))
-        what_to_do = f"lower omega_o to about {lower:.2g} rad/s, and omega_c with it, or measure better"
+        lower = controller.observer.omega_o * (_NOISE / share) ** (
+            1.0 / (controller.observer.order + 0.5)
+        )
+        what_to_do = (
+            f"lower omega_o to about {lower:.2g} rad/s, and omega_c with it, or measure better"
+        )
     return [
         Finding(
             *("noise", share, _NOISE),

@@ -21,9 +21,18 @@ import numpy as np
 
 from quell import checks
 from quell.guard import UnguardedDesign
-from quell.learners.base import NoLearner, NoLearnerDesign, NoLearnerMemory, adapt, coefficients, commit, predict, restart
-from quell.record import first_sample_at
-from quell.trajectory import Trajectory
+from quell.learners.base import (
+    NoLearner,
+    NoLearnerDesign,
+    NoLearnerMemory,
+    adapt,
+    coefficients,
+    commit,
+    predict,
+    restart,
+)
+from quell.records.record import first_sample_at
+from quell.records.trajectory import Trajectory
 from quell.types import Vector
 
 # Central differences over so much of the size of a signal: they err by its square.
@@ -43,7 +52,9 @@ class Frozen(NamedTuple):
 
 
 @predict.register(Frozen)
-def _predict(learner: Frozen, memory: NoLearnerMemory, seen: Vector, u_before: float) -> tuple[float, float]:
+def _predict(
+    learner: Frozen, memory: NoLearnerMemory, seen: Vector, u_before: float
+) -> tuple[float, float]:
     constant = learner.before * u_before
     for i in range(seen.size):
         constant += learner.gain[i] * seen[i]
@@ -82,7 +93,9 @@ def frozen(controller: Any, run: Any = None, t: float | None = None) -> Frozen:
         answer is held between calls.
     """
     if not hasattr(controller, "observer"):
-        raise ValueError(f"controller = {controller!r}: must be an ADRC, only that has a learner to freeze")
+        raise ValueError(
+            f"controller = {controller!r}: must be an ADRC, only that has a learner to freeze"
+        )
     if run is None:
         return _from_state(controller, controller._state)
     if not isinstance(run, Trajectory):
@@ -98,7 +111,9 @@ def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
         raise ValueError(f"t = {t!r}: must be a time of the record, from 0 to {run.t[-1]:g} s")
     order = controller.observer.order
     if tuple(run.features) != tuple(controller.features):
-        raise ValueError(f"run has the features {run.features}: must be a run of this controller, which has {controller.features}")
+        raise ValueError(
+            f"run has the features {run.features}: must be a run of this controller, which has {controller.features}"
+        )
     if not (run.features or isinstance(controller.learner, NoLearner)):
         raise ValueError(
             f"t = {t!r}: {type(controller.learner).__name__} has no coefficients to record; "
@@ -116,7 +131,13 @@ def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
                 f"t = {t!r}: the feature {name!r} is not linear, its coefficient alone says nothing; "
                 "pass the scenario to loops_over_time, or the final_state of a run that ends then"
             )
-    return _heard(controller, gain, 0.0, slope, float(run["authority"][row]) if "authority" in run.names else 1.0)
+    return _heard(
+        controller,
+        gain,
+        0.0,
+        slope,
+        float(run["authority"][row]) if "authority" in run.names else 1.0,
+    )
 
 
 def _from_state(controller: Any, state: Any) -> Frozen:
@@ -139,7 +160,9 @@ def _from_state(controller: Any, state: Any) -> Frozen:
         moved = [np.append(seen, u) for _ in range(2)]
         moved[0][i] += step
         moved[1][i] -= step
-        return (output(moved[0][:-1], moved[0][-1]) - output(moved[1][:-1], moved[1][-1])) / float(moved[0][i] - moved[1][i])
+        return (output(moved[0][:-1], moved[0][-1]) - output(moved[1][:-1], moved[1][-1])) / float(
+            moved[0][i] - moved[1][i]
+        )
 
     gains = [derivative(i) for i in range(seen.size + 1)]
     slope = float(predict(learner, copied(memory), seen, u)[1])
@@ -149,10 +172,15 @@ def _from_state(controller: Any, state: Any) -> Frozen:
 def _heard(controller: Any, gain: Vector, before: float, slope: float, authority: float) -> Frozen:
     """Return what a guard lets through: β times all of it; a slope outside of its interval counts for the u before."""
     if not (np.all(np.isfinite(gain)) and math.isfinite(before) and math.isfinite(slope)):
-        raise ValueError("learner: its output is not a number at this instant; there is nothing to analyse")
+        raise ValueError(
+            "learner: its output is not a number at this instant; there is nothing to analyse"
+        )
     gain, before, slope = authority * gain, authority * before, authority * slope
     guard = controller.parameters.guard
-    if not isinstance(guard, UnguardedDesign) and not guard.least_slope <= slope <= guard.largest_slope:
+    if (
+        not isinstance(guard, UnguardedDesign)
+        and not guard.least_slope <= slope <= guard.largest_slope
+    ):
         before, slope = before + slope, 0.0
     return Frozen(gain, float(before), float(slope))
 
@@ -169,4 +197,8 @@ def _sizes(controller: Any, memory: Any, seen: Vector, u: float) -> Vector:
 
 def copied(state: Any) -> Any:
     """Return a copy of a nested NamedTuple of arrays."""
-    return type(state)(*(copied(value) for value in state)) if isinstance(state, tuple) else np.array(state)
+    return (
+        type(state)(*(copied(value) for value in state))
+        if isinstance(state, tuple)
+        else np.array(state)
+    )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from quell.analysis.frozen import Frozen, copied, frozen
 from quell.controllers.base import control
 from quell.controllers.limits import Limits
-from quell.controllers.linear import LinearLaw
+from quell.controllers.linear.linear import LinearLaw
 from quell.guard import UnguardedDesign, UnguardedMemory
 from quell.learners.base import NoLearnerMemory
 from quell.types import Matrix, Vector
@@ -55,15 +55,24 @@ def linear_law(controller: Any, at: Any = None) -> LinearLaw:
     learner = at if isinstance(at, Frozen) else frozen(controller, at)
     design = controller.parameters._replace(learner=learner, guard=UnguardedDesign(), limits=_FREE)
     nothing = np.zeros(0)
-    state = controller.initial_state()._replace(learner=NoLearnerMemory(nothing), guard=UnguardedMemory(nothing))
+    state = controller.initial_state()._replace(
+        learner=NoLearnerMemory(nothing), guard=UnguardedMemory(nothing)
+    )
     control(design, state, 0.0, 0.0)
     law = _asked(design, state)
     control(design, state, 0.0, 0.0)
     again = _asked(design, state)
-    if not all(np.array_equal(np.asarray(one), np.asarray(other)) for one, other in zip(law, again, strict=True)):
-        raise ValueError(f"controller = {controller!r}: its law changes from sample to sample, so there is no linear one")
+    if not all(
+        np.array_equal(np.asarray(one), np.asarray(other))
+        for one, other in zip(law, again, strict=True)
+    ):
+        raise ValueError(
+            f"controller = {controller!r}: its law changes from sample to sample, so there is no linear one"
+        )
     if not all(np.all(np.isfinite(part)) for part in law):
-        raise ValueError(f"controller = {controller!r}: the gain b0 + ∂f_L/∂u is zero with this learner, so its law is not finite")
+        raise ValueError(
+            f"controller = {controller!r}: the gain b0 + ∂f_L/∂u is zero with this learner, so its law is not finite"
+        )
     return law
 
 
@@ -83,9 +92,16 @@ def closed_loop_matrix(A: Matrix, B: Vector, C: Vector, law: LinearLaw, inner: M
 def _asked(design: Any, origin: Any) -> LinearLaw:
     """Return the law around a state ``origin`` that no limit and no flag is about to change."""
     held = [design._replace(limits=Limits(u, u, math.inf)) for u in (0.0, _UNIT)]
-    places = [(i, where) for i, array in enumerate(_arrays(origin)) for where in np.ndindex(array.shape) if array[where] == 0.0]
+    places = [
+        (i, where)
+        for i, array in enumerate(_arrays(origin))
+        for where in np.ndindex(array.shape)
+        if array[where] == 0.0
+    ]
 
-    def respond(design: Any, place: Any = None, r: float = 0.0, y: float = 0.0) -> tuple[Vector, float]:
+    def respond(
+        design: Any, place: Any = None, r: float = 0.0, y: float = 0.0
+    ) -> tuple[Vector, float]:
         state = copied(origin)
         arrays = _arrays(state)
         if place is not None:
@@ -101,7 +117,15 @@ def _asked(design: Any, origin: Any) -> LinearLaw:
     B_y, D_y = respond(held[0], y=_UNIT)[0], respond(design, y=_UNIT)[1]
     B_u = respond(held[1])[0]
     keep = np.flatnonzero(_reached(A.T, C) & _reached(A, np.abs(B_r) + np.abs(B_y) + np.abs(B_u)))
-    return LinearLaw(np.ascontiguousarray(A[np.ix_(keep, keep)]), B_r[keep], B_y[keep], B_u[keep], C[keep], D_r, D_y)
+    return LinearLaw(
+        np.ascontiguousarray(A[np.ix_(keep, keep)]),
+        B_r[keep],
+        B_y[keep],
+        B_u[keep],
+        C[keep],
+        D_r,
+        D_y,
+    )
 
 
 def _reached(A: Matrix, start: Vector) -> NDArray[np.bool_]:
@@ -116,4 +140,8 @@ def _reached(A: Matrix, start: Vector) -> NDArray[np.bool_]:
 
 def _arrays(state: Any) -> list[Vector]:
     """Return the arrays of a nested NamedTuple."""
-    return [array for value in state for array in _arrays(value)] if isinstance(state, tuple) else [state]
+    return (
+        [array for value in state for array in _arrays(value)]
+        if isinstance(state, tuple)
+        else [state]
+    )

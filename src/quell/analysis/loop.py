@@ -21,12 +21,14 @@ from quell.analysis.laws import closed_loop_matrix, linear_law
 from quell.analysis.margins import Margins, least, margins
 from quell.analysis.response import Complex, System, frequencies, in_s_plane, response
 from quell.analysis.sampled import SampledPlant, sampled_plant
-from quell.controllers.linear import LinearLaw
-from quell.controllers.prefilter import Prefiltered
+from quell.controllers.linear.linear import LinearLaw
+from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.types import Matrix, Vector
 
 
-def analyse(plant: Any, controller: Any, *, at: Any = None, delay: float = 0.0, actuator_lag: float = 0.0) -> LoopAnalysis:
+def analyse(
+    plant: Any, controller: Any, *, at: Any = None, delay: float = 0.0, actuator_lag: float = 0.0
+) -> LoopAnalysis:
     """Analyse the loop of a linear plant and a controller, while no limit holds, its learner frozen.
 
     Parameters
@@ -55,11 +57,19 @@ def analyse(plant: Any, controller: Any, *, at: Any = None, delay: float = 0.0, 
     """
     while isinstance(controller, Prefiltered):  # what comes before the loop is not in it
         controller = controller.controller
-    if not (hasattr(controller, "dt") and (hasattr(controller, "law") or hasattr(controller, "observer"))):
+    if not (
+        hasattr(controller, "dt")
+        and (hasattr(controller, "law") or hasattr(controller, "observer"))
+    ):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     dt = float(controller.dt)
     sampled = sampled_plant(plant, dt, delay, actuator_lag)
-    return LoopAnalysis(sampled, linear_law(controller, at), dt, _b_over_b0(sampled, getattr(controller, "observer", None)))
+    return LoopAnalysis(
+        sampled,
+        linear_law(controller, at),
+        dt,
+        _b_over_b0(sampled, getattr(controller, "observer", None)),
+    )
 
 
 def _b_over_b0(plant: SampledPlant, observer: Any) -> float | None:
@@ -85,7 +95,9 @@ class LoopAnalysis:
         reach the derivative of y first that the controller takes for it.
     """
 
-    def __init__(self, plant: SampledPlant, law: LinearLaw, dt: float, b_over_b0: float | None = None) -> None:
+    def __init__(
+        self, plant: SampledPlant, law: LinearLaw, dt: float, b_over_b0: float | None = None
+    ) -> None:
         self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
         self._N = law.A - np.eye(law.A.shape[0]) + np.outer(law.B_u, law.C)
         self._P = System.balanced(plant.N, plant.B, plant.C, 0.0)
@@ -117,7 +129,9 @@ class LoopAnalysis:
 
     def closed_loop_matrix(self, gain: float = 1.0) -> Matrix:
         """Return ``A − I`` of the closed loop, the plant's states first, with the plant's gain multiplied by ``gain``."""
-        return closed_loop_matrix(self.plant.N, gain * self.plant.B, self.plant.C, self.law, self._N)
+        return closed_loop_matrix(
+            self.plant.N, gain * self.plant.B, self.plant.C, self.law, self._N
+        )
 
     def _shifted_poles(self, gain: float = 1.0) -> Complex:
         poles: Complex = np.linalg.eigvals(self.closed_loop_matrix(gain)).astype(np.complex128)
@@ -150,7 +164,10 @@ class LoopAnalysis:
     @cached_property
     def omega(self) -> Vector:
         """Frequencies [rad/s] at which to draw, up to half the sampling rate; dense where poles are."""
-        loose = [in_s_plane(np.linalg.eigvals(N).astype(np.complex128), self.dt) for N in (self.plant.N, self._N)]
+        loose = [
+            in_s_plane(np.linalg.eigvals(N).astype(np.complex128), self.dt)
+            for N in (self.plant.N, self._N)
+        ]
         return frequencies(np.concatenate([self.s_poles, *loose]), self.dt)
 
     def response(self, name: str, omega: Any) -> Complex:
@@ -175,7 +192,9 @@ class LoopAnalysis:
         """
         checks.one_of("name", name, ("P", "C_r", "C_y", "L", "S", "T", "PS", "CS", "closed_loop"))
         if name in ("P", "C_r", "C_y"):
-            return response({"P": self._P, "C_r": self._C_r, "C_y": self._C_y}[name], omega, self.dt)
+            return response(
+                {"P": self._P, "C_r": self._C_r, "C_y": self._C_y}[name], omega, self.dt
+            )
         L = self._loop(omega)
         if name == "L":
             return L
@@ -228,7 +247,11 @@ class LoopAnalysis:
         """Largest factor by which a sinusoid in the measurement is seen in u; infinite for an unstable loop."""
         if not self.stable:
             return math.inf
-        inverse, _ = least(lambda w: 1.0 / np.abs(self.response("CS", w)), self.omega, 1.0 / np.abs(self.response("CS", self.omega)))
+        inverse, _ = least(
+            lambda w: 1.0 / np.abs(self.response("CS", w)),
+            self.omega,
+            1.0 / np.abs(self.response("CS", self.omega)),
+        )
         top = float(np.abs(self.response("CS", [math.pi / self.dt]))[0])
         return max(1.0 / inverse, top)
 
@@ -266,9 +289,16 @@ class LoopAnalysis:
         else:
             B = np.concatenate([P.B if source == "d" else P.E[:, int(source[1:]) - 1], np.zeros(m)])
         if target == "u":
-            return System(self.closed_loop_matrix(), B, np.concatenate([law.D_y * P.C, law.C]), u_direct)
+            return System(
+                self.closed_loop_matrix(), B, np.concatenate([law.D_y * P.C, law.C]), u_direct
+            )
         C = np.concatenate([P.C, np.zeros(m)])
-        return System(self.closed_loop_matrix(), B, C if target == "y" else -C, float(target == "e" and source == "r"))
+        return System(
+            self.closed_loop_matrix(),
+            B,
+            C if target == "y" else -C,
+            float(target == "e" and source == "r"),
+        )
 
     def system(self, name: str) -> Any:
         """Return a part of the loop, or a closed loop, as a ``control.StateSpace`` in discrete time.

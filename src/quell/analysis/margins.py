@@ -55,7 +55,9 @@ class Margins(NamedTuple):
         return math.degrees(2.0 * math.atan(self.disk / 2.0))
 
 
-def margins(loop: Response, omega: Vector, dt: float, stable_with: Callable[[float], bool]) -> Margins:
+def margins(
+    loop: Response, omega: Vector, dt: float, stable_with: Callable[[float], bool]
+) -> Margins:
     """Return the margins of a loop.
 
     Parameters
@@ -80,12 +82,25 @@ def margins(loop: Response, omega: Vector, dt: float, stable_with: Callable[[flo
         crossings = _zeros(lambda w: np.log(np.abs(loop(w))), omega, np.log(np.abs(L)))
     phase, phase_omega, delay, delay_omega = math.inf, nan, math.inf, nan
     for at in crossings:
-        lead = math.pi + float(np.angle(loop(np.array([at])))[0])  # from −1, counter-clockwise: 0 … 2π
+        lead = math.pi + float(
+            np.angle(loop(np.array([at])))[0]
+        )  # from −1, counter-clockwise: 0 … 2π
         if abs(math.remainder(lead, 2.0 * math.pi)) < phase:
             phase, phase_omega = abs(math.remainder(lead, 2.0 * math.pi)), at
         if lead / at < delay:
             delay, delay_omega = lead / at, at
-    return Margins(gain, gain_omega, math.degrees(phase), phase_omega, modulus, modulus_omega, disk, disk_omega, delay, delay_omega)
+    return Margins(
+        gain,
+        gain_omega,
+        math.degrees(phase),
+        phase_omega,
+        modulus,
+        modulus_omega,
+        disk,
+        disk_omega,
+        delay,
+        delay_omega,
+    )
 
 
 def _away(L: Complex) -> Vector:
@@ -113,7 +128,10 @@ def _gain_margin(
         if 1e-9 < factor < 1e9:
             candidates[factor] = at
     low, high, low_omega, high_omega = 0.0, math.inf, math.nan, math.nan
-    above, below = sorted(k for k in candidates if k > 1.0), sorted((k for k in candidates if k <= 1.0), reverse=True)
+    above, below = (
+        sorted(k for k in candidates if k > 1.0),
+        sorted((k for k in candidates if k <= 1.0), reverse=True),
+    )
     for factor, beyond in pairwise([*above, 4.0 * max([1.0, *above])]):
         if not stable_with(math.sqrt(factor * beyond)):
             high, high_omega = factor, candidates[factor]
@@ -125,7 +143,9 @@ def _gain_margin(
     return (low, high), (low_omega, high_omega)
 
 
-def least(function: Callable[[Vector], Vector], omega: Vector, values: Vector) -> tuple[float, float]:
+def least(
+    function: Callable[[Vector], Vector], omega: Vector, values: Vector
+) -> tuple[float, float]:
     """Return the least value of a function of the frequency, and where; ``values`` are those at ``omega``."""
     from scipy.optimize import minimize_scalar
 

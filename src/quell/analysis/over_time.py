@@ -9,11 +9,13 @@ from typing import Any
 from quell import checks
 from quell.analysis.frozen import frozen
 from quell.analysis.loop import LoopAnalysis, analyse
+from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
-from quell.trajectory import Trajectory
 
 
-def loops_over_time(plant: Any, controller: Any, run: Any, times: Any, **lags: float) -> list[LoopAnalysis]:
+def loops_over_time(
+    plant: Any, controller: Any, run: Any, times: Any, **lags: float
+) -> list[LoopAnalysis]:
     """Analyse the loop with its learner frozen at several instants.
 
     Each is the loop that there would be if nothing more were learned from then on. That all of them are stable does not prove the
@@ -43,7 +45,10 @@ def loops_over_time(plant: Any, controller: Any, run: Any, times: Any, **lags: f
     """
     instants = checks.vector("times", times)
     if isinstance(run, Trajectory):
-        return [analyse(plant, controller, at=frozen(controller, run, t), **lags) for t in instants.tolist()]
+        return [
+            analyse(plant, controller, at=frozen(controller, run, t), **lags)
+            for t in instants.tolist()
+        ]
     if not isinstance(run, Scenario):
         raise ValueError(f"run = {run!r}: must be a Trajectory or a Scenario")
     loops = []
@@ -58,7 +63,9 @@ def loops_over_time(plant: Any, controller: Any, run: Any, times: Any, **lags: f
     return loops
 
 
-def loops_over_omega_o(plant: Any, make_controller: Callable[[float], Any], omegas: Any, **lags: float) -> list[LoopAnalysis]:
+def loops_over_omega_o(
+    plant: Any, make_controller: Callable[[float], Any], omegas: Any, **lags: float
+) -> list[LoopAnalysis]:
     """Analyse designs with several observer bandwidths.
 
     Parameters

@@ -46,14 +46,25 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     low.axhline(-180.0, color="0.5", linewidth=0.8)
     if np.isfinite(margins.phase_omega):
         at = float(np.interp(margins.phase_omega, omega, phase))
-        low.vlines(margins.phase_omega, -180.0, at, color=line.get_color(), linewidth=2.5, alpha=0.6)
+        low.vlines(
+            margins.phase_omega, -180.0, at, color=line.get_color(), linewidth=2.5, alpha=0.6
+        )
         if alone:
-            low.annotate(f"{margins.phase:.0f}°", (margins.phase_omega, 0.5 * (at - 180.0)), xytext=(5, -3), textcoords="offset points")
+            low.annotate(
+                f"{margins.phase:.0f}°",
+                (margins.phase_omega, 0.5 * (at - 180.0)),
+                xytext=(5, -3),
+                textcoords="offset points",
+            )
     for factor, at in zip(margins.gain, margins.gain_omega, strict=True):
         if np.isfinite(at):
-            top.vlines(at, *sorted((1.0, 1.0 / factor)), color=line.get_color(), linewidth=2.5, alpha=0.6)
+            top.vlines(
+                at, *sorted((1.0, 1.0 / factor)), color=line.get_color(), linewidth=2.5, alpha=0.6
+            )
             if alone:
-                top.annotate(f"{factor:.2g}", (at, factor**-0.5), xytext=(5, -3), textcoords="offset points")
+                top.annotate(
+                    f"{factor:.2g}", (at, factor**-0.5), xytext=(5, -3), textcoords="offset points"
+                )
     _limit_ratio(top, np.abs(L))
     low.set_ylim(max(float(np.min(phase)), -720.0) - 20.0, min(float(np.max(phase)), 180.0) + 20.0)
     for ax, label in zip(axes, ("|L|", "phase of L [°]"), strict=True):
@@ -81,7 +92,10 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any
     """
     axes = _axes(axes, 2, 2)
     for ax, name, meaning in zip(
-        axes, ("S", "T", "PS", "CS"), ("", "", ": load at the plant's input to y", ": measurement noise to u"), strict=True
+        axes,
+        ("S", "T", "PS", "CS"),
+        ("", "", ": load at the plant's input to y", ": measurement noise to u"),
+        strict=True,
     ):
         size = np.abs(loop.response(name, loop.omega))
         ax.loglog(loop.omega, size, **style)
@@ -95,7 +109,9 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any
     return axes
 
 
-def plot_margins_over_time(times: Any, loops: Sequence[LoopAnalysis], axes: Any = None, **style: Any) -> Any:
+def plot_margins_over_time(
+    times: Any, loops: Sequence[LoopAnalysis], axes: Any = None, **style: Any
+) -> Any:
     """Draw the margins of the loop with its learner frozen at each instant; return the axes.
 
     Parameters
@@ -119,7 +135,13 @@ def plot_margins_over_time(times: Any, loops: Sequence[LoopAnalysis], axes: Any 
     return axes
 
 
-def plot_margins_against_omega_o(plant: Any, make_controller: Callable[[float], Any], omegas: Any, axes: Any = None, **lags: float) -> Any:
+def plot_margins_against_omega_o(
+    plant: Any,
+    make_controller: Callable[[float], Any],
+    omegas: Any,
+    axes: Any = None,
+    **lags: float,
+) -> Any:
     """Draw the margins, and what noise does to u, over the observer's bandwidth; return the axes.
 
     Parameters
@@ -149,9 +171,14 @@ def plot_margins_against_omega_o(plant: Any, make_controller: Callable[[float], 
 
 def _plot_margins(x: Any, loops: Sequence[LoopAnalysis], axes: Any, style: dict[str, Any]) -> Any:
     if len(x) != len(loops):
-        raise ValueError(f"loops has {len(loops)} entries: must have one for each of the {len(x)} abscissae")
+        raise ValueError(
+            f"loops has {len(loops)} entries: must have one for each of the {len(x)} abscissae"
+        )
     axes = _axes(axes, 3, 1)
-    modulus, disk, phase = (np.array([getattr(loop.margins, name) for loop in loops]) for name in ("modulus", "disk", "phase"))
+    modulus, disk, phase = (
+        np.array([getattr(loop.margins, name) for loop in loops])
+        for name in ("modulus", "disk", "phase")
+    )
     axes[0].plot(x, modulus, **({"label": "modulus margin"} | style))
     axes[0].plot(x, disk, **({"label": "disk margin"} | style))
     axes[0].set_ylim(0.0, None)
@@ -162,7 +189,9 @@ def _plot_margins(x: Any, loops: Sequence[LoopAnalysis], axes: Any, style: dict[
     axes[2].set_yscale("log")
     axes[2].axhline(1.0, color="0.5", linewidth=0.8)
     gain = "gain" if any(loop.b_over_b0 is None for loop in loops) else "b/b0"
-    for ax, label in zip(axes, ("margin", "phase margin [°]", f"{gain} for which\nit is stable"), strict=True):
+    for ax, label in zip(
+        axes, ("margin", "phase margin [°]", f"{gain} for which\nit is stable"), strict=True
+    ):
         ax.set_ylabel(label)
         ax.grid(alpha=0.3)
     axes[0].legend(fontsize="small")
@@ -186,7 +215,10 @@ def _limit_ratio(ax: Any, size: Any) -> None:
     """Leave out what is more than six decades off: poles on the axis and zeros of a size."""
     finite = size[np.isfinite(size) & (size > 0.0)]
     middle = float(np.median(finite))
-    ax.set_ylim(max(0.5 * float(np.min(finite)), 1e-6 * middle), min(2.0 * float(np.max(finite)), 1e6 * middle))
+    ax.set_ylim(
+        max(0.5 * float(np.min(finite)), 1e-6 * middle),
+        min(2.0 * float(np.max(finite)), 1e6 * middle),
+    )
 
 
 def _finish(ax: Any, loop: LoopAnalysis, label: str) -> None:

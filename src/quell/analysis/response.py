@@ -55,7 +55,9 @@ def response(system: System, omega: Any, dt: float) -> Complex:
         return np.full(zeta.shape, complex(system.D))
     resolvent = zeta[:, None, None] * np.eye(system.N.shape[0]) - system.N
     try:
-        solved = np.linalg.solve(resolvent, np.broadcast_to(system.B[:, None], (zeta.size, system.B.size, 1)))
+        solved = np.linalg.solve(
+            resolvent, np.broadcast_to(system.B[:, None], (zeta.size, system.B.size, 1))
+        )
     except np.linalg.LinAlgError:
         raise ValueError(
             f"omega = {np.atleast_1d(omega).tolist()!r} rad/s: the response is infinite at one of them, a pole; leave it out"
@@ -66,7 +68,11 @@ def response(system: System, omega: Any, dt: float) -> Complex:
 def in_s_plane(shifted: Complex, dt: float) -> Complex:
     """Return ``log(z)/dt`` for poles given as z − 1; a pole at z = 0, a sample of memory, is at −inf."""
     with np.errstate(divide="ignore"):
-        size = np.where(np.abs(1.0 + shifted) < 1e-7, -np.inf, 0.5 * np.log1p(2.0 * shifted.real + np.abs(shifted) ** 2))
+        size = np.where(
+            np.abs(1.0 + shifted) < 1e-7,
+            -np.inf,
+            0.5 * np.log1p(2.0 * shifted.real + np.abs(shifted) ** 2),
+        )
     angle = np.where(np.isinf(size), 0.0, np.angle(1.0 + shifted))
     s: Complex = size / dt + 1j * (angle / dt)
     return s

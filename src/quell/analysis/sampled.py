@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.discretize import zero_order_hold
-from quell.models import Fraction, leading_gain, read, with_states
+from quell.lti.discretize import zero_order_hold
+from quell.lti.models import Fraction, leading_gain, read, with_states
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
@@ -36,7 +36,9 @@ class SampledPlant(NamedTuple):
     """What u adds to y^(k), by k, where that is the first derivative it reaches."""
 
 
-def sampled_plant(plant: Any, dt: float, delay: float = 0.0, actuator_lag: float = 0.0) -> SampledPlant:
+def sampled_plant(
+    plant: Any, dt: float, delay: float = 0.0, actuator_lag: float = 0.0
+) -> SampledPlant:
     """Sample a linear plant exactly.
 
     Parameters
@@ -74,9 +76,15 @@ def sampled_plant(plant: Any, dt: float, delay: float = 0.0, actuator_lag: float
     if actuator_lag > 0.0:
         n = A.shape[0]
         A = np.block([[A, B], [np.zeros((1, n)), np.full((1, 1), -1.0 / actuator_lag)]])
-        B, C, E = np.vstack([np.zeros_like(B), [[1.0 / actuator_lag]]]), np.append(C, 0.0), np.vstack([E, np.zeros((1, E.shape[1]))])
+        B, C, E = (
+            np.vstack([np.zeros_like(B), [[1.0 / actuator_lag]]]),
+            np.append(C, 0.0),
+            np.vstack([E, np.zeros((1, E.shape[1]))]),
+        )
     if delay > _MOST_SAMPLES * dt:
-        raise ValueError(f"delay = {delay!r} s: must be at most {_MOST_SAMPLES} samples of dt = {dt!r} s")
+        raise ValueError(
+            f"delay = {delay!r} s: must be at most {_MOST_SAMPLES} samples of dt = {dt!r} s"
+        )
     samples = math.floor(delay / dt * (1.0 + 1e-12))
     late = max(delay - samples * dt, 0.0)
     if late < 1e-12 * dt:
@@ -89,7 +97,15 @@ def sampled_plant(plant: Any, dt: float, delay: float = 0.0, actuator_lag: float
     return _delayed(A @ whole, rest @ B, before, C, gamma_w, samples, gains)
 
 
-def _delayed(N: Matrix, now: Matrix, before: Matrix, C: Vector, E: Matrix, samples: int, gains: dict[int, float]) -> SampledPlant:
+def _delayed(
+    N: Matrix,
+    now: Matrix,
+    before: Matrix,
+    C: Vector,
+    E: Matrix,
+    samples: int,
+    gains: dict[int, float],
+) -> SampledPlant:
     """Append the control signals that have not arrived yet as states, the newest last."""
     waiting = samples + bool(np.any(before))
     n = N.shape[0]

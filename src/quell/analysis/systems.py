@@ -14,7 +14,13 @@ from quell.types import Matrix, Vector
 if TYPE_CHECKING:
     from quell.analysis.loop import LoopAnalysis
 
-_CLOSED = {"closed_loop": ("r", "y"), "PS": ("d", "y"), "CS": ("n", "u"), "S": ("n", "y"), "T": ("n", "y")}
+_CLOSED = {
+    "closed_loop": ("r", "y"),
+    "PS": ("d", "y"),
+    "CS": ("n", "u"),
+    "S": ("n", "y"),
+    "T": ("n", "y"),
+}
 # Least coefficient of a polynomial, of its largest.
 _ROUNDING = 1e-13
 _PARTS = ("P", "C_r", "C_y", "L")
@@ -40,9 +46,13 @@ def transfer_function(loop: LoopAnalysis, name: str) -> Any:
         x = x + N @ x
     numerator = np.convolve(denominator, pulse)[: denominator.size]
     # What is a pole at z = 0 in both is u of the sample before, counted twice.
-    while denominator.size > 1 and all(abs(part[-1]) < _ROUNDING * np.max(np.abs(part)) for part in (numerator, denominator)):
+    while denominator.size > 1 and all(
+        abs(part[-1]) < _ROUNDING * np.max(np.abs(part)) for part in (numerator, denominator)
+    ):
         numerator, denominator = numerator[:-1], denominator[:-1]
-    return _control().tf(np.trim_zeros(numerator, "f") if np.any(numerator) else [0.0], denominator, loop.dt)
+    return _control().tf(
+        np.trim_zeros(numerator, "f") if np.any(numerator) else [0.0], denominator, loop.dt
+    )
 
 
 def _named(loop: LoopAnalysis, name: str) -> System:
@@ -79,4 +89,6 @@ def _control() -> Any:
     try:
         return importlib.import_module("control")
     except ImportError as error:
-        raise ImportError(f"systems of python-control need python-control ({error}): pip install 'quell[control]'") from error
+        raise ImportError(
+            f"systems of python-control need python-control ({error}): pip install 'quell[control]'"
+        ) from error

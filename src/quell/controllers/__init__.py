@@ -1,15 +1,15 @@
 """Controllers: what makes a control signal of a reference and a measurement."""
 
 from quell.controllers import baselines
-from quell.controllers.adrc import ADRC
+from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.adrc.estimate import Estimate
 from quell.controllers.bandwidth import omega_c_for
 from quell.controllers.base import Controller
-from quell.controllers.differentiator import TrackingDifferentiator
-from quell.controllers.estimate import Estimate
-from quell.controllers.linear import LinearController, LinearLaw
-from quell.controllers.prefilter import Prefilter, Prefiltered
-from quell.controllers.reference_model import ReferenceModel
-from quell.controllers.unwise import warn_if_unwise
+from quell.controllers.design_checks import warn_if_unwise
+from quell.controllers.linear.linear import LinearController, LinearLaw
+from quell.controllers.prefilters.differentiator import TrackingDifferentiator
+from quell.controllers.prefilters.prefilter import Prefilter, Prefiltered
+from quell.controllers.prefilters.reference_model import ReferenceModel
 
 __all__ = [
     "ADRC",

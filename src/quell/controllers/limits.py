@@ -6,7 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 from quell import checks
-from quell.dispatch import kernel
+from quell.kernels.dispatch import kernel
 from quell.types import Status
 
 _SATURATED = int(Status.SATURATED)

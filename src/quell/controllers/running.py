@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import applied
-from quell.controllers.handle import bind, bound_control, entry_point
+from quell.controllers.compiled_step import bind, bound_control, entry_point
 from quell.controllers.limits import Limits
-from quell.dispatch import compiling, for_types
+from quell.kernels.dispatch import compiling, for_types
 
 # What only this process can use, or what can be made anew.
 _MADE_ANEW = ("parameters", "_state", "_arrays", "_handle", "_step")
@@ -92,7 +92,9 @@ class Running:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""
-        return {name: value for name, value in vars(self).items() if name not in _MADE_ANEW} | {"state": self.state}
+        return {name: value for name, value in vars(self).items() if name not in _MADE_ANEW} | {
+            "state": self.state
+        }
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update({name: value for name, value in kept.items() if name != "state"})
@@ -128,7 +130,9 @@ class Running:
             except (TypeError, ValueError):
                 raise ValueError(f"state[{name!r}]: must be an array of numbers") from None
             if checked[name].shape != array.shape:
-                raise ValueError(f"state[{name!r}] has shape {checked[name].shape}: must have {array.shape}")
+                raise ValueError(
+                    f"state[{name!r}] has shape {checked[name].shape}: must have {array.shape}"
+                )
         if snapshots:
             self._recall(self._state, snapshots)
         for name, value in checked.items():
@@ -147,7 +151,9 @@ class Running:
         """Put back what ``_snapshots`` returned."""
 
     def _saved(self, state: Any) -> dict[str, NDArray[Any]]:
-        saved: dict[str, NDArray[Any]] = {name: array.copy() for name, array in named_arrays(state).items()}
+        saved: dict[str, NDArray[Any]] = {
+            name: array.copy() for name, array in named_arrays(state).items()
+        }
         for name, snapshot in self._snapshots(state).items():
             box = np.empty((), dtype=object)
             box[()] = snapshot

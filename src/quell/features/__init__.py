@@ -8,4 +8,15 @@ from quell.features.linear import Bias, Input, State
 from quell.features.polynomial import Polynomial
 from quell.features.radial import RBF
 
-__all__ = ["RBF", "Bias", "Custom", "Features", "Friction", "Input", "Joined", "Polynomial", "RandomFourier", "State"]
+__all__ = [
+    "RBF",
+    "Bias",
+    "Custom",
+    "Features",
+    "Friction",
+    "Input",
+    "Joined",
+    "Polynomial",
+    "RandomFourier",
+    "State",
+]

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell import tryout
-from quell.dispatch import generic
+from quell.kernels import validation
+from quell.kernels.dispatch import generic
 from quell.types import Vector
 
 
@@ -76,7 +76,9 @@ class Joined(Features):
 
     def design(self, order: int) -> JoinedDesign:
         """Return both blocks' parameters."""
-        return JoinedDesign(self.first.design(order), self.second.design(order), len(self.first.names(order)))
+        return JoinedDesign(
+            self.first.design(order), self.second.design(order), len(self.first.names(order))
+        )
 
     def names(self, order: int) -> tuple[str, ...]:
         """Return both blocks' names; a name that comes again is numbered."""
@@ -134,7 +136,7 @@ def tried(features: Features, order: int) -> Any:
     if isinstance(features, Joined):
         tried(features.first, order)
         tried(features.second, order)
-    elif tryout.of_users(features):
+    elif validation.of_users(features):
         _try_block(features, order)
     return features.design(order)
 
@@ -142,19 +144,31 @@ def tried(features: Features, order: int) -> Any:
 def _try_block(block: Features, order: int) -> None:
     name = type(block).__name__
     what = f"{name}.design({order})"
-    parameters = tryout.attempt(what, "design takes the plant's order", block.design, order)
-    tryout.named_tuple(what, parameters, "numbers and arrays")
-    names = tryout.attempt(f"{name}.names({order})", "names takes the plant's order", block.names, order)
-    if not isinstance(names, tuple) or not names or not all(isinstance(label, str) for label in names):
-        raise ValueError(f"{name}.names({order}) returns {names!r}: must return a tuple with a name for each feature")
-    tryout.registered(name, parameters, write, unit)
-    rule = f"it is given x ({order},), u, and room for {len(names)} features, as many as it has names"
+    parameters = validation.attempt(what, "design takes the plant's order", block.design, order)
+    validation.named_tuple(what, parameters, "numbers and arrays")
+    names = validation.attempt(
+        f"{name}.names({order})", "names takes the plant's order", block.names, order
+    )
+    if (
+        not isinstance(names, tuple)
+        or not names
+        or not all(isinstance(label, str) for label in names)
+    ):
+        raise ValueError(
+            f"{name}.names({order}) returns {names!r}: must return a tuple with a name for each feature"
+        )
+    validation.registered(name, parameters, write, unit)
+    rule = (
+        f"it is given x ({order},), u, and room for {len(names)} features, as many as it has names"
+    )
     ones, marks = np.ones(order + 2), (7e77, -7e77)
-    for function, arguments in ((write, (tryout.wave(order), 0.5)), (unit, (ones,))):
+    for function, arguments in ((write, (validation.wave(order), 0.5)), (unit, (ones,))):
         written = []
         for mark in marks:
             out = np.full(len(names), mark)
-            tryout.attempt_kernel(f"{name}: {function.__name__}", rule, function, parameters, *arguments, out)
+            validation.attempt_kernel(
+                f"{name}: {function.__name__}", rule, function, parameters, *arguments, out
+            )
             written.append(out != mark)
         if not np.all(written):
             raise ValueError(

@@ -11,7 +11,7 @@ import numpy as np
 from numba.core import types as nb_types
 
 from quell.features.base import Features, unit, write
-from quell.foreign import POINTER, NotCompilableError, call, inner, machine_code
+from quell.kernels.function_pointers import POINTER, NotCompilableError, call, inner, machine_code
 from quell.types import Vector
 
 _SIGNATURE = nb_types.void(POINTER, nb_types.float64, POINTER)
@@ -49,7 +49,12 @@ class Custom(Features):
     def __init__(self, function: Callable[..., Any], names: Sequence[str]) -> None:
         if not callable(function):
             raise ValueError(f"function = {function!r}: must be a function f(x, u)")
-        if isinstance(names, str) or not isinstance(names, Sequence) or not names or not all(isinstance(name, str) for name in names):
+        if (
+            isinstance(names, str)
+            or not isinstance(names, Sequence)
+            or not names
+            or not all(isinstance(name, str) for name in names)
+        ):
             raise ValueError(f"names = {names!r}: must be a tuple with a name for each feature")
         if len(set(names)) < len(names):
             raise ValueError(f"names = {names!r}: each must be there once")
@@ -57,7 +62,9 @@ class Custom(Features):
         self.labels = tuple(names)
 
     def __repr__(self) -> str:
-        return f"Custom({getattr(self.function, '__name__', self.function)!s}, names={self.labels!r})"
+        return (
+            f"Custom({getattr(self.function, '__name__', self.function)!s}, names={self.labels!r})"
+        )
 
     def design(self, order: int) -> CustomDesign:
         """Compile the function, for a plant of order ``order``."""
@@ -67,9 +74,13 @@ class Custom(Features):
         except ArithmeticError:  # the origin is no place for it
             returned = (count,)
         except Exception as error:
-            raise ValueError(f"function(zeros({order}), 0.0) fails with {type(error).__name__}: {error}") from error
+            raise ValueError(
+                f"function(zeros({order}), 0.0) fails with {type(error).__name__}: {error}"
+            ) from error
         if returned != (count,):
-            raise ValueError(f"function returns shape {returned}: must return a tuple of {count} numbers, one for each of names")
+            raise ValueError(
+                f"function returns shape {returned}: must return a tuple of {count} numbers, one for each of names"
+            )
         return CustomDesign(_machine_code(self.function, order, count).address, count)
 
     def names(self, order: int) -> tuple[str, ...]:
@@ -89,7 +100,9 @@ def _machine_code(function: Callable[..., Any], order: int, count: int) -> Any:
         compiled = inner(function)
         return machine_code(_SIGNATURE, features)
     except NotCompilableError as error:
-        raise ValueError(f"function can't be compiled by Numba: {error}; it must be a plain function of numbers") from error
+        raise ValueError(
+            f"function can't be compiled by Numba: {error}; it must be a plain function of numbers"
+        ) from error
 
 
 @write.register(CustomDesign)

@@ -64,7 +64,10 @@ class Friction(Features):
         return tuple(
             name
             for i in places(self.states, order)
-            for name in (f"tanh(x{i + 1}/{self.width:g})", *([f"sign(x{i + 1})"] if self.sign else []))
+            for name in (
+                f"tanh(x{i + 1}/{self.width:g})",
+                *([f"sign(x{i + 1})"] if self.sign else []),
+            )
         )
 
 

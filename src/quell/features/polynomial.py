@@ -66,7 +66,9 @@ class Polynomial(Features):
 
 def _name(factors: list[int]) -> str:
     powers = {i: factors.count(i) for i in factors}
-    return " ".join(f"x{i + 1}^{power}" if power > 1 else f"x{i + 1}" for i, power in powers.items())
+    return " ".join(
+        f"x{i + 1}^{power}" if power > 1 else f"x{i + 1}" for i, power in powers.items()
+    )
 
 
 @write.register(PolynomialDesign)

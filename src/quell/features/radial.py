@@ -54,12 +54,21 @@ class RBF(Features):
     """
 
     def __init__(
-        self, count: int | None = None, width: float | None = None, *, states: Sequence[int] | None = None, centers: Any = None
+        self,
+        count: int | None = None,
+        width: float | None = None,
+        *,
+        states: Sequence[int] | None = None,
+        centers: Any = None,
     ) -> None:
         if count is not None and centers is not None:
             raise ValueError("count and centers: give one of them")
         self.centers = None if centers is None else checks.matrix("centers", centers)
-        self.count = checks.whole("count", 25 if count is None else count, 1) if self.centers is None else len(self.centers)
+        self.count = (
+            checks.whole("count", 25 if count is None else count, 1)
+            if self.centers is None
+            else len(self.centers)
+        )
         self.width = None if width is None else checks.positive("width", width)
         check_states(states)
         self.states = None if states is None else tuple(states)
@@ -72,8 +81,19 @@ class RBF(Features):
         chosen = places(self.states, order, 2)
         if self.centers is None:
             if chosen.size > len(_PRIMES):
-                raise ValueError(f"states = {self.states!r}: must be at most {len(_PRIMES)}, or centers must be given")
-            centers = 2.0 * np.array([[_radical_inverse(i + 1, _PRIMES[k]) for k in range(chosen.size)] for i in range(self.count)]) - 1.0
+                raise ValueError(
+                    f"states = {self.states!r}: must be at most {len(_PRIMES)}, or centers must be given"
+                )
+            centers = (
+                2.0
+                * np.array(
+                    [
+                        [_radical_inverse(i + 1, _PRIMES[k]) for k in range(chosen.size)]
+                        for i in range(self.count)
+                    ]
+                )
+                - 1.0
+            )
         else:
             centers = checks.matrix("centers", self.centers, columns=chosen.size)
         width = 2.0 * self.count ** (-1.0 / chosen.size) if self.width is None else self.width

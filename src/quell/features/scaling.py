@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.dispatch import is_finite, kernel
+from quell.kernels.dispatch import is_finite, kernel
 from quell.observers.eso import ESO
 from quell.types import Vector
 

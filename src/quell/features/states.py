@@ -17,7 +17,9 @@ def check_states(states: Sequence[int] | None) -> None:
     if states is None:
         return
     if not isinstance(states, tuple | list) or len(states) == 0:
-        raise ValueError(f"states = {states!r}: must be a tuple of the numbers of states, for example (1, 2)")
+        raise ValueError(
+            f"states = {states!r}: must be a tuple of the numbers of states, for example (1, 2)"
+        )
     for i, state in enumerate(states):
         checks.whole(f"states[{i}]", state, 1)
     if len(set(states)) < len(states):
@@ -35,5 +37,7 @@ def places(states: Sequence[int] | None, order: int, default: int | None = None)
     if states is None:
         return np.arange(order if default is None else min(order, default))
     if max(states) > order:
-        raise ValueError(f"states = {states!r}: a plant of order {order} has no state {max(states)}")
+        raise ValueError(
+            f"states = {states!r}: a plant of order {order} has no state {max(states)}"
+        )
     return np.array(states, dtype=np.int64) - 1

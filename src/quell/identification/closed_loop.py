@@ -18,9 +18,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from quell.identification.initial_estimate import cost, equation, stable
 from quell.identification.output_error import Refined
 from quell.identification.sampling import chain, sampled, states
-from quell.identification.start import cost, equation, stable
 from quell.identification.structure import Structure, linear_columns
 from quell.types import Matrix, Vector
 
@@ -49,7 +49,10 @@ def instrumental(structure: Structure, theta: Vector, v: Matrix, y: Vector, r: V
         after = np.linalg.lstsq(left, projected.T @ target, rcond=1e-12)[0] / size
         if not np.all(np.isfinite(after)):
             break
-        moved, theta = float(np.max(np.abs((after - theta) * size)) / np.max(np.abs(theta * size))), after
+        moved, theta = (
+            float(np.max(np.abs((after - theta) * size)) / np.max(np.abs(theta * size))),
+            after,
+        )
         if moved < _ENOUGH:
             converged = True
             break
@@ -57,7 +60,9 @@ def instrumental(structure: Structure, theta: Vector, v: Matrix, y: Vector, r: V
     edges = np.linspace(0, y.size, max(_BLOCKS, 4 * theta.size) + 1).astype(int)
     scores = np.array([left_over[i:j] @ projected[i:j] for i, j in pairwise(edges)])
     half = np.linalg.pinv(left, rcond=1e-12) @ scores.T
-    return Refined(theta, half @ half.T / np.outer(size, size), cost(structure, theta, v, y), converged)
+    return Refined(
+        theta, half @ half.T / np.outer(size, size), cost(structure, theta, v, y), converged
+    )
 
 
 def _answers(a: Vector, r: Vector) -> Matrix:
@@ -65,14 +70,18 @@ def _answers(a: Vector, r: Vector) -> Matrix:
     poles = np.abs(np.roots(np.append(1.0, a[::-1])))
     fast = float(np.clip(np.max(poles), 1e-4, 1.0))
     bank = chain(a, r)
-    laguerre = [_laguerre(rate, signal) for rate in (fast, 0.2 * fast) for signal in (r, bank[:, -1])]
+    laguerre = [
+        _laguerre(rate, signal) for rate in (fast, 0.2 * fast) for signal in (r, bank[:, -1])
+    ]
     return np.column_stack([r, bank, *laguerre])
 
 
 def _laguerre(rate: float, signal: Vector) -> Matrix:
     """Return ``√(2 λ) (p − λ)^(k−1)/(p + λ)^k`` times the signal, k = 1 … K (N, K)."""
     A = -rate * np.eye(_LAGUERRE) - 2.0 * rate * np.tril(np.ones((_LAGUERRE, _LAGUERRE)), -1)
-    return states(sampled(A, np.full((_LAGUERRE, 1), np.sqrt(2.0 * rate)), straight=True), signal[:, None])
+    return states(
+        sampled(A, np.full((_LAGUERRE, 1), np.sqrt(2.0 * rate)), straight=True), signal[:, None]
+    )
 
 
 def _normalised(columns: Matrix) -> Matrix:

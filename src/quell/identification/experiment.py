@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from quell.controllers.linear import LinearController, LinearLaw
-from quell.identification.design import Excitation
-from quell.identification.records import Measured
+from quell.controllers.linear.linear import LinearController, LinearLaw
+from quell.identification.excitation import Excitation
+from quell.identification.measured import Measured
 from quell.simulation import Scenario, simulate
 
 
@@ -35,5 +35,9 @@ def excited(plant: Any, design: Excitation) -> Measured:
     nothing = np.zeros(0)
     through = LinearLaw(np.zeros((0, 0)), nothing, nothing, nothing, nothing, 1.0, 0.0)
     duration = (design.u.size - 1) * design.dt
-    run = simulate(plant, LinearController(through, design.dt), Scenario(reference=design.signal, duration=duration))
+    run = simulate(
+        plant,
+        LinearController(through, design.dt),
+        Scenario(reference=design.signal, duration=duration),
+    )
     return Measured(run["u"], run["y_measured"], design.dt, None)

@@ -31,7 +31,9 @@ def measured_sign(y: Vector, half_width: int) -> Vector:
     return -np.sign(y[ahead] - y[behind])
 
 
-def free_run(structure: Structure, theta: Vector, v: Matrix, own_friction: bool = False) -> tuple[Vector, Matrix]:
+def free_run(
+    structure: Structure, theta: Vector, v: Matrix, own_friction: bool = False
+) -> tuple[Vector, Matrix]:
     """Return y (N,) and the inputs; with ``own_friction`` those of friction are taken from the model's own speeds.
 
     ``structure.rubbing`` has 1/ω_a² for each of them [samples²], 0.0 for that of what is measured.
@@ -45,7 +47,9 @@ def free_run(structure: Structure, theta: Vector, v: Matrix, own_friction: bool 
     # y' and y‴ without what the inputs feed through; y = x_1
     slope = A[0]
     third = slope @ A @ A
-    x, inputs = states_with_friction(system, v, np.array([slope + weight * third for weight in structure.rubbing]), start)
+    x, inputs = states_with_friction(
+        system, v, np.array([slope + weight * third for weight in structure.rubbing]), start
+    )
     return x[:, 0], inputs
 
 

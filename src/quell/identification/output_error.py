@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.start import cost
+from quell.identification.initial_estimate import cost
 from quell.identification.structure import Structure, gradient
 from quell.types import Matrix, Vector
 
@@ -59,7 +59,10 @@ def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: in
             near = _linearised(structure, theta, v, y)
         else:
             # What is left of e in the range of its gradient may be no more than rounding.
-            converged = bool(near.right @ np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0] <= _ENOUGH * best * y.size)
+            converged = bool(
+                near.right @ np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0]
+                <= _ENOUGH * best * y.size
+            )
             damping = max(10.0 * damping, 1e-8)
         converged = converged or best <= rounding or damping > _GIVE_UP
     if not near.finite:
@@ -106,4 +109,6 @@ def _linearised(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _N
     blocks = min(max(4 * theta.size, 60), y.size)
     edges = np.linspace(0, y.size, blocks + 1).astype(int)
     scores = np.array([error[i:j] @ psi[i:j] for i, j in pairwise(edges)]) / size
-    return _Near(size, hessian / np.outer(size, size), np.sum(scores, axis=0), scores, power, finite)
+    return _Near(
+        size, hessian / np.outer(size, size), np.sum(scores, axis=0), scores, power, finite
+    )

@@ -6,12 +6,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quell.plotting import draw
+from quell.records.plotting import draw
 
 if TYPE_CHECKING:
-    from quell.identification.identified import Identified
+    from quell.identification.result import Identified
 
-_MOSAIC: Any = [["gain", "output"], ["gain", "output"], ["phase", "error"], ["phase", "auto"], ["coherence", "cross"]]
+_MOSAIC: Any = [
+    ["gain", "output"],
+    ["gain", "output"],
+    ["phase", "error"],
+    ["phase", "auto"],
+    ["coherence", "cross"],
+]
 _PLACES = ("gain", "phase", "coherence", "output", "error", "auto", "cross")
 # Below this coherence the empirical response says nothing.
 _COHERENT = 0.5
@@ -41,11 +47,23 @@ def _draw_bode(found: Identified, gain: Any, phase: Any, coherence: Any) -> None
     good = empirical.coherence > _COHERENT
     omega = np.geomspace(empirical.omega[0], empirical.omega[-1], 2000)
     model = found.response(omega)
-    gain.loglog(empirical.omega[good], np.abs(empirical.response[good]), ".", color="0.6", markersize=3.0, label="empirical")
+    gain.loglog(
+        empirical.omega[good],
+        np.abs(empirical.response[good]),
+        ".",
+        color="0.6",
+        markersize=3.0,
+        label="empirical",
+    )
     gain.loglog(omega, np.abs(model), color="C0", label="model")
     degrees = np.degrees(np.unwrap(np.angle(model)))
     # The phase of the record is that within half a turn of the model's.
-    measured = np.degrees(np.angle(empirical.response * np.exp(-1j * np.radians(np.interp(empirical.omega, omega, degrees)))))
+    measured = np.degrees(
+        np.angle(
+            empirical.response
+            * np.exp(-1j * np.radians(np.interp(empirical.omega, omega, degrees)))
+        )
+    )
     measured += np.interp(empirical.omega, omega, degrees)
     phase.semilogx(empirical.omega[good], measured[good], ".", color="0.6", markersize=3.0)
     phase.semilogx(omega, degrees, color="C0")
@@ -56,9 +74,15 @@ def _draw_bode(found: Identified, gain: Any, phase: Any, coherence: Any) -> None
         ax.set_xlim(omega[0], omega[-1])
     inside = np.abs(empirical.response[good])
     if inside.size:
-        gain.set_ylim(0.3 * np.min(inside), 3.0 * max(np.max(inside), float(np.max(np.abs(model[omega >= empirical.omega[good][0]])))))
+        gain.set_ylim(
+            0.3 * np.min(inside),
+            3.0
+            * max(np.max(inside), float(np.max(np.abs(model[omega >= empirical.omega[good][0]])))),
+        )
         shown = degrees[(omega <= empirical.omega[good][-1])]
-        phase.set_ylim(min(np.min(measured[good]), np.min(shown)) - 30.0, np.max(measured[good]) + 30.0)
+        phase.set_ylim(
+            min(np.min(measured[good]), np.min(shown)) - 30.0, np.max(measured[good]) + 30.0
+        )
     gain.legend(fontsize="small")
     coherence.set_xlabel("ω [rad/s]")
 
@@ -66,10 +90,24 @@ def _draw_bode(found: Identified, gain: Any, phase: Any, coherence: Any) -> None
 def _draw_output(found: Identified, output: Any, error: Any) -> None:
     t, split = found.t, found.held_from
     draw(output, t, found.y, color="0.6", linewidth=2.5, label="measured")
-    draw(output, t[:split], found.simulated[:split], color="C0", linewidth=1.0, label=f"simulated, {found.fits['estimation']:.2f} %")
+    draw(
+        output,
+        t[:split],
+        found.simulated[:split],
+        color="C0",
+        linewidth=1.0,
+        label=f"simulated, {found.fits['estimation']:.2f} %",
+    )
     draw(error, t[:split], (found.y - found.simulated)[:split], color="C0", linewidth=0.8)
     if split < t.size:
-        draw(output, t[split:], found.simulated[split:], color="C1", linewidth=1.0, label=f"held out, {found.fits['held out']:.2f} %")
+        draw(
+            output,
+            t[split:],
+            found.simulated[split:],
+            color="C1",
+            linewidth=1.0,
+            label=f"held out, {found.fits['held out']:.2f} %",
+        )
         draw(error, t[split:], (found.y - found.simulated)[split:], color="C1", linewidth=0.8)
     output.set_ylabel("output")
     output.legend(fontsize="small")
@@ -81,7 +119,9 @@ def _draw_output(found: Identified, output: Any, error: Any) -> None:
 def _draw_tests(found: Identified, auto: Any, cross: Any) -> None:
     left = found.residuals
     lags, both = np.arange(left.lags + 1), np.arange(-left.lags, left.lags + 1)
-    bound = 2.576 / np.sqrt(max(found.y.size - found.held_from, 1) if found.held_from < found.y.size else found.y.size)
+    bound = 2.576 / np.sqrt(
+        max(found.y.size - found.held_from, 1) if found.held_from < found.y.size else found.y.size
+    )
     for ax, x, values, limit, label in (
         (auto, lags, left.autocorrelation, bound, "correlation\nof the error"),
         (cross, both, left.cross_correlation, left.cross_limit, "with u"),

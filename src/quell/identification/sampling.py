@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.discretize import zero_order_hold
-from quell.dispatch import compiled
+from quell.kernels.dispatch import compiled
+from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
 # Far below what matters in any unit, far above where processors become slow.
@@ -67,7 +67,17 @@ def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Any) -> None:
 
 
 @compiled
-def _gradient(one: Sampled, bank: Matrix, columns: Any, both: Sampled, x: Vector, skipped: int, v: Matrix, y: Vector, out: Matrix) -> None:
+def _gradient(
+    one: Sampled,
+    bank: Matrix,
+    columns: Any,
+    both: Sampled,
+    x: Vector,
+    skipped: int,
+    v: Matrix,
+    y: Vector,
+    out: Matrix,
+) -> None:
     """Write y (N,) and its derivatives ``out`` (N, size); see ``structure.gradient``.
 
     ``one`` is the filter on each input, ``bank`` (2, n, inputs) has room for its states now and then, ``columns`` (n, inputs) says where
@@ -102,7 +112,9 @@ def _gradient(one: Sampled, bank: Matrix, columns: Any, both: Sampled, x: Vector
 
 
 @compiled
-def _states_with_friction(phi: Matrix, gamma: Matrix, v: Matrix, speeds: Matrix, x: Vector, out: Matrix) -> None:
+def _states_with_friction(
+    phi: Matrix, gamma: Matrix, v: Matrix, speeds: Matrix, x: Vector, out: Matrix
+) -> None:
     """As ``_states`` for held inputs, the last of which are written: minus the signs of ``speeds`` (frictions, n) times the state."""
     n, m = gamma.shape
     first = m - speeds.shape[0]
@@ -150,7 +162,11 @@ def sampled(A: Matrix, B: Matrix, straight: bool = False) -> Sampled:
     block = np.zeros((n + m, n + m))
     block[:n, :n], block[:n, n:] = A, B
     phi, (slope,) = zero_order_hold(block, [np.eye(n + m)[:, n:]], 1.0)
-    return Sampled(np.ascontiguousarray(phi[:n, :n]), np.ascontiguousarray(phi[:n, n:]), np.ascontiguousarray(slope[:n]))
+    return Sampled(
+        np.ascontiguousarray(phi[:n, :n]),
+        np.ascontiguousarray(phi[:n, n:]),
+        np.ascontiguousarray(slope[:n]),
+    )
 
 
 def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
@@ -162,10 +178,19 @@ def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
     return out
 
 
-def states_with_friction(system: Sampled, v: Matrix, speeds: Matrix, x0: Vector) -> tuple[Matrix, Matrix]:
+def states_with_friction(
+    system: Sampled, v: Matrix, speeds: Matrix, x0: Vector
+) -> tuple[Matrix, Matrix]:
     """Return the states and the inputs, of which the last are minus the signs of ``speeds`` (frictions, n) times the state."""
     out, inputs = np.empty((v.shape[0], x0.size)), np.array(v, order="C")
-    _states_with_friction(system.phi, system.gamma, inputs, np.ascontiguousarray(speeds), np.array(x0, dtype=np.float64), out)
+    _states_with_friction(
+        system.phi,
+        system.gamma,
+        inputs,
+        np.ascontiguousarray(speeds),
+        np.array(x0, dtype=np.float64),
+        out,
+    )
     return out, inputs
 
 
@@ -182,7 +207,9 @@ def chains(a: Vector, v: Matrix) -> Any:
     return out
 
 
-def gradient(a: Vector, B: Matrix, start: Vector, columns: Any, skipped: int, v: Matrix, size: int) -> tuple[Vector, Matrix]:
+def gradient(
+    a: Vector, B: Matrix, start: Vector, columns: Any, skipped: int, v: Matrix, size: int
+) -> tuple[Vector, Matrix]:
     """Return y (N,) of a model in observable companion form, from the state ``start``, and its derivatives (N, size).
 
     The first are ``−p^i/A y`` for i from ``skipped`` on, the others the states of ``chains`` that ``columns`` (n, inputs + 1) gives a
@@ -196,7 +223,17 @@ def gradient(a: Vector, B: Matrix, start: Vector, columns: Any, skipped: int, v:
     x, bank = np.zeros((2, 2 * n)), np.zeros((2, n, v.shape[1] + 1))
     x[0, :n], bank[0] = start, _first(n, v.shape[1] + 1)
     y, out = np.empty(v.shape[0]), np.empty((v.shape[0], size))
-    _gradient(sampled(*companion(a)), bank, columns, sampled(A, both), x, skipped, _with_impulse(v), y, out)
+    _gradient(
+        sampled(*companion(a)),
+        bank,
+        columns,
+        sampled(A, both),
+        x,
+        skipped,
+        _with_impulse(v),
+        y,
+        out,
+    )
     return y, out
 
 

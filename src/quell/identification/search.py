@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.identification.friction import free_run, measured_sign, resonance
+from quell.identification.initial_estimate import started
 from quell.identification.output_error import Refined, promised, refined
-from quell.identification.start import started
 from quell.identification.structure import Structure
 from quell.types import Matrix, Vector
 
@@ -43,7 +43,11 @@ class Fit(NamedTuple):
 
     def inputs(self, u: Vector) -> Matrix:
         """Return the inputs (N, inputs) for ``u``; those of friction are zero, ``free_run`` fills them in."""
-        columns = [delayed(u, self.late), *([np.ones(u.size)] if self.bias else []), *[np.zeros(u.size)] * len(self.structure.rubbing)]
+        columns = [
+            delayed(u, self.late),
+            *([np.ones(u.size)] if self.bias else []),
+            *[np.zeros(u.size)] * len(self.structure.rubbing),
+        ]
         return np.column_stack(columns)
 
 
@@ -52,16 +56,35 @@ def delayed(u: Vector, late: int) -> Vector:
     return u if late == 0 else np.concatenate([np.full(late, u[0]), u[:-late]])
 
 
-def fit(u: Vector, y: Vector, order: int, zeros: int, integrators: int | None, late: tuple[int, int], bias: bool, friction: bool) -> Fit:
+def fit(
+    u: Vector,
+    y: Vector,
+    order: int,
+    zeros: int,
+    integrators: int | None,
+    late: tuple[int, int],
+    bias: bool,
+    friction: bool,
+) -> Fit:
     """Return the model of least output error; ``late`` is the range of delays [samples] that is looked through."""
     degrees = (zeros, *([0] if bias else []), *([max(order - 2, 0)] if friction else []))
     structure = Structure(order, integrators or 0, degrees, (0.0,) if friction else ())
-    v = np.column_stack([delayed(u, late[0]), *([np.ones(u.size)] if bias else []), *([measured_sign(y, _HALF_WIDTH)] if friction else [])])
+    v = np.column_stack(
+        [
+            delayed(u, late[0]),
+            *([np.ones(u.size)] if bias else []),
+            *([measured_sign(y, _HALF_WIDTH)] if friction else []),
+        ]
+    )
     starts = started(structure, v, y)
     steps = _BRIEFLY if len(starts) == 1 else _THOROUGHLY
-    found = min((refined(structure, theta, v, y, steps) for theta in starts), key=lambda one: one.cost)
+    found = min(
+        (refined(structure, theta, v, y, steps) for theta in starts), key=lambda one: one.cost
+    )
     if not np.isfinite(found.cost):
-        raise ValueError(f"order = {order}, zeros = {zeros}: no model was found whose output is finite; lower the order, or scale u and y")
+        raise ValueError(
+            f"order = {order}, zeros = {zeros}: no model was found whose output is finite; lower the order, or scale u and y"
+        )
     samples, found, v = _latest(structure, found, u, v, y, late, late[0])
     if integrators is None:
         structure, found = _with_integrator(structure, found, v, y)
@@ -94,7 +117,9 @@ def _settled(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tupl
     return refined(structure, found.theta, v, y, _THOROUGHLY), v
 
 
-def _driven(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Structure, Refined, Matrix]:
+def _driven(
+    structure: Structure, found: Refined, v: Matrix, y: Vector
+) -> tuple[Structure, Refined, Matrix]:
     """Return the structure with friction on what is driven too, where there is a resonance to tell the two apart; parameters and inputs."""
     from scipy.optimize import minimize_scalar
 
@@ -115,18 +140,28 @@ def _driven(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple
         candidate = wider._replace(rubbing=(1.0 / (share * omega**2), 0.0))
         value, after = min(tried, key=lambda one: one[0])[2] if tried else theta, 0.0
         for _ in range(2):
-            after, value = promised(candidate, value, free_run(candidate, value, v, own_friction=True)[1], y)
+            after, value = promised(
+                candidate, value, free_run(candidate, value, v, own_friction=True)[1], y
+            )
         tried.append((after, candidate, value))
         return after
 
-    minimize_scalar(error, bounds=_SHARES, method="bounded", options={"xatol": 1e-2, "maxiter": _TRIALS})
+    minimize_scalar(
+        error, bounds=_SHARES, method="bounded", options={"xatol": 1e-2, "maxiter": _TRIALS}
+    )
     _, wider, theta = min(tried, key=lambda one: one[0])
     v = free_run(wider, theta, v, own_friction=True)[1]
     return wider, refined(wider, theta, v, y, _BRIEFLY), v
 
 
 def _latest(
-    structure: Structure, found: Refined, u: Vector, v: Matrix, y: Vector, late: tuple[int, int], now: int
+    structure: Structure,
+    found: Refined,
+    u: Vector,
+    v: Matrix,
+    y: Vector,
+    late: tuple[int, int],
+    now: int,
 ) -> tuple[int, Refined, Matrix]:
     """Return the delay of least output error, found going down from ``now`` in steps of 8, 4, 2, 1; the parameters and inputs with it."""
 
@@ -144,23 +179,32 @@ def _latest(
     return now, known[now], moved(now)
 
 
-def _with_integrator(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Structure, Refined]:
+def _with_integrator(
+    structure: Structure, found: Refined, v: Matrix, y: Vector
+) -> tuple[Structure, Refined]:
     """Return the structure with one or two poles at s = 0, and its parameters, where the slowest can't be told from that."""
     if structure.integrators:
         return structure, found
     a, free, covariance = structure.denominator(found.theta), structure.free, found.covariance
     # An integrator whose zero can't be told from s = 0 either is none: the two cancel.
-    if structure.degrees[0] and abs(found.theta[free]) < _DEVIATIONS * np.sqrt(covariance[free, free]):
+    if structure.degrees[0] and abs(found.theta[free]) < _DEVIATIONS * np.sqrt(
+        covariance[free, free]
+    ):
         return structure, found
     poles = np.roots(np.append(1.0, a[::-1]))
     slow = poles[np.argsort(np.abs(poles))][:2]
     for count, limit in ((2, _PAIR), (1, _DEVIATIONS**2)):
         if count > slow.size or (count == 1 and abs(slow[0].imag) > 0.0):
             continue
-        if abs(slow[count - 1]) * _SLOWER * y.size < 1.0 or _squares(a, covariance[: a.size, : a.size], slow[:count]) < limit:
+        if (
+            abs(slow[count - 1]) * _SLOWER * y.size < 1.0
+            or _squares(a, covariance[: a.size, : a.size], slow[:count]) < limit
+        ):
             fewer = structure._replace(integrators=count)
             without = refined(fewer, found.theta[count:], v, y, _BRIEFLY)
-            if without.cost <= _AS_GOOD[count - 1] * found.cost or without.cost <= _ROUNDING * float(np.mean(y**2)):
+            if without.cost <= _AS_GOOD[
+                count - 1
+            ] * found.cost or without.cost <= _ROUNDING * float(np.mean(y**2)):
                 return fewer, without
     return structure, found
 
@@ -181,7 +225,9 @@ def _squares(a: Vector, covariance: Matrix, roots: Any) -> float:
 
 def _slope(a: Vector, root: complex) -> Vector:
     """Return the derivatives of a root of ``p^n + a_{n−1} p^(n−1) + …`` by its ``a``."""
-    found: Vector = -(root ** np.arange(a.size)) / np.polyval(np.polyder(np.append(1.0, a[::-1])), root)
+    found: Vector = -(root ** np.arange(a.size)) / np.polyval(
+        np.polyder(np.append(1.0, a[::-1])), root
+    )
     return found
 
 

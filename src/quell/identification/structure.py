@@ -66,19 +66,32 @@ class Structure(NamedTuple):
         """Return what each parameter is multiplied with when time is counted in units ``unit`` times as long."""
         n = self.order
         parts = [unit ** (n - np.arange(degree + 1.0)) for degree in self.degrees]
-        return np.concatenate([unit ** (n - np.arange(float(self.integrators), n)), *parts, unit ** (n - 1.0 - np.arange(n))])
+        return np.concatenate(
+            [
+                unit ** (n - np.arange(float(self.integrators), n)),
+                *parts,
+                unit ** (n - 1.0 - np.arange(n)),
+            ]
+        )
 
 
 def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
     """Return the derivatives of y by all parameters but those of A, which it is linear in (N, size − free)."""
     bank = chains(a, v)
-    return np.hstack([bank[:, : degree + 1, j] for j, degree in enumerate((*structure.degrees, structure.order - 1))])
+    return np.hstack(
+        [
+            bank[:, : degree + 1, j]
+            for j, degree in enumerate((*structure.degrees, structure.order - 1))
+        ]
+    )
 
 
 def output(structure: Structure, theta: Vector, v: Matrix) -> Vector:
     """Return y (N,) for the inputs ``v`` (N, inputs)."""
     B = np.ascontiguousarray(structure.numerators(theta)[:, ::-1].T)
-    return states(sampled(observable(structure.denominator(theta)), B), v, structure.start(theta)[::-1])[:, 0]
+    return states(
+        sampled(observable(structure.denominator(theta)), B), v, structure.start(theta)[::-1]
+    )[:, 0]
 
 
 def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Matrix]:

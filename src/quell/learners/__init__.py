@@ -2,15 +2,15 @@
 
 from quell.learners.adapters import JaxModel, PythonModel, RiverModel, SklearnModel, TorchModel
 from quell.learners.base import Learner, NoLearner
-from quell.learners.gradient import BatchGradient
-from quell.learners.harmonic import Harmonic
-from quell.learners.kalman import Kalman
-from quell.learners.model import Model, infer, learn
-from quell.learners.network import MLP
-from quell.learners.nlms import NLMS
-from quell.learners.online import Online
-from quell.learners.process import GaussianProcess
-from quell.learners.rls import RLS
+from quell.learners.gradient.gradient import BatchGradient
+from quell.learners.kalman.harmonic import Harmonic
+from quell.learners.kalman.kalman import Kalman
+from quell.learners.online.gaussian_process import GaussianProcess
+from quell.learners.online.model import Model, infer, learn
+from quell.learners.online.network import MLP
+from quell.learners.online.online import Online
+from quell.learners.regression.nlms import NLMS
+from quell.learners.regression.rls import RLS
 
 __all__ = [
     "MLP",

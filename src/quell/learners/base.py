@@ -22,8 +22,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from quell import tryout
-from quell.dispatch import generic
+from quell.kernels import validation
+from quell.kernels.dispatch import generic
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -42,7 +42,9 @@ class Learner(Protocol):
 
 
 @generic
-def adapt(learner: Any, memory: Any, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
+def adapt(
+    learner: Any, memory: Any, seen: Vector, y: float, u_before: float, f_plain: float
+) -> None:
     """Learn from ``seen = (x̂_1 … x̂_n, Δf̂)``, the measurement it follows from and the control signal applied before it.
 
     ``f_plain = Δf̂ + f_L^F`` is what an ESO without learner would have estimated: f, as the observer shows it (``lag.py``).
@@ -93,29 +95,53 @@ def tried(learner: Any, observer: ESO, omega_c: float) -> Any:
     ValueError
         that names the learner's class and the rule, for whatever is wrong.
     """
-    if not tryout.of_users(learner):
+    if not validation.of_users(learner):
         return learner.design(observer, omega_c)
     name, order = type(learner).__name__, observer.order
     what = f"{name}.design(observer, {omega_c:g})"
-    parameters = tryout.attempt(what, "design takes (observer, omega_c)", learner.design, observer, omega_c)
-    tryout.named_tuple(what, parameters, "numbers and arrays")
-    tryout.registered(name, parameters, adapt, predict, commit, restart, coefficients)
-    memory = tryout.attempt(f"{name}.memory(...)", "memory takes (parameters)", learner.memory, parameters)
-    tryout.arrays(f"{name}.memory", memory, nested=True)
-    names = tryout.attempt(f"{name}.feature_names({order})", "feature_names takes the plant's order", learner.feature_names, order)
+    parameters = validation.attempt(
+        what, "design takes (observer, omega_c)", learner.design, observer, omega_c
+    )
+    validation.named_tuple(what, parameters, "numbers and arrays")
+    validation.registered(name, parameters, adapt, predict, commit, restart, coefficients)
+    memory = validation.attempt(
+        f"{name}.memory(...)", "memory takes (parameters)", learner.memory, parameters
+    )
+    validation.arrays(f"{name}.memory", memory, nested=True)
+    names = validation.attempt(
+        f"{name}.feature_names({order})",
+        "feature_names takes the plant's order",
+        learner.feature_names,
+        order,
+    )
     if not isinstance(names, tuple) or not all(isinstance(label, str) for label in names):
-        raise ValueError(f"{name}.feature_names({order}) returns {names!r}: must return a tuple with a name for each coefficient")
-    seen, rule = tryout.wave(order + 1), "docs/extend says what it is given"
-    tryout.attempt_kernel(f"{name}: adapt", rule, adapt, parameters, memory, seen, 0.9, 0.5, 0.1)
-    predicted = tryout.attempt_kernel(f"{name}: predict", rule, predict, parameters, memory, seen, 0.5)
-    if predicted is not tryout.UNKNOWN:
+        raise ValueError(
+            f"{name}.feature_names({order}) returns {names!r}: must return a tuple with a name for each coefficient"
+        )
+    seen, rule = validation.wave(order + 1), "docs/extend says what it is given"
+    validation.attempt_kernel(
+        f"{name}: adapt", rule, adapt, parameters, memory, seen, 0.9, 0.5, 0.1
+    )
+    predicted = validation.attempt_kernel(
+        f"{name}: predict", rule, predict, parameters, memory, seen, 0.5
+    )
+    if predicted is not validation.UNKNOWN:
         if not (isinstance(predicted, tuple) and len(predicted) == 2):
-            raise ValueError(f"{name}: predict returns {predicted!r}: must return (constant, slope), two numbers")
+            raise ValueError(
+                f"{name}: predict returns {predicted!r}: must return (constant, slope), two numbers"
+            )
         for label, value in zip(("constant", "slope"), predicted, strict=True):
-            tryout.number(f"{name}: predict, {label},", value)
-    tryout.attempt_kernel(f"{name}: commit", rule, commit, parameters, memory, seen, 0.5, 0.1)
-    tryout.attempt_kernel(f"{name}: coefficients", f"it has {len(names)} names", coefficients, parameters, memory, np.zeros(len(names)))
-    tryout.attempt_kernel(f"{name}: restart", rule, restart, parameters, memory)
+            validation.number(f"{name}: predict, {label},", value)
+    validation.attempt_kernel(f"{name}: commit", rule, commit, parameters, memory, seen, 0.5, 0.1)
+    validation.attempt_kernel(
+        f"{name}: coefficients",
+        f"it has {len(names)} names",
+        coefficients,
+        parameters,
+        memory,
+        np.zeros(len(names)),
+    )
+    validation.attempt_kernel(f"{name}: restart", rule, restart, parameters, memory)
     return parameters
 
 
@@ -147,17 +173,28 @@ class NoLearnerMemory(NamedTuple):
 
 
 @adapt.register(NoLearnerDesign)
-def _adapt(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
+def _adapt(
+    learner: NoLearnerDesign,
+    memory: NoLearnerMemory,
+    seen: Vector,
+    y: float,
+    u_before: float,
+    f_plain: float,
+) -> None:
     pass
 
 
 @predict.register(NoLearnerDesign)
-def _predict(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u_before: float) -> tuple[float, float]:
+def _predict(
+    learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u_before: float
+) -> tuple[float, float]:
     return 0.0, 0.0
 
 
 @commit.register(NoLearnerDesign)
-def _commit(learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u: float, f_learned: float) -> None:
+def _commit(
+    learner: NoLearnerDesign, memory: NoLearnerMemory, seen: Vector, u: float, f_learned: float
+) -> None:
     pass
 
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.dispatch import generic
+from quell.kernels.dispatch import generic
 from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
 from quell.observers.response import f_lag, f_shadow, own_response, response
@@ -104,7 +104,9 @@ def group_delay(observer: ESO) -> float:
         return f_lag(own_response(observer))
     lag = _chain(observer)
     stage = np.arange(lag.taps.size)
-    return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (1.0 if lag.predictor else 0.0)
+    return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (
+        1.0 if lag.predictor else 0.0
+    )
 
 
 def _chain(observer: ESO) -> Lag:

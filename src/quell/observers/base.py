@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quell.dispatch import generic, kernel
+from quell.kernels.dispatch import generic, kernel
 from quell.types import Vector
 
 

@@ -45,7 +45,9 @@ class CascadeModel(NamedTuple):
 
 
 @observe.register(CascadeModel)
-def _observe(model: CascadeModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
+def _observe(
+    model: CascadeModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float
+) -> None:
     levels, size = model.gains.shape
     target, told, found = y, f_learned, 0.0
     for level in range(levels):
@@ -77,4 +79,6 @@ def _begin(model: CascadeModel, z: Vector, seen: Vector, y: float) -> None:
 def cascade_model(levels: Sequence[Any]) -> CascadeModel:
     """Return the cascade of these ``EsoModel``, which differ in their gain only; the first one sees y."""
     first = levels[0]
-    return CascadeModel(first.transition, first.input, first.feed, np.array([level.gain for level in levels]))
+    return CascadeModel(
+        first.transition, first.input, first.feed, np.array([level.gain for level in levels])
+    )

@@ -36,7 +36,9 @@ class DelayedModel(NamedTuple):
 
 
 @observe.register(DelayedModel)
-def _observe(model: DelayedModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
+def _observe(
+    model: DelayedModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float
+) -> None:
     last = z.size - 1
     arriving = z[last]
     for i in range(last, model.size, -1):
@@ -72,7 +74,9 @@ def delayed_model(model: Any, delay: float, dt: float) -> Any:
     """
     samples = checks.samples("delay", delay, dt)
     if samples > _MOST_SAMPLES:
-        raise ValueError(f"delay = {delay!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES} samples; is it in seconds?")
+        raise ValueError(
+            f"delay = {delay!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES} samples; is it in seconds?"
+        )
     return model if samples == 0 else DelayedModel(model, model.states, samples)
 
 

@@ -29,9 +29,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.discretize import zero_order_hold
+from quell.lti.canonical import Canonical, canonical, spell
+from quell.lti.discretize import zero_order_hold
 from quell.observers.base import begin, begin_at, forecast, observe
-from quell.observers.canonical import Canonical, canonical, spell
 from quell.observers.delay import delayed_model, without_delay
 from quell.observers.forms import OtherForms
 from quell.observers.nonlinear import NonlinearModel
@@ -65,7 +65,9 @@ class EsoModel(NamedTuple):
 
 
 @observe.register(EsoModel)
-def _observe(model: EsoModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
+def _observe(
+    model: EsoModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float
+) -> None:
     forecast(model, z, seen, u, f_learned)
     error = y - seen[0]
     for i in range(z.size):
@@ -121,7 +123,15 @@ class ESO(OtherForms):
 
     @classmethod
     def model_free(
-        cls, order: int, b0: float, omega_o: float, dt: float, *, form: str = "current", half_gain: bool = False, delay: float = 0.0
+        cls,
+        order: int,
+        b0: float,
+        omega_o: float,
+        dt: float,
+        *,
+        form: str = "current",
+        half_gain: bool = False,
+        delay: float = 0.0,
     ) -> ESO:
         """Design an ESO that knows of the plant its order and nominal gain only (paper eq. (mfplant)).
 
@@ -196,13 +206,32 @@ class ESO(OtherForms):
                 f"plant has a zero at s = 0 (zeros from u: {spell(found.zeros)} rad/s): a constant f leaves no trace in y and can not be "
                 "estimated; measure another output"
             )
-        return cls._design(found, found.b if b0 is None else b0, omega_o, dt, form, half_gain, delay, checks.flag("keep_zeros", keep_zeros))
+        return cls._design(
+            found,
+            found.b if b0 is None else b0,
+            omega_o,
+            dt,
+            form,
+            half_gain,
+            delay,
+            checks.flag("keep_zeros", keep_zeros),
+        )
 
     @classmethod
     def _design(
-        cls, plant: Canonical, b0: float, omega_o: float, dt: float, form: str, half_gain: bool, delay: float, keep_zeros: bool = False
+        cls,
+        plant: Canonical,
+        b0: float,
+        omega_o: float,
+        dt: float,
+        form: str,
+        half_gain: bool,
+        delay: float,
+        keep_zeros: bool = False,
     ) -> ESO:
-        b0 = checks.nonzero("b0", b0, "it is the gain from u to the first derivative of y that u moves")
+        b0 = checks.nonzero(
+            "b0", b0, "it is the gain from u to the first derivative of y that u moves"
+        )
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         checks.one_of("form", form, FORMS)
         if omega_o * dt >= math.pi:
@@ -211,12 +240,26 @@ class ESO(OtherForms):
                 "no sampling can follow a bandwidth above half its rate; lower omega_o or dt"
             )
         if checks.flag("half_gain", half_gain) and form == "reduced":
-            raise ValueError("half_gain = True with form = 'reduced': half its gain is not of reduced order; use form='current'")
-        kept = plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)] if keep_zeros and plant.matched else np.zeros(0)
+            raise ValueError(
+                "half_gain = True with form = 'reduced': half its gain is not of reduced order; use form='current'"
+            )
+        kept = (
+            plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)]
+            if keep_zeros and plant.matched
+            else np.zeros(0)
+        )
         model = _sampled_design(plant, b0, omega_o, dt, form, kept)
         if half_gain:
             model = model._replace(gain=0.5 * model.gain)
-        return cls(plant, b0, omega_o, dt, form, delayed_model(model, delay, dt), form != "reduced" and not half_gain)
+        return cls(
+            plant,
+            b0,
+            omega_o,
+            dt,
+            form,
+            delayed_model(model, delay, dt),
+            form != "reduced" and not half_gain,
+        )
 
     def __repr__(self) -> str:
         kind = type(self.model).__name__.removesuffix("Model")
@@ -295,10 +338,14 @@ class ESO(OtherForms):
         """
         x = np.asarray(x_hat, dtype=np.float64)
         if x.ndim == 0 or x.shape[-1] != self.order:
-            raise ValueError(f"x_hat has shape {x.shape}: the last axis must have the {self.order} states")
+            raise ValueError(
+                f"x_hat has shape {x.shape}: the last axis must have the {self.order} states"
+            )
         S = self.plant.S
         size = np.linalg.norm(S, axis=1)
-        mapped: Vector = np.linalg.solve(S / size[:, None], (x / size).reshape(-1, self.order).T).T.reshape(x.shape)
+        mapped: Vector = np.linalg.solve(
+            S / size[:, None], (x / size).reshape(-1, self.order).T
+        ).T.reshape(x.shape)
         return mapped
 
 
@@ -321,7 +368,9 @@ def continuous_gain(a: Vector, omega_o: float) -> Vector:
     return ell[1:]
 
 
-def _sampled_design(plant: Canonical, b0: float, omega_o: float, dt: float, form: str, kept: Vector) -> EsoModel:
+def _sampled_design(
+    plant: Canonical, b0: float, omega_o: float, dt: float, form: str, kept: Vector
+) -> EsoModel:
     """Sample the extended model, in the coordinates ``x_i dt^(i−1)`` and ``f dt^q`` where all entries are O(1), and place the poles.
 
     That is done in the coordinates ``x_i/omega_o^(i−1)``, ``f/omega_o^q``: over a sample hardly anything happens there, but it is known

@@ -22,7 +22,15 @@ class OtherForms:
 
     @classmethod
     def cascade(
-        cls: Any, order: int, b0: float, omega_o: float, dt: float, *, levels: int = 2, ratio: float = 2.0, delay: float = 0.0
+        cls: Any,
+        order: int,
+        b0: float,
+        omega_o: float,
+        dt: float,
+        *,
+        levels: int = 2,
+        ratio: float = 2.0,
+        delay: float = 0.0,
     ) -> ESO:
         """Design a cascade of model-free observers (``cascade.py``): for the same rejection of disturbances, less noise in u.
 
@@ -44,16 +52,28 @@ class OtherForms:
         """
         p, ratio = checks.whole("levels", levels, 1, 8), checks.positive("ratio", ratio)
         if ratio <= 1.0:
-            raise ValueError(f"ratio = {ratio!r}: must be above 1, each level is faster than the one before")
+            raise ValueError(
+                f"ratio = {ratio!r}: must be above 1, each level is faster than the one before"
+            )
         last = cls.model_free(order, b0, omega_o, dt)
-        models = [cls.model_free(order, b0, omega_o / ratio ** (p - 1 - i), dt).model for i in range(p)]
+        models = [
+            cls.model_free(order, b0, omega_o / ratio ** (p - 1 - i), dt).model for i in range(p)
+        ]
         model = delayed_model(cascade_model(models), delay, dt)
         made: ESO = cls(last.plant, last.b0, last.omega_o, last.dt, "current", model, False)
         return made
 
     @classmethod
     def nonlinear(
-        cls: Any, order: int, b0: float, omega_o: float, dt: float, *, delta: float, alpha: Any = None, delay: float = 0.0
+        cls: Any,
+        order: int,
+        b0: float,
+        omega_o: float,
+        dt: float,
+        *,
+        delta: float,
+        alpha: Any = None,
+        delay: float = 0.0,
     ) -> ESO:
         """Design Han's nonlinear observer (``nonlinear.py``): the linear one while ``|y − z⁻_1|`` is below delta, gentler beyond.
 
@@ -75,12 +95,24 @@ class OtherForms:
         """
         linear = cls.model_free(order, b0, omega_o, dt)
         delta = checks.positive("delta", delta, "y-unit")
-        powers: Vector = 0.5 ** np.arange(order + 1.0) if alpha is None else checks.vector("alpha", alpha, order + 1)
+        powers: Vector = (
+            0.5 ** np.arange(order + 1.0)
+            if alpha is None
+            else checks.vector("alpha", alpha, order + 1)
+        )
         if not np.all((powers > 0.0) & (powers <= 1.0)):
             raise ValueError(f"alpha = {alpha!r}: each entry must be above 0 and at most 1")
         known = linear.model
         model = NonlinearModel(known.transition, known.input, known.feed, known.gain, powers, delta)
-        made: ESO = cls(linear.plant, linear.b0, linear.omega_o, linear.dt, "current", delayed_model(model, delay, dt), False)
+        made: ESO = cls(
+            linear.plant,
+            linear.b0,
+            linear.omega_o,
+            linear.dt,
+            "current",
+            delayed_model(model, delay, dt),
+            False,
+        )
         return made
 
     @classmethod
@@ -119,7 +151,10 @@ class OtherForms:
             naming the argument, its value and the rule.
         """
         n = checks.whole("order", order, 1, 8)
-        noise, drift = checks.positive("noise_variance", noise_variance), checks.positive("drift", drift)
+        noise, drift = (
+            checks.positive("noise_variance", noise_variance),
+            checks.positive("drift", drift),
+        )
         jitter, dt = checks.non_negative("jitter", jitter), checks.positive("dt", dt, "s")
         checks.one_of("form", form, ("current", "predictor"))
         gain, omega_o = kalman_gain(np.diag(np.ones(n), 1), dt, noise, drift, jitter)

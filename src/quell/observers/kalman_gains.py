@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from quell.discretize import gramian, zero_order_hold
+from quell.lti.discretize import gramian, zero_order_hold
 from quell.types import Matrix, Vector
 
 
-def kalman_gain(A: Matrix, dt: float, noise: float, drift: float, jitter: float) -> tuple[Vector, float]:
+def kalman_gain(
+    A: Matrix, dt: float, noise: float, drift: float, jitter: float
+) -> tuple[Vector, float]:
     """Return L (N,), in the coordinates of ``A`` (N, N), whose last state is f, and the geometric mean of ``|ln z_i|/dt`` [rad/s].
 
     Solved in units of time of the Butterworth pattern's, where neither Φ nor Q nor P has entries of very different size.
@@ -47,7 +49,11 @@ def kalman_gain(A: Matrix, dt: float, noise: float, drift: float, jitter: float)
     except (np.linalg.LinAlgError, ValueError):
         P = np.full((size, size), np.nan)
     gain = P[:, 0] / (P[0, 0] + R[0, 0])
-    poles = np.linalg.eigvals((np.eye(size) - np.outer(gain, C)) @ phi) if np.all(np.isfinite(gain)) else np.array([np.inf])
+    poles = (
+        np.linalg.eigvals((np.eye(size) - np.outer(gain, C)) @ phi)
+        if np.all(np.isfinite(gain))
+        else np.array([np.inf])
+    )
     with np.errstate(divide="ignore"):
         rate = float(np.exp(np.mean(np.log(np.abs(np.log(poles.astype(complex)))))))
     if not (np.max(np.abs(poles)) < 1.0 and rate < np.pi):

@@ -34,7 +34,10 @@ def _unit_noise_gains(size: int) -> Vector:
     s = 1j * omega
     gains = np.empty(size)
     for i in range(1, size + 1):
-        response = sum(math.comb(size, k) * s ** (size - k + i - 1) for k in range(i, size + 1)) / (s + 1.0) ** size
+        response = (
+            sum(math.comb(size, k) * s ** (size - k + i - 1) for k in range(i, size + 1))
+            / (s + 1.0) ** size
+        )
         gains[i - 1] = np.trapezoid(np.abs(response) ** 2, omega) / math.pi
     gains.flags.writeable = False
     return gains

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from quell.dispatch import kernel
+from quell.kernels.dispatch import kernel
 from quell.observers.base import begin, begin_at, forecast, observe
 from quell.types import Matrix, Vector
 
@@ -56,11 +56,17 @@ def fal(error: float, alpha: float, delta: float) -> float:
 
 
 @observe.register(NonlinearModel)
-def _observe(model: NonlinearModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
+def _observe(
+    model: NonlinearModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float
+) -> None:
     forecast(model, z, seen, u, f_learned)
     error = y - seen[0]
     for i in range(z.size):
-        seen[i] += model.gain[i] * model.delta ** (1.0 - model.alpha[i]) * fal(error, model.alpha[i], model.delta)
+        seen[i] += (
+            model.gain[i]
+            * model.delta ** (1.0 - model.alpha[i])
+            * fal(error, model.alpha[i], model.delta)
+        )
         z[i] = seen[i]
 
 

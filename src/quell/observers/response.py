@@ -34,7 +34,9 @@ def response(model: Any, estimates: int) -> Response:
         for a nonlinear observer, which has none.
     """
     if isinstance(without_delay(model), NonlinearModel):
-        raise ValueError("observer is nonlinear (ESO.nonlinear): it has no exact lag, which learners and guards need; use a linear one")
+        raise ValueError(
+            "observer is nonlinear (ESO.nonlinear): it has no exact lag, which learners and guards need; use a linear one"
+        )
     m = model.states
     after, seen = np.zeros((m, m + 3)), np.zeros((estimates, m + 3))
     for i in range(m + 3):
@@ -45,7 +47,9 @@ def response(model: Any, estimates: int) -> Response:
             values[i - m] = 1.0
         observe(model, z, shown, *values.tolist())
         after[:, i], seen[:, i] = z, shown
-    return Response(after[:, :m].copy(), after[:, m:].copy(), seen[:, :m].copy(), seen[:, m:].copy())
+    return Response(
+        after[:, :m].copy(), after[:, m:].copy(), seen[:, :m].copy(), seen[:, m:].copy()
+    )
 
 
 def f_shadow(found: Response) -> tuple[Matrix, Vector, Vector, float]:
@@ -57,7 +61,10 @@ def own_response(observer: Any) -> Response:
     """Return that of an ``ESO`` without its delay of u, in its own time: z as ``x_i/omega_o^(i−1)``, ``f/omega_o^q``; ``seen`` as it is."""
     n = observer.order
     found = response(without_delay(observer.model), n + 1)
-    units = np.resize(observer.omega_o ** np.append(np.arange(n, dtype=np.float64), observer.f_degree), found.transition.shape[0])
+    units = np.resize(
+        observer.omega_o ** np.append(np.arange(n, dtype=np.float64), observer.f_degree),
+        found.transition.shape[0],
+    )
     return found._replace(
         transition=found.transition * units[None, :] / units[:, None],
         inputs=found.inputs / units[:, None],

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from quell.dispatch import generic
+from quell.kernels.dispatch import generic
 from quell.types import Vector
 
 

@@ -29,31 +29,43 @@ class PlantBatch(Sequence[Plant]):
         where one is no plant, or is of another kind, order or number of disturbances than the first; the message says which.
     """
 
-    def __init__(self, plants: Sequence[Plant], parameters: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, plants: Sequence[Plant], parameters: Mapping[str, Any] | None = None
+    ) -> None:
         self._plants = tuple(plants)
         if not self._plants:
             raise ValueError("plants has no entries: a batch must hold at least one plant")
         for i, plant in enumerate(self._plants):
             if isinstance(plant, type) or not hasattr(plant, "sampled"):
-                raise ValueError(f"plant[{i}] = {plant!r}: must be a plant, for example quell.plants.LinearPlant.of(model)")
+                raise ValueError(
+                    f"plant[{i}] = {plant!r}: must be a plant, for example quell.plants.LinearPlant.of(model)"
+                )
             for what, (mine, first) in {
                 "kind": (type(plant).__name__, type(self._plants[0]).__name__),
                 "order": (plant.order, self._plants[0].order),
                 "disturbances": (plant.disturbances, self._plants[0].disturbances),
             }.items():
                 if mine != first:
-                    raise ValueError(f"plant[{i}] has {what} {mine}, plant[0] {first}: must be the same; run them as two batches")
+                    raise ValueError(
+                        f"plant[{i}] has {what} {mine}, plant[0] {first}: must be the same; run them as two batches"
+                    )
         arrays = {name: np.array(values) for name, values in (parameters or {}).items()}
         for name, array in arrays.items():
             if array.shape != (len(self._plants),):
-                raise ValueError(f"parameters[{name!r}] has shape {array.shape}: must be ({len(self._plants)},), one value for each plant")
+                raise ValueError(
+                    f"parameters[{name!r}] has shape {array.shape}: must be ({len(self._plants)},), one value for each plant"
+                )
             array.flags.writeable = False
         self.parameters: Mapping[str, NDArray[Any]] = MappingProxyType(arrays)
 
     @property
     def name(self) -> str:
         """Their name, where it is the same."""
-        return self._plants[0].name if len({plant.name for plant in self._plants}) == 1 else f"{len(self)} plants"
+        return (
+            self._plants[0].name
+            if len({plant.name for plant in self._plants}) == 1
+            else f"{len(self)} plants"
+        )
 
     @property
     def order(self) -> int:
@@ -74,7 +86,10 @@ class PlantBatch(Sequence[Plant]):
     def __getitem__(self, which: slice) -> PlantBatch: ...
     def __getitem__(self, which: int | slice) -> Plant | PlantBatch:
         if isinstance(which, slice):
-            return PlantBatch(self._plants[which], {name: values[which] for name, values in self.parameters.items()})
+            return PlantBatch(
+                self._plants[which],
+                {name: values[which] for name, values in self.parameters.items()},
+            )
         return self._plants[which]
 
 
@@ -109,13 +124,17 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
     for name, length in lengths.items():
         if length not in (1, runs) or length == 0:
             longest = max(lengths, key=lambda name: lengths[name])
-            raise ValueError(f"{name} has {length} entries, {longest} {runs}: must be numbers or vectors of one length, at least 1")
+            raise ValueError(
+                f"{name} has {length} entries, {longest} {runs}: must be numbers or vectors of one length, at least 1"
+            )
     whole = {name: np.broadcast_to(array, (runs,)) for name, array in arrays.items()}
     columns = {name: values.tolist() for name, values in whole.items()}
     try:
         inspect.signature(factory).bind(**columns)
     except TypeError as error:
-        raise ValueError(f"parameters = {', '.join(parameters) or 'none'}: the factory can't be called with them: {error}") from None
+        raise ValueError(
+            f"parameters = {', '.join(parameters) or 'none'}: the factory can't be called with them: {error}"
+        ) from None
     plants = []
     for i in range(runs):
         try:
@@ -131,7 +150,11 @@ def _numbers(name: str, value: Any) -> NDArray[Any]:
     except ValueError:  # ragged
         array = np.empty((), dtype=object)
     if array.dtype.kind not in "iuf":
-        raise ValueError(f"{name}: must be a number or a vector of numbers, one for each run, got {value!r:.60}")
+        raise ValueError(
+            f"{name}: must be a number or a vector of numbers, one for each run, got {value!r:.60}"
+        )
     if array.ndim > 1:
-        raise ValueError(f"{name} has shape {array.shape}: must be a number or a vector of numbers, one for each run")
+        raise ValueError(
+            f"{name} has shape {array.shape}: must be a number or a vector of numbers, one for each run"
+        )
     return array

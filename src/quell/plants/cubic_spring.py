@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.dispatch import kernel
+from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.linear import LinearModel, LinearPlant
 from quell.types import Matrix, Vector
@@ -45,9 +45,18 @@ def _measure(plant: CubicSpringModel, x: Vector) -> float:
 
 
 @advance.register(CubicSpringModel)
-def _advance(plant: CubicSpringModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+def _advance(
+    plant: CubicSpringModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
     _push(plant, x)
-    advance(LinearModel(plant.transition, plant.input, plant.disturbance, plant.output), x, scratch, t, u, w)
+    advance(
+        LinearModel(plant.transition, plant.input, plant.disturbance, plant.output),
+        x,
+        scratch,
+        t,
+        u,
+        w,
+    )
     _push(plant, x)
 
 
@@ -94,7 +103,12 @@ class CubicSpringPlant:
 
 
 def lagged_two_mass_spring(
-    m1: float = 1.0, m2: float = 1.0, k: float = 1.0, k_cubic: float | None = None, effectiveness: float = 1.0, lag: float = 0.01
+    m1: float = 1.0,
+    m2: float = 1.0,
+    k: float = 1.0,
+    k_cubic: float | None = None,
+    effectiveness: float = 1.0,
+    lag: float = 0.01,
 ) -> LinearPlant | CubicSpringPlant:
     """Return two masses on a spring, pushed through an actuator with lag.
 
@@ -120,8 +134,15 @@ def lagged_two_mass_spring(
     ValueError
         for a mass, stiffness, effectiveness or lag that is not positive, or a ``k_cubic`` that is not finite.
     """
-    m1, m2, k = checks.positive("m1", m1, "kg"), checks.positive("m2", m2, "kg"), checks.positive("k", k, "N/m")
-    effectiveness, lag = checks.positive("effectiveness", effectiveness), checks.positive("lag", lag, "s")
+    m1, m2, k = (
+        checks.positive("m1", m1, "kg"),
+        checks.positive("m2", m2, "kg"),
+        checks.positive("k", k, "N/m"),
+    )
+    effectiveness, lag = (
+        checks.positive("effectiveness", effectiveness),
+        checks.positive("lag", lag, "s"),
+    )
     cubic = None if k_cubic is None else checks.finite("k_cubic", k_cubic)
     A = np.zeros((5, 5))
     A[0, 2] = A[1, 3] = 1.0
@@ -130,5 +151,11 @@ def lagged_two_mass_spring(
     A[2, 4], A[4, 4] = effectiveness / m1, -1.0 / lag
     E = np.zeros((5, 2))
     E[2, 0], E[3, 1] = 1.0 / m1, 1.0 / m2
-    linear = LinearPlant(A, B=[0.0, 0.0, 0.0, 0.0, 1.0 / lag], C=[0.0, 1.0, 0.0, 0.0, 0.0], E=E, name="two-mass-spring with lag")
+    linear = LinearPlant(
+        A,
+        B=[0.0, 0.0, 0.0, 0.0, 1.0 / lag],
+        C=[0.0, 1.0, 0.0, 0.0, 0.0],
+        E=E,
+        name="two-mass-spring with lag",
+    )
     return linear if cubic is None else CubicSpringPlant(linear, m1, m2, cubic)

@@ -29,7 +29,9 @@ def _measure(plant: DelayedPlantModel, x: Vector) -> float:
 
 
 @advance.register(DelayedPlantModel)
-def _advance(plant: DelayedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+def _advance(
+    plant: DelayedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
     last = x.size - 1
     arriving = x[last]
     for i in range(last, plant.size, -1):
@@ -59,7 +61,9 @@ class DelayedPlant(Around):
     def sampled(self, dt: float, interpret: bool = False) -> DelayedPlantModel:
         """Return the parameters for the sample time ``dt`` [s] that it was made for."""
         if abs(dt - self.dt) > 1e-9 * self.dt:
-            raise ValueError(f"dt = {dt!r} s: this delayed plant has the states of {self.dt!r} s; make it with dt={dt!r}")
+            raise ValueError(
+                f"dt = {dt!r} s: this delayed plant has the states of {self.dt!r} s; make it with dt={dt!r}"
+            )
         return DelayedPlantModel(self.plant.sampled(dt, interpret), int(self.plant.order))
 
 

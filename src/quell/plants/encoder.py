@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.dispatch import kernel
+from quell.kernels.dispatch import kernel
 from quell.plants.base import Around, Plant, advance, check_plant, measure
 from quell.types import Vector
 
@@ -39,7 +39,9 @@ def _measure(plant: EncodedPlantModel, x: Vector) -> float:
 
 
 @advance.register(EncodedPlantModel)
-def _advance(plant: EncodedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+def _advance(
+    plant: EncodedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
     advance(plant.inner, x, scratch, t, u, w)
 
 

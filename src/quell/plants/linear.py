@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from quell import checks
-from quell.discretize import zero_order_hold
-from quell.models import Fraction, matrices, read, with_states
+from quell.lti.discretize import zero_order_hold
+from quell.lti.models import Fraction, matrices, read, with_states
 from quell.plants.base import advance, measure
 from quell.types import Matrix, Vector
 
@@ -146,5 +146,7 @@ class LinearPlant:
 
     def sampled(self, dt: float, interpret: bool = False) -> LinearModel:
         """Return the plant sampled with zero-order hold on u and w at ``dt`` [s], for the driver (interpreted or not, the same)."""
-        phi, (gamma, gamma_w) = zero_order_hold(self.A, [self.B, self.E], checks.positive("dt", dt, "s"))
+        phi, (gamma, gamma_w) = zero_order_hold(
+            self.A, [self.B, self.E], checks.positive("dt", dt, "s")
+        )
         return LinearModel(phi, gamma[:, 0].copy(), gamma_w, self.C[0].copy())

@@ -13,8 +13,15 @@ import numpy as np
 from numba.core import types as nb_types
 
 from quell import checks
-from quell.dispatch import generic, kernel
-from quell.foreign import POINTER, NotCompilableError, call, evaluate, inner, machine_code
+from quell.kernels.dispatch import generic, kernel
+from quell.kernels.function_pointers import (
+    POINTER,
+    NotCompilableError,
+    call,
+    evaluate,
+    inner,
+    machine_code,
+)
 from quell.plants.base import advance, measure
 from quell.types import Vector
 
@@ -76,12 +83,16 @@ def _measure(plant: CompiledNonlinear, x: Vector) -> float:
 
 
 @advance.register(CompiledNonlinear)
-def _advance(plant: CompiledNonlinear, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+def _advance(
+    plant: CompiledNonlinear, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
     _runge_kutta(plant, x, scratch, t, u, w)
 
 
 @derivatives.register(CompiledNonlinear)
-def _derivatives(plant: CompiledNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
+def _derivatives(
+    plant: CompiledNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
+) -> None:
     call(plant.rate, t, x, u, w, dx)
 
 
@@ -96,12 +107,16 @@ def _measure_python(plant: PythonNonlinear, x: Vector) -> float:
 
 
 @advance.register(PythonNonlinear)
-def _advance_python(plant: PythonNonlinear, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+def _advance_python(
+    plant: PythonNonlinear, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
     _runge_kutta(plant, x, scratch, t, u, w)
 
 
 @derivatives.register(PythonNonlinear)
-def _derivatives_python(plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
+def _derivatives_python(
+    plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
+) -> None:
     try:
         dx[:] = plant.rate(t, x, u, w)
     except Exception as error:
@@ -156,7 +171,9 @@ class NonlinearPlant:
             raise ValueError(f"f = {self.f!r}: must be a function f(t, x, u, w)")
         returned = _tried("f(0.0, zeros, 0.0, zeros)", self.f, 0.0, np.zeros(n), 0.0, np.zeros(m))
         if returned is not None and np.shape(returned) != (n,):
-            raise ValueError(f"f returns shape {np.shape(returned)}: must return the {n} derivatives of the state")
+            raise ValueError(
+                f"f returns shape {np.shape(returned)}: must return the {n} derivatives of the state"
+            )
         if not callable(self.output):
             checks.vector("output", self._row, n)
         elif np.shape(_tried("output(zeros)", self.output, np.zeros(n))) != ():
@@ -202,7 +219,10 @@ class NonlinearPlant:
             return None
 
     def _warn(self, reason: str) -> None:
-        warnings.warn(f"{self.name}: f or output can't be compiled and runs as Python, which is slow ({reason})", stacklevel=4)
+        warnings.warn(
+            f"{self.name}: f or output can't be compiled and runs as Python, which is slow ({reason})",
+            stacklevel=4,
+        )
 
     @property
     def compiled(self) -> bool:

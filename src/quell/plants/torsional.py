@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.dispatch import kernel
+from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.delay import DelayedPlantModel
 from quell.plants.encoder import EncodedPlantModel, counted
@@ -64,7 +64,9 @@ def _measure(plant: TorsionalModel, x: Vector) -> float:
 
 
 @advance.register(TorsionalModel)
-def _advance(plant: TorsionalModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+def _advance(
+    plant: TorsionalModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
+) -> None:
     applied = counted(u, plant.step) if plant.step > 0.0 else u
     applied = min(max(applied, -plant.u_max), plant.u_max)
     for _ in range(plant.substeps):
@@ -232,13 +234,20 @@ def torsional(
         "amplifier": (amplifier, "A/V"),
         "current_limit": (current_limit, "A"),
     }
-    j_lower, j2, ratio, k, k_t, k_a, i_max = (checks.positive(name, value, unit) for name, (value, unit) in positive.items())
+    j_lower, j2, ratio, k, k_t, k_a, i_max = (
+        checks.positive(name, value, unit) for name, (value, unit) in positive.items()
+    )
     j_motor = checks.non_negative("motor_inertia", motor_inertia, "kg m²")
     d = checks.non_negative("shaft_damping", shaft_damping, "N m s/rad")
     c1 = checks.non_negative("lower_viscous", lower_viscous, "N m s/rad")
     c2 = checks.non_negative("upper_viscous", upper_viscous, "N m s/rad")
-    dry = (checks.non_negative("lower_coulomb", lower_coulomb, "N m"), checks.non_negative("upper_coulomb", upper_coulomb, "N m"))
-    step = 0.0 if dac_bits is None else 2.0 * _RANGE / 2 ** checks.whole("dac_bits", dac_bits, 2, 32)
+    dry = (
+        checks.non_negative("lower_coulomb", lower_coulomb, "N m"),
+        checks.non_negative("upper_coulomb", upper_coulomb, "N m"),
+    )
+    step = (
+        0.0 if dac_bits is None else 2.0 * _RANGE / 2 ** checks.whole("dac_bits", dac_bits, 2, 32)
+    )
     if counts is not None:
         counts = checks.whole("counts", counts, 1)
     j1 = j_lower + ratio**2 * j_motor
@@ -248,8 +257,16 @@ def torsional(
     A[3] = k / j2, -k / j2, d / j2, -(c2 + d) / j2
     E = np.zeros((4, 2))
     E[2, 0], E[3, 1] = 1.0 / j1, 1.0 / j2
-    linear = LinearPlant(A, B=ratio * k_t * k_a * E[:, 0], C=[0.0, 1.0, 0.0, 0.0], E=E, name="torsional plant without friction")
-    return TorsionalPlant(linear, dry, min(_RANGE, i_max / k_a), step, counts, checks.whole("late", late, 0, 1000))
+    linear = LinearPlant(
+        A,
+        B=ratio * k_t * k_a * E[:, 0],
+        C=[0.0, 1.0, 0.0, 0.0],
+        E=E,
+        name="torsional plant without friction",
+    )
+    return TorsionalPlant(
+        linear, dry, min(_RANGE, i_max / k_a), step, counts, checks.whole("late", late, 0, 1000)
+    )
 
 
 def torsional_identified() -> LinearPlant:
@@ -257,4 +274,6 @@ def torsional_identified() -> LinearPlant:
 
     States: the upper disk's angle [rad] and its derivatives [rad/s, …]; u [V] and one disturbance, which enters as u does.
     """
-    return LinearPlant.of(([4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032]), name="torsional plant as identified")
+    return LinearPlant.of(
+        ([4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032]), name="torsional plant as identified"
+    )

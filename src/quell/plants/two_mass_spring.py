@@ -8,7 +8,9 @@ from quell import checks
 from quell.plants.linear import LinearPlant
 
 
-def two_mass_spring(m1: float = 1.0, m2: float = 1.0, k: float = 1.0, c1: float = 0.0, c2: float = 1.0) -> LinearPlant:
+def two_mass_spring(
+    m1: float = 1.0, m2: float = 1.0, k: float = 1.0, c1: float = 0.0, c2: float = 1.0
+) -> LinearPlant:
     """Return the two-mass-spring system (paper eq. (two-mass)), without friction.
 
     States: positions of m1 and m2 [m], their velocities [m/s]. The control force u [N] acts on m1, the disturbance forces w1 on m1
@@ -30,10 +32,16 @@ def two_mass_spring(m1: float = 1.0, m2: float = 1.0, k: float = 1.0, c1: float 
     ValueError
         for a mass or stiffness that is not positive, or where nothing is measured.
     """
-    m1, m2, k = checks.positive("m1", m1, "kg"), checks.positive("m2", m2, "kg"), checks.positive("k", k, "N/m")
+    m1, m2, k = (
+        checks.positive("m1", m1, "kg"),
+        checks.positive("m2", m2, "kg"),
+        checks.positive("k", k, "N/m"),
+    )
     c1, c2 = checks.finite("c1", c1), checks.finite("c2", c2)
     if c1 == 0.0 and c2 == 0.0:
-        raise ValueError("c1 = 0.0, c2 = 0.0: at least one must differ from zero, or nothing is measured")
+        raise ValueError(
+            "c1 = 0.0, c2 = 0.0: at least one must differ from zero, or nothing is measured"
+        )
     A = np.zeros((4, 4))
     A[0, 2] = A[1, 3] = 1.0
     A[2, :2] = -k / m1, k / m1

@@ -15,30 +15,30 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quell.realtime.device import Device
-    from quell.realtime.devices import open_device
-    from quell.realtime.outcome import RigRun
-    from quell.realtime.recording import load
-    from quell.realtime.replay import replay
-    from quell.realtime.run import run_rig
-    from quell.realtime.safety import Safety
-    from quell.realtime.server import Rig
-    from quell.realtime.sinks import CsvSink, LiveSink, McapSink
-    from quell.realtime.twin import TwinDevice
+    from quell.realtime.devices.base import Device
+    from quell.realtime.devices.registry import open_device
+    from quell.realtime.devices.twin import TwinDevice
+    from quell.realtime.loop.outcome import RigRun
+    from quell.realtime.loop.replay import replay
+    from quell.realtime.loop.run import run_rig
+    from quell.realtime.loop.safety import Safety
+    from quell.realtime.rig.server import Rig
+    from quell.realtime.telemetry.load import load
+    from quell.realtime.telemetry.sinks import CsvSink, LiveSink, McapSink
 
 _HOME = {
-    "CsvSink": "sinks",
-    "Device": "device",
-    "LiveSink": "sinks",
-    "McapSink": "sinks",
-    "Rig": "server",
-    "RigRun": "outcome",
-    "Safety": "safety",
-    "TwinDevice": "twin",
-    "load": "recording",
-    "open_device": "devices",
-    "replay": "replay",
-    "run_rig": "run",
+    "CsvSink": "telemetry.sinks",
+    "Device": "devices.base",
+    "LiveSink": "telemetry.sinks",
+    "McapSink": "telemetry.sinks",
+    "Rig": "rig.server",
+    "RigRun": "loop.outcome",
+    "Safety": "loop.safety",
+    "TwinDevice": "devices.twin",
+    "load": "telemetry.load",
+    "open_device": "devices.registry",
+    "replay": "loop.replay",
+    "run_rig": "loop.run",
 }
 
 __all__ = [

@@ -16,8 +16,8 @@ from quell.files import without_gaps
 from quell.plants import Plant
 from quell.setup.build import Builder, linear_part
 from quell.setup.description import Description, describe, read
-from quell.setup.mistakes import SetupError
-from quell.simulation import Scenario
+from quell.setup.errors import SetupError
+from quell.simulation.scenario import Scenario
 
 __all__ = ["EXAMPLES", "Description", "Setup", "SetupError", "load", "made", "read"]
 
@@ -95,7 +95,7 @@ def load(path: str | os.PathLike[str]) -> Setup:
     ...     load(path)
     Traceback (most recent call last):
         ...
-    quell.setup.mistakes.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
+    quell.setup.errors.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
     """
     return made(*read(path))
 
@@ -118,10 +118,16 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
     plant = part("plant")
     model = linear_part(plant)
     parts = {key: part(key, plant=model) for key in ("observer", "learner", "guard")}
-    idle = [key for key, value in parts.items() if value is not None and key not in described.controller.context]
+    idle = [
+        key
+        for key, value in parts.items()
+        if value is not None and key not in described.controller.context
+    ]
     if idle:
         kind = described.controller.called
-        raise SetupError([f"{name}: {key}: a controller of the kind {kind} has no use for it" for key in idle])
+        raise SetupError(
+            [f"{name}: {key}: a controller of the kind {kind} has no use for it" for key in idle]
+        )
     controller = part("controller", plant=model, **parts)
     prefilter, scenario, rig = part("prefilter"), part("scenario"), part("rig")
     if prefilter is not None:
@@ -135,7 +141,9 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
     return Setup(name, title, controller, plant, scenario, rig, windows, described)
 
 
-def _check_window(start: float = 0.0, stop: float | None = None, target: float | None = None, band: float = 0.002) -> None:
+def _check_window(
+    start: float = 0.0, stop: float | None = None, target: float | None = None, band: float = 0.002
+) -> None:
     """Say before the run what ``Trajectory.metrics`` would say after it."""
     checks.finite("start", start)
     if stop is not None:

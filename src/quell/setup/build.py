@@ -9,8 +9,8 @@ from operator import add
 from typing import Any
 
 from quell.features import Features
-from quell.setup.mistakes import SetupError, refused
-from quell.setup.tables import Call
+from quell.setup.errors import SetupError, refused
+from quell.setup.schema import Call
 from quell.signals import Signal
 
 # Where a plant is a model of one.
@@ -46,15 +46,26 @@ class Builder:
             for what the call refuses, and for what it lacks.
         """
         takes = inspect.signature(table.make).parameters
-        arguments = {key: value for key, value in context.items() if key in takes and value is not None}
+        arguments = {
+            key: value for key, value in context.items() if key in takes and value is not None
+        }
         inner = {"dt": context["dt"]} if "dt" in context else {}
-        arguments |= {key: self._value(value, f"{path}.{key}", key != "disturbances", inner) for key, value in table.given().items()}
+        arguments |= {
+            key: self._value(value, f"{path}.{key}", key != "disturbances", inner)
+            for key, value in table.given().items()
+        }
         for key, parameter in takes.items():
-            if key not in arguments and parameter.default is parameter.empty and parameter.kind is not parameter.VAR_KEYWORD:
+            if (
+                key not in arguments
+                and parameter.default is parameter.empty
+                and parameter.kind is not parameter.VAR_KEYWORD
+            ):
                 raise SetupError([f"{self.name}: {path}: {key} is missing; give a table [{key}]"])
         return self.attempt(path, [*arguments], partial(table.make, **arguments))
 
-    def attempt(self, path: str, keys: Sequence[str], action: Callable[..., Any], *arguments: Any) -> Any:
+    def attempt(
+        self, path: str, keys: Sequence[str], action: Callable[..., Any], *arguments: Any
+    ) -> Any:
         """Return what ``action`` returns; what it refuses is told with the path, and the key where it begins with one of ``keys``.
 
         Raises
@@ -74,7 +85,9 @@ class Builder:
             return linear_part(built) if path in _MODELS else built
         if not isinstance(value, tuple):
             return value
-        parts = tuple(self._value(part, f"{path}[{i}]", True, context) for i, part in enumerate(value))
+        parts = tuple(
+            self._value(part, f"{path}[{i}]", True, context) for i, part in enumerate(value)
+        )
         if not (joined and any(isinstance(part, Features | Signal) for part in parts)):
             return parts
         return self.attempt(path, (), reduce, add, parts)

@@ -10,37 +10,62 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, ValidationError
 
-from quell.setup.mistakes import SetupError, mistakes
-from quell.setup.tables import Table
+from quell.setup.errors import SetupError, mistakes
+from quell.setup.schema import Table
 
 if TYPE_CHECKING:  # they are made of signatures, which a type checker does not read
-    from quell.setup.tables import Call as Controller
-    from quell.setup.tables import Call as Guard
-    from quell.setup.tables import Call as Learner
-    from quell.setup.tables import Call as Metrics
-    from quell.setup.tables import Call as Observer
-    from quell.setup.tables import Call as Plant
-    from quell.setup.tables import Call as Prefilter
-    from quell.setup.tables import Call as Rig
-    from quell.setup.tables import Call as Scenario
+    from quell.setup.schema import Call as Controller
+    from quell.setup.schema import Call as Guard
+    from quell.setup.schema import Call as Learner
+    from quell.setup.schema import Call as Metrics
+    from quell.setup.schema import Call as Observer
+    from quell.setup.schema import Call as Plant
+    from quell.setup.schema import Call as Prefilter
+    from quell.setup.schema import Call as Rig
+    from quell.setup.schema import Call as Scenario
 else:
-    from quell.setup.kinds import Controller, Guard, Learner, Metrics, Observer, Plant, Prefilter, Rig, Scenario
+    from quell.setup.registry import (
+        Controller,
+        Guard,
+        Learner,
+        Metrics,
+        Observer,
+        Plant,
+        Prefilter,
+        Rig,
+        Scenario,
+    )
 
 
 class Description(Table):
     """All that a setup file may hold."""
 
-    title: str = Field("", description="what tables and figures call it; the file's name by default.")
+    title: str = Field(
+        "", description="what tables and figures call it; the file's name by default."
+    )
     dt: float = Field(description="sample time of the loop [s], for all that has one.")
-    plant: Plant | None = Field(None, description="what is controlled, for `quell run`, and for observers that know a model.")
+    plant: Plant | None = Field(
+        None,
+        description="what is controlled, for `quell run`, and for observers that know a model.",
+    )
     observer: Observer | None = Field(None, description="what an `adrc` controller needs.")
     controller: Controller = Field(description="what controls.")
-    learner: Learner | None = Field(None, description="what feeds forward what it has learned; none by default.")
-    guard: Guard | None = Field(None, description="what gives the learner the authority it has earned; none by default.")
-    prefilter: Prefilter | None = Field(None, description="what shapes the reference; none by default.")
+    learner: Learner | None = Field(
+        None, description="what feeds forward what it has learned; none by default."
+    )
+    guard: Guard | None = Field(
+        None, description="what gives the learner the authority it has earned; none by default."
+    )
+    prefilter: Prefilter | None = Field(
+        None, description="what shapes the reference; none by default."
+    )
     scenario: Scenario | None = Field(None, description="what happens.")
-    rig: Rig | None = Field(None, description="the device, and the limits that keep it safe, for `quell run-rig`.")
-    metrics: tuple[Metrics, ...] = Field((), description="[[metrics]]: windows of time in which the response is judged.")
+    rig: Rig | None = Field(
+        None, description="the device, and the limits that keep it safe, for `quell run-rig`."
+    )
+    metrics: tuple[Metrics, ...] = Field(
+        (), description="[[metrics]]: windows of time in which the response is judged."
+    )
 
 
 def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:

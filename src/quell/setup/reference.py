@@ -8,7 +8,7 @@ from typing import Any, Union, get_args, get_origin
 
 from pydantic_core import PydanticUndefined
 
-from quell.setup.tables import Call, Table
+from quell.setup.schema import Call, Table
 
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
@@ -25,13 +25,20 @@ def keys(of: type[Table]) -> list[tuple[str, str, str, str]]:
 def table(of: type[Table]) -> str:
     """Return the keys of a table in Markdown; nothing where there are none."""
     bar = r"\|"
-    rows = [f"| `{key}` | {kind} | {default} | {words.replace('|', bar)} |" for key, kind, default, words in keys(of)]
-    return "\n".join(["| key | type | default | |", "|---|---|---|---|", *rows] if rows else []).replace("``", "`")
+    rows = [
+        f"| `{key}` | {kind} | {default} | {words.replace('|', bar)} |"
+        for key, kind, default, words in keys(of)
+    ]
+    return "\n".join(
+        ["| key | type | default | |", "|---|---|---|---|", *rows] if rows else []
+    ).replace("``", "`")
 
 
 def markdown(kinds: Mapping[str, type[Call]]) -> str:
     """Return the kinds of a table and their keys in Markdown."""
-    return "\n\n".join(f"**`{kind}`** {of.__doc__}\n\n{table(of)}".replace("``", "`") for kind, of in kinds.items())
+    return "\n\n".join(
+        f"**`{kind}`** {of.__doc__}\n\n{table(of)}".replace("``", "`") for kind, of in kinds.items()
+    )
 
 
 def _default(value: Any) -> str:
@@ -48,7 +55,10 @@ def _type(annotation: Any) -> str:
     """Return the name of a type in TOML."""
     if annotation in _TYPES:
         return _TYPES[annotation]
-    origin, inside = get_origin(annotation), [part for part in get_args(annotation) if part is not types.NoneType]
+    origin, inside = (
+        get_origin(annotation),
+        [part for part in get_args(annotation) if part is not types.NoneType],
+    )
     if origin is tuple:
         return "list"
     if origin in (Union, types.UnionType):

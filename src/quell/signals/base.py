@@ -28,7 +28,9 @@ class Signal:
         times = np.asarray(t, dtype=np.float64)
         values = np.asarray(self.evaluate(times), dtype=np.float64)
         if values.shape != times.shape:
-            raise ValueError(f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape {times.shape}")
+            raise ValueError(
+                f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape {times.shape}"
+            )
         return values
 
     def seeded(self, seed: int) -> Signal:
@@ -68,7 +70,9 @@ class Signal:
         return as_signal(other) - self
 
     def __truediv__(self, factor: float) -> Signal:
-        return Scaled(1.0 / checks.nonzero("factor", factor, "a signal can't be divided by it"), self)
+        return Scaled(
+            1.0 / checks.nonzero("factor", factor, "a signal can't be divided by it"), self
+        )
 
     __radd__ = __add__
     __rmul__ = __mul__
@@ -144,7 +148,9 @@ class Switched(Signal):
     def __post_init__(self) -> None:
         times = checks.vector("times", self.times)
         if len(self.pieces) != times.size + 1:
-            raise ValueError(f"pieces has {len(self.pieces)} entries, times {times.size}: there must be one piece more than times")
+            raise ValueError(
+                f"pieces has {len(self.pieces)} entries, times {times.size}: there must be one piece more than times"
+            )
         if np.any(np.diff(times) <= 0.0):
             raise ValueError(f"times = {self.times!r}: must increase")
 

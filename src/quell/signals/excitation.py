@@ -65,7 +65,9 @@ class PRBS(Signal):
         """Return the sequence."""
         since = (t - self.start + EDGE) / self.step
         which = np.floor(since).astype(np.int64) + self.seed
-        return np.where(since >= 0.0, self.amplitude * _sequence(self.bits)[which % (2**self.bits - 1)], 0.0)
+        return np.where(
+            since >= 0.0, self.amplitude * _sequence(self.bits)[which % (2**self.bits - 1)], 0.0
+        )
 
     def derivative(self) -> Signal:
         """Return zero."""
@@ -107,8 +109,16 @@ class Multisine(Signal):
 
     def __post_init__(self) -> None:
         omegas = checks.positive_vector("omegas", self.omegas)
-        amplitudes = np.ones(omegas.size) if self.amplitudes is None else checks.vector("amplitudes", self.amplitudes, omegas.size)
-        phases = schroeder_phases(amplitudes) if self.phases is None else checks.vector("phases", self.phases, omegas.size)
+        amplitudes = (
+            np.ones(omegas.size)
+            if self.amplitudes is None
+            else checks.vector("amplitudes", self.amplitudes, omegas.size)
+        )
+        phases = (
+            schroeder_phases(amplitudes)
+            if self.phases is None
+            else checks.vector("phases", self.phases, omegas.size)
+        )
         for name, value in (("omegas", omegas), ("amplitudes", amplitudes), ("phases", phases)):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -117,13 +127,17 @@ class Multisine(Signal):
     def evaluate(self, t: Vector) -> Vector:
         """Return the sum."""
         since, total = t - self.start, np.zeros(t.shape)
-        for omega, amplitude, phase in zip(self.omegas.tolist(), self.amplitudes.tolist(), self.phases.tolist(), strict=True):
+        for omega, amplitude, phase in zip(
+            self.omegas.tolist(), self.amplitudes.tolist(), self.phases.tolist(), strict=True
+        ):
             total += amplitude * np.sin(omega * since + phase)
         return np.where(since >= -EDGE, total, 0.0)
 
     def derivative(self) -> Signal:
         """Return the sum of the derivatives."""
-        return Multisine(self.omegas, self.amplitudes * self.omegas, self.phases + 0.5 * math.pi, self.start)
+        return Multisine(
+            self.omegas, self.amplitudes * self.omegas, self.phases + 0.5 * math.pi, self.start
+        )
 
 
 def schroeder_phases(amplitudes: Vector) -> Vector:

@@ -44,10 +44,18 @@ class BandLimitedNoise(Signal):
         """Return the draws that hold at ``t``; none are drawn for negative times, which give zero."""
         count = t * (1.0 / self.sample_time) + (1.0 + 1e-6)
         if t.size and not float(np.max(np.abs(count))) < 2.0**52:
-            raise ValueError(f"sample_time = {self.sample_time!r}: too short to be counted in times of {float(np.max(np.abs(t))):g} s")
+            raise ValueError(
+                f"sample_time = {self.sample_time!r}: too short to be counted in times of {float(np.max(np.abs(t))):g} s"
+            )
         index = count.astype(np.int64) - 1  # floor, for times from 0 on
-        first, last = (int(index.min()) // _BLOCK, int(index.max()) // _BLOCK) if t.size else (0, -1)
-        blocks = np.arange(first, last + 1) if last - first < _BLOCKS_AT_ONCE else np.unique(index // _BLOCK)
+        first, last = (
+            (int(index.min()) // _BLOCK, int(index.max()) // _BLOCK) if t.size else (0, -1)
+        )
+        blocks = (
+            np.arange(first, last + 1)
+            if last - first < _BLOCKS_AT_ONCE
+            else np.unique(index // _BLOCK)
+        )
         values = np.zeros(t.shape)
         sigma = math.sqrt(self.power / self.sample_time)
         for block in blocks[blocks >= 0].tolist():

@@ -77,7 +77,9 @@ class Sinusoid(Signal):
 
     def derivative(self) -> Signal:
         """Return the sinusoid a quarter of a period ahead."""
-        return replace(self, amplitude=self.amplitude * self.omega, phase=self.phase + 0.5 * math.pi)
+        return replace(
+            self, amplitude=self.amplitude * self.omega, phase=self.phase + 0.5 * math.pi
+        )
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,16 @@ class Chirp(Signal):
         """Return the chirp."""
         since = np.maximum(t - self.start, 0.0)
         sweep = np.minimum(since, self.duration)
-        growth = math.log(self.omega_end / self.omega_start) / self.duration if self.logarithmic else 0.0
+        growth = (
+            math.log(self.omega_end / self.omega_start) / self.duration if self.logarithmic else 0.0
+        )
         if growth:
             phase = self.omega_start * np.expm1(growth * sweep) / growth
         else:
-            phase = self.omega_start * sweep + 0.5 * (self.omega_end - self.omega_start) * sweep**2 / self.duration
+            phase = (
+                self.omega_start * sweep
+                + 0.5 * (self.omega_end - self.omega_start) * sweep**2 / self.duration
+            )
         return self.amplitude * np.sin(phase + self.omega_end * (since - sweep))
 
 
@@ -150,11 +157,17 @@ class Trapezoid(Signal):
         checks.positive("duration", self.duration, "s")
         ramp = self._ramp
         if not 0.0 < ramp <= self.duration / 2:
-            raise ValueError(f"ramp_time = {self.ramp_time!r}: must be in (0, duration / 2 = {self.duration / 2}]")
+            raise ValueError(
+                f"ramp_time = {self.ramp_time!r}: must be in (0, duration / 2 = {self.duration / 2}]"
+            )
 
     @property
     def _ramp(self) -> float:
-        return self.duration / 3 if self.ramp_time is None else checks.finite("ramp_time", self.ramp_time)
+        return (
+            self.duration / 3
+            if self.ramp_time is None
+            else checks.finite("ramp_time", self.ramp_time)
+        )
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the position along the move."""
@@ -163,13 +176,17 @@ class Trapezoid(Signal):
         left = self.duration - since
         speeding = 0.5 * cruise / ramp * since**2
         braking = self.distance - 0.5 * cruise / ramp * left**2
-        return np.where(since < ramp, speeding, np.where(left < ramp, braking, cruise * (since - 0.5 * ramp)))
+        return np.where(
+            since < ramp, speeding, np.where(left < ramp, braking, cruise * (since - 0.5 * ramp))
+        )
 
     def derivative(self) -> Signal:
         """Return the speed: a trapezoid of two ramps."""
         ramp, end = self._ramp, self.start + self.duration
         acceleration = self.distance / (self.duration - ramp) / ramp
-        return Ramp(acceleration, self.start, self.start + ramp) - Ramp(acceleration, end - ramp, end)
+        return Ramp(acceleration, self.start, self.start + ramp) - Ramp(
+            acceleration, end - ramp, end
+        )
 
 
 @dataclass(frozen=True)
@@ -212,13 +229,21 @@ class SmoothMove(Signal):
         # The second half is the first one mirrored: the polynomial itself cancels badly near σ = 1.
         back = sigma > 0.5
         near = np.where(back, 1.0 - sigma, sigma)
-        speed = np.polynomial.Polynomial([math.comb(m, i) * (-1.0) ** i for i in range(m + 1)]) * np.polynomial.Polynomial.basis(m)
+        speed = np.polynomial.Polynomial(
+            [math.comb(m, i) * (-1.0) ** i for i in range(m + 1)]
+        ) * np.polynomial.Polynomial.basis(m)
         position = speed.integ()
         value = position.deriv(self.order)(near) if self.order else position(near)
         value = value / (position(0.5) * 2.0) * self.distance / self.duration**self.order
         mirrored = self.distance - value if self.order == 0 else (-1.0) ** (self.order + 1) * value
         inside = np.where(back, mirrored, value)
-        return inside if self.order == 0 else np.where((t >= self.start - EDGE) & (t < self.start + self.duration - EDGE), inside, 0.0)
+        return (
+            inside
+            if self.order == 0
+            else np.where(
+                (t >= self.start - EDGE) & (t < self.start + self.duration - EDGE), inside, 0.0
+            )
+        )
 
     def derivative(self) -> Signal:
         """Return the next derivative."""
@@ -263,4 +288,6 @@ class Samples(Signal):
         if self.hold == "previous" or self.times.size < 2:
             return Constant(0.0)
         slopes = np.diff(self.values) / np.diff(self.times)
-        return Constant(0.0).until(self.times[0], then=Samples(self.times, np.append(slopes, 0.0), hold="previous"))
+        return Constant(0.0).until(
+            self.times[0], then=Samples(self.times, np.append(slopes, 0.0), hold="previous")
+        )

@@ -5,6 +5,16 @@ from quell.controllers.baselines.lqg import LQG
 from quell.controllers.baselines.notch import Notch, NotchPID
 from quell.controllers.baselines.pid import PID
 from quell.controllers.baselines.resonance_ratio import ResonanceRatio
-from quell.controllers.baselines.shaping import ZV, ZVD, Shaper
+from quell.controllers.prefilters.shaping import ZV, ZVD, Shaper
 
-__all__ = ["LQG", "PID", "ZV", "ZVD", "Notch", "NotchPID", "ResonanceRatio", "Shaper", "equivalent_pid"]
+__all__ = [
+    "LQG",
+    "PID",
+    "ZV",
+    "ZVD",
+    "Notch",
+    "NotchPID",
+    "ResonanceRatio",
+    "Shaper",
+    "equivalent_pid",
+]

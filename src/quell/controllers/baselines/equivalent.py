@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.controllers.adrc import ADRC
+from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.baselines.pid import PID
 from quell.learners.base import NoLearner
 from quell.observers.eso import ESO
@@ -61,15 +61,24 @@ def equivalent_pid(controller: Any, **options: Any) -> PID:
             f"controller is of order {observer.order}: must be of order 1 (PI) or 2 (PID); an ADRC of order n has n zeros from y, a PID "
             "controller two at most"
         )
-    usual = ESO.model_free(observer.order, observer.b0, observer.omega_o, observer.dt, form=observer.form).model
+    usual = ESO.model_free(
+        observer.order, observer.b0, observer.omega_o, observer.dt, form=observer.form
+    ).model
     if (
         observer.form == "reduced"
         or type(observer.model) is not type(usual)
-        or any(not np.array_equal(getattr(observer.model, name), getattr(usual, name)) for name in usual._fields)
+        or any(
+            not np.array_equal(getattr(observer.model, name), getattr(usual, name))
+            for name in usual._fields
+        )
     ):
-        raise ValueError("controller has an observer that knows a model, or is of another kind: must be around ESO.model_free")
+        raise ValueError(
+            "controller has an observer that knows a model, or is of another kind: must be around ESO.model_free"
+        )
     if controller.derivatives:
-        raise ValueError("controller has feedforward: a PID controller has no derivatives of the reference; use feedforward=False")
+        raise ValueError(
+            "controller has feedforward: a PID controller has no derivatives of the reference; use feedforward=False"
+        )
     w, b0 = observer.omega_o, observer.b0
     if observer.order == 1:
         (k1,) = controller.parameters.law.tolist()

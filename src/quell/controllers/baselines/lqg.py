@@ -27,9 +27,9 @@ from quell.controllers.baselines.observer_law import (
     stationary_gain,
     with_disturbance,
 )
-from quell.controllers.linear import LinearController
-from quell.discretize import gramian, zero_order_hold
-from quell.models import leading_gain
+from quell.controllers.linear.linear import LinearController
+from quell.lti.discretize import gramian, zero_order_hold
+from quell.lti.models import leading_gain
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
@@ -93,7 +93,10 @@ class LQG(LinearController):
         linear = LinearPlant.of(plant)
         A, B, C = linear.A, linear.B, linear.C
         n = A.shape[0]
-        omega_c, omega_o = checks.positive("omega_c", omega_c, "rad/s"), checks.positive("omega_o", omega_o, "rad/s")
+        omega_c, omega_o = (
+            checks.positive("omega_c", omega_c, "rad/s"),
+            checks.positive("omega_o", omega_o, "rad/s"),
+        )
         dt = checks.positive("dt", dt, "s")
         check_reachable(A, B, "plant is not stabilisable from u")
         check_reachable(A.T, C.T, "plant is not detectable from y")
@@ -113,14 +116,22 @@ class LQG(LinearController):
             W[:n, :n] = gramian(A, checks.weight("process_noise", process_noise, n), dt)
         self.L = stationary_gain(self.model, W, 1.0 / dt)
         phi, gamma = self.model.F[:n, :n], self.model.G[:n]
-        self.N = 1.0 / float(C[0] @ np.linalg.solve(np.eye(n) - phi + np.outer(gamma, self.K), gamma))
-        super().__init__(feedback_law(self.model, self.L, np.append(self.K, 1.0), self.N), dt, **({"name": "LQG"} | options))
+        self.N = 1.0 / float(
+            C[0] @ np.linalg.solve(np.eye(n) - phi + np.outer(gamma, self.K), gamma)
+        )
+        super().__init__(
+            feedback_law(self.model, self.L, np.append(self.K, 1.0), self.N),
+            dt,
+            **({"name": "LQG"} | options),
+        )
 
 
 def _check_zero(A: Matrix, B: Matrix, C: Matrix) -> None:
     singular = np.linalg.svd(np.block([[A, B], [C, np.zeros((1, 1))]]), compute_uv=False)
     if singular[-1] <= 1e-12 * singular[0]:
-        raise ValueError("plant has a zero at s = 0: a constant disturbance does not show in y, nor can y be held at a reference")
+        raise ValueError(
+            "plant has a zero at s = 0: a constant disturbance does not show in y, nor can y be held at a reference"
+        )
 
 
 def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vector:
@@ -137,6 +148,8 @@ def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vecto
     try:
         P = solve_discrete_are(phi, gamma, sampled[:n, :n], R, s=S)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(f"no stabilising state feedback: {error}; every mode that does not fade must show in Q") from None
+        raise ValueError(
+            f"no stabilising state feedback: {error}; every mode that does not fade must show in Q"
+        ) from None
     gain: Vector = np.linalg.solve(R + gamma.T @ P @ gamma, gamma.T @ P @ phi + S.T)[0]
     return gain

@@ -54,7 +54,9 @@ class Notch(NamedTuple):
         omega, width = checks.positive("omega", omega, "rad/s"), checks.positive("width", width)
         depth = checks.non_negative("depth", depth)
         if depth >= 1.0:
-            raise ValueError(f"depth = {depth!r}: must be below 1, the share of the amplitude that passes at the centre")
+            raise ValueError(
+                f"depth = {depth!r}: must be below 1, the share of the amplitude that passes at the centre"
+            )
         return cls(omega, 0.5 * depth * width, 0.5 * width)
 
     @property
@@ -64,7 +66,10 @@ class Notch(NamedTuple):
 
     def polynomials(self) -> tuple[list[float], list[float]]:
         """Return numerator and denominator in s, highest power first."""
-        zeros, poles = ([1.0, 2.0 * damping * self.omega, self.omega**2] for damping in (self.zero_damping, self.pole_damping))
+        zeros, poles = (
+            [1.0, 2.0 * damping * self.omega, self.omega**2]
+            for damping in (self.zero_damping, self.pole_damping)
+        )
         return zeros, poles
 
 
@@ -92,14 +97,27 @@ class NotchPID(PID):
     0.68
     """
 
-    def __init__(self, notch: Notch, kp: float, ki: float = 0.0, kd: float = 0.0, *, dt: float, **options: Any) -> None:
+    def __init__(
+        self,
+        notch: Notch,
+        kp: float,
+        ki: float = 0.0,
+        kd: float = 0.0,
+        *,
+        dt: float,
+        **options: Any,
+    ) -> None:
         if not isinstance(notch, Notch):
             raise ValueError(f"notch = {notch!r}: must be from quell.baselines.Notch.at(omega)")
         if notch.omega * checks.positive("dt", dt, "s") >= math.pi:
-            raise ValueError(f"notch at {notch.omega!r} rad/s with dt = {dt!r} s: must be below pi/dt = {math.pi / dt:.3g} rad/s")
+            raise ValueError(
+                f"notch at {notch.omega!r} rad/s with dt = {dt!r} s: must be below pi/dt = {math.pi / dt:.3g} rad/s"
+            )
         self.notch = notch
         self._prewarp = notch.omega
-        super().__init__(kp, ki, kd, dt=dt, **({"name": "PID + notch" if kd else "PI + notch"} | options))
+        super().__init__(
+            kp, ki, kd, dt=dt, **({"name": "PID + notch" if kd else "PI + notch"} | options)
+        )
 
     def polynomials(self) -> tuple[list[Any], Any]:
         """Return the numerators from r and from y, and the denominator that they share, in s, highest power first."""

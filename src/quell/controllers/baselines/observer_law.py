@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.controllers.linear import LinearLaw
-from quell.discretize import zero_order_hold
+from quell.controllers.linear.linear import LinearLaw
+from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
 # Relative to their size: below this, singular values and distances to the unit circle count as zero.
@@ -56,7 +56,9 @@ def check_reachable(A: Matrix, B: Matrix, what: str) -> None:
         if pole.real >= -_TINY * np.linalg.norm(A):
             singular = np.linalg.svd(np.hstack([A - pole * np.eye(n), B]), compute_uv=False)
             if singular[-1] <= _TINY * singular[0]:
-                raise ValueError(f"{what}: its mode at s = {pole:.4g} rad/s does not fade by itself")
+                raise ValueError(
+                    f"{what}: its mode at s = {pole:.4g} rad/s does not fade by itself"
+                )
 
 
 def stationary_gain(model: SampledModel, W: Matrix, V: float) -> Vector:
@@ -75,10 +77,14 @@ def stationary_gain(model: SampledModel, W: Matrix, V: float) -> Vector:
     try:
         P = solve_discrete_are(F.T, H[:, None], W, np.array([[V]]))
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(f"no stationary Kalman filter: {error}; look at the noise densities, dt and the plant's units") from None
+        raise ValueError(
+            f"no stationary Kalman filter: {error}; look at the noise densities, dt and the plant's units"
+        ) from None
     gain: Vector = P @ H / (H @ P @ H + V)
     if not np.max(np.abs(np.linalg.eigvals(F - np.outer(F @ gain, H)))) < 1.0:
-        raise ValueError("no stable stationary Kalman filter: look at the noise densities, dt and the plant's units")
+        raise ValueError(
+            "no stable stationary Kalman filter: look at the noise densities, dt and the plant's units"
+        )
     return gain
 
 
@@ -86,4 +92,6 @@ def feedback_law(model: SampledModel, L: Vector, K: Vector, N: float) -> LinearL
     """Return ``u = N r − K z`` with the filter of gain L as a law whose state is z⁻."""
     F, G, H = model
     corrected = np.eye(G.size) - np.outer(L, H)
-    return LinearLaw(F @ corrected, np.zeros(G.size), F @ L, G.copy(), -K @ corrected, N, -float(K @ L))
+    return LinearLaw(
+        F @ corrected, np.zeros(G.size), F @ L, G.copy(), -K @ corrected, N, -float(K @ L)
+    )

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.linear import LinearController
-from quell.controllers.transfer import realised, sampled_law
+from quell.controllers.linear.linear import LinearController
+from quell.controllers.linear.transfer import realised, sampled_law
 
 
 class PID(LinearController):
@@ -74,17 +74,31 @@ class PID(LinearController):
         rate_limit: float = math.inf,
         name: str = "PID",
     ) -> None:
-        self.kp, self.ki, self.kd = checks.finite("kp", kp), checks.finite("ki", ki), checks.finite("kd", kd)
+        self.kp, self.ki, self.kd = (
+            checks.finite("kp", kp),
+            checks.finite("ki", ki),
+            checks.finite("kd", kd),
+        )
         self.b, self.c = checks.finite("b", b), checks.finite("c", c)
         self.filter = _filter(tf)
         if self.kd != 0.0 and self.filter == (0.0, 0.0):
-            raise ValueError(f"kd = {kd!r}, tf = {tf!r}: a derivative needs a filter, tf greater than zero; a tenth of kd/kp is usual")
+            raise ValueError(
+                f"kd = {kd!r}, tf = {tf!r}: a derivative needs a filter, tf greater than zero; a tenth of kd/kp is usual"
+            )
         self.tt = self._tracking_time() if tt is None else checks.positive("tt", tt, "s")
-        self.setpoint = (self.kd * self.c, self.kp * self.b, self.ki) if setpoint is None else tuple(checks.vector("setpoint", setpoint))
+        self.setpoint = (
+            (self.kd * self.c, self.kp * self.b, self.ki)
+            if setpoint is None
+            else tuple(checks.vector("setpoint", setpoint))
+        )
         if not self.setpoint:
-            raise ValueError(f"setpoint = {setpoint!r}: must be a polynomial in s, highest power first")
+            raise ValueError(
+                f"setpoint = {setpoint!r}: must be a polynomial in s, highest power first"
+            )
         system = realised(*self.polynomials())
-        law = sampled_law(system, checks.positive("dt", dt, "s"), prewarp=self._prewarp, tracking_time=self.tt)
+        law = sampled_law(
+            system, checks.positive("dt", dt, "s"), prewarp=self._prewarp, tracking_time=self.tt
+        )
         super().__init__(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
 
     def polynomials(self) -> tuple[list[Any], Any]:
@@ -103,7 +117,15 @@ class PID(LinearController):
 
     @classmethod
     def simc(
-        cls, gain: float, tau1: float, theta: float, tau2: float = 0.0, *, tau_c: float | None = None, dt: float, **options: Any
+        cls,
+        gain: float,
+        tau1: float,
+        theta: float,
+        tau2: float = 0.0,
+        *,
+        tau_c: float | None = None,
+        dt: float,
+        **options: Any,
     ) -> PID:
         """Tune for ``gain e^(−θs) / ((τ1 s + 1)(τ2 s + 1))`` by the SIMC rules (Skogestad, *J. Process Control* 13, 2003, eqs. (23)-(25)).
 
@@ -125,13 +147,21 @@ class PID(LinearController):
         ValueError
             for a gain of zero, a time out of range, a loop asked to be infinitely fast (θ = 0 without ``tau_c``), and as ``PID``.
         """
-        gain, tau1 = checks.nonzero("gain", gain, "or u does not reach y"), checks.positive("tau1", tau1, "s")
-        theta, tau2 = checks.non_negative("theta", theta, "s"), checks.non_negative("tau2", tau2, "s")
+        gain, tau1 = (
+            checks.nonzero("gain", gain, "or u does not reach y"),
+            checks.positive("tau1", tau1, "s"),
+        )
+        theta, tau2 = (
+            checks.non_negative("theta", theta, "s"),
+            checks.non_negative("tau2", tau2, "s"),
+        )
         tight = checks.positive("theta, or tau_c,", theta if tau_c is None else tau_c, "s") + theta
         return cls._series(tau1 / (gain * tight), min(tau1, 4.0 * tight), tau2, dt, options)
 
     @classmethod
-    def simc_double_integrator(cls, gain: float, theta: float, *, tau_c: float | None = None, dt: float, **options: Any) -> PID:
+    def simc_double_integrator(
+        cls, gain: float, theta: float, *, tau_c: float | None = None, dt: float, **options: Any
+    ) -> PID:
         """Tune for ``gain e^(−θs) / s²`` by the SIMC rule for double integrating processes (Skogestad 2003, table 1).
 
         In series form ``K_c = 1 / (4 gain (τ_c + θ)²)``, ``τ_I = τ_D = 4 (τ_c + θ)``.
@@ -154,15 +184,22 @@ class PID(LinearController):
         ValueError
             as ``simc``.
         """
-        gain, theta = checks.nonzero("gain", gain, "or u does not reach y"), checks.non_negative("theta", theta, "s")
+        gain, theta = (
+            checks.nonzero("gain", gain, "or u does not reach y"),
+            checks.non_negative("theta", theta, "s"),
+        )
         tight = checks.positive("theta, or tau_c,", theta if tau_c is None else tau_c, "s") + theta
         return cls._series(0.25 / (gain * tight**2), 4.0 * tight, 4.0 * tight, dt, options)
 
     @classmethod
-    def _series(cls, K: float, integral: float, derivative: float, dt: float, options: dict[str, Any]) -> PID:
+    def _series(
+        cls, K: float, integral: float, derivative: float, dt: float, options: dict[str, Any]
+    ) -> PID:
         """Return the parallel form of ``K (1 + 1/(τ_I s)) (1 + τ_D s)``."""
         options = {"tf": 0.1 * derivative} | options
-        return cls(K * (1.0 + derivative / integral), K / integral, K * derivative, dt=dt, **options)
+        return cls(
+            K * (1.0 + derivative / integral), K / integral, K * derivative, dt=dt, **options
+        )
 
 
 def _filter(tf: Any) -> tuple[float, float]:

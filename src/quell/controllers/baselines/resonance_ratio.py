@@ -29,9 +29,9 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.baselines.observer_law import feedback_law, stationary_gain, with_disturbance
-from quell.controllers.linear import LinearController
-from quell.discretize import gramian
-from quell.models import leading_gain
+from quell.controllers.linear.linear import LinearController
+from quell.lti.discretize import gramian
+from quell.lti.models import leading_gain
 from quell.plants import two_mass_spring
 
 
@@ -93,10 +93,14 @@ class ResonanceRatio(LinearController):
         plant = two_mass_spring(m1, m2, k, c1, 1.0 - c1)
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         if not checks.positive("ratio", ratio) > 1.0:
-            raise ValueError(f"ratio = {ratio!r}: must be above 1, the resonance lies above the anti-resonance")
+            raise ValueError(
+                f"ratio = {ratio!r}: must be above 1, the resonance lies above the anti-resonance"
+            )
         antiresonance = math.sqrt(k / m2)
         self.kappa = round((ratio**2 - 1.0) * m1 / m2, 12)
-        omega_d = 0.5 * antiresonance if omega_d is None else checks.positive("omega_d", omega_d, "rad/s")
+        omega_d = (
+            0.5 * antiresonance if omega_d is None else checks.positive("omega_d", omega_d, "rad/s")
+        )
         kp, kv = antiresonance**2, 4.0 * antiresonance
         torque = (1.0 - self.kappa) * k
         self.K = np.array([m1 * kp - torque, torque, m1 * kv, 0.0])
@@ -108,8 +112,13 @@ class ResonanceRatio(LinearController):
         # force does not show: a filter that knew of no other would have undamped poles there.
         far = plant.E[:, :1] if measured == "load" else plant.E[:, 1:]
         reached = [leading_gain(plant.A, column, plant.C) for column in (far, plant.E[:, 1:])]
-        (b_far, degree_far), (b_d, degree_d) = (found for found in reached if found is not None)  # the spring joins both masses
-        density = min(omega_o ** (2 * degree_far) / b_far**2, omega_o ** (2 * degree_d + 2) / (b_d * omega_d) ** 2)
+        (b_far, degree_far), (b_d, degree_d) = (
+            found for found in reached if found is not None
+        )  # the spring joins both masses
+        density = min(
+            omega_o ** (2 * degree_far) / b_far**2,
+            omega_o ** (2 * degree_d + 2) / (b_d * omega_d) ** 2,
+        )
         W = np.zeros((5, 5))
         W[:4, :4] = gramian(plant.A, far @ far.T * density, dt)
         W[4, 4] = dt * density * omega_d**2

@@ -50,7 +50,9 @@ class Instance:
         called with the text of each problem.
     """
 
-    def __init__(self, source: Any, name: str, budget: float | None, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, source: Any, name: str, budget: float | None, tell: Callable[[str], None]
+    ) -> None:
         self.source, self.name, self.budget, self.tell = source, name, budget, tell
         self.model = copy.deepcopy(source)
         self.failures = 0
@@ -65,7 +67,10 @@ class Instance:
         if self.worker.busy:
             late = self.worker.answer(0.0)
             if late is None:
-                return None, _LATE  # what was gathered meanwhile is dropped: a model that is late would only get later
+                return (
+                    None,
+                    _LATE,
+                )  # what was gathered meanwhile is dropped: a model that is late would only get later
             value, failed = self._judged(late)
             if failed:
                 return value, failed
@@ -182,13 +187,19 @@ def _array(address: int, *shape: int) -> Any:
     return np.frombuffer(buffer).reshape(shape)
 
 
-def _serve(holder: int, features: int, targets: int, count: int, width: int, now: int, answer: int) -> None:
+def _serve(
+    holder: int, features: int, targets: int, count: int, width: int, now: int, answer: int
+) -> None:
     """Answer a loop; all arrays are given by their address, and copied, as a model may keep what it is shown."""
     reply = None
     try:
         reply = _array(answer, 4)
         instance = INSTANCES[int(_array(holder, 1)[0])]
-        value, status = instance.ask(_array(features, count, width).copy(), _array(targets, count).copy(), _array(now, width).copy())
+        value, status = instance.ask(
+            _array(features, count, width).copy(),
+            _array(targets, count).copy(),
+            _array(now, width).copy(),
+        )
         if value is not None:
             reply[PREDICTION] = value
         reply[STATUS] = status
@@ -200,7 +211,9 @@ def _serve(holder: int, features: int, targets: int, count: int, width: int, now
 
 
 _POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
-_SERVE = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, _POINTER, _COUNT, _COUNT, _POINTER, _POINTER)(_serve)
+_SERVE = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, _POINTER, _COUNT, _COUNT, _POINTER, _POINTER)(
+    _serve
+)
 
 
 def address() -> int:

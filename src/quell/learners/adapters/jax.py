@@ -37,14 +37,20 @@ class JaxModel(PythonModel):
         for something that is no module or optimiser, and as ``PythonModel``.
     """
 
-    def __init__(self, module: Any, optimizer: Any = None, *, steps: int = 1, **options: Unpack[Options]) -> None:
+    def __init__(
+        self, module: Any, optimizer: Any = None, *, steps: int = 1, **options: Unpack[Options]
+    ) -> None:
         needed("jax", "jax")
         equinox, optax = needed("equinox", "jax"), needed("optax", "jax")
         if not (isinstance(module, equinox.Module) and callable(module)):
-            raise ValueError(f"module = {module!r}: must be an equinox.Module that can be called with an array (p,)")
+            raise ValueError(
+                f"module = {module!r}: must be an equinox.Module that can be called with an array (p,)"
+            )
         optimizer = optax.sgd(0.1) if optimizer is None else optimizer
         if not all(callable(getattr(optimizer, name, None)) for name in ("init", "update")):
-            raise ValueError(f"optimizer = {optimizer!r}: must be an optax optimiser, for example optax.sgd(0.1)")
+            raise ValueError(
+                f"optimizer = {optimizer!r}: must be an optax optimiser, for example optax.sgd(0.1)"
+            )
         self.name = type(module).__name__
         self._set_up(_Module(module, optimizer, checks.whole("steps", steps, 1)), **options)
 
@@ -69,9 +75,15 @@ class _Module:
         # JAX compiles for each shape: batches are filled up to a power of two with rows that do not count.
         size = 1 << (len(targets) - 1).bit_length()
         rows, wanted, weights = np.zeros((size, features.shape[1])), np.zeros(size), np.zeros(size)
-        rows[: len(targets)], wanted[: len(targets)], weights[: len(targets)] = features, targets, 1.0
+        rows[: len(targets)], wanted[: len(targets)], weights[: len(targets)] = (
+            features,
+            targets,
+            1.0,
+        )
         for _ in range(self.steps):
-            self.module, self.moments = step(self.module, self.moments, self.optimizer, rows, wanted, weights)
+            self.module, self.moments = step(
+                self.module, self.moments, self.optimizer, rows, wanted, weights
+            )
 
     def predict(self, features: Vector) -> Any:
         return np.asarray(_compiled()[1](self.module, features))
@@ -88,9 +100,13 @@ def _compiled() -> tuple[Any, Any]:
             raise ValueError(f"returned shape {output.shape[1:]} for a row: must be one number")
         return (weights * (output.reshape(wanted.shape) - wanted) ** 2).sum() / weights.sum()
 
-    def step(module: Any, moments: Any, optimizer: Any, rows: Any, wanted: Any, weights: Any) -> Any:
+    def step(
+        module: Any, moments: Any, optimizer: Any, rows: Any, wanted: Any, weights: Any
+    ) -> Any:
         gradient = equinox.filter_grad(loss)(module, rows, wanted, weights)
-        updates, moments = optimizer.update(gradient, moments, equinox.filter(module, equinox.is_inexact_array))
+        updates, moments = optimizer.update(
+            gradient, moments, equinox.filter(module, equinox.is_inexact_array)
+        )
         return equinox.apply_updates(module, updates), moments
 
     return equinox.filter_jit(step), equinox.filter_jit(lambda module, features: module(features))

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.dispatch import is_finite, kernel
-from quell.foreign import call
+from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.function_pointers import call
 from quell.learners.adapters.instances import GIVEN_UP, PREDICTION, STATUS, UNTIL
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
-from quell.learners.model import infer, learn
-from quell.learners.online import OnlineDesign, OnlineMemory, ready, show
+from quell.learners.online.model import infer, learn
+from quell.learners.online.online import OnlineDesign, OnlineMemory, ready, show
 from quell.types import Matrix, Status, Vector
 
 _FAILED = int(Status.LEARNER_FAILED)
@@ -70,7 +70,9 @@ class Batch:
 
     def memory(self, parameters: BatchDesign) -> BatchMemory:
         """Return an empty batch."""
-        return BatchMemory(np.zeros((parameters.size, parameters.width)), np.zeros(parameters.size), np.zeros(1))
+        return BatchMemory(
+            np.zeros((parameters.size, parameters.width)), np.zeros(parameters.size), np.zeros(1)
+        )
 
 
 @infer.register(BatchDesign)
@@ -98,7 +100,14 @@ def _finite(values: Vector) -> bool:
 
 
 @adapt.register(PythonDesign)
-def _adapt(learner: PythonDesign, memory: PythonMemory, seen: Vector, y: float, u_before: float, f_plain: float) -> None:
+def _adapt(
+    learner: PythonDesign,
+    memory: PythonMemory,
+    seen: Vector,
+    y: float,
+    u_before: float,
+    f_plain: float,
+) -> None:
     online, answer = memory.online, memory.answer
     if answer[GIVEN_UP] != 0.0:
         answer[PREDICTION] = 0.0
@@ -115,19 +124,32 @@ def _adapt(learner: PythonDesign, memory: PythonMemory, seen: Vector, y: float, 
     batch = online.model
     if batch.filled[0] > 0.0 and _finite(online.now):
         filled = int(batch.filled[0])
-        call(learner.address, memory.model, batch.features, batch.targets, filled, online.now.size, online.now, answer)
+        call(
+            learner.address,
+            memory.model,
+            batch.features,
+            batch.targets,
+            filled,
+            online.now.size,
+            online.now,
+            answer,
+        )
         batch.filled[0] = 0.0
         answer[UNTIL] = learner.period
 
 
 @predict.register(PythonDesign)
-def _predict(learner: PythonDesign, memory: PythonMemory, seen: Vector, u_before: float) -> tuple[float, float]:
+def _predict(
+    learner: PythonDesign, memory: PythonMemory, seen: Vector, u_before: float
+) -> tuple[float, float]:
     scale = memory.online.scale
     return memory.answer[PREDICTION] * scale[scale.size - 1], 0.0
 
 
 @commit.register(PythonDesign)
-def _commit(learner: PythonDesign, memory: PythonMemory, seen: Vector, u: float, f_learned: float) -> None:
+def _commit(
+    learner: PythonDesign, memory: PythonMemory, seen: Vector, u: float, f_learned: float
+) -> None:
     commit(learner.online, memory.online, seen, u, f_learned)
 
 

@@ -15,7 +15,7 @@ from quell.features import Features, State
 from quell.features.base import tried
 from quell.learners.adapters.instances import Instance, address, enter, finite_number, instance_of
 from quell.learners.adapters.loop import Batch, PythonDesign, PythonMemory
-from quell.learners.online import Online
+from quell.learners.online.online import Online
 from quell.observers.eso import ESO
 
 
@@ -80,8 +80,12 @@ class PythonModel:
     """The field of the memory that stands for the model."""
 
     def __init__(self, model: Any, **options: Unpack[Options]) -> None:
-        if isinstance(model, type) or not all(callable(getattr(model, name, None)) for name in ("learn", "predict")):
-            raise ValueError(f"model = {model!r}: must be an object with learn(features, targets) and predict(features)")
+        if isinstance(model, type) or not all(
+            callable(getattr(model, name, None)) for name in ("learn", "predict")
+        ):
+            raise ValueError(
+                f"model = {model!r}: must be an object with learn(features, targets) and predict(features)"
+            )
         self.name = type(model).__name__
         self._set_up(model, **options)
 
@@ -97,12 +101,18 @@ class PythonModel:
         self.period = checks.whole("period", period, 1)
         self.budget = None if budget is None else checks.positive("budget", budget, "s")
         self._online = Online(
-            Batch(self.period), State() if features is None else features, frequency=frequency, scale=scale, bias_bandwidth=0.0
+            Batch(self.period),
+            State() if features is None else features,
+            frequency=frequency,
+            scale=scale,
+            bias_bandwidth=0.0,
         )
         try:
             self._source = copy.deepcopy(model)
         except Exception as error:
-            raise ValueError(f"{self.name}: must be something copy.deepcopy can copy ({type(error).__name__}: {error})") from error
+            raise ValueError(
+                f"{self.name}: must be something copy.deepcopy can copy ({type(error).__name__}: {error})"
+            ) from error
         self.last_problem = ""
         """The text of the last problem that a loop had with the model; empty where there was none."""
         self._tried: set[int] = set()
@@ -140,7 +150,9 @@ class PythonModel:
         """Go on with copies of what ``snapshot`` returned."""
         snapshot = snapshots["model"]
         if not isinstance(snapshot, Snapshot):
-            raise ValueError(f"state of {self.name}: must be what controller.state gave, in this process, got {type(snapshot).__name__}")
+            raise ValueError(
+                f"state of {self.name}: must be what controller.state gave, in this process, got {type(snapshot).__name__}"
+            )
         instance_of(memory.model).replaced(snapshot.model, snapshot.failures)
 
     def _unwrapped(self, model: Any) -> Any:
@@ -178,4 +190,6 @@ def needed(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f"{module} is needed for this learner and can't be imported ({error}): pip install 'quell[{extra}]'") from error
+        raise ImportError(
+            f"{module} is needed for this learner and can't be imported ({error}): pip install 'quell[{extra}]'"
+        ) from error

@@ -27,8 +27,12 @@ class RiverModel(PythonModel):
     """
 
     def __init__(self, regressor: Any, **options: Unpack[Options]) -> None:
-        if isinstance(regressor, type) or not all(callable(getattr(regressor, name, None)) for name in ("learn_one", "predict_one")):
-            raise ValueError(f"regressor = {regressor!r}: must have learn_one and predict_one, as river's regressors have")
+        if isinstance(regressor, type) or not all(
+            callable(getattr(regressor, name, None)) for name in ("learn_one", "predict_one")
+        ):
+            raise ValueError(
+                f"regressor = {regressor!r}: must have learn_one and predict_one, as river's regressors have"
+            )
         self.name = type(regressor).__name__
         self._set_up(_Regressor(regressor), **options)
 

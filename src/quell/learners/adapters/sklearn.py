@@ -29,7 +29,9 @@ class SklearnModel(PythonModel):
     """
 
     def __init__(self, estimator: Any, **options: Unpack[Options]) -> None:
-        if isinstance(estimator, type) or not all(callable(getattr(estimator, name, None)) for name in ("partial_fit", "predict")):
+        if isinstance(estimator, type) or not all(
+            callable(getattr(estimator, name, None)) for name in ("partial_fit", "predict")
+        ):
             raise ValueError(
                 f"estimator = {estimator!r}: must have partial_fit and predict, as SGDRegressor and MLPRegressor have; "
                 "of a pipeline, give its last step: features come scaled"

@@ -34,7 +34,14 @@ class TorchModel(PythonModel):
         for something that is no module or optimiser, and as ``PythonModel``.
     """
 
-    def __init__(self, module: Any, optimizer: Callable[[Any], Any] | Any = None, *, steps: int = 1, **options: Unpack[Options]) -> None:
+    def __init__(
+        self,
+        module: Any,
+        optimizer: Callable[[Any], Any] | Any = None,
+        *,
+        steps: int = 1,
+        **options: Unpack[Options],
+    ) -> None:
         torch = needed("torch", "torch")
         if not isinstance(module, torch.nn.Module):
             raise ValueError(f"module = {module!r}: must be a torch.nn.Module")
@@ -46,10 +53,18 @@ class TorchModel(PythonModel):
         elif not isinstance(optimizer, torch.optim.Optimizer) and callable(optimizer):
             optimizer = optimizer(parameters)
         if not isinstance(optimizer, torch.optim.Optimizer):
-            raise ValueError(f"optimizer = {optimizer!r}: must be a torch optimiser, or a function that makes one of parameters")
+            raise ValueError(
+                f"optimizer = {optimizer!r}: must be a torch optimiser, or a function that makes one of parameters"
+            )
         own = {id(parameter) for parameter in parameters}
-        if any(id(parameter) not in own for group in optimizer.param_groups for parameter in group["params"]):
-            raise ValueError("optimizer: must be on the parameters of the module; make it of module.parameters()")
+        if any(
+            id(parameter) not in own
+            for group in optimizer.param_groups
+            for parameter in group["params"]
+        ):
+            raise ValueError(
+                "optimizer: must be on the parameters of the module; make it of module.parameters()"
+            )
         self.name = type(module).__name__
         self._set_up(_Module(module, optimizer, checks.whole("steps", steps, 1)), **options)
 
@@ -71,7 +86,9 @@ class _Module:
             self.optimizer.zero_grad()
             output = self.module(rows)
             if tuple(output.shape) not in ((len(wanted), 1), (len(wanted),)):
-                raise ValueError(f"returned shape {tuple(output.shape)} for {len(wanted)} rows: must be one number for each")
+                raise ValueError(
+                    f"returned shape {tuple(output.shape)} for {len(wanted)} rows: must be one number for each"
+                )
             torch.nn.functional.mse_loss(output.reshape(-1), wanted).backward()
             self.optimizer.step()
 

@@ -23,7 +23,12 @@ class Worker:
         """Start a job, which must not raise."""
         if self._thread is None:
             # What the thread holds on to must not be the worker, or neither would ever end.
-            self._thread = threading.Thread(target=_run, args=(self._jobs, self._done, self._box), name="quell learner", daemon=True)
+            self._thread = threading.Thread(
+                target=_run,
+                args=(self._jobs, self._done, self._box),
+                name="quell learner",
+                daemon=True,
+            )
             self._thread.start()
         self._done.clear()
         self.busy = True
@@ -46,7 +51,9 @@ class Worker:
         self._jobs.put(None)
 
 
-def _run(jobs: queue.SimpleQueue[Callable[[], Any] | None], done: threading.Event, box: list[Any]) -> None:
+def _run(
+    jobs: queue.SimpleQueue[Callable[[], Any] | None], done: threading.Event, box: list[Any]
+) -> None:
     while True:
         job = jobs.get()
         if job is None:

@@ -1,1 +1,0 @@
-"""What the commands of ``quell`` print: one module for each."""

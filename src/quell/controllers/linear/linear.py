@@ -1,0 +1,310 @@
+"""Linear controllers of two degrees of freedom in discrete time: one kernel for every linear law there is."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.controllers.bad_samples import hold, rest_within
+from quell.controllers.base import applied, control, flags, report, rest
+from quell.controllers.limits import Limits, apply_limits, limits
+from quell.controllers.running import Running
+from quell.kernels.dispatch import is_finite, kernel
+from quell.types import Matrix, Status, Vector
+
+_MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
+_OVERFLOWED = int(Status.OVERFLOWED)
+
+# Places in LinearState.loop.
+_U, _WISHED, _R, _Y, _STARTED, _REFERENCED, _STATUS = range(7)
+
+
+class LinearLaw(NamedTuple):
+    """A sampled linear law of m states that is told what was really applied.
+
+    ::
+
+        u_wished = C x + D_r r + D_y y          u = limited(u_wished)
+        x⁺       = A x + B_r r + B_y y + B_u u
+
+    Without limits, u is u_wished and the law is the linear system with A + B_u C and so on. B_u is what keeps it from winding up.
+    """
+
+    A: Matrix
+    """(m, m)."""
+    B_r: Vector
+    """(m,)."""
+    B_y: Vector
+    """(m,)."""
+    B_u: Vector
+    """(m,)."""
+    C: Vector
+    """(m,)."""
+    D_r: float
+    D_y: float
+
+
+class LinearDesign(NamedTuple):
+    """Parameters of the controller."""
+
+    law: LinearLaw
+    start: Vector
+    """The state (m,) of rest at y = 1."""
+    limits: Limits
+
+
+class LinearState(NamedTuple):
+    """State of the controller."""
+
+    x: Vector
+    """The law's state (m,)."""
+    next: Vector
+    """Room for the one after it (m,)."""
+    loop: Vector
+    """(7,): u applied, u wished, last good r and y, whether there was a good y, whether a good r, status."""
+
+
+@kernel
+def _start(design: LinearDesign, state: LinearState, y: float) -> None:
+    for i in range(state.x.size):
+        state.x[i] = design.start[i] * y
+
+
+@control.register(LinearDesign)
+def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> float:
+    law, x, loop = design.law, state.x, state.loop
+    status = hold(loop, _R, r, y)
+    if loop[_STARTED] == 0.0:
+        if status & _MEASUREMENT_HELD != 0:
+            loop[_U] = loop[_WISHED] = rest_within(design.limits)
+            loop[_STATUS] = status
+            return loop[_U]
+        _start(design, state, loop[_Y])
+        loop[_STARTED] = 1.0
+    wished = law.D_r * loop[_R] + law.D_y * loop[_Y]
+    for i in range(x.size):
+        wished += law.C[i] * x[i]
+    if not is_finite(wished):
+        status |= _OVERFLOWED
+        _start(design, state, loop[_Y])
+        wished = loop[_U]
+    u, cut = apply_limits(design.limits, wished, loop[_U])
+    for i in range(x.size):
+        total = law.B_r[i] * loop[_R] + law.B_y[i] * loop[_Y] + law.B_u[i] * u
+        for j in range(x.size):
+            total += law.A[i, j] * x[j]
+        state.next[i] = total
+    for i in range(x.size):
+        x[i] = state.next[i]
+    loop[_U] = u
+    loop[_WISHED] = wished
+    loop[_STATUS] = status | cut
+    return u
+
+
+@report.register(LinearDesign)
+def _report(design: LinearDesign, state: LinearState, row: Vector) -> None:
+    row[0] = state.loop[_WISHED]
+    row[1] = state.loop[_STATUS]
+
+
+@flags.register(LinearDesign)
+def _flags(design: LinearDesign, state: LinearState) -> int:
+    return int(state.loop[_STATUS])
+
+
+@rest.register(LinearDesign)
+def _rest(design: LinearDesign, state: LinearState) -> None:
+    for i in range(state.loop.size):
+        state.loop[i] = 0.0
+
+
+@applied.register(LinearDesign)
+def _applied(design: LinearDesign, state: LinearState, u: float) -> None:
+    # The law's state went on with the u that was returned.
+    correction = u - state.loop[_U]
+    for i in range(state.x.size):
+        state.x[i] += design.law.B_u[i] * correction
+    state.loop[_U] = u
+
+
+class LinearController(Running):
+    """Any sampled linear law of two degrees of freedom, with limits, as a controller.
+
+    It starts from rest: at the first good measurement y_0 the state is the one that a loop would have that had been resting at
+    r = y = y_0 with u = 0. So no bump comes from y_0 ≠ 0 where the law has such a state; every law with integral action has. Where it has
+    none, the state is at rest and u is what the law makes of it.
+
+    What is applied, after limits, drives the law through ``B_u``; ``from_transfer_function`` chooses it. Bad samples are held, and u waits
+    for a first good measurement, as in ``ADRC``.
+
+    Parameters
+    ----------
+    law
+        the law, for the sample time ``dt``.
+    dt
+        sample time [s].
+    u_min, u_max
+        limits of the control signal [u-unit].
+    rate_limit
+        how fast it may move, in either direction [u-unit/s].
+    name
+        for tables and plots.
+
+    Raises
+    ------
+    ValueError
+        for matrices whose shapes do not fit or that hold what is not finite, limits in the wrong order, a rate limit or sample time
+        that is not positive.
+
+    Examples
+    --------
+    >>> controller = LinearController.from_transfer_function([2.0, 1.0], [1.0, 0.0], dt=0.1, u_max=1.5)  # 2 + 1/s
+    >>> controller.step(r=1.0, y=0.0)
+    1.5
+    >>> controller.status
+    <Status.SATURATED: 4>
+    """
+
+    features: tuple[str, ...] = ()
+    channels: tuple[tuple[str, int], ...] = (("u_wished", 1), ("status", 1))
+
+    def __init__(
+        self,
+        law: LinearLaw,
+        dt: float,
+        *,
+        u_min: float = -math.inf,
+        u_max: float = math.inf,
+        rate_limit: float = math.inf,
+        name: str = "linear controller",
+    ) -> None:
+        self.law = checked_law(law)
+        self.dt = checks.positive("dt", dt, "s")
+        self.name = name
+        self._limits = limits(u_min, u_max, rate_limit, self.dt)
+        self._begin()
+
+    @classmethod
+    def from_transfer_function(
+        cls,
+        num: Any,
+        den: Any = None,
+        dt: float | None = None,
+        *,
+        feedback: str = "error",
+        method: str = "tustin",
+        prewarp: float | None = None,
+        tracking_time: float | None = None,
+        u_min: float = -math.inf,
+        u_max: float = math.inf,
+        rate_limit: float = math.inf,
+        name: str = "transfer function",
+    ) -> LinearController:
+        """Make a controller of one degree of freedom from C(s): ``u = C (r − y)``, or ``u = −C y``.
+
+        It is realised in scaled, balanced coordinates and sampled there, never as polynomials in z, whose roots crowd at 1.
+
+        Parameters
+        ----------
+        num, den
+            polynomials in s, highest power first; or ``num`` is a ``control.TransferFunction`` or ``control.StateSpace`` in continuous
+            time, and ``den`` is left out.
+        dt
+            sample time [s].
+        feedback
+            ``"error"``: C acts on r − y; ``"output"``: on −y alone.
+        method
+            ``"tustin"``: ``s = 2 (z − 1) / (dt (z + 1))``, or ``"zoh"``: as if r and y were held over a sample, which is half a sample
+            later.
+        prewarp
+            frequency [rad/s] at which Tustin's response is that of C(s) exactly.
+        tracking_time
+            how fast integrators follow u at its limits [s]; see ``quell.controllers.linear.transfer.anti_windup``. By default the time
+            constant of C's slowest zero, or of its slowest pole, where it has none, other than zero.
+        u_min, u_max, rate_limit, name
+            as for the class.
+
+        Raises
+        ------
+        ValueError
+            for a C(s) that is not proper or not of one input and output, or arguments out of range.
+        """
+        from quell.controllers.linear.transfer import as_state_space, sampled_law
+
+        dt = checks.positive("dt", dt, "s")
+        on_error = checks.one_of("feedback", feedback, ("error", "output")) == "error"
+        A, B, C, D = as_state_space(num, den)
+        system = (
+            A,
+            np.hstack([B if on_error else 0.0 * B, -B]),
+            C,
+            np.hstack([D if on_error else 0.0 * D, -D]),
+        )
+        law = sampled_law(system, dt, method=method, prewarp=prewarp, tracking_time=tracking_time)
+        return LinearController(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
+
+    def _prepare_design(self) -> None:
+        self.parameters = LinearDesign(self.law, rest_state(self.law), self._limits)
+
+    def initial_state(self) -> LinearState:
+        """Return a state before the first sample."""
+        size = self.law.C.size
+        return LinearState(np.zeros(size), np.zeros(size), np.zeros(7))
+
+    @property
+    def status(self) -> Status:
+        """What the last step had to report."""
+        return Status(int(self._state.loop[_STATUS]))
+
+
+def checked_law(law: Any) -> LinearLaw:
+    """Return the law with contiguous arrays that can't be written to.
+
+    Parameters
+    ----------
+    law
+        a ``LinearLaw``: A (m, m); B_r, B_y, B_u and C (m,); D_r and D_y numbers [u-unit/y-unit].
+
+    Raises
+    ------
+    ValueError
+        for what is no ``LinearLaw``, shapes that do not fit, or an entry that is not finite; the message names the matrix.
+    """
+    if not isinstance(law, LinearLaw):
+        raise ValueError(f"law = {law!r}: must be a quell.controllers.LinearLaw")
+    A = checks.matrix("law.A", law.A)
+    m = A.shape[0]
+    checks.matrix("law.A", A, m, m)
+    B_r, B_y, B_u, C = (
+        checks.vector(f"law.{name}", getattr(law, name), m) for name in ("B_r", "B_y", "B_u", "C")
+    )
+    for array in (A, B_r, B_y, B_u, C):
+        array.flags.writeable = False
+    return LinearLaw(
+        A, B_r, B_y, B_u, C, checks.finite("law.D_r", law.D_r), checks.finite("law.D_y", law.D_y)
+    )
+
+
+def rest_state(law: LinearLaw) -> Vector:
+    """Return the state (m,) of a law that rests at r = y = 1 with u = 0, or as near to it as it can.
+
+    Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y))`` it is the one whose u is nearest to zero: an integrator holds
+    whatever the rest of the law needs. By least squares, where there is none.
+    """
+    D = law.D_r + law.D_y
+    pull = np.eye(law.C.size) - law.A - np.outer(law.B_u, law.C)
+    x = (
+        np.linalg.pinv(pull, rcond=1e-10) @ (law.B_r + law.B_y + law.B_u * D)
+        if law.C.size
+        else np.zeros(0)
+    )
+    _, singular, rows = np.linalg.svd(pull)
+    free = rows[singular <= 1e-10 * np.max(singular, initial=0.0)]
+    seen = free @ law.C
+    if seen @ seen > 0.0:
+        x = x - free.T @ seen * ((law.C @ x + D) / (seen @ seen))
+    return np.ascontiguousarray(x)

@@ -1,0 +1,224 @@
+"""From a transfer function in s to a sampled linear law: realisation, sampling, anti-windup.
+
+Polynomials in z are no way to keep a law: sampled fast, all their roots crowd at z = 1, and a coefficient's last digit moves them. So a
+law is realised in continuous time, in coordinates where entries are O(1), and sampled as a state-space system, where what is kept is
+of the form I + O(dt).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.controllers.linear.linear import LinearLaw
+from quell.lti.discretize import zero_order_hold
+from quell.types import Matrix, Vector
+
+METHODS = ("tustin", "zoh")
+# Poles this near to the unit circle, or outside of it, do not fade by themselves while u is at a limit.
+_MARGINAL = 1e-9
+
+System = tuple[Matrix, Matrix, Matrix, Matrix]
+
+
+def as_state_space(num: Any, den: Any = None) -> System:
+    """Return (A, B, C, D) of a transfer function, in balanced coordinates.
+
+    Parameters
+    ----------
+    num, den
+        polynomials in s, highest power first; or a ``control.TransferFunction`` or ``control.StateSpace`` in continuous time.
+
+    Raises
+    ------
+    ValueError
+        where it has several inputs or outputs, is not proper, or has a sample time.
+    """
+    if den is not None:
+        return realised([num], den)
+    if getattr(num, "dt", None):
+        raise ValueError(
+            f"transfer function has a sample time, dt = {num.dt!r}: must be in continuous time; it is sampled here"
+        )
+    if hasattr(num, "num") and hasattr(num, "den"):
+        if np.shape(num.num)[:2] != (1, 1):
+            raise ValueError(
+                f"transfer function has {np.shape(num.num)[:2]} outputs and inputs: must have one of each"
+            )
+        return realised([num.num[0][0]], num.den[0][0])
+    if all(hasattr(num, name) for name in "ABCD"):
+        A = checks.matrix("A", num.A)
+        m = A.shape[0]
+        checks.matrix("A", A, m, m)
+        return balanced(
+            A,
+            checks.matrix("B", num.B, m, 1),
+            checks.matrix("C", num.C, 1, m),
+            checks.matrix("D", num.D, 1, 1),
+        )
+    raise ValueError(
+        f"num = {num!r}: must be a polynomial, with den, or a control.TransferFunction or control.StateSpace"
+    )
+
+
+def realised(numerators: list[Any], den: Any) -> System:
+    """Return (A, B, C, D) of one output ``Σ N_i(s)/D(s) · input_i``, of the order of D, in balanced coordinates.
+
+    It is the observer canonical form in time scaled by the geometric mean of the poles that are not zero, which serves several inputs
+    with no more states than D has roots.
+
+    Raises
+    ------
+    ValueError
+        for a denominator of zero, or a numerator of higher degree than it.
+    """
+    D = np.trim_zeros(checks.vector("den", den), "f")
+    if D.size == 0:
+        raise ValueError(f"den = {den!r}: must not be zero")
+    m = D.size - 1
+    N = np.zeros((len(numerators), m + 1))
+    for row, given in zip(N, numerators, strict=True):
+        polynomial = np.trim_zeros(checks.vector("num", given), "f")
+        if polynomial.size > m + 1:
+            raise ValueError(
+                f"num = {np.asarray(given).tolist()!r}: is of degree {polynomial.size - 1}, den of degree {m}: C(s) must be proper; "
+                "add a filter to what differentiates"
+            )
+        row[m + 1 - polynomial.size :] = polynomial
+    last = np.flatnonzero(D)[-1]  # what follows are poles at zero
+    unit = abs(D[last] / D[0]) ** (1.0 / last) if last else 1.0
+    powers = unit ** -np.arange(m + 1.0) / D[0]
+    D, N = D * powers, N * powers
+    through = N[:, :1]
+    A = np.diag(np.ones(m - 1), 1) if m else np.zeros((0, 0))
+    if m:
+        A[:, 0] = -D[1:]
+    B = (N[:, 1:] - through * D[1:]).T
+    C = np.eye(1, m)
+    # x' is by scaled time: s = unit · scaled s.
+    return balanced(unit * A, unit * B, C, through.T.copy())
+
+
+def balanced(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> System:
+    """Scale the states so that A's rows and columns are alike in size, and B and C share what is left."""
+    from scipy.linalg import matrix_balance
+
+    if A.shape[0] == 0:
+        return A, B, C, D
+    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    B, C = B / scale[:, None], C * scale
+    into, out = float(np.max(np.abs(B))), float(np.max(np.abs(C)))
+    share = math.sqrt(out / into) if into > 0.0 and out > 0.0 else 1.0
+    return A, B * share, C / share, D
+
+
+def tustin(system: System, dt: float, prewarp: float | None = None) -> System:
+    """Sample by the trapezoidal rule: ``s = (z − 1) / (h (z + 1))`` with h = dt/2, or h = tan(ω dt/2)/ω, which is exact at ω.
+
+    ``A_d = (I − hA)⁻¹ (I + hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``, ``D_d = D + h C (I − hA)⁻¹ B`` (Franklin, Powell &
+    Workman, *Digital Control of Dynamic Systems*, 1998, section 6.1).
+
+    Raises
+    ------
+    ValueError
+        for a prewarping frequency at or above half the sampling rate.
+    """
+    h = 0.5 * dt
+    if prewarp is not None:
+        if checks.positive("prewarp", prewarp, "rad/s") * dt >= math.pi:
+            raise ValueError(
+                f"prewarp = {prewarp!r} rad/s with dt = {dt!r} s: must be below pi/dt = {math.pi / dt:.3g} rad/s"
+            )
+        h = math.tan(0.5 * prewarp * dt) / prewarp
+    A, B, C, D = system
+    one = np.eye(A.shape[0])
+    inverse = np.asarray(np.linalg.inv(one - h * A), dtype=np.float64)
+    B_d, C_d = 2.0 * h * inverse @ B, C @ inverse
+    return inverse @ (one + h * A), B_d, C_d, D + 0.5 * C @ B_d
+
+
+def sampled_law(
+    system: System,
+    dt: float,
+    *,
+    method: str = "tustin",
+    prewarp: float | None = None,
+    tracking_time: float | None = None,
+) -> LinearLaw:
+    """Return the law of a continuous-time system with the inputs (r, y) and the output u; see ``from_transfer_function``."""
+    if checks.one_of("method", method, METHODS) == "tustin":
+        A, B, C, D = tustin(system, dt, prewarp)
+    else:
+        if prewarp is not None:
+            raise ValueError(f"prewarp = {prewarp!r}: goes with method = 'tustin' only")
+        (B, C, D), (A, [B]) = system[1:], zero_order_hold(system[0], [system[1]], dt)
+    time = (
+        _default_tracking_time(system)
+        if tracking_time is None
+        else checks.positive("tracking_time", tracking_time, "s")
+    )
+    back = anti_windup(A, C[0], math.exp(-dt / time))
+    return LinearLaw(
+        A - np.outer(back, C[0]),
+        B[:, 0] - back * D[0, 0],
+        B[:, 1] - back * D[0, 1],
+        back,
+        C[0],
+        D[0, 0],
+        D[0, 1],
+    )
+
+
+def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
+    """Return the gain B_u (m,) of ``x⁺ = A x + … + B_u (u − u_wished)`` by which a law follows what is applied.
+
+    The law is seen as an observer of its own state with the applied u as measurement (Åström & Wittenmark, *Computer-Controlled
+    Systems*, 1997, section 3.5; Kothare, Campo, Morari & Nett, *Automatica* 30, 1994). Poles on the unit circle or outside of it, which
+    do not fade by themselves, go to ``pole``; the others stay where they are. For a PID controller that is back-calculation: the
+    integrator alone follows, with the tracking time ``−dt / ln(pole)``.
+    """
+    from scipy.linalg import schur
+
+    if A.shape[0] == 0:
+        return np.zeros(0)
+    marginal = 1.0 - _MARGINAL
+    block, basis, count = schur(
+        A, output="real", sort=lambda re, im=0.0: abs(complex(re, im)) > marginal
+    )
+    # What B_u and the law together can't see, C does not show either: it stays.
+    inner, seen = block[:count, :count], C @ basis[:, :count]
+    rows, power, moved = np.empty((count, count)), np.eye(count), np.eye(count)
+    for i in range(count):
+        rows[i] = seen @ power
+        power, moved = power @ (inner - np.eye(count)), moved @ (inner - pole * np.eye(count))
+    if count == 0 or np.linalg.matrix_rank(rows) < count:
+        return np.zeros(A.shape[0])
+    return np.ascontiguousarray(
+        basis[:, :count] @ (moved @ np.linalg.solve(rows, np.eye(count)[-1]))
+    )
+
+
+def _default_tracking_time(system: System) -> float:
+    """Return the time constant of the slowest zero from y, or of the slowest pole, other than zero [s]."""
+    A, B, C, D = system
+    if A.shape[0] == 0:
+        return 1.0
+    from scipy.linalg import eigvals
+
+    poles = np.linalg.eigvals(A)
+    pencil = np.block([[A, B[:, 1:]], [C, D[:, 1:]]])
+    zeros = eigvals(pencil, np.diag([*np.ones(A.shape[0]), 0.0]))
+    fastest = max(float(np.max(np.abs(poles))), 1e-300)
+    for candidates in (zeros, poles):
+        sizes = np.abs(candidates[np.isfinite(candidates)])
+        sizes = (
+            sizes[(sizes > 1e-6 * fastest) & (sizes < 1e6 * fastest)]
+            if np.any(np.abs(poles) > 0.0)
+            else sizes[sizes > 0.0]
+        )
+        if sizes.size:
+            return float(1.0 / np.min(sizes))
+    return 1.0

@@ -1,0 +1,123 @@
+"""Han's tracking differentiator: a reference that a plant can follow, and its derivative.
+
+Han, *IEEE Trans. Industrial Electronics* 56, 2009, eqs. (10) and (11)::
+
+    v_1⁺ = v_1 + h v_2,      v_2⁺ = v_2 + h fhan(v_1 − r, v_2, r_0, h_0)
+
+``fhan`` drives the sampled double integrator to the origin in the least time that ``|fhan| ≤ r_0`` allows, and for ``h_0 = h`` without
+overshoot. A larger ``h_0`` smooths, and filters noise in r. The paper prints ``d = h_0 r_0²``, which has the wrong unit; d is compared
+with a position, and is ``r_0 h_0²``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.controllers.prefilters.prefilter import prefilter, settle, slopes
+from quell.kernels.dispatch import kernel
+from quell.types import Vector
+
+
+class TrackingDesign(NamedTuple):
+    """Parameters."""
+
+    acceleration: float
+    """r_0 [y-unit/s²]."""
+    horizon: float
+    """h_0 [s]."""
+    dt: float
+    """h [s]."""
+
+
+class TrackingMemory(NamedTuple):
+    """State."""
+
+    v: Vector
+    """v_1 [y-unit] and v_2 [y-unit/s] (2,)."""
+
+
+@kernel
+def fhan(x1: float, x2: float, r0: float, h0: float) -> float:
+    """Return the acceleration, within ±r0, that takes position ``x1`` and speed ``x2`` to zero soonest."""
+    d = r0 * h0 * h0
+    a0 = h0 * x2
+    y = x1 + a0
+    a = a0 + (y if abs(y) <= d else math.copysign(0.5 * (math.sqrt(d * (d + 8.0 * abs(y))) - d), y))
+    return -r0 * a / d if abs(a) <= d else -math.copysign(r0, a)
+
+
+@prefilter.register(TrackingDesign)
+def _prefilter(design: TrackingDesign, memory: TrackingMemory, r: float) -> float:
+    v = memory.v
+    pull = fhan(v[0] - r, v[1], design.acceleration, design.horizon)
+    v[0] += design.dt * v[1]
+    v[1] += design.dt * pull
+    return float(v[0])
+
+
+@slopes.register(TrackingDesign)
+def _slopes(design: TrackingDesign, memory: TrackingMemory, derivatives: Vector) -> None:
+    derivatives[0] = memory.v[1]
+
+
+@settle.register(TrackingDesign)
+def _settle(design: TrackingDesign, memory: TrackingMemory, value: float) -> None:
+    memory.v[0], memory.v[1] = value, 0.0
+
+
+@dataclass(frozen=True)
+class TrackingDifferentiator:
+    """A reference whose second derivative stays within a limit, with its derivative; to be used in ``Prefiltered``.
+
+    Parameters
+    ----------
+    acceleration
+        the limit, r_0 [y-unit/s²].
+    horizon
+        h_0 [s]: the sample time (by default) for the shortest transition, larger for a smoother one.
+
+    Raises
+    ------
+    ValueError
+        for a parameter that is not positive, and from ``design`` where the horizon is shorter than a sample.
+
+    Examples
+    --------
+    >>> profile = TrackingDifferentiator(acceleration=2.0)
+    >>> design = profile.design(dt=0.01)
+    >>> memory = profile.memory(design)
+    >>> [round(prefilter(design, memory, 1.0), 4) for _ in range(3)]
+    [0.0, 0.0002, 0.0006]
+    """
+
+    acceleration: float
+    horizon: float | None = None
+
+    def __post_init__(self) -> None:
+        checks.positive("acceleration", self.acceleration, "y-unit/s^2")
+        if self.horizon is not None:
+            checks.positive("horizon", self.horizon, "s")
+
+    @property
+    def derivatives(self) -> int:
+        """How many derivatives it gives: one."""
+        return 1
+
+    def design(self, dt: float) -> TrackingDesign:
+        """Return the parameters for a sample time [s]."""
+        dt = checks.positive("dt", dt, "s")
+        horizon = dt if self.horizon is None else float(self.horizon)
+        if horizon < dt:
+            raise ValueError(
+                f"horizon = {horizon!r} s with dt = {dt!r} s: must be at least a sample, or the profile would swing"
+            )
+        return TrackingDesign(float(self.acceleration), horizon, dt)
+
+    def memory(self, design: TrackingDesign) -> TrackingMemory:
+        """Return the state at rest at zero."""
+        return TrackingMemory(np.zeros(2))

@@ -1,0 +1,283 @@
+"""A prefilter of the reference before any controller.
+
+A prefilter is an object with ``design(dt)``, which returns a NamedTuple of parameters, and ``memory(design)``, which returns its state, a
+NamedTuple of arrays. For the type of the parameters two functions are registered: ``prefilter`` and ``settle``. One that knows derivatives
+of what it makes of the reference says how many with ``derivatives``, and registers ``slopes``.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.adrc.handover import HandOver
+from quell.controllers.base import applied, control, flags, heed, report, rest, take_over
+from quell.controllers.compiled_step import bind
+from quell.controllers.limits import Limits
+from quell.controllers.running import Running
+from quell.kernels.dispatch import generic, is_finite
+from quell.types import Status, Vector
+
+_REFERENCE_HELD = int(Status.REFERENCE_HELD)
+
+# Places in PrefilteredState.loop.
+_SHAPED, _R, _STARTED, _REFERENCED, _STATUS = range(5)
+
+
+class Prefilter(Protocol):
+    """What ``Prefiltered`` asks of a prefilter."""
+
+    def design(self, dt: float) -> Any:
+        """Return the parameters for a sample time ``dt`` [s], a NamedTuple."""
+
+    def memory(self, design: Any) -> Any:
+        """Return the state, a NamedTuple of arrays."""
+
+
+@generic
+def prefilter(design: Any, memory: Any, r: float) -> float:
+    """Take one sample: the reference to follow instead of ``r``, which is finite."""
+    raise TypeError
+
+
+@generic
+def settle(design: Any, memory: Any, value: float) -> None:
+    """Come to rest at ``value``, as if the reference had been there for ever."""
+    raise TypeError
+
+
+@generic
+def slopes(design: Any, memory: Any, derivatives: Vector) -> None:
+    """Write the derivatives of the last shaped reference, from the first on, into ``derivatives``."""
+    raise TypeError
+
+
+@slopes.register(object)
+def _no_slopes(design: Any, memory: Any, derivatives: Vector) -> None:
+    pass
+
+
+class PrefilteredDesign(NamedTuple):
+    """Parameters of a controller behind a prefilter."""
+
+    controller: Any
+    prefilter: Any
+
+
+class PrefilteredState(NamedTuple):
+    """State of a controller behind a prefilter."""
+
+    controller: Any
+    prefilter: Any
+    derivatives: Vector
+    """Of the shaped reference, as many as the prefilter knows."""
+    loop: Vector
+    """(5,): shaped reference, last good r, whether there was a good y, whether a good r, status of the prefilter."""
+
+
+@control.register(PrefilteredDesign)
+def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: float) -> float:
+    loop = state.loop
+    loop[_STATUS] = 0.0
+    if loop[_STARTED] == 0.0 and is_finite(y):
+        settle(design.prefilter, state.prefilter, y)
+        loop[_STARTED] = 1.0
+    if is_finite(r):
+        loop[_R] = r
+        loop[_REFERENCED] = 1.0
+    else:
+        loop[_STATUS] = _REFERENCE_HELD
+    shaped = r
+    if loop[_STARTED] != 0.0 and loop[_REFERENCED] != 0.0:
+        shaped = prefilter(design.prefilter, state.prefilter, loop[_R])
+        if state.derivatives.size > 0:
+            slopes(design.prefilter, state.prefilter, state.derivatives)
+            heed(design.controller, state.controller, state.derivatives)
+    loop[_SHAPED] = shaped if is_finite(shaped) else y
+    return control(design.controller, state.controller, shaped, y)
+
+
+@report.register(PrefilteredDesign)
+def _report(design: PrefilteredDesign, state: PrefilteredState, row: Vector) -> None:
+    row[0] = state.loop[_SHAPED]
+    report(design.controller, state.controller, row[1:])
+
+
+@flags.register(PrefilteredDesign)
+def _flags(design: PrefilteredDesign, state: PrefilteredState) -> int:
+    return flags(design.controller, state.controller) | int(state.loop[_STATUS])
+
+
+@rest.register(PrefilteredDesign)
+def _rest(design: PrefilteredDesign, state: PrefilteredState) -> None:
+    for i in range(state.loop.size):
+        state.loop[i] = 0.0
+    rest(design.controller, state.controller)
+
+
+@applied.register(PrefilteredDesign)
+def _applied(design: PrefilteredDesign, state: PrefilteredState, u: float) -> None:
+    applied(design.controller, state.controller, u)
+
+
+@take_over.register(PrefilteredDesign)
+def _take_over(design: PrefilteredDesign, state: PrefilteredState) -> None:
+    take_over(design.controller, state.controller)
+
+
+class Prefiltered(HandOver):
+    """A controller that follows a prefiltered reference.
+
+    The prefilter starts at rest at the first good measurement, so that a reference that stands elsewhere from the first sample on is a
+    step to it. What it makes of the reference is the channel ``r_shaped``. The controller that is passed stays as it is: its copy here
+    runs. Around an ADRC there are ``start``, ``track``, ``hand_over``, ``applied``, ``increment`` and ``retune`` as there.
+
+    Parameters
+    ----------
+    controller
+        any controller: ``ADRC``, ``LinearController``, another ``Prefiltered``.
+    prefilter
+        for example ``quell.baselines.ZV(omega, zeta)``.
+
+    Raises
+    ------
+    ValueError
+        for something that is no controller or no prefilter, and for a controller with feedforward behind a prefilter that knows no
+        derivatives of what it makes of the reference.
+
+    Examples
+    --------
+    >>> from quell.controllers.baselines import PID, ZV
+    >>> shaped = Prefiltered(PID(kp=2.0, dt=0.1), ZV(omega=5.0))
+    >>> shaped.step(r=1.0, y=0.0)
+    1.0
+    """
+
+    def __init__(self, controller: Any, prefilter: Prefilter) -> None:
+        if isinstance(controller, type) or not all(
+            hasattr(controller, name) for name in ("parameters", "initial_state", "channels")
+        ):
+            raise ValueError(
+                f"controller = {controller!r}: must be a controller, for example quell.ADRC(...)"
+            )
+        if isinstance(prefilter, type) or not all(
+            hasattr(prefilter, name) for name in ("design", "memory")
+        ):
+            raise ValueError(
+                f"prefilter = {prefilter!r}: must be a prefilter, for example quell.baselines.ZV(omega=1.4)"
+            )
+        if getattr(controller, "derivatives", 0) and not getattr(prefilter, "derivatives", 0):
+            raise ValueError(
+                f"controller has feedforward, and {type(prefilter).__name__} knows no derivatives of what it makes of the reference: "
+                "use feedforward=False, or a prefilter such as ReferenceModel"
+            )
+        self.controller = copy.copy(controller)
+        self.prefilter = prefilter
+        self._begin()
+
+    def _begin(self) -> None:
+        super()._begin()
+        # One running state: what is done to the controller is done to what runs here.
+        if isinstance(self.controller, Running):
+            self.controller._adopt(self._state.controller)
+
+    @property
+    def _law(self) -> ADRC:
+        if isinstance(self.controller, ADRC):
+            return self.controller
+        if isinstance(self.controller, Prefiltered):
+            return self.controller._law
+        raise ValueError(
+            f"controller = {type(self.controller).__name__}: only an ADRC starts under load, hands over and is retuned"
+        )
+
+    def _rebind(self) -> None:
+        if isinstance(self.controller, Prefiltered):
+            self.controller._rebind()
+        self.parameters = self.parameters._replace(controller=self.controller.parameters)
+        if self._handle is not None:
+            self._handle = bind(self.parameters, self._state)
+
+    def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
+        """Start where the plant rests, see ``ADRC.start``; the prefilter comes to rest at ``y``."""
+        if isinstance(self.controller, Prefiltered):
+            self.controller.start(y, u, r)
+        else:
+            super().start(y, u, r)
+        state = self._state
+        settle(self.parameters.prefilter, state.prefilter, float(y))
+        state.loop[_STARTED] = state.loop[_REFERENCED] = 1.0
+        state.loop[_R] = float(y if r is None else r)
+
+    def _prepare_design(self) -> None:
+        self.parameters = PrefilteredDesign(
+            self.controller.parameters, self.prefilter.design(self.dt)
+        )
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s]."""
+        return float(self.controller.dt)
+
+    @property
+    def limits(self) -> Limits:
+        """What the control signal keeps to."""
+        return self.controller.limits
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """What the entries of the channel ``theta`` multiply, where there is one."""
+        return tuple(self.controller.features)
+
+    @property
+    def channels(self) -> tuple[tuple[str, int], ...]:
+        """Name and width of what ``report`` writes, in order."""
+        return (("r_shaped", 1), *self.controller.channels)
+
+    def initial_state(self) -> PrefilteredState:
+        """Return a state before the first sample, with nothing learned."""
+        known = (
+            getattr(self.prefilter, "derivatives", 0)
+            if getattr(self.controller, "derivatives", 0)
+            else 0
+        )
+        return PrefilteredState(
+            self.controller.initial_state(),
+            self.prefilter.memory(self.parameters.prefilter),
+            np.zeros(known),
+            np.zeros(5),
+        )
+
+    @property
+    def status(self) -> Status:
+        """What the last step had to report."""
+        return Status(int(flags(self.parameters, self._state)))
+
+    @property
+    def estimate(self) -> Any:
+        """What an ADRC behind the prefilter knows after the last step."""
+        return self.read(self._state)
+
+    def read(self, state: PrefilteredState) -> Any:
+        """Return what the controller knows in ``state``; an error where it is none that reads."""
+        return self.controller.read(state.controller)
+
+    @property
+    def _outside(self) -> tuple[str, ...]:
+        return tuple(f"controller.{name}" for name in getattr(self.controller, "_outside", ()))
+
+    def _snapshots(self, state: PrefilteredState) -> dict[str, Any]:
+        if not self._outside:
+            return {}
+        saved = self.controller._saved(state.controller)
+        return {name: saved[name.removeprefix("controller.")][()] for name in self._outside}
+
+    def _recall(self, state: PrefilteredState, snapshots: Mapping[str, Any]) -> None:
+        self.controller._recall(
+            state.controller,
+            {name.removeprefix("controller."): value for name, value in snapshots.items()},
+        )

@@ -1,0 +1,1 @@
+"""The ACC robust-control benchmark: published designs and ours on a thousand uncertain plants."""

@@ -1,0 +1,153 @@
+"""Uncertain plants of the ACC benchmark: read from a file, or drawn.
+
+A sample is a row ``(m1, m2, k_lin, k_nonlin, lambda, tau)``: masses [kg], stiffness [N/m] and its cubic part [N/m³], effectiveness and lag
+[s] of the actuator. ``generated`` draws more of the kind that Rocchetta, Crespo & Kenny (DSCC 2019) published: each parameter has the
+quantiles of their 1000 samples of small uncertainty, and spring, cubic part and effectiveness go together as they do there (a Gaussian
+copula with their rank correlations). What it leaves out is that light and heavy m1 both tend to go with soft springs; that makes it a
+little harsher than the original.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from quell import checks
+from quell.files import csv_rows, read_text
+from quell.plants import CubicSpringPlant, LinearPlant, lagged_two_mass_spring
+from quell.types import Matrix, Vector
+
+COLUMNS = ("m1", "m2", "k_lin", "k_nonlin", "lambda", "tau")
+NOMINAL = np.array([1.0, 1.0, 1.0, 0.0, 1.0, 0.0065])
+"""The actuator's lag is a few milliseconds where all is well; uncertainty only adds to it."""
+
+# Beyond these no such plant is, and its loop's poles are rounding.
+_MOST, _LEAST_LAG = 1e6, 1e-9
+_UNITS = {"m1": "kg", "m2": "kg", "k_lin": "N/m", "tau": "s"}
+# Quantiles of the published samples, one row a parameter.
+_LEVELS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
+_QUANTILES = (
+    (0.748, 0.781, 0.868, 0.951, 1.017, 1.056, 1.071, 1.084, 1.093),
+    (0.701, 0.803, 0.858, 0.937, 1.008, 1.072, 1.119, 1.142, 1.166),
+    (0.675, 0.815, 0.910, 0.978, 1.012, 1.029, 1.049, 1.064, 1.083),
+    (-0.278, -0.217, -0.171, -0.064, 0.019, 0.081, 0.130, 0.173, 0.234),
+    (0.736, 0.798, 0.871, 0.945, 0.999, 1.050, 1.102, 1.150, 1.215),
+    (0.0062, 0.0063, 0.0065, 0.0069, 0.0079, 0.0108, 0.0183, 0.0315, 0.0803),
+)
+# Between k_lin, k_nonlin and lambda.
+_CORRELATIONS = ((1.0, 0.94, 0.76), (0.94, 1.0, 0.71), (0.76, 0.71, 1.0))
+_MOST_SPREAD = 5.0
+
+
+def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
+    """Draw ``count`` samples, (count, 6); the same seed gives the same.
+
+    Parameters
+    ----------
+    count
+        how many, at least one.
+    spread
+        how far they are from nominal: 1 for the published small uncertainty, up to 5. What must be positive is widened as a factor
+        (``value^spread``), the cubic part and the lag linearly.
+    seed
+        of the generator.
+
+    Raises
+    ------
+    ValueError
+        for a number out of range.
+    """
+    checks.whole("count", count, 1)
+    if checks.positive("spread", spread) > _MOST_SPREAD:
+        raise ValueError(
+            f"spread = {spread!r}: must be at most {_MOST_SPREAD:g}, the published samples tell nothing of what lies so far out"
+        )
+    from scipy.stats import norm
+
+    random = np.random.default_rng(checks.whole("seed", seed, 0))
+    scores = random.standard_normal((count, 6))
+    scores[:, 2:5] = scores[:, 2:5] @ np.linalg.cholesky(_CORRELATIONS).T
+    ranks = norm.cdf(scores)
+    small = np.column_stack(
+        [np.interp(ranks[:, j], _LEVELS, row) for j, row in enumerate(_QUANTILES)]
+    )
+    return widened(small, spread)
+
+
+def widened(samples: Matrix, spread: float) -> Matrix:
+    """Return samples ``spread`` times as far from nominal, masses, stiffness and effectiveness in proportion, the rest in difference."""
+    wide = np.empty_like(samples)
+    for j in range(6):
+        wide[:, j] = (
+            NOMINAL[j] + spread * (samples[:, j] - NOMINAL[j])
+            if j in (3, 5)
+            else samples[:, j] ** spread
+        )
+    wide[:, 5] = np.maximum(wide[:, 5], 1e-3)
+    return wide
+
+
+def read(path: str | os.PathLike[str]) -> Matrix:
+    """Read samples from a CSV file, (count, 6).
+
+    The first line names the columns, in any order: ``m1, m2, k_lin, k_nonlin, lambda, tau``, or ``theta_1`` to ``theta_6`` as published.
+    Other columns are left alone.
+
+    Raises
+    ------
+    ValueError
+        where the file can't be read, a column is missing, or a value is no number or out of range; it names line and column.
+    """
+    where = f"samples = {os.fspath(path)!r}"
+    rows = csv_rows(read_text(path, where), where)
+    if len(rows) < 2:
+        raise ValueError(f"{where}: must have a line of column names and at least one sample")
+    header = [cell.lstrip("\\") for cell in rows[0][1]]
+    places = [_place(where, header, j) for j in range(6)]
+    return np.array(
+        [
+            [_value(where, number, row, place, j) for j, place in enumerate(places)]
+            for number, row in rows[1:]
+        ]
+    )
+
+
+def _place(where: str, header: list[str], j: int) -> int:
+    names = (COLUMNS[j], f"theta_{j + 1}")
+    found = [i for i, name in enumerate(header) if name in names]
+    if len(found) != 1:
+        fault = "is missing" if not found else "is there more than once"
+        raise ValueError(
+            f"{where}: column {names[0]} (or {names[1]}) {fault}; the first line has {', '.join(header)}"
+        )
+    return found[0]
+
+
+def _value(where: str, number: int, row: list[str], place: int, j: int) -> float:
+    name = COLUMNS[j]
+    text = row[place].strip() if place < len(row) else ""
+    try:
+        value = float(text.replace("_", "?"))  # which Python would read over
+    except ValueError:
+        raise ValueError(f"{where}, line {number}: {name} = {text!r}: must be a number") from None
+    try:
+        value = (
+            checks.finite(name, value)
+            if name == "k_nonlin"
+            else checks.positive(name, value, _UNITS.get(name, ""))
+        )
+    except ValueError as error:
+        raise ValueError(f"{where}, line {number}: {error}") from None
+    least = 0.0 if name == "k_nonlin" else _LEAST_LAG if name == "tau" else 1.0 / _MOST
+    if not least <= abs(value) <= _MOST:
+        raise ValueError(
+            f"{where}, line {number}: {name} = {value!r}: must be between {least:g} and {_MOST:g}, is the unit right?"
+        )
+    return value
+
+
+def plant(sample: Vector, cubic: bool) -> LinearPlant | CubicSpringPlant:
+    """Return the plant of one sample; with ``cubic`` one with a cubic part, be that zero, so that all are of one kind."""
+    m1, m2, k, k_cubic, effectiveness, lag = map(float, sample)
+    return lagged_two_mass_spring(m1, m2, k, k_cubic if cubic else None, effectiveness, lag)

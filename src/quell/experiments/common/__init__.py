@@ -1,0 +1,1 @@
+"""What all experiments use: judged claims and figures."""

@@ -1,0 +1,196 @@
+"""The figures of the torsional experiment: the paper's two, for each pair of bandwidths, and what was learned."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quell.experiments.common.figures import STYLES, blank, label_of, save_all
+from quell.experiments.torsional.setup import (
+    B0,
+    BAND,
+    END,
+    FRICTION,
+    LINEAR,
+    MB,
+    MB_OFF,
+    MF,
+    PLANTS,
+    PROFILE_AT,
+    TARGET,
+    L,
+)
+from quell.experiments.torsional.study import Case, Result
+from quell.plants import torsional_identified
+from quell.records.plotting import draw
+from quell.records.trajectory import Trajectory
+
+_STYLES: Mapping[str, dict[str, Any]] = {
+    MF: STYLES[MF],
+    MB: STYLES[MB],
+    MB_OFF: {"color": "#2a6f97", "linewidth": 1.0, "linestyle": "--"},
+    L: STYLES[L],
+}
+_HEADINGS = {FRICTION: "with friction", LINEAR: "linear"}
+# From the profile's start [s]: the move, where y reaches π, and how near it is then, in bands.
+_MOVE, _ARRIVAL, _NEAR = (0.0, 4.0), (1.9, 6.0), 4.0
+_SMOOTHED = 0.02
+
+
+def save(
+    result: Result, folder: str | os.PathLike[str], tell: Callable[[str, float], None]
+) -> list[Path]:
+    """Draw all figures into ``folder``, made if need be, each as PNG and SVG; return the paths.
+
+    Raises
+    ------
+    ValueError
+        where the folder can't be made.
+    """
+    return save_all(_figures(result), 3, folder, tell)
+
+
+def _figures(result: Result) -> Iterator[tuple[str, Any]]:
+    yield "torsional-position", _position(result)
+    yield "torsional-control", _control(result)
+    yield "torsional-learning", _learning(result.cases[-1])
+
+
+def _position(result: Result) -> Any:
+    """Draw the upper disk's angle: the move, and the arrival on either plant."""
+    figure = blank(8.4)
+    figure.subplots_adjust(top=0.93, hspace=0.2)
+    rows = figure.subplots(len(result.cases), 3, squeeze=False)
+    for case, axes in zip(result.cases, rows, strict=True):
+        runs = case.outcomes[FRICTION].records
+        for name, style in _STYLES.items():
+            _line(
+                axes[0], runs[name], "y", _MOVE, 1.0, 0.0, label=label_of(name, runs[name]), **style
+            )
+        _line(
+            axes[0],
+            runs[MF],
+            "r",
+            _MOVE,
+            1.0,
+            0.0,
+            label="r",
+            color="0.3",
+            linestyle=":",
+            linewidth=1.0,
+        )
+        axes[0].set_ylabel(f"{case.label}\nupper disk [rad]")
+        for ax, kind in zip(axes[1:], PLANTS, strict=True):
+            for name, style in _STYLES.items():
+                _line(
+                    ax,
+                    case.outcomes[kind].records[name],
+                    "y",
+                    _ARRIVAL,
+                    100.0 / TARGET,
+                    TARGET,
+                    **style,
+                )
+            ax.axhspan(-100.0 * BAND, 100.0 * BAND, color="0.9", zorder=0)
+            ax.set_ylim(-100.0 * _NEAR * BAND, 100.0 * _NEAR * BAND)
+    rows[0, 0].set_title("with friction", fontsize="medium")
+    for ax, kind in zip(rows[0, 1:], PLANTS, strict=True):
+        ax.set_title(f"distance from π [%], {_HEADINGS[kind]}", fontsize="medium")
+    rows[0, 0].legend(fontsize="x-small", loc="lower right")
+    for ax in rows[-1]:
+        ax.set_xlabel("time from the profile's start [s]")
+    figure.suptitle(
+        "Upper disk along the trapezoid to π, for each omega_c/omega_o [rad/s]; grey: ±0.2 %",
+        fontsize="medium",
+        y=0.995,
+    )
+    return figure
+
+
+def _control(result: Result) -> Any:
+    """Draw the control signal on either plant."""
+    figure = blank(8.4)
+    figure.subplots_adjust(left=0.1, hspace=0.1, wspace=0.05)
+    rows = figure.subplots(len(result.cases), 2, squeeze=False, sharex=True, sharey="row")
+    for case, axes in zip(result.cases, rows, strict=True):
+        for ax, kind in zip(axes, PLANTS, strict=True):
+            runs = case.outcomes[kind].records
+            # The quieter in front.
+            for name in (MF, L, MB):
+                style = _STYLES[name] | {"linewidth": 0.7, "alpha": 0.8}
+                _line(
+                    ax,
+                    runs[name],
+                    "u",
+                    (0.0, END - PROFILE_AT),
+                    1.0,
+                    0.0,
+                    label=label_of(name, runs[name]),
+                    **style,
+                )
+        axes[0].set_ylabel(f"{case.label}\ncontrol signal [V]")
+    for ax, kind in zip(rows[0], PLANTS, strict=True):
+        ax.set_title(_HEADINGS[kind], fontsize="medium")
+    rows[0, 0].legend(fontsize="small", loc="upper right", ncols=3)
+    for ax in rows[-1]:
+        ax.set_xlabel("time from the profile's start [s]")
+    return figure
+
+
+def _learning(case: Case) -> Any:
+    """Draw what L-ESO learned on the plant with friction, in terms of the paper's model, and how it splits up f."""
+    run = case.outcomes[FRICTION].records[L]
+    figure = blank(7.2)
+    figure.subplots_adjust(left=0.1)
+    above, below = figure.subplots(2, 1)
+    # f = −(b0/b) a·x + (1 − b0/b)(…): what the plant itself would have, its gain being b and not b0.
+    numbers = -torsional_identified().A[-1] * B0 / float(torsional_identified().B[-1, 0])
+    for i, feature in enumerate(run.features[:3]):
+        draw(above, run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
+        above.axhline(-numbers[i], color=f"C{i}", linestyle=":", linewidth=1.2)
+    above.set_ylim(-4000.0, 2000.0)
+    above.set_title(
+        f"coefficients of L-ESO at {case.label} with friction; dotted: the identified plant's, for b0",
+        fontsize="medium",
+    )
+    above.set_ylabel("theta")
+    for channel, label in (
+        ("f_hat", "estimate"),
+        ("f_learned", "learned"),
+        ("f_residual", "residual"),
+    ):
+        draw(below, run.t, _smooth(run[channel], run.dt * run.every), label=label, linewidth=1.0)
+    below.set_title("total disturbance as L-ESO has it, averaged over 20 ms", fontsize="medium")
+    below.set_ylabel("f [rad/s⁴]")
+    below.set_ylim(-2e4, 2e4)
+    for ax in (above, below):
+        ax.axvline(PROFILE_AT, color="0.3", linewidth=1.0, linestyle="--")
+        ax.set_xlim(0.0, END)
+        ax.legend(fontsize="small", ncols=3, loc="upper right")
+    below.set_xlabel("time [s]")
+    return figure
+
+
+def _smooth(values: Any, dt: float) -> Any:
+    width = max(round(_SMOOTHED / dt), 1)
+    return np.convolve(values, np.full(width, 1.0 / width), mode="same")
+
+
+def _line(
+    ax: Any,
+    run: Trajectory,
+    channel: str,
+    span: tuple[float, float],
+    factor: float,
+    offset: float,
+    **style: Any,
+) -> None:
+    """Draw ``factor`` times a channel less ``offset``, in a span of time from the profile's start."""
+    part = run.window(PROFILE_AT + span[0], PROFILE_AT + span[1])
+    if part.stop > part.start:
+        draw(ax, run.t[part] - PROFILE_AT, factor * (run[channel][part] - offset), **style)
+    ax.set_xlim(*span)

@@ -1,0 +1,1 @@
+"""The paper's simulation study on two masses and a spring, every claim judged."""

@@ -1,0 +1,121 @@
+"""A plant in this process as a device: it has no clock, and moves on by a sample whenever u is written."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quell import checks
+from quell.kernels.dispatch import compiled, for_types
+from quell.plants.base import advance, measure
+from quell.realtime.devices.base import fetch, put
+from quell.simulation.driver import check_part
+from quell.types import Vector
+
+
+class TwinLine(NamedTuple):
+    """A sampled plant and its state."""
+
+    plant: Any
+    x: Vector
+    """The plant's state (n,)."""
+    scratch: Vector
+    w: Vector
+    """Its disturbances: zero (m,)."""
+    t: Vector
+    """Samples since the start, and the sample time [s] (2,)."""
+
+
+@fetch.register(TwinLine)
+def _fetch(line: TwinLine, clock: Any, until: int) -> tuple[float, int]:
+    return measure(line.plant, line.x), 0
+
+
+@put.register(TwinLine)
+def _put(line: TwinLine, u: float) -> int:
+    advance(line.plant, line.x, line.scratch, line.t[0] * line.t[1], u, line.w)
+    line.t[0] += 1.0
+    return 0
+
+
+@compiled
+def _read(line: TwinLine) -> float:
+    return measure(line.plant, line.x)
+
+
+@compiled
+def _write(line: TwinLine, u: float) -> None:
+    put(line, u)
+
+
+class TwinDevice:
+    """A simulated plant: ``read`` measures it, ``write(u)`` takes it a sample further.
+
+    A u acts at once. Over a wire it acts a sample later: with ``quell.plants.delayed(plant, dt, dt)`` this device does as those do.
+
+    Parameters
+    ----------
+    plant
+        any plant.
+    dt
+        sample time [s].
+    x0
+        its state at the start; zero by default.
+
+    Raises
+    ------
+    ValueError
+        for something that is no plant, a sample time that is not positive, or an x0 of another size.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> from quell.realtime.devices.twin import TwinDevice
+    >>> twin = TwinDevice(ql.plants.two_mass_spring(), dt=0.01)
+    >>> twin.write(1.0)
+    >>> f"{twin.read():.3g}"
+    '4.17e-10'
+    """
+
+    paced = False
+    lost = False
+
+    def __init__(self, plant: Any, dt: float, x0: ArrayLike | None = None) -> None:
+        check_part("plant", plant)
+        self.dt = checks.positive("dt", dt, "s")
+        order = plant.order
+        x = np.zeros(order) if x0 is None else checks.vector("x0", x0, order)
+        model = plant.sampled(dt, not plant.compiled)
+        self._line = TwinLine(
+            model, x, np.zeros(6 * order), np.zeros(plant.disturbances), np.array([0.0, dt])
+        )
+        # Without a line the loop around it runs as Python.
+        self.line = self._line if plant.compiled else None
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Samples written so far."""
+        return {"written": int(self._line.t[0])}
+
+    @property
+    def x(self) -> Vector:
+        """The plant's state, as a copy (n,)."""
+        return self._line.x.copy()
+
+    def read(self) -> float:
+        """Return y [y-unit]."""
+        if self.line is None:
+            return float(measure(self._line.plant, self._line.x))
+        return float(for_types(_read, self.line)(self.line))
+
+    def write(self, u: float) -> None:
+        """Apply u [u-unit] for a sample."""
+        if self.line is None:
+            put(self._line, float(u))
+        else:
+            for_types(_write, self.line)(self.line, float(u))
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to give free."""

@@ -1,0 +1,77 @@
+"""One end of a wire: frames go in and come out. Devices and the rig are written once, over what is declared here.
+
+A link is a NamedTuple; for its type ``receive``, ``send``, ``answer``, ``adopt`` and ``await_news`` are registered: see ``udp.py`` for a
+complete example. None of them allocates, and only ``await_news`` waits.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.kernels.dispatch import generic, kernel
+from quell.realtime.system.libc import external
+from quell.realtime.wire.frames import Buffer
+
+_SECOND = 1_000_000_000
+_POLLIN = 1
+
+_ppoll = external("ppoll", "int", "address", "long", "address", "address")
+
+
+@generic
+def receive(link: Any, frame: Buffer) -> int:
+    """Write what came next into ``frame`` and return how many bytes it has; -1 where nothing is waiting."""
+    raise TypeError
+
+
+@generic
+def send(link: Any, frame: Buffer) -> int:
+    """Send a frame to the other side; return 0, or another number where it can't be reached."""
+    raise TypeError
+
+
+@generic
+def answer(link: Any, frame: Buffer) -> int:
+    """Send a frame to whoever sent what was received last; return as ``send``."""
+    raise TypeError
+
+
+@generic
+def adopt(link: Any) -> None:
+    """Make whoever sent what was received last the other side."""
+    raise TypeError
+
+
+@generic
+def await_news(link: Any, nanoseconds: int) -> None:
+    """Wait until something may have come, at most so long [ns]."""
+    raise TypeError
+
+
+class Descriptor(NamedTuple):
+    """A file descriptor that can be waited for; make it with ``descriptor``."""
+
+    fd: int
+    words: NDArray[np.int64]
+    """Room for a pollfd, seconds and nanoseconds (3,)."""
+    address: int
+    """Of ``words``."""
+
+
+def descriptor(fd: int) -> Descriptor:
+    """Return what ``wait_readable`` needs to know of a file descriptor."""
+    words = np.zeros(3, dtype=np.int64)
+    words[:1].view(np.int32)[0] = fd
+    words[:1].view(np.int16)[2] = _POLLIN
+    return Descriptor(fd, words, words.ctypes.data)
+
+
+@kernel
+def wait_readable(descriptor: Descriptor, nanoseconds: int) -> None:
+    """Wait until there is something to read, at most so long [ns]."""
+    descriptor.words[1] = nanoseconds // _SECOND
+    descriptor.words[2] = nanoseconds % _SECOND
+    _ppoll(descriptor.address, 1, descriptor.address + 8, 0)

@@ -1,0 +1,112 @@
+"""What a response is judged by. Times in seconds, values in the unit of y; every function takes plain arrays.
+
+Integrals are trapezoidal. A record must be whole for the control variation: thinned by ``record_every`` the integrals stay close, the
+variation does not. Records must be finite.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.types import Vector
+
+
+def overshoot(y: Vector, target: float, initial: float = 0.0) -> float:
+    """Return how far y goes beyond ``target``, as a fraction of the move from ``initial``; 0.0 where it never does."""
+    move = checks.nonzero("target - initial", target - initial, "there is no move to overshoot")
+    return max(float(np.max((_record(y) - target) / move)), 0.0)
+
+
+def settling_time(
+    t: Vector, y: Vector, target: float, band: float = 0.002, initial: float = 0.0
+) -> float:
+    """Return how long after ``t[0]`` y enters for good the band around ``target``, ``band`` times the move wide to either side [s].
+
+    0.0 where y never leaves the band, NaN where it is outside of it at the end.
+    """
+    t, y = _pair(t, y)
+    width = checks.positive("band", band) * abs(
+        checks.nonzero("target - initial", target - initial, "there is no move to settle")
+    )
+    outside = np.flatnonzero(np.abs(y - target) > width)
+    if outside.size == 0:
+        return 0.0
+    if outside[-1] + 1 == y.size:
+        return float("nan")
+    return float(t[outside[-1] + 1] - t[0])
+
+
+def rise_time(t: Vector, y: Vector, target: float, initial: float = 0.0) -> float:
+    """Return the time from 10 % to 90 % of the move, between samples by interpolation [s]; NaN where y does not get there."""
+    t, y = _pair(t, y)
+    done = (y - initial) / checks.nonzero(
+        "target - initial", target - initial, "there is no move to rise"
+    )
+    return _first_crossing(t, done, 0.9) - _first_crossing(t, done, 0.1)
+
+
+def peak(error: Vector) -> float:
+    """Return ``max |e|``."""
+    return float(np.max(np.abs(_record(error))))
+
+
+def rms(error: Vector) -> float:
+    """Return the root of the mean of e²."""
+    return float(np.sqrt(np.mean(np.square(_record(error)))))
+
+
+def iae(t: Vector, error: Vector) -> float:
+    """Return ``∫ |e| dt``."""
+    t, error = _pair(t, error)
+    return float(np.trapezoid(np.abs(error), t))
+
+
+def ise(t: Vector, error: Vector) -> float:
+    """Return ``∫ e² dt``."""
+    t, error = _pair(t, error)
+    return float(np.trapezoid(np.square(error), t))
+
+
+def itae(t: Vector, error: Vector) -> float:
+    """Return ``∫ (t − t[0]) |e| dt``."""
+    t, error = _pair(t, error)
+    return float(np.trapezoid((t - t[0]) * np.abs(error), t))
+
+
+def control_variation(u: Vector) -> float:
+    """Return ``Σ |u_k − u_{k−1}|``: how much the actuator has to travel [u-unit]."""
+    return float(np.sum(np.abs(np.diff(_record(u)))))
+
+
+def _first_crossing(t: Vector, done: Vector, level: float) -> float:
+    above = np.flatnonzero(done >= level)
+    if above.size == 0:
+        return float("nan")
+    k = int(above[0])
+    if k == 0:
+        return float(t[0])
+    share = (level - done[k - 1]) / (done[k] - done[k - 1])
+    return float(t[k - 1] + share * (t[k] - t[k - 1]))
+
+
+def _record(values: Any) -> Vector:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(
+            f"record has shape {array.shape}: must be a vector of at least one sample; widen the window of time"
+        )
+    if not np.all(np.isfinite(array)):
+        raise ValueError(
+            f"record has a value that is not finite at sample {int(np.argmin(np.isfinite(array)))}: judge what comes before it"
+        )
+    return array
+
+
+def _pair(t: Any, values: Any) -> tuple[Vector, Vector]:
+    t, values = _record(t), _record(values)
+    if t.size != values.size:
+        raise ValueError(f"t has {t.size} samples, the record {values.size}: must be as many")
+    return t, values

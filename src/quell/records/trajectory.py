@@ -1,0 +1,182 @@
+"""What a run returns."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quell import checks
+from quell.records import metrics
+from quell.records.record import Record, channels_in, read_dataset
+from quell.types import Matrix, Status
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory(Record):
+    """The record of one run.
+
+    ``run["y"]`` is a channel: (samples,), or (samples, width) for ``w``, ``x``, ``x_hat`` and ``theta``; ``run.t`` are its times [s].
+    Besides what was recorded there is ``f_hat = f_learned + f_residual``.
+
+    Attributes
+    ----------
+    log : (samples, columns) array
+        all channels side by side.
+    channels : tuple of (name, width)
+        what the columns are, in order.
+    dt : float
+        sample time of the run [s]; recorded was every ``every``-th sample.
+    status : Status
+        all flags that any step reported, and ``DIVERGED`` where the run ended early; ``message`` puts it in words.
+    ended : float
+        when the run ended [s].
+    limit : float
+        the ``|y|`` at which it would have been ended [y-unit].
+    plant : str
+        its name.
+    features : tuple of str
+        what the entries of ``theta`` multiply.
+    final_state
+        the controller's state at the end, a NamedTuple; ``controller.read(run.final_state)`` puts it in words.
+    """
+
+    log: Matrix
+    channels: tuple[tuple[str, int], ...]
+    dt: float
+    every: int = 1
+    status: Status = Status.OK
+    ended: float = 0.0
+    limit: float = math.inf
+    plant: str = ""
+    features: tuple[str, ...] = ()
+    final_state: Any = None
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the run ended early."""
+        return Status.DIVERGED in self.status
+
+    @property
+    def message(self) -> str:
+        """What happened, when, and what to do."""
+        if not self.diverged:
+            return self.status.message
+        return f"|y| went beyond limit = {self.limit:.3g}, or was no number, at {self.ended:.6g} s. {self.status.message}"
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return int(self.log.shape[0])
+
+    def metrics(
+        self,
+        start: float = 0.0,
+        stop: float | None = None,
+        *,
+        target: float | None = None,
+        band: float = 0.002,
+    ) -> dict[str, float]:
+        """Judge the response in the window ``[start, stop)`` [s] as a step from its first value of y.
+
+        Parameters
+        ----------
+        start, stop
+            the window; to the end of the record by default.
+        target
+            where y should go; the reference at the end of the window by default.
+        band
+            half width of the settling band, as a fraction of the move.
+
+        Returns
+        -------
+        dict
+            ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y, and ``control_variation``; and, where the reference steps at the
+            start of the window or ``target`` is given: ``overshoot`` (fraction of the move), ``settling_time`` and ``rise_time`` [s]
+            (NaN where y does not get there).
+
+        Raises
+        ------
+        ValueError
+            where the window holds no sample: for instance because the run ended before it.
+        """
+        part = self.window(start, np.inf if stop is None else stop)
+        if part.start >= len(self) or part.stop <= part.start:
+            raise ValueError(
+                f"start = {start!r}, stop = {stop!r}: the record ends at {self.ended:.6g} s ({self.message}); "
+                "the window must hold at least one sample"
+            )
+        t, y, u = self.t[part], self["y"][part], self["u"][part]
+        error = self["r"][part] - y
+        goal = float(self["r"][part][-1]) if target is None else checks.finite("target", target)
+        initial = float(y[0])
+        found: dict[str, float] = {}
+        if goal != initial and (target is not None or self._steps_at(part, goal)):
+            found |= {
+                "overshoot": metrics.overshoot(y, goal, initial),
+                "settling_time": metrics.settling_time(t, y, goal, band, initial),
+                "rise_time": metrics.rise_time(t, y, goal, initial),
+            }
+        return found | {
+            "peak_error": metrics.peak(error),
+            "rms": metrics.rms(error),
+            "iae": metrics.iae(t, error),
+            "ise": metrics.ise(t, error),
+            "itae": metrics.itae(t, error),
+            "control_variation": metrics.control_variation(u),
+        }
+
+    def _steps_at(self, part: slice, goal: float) -> bool:
+        """Tell whether the reference goes to ``goal`` at the start of a window, give or take a sample, and stays; 0 s is such a start."""
+        r = self["r"]
+        stays = bool(np.all(r[part.start + 1 : part.stop] == goal))
+        return stays and (
+            part.start == 0 or bool(np.any(r[max(part.start - 2, 0) : part.start + 1] != goal))
+        )
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw output and reference, control signal, estimates of f and, where there is a guard, what it did; return the axes.
+
+        Parameters
+        ----------
+        axes
+            three matplotlib axes to draw into, or four for a run with a guard; a new figure by default.
+        """
+        from quell.records.plotting import plot_trajectory
+
+        return plot_trajectory(self, axes)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the record as an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
+        about = {
+            "plant": self.plant,
+            "status": int(self.status),
+            "ended": self.ended,
+            "limit": self.limit,
+            "message": self.message,
+        }
+        return self._dataset(("time",), about)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Trajectory:
+        """Read back what ``save`` wrote (all but ``final_state``).
+
+        Raises
+        ------
+        ValueError
+            where the file is not such a record.
+        """
+        data = read_dataset(
+            path, "Trajectory.save", ("time",), {"dt", "every", "status", "ended", "plant"}
+        )
+        return cls(
+            **channels_in(data, axes=1),
+            status=Status(int(data.attrs["status"])),
+            ended=float(data.attrs["ended"]),
+            limit=float(data.attrs.get("limit", math.inf)),
+        )

@@ -1,0 +1,80 @@
+"""A scenario: what happens to a loop during a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.signals import Constant, Signal, as_signal, seeded_apart
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What happens to the loop.
+
+    Parameters
+    ----------
+    reference
+        what y has to follow [y-unit]; a signal or a number.
+    disturbances
+        one signal or number for each disturbance input of the plant, in its order; missing ones are zero.
+    noise
+        what is added to y before the controller sees it; none by default.
+    duration
+        how long it takes [s]; the record has the samples from 0 to ``duration``, both included.
+    x0
+        the plant's state at the start; zero by default.
+    rest_at
+        times [s] at which the plant is put back to ``x0`` and the controller starts from rest, with what it has learned.
+    seed
+        which noise; the same seed gives the same bits.
+
+    Raises
+    ------
+    ValueError
+        for a duration that is not positive, a seed below zero, something that is no signal, or ``rest_at`` times that do not increase
+        within the duration.
+    """
+
+    reference: Signal | float = 0.0
+    duration: float = 10.0
+    disturbances: Sequence[Signal | float] = ()
+    noise: Signal | float = 0.0
+    x0: Any = None
+    rest_at: Sequence[float] = field(default=())
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks.positive("duration", self.duration, "s")
+        checks.whole("seed", self.seed, 0)
+        as_signal(self.reference, "reference")
+        as_signal(self.noise, "noise")
+        if not isinstance(self.disturbances, Sequence):
+            raise ValueError(
+                f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers, one for each input"
+            )
+        for i, disturbance in enumerate(self.disturbances):
+            as_signal(disturbance, f"disturbances[{i}]")
+        times = checks.vector("rest_at", self.rest_at)
+        if times.size and (
+            np.any(np.diff(times) <= 0.0) or times[0] <= 0.0 or times[-1] >= self.duration
+        ):
+            raise ValueError(
+                f"rest_at = {self.rest_at!r}: must increase and lie within (0, duration = {self.duration!r})"
+            )
+
+    def seeded_signals(self, inputs: int) -> tuple[Signal, tuple[Signal, ...], Signal]:
+        """Return the reference, ``inputs`` disturbances and the noise, with all that is random drawn from ``seed``."""
+        if len(self.disturbances) > inputs:
+            raise ValueError(
+                f"disturbances has {len(self.disturbances)} signals: the plant has {inputs} disturbance inputs"
+            )
+        given = (as_signal(self.reference), *map(as_signal, self.disturbances))
+        noise = as_signal(self.noise).seeded(self.seed)
+        # The noise takes the seed itself, so that its bits do not depend on how many disturbances there are.
+        reference, *disturbances = seeded_apart(given, self.seed)
+        return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise
