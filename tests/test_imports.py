@@ -1,0 +1,106 @@
+"""Imports between the folders of the package point one way, and never in a circle."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+# The order of the folders: each may import itself and what stands before it. ``__init__`` after a folder's
+# name is the file that gathers the folder's public names. A new folder needs an entry here.
+ORDER = """
+    types checks files parallel optional
+    kernels
+    lti signals
+    observers plants features
+    learners learners.kalman learners.regression learners.gradient learners.online learners.adapters
+        learners.__init__
+    guard
+    controllers controllers.linear controllers.adrc controllers.prefilters controllers.baselines
+        controllers.__init__
+    records simulation
+    analysis identification
+    realtime.system realtime.telemetry realtime.devices realtime.wire realtime.loop realtime.rig
+        realtime.__init__
+    setup
+    experiments.common experiments.two_mass_spring experiments.torsional experiments.compare
+        experiments.acc experiments.stress experiments.__init__
+    __init__
+    cli.options cli.output cli.report cli.interrupt cli.commands cli
+""".split()
+
+ROOT = Path(importlib.util.find_spec("quell").origin or "").parent
+
+
+def module_of(file: Path) -> str:
+    """Return a file's module name below ``quell``: ``plants.base``, or ``plants.__init__``."""
+    return ".".join(file.relative_to(ROOT).with_suffix("").parts)
+
+
+MODULES = {module_of(file): file for file in sorted(ROOT.rglob("*.py"))}
+
+
+def target(name: str) -> str | None:
+    """Return the module that a dotted name below ``quell`` stands for, if it is one."""
+    for module in (name, f"{name}.__init__" if name else "__init__"):
+        if module in MODULES:
+            return module
+    return None
+
+
+def imports_of(module: str) -> set[str]:
+    """Return the modules that a file imports, at its top, inside functions or for types only."""
+    found = set()
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, (
+                f"{module} line {node.lineno}: write the whole name of the module"
+            )
+            package = node.module or ""
+            names = [f"{package}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            parts = name.split(".")
+            if parts[0] == "quell":
+                inside = ".".join(parts[1:])
+                where = target(inside) or target(".".join(parts[1:-1]))
+                assert where is not None, f"{module}: {name} is no module"
+                found.add(where)
+    return found - {module}
+
+
+IMPORTS = {module: imports_of(module) for module in MODULES}
+
+
+def place(module: str) -> int:
+    """Return the place in the order of the folder that a module is in."""
+    if module in ORDER:
+        return ORDER.index(module)
+    folders = [folder for folder in ORDER if module.startswith(f"{folder}.")]
+    assert folders, f"{module} is in no folder of ORDER: add its folder to the table in this file"
+    return ORDER.index(max(folders, key=len))
+
+
+def test_a_file_imports_only_what_stands_before_it() -> None:
+    """Its own folder, and folders that come earlier in the table."""
+    wrong = [
+        f"{module} imports {other}"
+        for module, others in IMPORTS.items()
+        for other in sorted(others)
+        if place(other) > place(module)
+    ]
+    assert not wrong, "against ORDER: " + "; ".join(wrong)
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    """Imports that are there for types only, or inside functions, count too."""
+    try:
+        tuple(TopologicalSorter(IMPORTS).static_order())
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
