@@ -24,7 +24,7 @@ from quell.experiments.stress.adversaries import (
     Turncoat,
 )
 from quell.experiments.stress.random_loops import Loop
-from quell.guard import note, permit, watch
+from quell.guard import assess, limit, record_output
 from quell.learners.lag import lag_of, lag_push
 from quell.types import Status
 
@@ -107,11 +107,11 @@ def test_what_is_permitted_lies_within_its_bounds(rng: np.random.Generator) -> N
     heard = 0
     for k in range(20_000):
         f_plain += 0.05 * rng.normal() - 0.01 * f_plain
-        watch(design, memory, f_plain)
+        assess(design, memory, f_plain)
         wild = rng.random() < 0.3
         constant = f_plain + rng.normal() * (10.0 ** rng.uniform(-3.0, 6.0) if wild else 0.05)
         memory.record[:3] = 0.5  # the record of one that is always right
-        permitted, slope, cut_off = permit(design, memory, f_plain, constant, 0.0, 0.0)
+        permitted, slope, cut_off = limit(design, memory, f_plain, constant, 0.0, 0.0)
         e, exploded = memory.moment[1], memory.moment[4] == ql.Reason.EXPLODED
         low, high = min(f_plain - 0.8 * e, 0.0), max(f_plain + 0.8 * e, 0.0)
         assert slope == 0.0
@@ -119,7 +119,7 @@ def test_what_is_permitted_lies_within_its_bounds(rng: np.random.Generator) -> N
         assert low <= permitted <= high, k
         fast = abs(permitted - last) > 2.0 * OBSERVER.omega_o * OBSERVER.dt * e * (1.0 + 1e-9)
         assert not fast or exploded or permitted in (low, high), k
-        note(design, memory, permitted)
+        record_output(design, memory, permitted)
         last = permitted
         heard += permitted != 0.0
     assert heard > 5000, "hardly anything was permitted: the test says nothing"
@@ -134,9 +134,9 @@ def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
     chain, shown = np.zeros((1, 5)), 0.0
     for k in range(12_000):
         f = math.sin(0.7 * k * OBSERVER.dt)
-        watch(design, memory, shown)
-        permit(design, memory, shown, f, 0.0, 0.0)
-        note(design, memory, f)
+        assess(design, memory, shown)
+        limit(design, memory, shown, f, 0.0, 0.0)
+        record_output(design, memory, f)
         shown = lag_push(lag, chain, 0, f)
     qq, qp, pp = memory.record[:3]
     assert qp == pytest.approx(qq, rel=1e-6)
@@ -155,14 +155,14 @@ def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() 
     chain, shown, heard = np.zeros((1, 5)), 0.0, []
     for k in range(6000):
         f = math.sin(0.7 * k * OBSERVER.dt)
-        watch(design, memory, shown)
+        assess(design, memory, shown)
         said = math.nan if k == 3000 else f
-        kept, slope, cut_off = permit(design, memory, shown, said, 0.0, 0.0)
+        kept, slope, cut_off = limit(design, memory, shown, said, 0.0, 0.0)
         assert cut_off == (k == 3000)
         if k == 3000:
             assert (kept, slope) == (0.0, 0.0)
             assert ql.Reason(int(memory.moment[4])) == ql.Reason.NOT_FINITE
-        note(design, memory, kept)
+        record_output(design, memory, kept)
         heard.append(memory.moment[0] > 0.0)
         shown = lag_push(design.lag, chain, 0, f)
     again = 3000 + heard[3001:].index(True)

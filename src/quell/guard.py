@@ -99,13 +99,13 @@ _TRUST, _UNPROVEN, _TOO_LOUD, _OUT, _TOO_FAST, _EXPLODED, _NOT_FINITE = (
 
 
 @generic
-def watch(guard: Any, memory: Any, f_plain: float) -> None:
+def assess(guard: Any, memory: Any, f_plain: float) -> None:
     """Take note of what an ESO without learner would have estimated."""
     raise TypeError
 
 
 @generic
-def permit(
+def limit(
     guard: Any, memory: Any, f_plain: float, constant: float, slope: float, u_before: float
 ) -> tuple[float, float, bool]:
     """Return what is left of the learner's ``constant + slope · u``, and whether it was cut off because it is not finite."""
@@ -113,19 +113,19 @@ def permit(
 
 
 @generic
-def note(guard: Any, memory: Any, f_learned: float) -> None:
+def record_output(guard: Any, memory: Any, f_learned: float) -> None:
     """Take note of the ``f_learned`` that the observer is fed."""
     raise TypeError
 
 
 @generic
-def explain(guard: Any, memory: Any, row: Vector) -> int:
+def write_channels(guard: Any, memory: Any, row: Vector) -> int:
     """Write what the guard knows (``GUARD_CHANNELS``) to the start of ``row``; return how many numbers that are."""
     raise TypeError
 
 
 @generic
-def calm(guard: Any, memory: Any) -> None:
+def reset_filters(guard: Any, memory: Any) -> None:
     """Forget what belongs to the moment (filters); keep the learner's record."""
     raise TypeError
 
@@ -144,12 +144,12 @@ class UnguardedMemory(NamedTuple):
     """(0,)."""
 
 
-@watch.register(UnguardedDesign)
+@assess.register(UnguardedDesign)
 def _watch_nothing(guard: UnguardedDesign, memory: UnguardedMemory, f_plain: float) -> None:
     pass
 
 
-@permit.register(UnguardedDesign)
+@limit.register(UnguardedDesign)
 def _permit_all(
     guard: UnguardedDesign,
     memory: UnguardedMemory,
@@ -161,17 +161,17 @@ def _permit_all(
     return constant, slope, False
 
 
-@note.register(UnguardedDesign)
+@record_output.register(UnguardedDesign)
 def _note_nothing(guard: UnguardedDesign, memory: UnguardedMemory, f_learned: float) -> None:
     pass
 
 
-@explain.register(UnguardedDesign)
+@write_channels.register(UnguardedDesign)
 def _explain_nothing(guard: UnguardedDesign, memory: UnguardedMemory, row: Vector) -> int:
     return 0
 
 
-@calm.register(UnguardedDesign)
+@reset_filters.register(UnguardedDesign)
 def _calm_nothing(guard: UnguardedDesign, memory: UnguardedMemory) -> None:
     pass
 
@@ -213,14 +213,14 @@ _QQ, _QP, _PP, _PLAIN, _LEARNED = range(5)
 _AUTHORITY, _USUAL, _OUTPUT, _LAST, _REASON, _SINCE = range(6)
 
 
-@watch.register(GuardDesign)
-def _watch(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
+@assess.register(GuardDesign)
+def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     shown, record, moment = memory.shown, memory.record, memory.moment
     q, p = f_plain - shown[_F_PLAIN], shown[_G] - shown[_GG]
     qq, pp = q * q, p * p
     if not is_finite(qq + pp):
         # A measurement beyond all numbers, perhaps: what it left here is worth nothing.
-        calm(guard, memory)
+        reset_filters(guard, memory)
         return
     shown[_F_PLAIN] = lag_push(guard.lag, memory.chain, _F_PLAIN, f_plain)
     shown[_GG] = lag_push(guard.lag, memory.chain, _GG, shown[_G])
@@ -242,8 +242,8 @@ def _watch(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     record[_LEARNED] += guard.forget * ((q - p) * (q - p) - record[_LEARNED])
 
 
-@permit.register(GuardDesign)
-def _permit(
+@limit.register(GuardDesign)
+def _limit(
     guard: GuardDesign,
     memory: GuardMemory,
     f_plain: float,
@@ -308,14 +308,14 @@ def _distrust(record: Vector) -> None:
     record[_QP] = 0.0
 
 
-@note.register(GuardDesign)
-def _note(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> None:
+@record_output.register(GuardDesign)
+def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> None:
     memory.shown[_G] = lag_push(guard.lag, memory.chain, _G, memory.moment[_OUTPUT])
     memory.moment[_LAST] = f_learned
 
 
-@explain.register(GuardDesign)
-def _explain(guard: GuardDesign, memory: GuardMemory, row: Vector) -> int:
+@write_channels.register(GuardDesign)
+def _write_channels(guard: GuardDesign, memory: GuardMemory, row: Vector) -> int:
     row[0] = memory.moment[_AUTHORITY]
     row[1] = math.sqrt(memory.record[_PLAIN])
     row[2] = math.sqrt(memory.record[_LEARNED])
@@ -323,8 +323,8 @@ def _explain(guard: GuardDesign, memory: GuardMemory, row: Vector) -> int:
     return 4
 
 
-@calm.register(GuardDesign)
-def _calm(guard: GuardDesign, memory: GuardMemory) -> None:
+@reset_filters.register(GuardDesign)
+def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     for i in range(memory.chain.shape[0]):
         memory.shown[i] = 0.0
         for j in range(memory.chain.shape[1]):

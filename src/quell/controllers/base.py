@@ -43,13 +43,13 @@ def control(controller: Any, state: Any, r: float, y: float) -> float:
 
 
 @generic
-def heed(controller: Any, state: Any, derivatives: Vector) -> None:
+def set_reference_derivatives(controller: Any, state: Any, derivatives: Vector) -> None:
     """Take note of the reference's derivatives r', r'', … for the next sample; a controller without use for them does nothing."""
     raise TypeError
 
 
-@heed.register(object)
-def _heed_nothing(controller: Any, state: Any, derivatives: Vector) -> None:
+@set_reference_derivatives.register(object)
+def _ignore_reference_derivatives(controller: Any, state: Any, derivatives: Vector) -> None:
     pass
 
 

@@ -11,7 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import Controller, control, flags, heed, report, rest
+from quell.controllers.base import (
+    Controller,
+    control,
+    flags,
+    report,
+    rest,
+    set_reference_derivatives,
+)
 from quell.kernels.dispatch import compiled, compiling, for_types, interpreted
 from quell.plants.base import Plant, advance, measure
 from quell.records.record import first_sample_at, in_steps
@@ -65,7 +72,7 @@ def run_block(
         if not abs(y) <= limit:
             return k, row, until_next, status
         if derivatives.shape[1] > 0:
-            heed(design, state, derivatives[k])
+            set_reference_derivatives(design, state, derivatives[k])
         u = control(design, state, r[k], measured)
         status |= flags(design, state)
         if until_next == 0:

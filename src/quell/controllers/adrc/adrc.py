@@ -12,11 +12,18 @@ from quell import checks
 from quell.controllers.adrc.estimate import Estimate
 from quell.controllers.adrc.handover import HandOver
 from quell.controllers.adrc.law import F_LEARNED, LOOP, STATUS, AdrcDesign, AdrcState, U, law_gains
-from quell.controllers.base import heed
+from quell.controllers.base import set_reference_derivatives
 from quell.controllers.compiled_step import bind
 from quell.controllers.design_checks import warn_if_unwise
 from quell.controllers.limits import limits
-from quell.guard import GUARD_CHANNELS, Guard, Reason, UnguardedDesign, UnguardedMemory, explain
+from quell.guard import (
+    GUARD_CHANNELS,
+    Guard,
+    Reason,
+    UnguardedDesign,
+    UnguardedMemory,
+    write_channels,
+)
 from quell.learners.base import Learner, NoLearner, coefficients, tried
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.lti.canonical import spell
@@ -203,7 +210,9 @@ class ADRC(HandOver):
             raise ValueError(
                 f"step was given {len(derivatives)} derivatives of the reference: there is use for {self.observer.degree} at most"
             )
-        heed(self.parameters, self._state, np.array(derivatives, dtype=np.float64))
+        set_reference_derivatives(
+            self.parameters, self._state, np.array(derivatives, dtype=np.float64)
+        )
 
     @property
     def _outside(self) -> tuple[str, ...]:
@@ -243,7 +252,7 @@ class ADRC(HandOver):
 
     def _guard_report(self, state: AdrcState) -> dict[str, Any]:
         told = np.zeros(len(GUARD_CHANNELS))
-        if explain(self.parameters.guard, state.guard, told) == 0:
+        if write_channels(self.parameters.guard, state.guard, told) == 0:
             return {}
         named = dict(zip([name for name, _ in GUARD_CHANNELS], told.tolist(), strict=True))
         return named | {"reason": Reason(int(named["reason"]))}

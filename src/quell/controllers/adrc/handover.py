@@ -28,12 +28,12 @@ from quell.controllers.adrc.law import (
     R,
     U,
     Y,
-    wish,
+    unlimited_u,
 )
 from quell.controllers.base import rest
 from quell.controllers.design_checks import warn_if_unwise
 from quell.controllers.running import Running
-from quell.guard import permit
+from quell.guard import limit
 from quell.kernels.dispatch import compiled
 from quell.learners.base import NoLearner, predict
 from quell.observers.base import acting, begin, observe
@@ -97,7 +97,7 @@ class HandOver(Running):
         samples = _samples_to_forget(law.observer)
         _settle(design.eso, state.z, state.seen, y, u, 0.0, samples)
         constant, slope = predict(design.learner, state.learner, state.seen, u)
-        constant, slope, _ = permit(design.guard, state.guard, 0.0, constant, slope, u)
+        constant, slope, _ = limit(design.guard, state.guard, 0.0, constant, slope, u)
         loop[CONSTANT], loop[SLOPE] = constant, slope
         loop[F_LEARNED] = constant + slope * u
         _settle(design.eso, state.z, state.seen, y, u, loop[F_LEARNED], samples)
@@ -200,7 +200,7 @@ class HandOver(Running):
         state = law._state
         loop, size = state.loop, new_observer.order
         if loop[STARTED] != 0.0:
-            before = wish(old, state, loop[CONSTANT], loop[SLOPE])
+            before = unlimited_u(old, state, loop[CONSTANT], loop[SLOPE])
             # f is what b0 u and a·x leave: with another b0 or a it is another number.
             acted = acting(old.eso, state.z, float(loop[U]))
             change = (kept[0].b0 - new_observer.b0) * acted + (
@@ -208,7 +208,7 @@ class HandOver(Running):
             ) @ state.seen[:size]
             state.z[size] += change
             state.seen[size] += change
-            loop[OFFSET] += before - wish(law.parameters, state, loop[CONSTANT], loop[SLOPE])
+            loop[OFFSET] += before - unlimited_u(law.parameters, state, loop[CONSTANT], loop[SLOPE])
         self._rebind()
 
 

@@ -18,9 +18,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.controllers.bad_samples import hold, rest_within
-from quell.controllers.base import applied, control, flags, heed, report, rest, take_over
+from quell.controllers.base import (
+    applied,
+    control,
+    flags,
+    report,
+    rest,
+    set_reference_derivatives,
+    take_over,
+)
 from quell.controllers.limits import Limits, apply_limits
-from quell.guard import calm, explain, note, permit, watch
+from quell.guard import assess, limit, record_output, reset_filters, write_channels
 from quell.kernels.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
 from quell.learners.lag import lag_push
@@ -115,20 +123,20 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
                 loop[Y] = y
         observe(design.eso, state.z, seen, loop[Y], loop[U], loop[F_LEARNED])
         f_plain = seen[seen.size - 1] + loop[_F_SHOWN]
-        watch(design.guard, state.guard, f_plain)
+        assess(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
             adapt(design.learner, state.learner, seen, loop[Y], acted, f_plain)
             status |= trouble(design.learner, state.learner)
     constant, slope = predict(design.learner, state.learner, seen, acted)
-    constant, slope, cut_off = permit(design.guard, state.guard, f_plain, constant, slope, acted)
+    constant, slope, cut_off = limit(design.guard, state.guard, f_plain, constant, slope, acted)
     if cut_off:
         status |= _LEARNER_CUT
         restart(design.learner, state.learner)
-    wished = wish(design, state, constant, slope)
+    wished = unlimited_u(design, state, constant, slope)
     if not is_finite(wished):
         status |= _OVERFLOWED
         restart(design.learner, state.learner)
-        forget_f_learned(design, state)
+        reset_lag_filters(design, state)
         begin(design.eso, state.z, seen, loop[Y])
         constant = slope = loop[OFFSET] = 0.0
         wished = loop[U]
@@ -160,20 +168,20 @@ def _conclude(design: AdrcDesign, state: AdrcState, acted: float) -> None:
     loop[F_LEARNED] = f_learned
     loop[_F_SHOWN] = lag_push(design.lag, state.shadow, 0, f_learned)
     commit(design.learner, state.learner, state.seen, acted, f_learned)
-    note(design.guard, state.guard, f_learned)
+    record_output(design.guard, state.guard, f_learned)
 
 
 @kernel
-def forget_f_learned(design: AdrcDesign, state: AdrcState) -> None:
+def reset_lag_filters(design: AdrcDesign, state: AdrcState) -> None:
     """Empty the filter of f_L, and the guard's."""
-    calm(design.guard, state.guard)
+    reset_filters(design.guard, state.guard)
     state.loop[_F_SHOWN] = 0.0
     for i in range(state.shadow.shape[1]):
         state.shadow[0, i] = 0.0
 
 
 @kernel
-def wish(design: AdrcDesign, state: AdrcState, constant: float, slope: float) -> float:
+def unlimited_u(design: AdrcDesign, state: AdrcState, constant: float, slope: float) -> float:
     """Return the u that the law wants, before limits, for ``f_L = constant + slope · u``."""
     seen, reference, order = state.seen, state.reference, design.law.size
     wished = design.law[0] * state.loop[R] - design.cancel_f * (seen[order] + constant)
@@ -186,8 +194,8 @@ def wish(design: AdrcDesign, state: AdrcState, constant: float, slope: float) ->
     return wished / (design.b0 + design.cancel_f * slope)
 
 
-@heed.register(AdrcDesign)
-def _heed(design: AdrcDesign, state: AdrcState, derivatives: Vector) -> None:
+@set_reference_derivatives.register(AdrcDesign)
+def _set_reference_derivatives(design: AdrcDesign, state: AdrcState, derivatives: Vector) -> None:
     for i in range(state.reference.size):
         known = i < derivatives.size and is_finite(derivatives[i])
         state.reference[i] = derivatives[i] if known else 0.0
@@ -200,7 +208,7 @@ def _report(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
         row[i] = state.seen[i]
     row[order + 1] = state.loop[F_LEARNED]
     row[order + 2] = state.loop[STATUS]
-    told = explain(design.guard, state.guard, row[order + 3 :])
+    told = write_channels(design.guard, state.guard, row[order + 3 :])
     coefficients(design.learner, state.learner, row[order + 3 + told :])
 
 
@@ -215,7 +223,7 @@ def _rest(design: AdrcDesign, state: AdrcState) -> None:
         state.loop[i] = 0.0
     for i in range(state.reference.size):
         state.reference[i] = 0.0
-    forget_f_learned(design, state)
+    reset_lag_filters(design, state)
     restart(design.learner, state.learner)
 
 
@@ -229,7 +237,7 @@ def _take_over(design: AdrcDesign, state: AdrcState) -> None:
     loop = state.loop
     if loop[STARTED] != 0.0:
         # Without this offset the law, whose reference is where y is, would already have applied something else.
-        loop[OFFSET] = loop[U] - wish(design, state, loop[CONSTANT], loop[SLOPE])
+        loop[OFFSET] = loop[U] - unlimited_u(design, state, loop[CONSTANT], loop[SLOPE])
 
 
 def law_gains(order: int, omega_c: float) -> Vector:

@@ -15,7 +15,15 @@ import numpy as np
 
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.handover import HandOver
-from quell.controllers.base import applied, control, flags, heed, report, rest, take_over
+from quell.controllers.base import (
+    applied,
+    control,
+    flags,
+    report,
+    rest,
+    set_reference_derivatives,
+    take_over,
+)
 from quell.controllers.compiled_step import bind
 from quell.controllers.limits import Limits
 from quell.controllers.running import Running
@@ -96,7 +104,7 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
         shaped = prefilter(design.prefilter, state.prefilter, loop[_R])
         if state.derivatives.size > 0:
             slopes(design.prefilter, state.prefilter, state.derivatives)
-            heed(design.controller, state.controller, state.derivatives)
+            set_reference_derivatives(design.controller, state.controller, state.derivatives)
     loop[_SHAPED] = shaped if is_finite(shaped) else y
     return control(design.controller, state.controller, shaped, y)
 

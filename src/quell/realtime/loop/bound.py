@@ -17,7 +17,7 @@ class BoundControl(NamedTuple):
 
     design: Any
     control: Any
-    heed: Any
+    set_reference_derivatives: Any
     applied: Any
     take_over: Any
     report: Any
@@ -29,8 +29,8 @@ def _control(design: Any, state: Any, r: float, y: float) -> float:
 
 
 @compiled
-def _heed(design: Any, state: Any, derivatives: Vector) -> None:
-    base.heed(design, state, derivatives)
+def _set_reference_derivatives(design: Any, state: Any, derivatives: Vector) -> None:
+    base.set_reference_derivatives(design, state, derivatives)
 
 
 @compiled
@@ -52,7 +52,10 @@ def bound(design: Any) -> BoundControl:
     """Return a controller's parameters with its compiled functions."""
     return BoundControl(
         design,
-        *(for_types(entry, design) for entry in (_control, _heed, _applied, _take_over, _report)),
+        *(
+            for_types(entry, design)
+            for entry in (_control, _set_reference_derivatives, _applied, _take_over, _report)
+        ),
     )
 
 
@@ -60,7 +63,7 @@ def warm(controller: BoundControl, state: Any, derivatives: Vector, row: Vector)
     """Compile everything, or load it, by a sample on a ``state`` that is for nothing else."""
     with compiling(controller.design):
         base.control(controller, state, 0.0, 0.0)
-        base.heed(controller, state, derivatives)
+        base.set_reference_derivatives(controller, state, derivatives)
         base.applied(controller, state, 0.0)
         base.take_over(controller, state)
         base.report(controller, state, row)
@@ -71,9 +74,9 @@ def _bound_control(controller: BoundControl, state: Any, r: float, y: float) -> 
     return float(controller.control(controller.design, state, float(r), float(y)))
 
 
-@base.heed.register(BoundControl)
+@base.set_reference_derivatives.register(BoundControl)
 def _bound_heed(controller: BoundControl, state: Any, derivatives: Vector) -> None:
-    controller.heed(controller.design, state, derivatives)
+    controller.set_reference_derivatives(controller.design, state, derivatives)
 
 
 @base.applied.register(BoundControl)

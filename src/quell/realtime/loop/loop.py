@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.base import applied, control, heed, report, take_over
+from quell.controllers.base import applied, control, report, set_reference_derivatives, take_over
 from quell.kernels.dispatch import compiled, is_finite, kernel
 from quell.realtime.devices.base import fetch, put
 from quell.realtime.loop.supervisor import (
@@ -310,5 +310,5 @@ def _reference(design: Any, state: Any, setpoints: Setpoints, watch: Watch, k: i
             setpoints.now[j] = setpoints.derivatives[i, j]
             if gap != 0.0:
                 setpoints.now[j] += gap * setpoints.slide[i, 1 + j]
-        heed(design, state, setpoints.now)
+        set_reference_derivatives(design, state, setpoints.now)
     return r

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.base import Controller, applied, control, flags, heed, report, take_over
+from quell.controllers.base import (
+    Controller,
+    applied,
+    control,
+    flags,
+    report,
+    set_reference_derivatives,
+    take_over,
+)
 from quell.kernels.dispatch import compiled, compiling, for_types
 from quell.realtime.loop.supervisor import RUN
 from quell.records.trajectory import Trajectory
@@ -128,7 +136,7 @@ def _follow(
     for k in range(r.size):
         if k == began and k > 0:
             take_over(design, state)
-        heed(design, state, derivatives)
+        set_reference_derivatives(design, state, derivatives)
         wished = control(design, state, r[k], measured[k])
         status |= flags(design, state)
         log[k, 0] = r[k]
