@@ -17,12 +17,12 @@ from quell.analysis import analyse, linear_law
 from quell.analysis.laws import closed_loop_matrix
 from quell.cli.app import app
 from quell.cli.commands.acc import _print_cases
-from quell.experiments.acc import designs as acc_designs
+from quell.experiments.acc import controllers as acc_controllers
 from quell.experiments.acc import samples as acc_samples
 from quell.experiments.acc import study as acc
 from quell.experiments.acc.cases import CaseResult, study_cases
+from quell.experiments.acc.controllers import DT, MB, MF, PUBLISHED, L, designs
 from quell.experiments.acc.criteria import interval, judge
-from quell.experiments.acc.designs import DT, MB, MF, PUBLISHED, L, designs
 from quell.experiments.acc.loops import unstable
 from quell.experiments.acc.published import judge_published
 from quell.plants import lagged_two_mass_spring, two_mass_spring
@@ -268,7 +268,7 @@ def test_the_command_writes_what_programs_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The keys are fixed, rates lie in their intervals; without the baselines, whose loops would be compiled for this alone."""
-    monkeypatch.setattr(acc_designs, "BASELINES", {})
+    monkeypatch.setattr(acc_controllers, "BASELINES", {})
     (tmp_path / "few.csv").write_text(HEADER + "1,1,1,0.1,1,0.01\n0.9,1.1,0.95,-0.1,0.9,0.02\n")
     where = ["--json", str(tmp_path / "out.json"), "--no-figures"]
     with pytest.raises(SystemExit, match="0"):

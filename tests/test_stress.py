@@ -30,15 +30,15 @@ def test_the_same_seed_gives_the_same_trial() -> None:
 
 def test_results_are_plain_data() -> None:
     """For ``json.dump``, with counts for each kind and quantiles of the ratios."""
-    told: list[float] = []
-    found = stress.run(12, 1, seed=5, guard=ql.Guard(), tell=told.append).to_json()
+    shares: list[float] = []
+    found = stress.run(12, 1, seed=5, guard=ql.Guard(), progress=shares.append).to_json()
     assert json.loads(json.dumps(found)) == found
     assert set(found) == {"settings", "adversarial", "honest", "kinds", "worst"}
     assert found["adversarial"]["runs"] == 12
     assert list(found["kinds"]) == list(adversaries.KINDS)
     assert set(found["honest"]["load_ratio"]) == {"median", "p90", "p99", "max"}
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
 
 
 def test_loops_are_drawn_within_their_ranges(rng: np.random.Generator) -> None:

@@ -15,20 +15,20 @@ _LIMITING = threading.Lock()
 
 def in_parallel(
     jobs: Iterable[Callable[[], Any]],
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
     workers: int | None = None,
 ) -> list[Any]:
     """Run jobs on all cores, or in so many threads, and return their results in order; compiled loops release the interpreter.
 
-    ``tell`` is called with the share that is done. Where a job fails, or the run is interrupted, those not yet begun are dropped.
+    ``progress`` is called with the share that is done. Where a job fails, or the run is interrupted, those not yet begun are dropped.
     """
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         futures = [pool.submit(job) for job in jobs]
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 future.result()
-                if tell is not None:
-                    tell(done / len(futures))
+                if progress is not None:
+                    progress(done / len(futures))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise

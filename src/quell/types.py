@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntFlag
 from typing import TypeAlias
 
@@ -13,6 +14,9 @@ Vector: TypeAlias = NDArray[np.float64]
 
 Matrix: TypeAlias = NDArray[np.float64]
 """Two-dimensional, C-contiguous, float64."""
+
+Progress: TypeAlias = Callable[[str, float], None]
+"""Called with the name of the present part of the work and the share of it that is done, from 0 to 1."""
 
 
 class DesignWarning(UserWarning):

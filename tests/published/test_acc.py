@@ -12,7 +12,7 @@ import pytest
 
 from quell.experiments.acc import samples as acc_samples
 from quell.experiments.acc import study as acc
-from quell.experiments.acc.designs import PUBLISHED, designs
+from quell.experiments.acc.controllers import PUBLISHED, designs
 from quell.experiments.acc.published import judge_published
 
 SAMPLES = Path(__file__).resolve().parents[3] / "shared" / "benchmarks" / "acc" / "theta_small.csv"

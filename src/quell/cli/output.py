@@ -6,26 +6,21 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
+from rich.progress import BarColumn, ProgressColumn, TextColumn
+from rich.progress import Progress as ProgressBar
 
 from quell.controllers import Controller
-from quell.experiments.common.figures import made
+from quell.experiments.common.figures import make_folder
 from quell.files import check_writable, write_json
 from quell.kernels.dispatch import compilations
 from quell.plants import Plant
 from quell.simulation import Scenario, simulate
 from quell.simulation.driver import run_block
-
-
-class Tell(Protocol):
-    """Hears what is done, and the share that is."""
-
-    def __call__(self, what: str, share: float) -> None:
-        """Show it."""
+from quell.types import Progress
 
 
 def check_places(json_file: Path | None, figures: Path | None, record: Path | None = None) -> None:
@@ -40,7 +35,7 @@ def check_places(json_file: Path | None, figures: Path | None, record: Path | No
         if file is not None:
             check_writable(file)
     if figures is not None:
-        made(figures)
+        make_folder(figures)
 
 
 def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -> None:
@@ -63,11 +58,11 @@ def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -
 
 
 @contextmanager
-def progress(
+def progress_bar(
     console: Console, first: str = "simulating", *more: ProgressColumn, width: int = 0
-) -> Iterator[Tell]:
+) -> Iterator[Progress]:
     """Show a bar while the work goes on; ``first`` stands at it until something is told, in ``width`` places at least."""
-    with Progress(
+    with ProgressBar(
         TextColumn(f"{{task.description:<{width}}}"),
         BarColumn(),
         *more,

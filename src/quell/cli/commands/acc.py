@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from quell.cli.output import check_places, progress, write_results
+from quell.cli.output import check_places, progress_bar, write_results
 from quell.experiments.acc import figures as acc_figures
 from quell.experiments.acc import samples as acc_samples
 from quell.experiments.acc import study as acc
 from quell.experiments.acc.cases import CaseResult
-from quell.experiments.acc.designs import DT, designs
+from quell.experiments.acc.controllers import DT, designs
 
 
 def reproduce_acc(
@@ -55,9 +55,9 @@ def reproduce_acc(
         for controller in designs(DT).values():
             for cubic in (False, True):
                 acc.judge_sampled(controller, plants[:1], cubic)
-    with progress(console, width=28) as tell:
-        result = acc.run(plants, source, tell)
-        paths = acc_figures.save(result, figures, tell) if figures is not None else []
+    with progress_bar(console, width=28) as progress:
+        result = acc.run(plants, source, progress)
+        paths = acc_figures.save(result, figures, progress) if figures is not None else []
     _print_rates(console, result)
     _print_cases(console, result)
     write_results(console, result.to_json(), json_file, paths, figures)

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from quell.analysis import analyse
-from quell.cli.output import check_places, progress, write_results
+from quell.cli.output import check_places, progress_bar, write_results
 from quell.experiments.compare import figures as compare_figure
 from quell.experiments.compare import study as compare
 from quell.experiments.compare.study import BAND, END, FORCE, FORCE_AT, Benchmark, Comparison
@@ -52,8 +52,8 @@ def run_compare(
     check_places(json_file, figures)
     console = Console()
     what = "simulating (the first run compiles for some seconds)"
-    with progress(console, what) as tell:
-        result = compare.two_mass(settings, names, partial(tell, what))
+    with progress_bar(console, what) as progress:
+        result = compare.two_mass(settings, names, partial(progress, what))
     _print(console, result, settings, stable)
     paths = compare_figure.save(result, figures) if figures is not None else []
     about = {

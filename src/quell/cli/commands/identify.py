@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from quell.cli.output import check_places, write_results
-from quell.experiments.common.figures import made, save_figure
+from quell.experiments.common.figures import make_folder, save_figure
 from quell.files import check_writable
 from quell.identification.excitation import excitation
 from quell.identification.identify import identify
@@ -100,7 +100,7 @@ def _drawn(found: Identified, folder: Path) -> list[Path]:
 
     axes = found.plot()
     try:
-        return save_figure(axes[0].figure, made(folder), "identified")
+        return save_figure(axes[0].figure, make_folder(folder), "identified")
     finally:
         plt.close(axes[0].figure)
 

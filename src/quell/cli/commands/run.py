@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from quell.cli.output import check_places, progress, write_results
+from quell.cli.output import check_places, progress_bar, write_results
 from quell.cli.report import figure_of, judge, print_judgement, print_outcome
 from quell.setup import SetupError, load
 from quell.simulation.simulate import simulate
@@ -38,9 +38,11 @@ def run_setup(
         )
     check_places(json_file, figures, save)
     console = Console()
-    with progress(console, what := "simulating (the first run compiles for some seconds)") as tell:
+    with progress_bar(
+        console, what := "simulating (the first run compiles for some seconds)"
+    ) as progress:
         try:
-            run = simulate(plant, setup.controller, scenario, progress=partial(tell, what))
+            run = simulate(plant, setup.controller, scenario, progress=partial(progress, what))
         except ValueError as error:
             raise SetupError([f"{setup.file}: {error}"]) from None
     scores = judge(run, setup)

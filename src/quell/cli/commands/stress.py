@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.progress import TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from quell.cli.output import check_places, progress, write_results
+from quell.cli.output import check_places, progress_bar, write_results
 from quell.experiments.stress import figures as stress_figure
 from quell.experiments.stress import study as stress
 from quell.experiments.stress.study import HONEST, Outcome
@@ -37,11 +37,15 @@ def run_stress(
     check_places(json_file, figures)
     console = Console()
     first = "simulating (the first run compiles for half a minute)"
-    with progress(
+    with progress_bar(
         console, first, TextColumn("{task.percentage:>3.0f} %"), TimeRemainingColumn()
-    ) as tell:
+    ) as progress:
         result = stress.run(
-            runs, honest, seed, guard=Guard() if guarded else None, tell=partial(tell, "simulating")
+            runs,
+            honest,
+            seed,
+            guard=Guard() if guarded else None,
+            progress=partial(progress, "simulating"),
         )
     _print(console, result, guarded)
     paths = stress_figure.save(result, figures) if figures is not None else []

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from quell.cli.output import check_places, compile_loops, progress, write_results
+from quell.cli.output import check_places, compile_loops, progress_bar, write_results
 from quell.experiments.torsional import figures as torsional_figures
 from quell.experiments.torsional import setup as torsional
 from quell.experiments.torsional import study as torsional_study
@@ -43,9 +43,9 @@ def reproduce_torsional(
         for law in torsional.controllers(settings, *torsional.CASES[0]).values()
     ]
     compile_loops(console, loops)
-    with progress(console, width=15) as tell:
-        result = torsional_study.run(settings, tell)
-        paths = torsional_figures.save(result, figures, tell) if figures is not None else []
+    with progress_bar(console, width=15) as progress:
+        result = torsional_study.run(settings, progress)
+        paths = torsional_figures.save(result, figures, progress) if figures is not None else []
     _print(console, result)
     write_results(console, result.to_json(), json_file, paths, figures)
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from quell import plants
-from quell.cli.output import check_places, compile_loops, progress, write_results
+from quell.cli.output import check_places, compile_loops, progress_bar, write_results
 from quell.experiments.two_mass_spring import figures as two_mass_figures
 from quell.experiments.two_mass_spring import setup as two_mass_spring
 from quell.experiments.two_mass_spring import study as two_mass_study
@@ -55,9 +55,9 @@ def reproduce_two_mass(
         for candidate in two_mass_spring.controllers(settings).values()
     ]
     compile_loops(console, loops)
-    with progress(console, width=15) as tell:
-        result = two_mass_study.run(settings, tell)
-        paths = two_mass_figures.save(result, figures, tell) if figures is not None else []
+    with progress_bar(console, width=15) as progress:
+        result = two_mass_study.run(settings, progress)
+        paths = two_mass_figures.save(result, figures, progress) if figures is not None else []
     _print(console, result)
     write_results(console, result.to_json(), json_file, paths, figures)
 

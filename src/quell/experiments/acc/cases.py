@@ -6,7 +6,7 @@ Masses 1 kg, no actuator lag, u on m1, y = x2:
 2. the same, and stable for m1, m2 and k as far from 1 as can be, all at once;
 3. a sinusoid of 0.5 rad/s on m2, of unknown amplitude and phase, rejected with 20 s to settle, for all 0.5 < k < 2.
 
-The first two with the controllers of ``acc_designs`` as they are; in the third u has no limit, as a load of 1 N at m2 asks more than 0.5 N.
+The first two with the controllers of ``acc.controllers`` as they are; in the third u has no limit, as a load of 1 N at m2 asks more than 0.5 N.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 
 from quell.analysis import analyse
 from quell.analysis.margins import Margins
+from quell.experiments.acc.controllers import DT, OURS, designs
 from quell.experiments.acc.criteria import MOST_Y
-from quell.experiments.acc.designs import DT, OURS, designs
 from quell.experiments.acc.loops import unstable
 from quell.files import without_gaps
 from quell.parallel import in_parallel

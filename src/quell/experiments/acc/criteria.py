@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.experiments.acc.designs import MOST_U
+from quell.experiments.acc.controllers import MOST_U
 from quell.types import Matrix, Vector
 
 SETTLED_AT, MOST_Y = 15.0, 0.1

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from quell.experiments.acc import samples as acc_samples
+from quell.experiments.acc.controllers import DT, MF, MOST_U, OURS, PUBLISHED, designs
 from quell.experiments.acc.criteria import DURATION, MOST_Y, SETTLED_AT, interval
-from quell.experiments.acc.designs import DT, MF, MOST_U, OURS, PUBLISHED, designs
 from quell.experiments.acc.published import judge_published
 from quell.experiments.acc.study import SPRINGS, Result, judge_sampled, records
-from quell.experiments.common.figures import made, save_figure
+from quell.experiments.common.figures import make_folder, save_figure
 
 SPREADS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
 # Plants for each spread, and responses in a figure.
@@ -24,17 +24,17 @@ Rates = Mapping[str, Mapping[str, Sequence[tuple[float, float, float]]]]
 
 
 def save(
-    result: Result, folder: str | os.PathLike[str], tell: Callable[[str, float], None]
+    result: Result, folder: str | os.PathLike[str], progress: Callable[[str, float], None]
 ) -> list[Path]:
     """Draw the figures of a result and save them to a folder; return the paths."""
-    where = made(folder)
+    where = make_folder(folder)
     written = save_figure(_failures(result), where, "acc-failures")
     written += save_figure(_responses(result.samples[:_RESPONSES]), where, "acc-responses")
-    return written + save_figure(_spread(against_spread(tell)), where, "acc-spread")
+    return written + save_figure(_spread(against_spread(progress)), where, "acc-spread")
 
 
 def against_spread(
-    tell: Callable[[str, float], None], spreads: Sequence[float] = SPREADS, count: int = _COUNT
+    progress: Callable[[str, float], None], spreads: Sequence[float] = SPREADS, count: int = _COUNT
 ) -> Rates:
     """Return by spring and controller (failure rate, and its interval) for each spread, on ``count`` drawn samples each."""
     found: dict[str, dict[str, list[tuple[float, float, float]]]] = {
@@ -44,7 +44,7 @@ def against_spread(
     for i, spread in enumerate(spreads):
         samples = acc_samples.generated(count, spread, seed=1)
         for spring, cubic in SPRINGS.items():
-            tell("spread", i / len(spreads))
+            progress("spread", i / len(spreads))
             judged = {
                 name: judge_published(design, samples, cubic) for name, design in PUBLISHED.items()
             }

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from quell.experiments.acc.controllers import TransferFunction
 from quell.experiments.acc.criteria import DURATION, SETTLED_AT, Judged
-from quell.experiments.acc.designs import TransferFunction
 from quell.parallel import one_blas_thread
 from quell.types import Matrix, Vector
 

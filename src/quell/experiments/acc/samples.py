@@ -61,7 +61,7 @@ def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
     checks.whole("count", count, 1)
     if checks.positive("spread", spread) > _MOST_SPREAD:
         raise ValueError(
-            f"spread = {spread!r}: must be at most {_MOST_SPREAD:g}, the published samples tell nothing of what lies so far out"
+            f"spread = {spread!r}: must be at most {_MOST_SPREAD:g}, the published samples do not cover more"
         )
     from scipy.stats import norm
 

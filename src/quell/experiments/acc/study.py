@@ -15,8 +15,8 @@ from typing import Any
 
 from quell.experiments.acc import samples as acc_samples
 from quell.experiments.acc.cases import CaseResult, study_cases
+from quell.experiments.acc.controllers import DT, PUBLISHED, designs
 from quell.experiments.acc.criteria import DURATION, Judged, judge
-from quell.experiments.acc.designs import DT, PUBLISHED, designs
 from quell.experiments.acc.loops import unstable
 from quell.experiments.acc.published import judge_published
 from quell.plants import CubicSpringPlant, LinearPlant, PlantBatch
@@ -60,9 +60,9 @@ class Result:
         }
 
 
-def run(samples: Matrix, source: str = "given", tell: Tell | None = None) -> Result:
-    """Run the benchmark on samples (count, 6), and the original problem's cases; ``tell`` hears what is done, and the share that is."""
-    say = tell or (lambda what, share: None)
+def run(samples: Matrix, source: str = "given", progress: Tell | None = None) -> Result:
+    """Run the benchmark on samples (count, 6), and the original problem's cases; ``progress`` hears what is done, and the share that is."""
+    say = progress or (lambda what, share: None)
     sampled, judged, spent, count = designs(DT), {}, 0.0, 0
     for spring, cubic in SPRINGS.items():
         found = {}
@@ -90,13 +90,13 @@ def judge_sampled(
     controller: Any,
     samples: Matrix,
     cubic: bool,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
     workers: int | None = None,
 ) -> Judged:
     """Simulate one controller on every plant and judge it; on all cores by default."""
     plants = [acc_samples.plant(sample, cubic) for sample in samples]
     return judge(
-        *records(controller, plants, 1.0 / samples[:, 1], tell, workers),
+        *records(controller, plants, 1.0 / samples[:, 1], progress, workers),
         unstable(plants, controller),
     )
 
@@ -105,7 +105,7 @@ def records(
     controller: Any,
     plants: Sequence[LinearPlant | CubicSpringPlant],
     speeds: Vector,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
     workers: int | None = None,
 ) -> tuple[Vector, Matrix, Matrix]:
     """Return times (samples,), y and u (count, samples) after m2 was hit to the ``speeds`` [m/s]; no numbers after a run's early end."""
@@ -118,7 +118,7 @@ def records(
         impulses,
         limit=_LOST,
         record=("y", "u"),
-        progress=tell,
+        progress=progress,
         workers=workers,
     )
     return runs.t, runs["y"], runs["u"]

@@ -18,7 +18,7 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 
 
-def blank(height: float) -> Any:
+def wide_figure(height: float) -> Any:
     """Return an empty figure, apart from any that the user has open; its margins are fixed, as measuring them takes longer than drawing."""
     from matplotlib.figure import Figure
 
@@ -30,12 +30,12 @@ def blank(height: float) -> Any:
     return figure
 
 
-def label_of(name: str, run: Trajectory) -> str:
+def legend_label(name: str, run: Trajectory) -> str:
     """Return what a legend calls a run."""
     return f"{name} (diverged at {run.ended:.3g} s)" if run.diverged else name
 
 
-def made(folder: str | os.PathLike[str]) -> Path:
+def make_folder(folder: str | os.PathLike[str]) -> Path:
     """Return a folder for figures, made if need be; a ``ValueError`` says why it can't be."""
     where = Path(folder)
     try:
@@ -61,11 +61,11 @@ def save_figure(figure: Any, where: Path, name: str) -> list[Path]:
     return written
 
 
-def save_all(
+def save_figures(
     figures: Iterable[tuple[str, Any]],
     count: int,
     folder: str | os.PathLike[str],
-    tell: Callable[[str, float], None],
+    progress: Callable[[str, float], None],
 ) -> list[Path]:
     """Write ``count`` figures with their names, in the studies' style, into ``folder``, made if need be; return the paths.
 
@@ -76,11 +76,11 @@ def save_all(
     """
     import matplotlib
 
-    where = made(folder)
+    where = make_folder(folder)
     written = []
     with matplotlib.rc_context({"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}):
         for i, (name, figure) in enumerate(figures):
-            tell("figures", i / count)
+            progress("figures", i / count)
             written += save_figure(figure, where, name)
-    tell("figures", 1.0)
+    progress("figures", 1.0)
     return written

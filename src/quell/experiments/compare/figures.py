@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import made, save_figure
+from quell.experiments.common.figures import make_folder, save_figure
 from quell.experiments.compare.study import Comparison
 from quell.records.plotting import draw as line
 
@@ -44,7 +44,7 @@ def draw(result: Comparison) -> Any:
 
 def save(result: Comparison, folder: str | os.PathLike[str]) -> list[Path]:
     """Write the figure into ``folder``, made if need be; return the paths."""
-    return save_figure(draw(result), made(folder), "compare")
+    return save_figure(draw(result), make_folder(folder), "compare")
 
 
 def _window(signals: list[Any]) -> tuple[float, float]:

@@ -77,7 +77,7 @@ def compare(
     load_at: float | None = None,
     band: float = BAND,
     record_every: int = 1,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Comparison:
     """Run controllers on a plant through the same scenario, with the same noise, on all cores, and judge them.
 
@@ -94,7 +94,7 @@ def compare(
         half width of the settling band, as a fraction of the step.
     record_every
         as for ``simulate``; with more than 1 there is no control variation.
-    tell
+    progress
         called with the share done.
 
     Returns
@@ -128,7 +128,7 @@ def compare(
         partial(simulate, plant, controller, scenario, record_every=record_every)
         for controller in controllers.values()
     ]
-    runs = dict(zip(controllers, in_parallel(jobs, tell), strict=True))
+    runs = dict(zip(controllers, in_parallel(jobs, progress), strict=True))
     return Comparison(
         runs, {name: score(run, scenario.duration, load_at, band) for name, run in runs.items()}
     )
@@ -245,7 +245,7 @@ def controller(name: str, dt: float, u_max: float = math.inf) -> Any:
 
 
 def two_mass(
-    settings: Benchmark, names: Sequence[str], tell: Callable[[float], None] | None = None
+    settings: Benchmark, names: Sequence[str], progress: Callable[[float], None] | None = None
 ) -> Comparison:
     """Run the benchmark's comparison: the controllers of these names on the plant of ``settings``.
 
@@ -256,7 +256,7 @@ def two_mass(
     """
     made = {name: controller(name, settings.dt, settings.u_max) for name in names}
     plant = two_mass_spring(settings.m1, settings.m2, settings.k)
-    return compare(plant, made, scenario(settings), load_at=FORCE_AT, tell=tell)
+    return compare(plant, made, scenario(settings), load_at=FORCE_AT, progress=progress)
 
 
 def _pid(dt: float, limits: dict[str, Any]) -> PID:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import made, save_figure
+from quell.experiments.common.figures import make_folder, save_figure
 from quell.experiments.stress.study import HONEST, Result
 
 
@@ -47,4 +47,4 @@ def draw(result: Result) -> Any:
 
 def save(result: Result, folder: Path) -> list[Path]:
     """Write the figure into ``folder``, made if need be; return the paths."""
-    return save_figure(draw(result), made(folder), "stress")
+    return save_figure(draw(result), make_folder(folder), "stress")

@@ -113,7 +113,7 @@ def run(
     *,
     guard: Guard | None,
     learner: Learner | None = None,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Result:
     """Run a trial.
 
@@ -129,7 +129,7 @@ def run(
         the guard; None to see what happens without.
     learner
         the honest learner, ``Harmonic()`` by default.
-    tell
+    progress
         called with the share that is done.
 
     Raises
@@ -161,7 +161,7 @@ def run(
         "loops": random_loops.__doc__,
         "ratios": __doc__,
     }
-    return Result(settings, in_parallel(jobs, tell))
+    return Result(settings, in_parallel(jobs, progress))
 
 
 def one(kind: str, loop: Loop, learner: Learner, guard: Guard | None) -> Outcome:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import STYLES, blank, label_of, save_all
+from quell.experiments.common.figures import STYLES, legend_label, save_figures, wide_figure
 from quell.experiments.torsional.setup import (
     B0,
     BAND,
@@ -42,7 +42,7 @@ _SMOOTHED = 0.02
 
 
 def save(
-    result: Result, folder: str | os.PathLike[str], tell: Callable[[str, float], None]
+    result: Result, folder: str | os.PathLike[str], progress: Callable[[str, float], None]
 ) -> list[Path]:
     """Draw all figures into ``folder``, made if need be, each as PNG and SVG; return the paths.
 
@@ -51,7 +51,7 @@ def save(
     ValueError
         where the folder can't be made.
     """
-    return save_all(_figures(result), 3, folder, tell)
+    return save_figures(_figures(result), 3, folder, progress)
 
 
 def _figures(result: Result) -> Iterator[tuple[str, Any]]:
@@ -62,14 +62,21 @@ def _figures(result: Result) -> Iterator[tuple[str, Any]]:
 
 def _position(result: Result) -> Any:
     """Draw the upper disk's angle: the move, and the arrival on either plant."""
-    figure = blank(8.4)
+    figure = wide_figure(8.4)
     figure.subplots_adjust(top=0.93, hspace=0.2)
     rows = figure.subplots(len(result.cases), 3, squeeze=False)
     for case, axes in zip(result.cases, rows, strict=True):
         runs = case.outcomes[FRICTION].records
         for name, style in _STYLES.items():
             _line(
-                axes[0], runs[name], "y", _MOVE, 1.0, 0.0, label=label_of(name, runs[name]), **style
+                axes[0],
+                runs[name],
+                "y",
+                _MOVE,
+                1.0,
+                0.0,
+                label=legend_label(name, runs[name]),
+                **style,
             )
         _line(
             axes[0],
@@ -113,7 +120,7 @@ def _position(result: Result) -> Any:
 
 def _control(result: Result) -> Any:
     """Draw the control signal on either plant."""
-    figure = blank(8.4)
+    figure = wide_figure(8.4)
     figure.subplots_adjust(left=0.1, hspace=0.1, wspace=0.05)
     rows = figure.subplots(len(result.cases), 2, squeeze=False, sharex=True, sharey="row")
     for case, axes in zip(result.cases, rows, strict=True):
@@ -129,7 +136,7 @@ def _control(result: Result) -> Any:
                     (0.0, END - PROFILE_AT),
                     1.0,
                     0.0,
-                    label=label_of(name, runs[name]),
+                    label=legend_label(name, runs[name]),
                     **style,
                 )
         axes[0].set_ylabel(f"{case.label}\ncontrol signal [V]")
@@ -144,7 +151,7 @@ def _control(result: Result) -> Any:
 def _learning(case: Case) -> Any:
     """Draw what L-ESO learned on the plant with friction, in terms of the paper's model, and how it splits up f."""
     run = case.outcomes[FRICTION].records[L]
-    figure = blank(7.2)
+    figure = wide_figure(7.2)
     figure.subplots_adjust(left=0.1)
     above, below = figure.subplots(2, 1)
     # f = −(b0/b) a·x + (1 − b0/b)(…): what the plant itself would have, its gain being b and not b0.

@@ -123,7 +123,7 @@ def run(settings: Settings, progress: Callable[[str, float], None] | None = None
     progress
         called with what is being done and the share of it that is.
     """
-    tell = progress or (lambda what, share: None)
+    progress = progress or (lambda what, share: None)
     jobs = {
         (case, kind, name): partial(_starts, plant(kind), controller, scenarios(settings, kind))
         for case in CASES
@@ -131,7 +131,11 @@ def run(settings: Settings, progress: Callable[[str, float], None] | None = None
         for name, controller in controllers(settings, *case).items()
     }
     done = dict(
-        zip(jobs, in_parallel(jobs.values(), lambda share: tell("simulating", share)), strict=True)
+        zip(
+            jobs,
+            in_parallel(jobs.values(), lambda share: progress("simulating", share)),
+            strict=True,
+        )
     )
 
     def outcome(case: tuple[float, float], kind: str) -> Outcome:

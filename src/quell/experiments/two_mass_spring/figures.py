@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import STYLES, blank, label_of, save_all
+from quell.experiments.common.figures import STYLES, legend_label, save_figures, wide_figure
 from quell.experiments.two_mass_spring.gradient_range import HORIZON, Trial
 from quell.experiments.two_mass_spring.setup import END, FORCE_AT, L1, MB, MF, STEP_AT, L
 from quell.experiments.two_mass_spring.study import Result
@@ -30,7 +30,7 @@ _TRUE_THETA = {"x1": 0.0, "x2": 0.0, "x3": -2.0, "x4": 0.0}
 
 
 def save(
-    result: Result, folder: str | os.PathLike[str], tell: Callable[[str, float], None]
+    result: Result, folder: str | os.PathLike[str], progress: Callable[[str, float], None]
 ) -> list[Path]:
     """Draw all figures into ``folder``, made if need be, each as PNG and SVG; return the paths.
 
@@ -39,7 +39,7 @@ def save(
     ValueError
         where the folder can't be made.
     """
-    return save_all(_figures(result), 4, folder, tell)
+    return save_figures(_figures(result), 4, folder, progress)
 
 
 def _figures(result: Result) -> Iterator[tuple[str, Any]]:
@@ -51,7 +51,7 @@ def _figures(result: Result) -> Iterator[tuple[str, Any]]:
 
 def _comparison(result: Result, channel: str, label: str) -> Any:
     """Draw one channel of all controllers of the same bandwidth: whole, and the paper's two zooms."""
-    figure = blank(6.4)
+    figure = wide_figure(6.4)
     axes = figure.subplot_mosaic([["all", "all"], ["step", "force"]])
     spans = {"all": (_FROM, END), "step": _ZOOMS[0], "force": _ZOOMS[1]}
     for place, (start, stop) in spans.items():
@@ -60,7 +60,7 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
             run = result.runs[name]
             part = run.window(start, stop)
             if part.stop > part.start:
-                draw(ax, run.t[part], run[channel][part], label=label_of(name, run), **style)
+                draw(ax, run.t[part], run[channel][part], label=legend_label(name, run), **style)
         ax.set_xlim(start, stop)
         ax.set_xlabel("time [s]")
     axes["all"].set_ylabel(label)
@@ -80,7 +80,7 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
 def _learning(result: Result) -> Any:
     """Draw what L-ESO learned, what it takes f to be and how the three observers estimate it."""
     run = result.runs[L]
-    figure = blank(8.0)
+    figure = wide_figure(8.0)
     axes = figure.subplots(3, 1, sharex=True)
     for i, feature in enumerate(run.features):
         draw(axes[0], run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
@@ -104,7 +104,7 @@ def _learning(result: Result) -> Any:
             axes[2],
             other.t,
             other["f_hat"] - _true_disturbance(other, known=name == MB),
-            label=label_of(name, other),
+            label=legend_label(name, other),
             **_STYLES[name],
         )
     axes[2].set_title(
@@ -132,7 +132,7 @@ def _true_disturbance(run: Trajectory, known: bool = False) -> Any:
 
 def _algorithm_1(result: Result) -> Any:
     """Draw when Algorithm 1 diverges, and what it gains where it does not."""
-    figure = blank(6.0)
+    figure = wide_figure(6.0)
     axes = figure.subplots(2, 1, sharex=True)
     markers = "osx"
     for marker, batch in zip(

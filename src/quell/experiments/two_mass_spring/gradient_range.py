@@ -36,7 +36,9 @@ class Trial:
 
 
 def trials(
-    settings: setting.Settings, tell: Callable[[str, float], None], rates: Sequence[float] = RATES
+    settings: setting.Settings,
+    progress: Callable[[str, float], None],
+    rates: Sequence[float] = RATES,
 ) -> tuple[Trial, ...]:
     """Run Algorithm 1 with every batch and rate.
 
@@ -58,9 +60,9 @@ def trials(
     cases = [(batch, rate) for batch in BATCHES for rate in rates]
     done = []
     for i in range(0, len(cases), len(rates)):
-        tell("learning rates", i / len(cases))
+        progress("learning rates", i / len(cases))
         done += in_parallel([partial(trial, *case) for case in cases[i : i + len(rates)]])
-    tell("learning rates", 1.0)
+    progress("learning rates", 1.0)
     return tuple(done)
 
 

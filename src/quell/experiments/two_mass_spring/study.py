@@ -88,22 +88,22 @@ def run(settings: Settings, progress: Callable[[str, float], None] | None = None
     progress
         called with what is being done and the share of it that is.
     """
-    tell = progress or (lambda what, share: None)
+    progress = progress or (lambda what, share: None)
     plant, what = two_mass_spring(), scenario(settings)
     runs = {}
     for i, (name, candidate) in enumerate(controllers(settings).items()):
-        tell("simulating", i / len(NAMES))
+        progress("simulating", i / len(NAMES))
         runs[name] = simulate(plant, candidate, what)
-    tell("simulating", 1.0)
+    progress("simulating", 1.0)
     scores = {name: score(run) for name, run in runs.items()}
-    needed = {name: _bandwidth_for(settings, name == MB, scores, tell) for name in (MF, MB)}
+    needed = {name: _bandwidth_for(settings, name == MB, scores, progress) for name in (MF, MB)}
     variations = _batch_variations(settings)
     claims = tuple(_claims(runs, scores, needed, variations))
-    return Result(settings, runs, scores, claims, gradient_range.trials(settings, tell))
+    return Result(settings, runs, scores, claims, gradient_range.trials(settings, progress))
 
 
 def _bandwidth_for(
-    settings: Settings, model: bool, scores: Any, tell: Callable[[str, float], None]
+    settings: Settings, model: bool, scores: Any, progress: Callable[[str, float], None]
 ) -> dict[str, float | None]:
     """Return for each learner how many times ``omega_o`` the ESO without one needs for the same disturbance peak.
 
@@ -111,12 +111,12 @@ def _bandwidth_for(
     logarithms. A peak that none of them reaches gives the largest multiple that was measured; one that all are below gives None.
     """
     grid = [factor for factor in _BANDWIDTHS if factor * settings.omega_o * settings.dt < math.pi]
-    tell("bandwidths", 0.5 if model else 0.0)
+    progress("bandwidths", 0.5 if model else 0.0)
     candidates = [controller(settings, model=model, bandwidth=factor) for factor in grid]
     found = map(
         score, in_parallel([partial(quick_run, settings, candidate) for candidate in candidates])
     )
-    tell("bandwidths", 1.0 if model else 0.5)
+    progress("bandwidths", 1.0 if model else 0.5)
     points = [
         (math.log(s["disturbance_peak"]), math.log(factor))
         for s, factor in zip(found, grid, strict=True)
