@@ -18,7 +18,7 @@ from quell.lti import canonical
 from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
-from quell.observers.placement import place
+from quell.observers.placement import place_poles
 
 
 def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:
@@ -119,7 +119,7 @@ def test_poles_may_differ_and_be_complex(rng: np.random.Generator) -> None:
     """The placement takes any poles, not only equal ones."""
     difference = np.triu(0.05 * rng.uniform(0.5, 1.0, (4, 4)), 0)
     rises = np.array([0.1, 0.03, 0.05 + 0.02j, 0.05 - 0.02j])
-    gain = place(difference, rises)
+    gain = place_poles(difference, rises)
     phi = np.eye(4) + difference
     error = phi - np.outer(gain, phi[0])
     np.testing.assert_allclose(np.poly(np.eye(4) - error), np.poly(rises).real, atol=1e-12)

@@ -12,7 +12,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import quell as ql
 from quell.lti.discretize import zero_order_hold
-from quell.observers.base import acting, begin, observe
+from quell.observers.base import acting_control, begin, observe
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
 from quell.observers.nonlinear import fal
@@ -282,7 +282,7 @@ def test_an_observer_behind_a_delay_is_the_plain_one_fed_the_u_of_then(
     begin(late_one.model, z, seen, 0.0)
     for k in range(1, 30):
         # What reaches the plant in the sample that u[k - 1] is sent for.
-        assert acting(late_one.model, z, u[k - 1]) == shifted[k - 1]
+        assert acting_control(late_one.model, z, u[k - 1]) == shifted[k - 1]
         observe(late_one.model, z, seen, y[k], u[k - 1], 0.0)
 
 
@@ -363,8 +363,8 @@ def test_noise_gains_are_what_noise_does(name: str, rng: np.random.Generator) ->
     found = response(observer.model, 3)
     noise, state, total = rng.normal(size=40_000), np.zeros(observer.states), np.zeros(3)
     for value in noise:
-        total += (found.seen @ state + found.through[:, 0] * value) ** 2
-        state = found.transition @ state + found.inputs[:, 0] * value
+        total += (found.output @ state + found.feedthrough[:, 0] * value) ** 2
+        state = found.transition @ state + found.input[:, 0] * value
     np.testing.assert_allclose(total / noise.size, noise_gains(observer), rtol=0.2)
 
 

@@ -18,7 +18,7 @@ from quell.controllers import baselines as baseline_room
 from quell.controllers.adrc.law import F_LEARNED, U
 from quell.controllers.base import take_over
 from quell.controllers.running import named_arrays
-from quell.observers.base import expected
+from quell.observers.base import expected_measurement
 
 from .test_contracts import CHAIN, SCENARIO, check_run
 
@@ -93,7 +93,7 @@ def awaited(controller: Any, y: float) -> float:
     if not isinstance(law, ql.ADRC):
         return y
     loop = law._state.loop
-    return expected(law.parameters.eso, law._state.z, loop[U], loop[F_LEARNED])
+    return expected_measurement(law.parameters.eso, law._state.z, loop[U], loop[F_LEARNED])
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

@@ -13,7 +13,7 @@ import numpy as np
 
 from quell import checks
 from quell.lti.discretize import zero_order_hold
-from quell.lti.models import Fraction, leading_gain, read, with_states
+from quell.lti.models import TransferFunction, leading_gain, read_model, to_state_space
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
@@ -65,8 +65,8 @@ def sampled_plant(
                 f"delay = {delay!r} s, actuator_lag = {actuator_lag!r} s: a sampled plant takes whole samples of delay and no lag; "
                 "give it in continuous time"
             )
-        model = read(plant, dt=dt)
-        model = with_states(model) if isinstance(model, Fraction) else model
+        model = read_model(plant, dt=dt)
+        model = to_state_space(model) if isinstance(model, TransferFunction) else model
         N, B = model.A - np.eye(model.C.size), model.B[:, None]
         return _delayed(N, B, np.zeros_like(B), model.C, B, round(delay / dt), {})
     linear = LinearPlant.of(plant)

@@ -125,7 +125,7 @@ def _unit(features: JoinedDesign, scale: Vector, out: Vector) -> None:
     unit(features.second, scale, out[features.split :])
 
 
-def tried(features: Features, order: int) -> Any:
+def checked_design(features: Features, order: int) -> Any:
     """Return ``features.design(order)``; blocks of the user's own have to write their features once, interpreted.
 
     Raises
@@ -134,8 +134,8 @@ def tried(features: Features, order: int) -> Any:
         that names the block's class and the rule, for whatever is wrong.
     """
     if isinstance(features, Joined):
-        tried(features.first, order)
-        tried(features.second, order)
+        checked_design(features.first, order)
+        checked_design(features.second, order)
     elif validation.of_users(features):
         _try_block(features, order)
     return features.design(order)

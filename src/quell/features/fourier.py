@@ -11,14 +11,14 @@ import numpy as np
 
 from quell import checks
 from quell.features.base import Features, unit, write
-from quell.features.states import Places, check_states, places
+from quell.features.states import StateIndices, check_states, state_indices
 from quell.types import Matrix, Vector
 
 
 class RandomFourierDesign(NamedTuple):
     """Parameters of ``RandomFourier``."""
 
-    states: Places
+    states: StateIndices
     waves: Matrix
     """w (p, k)."""
     phase: Vector
@@ -67,7 +67,7 @@ class RandomFourier(Features):
 
     def design(self, order: int) -> RandomFourierDesign:
         """Return the waves, drawn from ``seed``."""
-        rng, chosen = np.random.default_rng(self.seed), places(self.states, order)
+        rng, chosen = np.random.default_rng(self.seed), state_indices(self.states, order)
         return RandomFourierDesign(
             states=chosen,
             waves=rng.normal(size=(self.count, chosen.size)) / self.length,

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 from quell import checks
 from quell.features.base import Features, unit, write
-from quell.features.states import Places, check_states, places
+from quell.features.states import StateIndices, check_states, state_indices
 from quell.types import Vector
 
 
 class FrictionDesign(NamedTuple):
     """Parameters of ``Friction``."""
 
-    states: Places
+    states: StateIndices
     width: float
     sign: bool
 
@@ -57,13 +57,13 @@ class Friction(Features):
 
     def design(self, order: int) -> FrictionDesign:
         """Return where the velocities are, and how friction reverses."""
-        return FrictionDesign(places(self.states, order), float(self.width), bool(self.sign))
+        return FrictionDesign(state_indices(self.states, order), float(self.width), bool(self.sign))
 
     def names(self, order: int) -> tuple[str, ...]:
         """Return ``("tanh(x2/0.05)",)``, and ``"sign(x2)"`` after each where that is a feature."""
         return tuple(
             name
-            for i in places(self.states, order)
+            for i in state_indices(self.states, order)
             for name in (
                 f"tanh(x{i + 1}/{self.width:g})",
                 *([f"sign(x{i + 1})"] if self.sign else []),

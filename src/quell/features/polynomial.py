@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.features.base import Features, unit, write
-from quell.features.states import check_states, places
+from quell.features.states import check_states, state_indices
 from quell.types import Vector
 
 
@@ -51,7 +51,7 @@ class Polynomial(Features):
 
     def design(self, order: int) -> PolynomialDesign:
         """Return the table of factors."""
-        chosen = places(self.states, order).tolist()
+        chosen = state_indices(self.states, order).tolist()
         rows = [
             [*factors, *[-1] * (self.degree - degree)]
             for degree in range(2, self.degree + 1)

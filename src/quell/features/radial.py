@@ -10,7 +10,7 @@ import numpy as np
 
 from quell import checks
 from quell.features.base import Features, unit, write
-from quell.features.states import Places, check_states, places
+from quell.features.states import StateIndices, check_states, state_indices
 from quell.types import Matrix, Vector
 
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
@@ -19,7 +19,7 @@ _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 class RadialDesign(NamedTuple):
     """Parameters of ``RBF``."""
 
-    states: Places
+    states: StateIndices
     centers: Matrix
     """(p, k)."""
     weight: float
@@ -78,7 +78,7 @@ class RBF(Features):
 
     def design(self, order: int) -> RadialDesign:
         """Return centres and width."""
-        chosen = places(self.states, order, 2)
+        chosen = state_indices(self.states, order, 2)
         if self.centers is None:
             if chosen.size > len(_PRIMES):
                 raise ValueError(

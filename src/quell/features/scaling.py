@@ -23,7 +23,7 @@ _LEAST = 1e-100
 class Scaling(NamedTuple):
     """Parameters, for a plant of order n."""
 
-    ladder: Vector
+    floors: Vector
     """ω^(i−1)/8 for x_2 … x_n; 0 for x_1, u and f (n + 2,)."""
     fixed: bool
     """Whether the scales are given, not found."""
@@ -31,19 +31,19 @@ class Scaling(NamedTuple):
 
 def scaling(observer: ESO, frequency: float, fixed: bool) -> Scaling:
     """Return the scaling for an observer and a frequency the plant has [rad/s]."""
-    ladder = frequency ** np.arange(observer.order) / 8.0
-    ladder[0] = 0.0
-    return Scaling(np.append(ladder, [0.0, 0.0]), fixed)
+    floors = frequency ** np.arange(observer.order) / 8.0
+    floors[0] = 0.0
+    return Scaling(np.append(floors, [0.0, 0.0]), fixed)
 
 
 @kernel
-def grow(scaling: Scaling, scale: Vector, seen: Vector, u: float, f: float) -> None:
+def update_scale(scaling: Scaling, scale: Vector, seen: Vector, u: float, f: float) -> None:
     """Let ``scale`` (n + 2,) grow to hold the state in ``seen`` (n + 1,), ``u`` and ``f``."""
     if scaling.fixed:
         return
     order = scale.size - 2
     for i in range(scale.size):
         size = abs(seen[i]) if i < order else (abs(u) if i == order else abs(f))
-        size = max(size, scaling.ladder[i] * scale[0], _LEAST)
+        size = max(size, scaling.floors[i] * scale[0], _LEAST)
         if size > scale[i] and is_finite(size):
             scale[i] = 2.0 ** math.ceil(math.log2(size))

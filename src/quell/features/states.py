@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 
-Places = NDArray[np.int64]
+StateIndices = NDArray[np.int64]
 
 
 def check_states(states: Sequence[int] | None) -> None:
@@ -26,7 +26,9 @@ def check_states(states: Sequence[int] | None) -> None:
         raise ValueError(f"states = {states!r}: a state may be named once")
 
 
-def places(states: Sequence[int] | None, order: int, default: int | None = None) -> Places:
+def state_indices(
+    states: Sequence[int] | None, order: int, default: int | None = None
+) -> StateIndices:
     """Return the places (k,) of ``states`` in x, counted from 0; without ``states`` the first ``default``, or all.
 
     Raises

@@ -11,7 +11,7 @@ import numpy as np
 
 from quell.identification.frequency_response import FrequencyResponse, frequency_response
 from quell.identification.validation import Residuals
-from quell.lti.canonical import spell
+from quell.lti.canonical import format_roots
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
@@ -191,7 +191,7 @@ class Identified:
 
     def __repr__(self) -> str:
         fit = self.fits.get("held out", self.fits["estimation"])
-        return f"Identified(order={self.den.size - 1}, poles {spell(np.array([p.value for p in self.poles]))} rad/s, fit {percent(fit, 2)} %)"
+        return f"Identified(order={self.den.size - 1}, poles {format_roots(np.array([p.value for p in self.poles]))} rad/s, fit {percent(fit, 2)} %)"
 
     def to_json(self) -> dict[str, Any]:
         """Return the results for ``quell.files.write_json``: no records, and None for what is not finite."""
@@ -252,7 +252,7 @@ def percent(fit: float, digits: int = 3) -> str:
 
 
 def _named(root: Root) -> str:
-    return f"{spell(np.array([root.value]))} rad/s"
+    return f"{format_roots(np.array([root.value]))} rad/s"
 
 
 def _row(root: Root) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 from quell.kernels.dispatch import generic
 from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
-from quell.observers.response import f_lag, f_shadow, own_response, response
+from quell.observers.response import f_lag, f_learned_response, response, scaled_response
 from quell.types import Matrix, Vector
 
 # In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
@@ -91,7 +91,7 @@ def lag_of(observer: ESO) -> Any:
     """
     if observer.has_one_pole:
         return _chain(observer)
-    M, g, c, d = f_shadow(response(without_delay(observer.model), observer.order + 1))
+    M, g, c, d = f_learned_response(response(without_delay(observer.model), observer.order + 1))
     return DenseLag(M, g.copy(), c, d)
 
 
@@ -101,7 +101,7 @@ def group_delay(observer: ESO) -> float:
     The j-th lag of the chain delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
     """
     if not observer.has_one_pole:
-        return f_lag(own_response(observer))
+        return f_lag(scaled_response(observer))
     lag = _chain(observer)
     stage = np.arange(lag.taps.size)
     return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.lti.models import ZERO_TOLERANCE, Fraction, StateSpace, read
+from quell.lti.models import ZERO_TOLERANCE, StateSpace, TransferFunction, read_model
 from quell.types import Matrix, Vector
 
 # A state that y shows less than this is not put into larger units: it is not seen.
@@ -100,11 +100,15 @@ def canonical(plant: Any, E: Any = None) -> Canonical:
     >>> found.degree, found.zeros.real.round(6).tolist(), found.B.round(6).tolist()
     (1, [-3.0], [1.0, 2.6])
     """
-    model = read(plant, E)
-    return _from_fraction(model) if isinstance(model, Fraction) else _from_state_space(model)
+    model = read_model(plant, E)
+    return (
+        _from_transfer_function(model)
+        if isinstance(model, TransferFunction)
+        else _from_state_space(model)
+    )
 
 
-def _from_fraction(model: Fraction) -> Canonical:
+def _from_transfer_function(model: TransferFunction) -> Canonical:
     """Divide the numerator by the denominator: the quotient's powers of 1/s are the Markov parameters."""
     n = model.a.size
     B = np.empty(n)
@@ -176,7 +180,7 @@ def _assemble(a: Vector, B: Vector, E: Vector | None, S: Matrix, condition: floa
     f_degree = int(np.flatnonzero(E)[0]) + 1
     if E is not B and f_degree < n:
         raise ValueError(
-            f"E: the disturbance has invariant zeros to y (assumption 3), {spell(_zeros(a, E))} rad/s, its relative degree is {f_degree} "
+            f"E: the disturbance has invariant zeros to y (assumption 3), {format_roots(_zeros(a, E))} rad/s, its relative degree is {f_degree} "
             f"and not {n}; leave E out (f then enters where u does), or measure another output"
         )
     return Canonical(
@@ -217,7 +221,7 @@ def _zeros(a: Vector, column: Vector) -> Vector:
     return zeros[np.argsort(zeros.real, kind="stable")]
 
 
-def spell(zeros: Vector) -> str:
+def format_roots(zeros: Vector) -> str:
     """Return zeros as text, conjugate pairs as one."""
     told = []
     for z in zeros[zeros.imag >= 0.0].tolist():

@@ -32,7 +32,7 @@ class StateSpace(NamedTuple):
     """(n,): where the disturbance enters; None: where u does."""
 
 
-class Fraction(NamedTuple):
+class TransferFunction(NamedTuple):
     """``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = c_{n−1} u^(n−1) + … + c_0 u``; for a sampled model shifts in place of derivatives."""
 
     a: Vector
@@ -41,7 +41,7 @@ class Fraction(NamedTuple):
     """(n,)."""
 
 
-def read(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace | Fraction:
+def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace | TransferFunction:
     """Return what ``plant`` is, checked.
 
     Parameters
@@ -87,8 +87,8 @@ def read(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace | Fra
         if np.ndim(plant[1]) == 0:
             a = checks.vector("a", plant[0])
             b = checks.nonzero("b", plant[1], "or the input does not reach the plant")
-            return Fraction(a, np.append(b, np.zeros(a.size - 1)))
-        return _fraction(*plant)
+            return TransferFunction(a, np.append(b, np.zeros(a.size - 1)))
+        return _transfer_function(*plant)
     if all(
         hasattr(plant, name) for name in ("zeros", "poles", "gain", "to_tf")
     ):  # scipy.signal.ZerosPolesGain
@@ -96,20 +96,20 @@ def read(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace | Fra
     if hasattr(plant, "num") and hasattr(plant, "den"):
         _check_time(plant, dt)
         if np.ndim(plant.num) == 1:  # as scipy.signal has them
-            return _fraction(plant.num, plant.den)
+            return _transfer_function(plant.num, plant.den)
         outputs, inputs = len(plant.num), len(plant.num[0])
         if (outputs, inputs) != (1, 1):
             raise ValueError(
                 f"plant has {(outputs, inputs)} outputs and inputs: must have one of each"
             )
-        return _fraction(plant.num[0][0], plant.den[0][0])
+        return _transfer_function(plant.num[0][0], plant.den[0][0])
     raise ValueError(
         f"plant = {plant!r}: must be a linear plant or control.StateSpace (with A, B, C), matrices (A, B, C) or (A, B, E, C), "
         "a control.TransferFunction, (numerator, denominator) or (a, b); a nonlinear one has to be linearised first"
     )
 
 
-def with_states(model: Fraction) -> StateSpace:
+def to_state_space(model: TransferFunction) -> StateSpace:
     """Return a transfer function with states, in observable companion form; its coefficients are taken as they are, so nothing is rounded.
 
     Without zeros y and its derivatives, ``x_i' = x_{i+1}``, ``x_n' = −a·x + c_0 u``. With zeros, where those would jump with u,
@@ -128,8 +128,8 @@ def with_states(model: Fraction) -> StateSpace:
     return StateSpace(A, B, np.eye(n)[0], None)
 
 
-def is_model(value: Any) -> bool:
-    """Return whether ``value`` is of a kind that ``read`` knows: an object with matrices or polynomials, or numbers in a tuple or list."""
+def is_linear_model(value: Any) -> bool:
+    """Return whether ``value`` is of a kind that ``read_model`` knows: an object with matrices or polynomials, or numbers in a tuple or list."""
     if isinstance(value, tuple | list):
         return len(value) > 0 and isinstance(
             value[0], int | float | np.number | np.ndarray | tuple | list
@@ -167,7 +167,7 @@ def leading_gain(A: Matrix, column: Matrix, C: Matrix) -> tuple[float, int] | No
     return None
 
 
-def matrices(A: Any, B: Any, C: Any) -> tuple[Matrix, Matrix, Matrix]:
+def check_matrices(A: Any, B: Any, C: Any) -> tuple[Matrix, Matrix, Matrix]:
     """Return A (n, n), B (n, 1) and C (1, n), checked; B and C may be given as vectors."""
     A = checks.matrix("A", A)
     n = A.shape[0]
@@ -178,7 +178,7 @@ def matrices(A: Any, B: Any, C: Any) -> tuple[Matrix, Matrix, Matrix]:
 
 
 def _state_space(A: Any, B: Any, C: Any, E: Any) -> StateSpace:
-    A, B, C = matrices(A, B, C)
+    A, B, C = check_matrices(A, B, C)
     n = A.shape[0]
     if E is not None:
         E = checks.matrix("E", E, n, 1)[:, 0]
@@ -198,7 +198,7 @@ def _channel(E: Any, columns: Any) -> Any:
     return np.reshape(E, (-1, 1)) if np.ndim(E) == 1 else E
 
 
-def _fraction(numerator: Any, denominator: Any) -> Fraction:
+def _transfer_function(numerator: Any, denominator: Any) -> TransferFunction:
     """Read coefficients in descending powers of s."""
     num, den = (
         np.trim_zeros(checks.vector("numerator", numerator), "f"),
@@ -223,7 +223,7 @@ def _fraction(numerator: Any, denominator: Any) -> Fraction:
         )
     c = np.zeros(den.size - 1)
     c[: num.size] = num[::-1] / den[0]
-    return Fraction(den[:0:-1] / den[0], c)
+    return TransferFunction(den[:0:-1] / den[0], c)
 
 
 def _without_rounding(num: Vector, den: Vector) -> Vector:

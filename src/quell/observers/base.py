@@ -2,8 +2,8 @@
 
 An observer is an ``ESO``: an immutable description with ``order`` n, ``b0``, ``omega_o``, ``dt`` and ``model``, a NamedTuple of
 parameters with ``states``, the length of its running state. That is one vector; entry n of it is a summand of the estimated f, so that a
-controller may shift the estimate there. For the type of ``model`` the functions below are registered; ``acting`` only where u is delayed,
-``expected`` only where the model has no ``transition``, ``input`` and ``feed`` for the first entries of z.
+controller may shift the estimate there. For the type of ``model`` the functions below are registered; ``acting_control`` only where u is delayed,
+``expected_measurement`` only where the model has no ``transition``, ``input`` and ``feed`` for the first entries of z.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ def observe(model: Any, z: Vector, seen: Vector, y: float, u: float, f_learned: 
 
 
 @generic
-def expected(model: Any, z: Vector, u: float, f_learned: float) -> float:
+def expected_measurement(model: Any, z: Vector, u: float, f_learned: float) -> float:
     """Return the measurement that ``observe`` would find nothing to correct by, for the same ``u`` and ``f_learned``."""
     raise TypeError
 
 
-@expected.register(object)
+@expected_measurement.register(object)
 def _first_of_the_forecast(model: Any, z: Vector, u: float, f_learned: float) -> float:
     total = model.input[0] * u + model.feed[0] * f_learned
     for j in range(model.feed.size):
@@ -44,18 +44,18 @@ def begin(model: Any, z: Vector, seen: Vector, y: float) -> None:
 
 
 @generic
-def acting(model: Any, z: Vector, u: float) -> float:
+def acting_control(model: Any, z: Vector, u: float) -> float:
     """Return the control signal that reaches the plant in the sample for which ``u`` is applied: u itself, unless it is delayed."""
     raise TypeError
 
 
-@acting.register(object)
+@acting_control.register(object)
 def _acts_at_once(model: Any, z: Vector, u: float) -> float:
     return u
 
 
 @kernel
-def forecast(model: Any, z: Vector, ahead: Vector, u: float, f: float) -> None:
+def predict_state(model: Any, z: Vector, ahead: Vector, u: float, f: float) -> None:
     """Write ``Φ z + Γ_u u + Γ_f f`` into ``ahead``, both (N,), for a model with ``transition``, ``input`` and ``feed``."""
     for i in range(z.size):
         total = model.input[i] * u + model.feed[i] * f

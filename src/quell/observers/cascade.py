@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.observers.base import begin, forecast, observe
+from quell.observers.base import begin, observe, predict_state
 from quell.types import Matrix, Vector
 
 
@@ -53,7 +53,7 @@ def _observe(
     for level in range(levels):
         state = z[level * size : (level + 1) * size]
         f_before = state[size - 1]
-        forecast(model, state, seen, u, told)
+        predict_state(model, state, seen, u, told)
         error = target - seen[0]
         for i in range(size):
             state[i] = seen[i] + model.gains[level, i] * error

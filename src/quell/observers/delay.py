@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from quell import checks
-from quell.observers.base import acting, begin, expected, observe
+from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Vector
 
 # All of them are moved on each sample.
@@ -47,9 +47,9 @@ def _observe(
     observe(model.inner, z[: model.size], seen, y, arriving, f_learned)
 
 
-@expected.register(DelayedModel)
+@expected_measurement.register(DelayedModel)
 def _expected(model: DelayedModel, z: Vector, u: float, f_learned: float) -> float:
-    return expected(model.inner, z, z[z.size - 1], f_learned)
+    return expected_measurement(model.inner, z, z[z.size - 1], f_learned)
 
 
 @begin.register(DelayedModel)
@@ -59,7 +59,7 @@ def _begin(model: DelayedModel, z: Vector, seen: Vector, y: float) -> None:
     begin(model.inner, z[: model.size], seen, y)
 
 
-@acting.register(DelayedModel)
+@acting_control.register(DelayedModel)
 def _acting(model: DelayedModel, z: Vector, u: float) -> float:
     return z[z.size - 1]
 

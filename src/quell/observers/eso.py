@@ -29,14 +29,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.lti.canonical import Canonical, canonical, spell
+from quell.lti.canonical import Canonical, canonical, format_roots
 from quell.lti.discretize import zero_order_hold
-from quell.observers.base import begin, begin_at, forecast, observe
+from quell.observers.base import begin, begin_at, observe, predict_state
 from quell.observers.delay import delayed_model, without_delay
 from quell.observers.forms import OtherForms
 from quell.observers.nonlinear import NonlinearModel
-from quell.observers.placement import place, sampled_zeros
-from quell.observers.response import own_response, settling_samples
+from quell.observers.placement import place_poles, sampled_zeros
+from quell.observers.response import scaled_response, total_time_constant
 from quell.types import Matrix, Vector
 
 FORMS = ("current", "predictor", "reduced")
@@ -68,7 +68,7 @@ class EsoModel(NamedTuple):
 def _observe(
     model: EsoModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float
 ) -> None:
-    forecast(model, z, seen, u, f_learned)
+    predict_state(model, z, seen, u, f_learned)
     error = y - seen[0]
     for i in range(z.size):
         z[i] = seen[i] + model.gain[i] * error
@@ -203,7 +203,7 @@ class ESO(OtherForms):
         checks.whole("order of the plant", found.a.size, 1, 8)
         if found.matched and np.any(found.zeros == 0.0):
             raise ValueError(
-                f"plant has a zero at s = 0 (zeros from u: {spell(found.zeros)} rad/s): a constant f leaves no trace in y and can not be "
+                f"plant has a zero at s = 0 (zeros from u: {format_roots(found.zeros)} rad/s): a constant f leaves no trace in y and can not be "
                 "estimated; measure another output"
             )
         return cls._design(
@@ -311,7 +311,7 @@ class ESO(OtherForms):
         """
         if self.has_one_pole or isinstance(without_delay(self.model), NonlinearModel):
             return (self.order + 1) / self.omega_o
-        return self.dt * settling_samples(own_response(self))
+        return self.dt * total_time_constant(scaled_response(self))
 
     @property
     def pole(self) -> float:
@@ -396,12 +396,12 @@ def _sampled_design(
             rises[: kept.size] = sampled_zeros(difference, kept, dt)
             if form == "reduced":
                 rises[-1] = 1.0
-            gain = place(difference, rises) * step**power
+            gain = place_poles(difference, rises) * step**power
             if form == "reduced" and np.isfinite(gain[0]):
                 gain[0] = 1.0  # as it is, but for rounding
     if not np.all(np.abs(gain) < _LARGEST_GAIN):
         fastest = np.max(np.abs(np.roots([1.0, *plant.a[::-1]])), initial=0.0)
-        zeros = f" or its zeros at {spell(plant.zeros)} rad/s" if plant.zeros.size else ""
+        zeros = f" or its zeros at {format_roots(plant.zeros)} rad/s" if plant.zeros.size else ""
         raise ValueError(
             f"dt = {dt!r} s: too long (or omega_o = {omega_o!r} rad/s too small) for the plant's fastest pole of {fastest:.3g} rad/s"
             f"{zeros}; sampled, the model cannot be observed"

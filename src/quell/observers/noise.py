@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.observers.response import own_response
+from quell.observers.response import scaled_response
 from quell.types import Vector
 
 
@@ -45,13 +45,13 @@ def _unit_noise_gains(size: int) -> Vector:
 
 def _summed_noise_gains(observer: Any) -> Vector:
     """Return the diagonal of ``C P Cᵀ + d dᵀ``, ``P = Σ M^k g gᵀ M^kᵀ``, by doubling, in the observer's own time."""
-    found = own_response(observer)
-    gain, through, transition = found.inputs[:, 0], found.through[:, 0], found.transition
+    found = scaled_response(observer)
+    gain, through, transition = found.input[:, 0], found.feedthrough[:, 0], found.transition
     total = np.outer(gain, gain)
     for _ in range(64):
         total += transition @ total @ transition.T
         transition = transition @ transition
         if np.max(np.abs(transition)) < 1e-12:
             break
-    variances: Vector = np.einsum("ij,jk,ik->i", found.seen, total, found.seen) + through**2
+    variances: Vector = np.einsum("ij,jk,ik->i", found.output, total, found.output) + through**2
     return variances

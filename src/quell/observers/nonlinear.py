@@ -20,7 +20,7 @@ import math
 from typing import NamedTuple
 
 from quell.kernels.dispatch import kernel
-from quell.observers.base import begin, begin_at, forecast, observe
+from quell.observers.base import begin, begin_at, observe, predict_state
 from quell.types import Matrix, Vector
 
 
@@ -59,7 +59,7 @@ def fal(error: float, alpha: float, delta: float) -> float:
 def _observe(
     model: NonlinearModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float
 ) -> None:
-    forecast(model, z, seen, u, f_learned)
+    predict_state(model, z, seen, u, f_learned)
     error = y - seen[0]
     for i in range(z.size):
         seen[i] += (

@@ -7,7 +7,7 @@ import numpy as np
 from quell.types import Matrix, Vector
 
 
-def place(difference: Matrix, rises: Vector) -> Vector:
+def place_poles(difference: Matrix, rises: Vector) -> Vector:
     """Return L that puts the eigenvalues of ``(I − L C) Φ``, with C = (1, 0, …), at ``1 − rises`` (Ackermann's formula).
 
     ``L = Π (Φ − β_i I) O⁻¹ e_N`` with the rows ``C Φ (Φ − I)^i`` for O: differences instead of powers leave ``O⁻¹ e_N`` as it is
@@ -53,7 +53,7 @@ def sampled_zeros(difference: Matrix, zeros: Vector, dt: float) -> Vector:
     Parameters
     ----------
     difference
-        ``Φ − I`` of the extended model (N, N), as for ``place``; its last state is f.
+        ``Φ − I`` of the extended model (N, N), as for ``place_poles``; its last state is f.
     zeros
         some of the plant's zeros from f, complex ones in conjugate pairs.
     dt

@@ -17,11 +17,11 @@ class Response(NamedTuple):
 
     transition: Matrix
     """M (m, m)."""
-    inputs: Matrix
+    input: Matrix
     """g_y, g_u, g_f (m, 3)."""
-    seen: Matrix
+    output: Matrix
     """C (N, m)."""
-    through: Matrix
+    feedthrough: Matrix
     """d_y, d_u, d_f (N, 3)."""
 
 
@@ -52,12 +52,12 @@ def response(model: Any, estimates: int) -> Response:
     )
 
 
-def f_shadow(found: Response) -> tuple[Matrix, Vector, Vector, float]:
+def f_learned_response(found: Response) -> tuple[Matrix, Vector, Vector, float]:
     """Return ``(M, g, c, d)`` of ``−Δf̂ = c·s + d φ``, ``s⁺ = M s + g φ``: what the estimate of f shows of f_L = φ, for y = u = 0."""
-    return found.transition, found.inputs[:, 2], -found.seen[-1], -float(found.through[-1, 2])
+    return found.transition, found.input[:, 2], -found.output[-1], -float(found.feedthrough[-1, 2])
 
 
-def own_response(observer: Any) -> Response:
+def scaled_response(observer: Any) -> Response:
     """Return that of an ``ESO`` without its delay of u, in its own time: z as ``x_i/omega_o^(i−1)``, ``f/omega_o^q``; ``seen`` as it is."""
     n = observer.order
     found = response(without_delay(observer.model), n + 1)
@@ -67,12 +67,12 @@ def own_response(observer: Any) -> Response:
     )
     return found._replace(
         transition=found.transition * units[None, :] / units[:, None],
-        inputs=found.inputs / units[:, None],
-        seen=found.seen * units[None, :],
+        input=found.input / units[:, None],
+        output=found.output * units[None, :],
     )
 
 
-def settling_samples(found: Response) -> float:
+def total_time_constant(found: Response) -> float:
     """Return ``Σ 1/|ln z_i|`` over the poles, as ``tr (I − M)⁻¹ − m/2``, which is it to second order."""
     m = found.transition.shape[0]
     return float(np.trace(np.linalg.inv(np.eye(m) - found.transition))) - 0.5 * m
@@ -80,6 +80,6 @@ def settling_samples(found: Response) -> float:
 
 def f_lag(found: Response) -> float:
     """Return by how many samples f, as the observer shows it, trails f, for what is slow: ``c (I − M)⁻² g``."""
-    M, g, c, _ = f_shadow(found)
+    M, g, c, _ = f_learned_response(found)
     at_rest = np.eye(M.shape[0]) - M
     return float(c @ np.linalg.solve(at_rest, np.linalg.solve(at_rest, g)))

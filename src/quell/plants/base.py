@@ -36,7 +36,7 @@ class Plant(Protocol):
         """Return the parameters for a sample time ``dt`` [s]; with ``interpret``, such that Python can run and debug them."""
 
 
-class Around:
+class PlantWrapper:
     """What a plant that is put around another one has of that one."""
 
     plant: Any

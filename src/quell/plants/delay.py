@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from quell import checks
-from quell.plants.base import Around, Plant, advance, check_plant, measure
+from quell.plants.base import Plant, PlantWrapper, advance, check_plant, measure
 from quell.types import Vector
 
 
@@ -41,7 +41,7 @@ def _advance(
 
 
 @dataclass(frozen=True, eq=False)
-class DelayedPlant(Around):
+class DelayedPlant(PlantWrapper):
     """A plant whose control signal arrives ``samples`` samples of ``dt`` [s] late; make it with ``delayed``."""
 
     plant: Any

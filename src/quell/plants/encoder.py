@@ -14,7 +14,7 @@ import numpy as np
 
 from quell import checks
 from quell.kernels.dispatch import kernel
-from quell.plants.base import Around, Plant, advance, check_plant, measure
+from quell.plants.base import Plant, PlantWrapper, advance, check_plant, measure
 from quell.types import Vector
 
 
@@ -28,14 +28,14 @@ class EncodedPlantModel(NamedTuple):
 
 
 @kernel
-def counted(value: float, resolution: float) -> float:
+def quantized(value: float, resolution: float) -> float:
     """Return the multiple of ``resolution`` next to ``value``: what a counter, or a converter, makes of it."""
     return resolution * np.floor(value / resolution + 0.5)
 
 
 @measure.register(EncodedPlantModel)
 def _measure(plant: EncodedPlantModel, x: Vector) -> float:
-    return counted(measure(plant.inner, x), plant.resolution)
+    return quantized(measure(plant.inner, x), plant.resolution)
 
 
 @advance.register(EncodedPlantModel)
@@ -46,7 +46,7 @@ def _advance(
 
 
 @dataclass(frozen=True, eq=False)
-class EncodedPlant(Around):
+class EncodedPlant(PlantWrapper):
     """A plant whose output [rad] an encoder of ``counts`` a turn measures; make it with ``encoded``."""
 
     plant: Any

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from quell import checks
 from quell.lti.discretize import zero_order_hold
-from quell.lti.models import Fraction, matrices, read, with_states
+from quell.lti.models import TransferFunction, check_matrices, read_model, to_state_space
 from quell.plants.base import advance, measure
 from quell.types import Matrix, Vector
 
@@ -77,7 +77,7 @@ class LinearPlant:
     name: str = "linear plant"
 
     def __post_init__(self) -> None:
-        A, B, C = matrices(self.A, self.B, self.C)
+        A, B, C = check_matrices(self.A, self.B, self.C)
         E = B if self.E is None else checks.matrix("E", self.E, A.shape[0])
         for name, value in (("A", A), ("B", B), ("C", C), ("E", E)):
             value.flags.writeable = False
@@ -123,9 +123,9 @@ class LinearPlant:
         """
         if isinstance(model, cls) and E is None:
             return model
-        found = read(model, E)
-        if isinstance(found, Fraction):
-            found = with_states(found)
+        found = read_model(model, E)
+        if isinstance(found, TransferFunction):
+            found = to_state_space(found)
         column = getattr(model, "E", None) if found.E is None else found.E[:, None]
         return cls(found.A, found.B, found.C, column, name=name)
 

@@ -32,7 +32,7 @@ from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.delay import DelayedPlantModel
-from quell.plants.encoder import EncodedPlantModel, counted
+from quell.plants.encoder import EncodedPlantModel, quantized
 from quell.plants.linear import LinearModel, LinearPlant
 from quell.types import Vector
 
@@ -67,7 +67,7 @@ def _measure(plant: TorsionalModel, x: Vector) -> float:
 def _advance(
     plant: TorsionalModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
 ) -> None:
-    applied = counted(u, plant.step) if plant.step > 0.0 else u
+    applied = quantized(u, plant.step) if plant.step > 0.0 else u
     applied = min(max(applied, -plant.u_max), plant.u_max)
     for _ in range(plant.substeps):
         advance(plant.disks, x, scratch, t, applied, w)

@@ -12,7 +12,7 @@ from quell import checks
 from quell.types import Vector
 
 # Edges that fall on a sample belong to it even when k * dt is short of it by rounding.
-EDGE = 1e-9
+EDGE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class Switched(Signal):
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the values of whichever piece holds."""
-        edges = np.asarray(self.times) - EDGE
+        edges = np.asarray(self.times) - EDGE_TOLERANCE
         if t.size:
             first, last = np.searchsorted(edges, (t.min(), t.max()), side="right")
             if first == last:
@@ -190,7 +190,7 @@ def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:
     return tuple(signal.seeded(child) for signal, child in zip(signals, children, strict=True))
 
 
-def check_fields(signal: Signal) -> None:
+def check_finite_fields(signal: Signal) -> None:
     """Check that every parameter of a signal is a finite number."""
     for f in fields(signal):
         checks.finite(f.name, getattr(signal, f.name))

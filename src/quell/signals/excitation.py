@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.signals.base import EDGE, Constant, Signal
+from quell.signals.base import EDGE_TOLERANCE, Constant, Signal
 from quell.types import Vector
 
 # Registers whose feedback, the sum of these stages, has the longest period (Golomb, *Shift Register Sequences*, 1967).
@@ -63,7 +63,7 @@ class PRBS(Signal):
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the sequence."""
-        since = (t - self.start + EDGE) / self.step
+        since = (t - self.start + EDGE_TOLERANCE) / self.step
         which = np.floor(since).astype(np.int64) + self.seed
         return np.where(
             since >= 0.0, self.amplitude * _sequence(self.bits)[which % (2**self.bits - 1)], 0.0
@@ -131,7 +131,7 @@ class Multisine(Signal):
             self.omegas.tolist(), self.amplitudes.tolist(), self.phases.tolist(), strict=True
         ):
             total += amplitude * np.sin(omega * since + phase)
-        return np.where(since >= -EDGE, total, 0.0)
+        return np.where(since >= -EDGE_TOLERANCE, total, 0.0)
 
     def derivative(self) -> Signal:
         """Return the sum of the derivatives."""

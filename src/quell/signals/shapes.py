@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.signals.base import EDGE, Constant, Signal, check_fields
+from quell.signals.base import EDGE_TOLERANCE, Constant, Signal, check_finite_fields
 from quell.types import Vector
 
 
@@ -21,11 +21,11 @@ class Step(Signal):
     at: float = 0.0
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_finite_fields(self)
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the step."""
-        return np.where(t >= self.at - EDGE, float(self.height), 0.0)
+        return np.where(t >= self.at - EDGE_TOLERANCE, float(self.height), 0.0)
 
     def derivative(self) -> Signal:
         """Return zero."""
@@ -64,12 +64,12 @@ class Sinusoid(Signal):
     start: float = 0.0
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_finite_fields(self)
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the sinusoid."""
         since = t - self.start
-        started = since >= -EDGE
+        started = since >= -EDGE_TOLERANCE
         if not started.any():
             return np.zeros(t.shape)
         wave = self.amplitude * np.sin(self.omega * since + self.phase)
@@ -241,7 +241,10 @@ class SmoothMove(Signal):
             inside
             if self.order == 0
             else np.where(
-                (t >= self.start - EDGE) & (t < self.start + self.duration - EDGE), inside, 0.0
+                (t >= self.start - EDGE_TOLERANCE)
+                & (t < self.start + self.duration - EDGE_TOLERANCE),
+                inside,
+                0.0,
             )
         )
 
@@ -280,7 +283,7 @@ class Samples(Signal):
         """Return the samples at ``t``."""
         if self.hold == "linear":
             return np.asarray(np.interp(t, self.times, self.values))
-        index = np.searchsorted(self.times - EDGE, t, side="right") - 1
+        index = np.searchsorted(self.times - EDGE_TOLERANCE, t, side="right") - 1
         return np.asarray(self.values[np.maximum(index, 0)])
 
     def derivative(self) -> Signal:

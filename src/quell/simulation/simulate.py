@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.base import Controller
-from quell.lti.models import is_model
+from quell.lti.models import is_linear_model
 from quell.plants.base import Plant
 from quell.plants.linear import LinearPlant
 from quell.records.batch_trajectory import BatchTrajectory
@@ -95,7 +95,7 @@ def simulate(
         for arguments out of range, a plant that ``LinearPlant.of`` refuses, an x0 of the wrong size, more disturbances than the plant has
         inputs, or runs that do not fit into one batch.
     """
-    if not hasattr(plant, "sampled") and is_model(plant):
+    if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
     if any(isinstance(value, Sequence) for value in (plant, controller, scenario)):
         return simulate_batch(

@@ -26,7 +26,7 @@ from quell.guard import (
 )
 from quell.learners.base import Learner, NoLearner, coefficients, tried
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
-from quell.lti.canonical import spell
+from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
 from quell.types import Status
 
@@ -263,7 +263,7 @@ def _check_zeros(observer: ESO) -> None:
     unstable = observer.plant.unstable_zeros
     if unstable.size:
         raise ValueError(
-            f"observer: the plant has zeros from u at {spell(unstable)} rad/s, not in the left half plane; ADRC inverts the plant, "
+            f"observer: the plant has zeros from u at {format_roots(unstable)} rad/s, not in the left half plane; ADRC inverts the plant, "
             "so that u would grow, or swing, without end while y looks well; control another output, or take a controller that does not "
             "invert the plant (linear-quadratic, for instance)"
         )

@@ -36,11 +36,11 @@ from quell.controllers.running import Running
 from quell.guard import limit
 from quell.kernels.dispatch import compiled
 from quell.learners.base import NoLearner, predict
-from quell.observers.base import acting, begin, observe
+from quell.observers.base import acting_control, begin, observe
 from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
 from quell.observers.nonlinear import NonlinearModel
-from quell.observers.response import own_response
+from quell.observers.response import scaled_response
 from quell.types import Vector
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ class HandOver(Running):
         if loop[STARTED] != 0.0:
             before = unlimited_u(old, state, loop[CONSTANT], loop[SLOPE])
             # f is what b0 u and a·x leave: with another b0 or a it is another number.
-            acted = acting(old.eso, state.z, float(loop[U]))
+            acted = acting_control(old.eso, state.z, float(loop[U]))
             change = (kept[0].b0 - new_observer.b0) * acted + (
                 new_observer.cancel - kept[0].cancel
             ) @ state.seen[:size]
@@ -257,7 +257,7 @@ def _samples_to_forget(observer: ESO) -> int:
     """Return after how many samples nothing is left of where an observer began; poles kept at slow zeros count."""
     samples = _SETTLED * observer.lag_time / observer.dt
     if not isinstance(without_delay(observer.model), NonlinearModel):
-        slowest = float(np.max(np.abs(np.linalg.eigvals(own_response(observer).transition))))
+        slowest = float(np.max(np.abs(np.linalg.eigvals(scaled_response(observer).transition))))
         samples = max(samples, _SETTLED / -math.log(slowest)) if 0.0 < slowest < 1.0 else samples
     return min(round(samples), _MOST_SAMPLES) + observer.states
 

@@ -6,7 +6,7 @@
 (Gao, ACC 2003; paper eq. (control), with the term ``a·x̂`` that the paper forgets.) The derivatives of r are zero where none are given; m
 is the relative degree from u to y, the plant's order unless it has zeros. With ``f_L = h + s u`` affine in u the loop through u is solved
 instead of closed a sample late: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``. Where u reaches the plant with a delay, learner, guard
-and observer are told of the u that *acts* (``observers.base.acting``): ``f_L = h + s u_acting``. The law is the same then, for when the u
+and observer are told of the u that *acts* (``observers.base.acting_control``): ``f_L = h + s u_acting``. The law is the same then, for when the u
 it finds acts, f will have ``s u`` in it.
 """
 
@@ -32,7 +32,7 @@ from quell.guard import assess, limit, record_output, reset_filters, write_chann
 from quell.kernels.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
 from quell.learners.lag import lag_push
-from quell.observers.base import acting, begin, expected, observe
+from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Matrix, Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
@@ -105,7 +105,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop, state.seen
     status = hold(loop, R, r, y)
     f_plain = 0.0
-    acted = acting(design.eso, state.z, loop[U])
+    acted = acting_control(design.eso, state.z, loop[U])
     if loop[STARTED] == 0.0:
         begin(design.eso, state.z, seen, loop[Y])
         if status & _MEASUREMENT_HELD != 0:
@@ -118,7 +118,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         _conclude(design, state, acted)
         if status & _MEASUREMENT_HELD != 0:
             # A y that stands still while the plant moves would be taken for a blow; the expected one tells the observer nothing.
-            y = expected(design.eso, state.z, loop[U], loop[F_LEARNED])
+            y = expected_measurement(design.eso, state.z, loop[U], loop[F_LEARNED])
             if is_finite(y):
                 loop[Y] = y
         observe(design.eso, state.z, seen, loop[Y], loop[U], loop[F_LEARNED])
@@ -155,7 +155,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         u = loop[MANUAL_U]
     loop[U] = u
     loop[CONSTANT], loop[SLOPE] = constant, slope
-    loop[F_LEARNED] = constant + slope * acting(design.eso, state.z, u)
+    loop[F_LEARNED] = constant + slope * acting_control(design.eso, state.z, u)
     loop[STATUS] = status
     return u
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from quell import checks
 from quell.features import Features, State
-from quell.features.base import tried
+from quell.features.base import checked_design
 from quell.learners.adapters.instances import Instance, address, enter, finite_number, instance_of
 from quell.learners.adapters.loop import Batch, PythonDesign, PythonMemory
 from quell.learners.online.online import Online
@@ -119,7 +119,7 @@ class PythonModel:
 
     def design(self, observer: ESO, omega_c: float) -> PythonDesign:
         """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s]; try the model on a copy first."""
-        tried(self._online.features, observer.order)
+        checked_design(self._online.features, observer.order)
         self._try(self._online.features.names(observer.order))
         return PythonDesign(self._online.design(observer, omega_c), self.period, address())
 

@@ -186,7 +186,7 @@ class BatchGradient:
         """Return empty buffers and θ = 0."""
         if isinstance(parameters, FeatureGradientDesign):
             return feature_gradient_memory(
-                parameters, len(self.feature_names(parameters.scaling.ladder.size - 2))
+                parameters, len(self.feature_names(parameters.scaling.floors.size - 2))
             )
         n, p = parameters.batch, parameters.order + 2
         return BatchGradientMemory(

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.features import Features
-from quell.features.base import tried, unit, write
-from quell.features.scaling import Scaling, grow, scaling
+from quell.features.base import checked_design, unit, write
+from quell.features.scaling import Scaling, scaling, update_scale
 from quell.kernels.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import watch_samples
@@ -69,7 +69,7 @@ def feature_gradient_design(
     return FeatureGradientDesign(
         rate=rate,
         batch=batch,
-        features=tried(features, observer.order),
+        features=checked_design(features, observer.order),
         scaling=scaling(observer, frequency, False),
         watch=watch_samples(observer),
     )
@@ -77,7 +77,7 @@ def feature_gradient_design(
 
 def feature_gradient_memory(design: FeatureGradientDesign, p: int) -> FeatureGradientMemory:
     """Return empty buffers and θ = 0, for p features."""
-    n, size = design.batch, design.scaling.ladder.size
+    n, size = design.batch, design.scaling.floors.size
     return FeatureGradientMemory(
         theta=np.zeros(p),
         features=np.zeros((n, p)),
@@ -137,7 +137,7 @@ def _rescale(
     before = after = 0.0
     for i in range(scale.size):
         before += scale[i]
-    grow(learner.scaling, scale, seen, u, f)
+    update_scale(learner.scaling, scale, seen, u, f)
     for i in range(scale.size):
         after += scale[i]
     if after == before:

@@ -24,9 +24,8 @@ import numpy as np
 
 from quell import checks
 from quell.features import Bias, Features, State
-from quell.features.base import tried as tried_features
-from quell.features.base import write
-from quell.features.scaling import Scaling, grow, scaling
+from quell.features.base import checked_design, write
+from quell.features.scaling import Scaling, scaling, update_scale
 from quell.kernels.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import group_delay, watch_samples
@@ -117,7 +116,7 @@ def _adapt(
     if memory.place[_SINCE] <= learner.watch:
         return
     scale = memory.scale
-    grow(learner.scaling, scale, seen, u_before, f_plain)
+    update_scale(learner.scaling, scale, seen, u_before, f_plain)
     if not ready(learner, memory):
         return
     # The ring has just been written at the row before: the oldest of its D + 1 rows, D samples older, is where the next one goes.
@@ -237,7 +236,7 @@ class Online:
         if self.scale is not None:
             checks.vector("scale", self.scale, n + 2)
         return OnlineDesign(
-            features=tried_features(self.features, n),
+            features=checked_design(self.features, n),
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
             sight=sight(observer, self.frequency or omega_c),
             model=tried(
@@ -254,7 +253,7 @@ class Online:
 
     def memory(self, parameters: OnlineDesign) -> OnlineMemory:
         """Return a state with nothing learned."""
-        n = parameters.scaling.ladder.size - 2
+        n = parameters.scaling.floors.size - 2
         p = len(self.features.names(n))
         model, flat = packed(self.model.memory(parameters.model))
         return OnlineMemory(

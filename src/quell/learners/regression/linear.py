@@ -8,7 +8,7 @@ import numpy as np
 
 from quell import checks
 from quell.features import Bias, Features, State
-from quell.features.base import tried, write
+from quell.features.base import checked_design, write
 from quell.features.scaling import scaling
 from quell.learners.lag import lag_memory, lag_of, watch_samples
 from quell.learners.noise_gate import sight, sight_memory
@@ -77,7 +77,7 @@ class Linear:
         if self.scale is not None:
             checks.vector("scale", self.scale, n + 2)
         features, p, constant = (
-            tried(self.features, n),
+            checked_design(self.features, n),
             len(self.features.names(n)),
             self.features.constant(n),
         )
@@ -104,8 +104,8 @@ class Linear:
     def memory(self, parameters: LinearDesign) -> LinearMemory:
         """Return a state with nothing learned."""
         n, p = (
-            parameters.scaling.ladder.size - 2,
-            len(self.features.names(parameters.scaling.ladder.size - 2)),
+            parameters.scaling.floors.size - 2,
+            len(self.features.names(parameters.scaling.floors.size - 2)),
         )
         return LinearMemory(
             theta=np.zeros(p),

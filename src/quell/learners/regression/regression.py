@@ -26,7 +26,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from quell.features.base import unit, write
-from quell.features.scaling import Scaling, grow
+from quell.features.scaling import Scaling, update_scale
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import lag_push
@@ -149,7 +149,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
     )
     for i in range(scale.size):
         former[i] = scale[i]
-    grow(learner.scaling, scale, seen, u, f)
+    update_scale(learner.scaling, scale, seen, u, f)
     if memory.place[_SCALED] == 0.0:
         # From now on there are features; what the observer showed until now was without them, so watch once more.
         memory.place[_SCALED] = 1.0
