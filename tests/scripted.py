@@ -10,7 +10,7 @@ import numpy as np
 import quell as ql
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
-from quell.realtime.devices.base import fetch, put
+from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.loop.prepared import Prepared, scenario_of, setpoints
 from quell.realtime.loop.safety import Safety
 from quell.realtime.system.clock import pass_time, virtual_clock
@@ -36,7 +36,7 @@ class Scripted(NamedTuple):
     moves: Any
     """By how many samples the plant has moved on meanwhile, under the last u."""
     refused: Any
-    """What ``put`` returns."""
+    """What ``write_command`` returns."""
     written: Any
     """What was put (·,)."""
 
@@ -46,24 +46,26 @@ def _entry(script: Any, k: int) -> Any:
     return script[min(k, script.size - 1)]
 
 
-@fetch.register(Scripted)
-def _fetch(line: Scripted, clock: Any, until: int) -> tuple[float, int]:
-    k = line.at[0]
-    line.at[0] += 1
-    pass_time(clock, _entry(line.stall, k))
-    for _ in range(_entry(line.moves, k)):
-        advance(line.plant, line.x, line.scratch, 0.0, line.written[line.at[1] - 1], line.w)
-    return measure(line.plant, line.x) + _entry(line.y, k), 0
+@read_measurement.register(Scripted)
+def _read_measurement(handle: Scripted, clock: Any, until: int) -> tuple[float, int]:
+    k = handle.at[0]
+    handle.at[0] += 1
+    pass_time(clock, _entry(handle.stall, k))
+    for _ in range(_entry(handle.moves, k)):
+        advance(
+            handle.plant, handle.x, handle.scratch, 0.0, handle.written[handle.at[1] - 1], handle.w
+        )
+    return measure(handle.plant, handle.x) + _entry(handle.y, k), 0
 
 
-@put.register(Scripted)
-def _put(line: Scripted, u: float) -> int:
-    k = line.at[1]
-    line.at[1] += 1
-    line.written[k] = u
-    if _entry(line.refused, k) != 0:
-        return _entry(line.refused, k)
-    advance(line.plant, line.x, line.scratch, 0.0, u, line.w)
+@write_command.register(Scripted)
+def _write_command(handle: Scripted, u: float) -> int:
+    k = handle.at[1]
+    handle.at[1] += 1
+    handle.written[k] = u
+    if _entry(handle.refused, k) != 0:
+        return _entry(handle.refused, k)
+    advance(handle.plant, handle.x, handle.scratch, 0.0, u, handle.w)
     return 0
 
 
@@ -82,7 +84,7 @@ class ScriptedDevice:
             for k, value in script.items():
                 told[name][k] = value
         room = np.full(samples, math.nan)
-        self.line = Scripted(
+        self.handle = Scripted(
             model,
             x,
             np.zeros(6 * plant.order),
@@ -95,7 +97,7 @@ class ScriptedDevice:
     @property
     def written(self) -> Any:
         """What was put."""
-        return self.line.written[: self.line.at[1]]
+        return self.handle.written[: self.handle.at[1]]
 
     def read(self) -> float:
         """Not used: there is a line."""

@@ -17,15 +17,21 @@ import pytest
 
 import quell as ql
 from quell.kernels.dispatch import interpreted
-from quell.realtime.devices.base import Device, PythonLine, fetch, line_of, put
+from quell.realtime.devices.base import (
+    Device,
+    PythonHandle,
+    handle_of,
+    read_measurement,
+    write_command,
+)
 from quell.realtime.devices.registry import listen, open_device
 from quell.realtime.devices.twin import TwinDevice
-from quell.realtime.rig.fault_injection import KINDS, Fault, Relay, Spoiler, random_faults
+from quell.realtime.rig.fault_injection import KINDS, Fault, FaultInjector, Relay, random_faults
 from quell.realtime.rig.kernel import serve
 from quell.realtime.rig.server import Rig
 from quell.realtime.system.clock import system_clock, virtual_clock
 from quell.realtime.wire import frames
-from quell.realtime.wire.shared_memory import SharedDevice
+from quell.realtime.wire.shared_memory import SharedMemoryDevice
 from quell.realtime.wire.udp import UdpDevice
 
 DT = 0.01
@@ -74,7 +80,7 @@ class Bench:
         def work() -> None:
             try:
                 made.append(
-                    (UdpDevice if self.url.startswith("udp") else SharedDevice)(
+                    (UdpDevice if self.url.startswith("udp") else SharedMemoryDevice)(
                         url or self.url, dt, timeout
                     )
                 )
@@ -105,7 +111,7 @@ class Bench:
 
 def read_all(device: Any) -> None:
     """Take what has come so far."""
-    fetch(device.line, system_clock(), 0)
+    read_measurement(device.handle, system_clock(), 0)
 
 
 def law(y: float) -> float:
@@ -155,7 +161,7 @@ def test_a_twin_of_a_plant_in_python_is_used_through_python() -> None:
         TwinDevice(Slow(), DT, x0=[0.1, 0.2, 0.0, 0.0]),
         TwinDevice(PLANT, DT, x0=[0.1, 0.2, 0.0, 0.0]),
     )
-    assert isinstance(line_of(slow), PythonLine)
+    assert isinstance(handle_of(slow), PythonHandle)
     for _ in range(20):
         assert slow.read() == pytest.approx(quick.read(), rel=1e-12)
         slow.write(1.0)
@@ -175,11 +181,11 @@ def test_a_device_that_raises_gives_no_number_and_says_so() -> None:
         def close(self) -> None:
             pass
 
-    line = line_of(Broken())
-    assert np.isnan(fetch(line, system_clock(), 0)[0])
-    assert put(line, 1.0) != 0
-    assert line.faults[0] == 2
-    assert str(line.errors[0]) == "cable"
+    handle = handle_of(Broken())
+    assert np.isnan(read_measurement(handle, system_clock(), 0)[0])
+    assert write_command(handle, 1.0) != 0
+    assert handle.faults[0] == 2
+    assert str(handle.errors[0]) == "cable"
 
 
 # Over a wire --------------------------------------------------------------------------------------------------------------------------
@@ -299,7 +305,7 @@ def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(
             say(kind, value, session)
 
     monkeypatch.setattr(device, "_say", lossy)
-    thread = threading.Thread(target=device.begin_anew)
+    thread = threading.Thread(target=device.restart_session)
     thread.start()
     while thread.is_alive():
         here.rig.tick()
@@ -308,7 +314,10 @@ def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(
     assert here.rig.counters["sessions"] == 2
     assert said.count(frames.GOODBYE) >= 2
     here.rig.tick()
-    assert here.rig.model.peer.numbers[frames.SESSION] == device.line.peer.numbers[frames.SESSION]
+    assert (
+        here.rig.model.endpoint.numbers[frames.SESSION]
+        == device.handle.endpoint.numbers[frames.SESSION]
+    )
 
 
 @pytest.mark.parametrize("wire", WIRES)
@@ -318,7 +327,7 @@ def test_a_hello_that_is_heard_when_its_loop_has_gone_begins_nothing(
     """The rig was not ready yet, the loop gave up: the next one finds the rig free."""
     here = bench(wire)
     with pytest.raises(ConnectionError, match="no device answers"):
-        (UdpDevice if wire == "udp" else SharedDevice)(here.url, DT, 0.1)
+        (UdpDevice if wire == "udp" else SharedMemoryDevice)(here.url, DT, 0.1)
     here.rig.tick(3)
     assert here.rig.state == "idle"
 
@@ -472,7 +481,7 @@ def test_the_rigs_end_is_told(wire: str, bench: Callable[..., Bench]) -> None:
 def test_where_nobody_answers_it_says_what_to_start(url: str) -> None:
     """In a line."""
     with pytest.raises(ConnectionError, match=f"start one with: quell rig --device {url}"):
-        (UdpDevice if url.startswith("udp") else SharedDevice)(url, DT, 0.1)
+        (UdpDevice if url.startswith("udp") else SharedMemoryDevice)(url, DT, 0.1)
 
 
 @pytest.mark.parametrize(
@@ -573,7 +582,7 @@ def test_a_session_that_is_over_does_not_come_back(bench: Callable[..., Bench]) 
     """A hello or a command of it that was late on its way is counted, and u stays zero."""
     here = bench("udp")
     device = here.open()
-    session = int(device.line.peer.numbers[frames.SESSION])
+    session = int(device.handle.endpoint.numbers[frames.SESSION])
     here.cycle(device, law, 3)
     device.close()
     here.rig.tick()
@@ -597,7 +606,7 @@ def test_what_waited_behind_many_others_is_not_taken_for_new(bench: Callable[...
     device = here.open()
     here.cycle(device, law, 2)
     here.rig.tick(60)
-    assert np.isnan(fetch(device.line, system_clock(), 0)[0])
+    assert np.isnan(read_measurement(device.handle, system_clock(), 0)[0])
     assert device.counters["stale"] == 1
     here.rig.tick()
     assert np.isfinite(device.read())
@@ -607,8 +616,8 @@ def test_a_rig_that_was_killed_leaves_nothing_in_the_way(bench: Callable[..., Be
     """Its mailboxes are taken over, and a loop that was killed at writing does not stop the next."""
     url = url_of("shm")
     dead = listen(url)
-    dead.link.own[:] = 7
-    dead.link.others[:] = 7
+    dead.transport.own[:] = 7
+    dead.transport.others[:] = 7
     for box in dead._boxes:
         box.close()  # as the system does
     here = bench(url=url)
@@ -634,7 +643,7 @@ def test_a_rig_that_was_killed_leaves_nothing_in_the_way(bench: Callable[..., Be
 )
 def test_a_fault_does_what_its_name_says(fault: Fault, expected: list[int]) -> None:
     """Frames one to six go in; hello passes, and is not counted."""
-    spoiler = Spoiler([fault], "rig")
+    spoiler = FaultInjector([fault], "rig")
     assert spoiler.frames(packed(frames.HELLO, 0, 0, DT)) == [packed(frames.HELLO, 0, 0, DT)]
     out = [
         frame for k in range(1, 7) for frame in spoiler.frames(packed(frames.COMMAND, k, k, 0.0))
@@ -655,14 +664,14 @@ def test_a_fault_does_what_its_name_says(fault: Fault, expected: list[int]) -> N
 )
 def test_spoiled_frames_break_the_rule_they_are_meant_to(kind: str, rule: str) -> None:
     """Each time."""
-    spoiler = Spoiler([Fault(kind, "rig", 0, 50)], "rig")
-    own = frames.peer(frames.COMMAND, 0x5EED0001, 20)
+    spoiler = FaultInjector([Fault(kind, "rig", 0, 50)], "rig")
+    own = frames.endpoint(frames.COMMAND, 0x5EED0001, 20)
     for k in range(1, 51):
         (data,) = spoiler.frames(packed(frames.COMMAND, k, 0, 1.0))
         frame = frames.buffer()
         frame.bytes[: len(data)] = np.frombuffer(data[:48], dtype=np.uint8)[: frame.bytes.size]
         frames.accept(frame, min(len(data), 48), own)
-    assert frames.told(own.counters)[rule] == 50
+    assert frames.counts_by_name(own.counters)[rule] == 50
 
 
 def test_random_plans_have_all_kinds_and_are_the_same_again() -> None:

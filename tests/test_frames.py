@@ -22,10 +22,10 @@ from quell.realtime.wire.frames import (
     MEASUREMENT,
     accept,
     buffer,
-    compose,
+    counts_by_name,
     crc32,
-    peer,
-    told,
+    endpoint,
+    write_next_frame,
 )
 
 SESSION = 0x5EED0001
@@ -38,8 +38,8 @@ def _accept(frame: Any, size: int, own: Any) -> bool:
 
 
 @compiled
-def _compose(out: Any, own: Any, kind: int, time: int, value: float, state: int) -> None:
-    compose(out, own, kind, time, value, state)
+def _write_next_frame(out: Any, own: Any, kind: int, time: int, value: float, state: int) -> None:
+    write_next_frame(out, own, kind, time, value, state)
 
 
 @compiled
@@ -82,7 +82,7 @@ def offered(own: Any, data: bytes, entry: Any = accept) -> bool:
 
 def refused_as(own: Any) -> str:
     """Return by which rule the only frame that was offered has been refused."""
-    (rule,) = [name for name in frames.REFUSALS if told(own.counters)[name]]
+    (rule,) = [name for name in frames.REFUSALS if counts_by_name(own.counters)[name]]
     return rule
 
 
@@ -93,11 +93,11 @@ def test_the_checksum_is_that_of_zlib(data: bytes) -> None:
     assert crc32(room, len(data)) == _crc32(room, len(data)) == zlib.crc32(data)
 
 
-@pytest.mark.parametrize("entry", [_compose, interpreted(_compose)])
+@pytest.mark.parametrize("entry", [_write_next_frame, interpreted(_write_next_frame)])
 def test_a_frame_is_what_the_table_says(entry: Any) -> None:
     """Byte by byte the one that ``struct`` and ``zlib`` make."""
-    own, out = peer(COMMAND, SESSION, 20), buffer()
-    own.numbers[frames.SENT], own.numbers[frames.HEARD] = 2**32 + 6, 41
+    own, out = endpoint(COMMAND, SESSION, 20), buffer()
+    own.numbers[frames.SENT], own.numbers[frames.RECEIVED] = 2**32 + 6, 41
     entry(out, own, MEASUREMENT, 123_456_789, -1.5, 1)
     assert out.bytes[:40].tobytes() == packed(MEASUREMENT, 7, 41, -1.5, state=1)
 
@@ -110,7 +110,7 @@ def test_the_frame_on_the_page_is_one() -> None:
     (block,) = re.findall(r"```text\n((?:[0-9a-f]{2}[ \n])+)```", PAGE.read_text(encoding="utf-8"))
     data = bytes.fromhex(block)
     assert data == packed(COMMAND, 7, 41, 2.5)
-    own = peer(COMMAND, SESSION, 20)
+    own = endpoint(COMMAND, SESSION, 20)
     own.numbers[frames.SENT] = 41
     assert offered(own, data)
 
@@ -118,12 +118,12 @@ def test_the_frame_on_the_page_is_one() -> None:
 @pytest.mark.parametrize("entry", [_accept, interpreted(_accept)])
 def test_news_is_accepted_once_and_in_order(entry: Any) -> None:
     """What is lost in between is counted."""
-    own = peer(MEASUREMENT, SESSION, 20)
+    own = endpoint(MEASUREMENT, SESSION, 20)
     assert offered(own, packed(MEASUREMENT, 1, 0, 0.1), entry)
     assert offered(own, packed(MEASUREMENT, 5, 0, 0.2), entry)
     assert not offered(own, packed(MEASUREMENT, 5, 0, 0.2), entry)
     assert not offered(own, packed(MEASUREMENT, 4, 0, 0.2), entry)
-    assert {name: n for name, n in told(own.counters).items() if n} == {
+    assert {name: n for name, n in counts_by_name(own.counters).items() if n} == {
         "accepted": 2,
         "skipped": 3,
         "duplicated": 1,
@@ -133,14 +133,14 @@ def test_news_is_accepted_once_and_in_order(entry: Any) -> None:
 
 def test_numbers_go_on_behind_the_largest() -> None:
     """From 2^32 − 1 to 0, as RFC 1982 has it."""
-    own = peer(COMMAND, SESSION, 20)
+    own = endpoint(COMMAND, SESSION, 20)
     own.numbers[frames.SENT] = 2**32 + 3
-    own.numbers[frames.HEARD] = 2**32 - 2
+    own.numbers[frames.RECEIVED] = 2**32 - 2
     for number in (2**32 - 1, 2**32, 2**32 + 1):
         assert offered(own, packed(COMMAND, number, number, 0.0))
     assert not offered(own, packed(COMMAND, 2**32 - 1, 2**32, 0.0))
-    assert own.numbers[frames.HEARD] == 2**32 + 1
-    assert told(own.counters)["reordered"] == 1
+    assert own.numbers[frames.RECEIVED] == 2**32 + 1
+    assert counts_by_name(own.counters)["reordered"] == 1
 
 
 @pytest.mark.parametrize(
@@ -166,12 +166,12 @@ def test_numbers_go_on_behind_the_largest() -> None:
 )
 def test_what_breaks_a_rule_is_counted_by_it(data: bytes, rule: str) -> None:
     """And changes nothing else. The receiver has sent a hundred frames, of which the last twenty may be answered."""
-    own = peer(COMMAND, SESSION, 20)
+    own = endpoint(COMMAND, SESSION, 20)
     own.numbers[frames.SENT] = 100
     before = own.numbers.copy()
     assert not offered(own, data)
     assert refused_as(own) == rule
-    assert sum(told(own.counters).values()) == 1
+    assert sum(counts_by_name(own.counters).values()) == 1
     assert np.array_equal(own.numbers, before)
     assert offered(own, packed(COMMAND, 1, 80, 0.0))
 
@@ -179,19 +179,19 @@ def test_what_breaks_a_rule_is_counted_by_it(data: bytes, rule: str) -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_value_that_is_no_number_is_news_and_counted(value: float) -> None:
     """That the other side is alive is known; whoever uses the value has to look at it."""
-    own = peer(MEASUREMENT, SESSION, 20)
+    own = endpoint(MEASUREMENT, SESSION, 20)
     assert offered(own, packed(MEASUREMENT, 1, 0, value))
-    assert told(own.counters)["not_finite"] == 1
+    assert counts_by_name(own.counters)["not_finite"] == 1
 
 
 @given(st.binary(max_size=60), st.booleans())
 def test_no_bytes_are_accepted_but_frames(data: bytes, magic: bool) -> None:
     """Whatever comes is counted, never an error; interpreted and compiled do the same."""
     data = b"QL\x01\x02" + data if magic else data
-    first, second = peer(COMMAND, SESSION, 20), peer(COMMAND, SESSION, 20)
+    first, second = endpoint(COMMAND, SESSION, 20), endpoint(COMMAND, SESSION, 20)
     assert not offered(first, data, interpreted(_accept))
     assert not offered(second, data, _accept)
-    assert told(first.counters) == told(second.counters)
+    assert counts_by_name(first.counters) == counts_by_name(second.counters)
     assert refused_as(first) == "malformed"
 
 
@@ -200,7 +200,7 @@ def test_a_wrong_byte_is_found(place: int, wrong: int) -> None:
     """Wherever it is."""
     data = bytearray(packed(COMMAND, 1, 0, 3.25))
     data[place] ^= wrong
-    own = peer(COMMAND, SESSION, 20)
+    own = endpoint(COMMAND, SESSION, 20)
     assert not offered(own, bytes(data))
     assert refused_as(own) == "malformed"
 
@@ -217,8 +217,8 @@ def test_what_is_accepted_obeys_all_rules(
     kind: int, version: int, session: int, number: int, answers: int, value: float
 ) -> None:
     """Well-formed frames of any content, against the rules written down a second time."""
-    own = peer(COMMAND, SESSION, 20)
-    own.numbers[frames.SENT], own.numbers[frames.HEARD] = 1000, 2**31
+    own = endpoint(COMMAND, SESSION, 20)
+    own.numbers[frames.SENT], own.numbers[frames.RECEIVED] = 1000, 2**31
     taken = offered(
         own, packed(kind, number, answers, value, session=session, version=version), _accept
     )
@@ -229,14 +229,14 @@ def test_what_is_accepted_obeys_all_rules(
         and number > 2**31
         and 980 <= answers <= 1000
     )
-    assert sum(told(own.counters)[name] for name in ("accepted", *frames.REFUSALS)) == 1
+    assert sum(counts_by_name(own.counters)[name] for name in ("accepted", *frames.REFUSALS)) == 1
 
 
 def test_a_session_begins_with_nothing_heard() -> None:
     """What was counted stays."""
-    own = peer(COMMAND, SESSION, 20)
+    own = endpoint(COMMAND, SESSION, 20)
     assert offered(own, packed(COMMAND, 9, 0, 0.0))
     assert not offered(own, packed(GOODBYE, 0, 0, 0.0))
     frames.start_session(own, 5)
     assert own.numbers.tolist() == [5, 0, 0, 0, 0]
-    assert told(own.counters)["accepted"] == 1
+    assert counts_by_name(own.counters)["accepted"] == 1

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import quell as ql
 from quell.controllers.running import named_arrays
 from quell.kernels.dispatch import compilations
-from quell.realtime.devices.base import PythonLine, fetch, put
+from quell.realtime.devices.base import PythonHandle, read_measurement, write_command
 from quell.realtime.loop.loop import run_cycles
 from quell.realtime.loop.prepared import Prepared, scenario_of, setpoints, sliding
 from quell.realtime.loop.safety import Safety
@@ -39,37 +39,37 @@ class Ticking(NamedTuple):
     """Number of the last one fetched, and the greatest age of one when it was fetched, but for the first thousand [ns] (2,)."""
 
 
-@fetch.register(Ticking)
-def _fetch(line: Ticking, clock: Any, until: int) -> tuple[float, int]:
+@read_measurement.register(Ticking)
+def _read_measurement(handle: Ticking, clock: Any, until: int) -> tuple[float, int]:
     begin = now(clock)
-    newest = _newest(line, begin)
-    if newest > line.seen[0]:
-        line.seen[0] = newest
+    newest = _newest(handle, begin)
+    if newest > handle.seen[0]:
+        handle.seen[0] = newest
         if newest > 1000:
-            line.seen[1] = max(line.seen[1], begin - int(newest * line.period))
+            handle.seen[1] = max(handle.seen[1], begin - int(newest * handle.period))
         return float(newest), 0
-    for k in range(int(line.seen[0]) + 1, int(until / line.period) + 1):
-        comes = int(k * line.period) + int(line.late[min(k, line.late.size - 1)])
+    for k in range(int(handle.seen[0]) + 1, int(until / handle.period) + 1):
+        comes = int(k * handle.period) + int(handle.late[min(k, handle.late.size - 1)])
         if comes <= until:
             pass_time(clock, max(comes - begin, 1))
-            line.seen[0] = k
+            handle.seen[0] = k
             return float(k), now(clock) - begin
     pass_time(clock, max(until - begin, 0))
     return math.nan, now(clock) - begin
 
 
-def _newest(line: Ticking, time: int) -> int:
-    last = int(time / line.period)
+def _newest(handle: Ticking, time: int) -> int:
+    last = int(time / handle.period)
     came = [
         k
         for k in range(max(last - 50, 0), last + 1)
-        if int(k * line.period) + line.late[min(k, line.late.size - 1)] <= time
+        if int(k * handle.period) + handle.late[min(k, handle.late.size - 1)] <= time
     ]
     return came[-1] if came else -1
 
 
-@put.register(Ticking)
-def _put(line: Ticking, u: float) -> int:
+@write_command.register(Ticking)
+def _write_command(handle: Ticking, u: float) -> int:
     return 0
 
 
@@ -84,7 +84,7 @@ class TickingDevice:
         delays = np.zeros(samples, dtype=np.int64)
         for k, value in (late or {}).items():
             delays[k] = value
-        self.line = Ticking(period, delays, np.array([-1, 0]))
+        self.handle = Ticking(period, delays, np.array([-1, 0]))
 
     def read(self) -> float:
         """Not used."""
@@ -130,7 +130,7 @@ def test_the_grid_follows_a_devices_clock(drift: float) -> None:
     """Whether it is as quick as the loop's or not: each cycle gets the next tick, none twice, none left out, none old."""
     device = TickingDevice(SAMPLE * (1.0 + drift))
     found, loop = ticks(device, 100.0)
-    assert device.line.seen[1] <= SAMPLE // 5_000
+    assert device.handle.seen[1] <= SAMPLE // 5_000
     y = found[:, LOOP_WIDTH - 2]
     np.testing.assert_array_equal(np.diff(y), 1.0)
     assert len(y) > 10_000
@@ -235,14 +235,14 @@ class ThroughPython:
 
     def read(self) -> float:
         """Read."""
-        y, _ = fetch(self.inner.line, self.clock, 0)
+        y, _ = read_measurement(self.inner.handle, self.clock, 0)
         if math.isinf(y):
             raise OSError("the driver is not well")
         return y
 
     def write(self, u: float) -> None:
         """Write; the driver may refuse."""
-        if put(self.inner.line, u):
+        if write_command(self.inner.handle, u):
             raise OSError("the driver is not well")
 
     def close(self) -> None:
@@ -267,9 +267,9 @@ def test_a_controller_is_stepped_compiled_though_the_device_is_python(name: str)
     # A driver that raises has measured nothing: NaN, where the line of the script says infinite.
     plain.rows[:, LOOP_WIDTH - 2][np.isinf(plain.rows[:, LOOP_WIDTH - 2])] = math.nan
     np.testing.assert_allclose(half.rows, plain.rows, rtol=1e-9, atol=1e-9)
-    line = half.prepared.line
-    assert isinstance(line, PythonLine)
-    assert (line.faults[0], str(line.errors[0])) == (2, "the driver is not well")
+    handle = half.prepared.handle
+    assert isinstance(handle, PythonHandle)
+    assert (handle.faults[0], str(handle.errors[0])) == (2, "the driver is not well")
     assert int(half["EVENTS"][60]) & Event.MISSED
     assert int(half["EVENTS"][90]) & Event.UNSENT
 
@@ -285,7 +285,7 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
     )
     width = sum(width for _, width in row_channels(controller.channels))
     loop = Prepared.of(device, controller, points, rules, virtual_clock(), ring(4096, width))
-    assert device.line.at.tolist() == [0, 0]
+    assert device.handle.at.tolist() == [0, 0]
     for array in named_arrays(loop.state).values():
         assert not np.any(array)
     compiled = compilations(run_cycles)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.realtime.devices.base import Device, fetch, line_of
+from quell.realtime.devices.base import Device, handle_of, read_measurement, write_command
 from quell.realtime.devices.ni import NiDevice, ni_device
 from quell.realtime.devices.twin import TwinDevice
 from quell.realtime.system.clock import virtual_clock
@@ -57,7 +57,7 @@ def device(rack):
 def test_an_ni_device_is_a_device(device):
     """It has what the loop asks for, and is reached through Python."""
     assert isinstance(device, Device)
-    assert fetch(line_of(device), virtual_clock(), 0) == (0.0, 0)
+    assert read_measurement(handle_of(device), virtual_clock(), 0) == (0.0, 0)
 
 
 def test_a_turn_of_the_shaft_is_two_pi(rack, device):
@@ -281,13 +281,13 @@ def test_without_the_package_one_line_says_which_extra(monkeypatch):
 
 def test_a_card_that_is_lost_is_an_error_that_the_loop_counts(rack, device):
     """Reading gives no number then, writing says that it failed; when it is closed, a warning says that the output could not be zeroed."""
-    line = line_of(device)
+    handle = handle_of(device)
     rack.cards["Dev1"].present = rack.cards["Dev2"].present = False
-    value, _ = fetch(line, virtual_clock(), 0)
+    value, _ = read_measurement(handle, virtual_clock(), 0)
     assert math.isnan(value)
-    assert ql.realtime.device.put(line, 1.0) != 0
-    assert line.faults[0] == 2
-    assert "-200324: the card is gone" in str(line.errors[0])
+    assert write_command(handle, 1.0) != 0
+    assert handle.faults[0] == 2
+    assert "-200324: the card is gone" in str(handle.errors[0])
     with pytest.warns(RuntimeWarning, match="switch the amplifier off"):
         device.close()
 
@@ -394,7 +394,7 @@ def test_the_loop_goes_to_its_safe_state_when_the_counter_card_is_lost(rack):
     assert after[:5] == [before[-1]] * 5
     assert after[25:] == [0.0] * len(after[25:])
     assert done.rows.shape[0] < 200
-    assert "-200324" in str(done.prepared.line.errors[0])
+    assert "-200324" in str(done.prepared.handle.errors[0])
     rack.cards["Dev1"].present = True
     shaft.close()
     assert not rack.cards["Dev2"].levels["port0/line0"]

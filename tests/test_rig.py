@@ -110,7 +110,7 @@ def test_a_loop_that_is_killed_leaves_u_at_zero(tmp_path: Path) -> None:
         url = ready.split()[2].rstrip(":")
         loop = f"""
 import os, signal
-from quell.realtime.devices import open_device
+from quell.realtime import open_device
 device = open_device({url!r}, {DT})
 for _ in range(5):
     device.read()

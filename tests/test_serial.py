@@ -17,11 +17,17 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.plants.base import advance, measure
+from quell.realtime.devices.base import read_measurement
 from quell.realtime.rig.server import Rig
 from quell.realtime.system.clock import system_clock
 from quell.realtime.wire import cobs, frames
-from quell.realtime.wire.link import await_news, receive, send
-from quell.realtime.wire.serial_line import FRAME_BITS, SerialDevice, SerialListener, serial_link
+from quell.realtime.wire.serial_line import (
+    FRAME_BITS,
+    SerialDevice,
+    SerialListener,
+    serial_transport,
+)
+from quell.realtime.wire.transport import receive, send, wait_for_frame
 
 pytest.importorskip("serial")
 DT = 1e-3
@@ -37,7 +43,7 @@ def decoded(packet):
     """What it makes of a packet without its zero; None where that is none."""
     out = np.zeros(len(packet) + 1, dtype=np.uint8)
     size = cobs.decode(np.frombuffer(packet, dtype=np.uint8), len(packet), out)
-    return None if size == cobs.BROKEN else out[:size].tobytes()
+    return None if size == cobs.INVALID else out[:size].tobytes()
 
 
 def plainly_decoded(packet):
@@ -112,14 +118,14 @@ class Stream:
     def __init__(self):
         self.sockets = socket.socketpair()
         self.fd = self.sockets[0].fileno()
-        self.here, self.there = (serial_link(end.fileno()) for end in self.sockets)
+        self.here, self.there = (serial_transport(end.fileno()) for end in self.sockets)
         self.frame = frames.buffer()
 
-    def accepted(self, peer):
+    def accepted(self, endpoint):
         """Return the values of all frames that have come and are accepted."""
         values = []
         while (size := receive(self.there, self.frame)) >= 0:
-            if frames.accept(self.frame, size, peer):
+            if frames.accept(self.frame, size, endpoint):
                 values.append(float(self.frame.doubles[3]))
         return values
 
@@ -142,26 +148,26 @@ def packet_of(number, session=7):
 
 def test_frames_come_out_as_they_went_in(wire):
     """And back."""
-    peer, out = frames.peer(frames.COMMAND, 7, 50), frames.buffer()
-    own = frames.peer(frames.MEASUREMENT, 7, 50)
+    endpoint, out = frames.endpoint(frames.COMMAND, 7, 50), frames.buffer()
+    own = frames.endpoint(frames.MEASUREMENT, 7, 50)
     for k in range(1, 6):
-        frames.compose(out, own, frames.COMMAND, 0, float(k), 0)
+        frames.write_next_frame(out, own, frames.COMMAND, 0, float(k), 0)
         assert send(wire.here, out) == 0
-        assert wire.accepted(peer) == [float(k)]
-    assert peer.counters[frames.ACCEPTED] == peer.counters.sum() == 5
+        assert wire.accepted(endpoint) == [float(k)]
+    assert endpoint.counters[frames.ACCEPTED] == endpoint.counters.sum() == 5
 
 
 @given(st.lists(st.integers(1, 120), min_size=1, max_size=20))
 @settings(max_examples=60)
 def test_a_stream_in_any_pieces_is_the_same_stream(wire, counts):
     """However few bytes come at a time, frames come out whole, in order."""
-    peer = frames.peer(frames.COMMAND, 7, 50)
+    endpoint = frames.endpoint(frames.COMMAND, 7, 50)
     stream = b"\0" + b"".join(packet_of(k) for k in range(1, 5))
     values = []
     for count in itertools.cycle(counts):
         os.write(wire.fd, stream[:count])
         stream = stream[count:]
-        values += wire.accepted(peer)
+        values += wire.accepted(endpoint)
         if not stream:
             break
     assert values == [1.0, 2.0, 3.0, 4.0]
@@ -171,17 +177,17 @@ def test_a_stream_in_any_pieces_is_the_same_stream(wire, counts):
 @settings(max_examples=100)
 def test_garbage_between_frames_costs_at_most_the_frame_behind_it(wire, garbage):
     """Any bytes at all: what is accepted was sent; and where a zero ends the garbage, nothing is lost."""
-    peer = frames.peer(frames.COMMAND, 7, 50)
+    endpoint = frames.endpoint(frames.COMMAND, 7, 50)
     for k, noise in enumerate(garbage, start=1):
         os.write(wire.fd, noise + packet_of(2 * k - 1) + packet_of(2 * k))
-    values = wire.accepted(peer)
+    values = wire.accepted(endpoint)
     assert set(values) >= {2.0, 4.0, 6.0, 8.0}
     assert values == sorted(set(values))
     assert set(values) <= {float(k) for k in range(1, 9)}
-    peer = frames.peer(frames.COMMAND, 7, 50)
+    endpoint = frames.endpoint(frames.COMMAND, 7, 50)
     for k, noise in enumerate(garbage, start=1):
         os.write(wire.fd, noise + b"\0" + packet_of(k))
-    assert wire.accepted(peer) == [1.0, 2.0, 3.0, 4.0]
+    assert wire.accepted(endpoint) == [1.0, 2.0, 3.0, 4.0]
 
 
 FAULTS = st.tuples(
@@ -203,44 +209,44 @@ def test_no_fault_of_bytes_makes_a_wrong_frame(wire, faults):
                 del broken[at]
             else:
                 broken[at] = byte
-    peer = frames.peer(frames.COMMAND, 7, 50)
+    endpoint = frames.endpoint(frames.COMMAND, 7, 50)
     os.write(wire.fd, b"\0" + packet_of(1) + bytes(broken) + packet_of(3) + packet_of(4))
-    values = wire.accepted(peer)
+    values = wire.accepted(endpoint)
     assert values[0] == 1.0
     assert values[-1] == 4.0
     assert set(values) <= {1.0, 2.0, 3.0, 4.0}
     lost = 4 - len(values)
-    assert peer.counters[frames.MALFORMED] >= (lost > 0)
-    assert peer.counters[frames.SKIPPED] == lost
+    assert endpoint.counters[frames.MALFORMED] >= (lost > 0)
+    assert endpoint.counters[frames.SKIPPED] == lost
 
 
 def test_a_packet_that_is_too_long_is_counted_once_and_forgotten(wire):
     """Ten thousand bytes without a zero: no more is kept than a frame is long."""
-    peer = frames.peer(frames.COMMAND, 7, 50)
+    endpoint = frames.endpoint(frames.COMMAND, 7, 50)
     for _ in range(100):
         os.write(wire.fd, b"\x55" * 100)
-        assert wire.accepted(peer) == []
+        assert wire.accepted(endpoint) == []
     os.write(wire.fd, b"\0" + packet_of(1))
-    assert wire.accepted(peer) == [1.0]
-    assert peer.counters[frames.MALFORMED] == 1
+    assert wire.accepted(endpoint) == [1.0]
+    assert endpoint.counters[frames.MALFORMED] == 1
 
 
 def test_a_frame_that_did_not_fit_does_not_spoil_the_next(wire):
     """When nobody reads, the line fills up; what was cut short there is ended by a zero."""
-    peer, own, out = (
-        frames.peer(frames.COMMAND, 7, 50),
-        frames.peer(frames.MEASUREMENT, 7, 50),
+    endpoint, own, out = (
+        frames.endpoint(frames.COMMAND, 7, 50),
+        frames.endpoint(frames.MEASUREMENT, 7, 50),
         frames.buffer(),
     )
     sent, failed = 0, False
     while not failed:
-        frames.compose(out, own, frames.COMMAND, 0, float(sent + 1), 0)
+        frames.write_next_frame(out, own, frames.COMMAND, 0, float(sent + 1), 0)
         failed = send(wire.here, out) != 0
         sent += not failed
-    values = wire.accepted(peer)
-    frames.compose(out, own, frames.COMMAND, 0, -1.0, 0)
+    values = wire.accepted(endpoint)
+    frames.write_next_frame(out, own, frames.COMMAND, 0, -1.0, 0)
     assert send(wire.here, out) == 0
-    assert values + wire.accepted(peer) == [float(k + 1) for k in range(sent)] + [-1.0]
+    assert values + wire.accepted(endpoint) == [float(k + 1) for k in range(sent)] + [-1.0]
 
 
 @pytest.fixture
@@ -273,8 +279,8 @@ def await_command(rig):
     """Wait until a command is there: a pseudoterminal hands on bytes when the system finds the time."""
     waiting = np.zeros(1, dtype=np.int32)
     while waiting[0] < FRAME_BITS // 10:
-        await_news(rig.listener.link, 100_000_000)
-        fcntl.ioctl(rig.listener.link.port.fd, termios.FIONREAD, waiting)
+        wait_for_frame(rig.listener.transport, 100_000_000)
+        fcntl.ioctl(rig.listener.transport.port.fd, termios.FIONREAD, waiting)
 
 
 def test_a_loop_over_the_line_is_the_loop_on_the_delayed_plant(rig):
@@ -287,7 +293,10 @@ def test_a_loop_over_the_line_is_the_loop_on_the_delayed_plant(rig):
         np.zeros(plant.disturbances),
     )
     with opened(rig) as device:
-        while device.line.peer.numbers[frames.HEARD] < rig.model.peer.numbers[frames.SENT]:
+        while (
+            device.handle.endpoint.numbers[frames.RECEIVED]
+            < rig.model.endpoint.numbers[frames.SENT]
+        ):
             device.read()
         for k in range(500):
             rig.tick()
@@ -325,9 +334,9 @@ def test_a_line_that_is_cut_is_told_at_once(rig):
     rig.listener.close()
     with pytest.raises(ConnectionError, match="could not be sent"):
         device.write(1.0)
-    line, clock = device.line, system_clock()
+    handle, clock = device.handle, system_clock()
     for _ in range(3):
-        y, _ = ql.realtime.device.fetch(line, clock, time.monotonic_ns() + 1_000_000)
+        y, _ = read_measurement(handle, clock, time.monotonic_ns() + 1_000_000)
     assert math.isnan(y)
     device.close()
 

@@ -134,7 +134,7 @@ def test_it_is_not_moved_by_garbage(board, rng):
             assert board.step("t")[2] == u
             device.read()
             noise = rng.integers(0, 256, size=rng.integers(1, 150), dtype="u1").tobytes() + b"\0"
-            os.write(device.line.link.port.fd, noise)
+            os.write(device.handle.transport.port.fd, noise)
             u = float(rng.uniform(-10.0, 10.0))
             device.write(u)
             for packet in noise.split(b"\0"):

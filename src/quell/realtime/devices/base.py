@@ -1,12 +1,12 @@
 """What the loop asks of a device, be it metal, a twin in this process or one at the other end of a wire.
 
 A device is an object with ``read() -> y``, ``write(u)`` and ``close()``: whoever writes those three has a device. One that can be used
-without Python says so by a ``line``: a NamedTuple for whose type ``fetch`` and ``put`` are registered below, and which the loop then calls
-from compiled code; ``read`` and ``write`` are the same two, called from Python. A device without a ``line`` gets a ``PythonLine``, and
+without Python says so by a ``handle``: a NamedTuple for whose type ``read_measurement`` and ``write_command`` are registered below, and which the loop then calls
+from compiled code; ``read`` and ``write`` are the same two, called from Python. A device without a ``handle`` gets a ``PythonHandle``, and
 the loop around it runs as Python.
 
 Some devices have a clock of their own: they send a measurement at each of their ticks, whether one asks or not (``paced`` is True). For
-those ``fetch`` waits for the next tick. Others answer whenever they are asked.
+those ``read_measurement`` waits for the next tick. Others answer whenever they are asked.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ class Device(Protocol):
 
 
 @generic
-def fetch(line: Any, clock: Any, until: int) -> tuple[float, int]:
+def read_measurement(handle: Any, clock: Any, until: int) -> tuple[float, int]:
     """Return the newest measurement [y-unit] and how long it was waited for [ns].
 
-    A measurement is returned once. Where there is none that is new, a paced line waits for one until the time ``until`` [ns] of ``clock``;
+    A measurement is returned once. Where there is none that is new, a paced handle waits for one until the time ``until`` [ns] of ``clock``;
     NaN where none has come, or where the device sent one.
     """
     raise TypeError
 
 
 @generic
-def put(line: Any, u: float) -> int:
+def write_command(handle: Any, u: float) -> int:
     """Apply ``u`` [u-unit]; return 0, 1 where the device can't be reached, or more where it has set u to zero for good."""
     raise TypeError
 
 
-class PythonLine(NamedTuple):
+class PythonHandle(NamedTuple):
     """A device of which only Python can make use."""
 
     device: Any
@@ -60,8 +60,8 @@ class PythonLine(NamedTuple):
     """How often it raised something (1,)."""
 
 
-def line_of(device: Any) -> Any:
-    """Return the line of a device, or one through Python where it has none.
+def handle_of(device: Any) -> Any:
+    """Return the handle of a device, or one through Python where it has none.
 
     Raises
     ------
@@ -72,29 +72,29 @@ def line_of(device: Any) -> Any:
         raise ValueError(
             f"device = {device!r}: must have read(), write(u) and close(), for example quell.realtime.TwinDevice(plant, dt)"
         )
-    line = getattr(device, "line", None)
-    return PythonLine(device, [], np.zeros(1, dtype=np.int64)) if line is None else line
+    handle = getattr(device, "handle", None)
+    return PythonHandle(device, [], np.zeros(1, dtype=np.int64)) if handle is None else handle
 
 
-@fetch.register(PythonLine)
-def _fetch(line: PythonLine, clock: Any, until: int) -> tuple[float, int]:
+@read_measurement.register(PythonHandle)
+def _read_measurement(handle: PythonHandle, clock: Any, until: int) -> tuple[float, int]:
     try:
-        return float(line.device.read()), 0
+        return float(handle.device.read()), 0
     except Exception as error:  # whatever a driver raises, the loop has to go on to its safe action
-        _note(line, error)
+        _note(handle, error)
         return math.nan, 0
 
 
-@put.register(PythonLine)
-def _put(line: PythonLine, u: float) -> int:
+@write_command.register(PythonHandle)
+def _write_command(handle: PythonHandle, u: float) -> int:
     try:
-        line.device.write(float(u))
+        handle.device.write(float(u))
     except Exception as error:
-        _note(line, error)
+        _note(handle, error)
         return 1
     return 0
 
 
-def _note(line: PythonLine, error: Exception) -> None:
-    line.faults[0] += 1
-    line.errors[:] = [error]
+def _note(handle: PythonHandle, error: Exception) -> None:
+    handle.faults[0] += 1
+    handle.errors[:] = [error]

@@ -6,7 +6,7 @@ import importlib
 from typing import Any
 
 from quell import checks
-from quell.realtime.devices.base import line_of
+from quell.realtime.devices.base import handle_of
 
 # Scheme: where it is, the loop's end and the device's end of it, and an example.
 _SCHEMES: dict[str, tuple[str, str, str | None, str]] = {
@@ -52,7 +52,7 @@ def open_device(device: Any, dt: float) -> Any:
         where the device does not answer.
     """
     if not isinstance(device, str):
-        line_of(device)
+        handle_of(device)
         return device
     return _part(device, 1)(device, dt)
 

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 from quell import checks
 from quell.kernels.dispatch import compiled, for_types
 from quell.plants.base import advance, measure
-from quell.realtime.devices.base import fetch, put
+from quell.realtime.devices.base import read_measurement, write_command
 from quell.simulation.driver import check_part
 from quell.types import Vector
 
 
-class TwinLine(NamedTuple):
+class TwinHandle(NamedTuple):
     """A sampled plant and its state."""
 
     plant: Any
@@ -28,26 +28,26 @@ class TwinLine(NamedTuple):
     """Samples since the start, and the sample time [s] (2,)."""
 
 
-@fetch.register(TwinLine)
-def _fetch(line: TwinLine, clock: Any, until: int) -> tuple[float, int]:
-    return measure(line.plant, line.x), 0
+@read_measurement.register(TwinHandle)
+def _read_measurement(handle: TwinHandle, clock: Any, until: int) -> tuple[float, int]:
+    return measure(handle.plant, handle.x), 0
 
 
-@put.register(TwinLine)
-def _put(line: TwinLine, u: float) -> int:
-    advance(line.plant, line.x, line.scratch, line.t[0] * line.t[1], u, line.w)
-    line.t[0] += 1.0
+@write_command.register(TwinHandle)
+def _write_command(handle: TwinHandle, u: float) -> int:
+    advance(handle.plant, handle.x, handle.scratch, handle.t[0] * handle.t[1], u, handle.w)
+    handle.t[0] += 1.0
     return 0
 
 
 @compiled
-def _read(line: TwinLine) -> float:
-    return measure(line.plant, line.x)
+def _read(handle: TwinHandle) -> float:
+    return measure(handle.plant, handle.x)
 
 
 @compiled
-def _write(line: TwinLine, u: float) -> None:
-    put(line, u)
+def _write(handle: TwinHandle, u: float) -> None:
+    write_command(handle, u)
 
 
 class TwinDevice:
@@ -88,34 +88,34 @@ class TwinDevice:
         order = plant.order
         x = np.zeros(order) if x0 is None else checks.vector("x0", x0, order)
         model = plant.sampled(dt, not plant.compiled)
-        self._line = TwinLine(
+        self._handle = TwinHandle(
             model, x, np.zeros(6 * order), np.zeros(plant.disturbances), np.array([0.0, dt])
         )
         # Without a line the loop around it runs as Python.
-        self.line = self._line if plant.compiled else None
+        self.handle = self._handle if plant.compiled else None
 
     @property
     def counters(self) -> dict[str, int]:
         """Samples written so far."""
-        return {"written": int(self._line.t[0])}
+        return {"written": int(self._handle.t[0])}
 
     @property
     def x(self) -> Vector:
         """The plant's state, as a copy (n,)."""
-        return self._line.x.copy()
+        return self._handle.x.copy()
 
     def read(self) -> float:
         """Return y [y-unit]."""
-        if self.line is None:
-            return float(measure(self._line.plant, self._line.x))
-        return float(for_types(_read, self.line)(self.line))
+        if self.handle is None:
+            return float(measure(self._handle.plant, self._handle.x))
+        return float(for_types(_read, self.handle)(self.handle))
 
     def write(self, u: float) -> None:
         """Apply u [u-unit] for a sample."""
-        if self.line is None:
-            put(self._line, float(u))
+        if self.handle is None:
+            write_command(self._handle, float(u))
         else:
-            for_types(_write, self.line)(self.line, float(u))
+            for_types(_write, self.handle)(self.handle, float(u))
 
     def close(self) -> None:
         """Do nothing: there is nothing to give free."""

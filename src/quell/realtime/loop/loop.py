@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from quell.controllers.base import applied, control, report, set_reference_derivatives, take_over
 from quell.kernels.dispatch import compiled, is_finite, kernel
-from quell.realtime.devices.base import fetch, put
+from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.loop.supervisor import (
     BEGAN,
     BLIND,
@@ -131,7 +131,7 @@ def pace(dt: float, paced: bool) -> Pace:
 
 @compiled
 def run_cycles(
-    line: Any,
+    handle: Any,
     clock: Any,
     design: Any,
     state: Any,
@@ -145,7 +145,7 @@ def run_cycles(
     counts, row = watch.counts, books.row
     origin = 0
     if not finished(watch):
-        origin = _first_deadline(line, clock, watch, pace, books.requests)
+        origin = _first_deadline(handle, clock, watch, pace, books.requests)
     k = left_out = 0
     while not finished(watch):
         deadline = origin + int(k * pace.period)
@@ -155,12 +155,12 @@ def run_cycles(
         left_out += slept_over
         k += slept_over
         _skip(counts, slept_over)
-        y, waited, shift = _measure(line, clock, pace, counts, origin + int(k * pace.period))
+        y, waited, shift = _measure(handle, clock, pace, counts, origin + int(k * pace.period))
         origin += shift
         changes = counts[CHANGES]
         clipped = counts[CLIPPED]
         u = _steer(design, state, rules, watch, setpoints, books, k, left_out, y)
-        fault = put(line, u)
+        fault = write_command(handle, u)
         unsent = fault == 1
         counts[FAILED] = counts[FAILED] + 1 if unsent else 0
         counts[TRIPPED] = fault > 1
@@ -197,19 +197,19 @@ def run_cycles(
 
 @kernel
 def _first_deadline(
-    line: Any, clock: Any, watch: Watch, pace: Pace, requests: NDArray[np.int64]
+    handle: Any, clock: Any, watch: Watch, pace: Pace, requests: NDArray[np.int64]
 ) -> int:
     """Return when cycle 0 is due [ns]: a sample from now, or from a paced device's next tick."""
     begin = now(clock)
     if pace.later == 0:
         return begin + int(pace.period)
-    fetch(line, clock, begin)  # what is there already is of no tick that is known
+    read_measurement(handle, clock, begin)  # what is there already is of no tick that is known
     while (
         now(clock) < begin + max(_FIRST, int(5.0 * pace.period))
         and load_acquire(requests, 0) == GO_ON
     ):
         before = now(clock)
-        y, _ = fetch(line, clock, before + max(_LOOK, int(2.0 * pace.period)))
+        y, _ = read_measurement(handle, clock, before + max(_LOOK, int(2.0 * pace.period)))
         after = now(clock)
         if is_finite(y):
             return after + int(pace.period)
@@ -231,10 +231,10 @@ def _skip(counts: NDArray[np.int64], deadlines: int) -> None:
 
 @kernel
 def _measure(
-    line: Any, clock: Any, pace: Pace, counts: NDArray[np.int64], deadline: int
+    handle: Any, clock: Any, pace: Pace, counts: NDArray[np.int64], deadline: int
 ) -> tuple[float, int, int]:
     """Return the measurement, how long it was waited for, and by how much the grid moves later [ns]."""
-    y, waited = fetch(line, clock, deadline + pace.patience)
+    y, waited = read_measurement(handle, clock, deadline + pace.patience)
     if pace.later == 0:
         return y, waited, 0
     if not is_finite(y):
@@ -243,7 +243,7 @@ def _measure(
     before = now(clock)
     if waited == 0 and counts[UNSURE] != 0 and before < deadline + pace.probe:
         counts[UNSURE] = 0
-        newer, _ = fetch(line, clock, deadline + pace.probe)
+        newer, _ = read_measurement(handle, clock, deadline + pace.probe)
         waited = now(clock) - before
         if is_finite(newer):
             return newer, waited, min(waited, pace.later)

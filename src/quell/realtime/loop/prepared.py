@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.kernels.dispatch import compiling, for_types, interpreted
-from quell.realtime.devices.base import PythonLine, line_of
+from quell.realtime.devices.base import PythonHandle, handle_of
 from quell.realtime.loop.bound import bound, warm
 from quell.realtime.loop.loop import Books, Pace, Setpoints, pace, run_cycles
 from quell.realtime.loop.supervisor import FLUSH, MODE, SAMPLES, STOPPED, Rules, Watch, watch
@@ -93,7 +93,7 @@ def sliding(dt: float, time: float, derivatives: int) -> Matrix:
 class Prepared:
     """A loop that is compiled and has not begun."""
 
-    line: Any
+    handle: Any
     clock: Any
     design: Any
     state: Any
@@ -122,11 +122,11 @@ class Prepared:
         The loop is interpreted where the device needs it, but the controller is compiled all the same; unless ``interpret`` wants both as
         plain Python, to debug.
         """
-        line = line_of(device)
+        handle = handle_of(device)
         design, state = controller.parameters, controller.initial_state()
         channels = row_channels(controller.channels)
         row = np.zeros(sum(width for _, width in channels))
-        if isinstance(line, PythonLine) and not interpret:
+        if isinstance(handle, PythonHandle) and not interpret:
             design = bound(design)
             warm(
                 design,
@@ -143,8 +143,10 @@ class Prepared:
             ring, row, f_learned, f_residual, tally(), tally(), np.zeros(1, dtype=np.int64)
         )
         due = pace(controller.dt, getattr(device, "paced", False))
-        as_python = interpret or isinstance(line, PythonLine)
-        prepared = cls(line, clock, design, state, rules, watch(), setpoints, due, books, as_python)
+        as_python = interpret or isinstance(handle, PythonHandle)
+        prepared = cls(
+            handle, clock, design, state, rules, watch(), setpoints, due, books, as_python
+        )
         prepared._compile()
         return prepared
 
@@ -158,12 +160,12 @@ class Prepared:
         entry = (
             interpreted(run_cycles)
             if self.interpreted
-            else for_types(run_cycles, self.line, self.clock, self.design)
+            else for_types(run_cycles, self.handle, self.clock, self.design)
         )
-        with np.errstate(over="ignore", invalid="ignore"), compiling(self.line, self.design):
+        with np.errstate(over="ignore", invalid="ignore"), compiling(self.handle, self.design):
             entry(
                 *(
-                    self.line,
+                    self.handle,
                     self.clock,
                     self.design,
                     self.state,

@@ -12,7 +12,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from quell.realtime.devices.base import Device, PythonLine, line_of
+from quell.realtime.devices.base import Device, PythonHandle, handle_of
 from quell.realtime.loop.outcome import ModeChange, RigRun, scenario_part, tally_of, told, unkept
 from quell.realtime.loop.prepared import Prepared, scenario_of, setpoints
 from quell.realtime.loop.safety import Safety
@@ -96,7 +96,7 @@ def run_rig(
     ConnectionError
         where the device's driver does not come back from a call.
     """
-    line = line_of(device)
+    handle = handle_of(device)
     with ExitStack() as stack:
         stack.callback(device.close)
         check_part("controller", controller)
@@ -118,11 +118,11 @@ def run_rig(
                 f"telemetry = {str(telemetry)!r}: must be a list of files and sinks, be it of one"
             )
         writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
-        if isinstance(line, PythonLine):
-            line.device.read()  # what it complains of comes before anything else
+        if isinstance(handle, PythonHandle):
+            handle.device.read()  # what it complains of comes before anything else
         loop = Prepared.of(device, controller, points, rules, system_clock(spin), writer.ring)
         writer.urgent = loop.interpreted and priority > 1
-        _begin_anew(device)
+        _restart_session(device)
         writer.header = replace(header, started=time.time_ns())
         # The signals come first: who is impatient shall not lose the end of the record.
         with _signals(loop.requests), writer, quiet_process(priority, loop.interpreted) as notes:
@@ -136,9 +136,9 @@ def run_rig(
         notes.append(
             "disturbances and noise of the scenario are left to the rig, which has its own"
         )
-    if isinstance(loop.line, PythonLine) and loop.line.errors:
+    if isinstance(loop.handle, PythonHandle) and loop.handle.errors:
         notes.append(
-            f"the device raised {int(loop.line.faults[0])} errors, the last of them: {loop.line.errors[0]!r}"
+            f"the device raised {int(loop.handle.faults[0])} errors, the last of them: {loop.handle.errors[0]!r}"
         )
     return RigRun(
         trajectory=scenario_part(record, watch, points.r.size),
@@ -169,9 +169,9 @@ def _supervised(
     def work() -> None:
         try:
             enter_real_time(priority, cpu, notes)
-            if isinstance(loop.line, PythonLine):
+            if isinstance(loop.handle, PythonHandle):
                 # What it has to set up comes before the first cycle, but no sooner: a watchdog that this starts would not wait.
-                loop.line.device.write(0.0)
+                loop.handle.device.write(0.0)
             loop.run()
         except BaseException as error:
             raised.append(error)
@@ -201,10 +201,10 @@ def _supervised(
         raise raised[0]
 
 
-def _begin_anew(device: Any) -> None:
+def _restart_session(device: Any) -> None:
     """Let a device that has sessions begin one now: compiling may have taken longer than it waits for a loop."""
-    if hasattr(device, "begin_anew"):
-        device.begin_anew()
+    if hasattr(device, "restart_session"):
+        device.restart_session()
 
 
 def _check_dt(device: Any, dt: float) -> None:

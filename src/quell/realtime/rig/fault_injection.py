@@ -94,7 +94,7 @@ def random_faults(number: int, frames: int, seed: int = 0, longest: int = 50) ->
     ]
 
 
-class Spoiler:
+class FaultInjector:
     """One direction of the wire: ``frames(data)`` says what comes out where ``data`` goes in."""
 
     def __init__(self, faults: Sequence[Fault], towards: str, seed: int = 0) -> None:
@@ -159,7 +159,7 @@ class Relay:
 
     def __init__(self, url: str, rig: str, faults: Sequence[Fault] = (), seed: int = 0) -> None:
         family, address = resolved(rig)
-        self._ways = {towards: Spoiler(faults, towards, seed) for towards in DIRECTIONS}
+        self._ways = {towards: FaultInjector(faults, towards, seed) for towards in DIRECTIONS}
         self._front = UdpListener(url)
         self.url = self._front.url
         self._back = socket.socket(family, socket.SOCK_DGRAM)

@@ -34,8 +34,8 @@ from quell.realtime.system.clock import now, wait_until
 from quell.realtime.system.histogram import count
 from quell.realtime.telemetry.ring import Ring, load_acquire, push
 from quell.realtime.wire import frames
-from quell.realtime.wire.frames import Buffer, Peer
-from quell.realtime.wire.link import adopt, answer, receive, send
+from quell.realtime.wire.frames import Buffer, Endpoint
+from quell.realtime.wire.transport import connect_to_sender, receive, reply, send
 from quell.realtime.wire.wire import MOST_AT_ONCE
 from quell.types import Vector
 
@@ -59,8 +59,8 @@ class RigModel(NamedTuple):
     """All that a tick needs."""
 
     plant: Any
-    link: Any
-    peer: Peer
+    transport: Any
+    endpoint: Endpoint
     inbox: Buffer
     outbox: Buffer
     dt: float
@@ -98,9 +98,9 @@ def tick(rig: RigModel, time: int) -> None:
     y = measure(rig.plant, rig.x)
     if counts[STATE] != IDLE:
         state = frames.WATCHDOG_TRIPPED if counts[STATE] == TRIPPED else 0
-        frames.compose(rig.outbox, rig.peer, frames.MEASUREMENT, time, y, state)
-        if send(rig.link, rig.outbox) != 0:
-            rig.peer.counters[frames.NOT_SENT] += 1
+        frames.write_next_frame(rig.outbox, rig.endpoint, frames.MEASUREMENT, time, y, state)
+        if send(rig.transport, rig.outbox) != 0:
+            rig.endpoint.counters[frames.NOT_SENT] += 1
     if rig.logged:
         _note(rig, y)
     advance(rig.plant, rig.x, rig.scratch, counts[SINCE_REST] * rig.dt, signals[APPLIED], rig.w)
@@ -111,13 +111,13 @@ def tick(rig: RigModel, time: int) -> None:
 @kernel
 def _hear(rig: RigModel, time: int) -> bool:
     """Take what has come; tell whether a fresh, finite command was in it."""
-    counters, frame = rig.peer.counters, rig.inbox
+    counters, frame = rig.endpoint.counters, rig.inbox
     u, news = 0.0, 0
     for _ in range(MOST_AT_ONCE):
-        size = receive(rig.link, frame)
+        size = receive(rig.transport, frame)
         if size < 0:
             break
-        if not frames.well_formed(frame, size, counters):
+        if not frames.is_well_formed(frame, size, counters):
             continue
         kind = frame.bytes[3]
         if kind == frames.HELLO:
@@ -127,7 +127,7 @@ def _hear(rig: RigModel, time: int) -> bool:
             _part(rig)
         elif rig.counts[STATE] == IDLE:
             counters[frames.WRONG_SESSION] += 1
-        elif frames.is_news(frame, rig.peer):
+        elif frames.accept_well_formed(frame, rig.endpoint):
             value = frame.doubles[3]
             if is_finite(value):
                 u = value
@@ -136,7 +136,7 @@ def _hear(rig: RigModel, time: int) -> bool:
     if news > 1:
         counters[frames.SKIPPED] += news - 1
     if (
-        news > rig.peer.most_age
+        news > rig.endpoint.most_age
     ):  # they may have waited in a queue that was full: the newest of them need not be new
         counters[frames.STALE] += 1
         return False
@@ -167,7 +167,7 @@ def _watch(rig: RigModel, fresh: bool) -> None:
 @kernel
 def _greet(rig: RigModel, time: int) -> bool:
     """Answer a hello; tell whether a session begins with it."""
-    counts, own = rig.counts, rig.peer
+    counts, own = rig.counts, rig.endpoint
     session, dt = int(rig.inbox.words[1]), rig.inbox.doubles[3]
     known = session == own.numbers[frames.SESSION]
     state, begins = 0, False
@@ -183,7 +183,7 @@ def _greet(rig: RigModel, time: int) -> bool:
             begins = True
     if begins:
         frames.start_session(own, session)
-        adopt(rig.link)
+        connect_to_sender(rig.transport)
         counts[STATE] = WAITING
         counts[SILENT] = 0
         counts[SESSIONS] += 1
@@ -195,17 +195,20 @@ def _greet(rig: RigModel, time: int) -> bool:
     elif state != 0:
         counts[REFUSED] += 1
     frames.write_frame(rig.outbox, frames.WELCOME, session, 0, 0, time, rig.dt, state)
-    answer(rig.link, rig.outbox)
+    reply(rig.transport, rig.outbox)
     return begins
 
 
 @kernel
 def _part(rig: RigModel) -> None:
     """Hear a goodbye."""
-    if rig.counts[STATE] != IDLE and int(rig.inbox.words[1]) == rig.peer.numbers[frames.SESSION]:
+    if (
+        rig.counts[STATE] != IDLE
+        and int(rig.inbox.words[1]) == rig.endpoint.numbers[frames.SESSION]
+    ):
         rig.counts[STATE] = IDLE
     else:
-        rig.peer.counters[frames.WRONG_SESSION] += 1
+        rig.endpoint.counters[frames.WRONG_SESSION] += 1
 
 
 @kernel
@@ -214,7 +217,7 @@ def _note(rig: RigModel, y: float) -> None:
     counts, row = rig.counts, rig.row
     row[0] = counts[TICKS]
     row[1] = counts[TICKS] * rig.dt
-    row[2] = rig.peer.numbers[frames.SESSION]
+    row[2] = rig.endpoint.numbers[frames.SESSION]
     row[3] = counts[STATE]
     row[4] = y
     row[5] = rig.signals[APPLIED]

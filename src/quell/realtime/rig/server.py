@@ -25,7 +25,7 @@ from quell.realtime.system.scheduling import (
 )
 from quell.realtime.telemetry.ring import drain, dropped, ring, store_release
 from quell.realtime.wire import frames
-from quell.realtime.wire.link import send
+from quell.realtime.wire.transport import send
 from quell.simulation.driver import check_part
 
 # The log is written so often [s], and has room for so many seconds.
@@ -44,8 +44,8 @@ class Listener(Protocol):
     """The device's end of a wire; ``quell.realtime.devices.registry.listen`` makes it of a URL."""
 
     url: str
-    link: Any
-    """For whose type the functions of ``quell.realtime.wire.link`` are registered."""
+    transport: Any
+    """For whose type the functions of ``quell.realtime.wire.transport`` are registered."""
 
     def close(self) -> None:
         """Give it free."""
@@ -106,8 +106,8 @@ class Rig:
         self.dt = dt
         self.model = RigModel(
             plant=plant.sampled(dt),
-            link=listener.link,
-            peer=frames.peer(frames.COMMAND, 0, watchdog),
+            transport=listener.transport,
+            endpoint=frames.endpoint(frames.COMMAND, 0, watchdog),
             inbox=frames.buffer(),
             outbox=frames.buffer(),
             dt=dt,
@@ -157,7 +157,7 @@ class Rig:
             "ticks": kernels.TICKS,
             "caught_up": kernels.CAUGHT_UP,
         }
-        return frames.told(self.model.peer.counters) | {
+        return frames.counts_by_name(self.model.endpoint.counters) | {
             name: int(counts[index]) for name, index in more.items()
         }
 
@@ -257,11 +257,11 @@ class Rig:
         """Say goodbye, if there is a session."""
         model = self.model
         if model.counts[kernels.STATE] != kernels.IDLE:
-            session = int(model.peer.numbers[frames.SESSION])
+            session = int(model.endpoint.numbers[frames.SESSION])
             frames.write_frame(
                 model.outbox, frames.GOODBYE, session, 0, 0, time.monotonic_ns(), 0.0, frames.GONE
             )
-            send(model.link, model.outbox)
+            send(model.transport, model.outbox)
             model.counts[kernels.STATE] = kernels.IDLE
 
     def __enter__(self) -> Rig:

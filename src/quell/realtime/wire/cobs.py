@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quell.kernels.dispatch import kernel
 
 # What ``decode`` returns for bytes that are no packet.
-BROKEN = -1
+INVALID = -1
 _LONGEST = 255
 
 
@@ -49,10 +49,10 @@ def decode(packet: NDArray[np.uint8], size: int, out: NDArray[np.uint8]) -> int:
     while i < size:
         code = int(packet[i])
         if code == 0 or i + code > size:
-            return BROKEN
+            return INVALID
         for j in range(i + 1, i + code):
             if packet[j] == 0:
-                return BROKEN
+                return INVALID
             out[length] = packet[j]
             length += 1
         i += code

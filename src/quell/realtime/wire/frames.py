@@ -93,7 +93,7 @@ def buffer() -> Buffer:
     )
 
 
-class Peer(NamedTuple):
+class Endpoint(NamedTuple):
     """What one side knows of its traffic with the other."""
 
     expects: int
@@ -106,14 +106,14 @@ class Peer(NamedTuple):
     """How many frames met which fate (11,), see ``COUNTERS``."""
 
 
-SESSION, SENT, HEARD, ANSWERED, STATE = range(5)
+SESSION, SENT, RECEIVED, ANSWERED, STATE = range(5)
 
 
-def peer(expects: int, session: int, most_age: int) -> Peer:
+def endpoint(expects: int, session: int, most_age: int) -> Endpoint:
     """Return a peer that has heard nothing yet."""
     numbers = np.zeros(5, dtype=np.int64)
     numbers[SESSION] = session
-    return Peer(expects, most_age, numbers, np.zeros(len(COUNTERS), dtype=np.int64))
+    return Endpoint(expects, most_age, numbers, np.zeros(len(COUNTERS), dtype=np.int64))
 
 
 @kernel
@@ -150,7 +150,7 @@ def write_frame(
 
 
 @kernel
-def well_formed(frame: Buffer, size: int, counters: NDArray[np.int64]) -> bool:
+def is_well_formed(frame: Buffer, size: int, counters: NDArray[np.int64]) -> bool:
     """Tell whether the first ``size`` bytes are a whole frame of this version; count it where they are not."""
     if (
         size != LENGTH
@@ -166,22 +166,31 @@ def well_formed(frame: Buffer, size: int, counters: NDArray[np.int64]) -> bool:
 
 
 @kernel
-def compose(out: Buffer, own: Peer, kind: int, time: int, value: float, state: int) -> None:
+def write_next_frame(
+    out: Buffer, own: Endpoint, kind: int, time: int, value: float, state: int
+) -> None:
     """Write the next frame of a session."""
     own.numbers[SENT] += 1
     write_frame(
-        out, kind, own.numbers[SESSION], own.numbers[SENT], own.numbers[HEARD], time, value, state
+        out,
+        kind,
+        own.numbers[SESSION],
+        own.numbers[SENT],
+        own.numbers[RECEIVED],
+        time,
+        value,
+        state,
     )
 
 
 @kernel
-def accept(frame: Buffer, size: int, own: Peer) -> bool:
+def accept(frame: Buffer, size: int, own: Endpoint) -> bool:
     """Tell whether the first ``size`` bytes are the news that was expected; count them either way."""
-    return well_formed(frame, size, own.counters) and is_news(frame, own)
+    return is_well_formed(frame, size, own.counters) and accept_well_formed(frame, own)
 
 
 @kernel
-def is_news(frame: Buffer, own: Peer) -> bool:
+def accept_well_formed(frame: Buffer, own: Endpoint) -> bool:
     """Tell whether a well-formed frame is the news that was expected; count it either way.
 
     Accepted is also a frame whose value is no number: that it came is news. It is counted once more, as ``not_finite``.
@@ -193,7 +202,7 @@ def is_news(frame: Buffer, own: Peer) -> bool:
     if int(frame.words[1]) != numbers[SESSION]:
         counters[WRONG_SESSION] += 1
         return False
-    ahead = _ahead(int(frame.words[2]), numbers[HEARD])
+    ahead = _ahead(int(frame.words[2]), numbers[RECEIVED])
     if ahead <= 0:
         counters[DUPLICATED if ahead == 0 else REORDERED] += 1
         return False
@@ -202,7 +211,7 @@ def is_news(frame: Buffer, own: Peer) -> bool:
         counters[STALE] += 1
         return False
     counters[SKIPPED] += ahead - 1
-    numbers[HEARD] += ahead
+    numbers[RECEIVED] += ahead
     numbers[ANSWERED] = int(frame.words[3])
     numbers[STATE] = int(frame.words[8]) | (
         numbers[STATE] & GONE
@@ -214,7 +223,7 @@ def is_news(frame: Buffer, own: Peer) -> bool:
 
 
 @kernel
-def start_session(own: Peer, session: int) -> None:
+def start_session(own: Endpoint, session: int) -> None:
     """Begin anew: nothing sent, nothing heard; what was counted stays."""
     for i in range(own.numbers.size):
         own.numbers[i] = 0
@@ -227,6 +236,6 @@ def _ahead(number: int, of: int) -> int:
     return (number - of + _ROUND // 2) % _ROUND - _ROUND // 2
 
 
-def told(counters: Any) -> dict[str, int]:
+def counts_by_name(counters: Any) -> dict[str, int]:
     """Return counters by name."""
     return dict(zip(COUNTERS, map(int, counters), strict=True))

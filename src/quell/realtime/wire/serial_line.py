@@ -25,14 +25,14 @@ from quell import checks
 from quell.realtime.system.libc import external
 from quell.realtime.wire import cobs
 from quell.realtime.wire.frames import LENGTH, Buffer
-from quell.realtime.wire.link import (
+from quell.realtime.wire.transport import (
     Descriptor,
-    adopt,
-    answer,
-    await_news,
+    connect_to_sender,
     descriptor,
     receive,
+    reply,
     send,
+    wait_for_frame,
     wait_readable,
 )
 from quell.realtime.wire.wire import WireDevice
@@ -57,7 +57,7 @@ _ppoll = external("ppoll", "int", "address", "long", "address", "address")
 _write = external("write", "long", "int", "address", "long")
 
 
-class SerialLink(NamedTuple):
+class SerialTransport(NamedTuple):
     """One end of a serial line; make it with ``serial_link``."""
 
     port: Descriptor
@@ -76,12 +76,12 @@ class SerialLink(NamedTuple):
 _NEXT, _END, _SIZE, _WITHIN = range(4)
 
 
-def serial_link(fd: int) -> SerialLink:
+def serial_transport(fd: int) -> SerialTransport:
     """Return the link of a file descriptor of a serial line in raw mode."""
     os.set_blocking(fd, False)
     raw, packet, out = (np.zeros(size, dtype=np.uint8) for size in (_AT_ONCE, _LONGEST, LENGTH + 3))
     coded = out[1:]
-    return SerialLink(
+    return SerialTransport(
         descriptor(fd),
         raw,
         packet,
@@ -92,59 +92,63 @@ def serial_link(fd: int) -> SerialLink:
     )
 
 
-@receive.register(SerialLink)
-def _receive(link: SerialLink, frame: Buffer) -> int:
-    state = link.state
+@receive.register(SerialTransport)
+def _receive(transport: SerialTransport, frame: Buffer) -> int:
+    state = transport.state
     for _ in range(_MOST_READS):
         while state[_NEXT] < state[_END]:
-            byte = link.raw[state[_NEXT]]
+            byte = transport.raw[state[_NEXT]]
             state[_NEXT] += 1
             if byte != 0:
                 if state[_SIZE] < _LONGEST:
-                    link.packet[state[_SIZE]] = byte
+                    transport.packet[state[_SIZE]] = byte
                 state[_SIZE] += 1
             elif state[_SIZE] > 0:
                 size = state[_SIZE]
                 state[_SIZE] = 0
-                return 0 if size > _LONGEST else max(cobs.decode(link.packet, size, frame.bytes), 0)
+                return (
+                    0
+                    if size > _LONGEST
+                    else max(cobs.decode(transport.packet, size, frame.bytes), 0)
+                )
         state[_NEXT] = 0
-        state[_END] = max(_read(link.port.fd, link.raw_at, _AT_ONCE), 0)
+        state[_END] = max(_read(transport.port.fd, transport.raw_at, _AT_ONCE), 0)
         if state[_END] == 0:
             break
     return -1
 
 
-@send.register(SerialLink)
-def _send(link: SerialLink, frame: Buffer) -> int:
+@send.register(SerialTransport)
+def _send(transport: SerialTransport, frame: Buffer) -> int:
     """Send a frame; after one that was cut short, and before the first, a zero ends whatever the other side is within."""
-    size = cobs.encode(frame.bytes, LENGTH, link.coded)
-    lead = int(link.state[_WITHIN])
-    link.state[_WITHIN] = (
-        0 if _write(link.port.fd, link.coded_at - lead, size + lead) == size + lead else 1
+    size = cobs.encode(frame.bytes, LENGTH, transport.coded)
+    lead = int(transport.state[_WITHIN])
+    transport.state[_WITHIN] = (
+        0 if _write(transport.port.fd, transport.coded_at - lead, size + lead) == size + lead else 1
     )
-    return int(link.state[_WITHIN])
+    return int(transport.state[_WITHIN])
 
 
-@answer.register(SerialLink)
-def _answer(link: SerialLink, frame: Buffer) -> int:
-    return send(link, frame)
+@reply.register(SerialTransport)
+def _reply(transport: SerialTransport, frame: Buffer) -> int:
+    return send(transport, frame)
 
 
-@adopt.register(SerialLink)
-def _adopt(link: SerialLink) -> None:
+@connect_to_sender.register(SerialTransport)
+def _connect_to_sender(transport: SerialTransport) -> None:
     """Do nothing: there is but one other side."""
 
 
-@await_news.register(SerialLink)
-def _await_news(link: SerialLink, nanoseconds: int) -> None:
-    if link.state[_NEXT] < link.state[_END]:
+@wait_for_frame.register(SerialTransport)
+def _wait_for_frame(transport: SerialTransport, nanoseconds: int) -> None:
+    if transport.state[_NEXT] < transport.state[_END]:
         return
-    wait_readable(link.port, nanoseconds)
-    if link.port.words[0] >> _REVENTS & _GONE:
+    wait_readable(transport.port, nanoseconds)
+    if transport.port.words[0] >> _REVENTS & _GONE:
         # A line that is gone is always ready to say so: wait a little for nothing, rather than ask without end.
-        link.port.words[1] = 0
-        link.port.words[2] = min(nanoseconds, _PAUSE)
-        _ppoll(0, 0, link.port.address + 8, 0)
+        transport.port.words[1] = 0
+        transport.port.words[2] = min(nanoseconds, _PAUSE)
+        _ppoll(0, 0, transport.port.address + 8, 0)
 
 
 class SerialDevice(WireDevice):
@@ -176,7 +180,7 @@ class SerialDevice(WireDevice):
         self._port = _opened(url, path, baud)
         super().__init__(
             url,
-            serial_link(self._port.fileno()),
+            serial_transport(self._port.fileno()),
             dt,
             timeout,
             "look at the cable (TX to RX, ground to ground) and at the baud rate of both; or start one with: quell rig",
@@ -199,7 +203,7 @@ class SerialListener:
         path, baud = _parsed(url)
         self._port: Any = _Pseudoterminal() if path == "pty" else _opened(url, path, baud)
         self.url = f"serial://{self._port.path}" if path == "pty" else url
-        self.link = serial_link(self._port.fileno())
+        self.transport = serial_transport(self._port.fileno())
 
     def close(self) -> None:
         """Give the port free."""

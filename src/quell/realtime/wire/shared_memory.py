@@ -38,7 +38,7 @@ from quell.kernels.dispatch import kernel
 from quell.realtime.system.clock import SystemClock, now, system_clock, wait_until
 from quell.realtime.telemetry.ring import load_acquire, store_release
 from quell.realtime.wire.frames import HELLO, LENGTH, Buffer
-from quell.realtime.wire.link import adopt, answer, await_news, receive, send
+from quell.realtime.wire.transport import connect_to_sender, receive, reply, send, wait_for_frame
 from quell.realtime.wire.wire import WireDevice
 
 _SLOT = 1 + LENGTH // 8
@@ -50,7 +50,7 @@ _LOOK_EVERY = 20_000
 _TRIES = 1000
 
 
-class SharedLink(NamedTuple):
+class SharedMemoryTransport(NamedTuple):
     """One end of a wire through shared memory."""
 
     own: NDArray[np.int64]
@@ -62,67 +62,67 @@ class SharedLink(NamedTuple):
     clock: SystemClock
 
 
-@receive.register(SharedLink)
-def _receive(link: SharedLink, frame: Buffer) -> int:
+@receive.register(SharedMemoryTransport)
+def _receive(transport: SharedMemoryTransport, frame: Buffer) -> int:
     for slot in range(2):
-        if _look(link, slot, frame):
+        if _look(transport, slot, frame):
             return LENGTH
     return -1
 
 
 @kernel
-def _look(link: SharedLink, slot: int, frame: Buffer) -> bool:
+def _look(transport: SharedMemoryTransport, slot: int, frame: Buffer) -> bool:
     """Take what is new in a slot; tell whether something is."""
     first = slot * _SLOT
     for _ in range(_TRIES):
-        count = load_acquire(link.others, first)
-        if count == link.seen[slot]:
+        count = load_acquire(transport.others, first)
+        if count == transport.seen[slot]:
             return False
         if count % 2 == 0:
             for i in range(LENGTH // 8):
-                frame.longs[i] = load_acquire(link.others, first + 1 + i)
-            if load_acquire(link.others, first) == count:
-                link.seen[slot] = count
+                frame.longs[i] = load_acquire(transport.others, first + 1 + i)
+            if load_acquire(transport.others, first) == count:
+                transport.seen[slot] = count
                 return True
     return False
 
 
-@send.register(SharedLink)
-def _send(link: SharedLink, frame: Buffer) -> int:
+@send.register(SharedMemoryTransport)
+def _send(transport: SharedMemoryTransport, frame: Buffer) -> int:
     first = 0 if frame.bytes[3] >= HELLO else _SLOT
     writing = (
-        load_acquire(link.own, first) | 1
+        load_acquire(transport.own, first) | 1
     )  # odd already where the last writer was killed at it
-    store_release(link.own, first, writing)
+    store_release(transport.own, first, writing)
     for i in range(LENGTH // 8):
-        store_release(link.own, first + 1 + i, frame.longs[i])
-    store_release(link.own, first, writing + 1)
+        store_release(transport.own, first + 1 + i, frame.longs[i])
+    store_release(transport.own, first, writing + 1)
     return 0
 
 
-@answer.register(SharedLink)
-def _answer(link: SharedLink, frame: Buffer) -> int:
-    return send(link, frame)
+@reply.register(SharedMemoryTransport)
+def _reply(transport: SharedMemoryTransport, frame: Buffer) -> int:
+    return send(transport, frame)
 
 
-@adopt.register(SharedLink)
-def _adopt(link: SharedLink) -> None:
+@connect_to_sender.register(SharedMemoryTransport)
+def _connect_to_sender(transport: SharedMemoryTransport) -> None:
     pass
 
 
-@await_news.register(SharedLink)
-def _await_news(link: SharedLink, nanoseconds: int) -> None:
-    time_now = now(link.clock)
+@wait_for_frame.register(SharedMemoryTransport)
+def _wait_for_frame(transport: SharedMemoryTransport, nanoseconds: int) -> None:
+    time_now = now(transport.clock)
     end = time_now + nanoseconds
     while (
         time_now < end
-        and load_acquire(link.others, 0) == link.seen[0]
-        and load_acquire(link.others, _SLOT) == link.seen[1]
+        and load_acquire(transport.others, 0) == transport.seen[0]
+        and load_acquire(transport.others, _SLOT) == transport.seen[1]
     ):
-        time_now = wait_until(link.clock, min(time_now + _LOOK_EVERY, end))
+        time_now = wait_until(transport.clock, min(time_now + _LOOK_EVERY, end))
 
 
-class SharedDevice(WireDevice):
+class SharedMemoryDevice(WireDevice):
     """A device in another process of this computer, through shared memory.
 
     Parameters
@@ -162,18 +162,18 @@ class SharedDevice(WireDevice):
         if not own.lock():
             self._free()
             raise ConnectionError(f"{url}: another session is alive there; end it first")
-        super().__init__(url, _link(own, theirs), dt, timeout, hint)
+        super().__init__(url, _transport(own, theirs), dt, timeout, hint)
 
     def _free(self) -> None:
         if hasattr(
-            self, "line"
+            self, "handle"
         ):  # there was a goodbye: the device is to see it before the next loop's hello takes its place
             time.sleep(min(2.0 * self.dt, 0.1))
         for box in self._boxes:
             box.close()
 
 
-class SharedListener:
+class SharedMemoryListener:
     """The device's end of a wire through shared memory; what a rig that was killed has left is taken over.
 
     Raises
@@ -199,7 +199,7 @@ class SharedListener:
             ) from None
         self._boxes = own, theirs
         self._paths: tuple[Path, ...] = paths
-        self.link = _link(own, theirs)
+        self.transport = _transport(own, theirs)
 
     def close(self) -> None:
         """Remove the mailboxes; a loop that still has them hears nothing more."""
@@ -242,8 +242,10 @@ class _Mailbox:
             self._file = -1
 
 
-def _link(own: _Mailbox, theirs: _Mailbox) -> SharedLink:
-    return SharedLink(own.words, theirs.words, theirs.words[::_SLOT].copy(), system_clock())
+def _transport(own: _Mailbox, theirs: _Mailbox) -> SharedMemoryTransport:
+    return SharedMemoryTransport(
+        own.words, theirs.words, theirs.words[::_SLOT].copy(), system_clock()
+    )
 
 
 def _paths(url: str) -> tuple[Path, Path]:

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.realtime.system.libc import external
 from quell.realtime.wire.frames import LENGTH, Buffer
-from quell.realtime.wire.link import (
+from quell.realtime.wire.transport import (
     Descriptor,
-    adopt,
-    answer,
-    await_news,
+    connect_to_sender,
     descriptor,
     receive,
+    reply,
     send,
+    wait_for_frame,
     wait_readable,
 )
 from quell.realtime.wire.wire import WireDevice
@@ -37,7 +37,7 @@ _recvfrom = external("recvfrom", "long", "int", "address", "long", "int", "addre
 _sendto = external("sendto", "long", "int", "address", "long", "int", "address", "int")
 
 
-class UdpLink(NamedTuple):
+class UdpTransport(NamedTuple):
     """One end of a UDP wire; make it with ``udp_link``."""
 
     socket: Descriptor
@@ -49,49 +49,58 @@ class UdpLink(NamedTuple):
     sender_at: int
 
 
-def udp_link(own: socket.socket) -> UdpLink:
+def udp_transport(own: socket.socket) -> UdpTransport:
     """Return the link of a socket that doesn't block."""
     other, sender = (np.zeros(_ADDRESS // 4 + 1, dtype=np.int32) for _ in range(2))
-    return UdpLink(descriptor(own.fileno()), other, sender, other.ctypes.data, sender.ctypes.data)
+    return UdpTransport(
+        descriptor(own.fileno()), other, sender, other.ctypes.data, sender.ctypes.data
+    )
 
 
-@receive.register(UdpLink)
-def _receive(link: UdpLink, frame: Buffer) -> int:
-    link.sender[_ADDRESS // 4] = _ADDRESS
+@receive.register(UdpTransport)
+def _receive(transport: UdpTransport, frame: Buffer) -> int:
+    transport.sender[_ADDRESS // 4] = _ADDRESS
     return _recvfrom(
-        link.socket.fd,
+        transport.socket.fd,
         frame.address,
         frame.bytes.size,
         0,
-        link.sender_at,
-        link.sender_at + _ADDRESS,
+        transport.sender_at,
+        transport.sender_at + _ADDRESS,
     )
 
 
-@send.register(UdpLink)
-def _send(link: UdpLink, frame: Buffer) -> int:
-    size = link.other[_ADDRESS // 4]
-    sent = _sendto(link.socket.fd, frame.address, LENGTH, 0, link.other_at if size > 0 else 0, size)
-    return 0 if sent == LENGTH else 1
-
-
-@answer.register(UdpLink)
-def _answer(link: UdpLink, frame: Buffer) -> int:
+@send.register(UdpTransport)
+def _send(transport: UdpTransport, frame: Buffer) -> int:
+    size = transport.other[_ADDRESS // 4]
     sent = _sendto(
-        link.socket.fd, frame.address, LENGTH, 0, link.sender_at, link.sender[_ADDRESS // 4]
+        transport.socket.fd, frame.address, LENGTH, 0, transport.other_at if size > 0 else 0, size
     )
     return 0 if sent == LENGTH else 1
 
 
-@adopt.register(UdpLink)
-def _adopt(link: UdpLink) -> None:
-    for i in range(link.other.size):
-        link.other[i] = link.sender[i]
+@reply.register(UdpTransport)
+def _reply(transport: UdpTransport, frame: Buffer) -> int:
+    sent = _sendto(
+        transport.socket.fd,
+        frame.address,
+        LENGTH,
+        0,
+        transport.sender_at,
+        transport.sender[_ADDRESS // 4],
+    )
+    return 0 if sent == LENGTH else 1
 
 
-@await_news.register(UdpLink)
-def _await_news(link: UdpLink, nanoseconds: int) -> None:
-    wait_readable(link.socket, nanoseconds)
+@connect_to_sender.register(UdpTransport)
+def _connect_to_sender(transport: UdpTransport) -> None:
+    for i in range(transport.other.size):
+        transport.other[i] = transport.sender[i]
+
+
+@wait_for_frame.register(UdpTransport)
+def _wait_for_frame(transport: UdpTransport, nanoseconds: int) -> None:
+    wait_readable(transport.socket, nanoseconds)
 
 
 class UdpDevice(WireDevice):
@@ -126,7 +135,11 @@ class UdpDevice(WireDevice):
             self._socket.close()
             raise ConnectionError(f"{url}: can't be reached ({error.strerror})") from None
         super().__init__(
-            url, udp_link(self._socket), dt, timeout, f"start one with: quell rig --device {url}"
+            url,
+            udp_transport(self._socket),
+            dt,
+            timeout,
+            f"start one with: quell rig --device {url}",
         )
 
     def _free(self) -> None:
@@ -154,7 +167,7 @@ class UdpListener:
             ) from None
         host, port = self.socket.getsockname()[:2]
         self.url = f"udp://[{host}]:{port}" if ":" in host else f"udp://{host}:{port}"
-        self.link = udp_link(self.socket)
+        self.transport = udp_transport(self.socket)
 
     def close(self) -> None:
         """Give the port free."""

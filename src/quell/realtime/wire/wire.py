@@ -1,7 +1,7 @@
 """A device at the other end of a wire: what the loop does with it, whatever carries the frames.
 
-The device has a clock of its own and sends a measurement at each of its ticks. ``fetch`` takes the newest and waits for one where there is
-none; ``put`` sends a command that says which measurement it answers.
+The device has a clock of its own and sends a measurement at each of its ticks. ``read_measurement`` takes the newest and waits for one where there is
+none; ``write_command`` sends a command that says which measurement it answers.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from numba import typeof
 
 from quell import checks
 from quell.kernels.dispatch import compiled, for_types, is_finite, kernel
-from quell.realtime.devices.base import fetch, put
+from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.system.clock import SystemClock, now, system_clock
 from quell.realtime.wire import frames
-from quell.realtime.wire.frames import Buffer, Peer
-from quell.realtime.wire.link import await_news, receive, send
+from quell.realtime.wire.frames import Buffer, Endpoint
+from quell.realtime.wire.transport import receive, send, wait_for_frame
 
 # A measurement that answers a command from before the last fifty is stale; so is what waited behind fifty others.
 _MOST_AGE = 50
@@ -31,73 +31,75 @@ _HELLO_EVERY = 0.05
 NOT_SENT, TRIPPED, GONE = 1, 2, 3
 
 
-class WireLine(NamedTuple):
+class WireHandle(NamedTuple):
     """The loop's end of a wire."""
 
-    link: Any
-    peer: Peer
+    transport: Any
+    endpoint: Endpoint
     inbox: Buffer
     outbox: Buffer
     watch: SystemClock
     """For how long it waits: a wire takes real time, whatever the loop's clock says."""
 
 
-@fetch.register(WireLine)
-def _fetch(line: WireLine, clock: Any, until: int) -> tuple[float, int]:
+@read_measurement.register(WireHandle)
+def _read_measurement(handle: WireHandle, clock: Any, until: int) -> tuple[float, int]:
     begin = now(clock)
-    y, came = _newest(line)
+    y, came = _newest(handle)
     if came:
         return y, 0
-    end = now(line.watch) + until - begin
+    end = now(handle.watch) + until - begin
     left = until - begin
     while not came and left > 0:
-        await_news(line.link, left)
-        y, came = _newest(line)
-        left = end - now(line.watch)
+        wait_for_frame(handle.transport, left)
+        y, came = _newest(handle)
+        left = end - now(handle.watch)
     return y, now(clock) - begin
 
 
 @kernel
-def _newest(line: WireLine) -> tuple[float, bool]:
+def _newest(handle: WireHandle) -> tuple[float, bool]:
     """Return the newest measurement of those that have come, and whether one has.
 
     Where more have come than can be fresh, the queue may have been full, and its end is not the newest: then none of them counts.
     """
-    counters, frame = line.peer.counters, line.inbox
+    counters, frame = handle.endpoint.counters, handle.inbox
     y, news, looked_at = math.nan, 0, 0
     while looked_at < MOST_AT_ONCE:
-        size = receive(line.link, frame)
+        size = receive(handle.transport, frame)
         if size < 0:
             break
         looked_at += 1
-        if not frames.well_formed(frame, size, counters):
+        if not frames.is_well_formed(frame, size, counters):
             continue
-        if _is_ours(line, frame, frames.GOODBYE):
-            line.peer.numbers[frames.STATE] |= frames.GONE
-        elif not _is_ours(line, frame, frames.WELCOME) and frames.is_news(frame, line.peer):
+        if _is_ours(handle, frame, frames.GOODBYE):
+            handle.endpoint.numbers[frames.STATE] |= frames.GONE
+        elif not _is_ours(handle, frame, frames.WELCOME) and frames.accept_well_formed(
+            frame, handle.endpoint
+        ):
             y = frame.doubles[3]
             news += 1
     if news > 1:
         counters[frames.SKIPPED] += news - 1
-    if news > line.peer.most_age:
+    if news > handle.endpoint.most_age:
         counters[frames.STALE] += 1
         return math.nan, False
     return (y if is_finite(y) else math.nan), news > 0
 
 
 @kernel
-def _is_ours(line: WireLine, frame: Buffer, kind: int) -> bool:
-    return frame.bytes[3] == kind and int(frame.words[1]) == line.peer.numbers[frames.SESSION]
+def _is_ours(handle: WireHandle, frame: Buffer, kind: int) -> bool:
+    return frame.bytes[3] == kind and int(frame.words[1]) == handle.endpoint.numbers[frames.SESSION]
 
 
-@put.register(WireLine)
-def _put(line: WireLine, u: float) -> int:
+@write_command.register(WireHandle)
+def _write_command(handle: WireHandle, u: float) -> int:
     """Send u; 1 where it could not be sent, 2 where the device has set u to zero for good, 3 where it has ended the session."""
-    frames.compose(line.outbox, line.peer, frames.COMMAND, now(line.watch), u, 0)
-    failed = send(line.link, line.outbox) != 0
+    frames.write_next_frame(handle.outbox, handle.endpoint, frames.COMMAND, now(handle.watch), u, 0)
+    failed = send(handle.transport, handle.outbox) != 0
     if failed:
-        line.peer.counters[frames.NOT_SENT] += 1
-    state = line.peer.numbers[frames.STATE]
+        handle.endpoint.counters[frames.NOT_SENT] += 1
+    state = handle.endpoint.numbers[frames.STATE]
     if state & frames.GONE:
         return GONE
     if state & frames.WATCHDOG_TRIPPED:
@@ -106,15 +108,15 @@ def _put(line: WireLine, u: float) -> int:
 
 
 @compiled
-def fetch_one(line: Any, clock: Any, until: int) -> tuple[float, int]:
+def fetch_one(handle: Any, clock: Any, until: int) -> tuple[float, int]:
     """Fetch, called from Python."""
-    return fetch(line, clock, until)
+    return read_measurement(handle, clock, until)
 
 
 @compiled
-def put_one(line: Any, u: float) -> int:
+def put_one(handle: Any, u: float) -> int:
     """Put, called from Python."""
-    return put(line, u)
+    return write_command(handle, u)
 
 
 class WireDevice:
@@ -125,13 +127,13 @@ class WireDevice:
 
     paced = True
 
-    def __init__(self, url: str, link: Any, dt: float, timeout: float, hint: str) -> None:
+    def __init__(self, url: str, transport: Any, dt: float, timeout: float, hint: str) -> None:
         """Begin a session, within ``timeout`` seconds; ``hint`` says what may be wrong where nobody answers."""
         self.url = url
         self.dt = checks.positive("dt", dt, "s")
-        self.line = WireLine(
-            link,
-            frames.peer(frames.MEASUREMENT, _new_session(), _MOST_AGE),
+        self.handle = WireHandle(
+            transport,
+            frames.endpoint(frames.MEASUREMENT, _new_session(), _MOST_AGE),
             frames.buffer(),
             frames.buffer(),
             system_clock(),
@@ -152,17 +154,19 @@ class WireDevice:
     @property
     def counters(self) -> dict[str, int]:
         """How many frames of the device met which fate, see ``quell.realtime.wire.frames``."""
-        return frames.told(self.line.peer.counters)
+        return frames.counts_by_name(self.handle.endpoint.counters)
 
     @property
     def lost(self) -> bool:
         """Whether the device's watchdog has set u to zero for good, or the device has ended the session."""
-        return bool(self.line.peer.numbers[frames.STATE] & (frames.WATCHDOG_TRIPPED | frames.GONE))
+        return bool(
+            self.handle.endpoint.numbers[frames.STATE] & (frames.WATCHDOG_TRIPPED | frames.GONE)
+        )
 
     def read(self) -> float:
         """Return the newest measurement [y-unit]; NaN where for fifty samples none has come."""
         self._check_open()
-        return self._fetch(_MOST_AGE * self.dt)
+        return self._read_measurement(_MOST_AGE * self.dt)
 
     def write(self, u: float) -> None:
         """Send u [u-unit].
@@ -177,7 +181,7 @@ class WireDevice:
         if fault:
             raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
 
-    def begin_anew(self) -> None:
+    def restart_session(self) -> None:
         """Begin a new session in place of this one: what the loop does before its first cycle, as the device waits for that only so long.
 
         Raises
@@ -190,7 +194,7 @@ class WireDevice:
         self._say(frames.GOODBYE, 0.0, former)
         # Where a frame replaces the one before, the device has to look before the hello comes.
         time.sleep(min(2.0 * self.dt, _HELLO_EVERY))
-        frames.start_session(self.line.peer, _new_session())
+        frames.start_session(self.handle.endpoint, _new_session())
         self._begin_session(former)
 
     def tick(self, timeout: float = 1.0) -> int:
@@ -202,10 +206,10 @@ class WireDevice:
             where none has come for ``timeout`` seconds.
         """
         self._check_open()
-        counters = self.line.peer.counters
-        self._fetch(0.0)
+        counters = self.handle.endpoint.counters
+        self._read_measurement(0.0)
         before = counters[frames.ACCEPTED]
-        self._fetch(timeout)
+        self._read_measurement(timeout)
         if counters[frames.ACCEPTED] == before:
             raise ConnectionError(f"{self.url}: no measurement has come for {timeout:g} s")
         return time.monotonic_ns()
@@ -229,25 +233,25 @@ class WireDevice:
 
     @property
     def _session(self) -> int:
-        return int(self.line.peer.numbers[frames.SESSION])
+        return int(self.handle.endpoint.numbers[frames.SESSION])
 
     def _begin_session(self, former: int = 0) -> None:
         """Say hello until there is a welcome; a goodbye to the ``former`` session may have been lost, and is said again."""
-        line, refused = self.line, 0
+        handle, refused = self.handle, 0
         apart = max(_HELLO_EVERY, 2.0 * self.dt)
         deadline = time.monotonic() + max(self._timeout, 2.0 * apart)
         while time.monotonic() < deadline:
             self._say(frames.HELLO, self.dt, self._session)
             again = time.monotonic() + apart
             while (left := again - time.monotonic()) > 0.0:
-                await_news(line.link, round(1e9 * left))
-                while (size := receive(line.link, line.inbox)) >= 0:
+                wait_for_frame(handle.transport, round(1e9 * left))
+                while (size := receive(handle.transport, handle.inbox)) >= 0:
                     if not (
-                        frames.well_formed(line.inbox, size, line.peer.counters)
-                        and _is_ours(line, line.inbox, frames.WELCOME)
+                        frames.is_well_formed(handle.inbox, size, handle.endpoint.counters)
+                        and _is_ours(handle, handle.inbox, frames.WELCOME)
                     ):
                         continue
-                    refused, dt = int(line.inbox.words[8]), float(line.inbox.doubles[3])
+                    refused, dt = int(handle.inbox.words[8]), float(handle.inbox.doubles[3])
                     if refused & frames.OTHER_DT:
                         raise ValueError(
                             f"dt = {self.dt!r} s: the device at {self.url} ticks every {dt!r} s; both must be the same"
@@ -263,21 +267,21 @@ class WireDevice:
         raise ConnectionError(f"{self.url}: no device answers; {self._hint}")
 
     def _say(self, kind: int, value: float, session: int) -> None:
-        line = self.line
-        frames.write_frame(line.outbox, kind, session, 0, 0, time.monotonic_ns(), value, 0)
-        send(line.link, line.outbox)
+        handle = self.handle
+        frames.write_frame(handle.outbox, kind, session, 0, 0, time.monotonic_ns(), value, 0)
+        send(handle.transport, handle.outbox)
 
-    def _fetch(self, seconds: float) -> float:
+    def _read_measurement(self, seconds: float) -> float:
         """Return the newest measurement, or the first that comes within so many seconds."""
         if not self._compiled:  # that may take seconds, and is not to be part of a cycle
             self._compiled = True
             for entry, arguments in ((fetch_one, (self._clock, 0)), (put_one, (0.0,))):
-                for_types(entry, self.line).compile(tuple(map(typeof, (self.line, *arguments))))
+                for_types(entry, self.handle).compile(tuple(map(typeof, (self.handle, *arguments))))
         y, _ = self._call(fetch_one, self._clock, time.monotonic_ns() + round(1e9 * seconds))
         return float(y)
 
     def _call(self, entry: Any, *arguments: Any) -> Any:
-        return for_types(entry, self.line, *arguments)(self.line, *arguments)
+        return for_types(entry, self.handle, *arguments)(self.handle, *arguments)
 
     def _check_open(self) -> None:
         if not self._open:

@@ -1,7 +1,7 @@
 """One end of a wire: frames go in and come out. Devices and the rig are written once, over what is declared here.
 
-A link is a NamedTuple; for its type ``receive``, ``send``, ``answer``, ``adopt`` and ``await_news`` are registered: see ``udp.py`` for a
-complete example. None of them allocates, and only ``await_news`` waits.
+A transport is a NamedTuple; for its type ``receive``, ``send``, ``reply``, ``connect_to_sender`` and ``wait_for_frame`` are registered: see ``udp.py`` for a
+complete example. None of them allocates, and only ``wait_for_frame`` waits.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ _ppoll = external("ppoll", "int", "address", "long", "address", "address")
 
 
 @generic
-def receive(link: Any, frame: Buffer) -> int:
+def receive(transport: Any, frame: Buffer) -> int:
     """Write what came next into ``frame`` and return how many bytes it has; -1 where nothing is waiting."""
     raise TypeError
 
 
 @generic
-def send(link: Any, frame: Buffer) -> int:
+def send(transport: Any, frame: Buffer) -> int:
     """Send a frame to the other side; return 0, or another number where it can't be reached."""
     raise TypeError
 
 
 @generic
-def answer(link: Any, frame: Buffer) -> int:
+def reply(transport: Any, frame: Buffer) -> int:
     """Send a frame to whoever sent what was received last; return as ``send``."""
     raise TypeError
 
 
 @generic
-def adopt(link: Any) -> None:
+def connect_to_sender(transport: Any) -> None:
     """Make whoever sent what was received last the other side."""
     raise TypeError
 
 
 @generic
-def await_news(link: Any, nanoseconds: int) -> None:
+def wait_for_frame(transport: Any, nanoseconds: int) -> None:
     """Wait until something may have come, at most so long [ns]."""
     raise TypeError
 
