@@ -11,8 +11,8 @@ import pytest
 import quell as ql
 from quell.features import RBF, Bias, Friction, Input, Polynomial, State
 from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.nlms import NlmsMemory, NlmsRule
-from quell.learners.regression.regression import improve, renew
 from quell.learners.regression.rls import RlsMemory, RlsRule
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)
@@ -29,7 +29,7 @@ def taught(rule: Any, memory: Any, features: np.ndarray, targets: np.ndarray) ->
     """θ after all pairs."""
     theta = np.zeros(features.shape[1])
     for row, target in zip(features, targets, strict=True):
-        improve(rule, memory, theta, row, target - theta @ row, 1.0)
+        update_theta(rule, memory, theta, row, target - theta @ row, 1.0)
     return theta
 
 
@@ -51,12 +51,12 @@ def test_rls_forgets_along_what_it_sees_and_nowhere_else() -> None:
     direction, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
     for _ in range(5):
         before = direction @ memory.covariance @ direction / rule.noise
-        improve(rule, memory, np.zeros(2), direction, 0.0, 1.0)
+        update_theta(rule, memory, np.zeros(2), direction, 0.0, 1.0)
         after = direction @ memory.covariance @ direction / rule.noise
         assert after == pytest.approx(before / (0.99 * (1.0 + before)), rel=1e-12)
         assert across @ memory.covariance @ across == pytest.approx(9.0, rel=1e-12)
     for _ in range(5000):
-        improve(rule, memory, np.zeros(2), direction, 0.0, 1.0)
+        update_theta(rule, memory, np.zeros(2), direction, 0.0, 1.0)
     assert direction @ memory.covariance @ direction / rule.noise == pytest.approx(
         0.01 / 0.99, rel=1e-6
     )
@@ -67,9 +67,9 @@ def test_rls_follows_what_drifts_in_its_memory_time(rng: np.random.Generator) ->
     rule, memory = rls(1, forget=0.01)
     theta = np.zeros(1)
     for _ in range(2000):
-        improve(rule, memory, theta, np.ones(1), -theta[0], 1.0)
+        update_theta(rule, memory, theta, np.ones(1), -theta[0], 1.0)
     for _ in range(100):
-        improve(rule, memory, theta, np.ones(1), 1.0 - theta[0], 1.0)
+        update_theta(rule, memory, theta, np.ones(1), 1.0 - theta[0], 1.0)
     assert theta[0] == pytest.approx(1.0 - math.exp(-1.0), abs=0.01)
 
 
@@ -79,7 +79,7 @@ def test_the_uncertainty_of_rls_is_bounded_without_excitation(rng: np.random.Gen
     theta = np.zeros(3)
     for k in range(20_000):
         features = np.ones(3) + (1e-3 if k % 2 else 1e-6) * rng.normal(size=3)
-        improve(rule, memory, theta, features * (1e-4 if k % 3 else 1.0), rng.normal(), 1.0)
+        update_theta(rule, memory, theta, features * (1e-4 if k % 3 else 1.0), rng.normal(), 1.0)
     assert np.trace(memory.covariance) <= 3 * rule.prior * (1.0 + 1e-9)
     assert np.min(np.linalg.eigvalsh(memory.covariance)) > 0.0
     assert np.all(np.abs(theta) < 1e3)
@@ -89,7 +89,7 @@ def test_nlms_projects_on_what_it_sees(rng: np.random.Generator) -> None:
     """With the step 1 and no regularisation the new θ explains the sample, and is the nearest that does (Haykin, section 7.1)."""
     features, theta = rng.normal(size=5), rng.normal(size=5)
     before = theta.copy()
-    improve(
+    update_theta(
         NlmsRule(1.0, 0.0), NlmsMemory(np.zeros(0)), theta, features, 2.0 - theta @ features, 1.0
     )
     assert theta @ features == pytest.approx(2.0, rel=1e-12)
@@ -216,7 +216,7 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
     restart(design, memory)
     np.testing.assert_array_equal(memory.theta, np.zeros(3))
     np.testing.assert_array_equal(memory.rule.covariance, learner.memory(design).rule.covariance)
-    renew(NlmsRule(1.0, 1.0), NlmsMemory(np.zeros(0)))
+    reset_uncertainty(NlmsRule(1.0, 1.0), NlmsMemory(np.zeros(0)))
 
 
 @pytest.mark.parametrize(

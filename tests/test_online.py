@@ -12,7 +12,7 @@ import quell as ql
 from quell.features import Bias, State
 from quell.learners.base import adapt, commit, predict, restart
 from quell.learners.lag import group_delay, lag_memory, lag_of, lag_push
-from quell.learners.online.gaussian_process import Process
+from quell.learners.online.gaussian_process import GaussianProcessModel
 from quell.learners.online.model import infer, learn
 from quell.learners.online.network import Network
 from quell.learners.regression.rls import RlsRule, least_squares_gain
@@ -167,7 +167,7 @@ def test_a_network_says_nothing_before_it_has_learned() -> None:
 
 def test_a_process_fits_a_nonlinear_function_on_its_budget(rng: np.random.Generator) -> None:
     """Far from its points it says nothing."""
-    design, memory, left = fitted(Process(40, 0.5, 1, math.inf, 0.05, 1e-3), 2000, rng)
+    design, memory, left = fitted(GaussianProcessModel(40, 0.5, 1, math.inf, 0.05, 1e-3), 2000, rng)
     assert left < 0.05
     assert memory.place[0] <= 40
     assert abs(infer(design, memory, np.array([50.0, 50.0]))) < 1e-12
@@ -179,7 +179,7 @@ def test_a_process_fits_a_nonlinear_function_on_its_budget(rng: np.random.Genera
 
 def test_a_process_is_a_gaussian_process_while_its_budget_lasts(rng: np.random.Generator) -> None:
     """Against the closed form: k(x)ᵀ (K + σ² I)⁻¹ y."""
-    model = Process(30, 0.2, 1, math.inf, 0.1, 1.0)
+    model = GaussianProcessModel(30, 0.2, 1, math.inf, 0.1, 1.0)
     design = model.design(2, 1.0)
     memory = model.memory(design)
     grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2), -1).reshape(-1, 2)
@@ -199,7 +199,7 @@ def test_a_process_is_a_gaussian_process_while_its_budget_lasts(rng: np.random.G
 
 def test_a_process_with_a_budget_of_one_still_works(rng: np.random.Generator) -> None:
     """The smallest there is."""
-    _, memory, _ = fitted(Process(1, 0.5, 1, 100.0, 0.1, 1.0), 200, rng)
+    _, memory, _ = fitted(GaussianProcessModel(1, 0.5, 1, 100.0, 0.1, 1.0), 200, rng)
     assert memory.place[0] == 1
     assert all(np.all(np.isfinite(array)) for array in memory)
 

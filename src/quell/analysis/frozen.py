@@ -141,7 +141,7 @@ def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
 
 
 def _from_state(controller: Any, state: Any) -> Frozen:
-    if hasattr(controller.learner, "outside"):
+    if hasattr(controller.learner, "external_fields"):
         raise ValueError(
             f"learner = {type(controller.learner).__name__}: a Python model is asked once a period and its answer held, "
             "so it has no gain at an instant; analyse the loop without it"

@@ -2,13 +2,13 @@
 
 from quell.learners.adapters import JaxModel, PythonModel, RiverModel, SklearnModel, TorchModel
 from quell.learners.base import Learner, NoLearner
-from quell.learners.gradient.gradient import BatchGradient
+from quell.learners.gradient.batch_gradient import BatchGradient
 from quell.learners.kalman.harmonic import Harmonic
 from quell.learners.kalman.kalman import Kalman
 from quell.learners.online.gaussian_process import GaussianProcess
+from quell.learners.online.learner import Online
 from quell.learners.online.model import Model, infer, learn
 from quell.learners.online.network import MLP
-from quell.learners.online.online import Online
 from quell.learners.regression.nlms import NLMS
 from quell.learners.regression.rls import RLS
 

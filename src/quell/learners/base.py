@@ -11,7 +11,7 @@ each sample the controller calls, in this order:
 
 ``restart`` is called where the loop starts anew from rest, ``coefficients`` where a run is recorded, ``trouble`` after ``adapt``.
 
-A learner whose memory stands for something outside of it, a Python object say, also has ``outside``, the names of the fields that do so,
+A learner whose memory stands for something outside of it, a Python object say, also has ``external_fields``, the names of the fields that do so,
 ``snapshot(memory)``, which returns copies of what they stand for by name, and ``recall(memory, snapshots)``, which puts copies of those in
 its place or says that they do not fit. The state that a controller shows has the snapshots instead of those fields.
 """
@@ -87,7 +87,7 @@ def _no_trouble(learner: Any, memory: Any) -> int:
     return 0
 
 
-def tried(learner: Any, observer: ESO, omega_c: float) -> Any:
+def validated_design(learner: Any, observer: ESO, omega_c: float) -> Any:
     """Return ``learner.design(observer, omega_c)``; a learner of the user's own has to take one sample, interpreted.
 
     Raises

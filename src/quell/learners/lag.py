@@ -26,7 +26,7 @@ from quell.observers.response import f_lag, f_learned_response, response, scaled
 from quell.types import Matrix, Vector
 
 # In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
-WATCH = 2.0
+STARTUP_LAGS = 2.0
 
 
 class Lag(NamedTuple):
@@ -69,9 +69,9 @@ NO_LAG = Lag(0.0, 0.0, np.zeros(0), False)
 """For where nothing is fed forward: it shows nothing."""
 
 
-def watch_samples(observer: ESO) -> int:
+def startup_samples(observer: ESO) -> int:
     """Return how many samples after a start from rest nothing is learned: the observer's own initial error is in Δf̂ then."""
-    return round(WATCH * observer.lag_time / observer.dt)
+    return round(STARTUP_LAGS * observer.lag_time / observer.dt)
 
 
 def lag_memory(lag: Any, count: int) -> Matrix:

@@ -1,12 +1,14 @@
-"""What of the state and the control signal stands clear of noise.
+"""A gate that separates motion from measurement noise.
 
-The observer's estimates of higher derivatives are noisy, and at rest all of them are nothing but noise. A regression on noise finds
-something, slowly and confidently. So a signal counts as moving only while its variance is ``CLEAR²`` times what the measurement noise,
-seen in y − x̂_1, puts into it; rounding counts as noise too. Of a signal that does not move its running mean is shown. Means are
-exponential ones, over ten lags of the observer.
+The observer's estimates of higher derivatives are noisy, and at rest they are only noise. A regression
+on noise slowly finds coefficients that mean nothing, and trusts them. So a signal counts as moving only
+while its variance exceeds ``SIGNAL_TO_NOISE²`` times the variance that measurement noise, estimated from
+y − x̂_1, causes in it; rounding counts as noise. A signal that does not move is replaced by its running
+mean. Means are exponential, over ``AVERAGING_LAGS`` lags of the observer.
 
-The same noise is in what is to be learned, f as the observer shows it, and there it grows with the power n + 1 of omega_o. ``trust`` weighs
-it with what a motion at a frequency of the plant would show, ``F = ω^n |x_1|``.
+The same noise disturbs the learning target, f as the observer shows it, and grows there with the power
+n + 1 of omega_o. ``confidence`` compares it with what a motion at a frequency ω of the plant would show,
+``F = ω^n |x_1|``.
 """
 
 from __future__ import annotations
@@ -21,113 +23,115 @@ from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
 from quell.types import Vector
 
-# How many times its noise a signal must be. White noise of each sample makes 1, noise held for ten samples 3.
-CLEAR = 6.0
-# So many standard deviations of noise count against what is to be learned.
-_SURE = 3.0
-# No sensor resolves better than this share of what it measures.
+# Least ratio of a moving signal's standard deviation to that of its noise. White noise has ratio 1,
+# noise that is held for ten samples 3; twice the latter, not tuned further.
+SIGNAL_TO_NOISE = 6.0
+# Standard deviations of noise in f that ``confidence`` counts: the usual three-sigma bound.
+_NOISE_DEVIATIONS = 3.0
+# Rounding in y counts as noise of this share of y: no sensor resolves better.
 RESOLUTION = 1e-8
-# Means are taken over so many lags of the observer.
-AVERAGE = 10.0
+# Averaging time of means and variances in lags of the observer; chosen by hand, not tuned further.
+AVERAGING_LAGS = 10.0
 
 
-class Sight(NamedTuple):
-    """Parameters, for a plant of order n."""
+class NoiseGate(NamedTuple):
+    """Parameters for a plant of order n."""
 
     threshold: Vector
-    """Least variance of x_1 … x_n and u, in units of that of y − x̂_1 (n + 1,)."""
+    """Least variance of x_1 … x_n and u when they move, in units of that of y − x̂_1 (n + 1,)."""
     forget: float
     """dt over the averaging time."""
     f_noise: float
-    """Variance that white noise of unit variance in y leaves in f̂."""
+    """Variance that white noise of unit variance in y causes in f̂."""
     power: float
     """ω^n."""
 
 
-class SightMemory(NamedTuple):
-    """State."""
+class NoiseGateMemory(NamedTuple):
+    """Running means of the signals and of the noise."""
 
     mean: Vector
     """Of x_1 … x_n and u (n + 1,)."""
     variance: Vector
     """(n + 1,)."""
     noise: Vector
-    """(2,): mean square of y − x̂_1; how much of the mean is filled."""
+    """(2,): mean square of y − x̂_1; sum of the weights in that mean, which grows from 0 to 1."""
 
 
-def noise_shown(observer: ESO) -> Vector:
-    """Return ``noise_gains``, as multiples of what ``y − x̂_1`` shows of the noise in y.
+def relative_noise(observer: ESO) -> Vector:
+    """Return ``noise_gains`` divided by the part of the noise in y that ``y − x̂_1`` shows.
 
     Raises
     ------
     ValueError
-        for an observer of reduced form, whose x̂_1 is y: what is noise can not be told there.
+        for an observer of reduced form: its x̂_1 is y, so y − x̂_1 does not show the noise.
     """
     if observer.form == "reduced":
         raise ValueError(
-            "form = 'reduced': x̂_1 = y shows this learner no noise to tell motion from; use form='current'"
+            "form = 'reduced': x̂_1 = y, so this learner cannot separate motion from noise; "
+            "use form='current'"
         )
     return noise_gains(observer)
 
 
-def sight(observer: ESO, frequency: float) -> Sight:
-    """Return the thresholds for an observer and a frequency the plant has [rad/s]."""
-    noise = noise_shown(observer)
+def noise_gate(observer: ESO, frequency: float) -> NoiseGate:
+    """Return the gate for an observer and a frequency of the plant [rad/s]."""
+    noise = relative_noise(observer)
     f_noise = float(noise[-1])
-    noise[-1] /= observer.b0**2  # what noise leaves in f̂ is also in b0 u
-    return Sight(
-        CLEAR**2 * noise,
-        -math.expm1(-observer.dt / (AVERAGE * observer.lag_time)),
+    noise[-1] /= observer.b0**2  # noise in f̂ reaches u through u = −f̂/b0
+    return NoiseGate(
+        SIGNAL_TO_NOISE**2 * noise,
+        -math.expm1(-observer.dt / (AVERAGING_LAGS * observer.lag_time)),
         f_noise,
         frequency**observer.f_degree,
     )
 
 
-def sight_memory(order: int) -> SightMemory:
-    """Return a state before anything was seen."""
-    return SightMemory(np.zeros(order + 1), np.zeros(order + 1), np.zeros(2))
+def noise_gate_memory(order: int) -> NoiseGateMemory:
+    """Return the state before the first sample."""
+    return NoiseGateMemory(np.zeros(order + 1), np.zeros(order + 1), np.zeros(2))
 
 
 @kernel
-def look(sight: Sight, memory: SightMemory, seen: Vector, y: float, u: float) -> bool:
-    """Take note of a sample; return whether anything moves."""
+def update_gate(gate: NoiseGate, memory: NoiseGateMemory, seen: Vector, y: float, u: float) -> bool:
+    """Update the means with a sample; return whether any state moves."""
     rounding, error = RESOLUTION * y, y - seen[0]
-    memory.noise[0] += sight.forget * (error * error + rounding * rounding - memory.noise[0])
-    memory.noise[1] += sight.forget * (1.0 - memory.noise[1])
+    memory.noise[0] += gate.forget * (error * error + rounding * rounding - memory.noise[0])
+    memory.noise[1] += gate.forget * (1.0 - memory.noise[1])
     order = memory.mean.size - 1
     moves = False
     for i in range(order + 1):
         away = (seen[i] if i < order else u) - memory.mean[i]
-        memory.mean[i] += sight.forget * away
-        memory.variance[i] += sight.forget * (away * away - memory.variance[i])
-        # u alone does not count: without a motion it is an answer to a load.
-        moves = moves or (i < order and is_clear(sight, memory, i))
+        memory.mean[i] += gate.forget * away
+        memory.variance[i] += gate.forget * (away * away - memory.variance[i])
+        # u alone does not count: without motion it is the answer to a load.
+        moves = moves or (i < order and is_moving(gate, memory, i))
     return moves
 
 
 @kernel
-def is_clear(sight: Sight, memory: SightMemory, i: int) -> bool:
+def is_moving(gate: NoiseGate, memory: NoiseGateMemory, i: int) -> bool:
     """Return whether signal ``i`` moves."""
-    return memory.variance[i] * memory.noise[1] > sight.threshold[i] * memory.noise[0]
+    return memory.variance[i] * memory.noise[1] > gate.threshold[i] * memory.noise[0]
 
 
 @kernel
-def clear_of_noise(sight: Sight, memory: SightMemory, i: int, value: float) -> float:
-    """Return ``value`` of signal ``i``, or its mean where it does not move."""
-    return value if is_clear(sight, memory, i) else memory.mean[i]
+def gated(gate: NoiseGate, memory: NoiseGateMemory, i: int, value: float) -> float:
+    """Return ``value`` of signal ``i`` if it moves, else its mean."""
+    return value if is_moving(gate, memory, i) else memory.mean[i]
 
 
 @kernel
-def trust(sight: Sight, memory: SightMemory, size: float) -> float:
-    """Return the share of F² in ``F² + (3σ)²``, σ being the noise in f; ``size`` is that of x_1."""
-    motion = sight.power * size
-    noise = _SURE * _SURE * sight.f_noise * memory.noise[0]
+def confidence(gate: NoiseGate, memory: NoiseGateMemory, size: float) -> float:
+    """Return ``F²/(F² + (3σ)²)`` with the noise σ in f; ``size`` is that of x_1."""
+    motion = gate.power * size
+    noise = _NOISE_DEVIATIONS * _NOISE_DEVIATIONS * gate.f_noise * memory.noise[0]
     return motion * motion * memory.noise[1] / (motion * motion * memory.noise[1] + noise)
 
 
 @kernel
-def look_anew(memory: SightMemory) -> None:
-    """Go back to the state before anything was seen."""
+def reset_gate(memory: NoiseGateMemory) -> None:
+    """Go back to the state before the first sample."""
     for i in range(memory.mean.size):
         memory.mean[i] = memory.variance[i] = 0.0
     memory.noise[0] = memory.noise[1] = 0.0

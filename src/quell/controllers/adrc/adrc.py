@@ -24,7 +24,7 @@ from quell.guard import (
     UnguardedMemory,
     write_channels,
 )
-from quell.learners.base import Learner, NoLearner, coefficients, tried
+from quell.learners.base import Learner, NoLearner, coefficients, validated_design
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
@@ -129,7 +129,7 @@ class ADRC(HandOver):
             fade=math.exp(-self.omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,
-            learner=tried(
+            learner=validated_design(
                 self.learner, observer, self._learned_at
             ),  # its scales stay, whatever the loop is retuned to
             lag=NO_LAG if isinstance(self.learner, NoLearner) else lag_of(observer),
@@ -216,7 +216,7 @@ class ADRC(HandOver):
 
     @property
     def _outside(self) -> tuple[str, ...]:
-        return tuple(f"learner.{name}" for name in getattr(self.learner, "outside", ()))
+        return tuple(f"learner.{name}" for name in getattr(self.learner, "external_fields", ()))
 
     def _snapshots(self, state: AdrcState) -> dict[str, Any]:
         if not self._outside:

@@ -14,8 +14,8 @@ from quell import checks
 from quell.features import Features, State
 from quell.features.base import checked_design
 from quell.learners.adapters.instances import Instance, address, enter, finite_number, instance_of
-from quell.learners.adapters.loop import Batch, PythonDesign, PythonMemory
-from quell.learners.online.online import Online
+from quell.learners.adapters.kernels import Batch, PythonDesign, PythonMemory
+from quell.learners.online.learner import Online
 from quell.observers.eso import ESO
 
 
@@ -76,7 +76,7 @@ class PythonModel:
         for arguments that fit nothing; in ``design``, where a copy of the model, tried on a few pairs, does not learn and predict.
     """
 
-    outside = ("model",)
+    external_fields = ("model",)
     """The field of the memory that stands for the model."""
 
     def __init__(self, model: Any, **options: Unpack[Options]) -> None:

@@ -20,7 +20,7 @@ follows the noise folds its high frequencies down to where the loop is sensitive
 is faster.
 
 *What teaches.* The observer's estimates of higher derivatives are noisy. At rest they are nothing but noise, and regression on noise finds
-something, slowly and confidently. So a feature teaches only while its variance is ``CLEAR²`` times what the measurement noise, seen in
+something, slowly and confidently. So a feature teaches only while its variance is ``SIGNAL_TO_NOISE²`` times what the measurement noise, seen in
 y − x̂_1, puts into it; else its place in φ̃ is zero. Rounding counts as noise too. What is constant in a feature is the bias's business,
 where there is one: φ̃ has the feature less its running mean, and the bias gives up at the mean what a coefficient gains.
 
@@ -40,8 +40,8 @@ from quell import checks
 from quell.kernels.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
-from quell.learners.lag import WATCH, lag_memory, lag_of, lag_push
-from quell.learners.noise_gate import AVERAGE, CLEAR, RESOLUTION, noise_shown
+from quell.learners.lag import STARTUP_LAGS, lag_memory, lag_of, lag_push
+from quell.learners.noise_gate import AVERAGING_LAGS, RESOLUTION, SIGNAL_TO_NOISE, relative_noise
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -153,7 +153,7 @@ def _adapt(
                 if variance[i] > learner.threshold[i] * noise
                 else 0.0
             )
-    if moment[_SINCE] <= WATCH * learner.lag_time:
+    if moment[_SINCE] <= STARTUP_LAGS * learner.lag_time:
         return
     spread = 0.0
     for i in range(size):
@@ -369,8 +369,8 @@ class Kalman:
         frequency = omega_c if self.frequency is None else float(self.frequency)
         scale = frequency ** -np.arange(n, dtype=np.float64)
         # What noise in y leaves in x̂_i; what it leaves in f̂ is also in b0 u.
-        noise = noise_shown(observer)
-        threshold = (CLEAR * np.append(scale, 1.0)) ** 2 * noise
+        noise = relative_noise(observer)
+        threshold = (SIGNAL_TO_NOISE * np.append(scale, 1.0)) ** 2 * noise
         size = self.prior * frequency**observer.f_degree
         oscillators, pair_bandwidth = self.oscillators(observer, omega_c)
         pairs = 2 * oscillators.omega.size
@@ -412,7 +412,7 @@ class Kalman:
             slope_low=self.gain_interval[0] - 1.0,
             slope_high=self.gain_interval[1] - 1.0,
             dt=observer.dt,
-            forget=-math.expm1(-observer.dt / (AVERAGE * lag_time)),
+            forget=-math.expm1(-observer.dt / (AVERAGING_LAGS * lag_time)),
             lag_time=lag_time,
         )
 

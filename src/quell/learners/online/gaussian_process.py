@@ -22,8 +22,8 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
+from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
-from quell.learners.online.online import Online
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -31,7 +31,7 @@ from quell.types import Matrix, Vector
 _NEW = 1e-2
 
 
-class ProcessDesign(NamedTuple):
+class GaussianProcessDesign(NamedTuple):
     """Parameters of a process with a budget of M points."""
 
     inputs: int
@@ -46,7 +46,7 @@ class ProcessDesign(NamedTuple):
     """Learn from every so-many-th pair."""
 
 
-class ProcessMemory(NamedTuple):
+class GaussianProcessMemory(NamedTuple):
     """State; room for one point more than the budget, m features."""
 
     points: Matrix
@@ -72,7 +72,9 @@ class ProcessMemory(NamedTuple):
 
 
 @kernel
-def _likeness(model: ProcessDesign, memory: ProcessMemory, i: int, features: Vector) -> float:
+def _likeness(
+    model: GaussianProcessDesign, memory: GaussianProcessMemory, i: int, features: Vector
+) -> float:
     distance = 0.0
     for j in range(features.size):
         away = features[j] - memory.points[i, j]
@@ -81,20 +83,22 @@ def _likeness(model: ProcessDesign, memory: ProcessMemory, i: int, features: Vec
 
 
 @kernel
-def _count(model: ProcessDesign, memory: ProcessMemory) -> int:
+def _count(model: GaussianProcessDesign, memory: GaussianProcessMemory) -> int:
     return min(max(int(memory.place[0]), 0), model.budget)
 
 
-@infer.register(ProcessDesign)
-def _infer(model: ProcessDesign, memory: ProcessMemory, features: Vector) -> float:
+@infer.register(GaussianProcessDesign)
+def _infer(model: GaussianProcessDesign, memory: GaussianProcessMemory, features: Vector) -> float:
     output = 0.0
     for i in range(_count(model, memory)):
         output += memory.weights[i] * _likeness(model, memory, i, features)
     return output
 
 
-@learn.register(ProcessDesign)
-def _learn(model: ProcessDesign, memory: ProcessMemory, features: Vector, target: float) -> None:
+@learn.register(GaussianProcessDesign)
+def _learn(
+    model: GaussianProcessDesign, memory: GaussianProcessMemory, features: Vector, target: float
+) -> None:
     memory.place[1] += 1.0
     if memory.place[1] < model.every or not is_finite(target):
         return
@@ -142,7 +146,7 @@ def _learn(model: ProcessDesign, memory: ProcessMemory, features: Vector, target
 
 
 @kernel
-def _fade(model: ProcessDesign, memory: ProcessMemory, count: int) -> None:
+def _fade(model: GaussianProcessDesign, memory: GaussianProcessMemory, count: int) -> None:
     """Go back towards the prior."""
     if model.forget == 0.0:
         return
@@ -158,7 +162,7 @@ def _fade(model: ProcessDesign, memory: ProcessMemory, count: int) -> None:
 
 @kernel
 def _join(
-    memory: ProcessMemory,
+    memory: GaussianProcessMemory,
     count: int,
     features: Vector,
     novelty: float,
@@ -183,7 +187,7 @@ def _join(
 
 
 @kernel
-def _weigh(memory: ProcessMemory, count: int) -> None:
+def _weigh(memory: GaussianProcessMemory, count: int) -> None:
     for i in range(count):
         total = 0.0
         for j in range(count):
@@ -192,7 +196,7 @@ def _weigh(memory: ProcessMemory, count: int) -> None:
 
 
 @kernel
-def _leave(memory: ProcessMemory, count: int) -> None:
+def _leave(memory: GaussianProcessMemory, count: int) -> None:
     """Remove the point whose loss changes the mean least; the last one takes its place."""
     least, out, last = math.inf, count - 1, count - 1
     for i in range(count):
@@ -218,7 +222,7 @@ def _leave(memory: ProcessMemory, count: int) -> None:
         memory.covariance[i, out] = memory.covariance[i, last]
 
 
-class Process:
+class GaussianProcessModel:
     """The model behind ``GaussianProcess``: see there.
 
     Parameters
@@ -247,10 +251,10 @@ class Process:
         self.noise = checks.positive("noise", noise)
         self.noise_time = checks.positive("noise_time", noise_time, "s")
 
-    def design(self, features: int, dt: float) -> ProcessDesign:
+    def design(self, features: int, dt: float) -> GaussianProcessDesign:
         """Return the parameters for so many features and a sample time [s]."""
         step = self.every * dt
-        return ProcessDesign(
+        return GaussianProcessDesign(
             inputs=features,
             budget=self.budget,
             weight=0.5 / self.length**2,
@@ -259,10 +263,10 @@ class Process:
             every=self.every,
         )
 
-    def memory(self, parameters: ProcessDesign) -> ProcessMemory:
+    def memory(self, parameters: GaussianProcessDesign) -> GaussianProcessMemory:
         """Return an empty dictionary."""
         size = parameters.budget + 1
-        return ProcessMemory(
+        return GaussianProcessMemory(
             points=np.zeros((size, parameters.inputs)),
             kernel=np.zeros((size, size)),
             inverse=np.zeros((size, size)),
@@ -325,7 +329,7 @@ class GaussianProcess(Online):
         self.memory_time = (
             None if memory_time is None else checks.time_constant("memory_time", memory_time)
         )
-        model = Process(budget, length, every, 1.0, noise, 1.0)
+        model = GaussianProcessModel(budget, length, every, 1.0, noise, 1.0)
         super().__init__(
             model,
             State() if features is None else features,
@@ -334,10 +338,10 @@ class GaussianProcess(Online):
             bias_bandwidth=bias_bandwidth,
         )
 
-    def fitted_model(self, observer: ESO, omega_c: float) -> Process:
+    def fitted_model(self, observer: ESO, omega_c: float) -> GaussianProcessModel:
         """Return the process with memory and correlation of noise as observer and controller want them."""
-        model: Process = self.model
-        return Process(
+        model: GaussianProcessModel = self.model
+        return GaussianProcessModel(
             model.budget,
             model.length,
             model.every,

@@ -38,7 +38,7 @@ def learn(model: Any, memory: Any, features: Vector, target: float) -> None:
     raise TypeError
 
 
-def tried(model: Any, features: int, dt: float) -> Any:
+def validated_design(model: Any, features: int, dt: float) -> Any:
     """Return ``model.design(features, dt)``; a model of the user's own has to infer and learn once, interpreted, on a memory of its own.
 
     Raises

@@ -17,8 +17,8 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
+from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
-from quell.learners.online.online import Online
 from quell.learners.regression.rls import RlsRule, least_squares_gain
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector

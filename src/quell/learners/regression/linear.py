@@ -10,9 +10,9 @@ from quell import checks
 from quell.features import Bias, Features, State
 from quell.features.base import checked_design, write
 from quell.features.scaling import scaling
-from quell.learners.lag import lag_memory, lag_of, watch_samples
-from quell.learners.noise_gate import sight, sight_memory
-from quell.learners.regression.regression import LinearDesign, LinearMemory
+from quell.learners.lag import lag_memory, lag_of, startup_samples
+from quell.learners.noise_gate import noise_gate, noise_gate_memory
+from quell.learners.regression.kernels import LinearDesign, LinearMemory
 from quell.observers.eso import ESO
 from quell.types import Matrix
 
@@ -85,7 +85,7 @@ class Linear:
         return LinearDesign(
             features=features,
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
-            sight=sight(observer, self.frequency or omega_c),
+            gate=noise_gate(observer, self.frequency or omega_c),
             lag=lag_of(observer),
             rule=self.rule(observer, omega_c, p),
             constant=constant,
@@ -98,7 +98,7 @@ class Linear:
                 * observer.dt,
                 1.0,
             ),
-            watch=watch_samples(observer),
+            watch=startup_samples(observer),
         )
 
     def memory(self, parameters: LinearDesign) -> LinearMemory:
@@ -117,7 +117,7 @@ class Linear:
             chain=lag_memory(parameters.lag, p),
             filtered=np.zeros(p),
             place=np.zeros(4),
-            sight=sight_memory(n),
+            gate=noise_gate_memory(n),
             rule=self.rule_memory(parameters.rule, p),
         )
 

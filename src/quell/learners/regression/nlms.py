@@ -3,7 +3,7 @@
     θ ← θ + rate dt · φ ε / (ρ + φ·φ)
 
 where ε is the error and φ the filtered features. Along φ the error decays as ``exp(−rate t)``, whatever the features' size and dt; slower
-where noise hides it (``sight.trust``).
+where noise hides it (``noise_gate.confidence``).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 from quell import checks
 from quell.features import Features
+from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.linear import Linear
-from quell.learners.regression.regression import improve, renew
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -36,7 +36,7 @@ class NlmsMemory(NamedTuple):
     """(0,)."""
 
 
-@improve.register(NlmsRule)
+@update_theta.register(NlmsRule)
 def _improve(
     rule: NlmsRule, memory: NlmsMemory, theta: Vector, features: Vector, error: float, sure: float
 ) -> None:
@@ -48,7 +48,7 @@ def _improve(
         theta[i] += step * features[i]
 
 
-@renew.register(NlmsRule)
+@reset_uncertainty.register(NlmsRule)
 def _renew(rule: NlmsRule, memory: NlmsMemory) -> None:
     pass
 

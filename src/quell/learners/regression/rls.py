@@ -9,7 +9,7 @@ as it is. Plain exponential forgetting lets P grow without bound where nothing i
 is left of the danger, a small φ that opens P by and by, is bounded: P grows no further once its trace is that of the prior.
 
 The variance of noise is ``R = τ/dt`` with the observer's lag τ = N/omega_o, for as long the noise in f̂ is correlated; so nothing depends
-on dt. Where measurement noise hides what is to be learned it is larger (``sight.trust``).
+on dt. Where measurement noise hides what is to be learned it is larger (``noise_gate.confidence``).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 from quell import checks
 from quell.features import Features
 from quell.kernels.dispatch import kernel
+from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.linear import Linear
-from quell.learners.regression.regression import improve, renew
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -80,14 +80,14 @@ def least_squares_gain(
 
 
 @kernel
-def open_covariance(rule: RlsRule, covariance: Matrix) -> None:
+def reset_covariance(rule: RlsRule, covariance: Matrix) -> None:
     """Set P back to the prior."""
     for i in range(covariance.shape[0]):
         for j in range(covariance.shape[1]):
             covariance[i, j] = rule.prior if i == j else 0.0
 
 
-@improve.register(RlsRule)
+@update_theta.register(RlsRule)
 def _improve(
     rule: RlsRule, memory: RlsMemory, theta: Vector, features: Vector, error: float, sure: float
 ) -> None:
@@ -97,9 +97,9 @@ def _improve(
         theta[i] += gain[i] * inverse * error
 
 
-@renew.register(RlsRule)
+@reset_uncertainty.register(RlsRule)
 def _renew(rule: RlsRule, memory: RlsMemory) -> None:
-    open_covariance(rule, memory.covariance)
+    reset_covariance(rule, memory.covariance)
 
 
 class RLS(Linear):

@@ -25,7 +25,7 @@ from quell import checks
 from quell.features import Features
 from quell.kernels.dispatch import is_finite
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.gradient.gradient_features import (
+from quell.learners.gradient.scaled_features import (
     FeatureGradientDesign,
     feature_gradient_design,
     feature_gradient_memory,

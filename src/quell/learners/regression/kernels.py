@@ -5,13 +5,13 @@ The features go through the observer's own lag filter (``lag.py``), so that
     Δf̂ + f_L^F = θ · φ^F + noise
 
 is a regression without lag bias, whatever the features. How θ is found is the business of a *rule*: a NamedTuple for whose type
-``improve`` and ``renew`` are registered (``nlms.py``, ``rls.py``).
+``update_theta`` and ``reset_uncertainty`` are registered (``nlms.py``, ``rls.py``).
 
 *Scaling.* States, u and f are divided by powers of two (``scaling.py``), and all is learned in these units. When one of them grows, θ and
 the filters are converted: for features that are products of signals exactly, so that nothing jumps. A nonlinear feature of such a state is
 another function from then on, and is learned anew. It happens in the first motions, and where a motion is larger than all before.
 
-*Rest.* What does not stand clear of noise is shown as its mean, and θ learns nothing while nothing moves (``sight.py``): a load that comes
+*Rest.* What does not stand clear of noise is shown as its mean, and θ learns nothing while nothing moves (``noise_gate.py``): a load that comes
 at rest says nothing about the features.
 
 *What is left.* A fast bias d follows what θ does not explain, ``d' = λ (Δf̂ + f_L^F − θ·φ^F − d)``, and is fed forward with it. θ does not
@@ -30,7 +30,14 @@ from quell.features.scaling import Scaling, update_scale
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.lag import lag_push
-from quell.learners.noise_gate import Sight, SightMemory, clear_of_noise, look, look_anew, trust
+from quell.learners.noise_gate import (
+    NoiseGate,
+    NoiseGateMemory,
+    confidence,
+    gated,
+    reset_gate,
+    update_gate,
+)
 from quell.types import Matrix, Vector
 
 # Where less than this share of what is seen can be a motion, nothing is learned from it: noise that is held is stronger than it looks.
@@ -41,7 +48,7 @@ _SINCE, _SCALED, _LEFT, _OPEN = range(4)
 
 
 @generic
-def improve(
+def update_theta(
     rule: Any, memory: Any, theta: Vector, features: Vector, error: float, sure: float
 ) -> None:
     """Move ``theta`` (p,) so that ``error = target − θ·features`` becomes smaller; ``sure``, in (0, 1], says how little noise is in it."""
@@ -49,7 +56,7 @@ def improve(
 
 
 @generic
-def renew(rule: Any, memory: Any) -> None:
+def reset_uncertainty(rule: Any, memory: Any) -> None:
     """Take what is known for uncertain again: the features have changed their meaning."""
     raise TypeError
 
@@ -59,7 +66,7 @@ class LinearDesign(NamedTuple):
 
     features: Any
     scaling: Scaling
-    sight: Sight
+    gate: NoiseGate
     lag: Any
     rule: Any
     constant: int
@@ -97,7 +104,7 @@ class LinearMemory(NamedTuple):
     """(p,): what they show."""
     place: Vector
     """(4,): samples since the start from rest; whether there is a scale; d, in the plant's units; after which sample θ learns."""
-    sight: SightMemory
+    gate: NoiseGateMemory
     rule: Any
 
 
@@ -111,7 +118,7 @@ def _adapt(
     f_plain: float,
 ) -> None:
     place, theta = memory.place, memory.theta
-    moves = look(learner.sight, memory.sight, seen, y, u_before)
+    moves = update_gate(learner.gate, memory.gate, seen, y, u_before)
     if place[_SINCE] <= learner.watch:
         return
     _rescale(learner, memory, seen, u_before, f_plain)
@@ -124,10 +131,10 @@ def _adapt(
     if not is_finite(error):
         return
     place[_LEFT] += learner.follow * (error * scale[scale.size - 1] - place[_LEFT])
-    sure = trust(learner.sight, memory.sight, scale[0])
+    sure = confidence(learner.gate, memory.gate, scale[0])
     if not moves or sure < _LEAST_SURE or place[_SINCE] <= place[_OPEN]:
         return
-    improve(learner.rule, memory.rule, theta, memory.filtered, error, sure)
+    update_theta(learner.rule, memory.rule, theta, memory.filtered, error, sure)
     if learner.with_u:
         last = theta.size - 1
         in_plant = scale[scale.size - 1] / scale[scale.size - 2]
@@ -186,7 +193,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
         for j in range(chain.shape[1]):
             chain[i, j] *= ratio
     if touched:
-        renew(learner.rule, memory.rule)
+        reset_uncertainty(learner.rule, memory.rule)
 
 
 @kernel
@@ -194,11 +201,11 @@ def _show(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float) -
     """Write the features of the state and u into ``memory.now``."""
     scale, shown = memory.scale, memory.shown
     for i in range(shown.size):
-        shown[i] = clear_of_noise(learner.sight, memory.sight, i, seen[i]) / scale[i]
+        shown[i] = gated(learner.gate, memory.gate, i, seen[i]) / scale[i]
     write(
         learner.features,
         shown,
-        clear_of_noise(learner.sight, memory.sight, shown.size, u) / scale[shown.size],
+        gated(learner.gate, memory.gate, shown.size, u) / scale[shown.size],
         memory.now,
     )
 
@@ -240,14 +247,14 @@ def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
         memory.filtered[i] = 0.0
         for j in range(memory.chain.shape[1]):
             memory.chain[i, j] = 0.0
-    look_anew(memory.sight)
+    reset_gate(memory.gate)
     finite = True
     for i in range(memory.theta.size):
         finite = finite and is_finite(memory.theta[i])
     if not finite:
         for i in range(memory.theta.size):
             memory.theta[i] = 0.0
-        renew(learner.rule, memory.rule)
+        reset_uncertainty(learner.rule, memory.rule)
 
 
 @coefficients.register(LinearDesign)

@@ -16,7 +16,7 @@ from quell.features.base import checked_design, unit, write
 from quell.features.scaling import Scaling, scaling, update_scale
 from quell.kernels.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.lag import watch_samples
+from quell.learners.lag import startup_samples
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -71,7 +71,7 @@ def feature_gradient_design(
         batch=batch,
         features=checked_design(features, observer.order),
         scaling=scaling(observer, frequency, False),
-        watch=watch_samples(observer),
+        watch=startup_samples(observer),
     )
 
 

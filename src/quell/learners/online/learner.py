@@ -9,7 +9,7 @@ and what it learns has no lag bias, up to second order in frequency over omega_o
 the approximation: ``regression.py``.)
 
 What does not stand clear of noise is shown as its mean, and nothing is learned while nothing moves, or where noise hides f
-(``sight.py``): at rest a black box would learn by heart what it sees, and forget the rest. A fast bias d follows what the model leaves, as
+(``noise_gate.py``): at rest a black box would learn by heart what it sees, and forget the rest. A fast bias d follows what the model leaves, as
 in ``regression.py``.
 
 A scale that grows, by a factor of two or more, makes the same motion look smaller to the model, which then has to learn anew what it
@@ -28,18 +28,18 @@ from quell.features.base import checked_design, write
 from quell.features.scaling import Scaling, scaling, update_scale
 from quell.kernels.dispatch import is_finite, kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.lag import group_delay, watch_samples
+from quell.learners.lag import group_delay, startup_samples
 from quell.learners.noise_gate import (
-    Sight,
-    SightMemory,
-    clear_of_noise,
-    look,
-    look_anew,
-    sight,
-    sight_memory,
-    trust,
+    NoiseGate,
+    NoiseGateMemory,
+    confidence,
+    gated,
+    noise_gate,
+    noise_gate_memory,
+    reset_gate,
+    update_gate,
 )
-from quell.learners.online.model import infer, learn, packed, tried
+from quell.learners.online.model import infer, learn, packed, validated_design
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -52,7 +52,7 @@ class OnlineDesign(NamedTuple):
 
     features: Any
     scaling: Scaling
-    sight: Sight
+    gate: NoiseGate
     model: Any
     follow: float
     """λ dt, at most 1."""
@@ -75,7 +75,7 @@ class OnlineMemory(NamedTuple):
     """The last features (D + 1, p)."""
     place: Vector
     """(3,): where the next row goes; samples since the start from rest; d, in the plant's units."""
-    sight: SightMemory
+    gate: NoiseGateMemory
     model: Any
     flat: Vector
     """All arrays of ``model``, end to end: the same memory."""
@@ -88,11 +88,11 @@ def show(learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, ou
     """Write the features of the estimates ``seen`` and of ``u`` into ``out`` (p,), scaled."""
     scale, scaled = memory.scale, memory.scaled
     for i in range(scaled.size):
-        scaled[i] = clear_of_noise(learner.sight, memory.sight, i, seen[i]) / scale[i]
+        scaled[i] = gated(learner.gate, memory.gate, i, seen[i]) / scale[i]
     write(
         learner.features,
         scaled,
-        clear_of_noise(learner.sight, memory.sight, scaled.size, u) / scale[scaled.size],
+        gated(learner.gate, memory.gate, scaled.size, u) / scale[scaled.size],
         out,
     )
 
@@ -112,7 +112,7 @@ def _adapt(
     u_before: float,
     f_plain: float,
 ) -> None:
-    moves = look(learner.sight, memory.sight, seen, y, u_before)
+    moves = update_gate(learner.gate, memory.gate, seen, y, u_before)
     if memory.place[_SINCE] <= learner.watch:
         return
     scale = memory.scale
@@ -130,7 +130,7 @@ def _adapt(
         )
         if is_finite(left):
             memory.place[_LEFT] += learner.follow * left
-    if moves and trust(learner.sight, memory.sight, scale[0]) > 0.5:
+    if moves and confidence(learner.gate, memory.gate, scale[0]) > 0.5:
         learn(learner.model, memory.model, features, f_plain / f_scale)
 
 
@@ -161,7 +161,7 @@ def _commit(
 @restart.register(OnlineDesign)
 def _restart(learner: OnlineDesign, memory: OnlineMemory) -> None:
     memory.place[_ROW] = memory.place[_SINCE] = memory.place[_LEFT] = 0.0
-    look_anew(memory.sight)
+    reset_gate(memory.gate)
     finite = True
     for i in range(memory.flat.size):
         finite = finite and abs(memory.flat[i]) <= 1e100
@@ -238,8 +238,8 @@ class Online:
         return OnlineDesign(
             features=checked_design(self.features, n),
             scaling=scaling(observer, self.frequency or omega_c, self.scale is not None),
-            sight=sight(observer, self.frequency or omega_c),
-            model=tried(
+            gate=noise_gate(observer, self.frequency or omega_c),
+            model=validated_design(
                 self.fitted_model(observer, omega_c), len(self.features.names(n)), observer.dt
             ),
             follow=min(
@@ -248,7 +248,7 @@ class Online:
                 1.0,
             ),
             delay=max(round(group_delay(observer)), 0),
-            watch=watch_samples(observer),
+            watch=startup_samples(observer),
         )
 
     def memory(self, parameters: OnlineDesign) -> OnlineMemory:
@@ -262,7 +262,7 @@ class Online:
             now=np.zeros(p),
             ring=np.zeros((parameters.delay + 1, p)),
             place=np.zeros(3),
-            sight=sight_memory(n),
+            gate=noise_gate_memory(n),
             model=model,
             flat=flat,
             fresh=flat.copy(),

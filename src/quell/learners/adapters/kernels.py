@@ -10,8 +10,8 @@ from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.function_pointers import call
 from quell.learners.adapters.instances import GIVEN_UP, PREDICTION, STATUS, UNTIL
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
+from quell.learners.online.learner import OnlineDesign, OnlineMemory, ready, show
 from quell.learners.online.model import infer, learn
-from quell.learners.online.online import OnlineDesign, OnlineMemory, ready, show
 from quell.types import Matrix, Status, Vector
 
 _FAILED = int(Status.LEARNER_FAILED)
