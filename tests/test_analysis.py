@@ -14,9 +14,9 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.analysis.frozen import Frozen
-from quell.analysis.sampled import sampled_plant
-from quell.controllers.linear.linear import LinearLaw
+from quell.analysis.frozen_learner import Frozen
+from quell.analysis.sampled_plant import sampled_plant
+from quell.controllers.linear.law import LinearLaw
 from quell.learners.base import NoLearnerMemory, predict
 
 PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.4]], [0.0, 2.0], [1.0, 0.0])

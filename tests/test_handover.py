@@ -242,14 +242,14 @@ def test_derivatives_are_fed_forward_in_manual_operation_too() -> None:
 
 def test_retuning_does_not_compile_again() -> None:
     """The types stay, so the step stays."""
-    from quell.controllers.compiled_step import bound_control
+    from quell.controllers.compiled_step import step_packed
 
     controller = ql.ADRC(OBSERVER, omega_c=2.0)
     controller.step(1.0, 0.0)
-    count = len(bound_control.signatures)
+    count = len(step_packed.signatures)
     controller.retune(omega_c=3.0)
     controller.step(1.0, 0.0)
-    assert len(bound_control.signatures) == count
+    assert len(step_packed.signatures) == count
 
 
 def test_increments_add_up_to_the_control_signal() -> None:

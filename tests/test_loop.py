@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.controllers.running import named_arrays
+from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compilations
 from quell.realtime.devices.base import PythonHandle, read_measurement, write_command
 from quell.realtime.loop.loop import run_cycles

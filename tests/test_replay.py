@@ -96,7 +96,7 @@ def test_a_start_under_load_is_replayed_when_the_load_is_told() -> None:
         y = measure(model, x)
         u = rig.step(0.7, y)
         told = np.zeros(sum(width for _, width in rig.channels))
-        ql.controllers.base.report(rig.parameters, rig._state, told)
+        ql.controllers.base.write_row(rig.parameters, rig._state, told)
         rows.append([k, 0.0, 0.0, 0.0, 0.0, 0.7, y, y, u, *told])
         advance(model, x, scratch, 0.0, u, np.array([-3.0]))
     run = trajectory_of(header_of(simulated(1.0), rig), np.array(rows))

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.controllers.base import applied, control, report
+from quell.controllers.base import control, set_applied_control, write_row
 from quell.realtime import Safety
 from quell.realtime.loop.outcome import told
 from quell.realtime.loop.supervisor import BEGAN, END, FLUSH, ZERO, Cause, Mode, changes
@@ -225,13 +225,13 @@ def _control(design: Broken, state: BrokenState, r: float, y: float) -> float:
     return 1.0 if state.samples[0] <= design.good else math.nan
 
 
-@applied.register(Broken)
-def _applied(design: Broken, state: BrokenState, u: float) -> None:
+@set_applied_control.register(Broken)
+def _set_applied_control(design: Broken, state: BrokenState, u: float) -> None:
     assert math.isfinite(u)
 
 
-@report.register(Broken)
-def _report(design: Broken, state: BrokenState, row: Any) -> None:
+@write_row.register(Broken)
+def _write_row(design: Broken, state: BrokenState, row: Any) -> None:
     pass
 
 

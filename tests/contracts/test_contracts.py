@@ -13,7 +13,7 @@ import pytest
 import quell as ql
 from quell import plants as plant_room
 from quell.controllers.base import control
-from quell.controllers.running import named_arrays as _named_arrays
+from quell.controllers.stateful import named_arrays as _named_arrays
 from quell.kernels.dispatch import compiled, for_types, interpreted
 from quell.learners.base import adapt, coefficients, commit, predict
 from quell.observers.base import begin, observe

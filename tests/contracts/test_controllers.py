@@ -16,8 +16,8 @@ import quell as ql
 from quell import controllers as room
 from quell.controllers import baselines as baseline_room
 from quell.controllers.adrc.law import F_LEARNED, U
-from quell.controllers.base import take_over
-from quell.controllers.running import named_arrays
+from quell.controllers.base import bumpless_transfer
+from quell.controllers.stateful import named_arrays
 from quell.observers.base import expected_measurement
 
 from .test_contracts import CHAIN, SCENARIO, check_run
@@ -146,7 +146,7 @@ def test_a_controller_takes_over_without_a_bump(name: str) -> None:
     for _ in range(500):
         controller.step(0.7, 0.7)
         controller.applied(0.0)
-    take_over(controller.parameters, controller._state)
+    bumpless_transfer(controller.parameters, controller._state)
     assert controller.step(0.7, 0.7) == pytest.approx(0.0, abs=0.02)
 
 

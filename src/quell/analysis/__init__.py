@@ -1,17 +1,17 @@
 """Analysis of loops: poles, margins, sensitivity functions, what noise does; as systems of python-control, and as pictures."""
 
 from quell.analysis.advice import advise
-from quell.analysis.frozen import Frozen, frozen
-from quell.analysis.laws import linear_law
+from quell.analysis.frozen_learner import Frozen, frozen
+from quell.analysis.linearise import linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
-from quell.analysis.over_time import loops_over_omega_o, loops_over_time
 from quell.analysis.plots import (
     plot_bode,
     plot_gang_of_four,
     plot_margins_against_omega_o,
     plot_margins_over_time,
 )
+from quell.analysis.sweeps import loops_over_omega_o, loops_over_time
 from quell.controllers.design_checks import Finding
 
 __all__ = [

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.laws import closed_loop_matrix, linear_law
+from quell.analysis.frequency_response import Complex, System, frequencies, in_s_plane, response
+from quell.analysis.linearise import closed_loop_matrix, linear_law
 from quell.analysis.margins import Margins, least, margins
-from quell.analysis.response import Complex, System, frequencies, in_s_plane, response
-from quell.analysis.sampled import SampledPlant, sampled_plant
-from quell.controllers.linear.linear import LinearLaw
+from quell.analysis.sampled_plant import SampledPlant, sampled_plant
+from quell.controllers.linear.law import LinearLaw
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.types import Matrix, Vector
 
@@ -314,7 +314,7 @@ class LoopAnalysis:
         ImportError
             where python-control is missing.
         """
-        from quell.analysis.systems import state_space
+        from quell.analysis.python_control import state_space
 
         return state_space(self, name)
 
@@ -325,7 +325,7 @@ class LoopAnalysis:
         step response of P, C_r and C_y, closed by python-control in state space, is right to 1e-9 up to order 3 and to 3e-8 for order 4;
         that of the closed loop as one fraction to 1e-9, 1e-6 and 3e-3 for orders 2, 3 and 4. ``system`` is right for all.
         """
-        from quell.analysis.systems import transfer_function
+        from quell.analysis.python_control import transfer_function
 
         return transfer_function(self, name)
 

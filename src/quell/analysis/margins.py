@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.analysis.response import Complex
+from quell.analysis.frequency_response import Complex
 from quell.types import Vector
 
 Response = Callable[[Vector], Complex]

@@ -9,7 +9,7 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis
-from quell.analysis.over_time import loops_over_omega_o
+from quell.analysis.sweeps import loops_over_omega_o
 
 
 def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:

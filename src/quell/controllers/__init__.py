@@ -6,7 +6,8 @@ from quell.controllers.adrc.estimate import Estimate
 from quell.controllers.bandwidth import omega_c_for
 from quell.controllers.base import Controller
 from quell.controllers.design_checks import warn_if_unwise
-from quell.controllers.linear.linear import LinearController, LinearLaw
+from quell.controllers.linear.law import LinearLaw
+from quell.controllers.linear.linear import LinearController
 from quell.controllers.prefilters.differentiator import TrackingDifferentiator
 from quell.controllers.prefilters.prefilter import Prefilter, Prefiltered
 from quell.controllers.prefilters.reference_model import ReferenceModel

@@ -11,7 +11,7 @@ _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 
 
 @kernel
-def hold(loop: Vector, first: int, r: float, y: float) -> int:
+def hold_last_good(loop: Vector, first: int, r: float, y: float) -> int:
     """Take in a sample, or hold the last good one in its place; return the status flags of what was held.
 
     Four places of ``loop`` are for it, from ``first`` on: last good r and y, whether there was a good y (which the controller sets when it
@@ -33,6 +33,6 @@ def hold(loop: Vector, first: int, r: float, y: float) -> int:
 
 
 @kernel
-def rest_within(limits: Limits) -> float:
+def control_at_rest(limits: Limits) -> float:
     """Return the u to wait with for a first good measurement: zero, or as near as the limits let it."""
     return min(max(0.0, limits.low), limits.high)

@@ -54,25 +54,25 @@ def _ignore_reference_derivatives(controller: Any, state: Any, derivatives: Vect
 
 
 @generic
-def report(controller: Any, state: Any, row: Vector) -> None:
+def write_row(controller: Any, state: Any, row: Vector) -> None:
     """Write what the controller knows, as its ``channels`` say, into ``row``."""
     raise TypeError
 
 
 @generic
-def flags(controller: Any, state: Any) -> int:
+def status_flags(controller: Any, state: Any) -> int:
     """Return the ``Status`` flags of the last sample."""
     raise TypeError
 
 
 @generic
-def rest(controller: Any, state: Any) -> None:
+def reset_loop(controller: Any, state: Any) -> None:
     """Start from rest at the next sample, with what was learned."""
     raise TypeError
 
 
 @generic
-def applied(controller: Any, state: Any, u: float) -> None:
+def set_applied_control(controller: Any, state: Any, u: float) -> None:
     """Say that ``u`` is applied until the next sample, not what the last ``control`` returned.
 
     A controller with wide limits that is told of narrower ones, sample after sample, is the controller with the narrower limits.
@@ -81,7 +81,7 @@ def applied(controller: Any, state: Any, u: float) -> None:
 
 
 @generic
-def take_over(controller: Any, state: Any) -> None:
+def bumpless_transfer(controller: Any, state: Any) -> None:
     """Take over at the next sample from whoever applied u until now: u goes on from there as if the loop had been at rest.
 
     Where the reference then is elsewhere, it is a step of the reference. A controller that follows the applied u by itself does nothing.
@@ -89,6 +89,6 @@ def take_over(controller: Any, state: Any) -> None:
     raise TypeError
 
 
-@take_over.register(object)
+@bumpless_transfer.register(object)
 def _follows_by_itself(controller: Any, state: Any) -> None:
     pass

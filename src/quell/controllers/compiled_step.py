@@ -20,11 +20,11 @@ from quell.kernels.dispatch import compiled, compiled_call
 
 
 @structref.register
-class _HandleType(nb_types.StructRef):
+class _PackedType(nb_types.StructRef):
     pass
 
 
-class Handle(structref.StructRefProxy):
+class PackedController(structref.StructRefProxy):
     """Parameters and state of a controller, unpacked for compiled code; the state's arrays are shared, not copied."""
 
     def __new__(cls, design: Any, state: Any) -> Any:
@@ -32,12 +32,12 @@ class Handle(structref.StructRefProxy):
         return structref.StructRefProxy.__new__(cls, design, state)
 
 
-structref.define_proxy(Handle, _HandleType, ["design", "state"])
+structref.define_proxy(PackedController, _PackedType, ["design", "state"])
 
 
-def bind(design: Any, state: Any) -> Any:
+def pack(design: Any, state: Any) -> Any:
     """Return a handle on a controller's parameters and state."""
-    return Handle(design, state)
+    return PackedController(design, state)
 
 
 @compiled
@@ -65,7 +65,7 @@ def _borrowed_control(typing_context: Any, handle: Any, r: Any, y: Any) -> Any:
 
 
 @compiled_call
-def bound_control(handle: Any, r: float, y: float) -> float:
+def step_packed(handle: Any, r: float, y: float) -> float:
     """Take one sample; see ``controllers.base.control``."""
     return _borrowed_control(handle, r, y)
 

@@ -22,7 +22,7 @@ class Limits(NamedTuple):
     """In a sample."""
 
 
-def limits(u_min: Any, u_max: Any, rate_limit: Any, dt: float) -> Limits:
+def checked_limits(u_min: Any, u_max: Any, rate_limit: Any, dt: float) -> Limits:
     """Check and return limits; ``rate_limit`` in u-units a second."""
     low, high = checks.interval("u_min", u_min, "u_max", u_max)
     if rate_limit != math.inf:

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from quell.controllers.linear.linear import LinearController, LinearLaw
+from quell.controllers.linear.law import LinearLaw
+from quell.controllers.linear.linear import LinearController
 from quell.identification.excitation import Excitation
 from quell.identification.measured import Measured
 from quell.simulation import Scenario, simulate

@@ -14,10 +14,10 @@ from quell import checks
 from quell.controllers.base import (
     Controller,
     control,
-    flags,
-    report,
-    rest,
+    reset_loop,
     set_reference_derivatives,
+    status_flags,
+    write_row,
 )
 from quell.kernels.dispatch import compiled, compiling, for_types, interpreted
 from quell.plants.base import Plant, advance, measure
@@ -74,7 +74,7 @@ def run_block(
         if derivatives.shape[1] > 0:
             set_reference_derivatives(design, state, derivatives[k])
         u = control(design, state, r[k], measured)
-        status |= flags(design, state)
+        status |= status_flags(design, state)
         if until_next == 0:
             log[row, 0] = r[k]
             log[row, 1] = y
@@ -84,7 +84,7 @@ def run_block(
                 log[row, 4 + j] = w[k, j]
             for j in range(x.size):
                 log[row, 4 + inputs + j] = x[j]
-            report(design, state, log[row, 4 + inputs + x.size :])
+            write_row(design, state, log[row, 4 + inputs + x.size :])
             row += 1
             until_next = every
         until_next -= 1
@@ -95,7 +95,7 @@ def run_block(
 @compiled
 def start_from_rest(design: Any, state: Any) -> None:
     """Start the controller from rest, with what it has learned."""
-    rest(design, state)
+    reset_loop(design, state)
 
 
 class Stretch(NamedTuple):

@@ -13,9 +13,9 @@ from quell.controllers.adrc.estimate import Estimate
 from quell.controllers.adrc.handover import HandOver
 from quell.controllers.adrc.law import F_LEARNED, LOOP, STATUS, AdrcDesign, AdrcState, U, law_gains
 from quell.controllers.base import set_reference_derivatives
-from quell.controllers.compiled_step import bind
+from quell.controllers.compiled_step import pack
 from quell.controllers.design_checks import warn_if_unwise
-from quell.controllers.limits import limits
+from quell.controllers.limits import checked_limits
 from quell.guard import (
     GUARD_CHANNELS,
     Guard,
@@ -106,7 +106,7 @@ class ADRC(HandOver):
         self.feedforward = checks.flag("feedforward", feedforward)
         self.half_gain = checks.flag("half_gain", half_gain)
         self._learned_at = self.omega_c
-        self._limits = limits(u_min, u_max, rate_limit, observer.dt)
+        self._limits = checked_limits(u_min, u_max, rate_limit, observer.dt)
         self._begin()
         warn_if_unwise(observer, self.omega_c)
 
@@ -115,8 +115,8 @@ class ADRC(HandOver):
         return self
 
     def _rebind(self) -> None:
-        if self._handle is not None:
-            self._handle = bind(self.parameters, self._state)
+        if self._packed is not None:
+            self._packed = pack(self.parameters, self._state)
 
     def _prepare_design(self) -> None:
         observer = self.observer
@@ -192,7 +192,7 @@ class ADRC(HandOver):
         TypeError
             for a value that is no number.
         """
-        if self._handle is None:
+        if self._packed is None:
             self.prepare()
         if self.feedforward:
             self._feed(derivatives)
@@ -201,7 +201,7 @@ class ADRC(HandOver):
                 f"step was given {len(derivatives)} derivatives of the reference: make the controller with feedforward=True"
             )
         try:
-            return self._step(self._handle, r, y)
+            return self._step(self._packed, r, y)
         except TypeError:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
 

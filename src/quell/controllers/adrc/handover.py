@@ -30,9 +30,9 @@ from quell.controllers.adrc.law import (
     Y,
     unlimited_u,
 )
-from quell.controllers.base import rest
+from quell.controllers.base import reset_loop
 from quell.controllers.design_checks import warn_if_unwise
-from quell.controllers.running import Running
+from quell.controllers.stateful import StatefulController
 from quell.guard import limit
 from quell.kernels.dispatch import compiled
 from quell.learners.base import NoLearner, predict
@@ -52,7 +52,7 @@ _SETTLED = 40.0
 _MOST_SAMPLES = 100_000_000
 
 
-class HandOver(Running):
+class HandOver(StatefulController):
     """What starts, hands over and retunes an ADRC, be it alone or behind a prefilter."""
 
     @property
@@ -89,7 +89,7 @@ class HandOver(Running):
         goal = y if r is None else checks.finite("r", r)
         law = self._law
         design, state = law.parameters, law._state
-        rest(design, state)
+        reset_loop(design, state)
         begin(design.eso, state.z, state.seen, y)
         loop = state.loop
         loop[Y], loop[R], loop[U] = y, goal, u
@@ -124,7 +124,7 @@ class HandOver(Running):
             where u is not finite.
         """
         u = checks.finite("u", u)
-        if self._handle is None:
+        if self._packed is None:
             self.prepare()
         loop = self._law._state.loop
         loop[MANUAL], loop[MANUAL_U] = 1.0, u

@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.bad_samples import hold, rest_within
+from quell.controllers.bad_samples import control_at_rest, hold_last_good
 from quell.controllers.base import (
-    applied,
+    bumpless_transfer,
     control,
-    flags,
-    report,
-    rest,
+    reset_loop,
+    set_applied_control,
     set_reference_derivatives,
-    take_over,
+    status_flags,
+    write_row,
 )
 from quell.controllers.limits import Limits, apply_limits
 from quell.guard import assess, limit, record_output, reset_filters, write_channels
@@ -103,13 +103,13 @@ class AdrcState(NamedTuple):
 @control.register(AdrcDesign)
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop, seen = state.loop, state.seen
-    status = hold(loop, R, r, y)
+    status = hold_last_good(loop, R, r, y)
     f_plain = 0.0
     acted = acting_control(design.eso, state.z, loop[U])
     if loop[STARTED] == 0.0:
         begin(design.eso, state.z, seen, loop[Y])
         if status & _MEASUREMENT_HELD != 0:
-            loop[WISHED] = rest_within(design.limits)
+            loop[WISHED] = control_at_rest(design.limits)
             loop[U] = loop[WISHED] if loop[MANUAL] == 0.0 else loop[MANUAL_U]
             loop[STATUS] = status
             return loop[U]
@@ -201,8 +201,8 @@ def _set_reference_derivatives(design: AdrcDesign, state: AdrcState, derivatives
         state.reference[i] = derivatives[i] if known else 0.0
 
 
-@report.register(AdrcDesign)
-def _report(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
+@write_row.register(AdrcDesign)
+def _write_row(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
     order = design.law.size
     for i in range(order + 1):
         row[i] = state.seen[i]
@@ -212,13 +212,13 @@ def _report(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
     coefficients(design.learner, state.learner, row[order + 3 + told :])
 
 
-@flags.register(AdrcDesign)
-def _flags(design: AdrcDesign, state: AdrcState) -> int:
+@status_flags.register(AdrcDesign)
+def _status_flags(design: AdrcDesign, state: AdrcState) -> int:
     return int(state.loop[STATUS])
 
 
-@rest.register(AdrcDesign)
-def _rest(design: AdrcDesign, state: AdrcState) -> None:
+@reset_loop.register(AdrcDesign)
+def _reset_loop(design: AdrcDesign, state: AdrcState) -> None:
     for i in range(state.loop.size):
         state.loop[i] = 0.0
     for i in range(state.reference.size):
@@ -227,13 +227,13 @@ def _rest(design: AdrcDesign, state: AdrcState) -> None:
     restart(design.learner, state.learner)
 
 
-@applied.register(AdrcDesign)
-def _applied(design: AdrcDesign, state: AdrcState, u: float) -> None:
+@set_applied_control.register(AdrcDesign)
+def _set_applied_control(design: AdrcDesign, state: AdrcState, u: float) -> None:
     state.loop[U] = u
 
 
-@take_over.register(AdrcDesign)
-def _take_over(design: AdrcDesign, state: AdrcState) -> None:
+@bumpless_transfer.register(AdrcDesign)
+def _bumpless_transfer(design: AdrcDesign, state: AdrcState) -> None:
     loop = state.loop
     if loop[STARTED] != 0.0:
         # Without this offset the law, whose reference is where y is, would already have applied something else.

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.controllers.linear.linear import LinearLaw
+from quell.controllers.linear.law import LinearLaw
 from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 

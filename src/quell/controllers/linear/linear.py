@@ -8,43 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.bad_samples import hold, rest_within
-from quell.controllers.base import applied, control, flags, report, rest
-from quell.controllers.limits import Limits, apply_limits, limits
-from quell.controllers.running import Running
+from quell.controllers.bad_samples import control_at_rest, hold_last_good
+from quell.controllers.base import control, reset_loop, set_applied_control, status_flags, write_row
+from quell.controllers.limits import Limits, apply_limits, checked_limits
+from quell.controllers.linear.law import LinearLaw, checked_law, rest_state
+from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import is_finite, kernel
-from quell.types import Matrix, Status, Vector
+from quell.types import Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 
 # Places in LinearState.loop.
 _U, _WISHED, _R, _Y, _STARTED, _REFERENCED, _STATUS = range(7)
-
-
-class LinearLaw(NamedTuple):
-    """A sampled linear law of m states that is told what was really applied.
-
-    ::
-
-        u_wished = C x + D_r r + D_y y          u = limited(u_wished)
-        x⁺       = A x + B_r r + B_y y + B_u u
-
-    Without limits, u is u_wished and the law is the linear system with A + B_u C and so on. B_u is what keeps it from winding up.
-    """
-
-    A: Matrix
-    """(m, m)."""
-    B_r: Vector
-    """(m,)."""
-    B_y: Vector
-    """(m,)."""
-    B_u: Vector
-    """(m,)."""
-    C: Vector
-    """(m,)."""
-    D_r: float
-    D_y: float
 
 
 class LinearDesign(NamedTuple):
@@ -76,10 +52,10 @@ def _start(design: LinearDesign, state: LinearState, y: float) -> None:
 @control.register(LinearDesign)
 def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> float:
     law, x, loop = design.law, state.x, state.loop
-    status = hold(loop, _R, r, y)
+    status = hold_last_good(loop, _R, r, y)
     if loop[_STARTED] == 0.0:
         if status & _MEASUREMENT_HELD != 0:
-            loop[_U] = loop[_WISHED] = rest_within(design.limits)
+            loop[_U] = loop[_WISHED] = control_at_rest(design.limits)
             loop[_STATUS] = status
             return loop[_U]
         _start(design, state, loop[_Y])
@@ -105,25 +81,25 @@ def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> fl
     return u
 
 
-@report.register(LinearDesign)
-def _report(design: LinearDesign, state: LinearState, row: Vector) -> None:
+@write_row.register(LinearDesign)
+def _write_row(design: LinearDesign, state: LinearState, row: Vector) -> None:
     row[0] = state.loop[_WISHED]
     row[1] = state.loop[_STATUS]
 
 
-@flags.register(LinearDesign)
-def _flags(design: LinearDesign, state: LinearState) -> int:
+@status_flags.register(LinearDesign)
+def _status_flags(design: LinearDesign, state: LinearState) -> int:
     return int(state.loop[_STATUS])
 
 
-@rest.register(LinearDesign)
-def _rest(design: LinearDesign, state: LinearState) -> None:
+@reset_loop.register(LinearDesign)
+def _reset_loop(design: LinearDesign, state: LinearState) -> None:
     for i in range(state.loop.size):
         state.loop[i] = 0.0
 
 
-@applied.register(LinearDesign)
-def _applied(design: LinearDesign, state: LinearState, u: float) -> None:
+@set_applied_control.register(LinearDesign)
+def _set_applied_control(design: LinearDesign, state: LinearState, u: float) -> None:
     # The law's state went on with the u that was returned.
     correction = u - state.loop[_U]
     for i in range(state.x.size):
@@ -131,7 +107,7 @@ def _applied(design: LinearDesign, state: LinearState, u: float) -> None:
     state.loop[_U] = u
 
 
-class LinearController(Running):
+class LinearController(StatefulController):
     """Any sampled linear law of two degrees of freedom, with limits, as a controller.
 
     It starts from rest: at the first good measurement y_0 the state is the one that a loop would have that had been resting at
@@ -185,7 +161,7 @@ class LinearController(Running):
         self.law = checked_law(law)
         self.dt = checks.positive("dt", dt, "s")
         self.name = name
-        self._limits = limits(u_min, u_max, rate_limit, self.dt)
+        self._limits = checked_limits(u_min, u_max, rate_limit, self.dt)
         self._begin()
 
     @classmethod
@@ -259,52 +235,3 @@ class LinearController(Running):
     def status(self) -> Status:
         """What the last step had to report."""
         return Status(int(self._state.loop[_STATUS]))
-
-
-def checked_law(law: Any) -> LinearLaw:
-    """Return the law with contiguous arrays that can't be written to.
-
-    Parameters
-    ----------
-    law
-        a ``LinearLaw``: A (m, m); B_r, B_y, B_u and C (m,); D_r and D_y numbers [u-unit/y-unit].
-
-    Raises
-    ------
-    ValueError
-        for what is no ``LinearLaw``, shapes that do not fit, or an entry that is not finite; the message names the matrix.
-    """
-    if not isinstance(law, LinearLaw):
-        raise ValueError(f"law = {law!r}: must be a quell.controllers.LinearLaw")
-    A = checks.matrix("law.A", law.A)
-    m = A.shape[0]
-    checks.matrix("law.A", A, m, m)
-    B_r, B_y, B_u, C = (
-        checks.vector(f"law.{name}", getattr(law, name), m) for name in ("B_r", "B_y", "B_u", "C")
-    )
-    for array in (A, B_r, B_y, B_u, C):
-        array.flags.writeable = False
-    return LinearLaw(
-        A, B_r, B_y, B_u, C, checks.finite("law.D_r", law.D_r), checks.finite("law.D_y", law.D_y)
-    )
-
-
-def rest_state(law: LinearLaw) -> Vector:
-    """Return the state (m,) of a law that rests at r = y = 1 with u = 0, or as near to it as it can.
-
-    Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y))`` it is the one whose u is nearest to zero: an integrator holds
-    whatever the rest of the law needs. By least squares, where there is none.
-    """
-    D = law.D_r + law.D_y
-    pull = np.eye(law.C.size) - law.A - np.outer(law.B_u, law.C)
-    x = (
-        np.linalg.pinv(pull, rcond=1e-10) @ (law.B_r + law.B_y + law.B_u * D)
-        if law.C.size
-        else np.zeros(0)
-    )
-    _, singular, rows = np.linalg.svd(pull)
-    free = rows[singular <= 1e-10 * np.max(singular, initial=0.0)]
-    seen = free @ law.C
-    if seen @ seen > 0.0:
-        x = x - free.T @ seen * ((law.C @ x + D) / (seen @ seen))
-    return np.ascontiguousarray(x)

@@ -16,17 +16,17 @@ import numpy as np
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.handover import HandOver
 from quell.controllers.base import (
-    applied,
+    bumpless_transfer,
     control,
-    flags,
-    report,
-    rest,
+    reset_loop,
+    set_applied_control,
     set_reference_derivatives,
-    take_over,
+    status_flags,
+    write_row,
 )
-from quell.controllers.compiled_step import bind
+from quell.controllers.compiled_step import pack
 from quell.controllers.limits import Limits
-from quell.controllers.running import Running
+from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import generic, is_finite
 from quell.types import Status, Vector
 
@@ -109,32 +109,32 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
     return control(design.controller, state.controller, shaped, y)
 
 
-@report.register(PrefilteredDesign)
-def _report(design: PrefilteredDesign, state: PrefilteredState, row: Vector) -> None:
+@write_row.register(PrefilteredDesign)
+def _write_row(design: PrefilteredDesign, state: PrefilteredState, row: Vector) -> None:
     row[0] = state.loop[_SHAPED]
-    report(design.controller, state.controller, row[1:])
+    write_row(design.controller, state.controller, row[1:])
 
 
-@flags.register(PrefilteredDesign)
-def _flags(design: PrefilteredDesign, state: PrefilteredState) -> int:
-    return flags(design.controller, state.controller) | int(state.loop[_STATUS])
+@status_flags.register(PrefilteredDesign)
+def _status_flags(design: PrefilteredDesign, state: PrefilteredState) -> int:
+    return status_flags(design.controller, state.controller) | int(state.loop[_STATUS])
 
 
-@rest.register(PrefilteredDesign)
-def _rest(design: PrefilteredDesign, state: PrefilteredState) -> None:
+@reset_loop.register(PrefilteredDesign)
+def _reset_loop(design: PrefilteredDesign, state: PrefilteredState) -> None:
     for i in range(state.loop.size):
         state.loop[i] = 0.0
-    rest(design.controller, state.controller)
+    reset_loop(design.controller, state.controller)
 
 
-@applied.register(PrefilteredDesign)
-def _applied(design: PrefilteredDesign, state: PrefilteredState, u: float) -> None:
-    applied(design.controller, state.controller, u)
+@set_applied_control.register(PrefilteredDesign)
+def _set_applied_control(design: PrefilteredDesign, state: PrefilteredState, u: float) -> None:
+    set_applied_control(design.controller, state.controller, u)
 
 
-@take_over.register(PrefilteredDesign)
-def _take_over(design: PrefilteredDesign, state: PrefilteredState) -> None:
-    take_over(design.controller, state.controller)
+@bumpless_transfer.register(PrefilteredDesign)
+def _bumpless_transfer(design: PrefilteredDesign, state: PrefilteredState) -> None:
+    bumpless_transfer(design.controller, state.controller)
 
 
 class Prefiltered(HandOver):
@@ -190,7 +190,7 @@ class Prefiltered(HandOver):
     def _begin(self) -> None:
         super()._begin()
         # One running state: what is done to the controller is done to what runs here.
-        if isinstance(self.controller, Running):
+        if isinstance(self.controller, StatefulController):
             self.controller._adopt(self._state.controller)
 
     @property
@@ -207,8 +207,8 @@ class Prefiltered(HandOver):
         if isinstance(self.controller, Prefiltered):
             self.controller._rebind()
         self.parameters = self.parameters._replace(controller=self.controller.parameters)
-        if self._handle is not None:
-            self._handle = bind(self.parameters, self._state)
+        if self._packed is not None:
+            self._packed = pack(self.parameters, self._state)
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
         """Start where the plant rests, see ``ADRC.start``; the prefilter comes to rest at ``y``."""
@@ -263,7 +263,7 @@ class Prefiltered(HandOver):
     @property
     def status(self) -> Status:
         """What the last step had to report."""
-        return Status(int(flags(self.parameters, self._state)))
+        return Status(int(status_flags(self.parameters, self._state)))
 
     @property
     def estimate(self) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.analysis.laws import closed_loop_matrix, linear_law
+from quell.analysis.linearise import closed_loop_matrix, linear_law
 from quell.parallel import one_blas_thread
 from quell.plants import CubicSpringPlant, LinearPlant
 

@@ -18,9 +18,9 @@ class BoundControl(NamedTuple):
     design: Any
     control: Any
     set_reference_derivatives: Any
-    applied: Any
-    take_over: Any
-    report: Any
+    set_applied_control: Any
+    bumpless_transfer: Any
+    write_row: Any
 
 
 @compiled
@@ -34,18 +34,18 @@ def _set_reference_derivatives(design: Any, state: Any, derivatives: Vector) -> 
 
 
 @compiled
-def _applied(design: Any, state: Any, u: float) -> None:
-    base.applied(design, state, u)
+def _set_applied_control(design: Any, state: Any, u: float) -> None:
+    base.set_applied_control(design, state, u)
 
 
 @compiled
-def _take_over(design: Any, state: Any) -> None:
-    base.take_over(design, state)
+def _bumpless_transfer(design: Any, state: Any) -> None:
+    base.bumpless_transfer(design, state)
 
 
 @compiled
-def _report(design: Any, state: Any, row: Vector) -> None:
-    base.report(design, state, row)
+def _write_row(design: Any, state: Any, row: Vector) -> None:
+    base.write_row(design, state, row)
 
 
 def bound(design: Any) -> BoundControl:
@@ -54,7 +54,13 @@ def bound(design: Any) -> BoundControl:
         design,
         *(
             for_types(entry, design)
-            for entry in (_control, _set_reference_derivatives, _applied, _take_over, _report)
+            for entry in (
+                _control,
+                _set_reference_derivatives,
+                _set_applied_control,
+                _bumpless_transfer,
+                _write_row,
+            )
         ),
     )
 
@@ -64,9 +70,9 @@ def warm(controller: BoundControl, state: Any, derivatives: Vector, row: Vector)
     with compiling(controller.design):
         base.control(controller, state, 0.0, 0.0)
         base.set_reference_derivatives(controller, state, derivatives)
-        base.applied(controller, state, 0.0)
-        base.take_over(controller, state)
-        base.report(controller, state, row)
+        base.set_applied_control(controller, state, 0.0)
+        base.bumpless_transfer(controller, state)
+        base.write_row(controller, state, row)
 
 
 @base.control.register(BoundControl)
@@ -79,16 +85,16 @@ def _bound_heed(controller: BoundControl, state: Any, derivatives: Vector) -> No
     controller.set_reference_derivatives(controller.design, state, derivatives)
 
 
-@base.applied.register(BoundControl)
-def _bound_applied(controller: BoundControl, state: Any, u: float) -> None:
-    controller.applied(controller.design, state, float(u))
+@base.set_applied_control.register(BoundControl)
+def _bound_set_applied_control(controller: BoundControl, state: Any, u: float) -> None:
+    controller.set_applied_control(controller.design, state, float(u))
 
 
-@base.take_over.register(BoundControl)
-def _bound_take_over(controller: BoundControl, state: Any) -> None:
-    controller.take_over(controller.design, state)
+@base.bumpless_transfer.register(BoundControl)
+def _bound_bumpless_transfer(controller: BoundControl, state: Any) -> None:
+    controller.bumpless_transfer(controller.design, state)
 
 
-@base.report.register(BoundControl)
-def _bound_report(controller: BoundControl, state: Any, row: Vector) -> None:
-    controller.report(controller.design, state, row)
+@base.write_row.register(BoundControl)
+def _bound_write_row(controller: BoundControl, state: Any, row: Vector) -> None:
+    controller.write_row(controller.design, state, row)

@@ -18,7 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.base import applied, control, report, set_reference_derivatives, take_over
+from quell.controllers.base import (
+    bumpless_transfer,
+    control,
+    set_applied_control,
+    set_reference_derivatives,
+    write_row,
+)
 from quell.kernels.dispatch import compiled, is_finite, kernel
 from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.loop.supervisor import (
@@ -273,7 +279,7 @@ def _steer(
     judge(rules, watch, k, y, load_acquire(books.requests, 0), setpoints.r.size)
     first = k - min(left_out, rules.hold)
     if counts[MODE] == RUN and counts[BEGAN] == k:
-        take_over(design, state)
+        bumpless_transfer(design, state)
         values[GAP] = y - setpoints.r[0]
         first = k
     awake = counts[MODE] != STOPPED and is_finite(values[Y])
@@ -283,13 +289,13 @@ def _steer(
         if awake:
             wished = control(design, state, r, y if i == k else np.nan)
             if i < k:
-                applied(design, state, values[U])
-    report(design, state, row[LOOP_WIDTH:])
+                set_applied_control(design, state, values[U])
+    write_row(design, state, row[LOOP_WIDTH:])
     if books.f_learned >= 0:
         f_hat = row[books.f_learned] + row[books.f_residual]
     u = decide(rules, watch, k, wished, r, f_hat)
     if awake and u != wished:
-        applied(design, state, u)
+        set_applied_control(design, state, u)
         counts[CLIPPED] += counts[MODE] == RUN
     row[ROW_R] = r
     return u

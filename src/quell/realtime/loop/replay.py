@@ -15,12 +15,12 @@ import numpy as np
 from quell import checks
 from quell.controllers.base import (
     Controller,
-    applied,
+    bumpless_transfer,
     control,
-    flags,
-    report,
+    set_applied_control,
     set_reference_derivatives,
-    take_over,
+    status_flags,
+    write_row,
 )
 from quell.kernels.dispatch import compiled, compiling, for_types
 from quell.realtime.loop.supervisor import RUN
@@ -135,16 +135,16 @@ def _follow(
     status = 0
     for k in range(r.size):
         if k == began and k > 0:
-            take_over(design, state)
+            bumpless_transfer(design, state)
         set_reference_derivatives(design, state, derivatives)
         wished = control(design, state, r[k], measured[k])
-        status |= flags(design, state)
+        status |= status_flags(design, state)
         log[k, 0] = r[k]
         log[k, 1] = y[k]
         log[k, 2] = measured[k]
         log[k, 3] = u[k]
         log[k, 4] = wished
-        report(design, state, log[k, 5:])
+        write_row(design, state, log[k, 5:])
         if u[k] != wished:
-            applied(design, state, u[k])
+            set_applied_control(design, state, u[k])
     return status

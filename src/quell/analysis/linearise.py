@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.analysis.frozen import Frozen, copied, frozen
+from quell.analysis.frozen_learner import Frozen, copied, frozen
 from quell.controllers.base import control
 from quell.controllers.limits import Limits
-from quell.controllers.linear.linear import LinearLaw
+from quell.controllers.linear.law import LinearLaw
 from quell.guard import UnguardedDesign, UnguardedMemory
 from quell.learners.base import NoLearnerMemory
 from quell.types import Matrix, Vector

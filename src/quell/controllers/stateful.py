@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.base import applied
-from quell.controllers.compiled_step import bind, bound_control, entry_point
+from quell.controllers.base import set_applied_control
+from quell.controllers.compiled_step import entry_point, pack, step_packed
 from quell.controllers.limits import Limits
 from quell.kernels.dispatch import compiling, for_types
 
 # What only this process can use, or what can be made anew.
-_MADE_ANEW = ("parameters", "_state", "_arrays", "_handle", "_step")
+_MADE_ANEW = ("parameters", "_state", "_arrays", "_packed", "_step")
 
 
-class Running:
+class StatefulController:
     """A controller with a running state of its own, which ``step`` moves on and ``simulate`` leaves alone.
 
     A subclass sets what it is made from, then calls ``_begin``. It has ``_prepare_design``, which makes ``parameters`` from that, and
@@ -29,7 +29,7 @@ class Running:
     """What the compiled functions need, a NamedTuple."""
     _state: Any
     _limits: Limits
-    _handle: Any
+    _packed: Any
     _step: Callable[[Any, float, float], float]
 
     def _begin(self) -> None:
@@ -40,7 +40,7 @@ class Running:
         """Run on ``state`` from here on."""
         self._state = state
         self._arrays = named_arrays(state)
-        self._handle = None
+        self._packed = None
 
     def _prepare_design(self) -> None:
         raise NotImplementedError
@@ -51,12 +51,12 @@ class Running:
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
-        dispatcher = for_types(bound_control, self.parameters)
-        self._handle = bind(self.parameters, self._state)
+        dispatcher = for_types(step_packed, self.parameters)
+        self._packed = pack(self.parameters, self._state)
         # The first call is made on a state of its own: it must not count as a sample.
         with compiling(self.parameters):
-            dispatcher(bind(self.parameters, self.initial_state()), 0.0, 0.0)
-        self._step = entry_point(dispatcher, self._handle, 0.0, 0.0)
+            dispatcher(pack(self.parameters, self.initial_state()), 0.0, 0.0)
+        self._step = entry_point(dispatcher, self._packed, 0.0, 0.0)
 
     def step(self, r: float, y: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
@@ -66,10 +66,10 @@ class Running:
 
         The first call compiles, or loads; ``prepare`` does that beforehand.
         """
-        if self._handle is None:
+        if self._packed is None:
             self.prepare()
         try:
-            return self._step(self._handle, r, y)
+            return self._step(self._packed, r, y)
         except TypeError:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
 
@@ -83,7 +83,7 @@ class Running:
         ValueError
             where u is not finite.
         """
-        applied(self.parameters, self._state, checks.finite("u", u))
+        set_applied_control(self.parameters, self._state, checks.finite("u", u))
 
     @property
     def limits(self) -> Limits:

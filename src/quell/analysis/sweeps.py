@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from quell import checks
-from quell.analysis.frozen import frozen
+from quell.analysis.frozen_learner import frozen
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate

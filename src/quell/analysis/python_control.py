@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.response import System
+from quell.analysis.frequency_response import System
 from quell.types import Matrix, Vector
 
 if TYPE_CHECKING:

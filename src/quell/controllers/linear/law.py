@@ -1,0 +1,84 @@
+"""The sampled linear law of two degrees of freedom, its checks and its state of rest."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.types import Matrix, Vector
+
+
+class LinearLaw(NamedTuple):
+    """A sampled linear law of m states that is told what was really applied.
+
+    ::
+
+        u_wished = C x + D_r r + D_y y          u = limited(u_wished)
+        x⁺       = A x + B_r r + B_y y + B_u u
+
+    Without limits, u is u_wished and the law is the linear system with A + B_u C and so on. B_u is what keeps it from winding up.
+    """
+
+    A: Matrix
+    """(m, m)."""
+    B_r: Vector
+    """(m,)."""
+    B_y: Vector
+    """(m,)."""
+    B_u: Vector
+    """(m,)."""
+    C: Vector
+    """(m,)."""
+    D_r: float
+    D_y: float
+
+
+def checked_law(law: Any) -> LinearLaw:
+    """Return the law with contiguous arrays that can't be written to.
+
+    Parameters
+    ----------
+    law
+        a ``LinearLaw``: A (m, m); B_r, B_y, B_u and C (m,); D_r and D_y numbers [u-unit/y-unit].
+
+    Raises
+    ------
+    ValueError
+        for what is no ``LinearLaw``, shapes that do not fit, or an entry that is not finite; the message names the matrix.
+    """
+    if not isinstance(law, LinearLaw):
+        raise ValueError(f"law = {law!r}: must be a quell.controllers.LinearLaw")
+    A = checks.matrix("law.A", law.A)
+    m = A.shape[0]
+    checks.matrix("law.A", A, m, m)
+    B_r, B_y, B_u, C = (
+        checks.vector(f"law.{name}", getattr(law, name), m) for name in ("B_r", "B_y", "B_u", "C")
+    )
+    for array in (A, B_r, B_y, B_u, C):
+        array.flags.writeable = False
+    return LinearLaw(
+        A, B_r, B_y, B_u, C, checks.finite("law.D_r", law.D_r), checks.finite("law.D_y", law.D_y)
+    )
+
+
+def rest_state(law: LinearLaw) -> Vector:
+    """Return the state (m,) of a law that rests at r = y = 1 with u = 0, or as near to it as it can.
+
+    Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y))`` it is the one whose u is nearest to zero: an integrator holds
+    whatever the rest of the law needs. By least squares, where there is none.
+    """
+    D = law.D_r + law.D_y
+    pull = np.eye(law.C.size) - law.A - np.outer(law.B_u, law.C)
+    x = (
+        np.linalg.pinv(pull, rcond=1e-10) @ (law.B_r + law.B_y + law.B_u * D)
+        if law.C.size
+        else np.zeros(0)
+    )
+    _, singular, rows = np.linalg.svd(pull)
+    free = rows[singular <= 1e-10 * np.max(singular, initial=0.0)]
+    seen = free @ law.C
+    if seen @ seen > 0.0:
+        x = x - free.T @ seen * ((law.C @ x + D) / (seen @ seen))
+    return np.ascontiguousarray(x)
