@@ -1,7 +1,7 @@
 """An example of everything there is.
 
-Learners are found in ``quell.learners`` and made with their defaults. Plants need arguments, so their examples stand here; a test
-fails for a plant without one.
+Learners are found in ``quell.learners`` and plants in their registry; both are made with their defaults. What needs arguments has
+an example here; a test fails for a plant without one.
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ from quell import learners as learner_room
 from quell.features import RBF, Bias, Input, Polynomial, RandomFourier, State
 from quell.learners.online.model import infer, learn
 from quell.observers.eso import ESO, FORMS
+from quell.plants import registry
 
 from .python_models import python_learners
 
+_LAG = ql.plants.LinearPlant([[-1.0]], [1.5], [1.0])
+_ARGUMENTS: dict[str, dict[str, Any]] = {
+    "linear": {"num": [1.5], "den": [1.0, 1.0]},
+    "delayed": {"plant": _LAG, "delay": 0.02, "dt": 0.01},
+    "encoded": {"plant": _LAG, "counts": 16_000},
+}
 PLANTS: dict[str, Any] = {
-    "delayed": ql.plants.delayed(
-        ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), delay=0.02, dt=0.01
-    ),
-    "encoded": ql.plants.encoded(ql.plants.LinearPlant([[-1.0]], [1.5], [1.0]), counts=16_000),
-    "torsional": ql.plants.torsional(late=2),
-    "TorsionalPlant": ql.plants.torsional(dac_bits=None, counts=None),
-    "torsional_identified": ql.plants.torsional_identified(),
-    "two_mass_spring": ql.plants.two_mass_spring(),
+    name: make(**_ARGUMENTS.get(name, {})) for name, make in registry.PLANTS.items()
+} | {
+    "torsional, late": ql.plants.torsional(late=2),
+    "torsional, not rounded": ql.plants.torsional(dac_bits=None, counts=None),
     "CubicSpringPlant": ql.plants.lagged_two_mass_spring(k_cubic=0.3),
-    "lagged_two_mass_spring": ql.plants.lagged_two_mass_spring(),
     "LinearPlant": ql.plants.LinearPlant(
         [[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0], [[0.0, 1.0], [1.0, 0.0]]
     ),

@@ -18,6 +18,7 @@ from quell.kernels.dispatch import compiled, for_types, interpreted
 from quell.learners.base import adapt, coefficients, commit, predict
 from quell.observers.base import begin, observe
 from quell.observers.delay import without_delay
+from quell.plants import registry
 from quell.plants.base import advance, measure
 from quell.simulation.driver import run_block
 
@@ -65,9 +66,12 @@ def flat(parameters: Any) -> list[Any]:
 
 
 def test_every_plant_has_an_example() -> None:
-    """Nothing public escapes the contracts."""
-    public = {name for name in plant_room.__all__ if name not in ("Plant", "PlantBatch", "batch")}
-    assert public == set(PLANTS)
+    """Nothing public escapes the contracts: functions are registered, and each class has an instance."""
+    names = set(plant_room.__all__) - {"Plant", "PlantBatch", "batch"}
+    public = {getattr(plant_room, name) for name in names}
+    classes = {thing for thing in public if isinstance(thing, type)}
+    assert public - classes == set(registry.PLANTS.values()) - {registry.linear}
+    assert classes <= {type(plant) for plant in PLANTS.values()}
 
 
 @pytest.mark.parametrize("name", PLANTS)

@@ -335,7 +335,7 @@ def rig(
         Where it listens: udp://127.0.0.1:5005 (this computer only; another address of this computer for others to reach it), shm://NAME,
         or serial:///dev/ttyX.
     plant
-        What it is: torsional, torsional-identified or two-mass.
+        Name of the plant, for example torsional; the message for an unknown name lists all names.
     dt
         Its tick [s].
     watchdog

@@ -7,47 +7,16 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from quell import features, guard, learners, plants, signals
+from quell import features, guard, learners, signals
 from quell.controllers import ADRC, LinearController, ReferenceModel, TrackingDifferentiator
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, NotchPID, ResonanceRatio, Shaper, notch
 from quell.observers import ESO
-from quell.plants import LinearPlant
+from quell.plants import registry as plants
 from quell.realtime.loop import safety
 from quell.realtime.loop.run import run_rig
 from quell.records.trajectory import Trajectory
 from quell.setup.schema import Call, call, list_of, one_of
 from quell.simulation.scenario import Scenario as SimulationScenario
-
-
-def linear(
-    num: Any = None, den: Any = None, A: Any = None, B: Any = None, C: Any = None, E: Any = None
-) -> LinearPlant:
-    """Return a linear plant: a transfer function ``num/den``, or matrices.
-
-    Parameters
-    ----------
-    num, den
-        coefficients of the transfer function, highest power of s first.
-    A, B, C
-        in place of num and den, matrices as lists of rows; B and C may be lists of numbers.
-    E
-        how disturbances enter, with a column for each; as u does by default.
-
-    Raises
-    ------
-    ValueError
-        for half of one, or half of each.
-    """
-    given = [
-        name
-        for name, value in (("num", num), ("den", den), ("A", A), ("B", B), ("C", C))
-        if value is not None
-    ]
-    if given == ["num", "den"]:
-        return LinearPlant.of((num, den), E)
-    if given == ["A", "B", "C"]:
-        return LinearPlant(A, B, C, E)
-    raise ValueError(f"given: {', '.join(given) or 'nothing'}; must be num and den, or A, B and C")
 
 
 def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
@@ -119,18 +88,7 @@ def _in_time(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
 
 
 # A plant may be in a plant, and a signal in a signal: their types are known by name until all of their tables are there.
-PLANTS = _calls(
-    {
-        "two-mass": plants.two_mass_spring,
-        "lagged-two-mass": plants.lagged_two_mass_spring,
-        "torsional": plants.torsional,
-        "torsional-identified": plants.torsional_identified,
-        "linear": linear,
-        "delayed": plants.delayed,
-        "encoded": plants.encoded,
-    },
-    {"plant": "Plant"},
-)
+PLANTS = _calls(plants.PLANTS, {"plant": "Plant"})
 _IN_TIME = {
     "until": "the end of it [s], where `then` takes over.",
     "then": "the signal, or number, from `until` on.",

@@ -6,6 +6,8 @@ import importlib
 from typing import Any
 
 from quell import checks
+from quell.plants.base import Plant
+from quell.plants.registry import TESTBEDS
 from quell.realtime.devices.base import handle_of
 
 # Scheme: where it is, the loop's end and the device's end of it, and an example.
@@ -22,15 +24,6 @@ _SCHEMES: dict[str, tuple[str, str, str | None, str]] = {
     "twin": ("quell.realtime.devices.registry", "twin", None, "twin:torsional"),
 }
 
-# Name: where the function is, without arguments, that makes the plant.
-_PLANTS = {
-    "torsional": ("quell.plants.torsional", "torsional"),
-    "torsional-identified": ("quell.plants.torsional", "torsional_identified"),
-    "two-mass": ("quell.plants.two_mass_spring", "two_mass_spring"),
-}
-PLANTS = tuple(_PLANTS)
-"""Names of the plants that a rig or a twin can be."""
-
 
 def open_device(device: Any, dt: float) -> Any:
     """Return the device that a URL names.
@@ -38,9 +31,10 @@ def open_device(device: Any, dt: float) -> Any:
     Parameters
     ----------
     device
-        ``udp://HOST:PORT``, ``shm://NAME``, ``serial:///dev/…``, ``ni://…``, or ``twin:torsional`` (also ``torsional-identified``,
-        ``two-mass``) for a plant in this process, on which u acts at once; an object with ``read``, ``write`` and ``close`` is returned as
-        it is.
+        ``udp://HOST:PORT``, ``shm://NAME``, ``serial:///dev/…``, ``ni://…``, or ``twin:NAME`` for
+        a plant in this process, on which u acts at once (``twin:torsional``; the names are in
+        ``quell.plants.registry.TESTBEDS``); an object with ``read``, ``write`` and ``close`` is
+        returned as it is.
     dt
         sample time [s].
 
@@ -75,7 +69,7 @@ def twin(url: str, dt: float) -> Any:
     return TwinDevice(plant_named(url.partition(":")[2], "device"), dt)
 
 
-def plant_named(name: str, argument: str = "plant") -> Any:
+def plant_named(name: str, argument: str = "plant") -> Plant:
     """Return the plant of this name, with its own parameters.
 
     Raises
@@ -83,8 +77,7 @@ def plant_named(name: str, argument: str = "plant") -> Any:
     ValueError
         for a name that is not known.
     """
-    module, function = _PLANTS[checks.one_of(argument, name, PLANTS)]
-    return getattr(importlib.import_module(module), function)()
+    return TESTBEDS[checks.one_of(argument, name, tuple(TESTBEDS))]()
 
 
 def _part(url: str, which: int) -> Any:

@@ -1,0 +1,62 @@
+"""The plants that setup files, rigs and twins know by name.
+
+A new plant needs its own file and one line here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from quell.plants.base import Plant
+from quell.plants.cubic_spring import lagged_two_mass_spring
+from quell.plants.delay import delayed
+from quell.plants.encoder import encoded
+from quell.plants.linear import LinearPlant
+from quell.plants.torsional import torsional, torsional_identified
+from quell.plants.two_mass_spring import two_mass_spring
+
+
+def linear(
+    num: Any = None, den: Any = None, A: Any = None, B: Any = None, C: Any = None, E: Any = None
+) -> LinearPlant:
+    """Return a linear plant: a transfer function ``num/den``, or matrices.
+
+    Parameters
+    ----------
+    num, den
+        coefficients of the transfer function, highest power of s first.
+    A, B, C
+        in place of num and den, matrices as lists of rows; B and C may be lists of numbers.
+    E
+        how disturbances enter, with a column for each; as u does by default.
+
+    Raises
+    ------
+    ValueError
+        if only some of num and den, or of A, B and C, are given, or some of both groups.
+    """
+    values = {"num": num, "den": den, "A": A, "B": B, "C": C}
+    given = [name for name, value in values.items() if value is not None]
+    if given == ["num", "den"]:
+        return LinearPlant.of((num, den), E)
+    if given == ["A", "B", "C"]:
+        return LinearPlant(A, B, C, E)
+    raise ValueError(f"given: {', '.join(given) or 'nothing'}; must be num and den, or A, B and C")
+
+
+TESTBEDS: Mapping[str, Callable[[], Plant]] = {
+    "torsional": torsional,
+    "torsional-identified": torsional_identified,
+    "two-mass": two_mass_spring,
+}
+"""Plants that a rig or a twin can be, by the name in its URL; made without arguments."""
+
+PLANTS: Mapping[str, Callable[..., Plant]] = {
+    **TESTBEDS,
+    "lagged-two-mass": lagged_two_mass_spring,
+    "linear": linear,
+    "delayed": delayed,
+    "encoded": encoded,
+}
+"""Plants that a setup file can have, by their ``kind``."""
