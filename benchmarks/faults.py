@@ -33,7 +33,8 @@ import numpy as np
 import quell as ql
 from quell.files import without_gaps, write_json
 from quell.realtime import Safety, load, open_device, run_rig
-from quell.realtime.loop.supervisor import FLUSH, Cause, Mode
+from quell.realtime.loop.modes import Cause, Mode
+from quell.realtime.loop.supervisor import FLUSH
 from quell.realtime.rig.fault_injection import KINDS, Fault, Relay
 from quell.realtime.rig.kernel import LIVE, LOG
 

@@ -22,7 +22,7 @@ from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.load import load
 from quell.realtime.telemetry.ring import push
 from quell.realtime.telemetry.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
-from quell.realtime.telemetry.telemetry import Telemetry
+from quell.realtime.telemetry.writer import TelemetryWriter
 
 CHANNELS = row_channels(
     (("x_hat", 4), ("f_residual", 1), ("f_learned", 1), ("status", 1), ("theta", 9))
@@ -75,7 +75,7 @@ def lateness(folder: Path, seconds: float) -> None:
     }
     for name, sinks in kinds.items():
         late = np.empty(len(rows))
-        with Telemetry(header, sinks, urgent=True) as telemetry:
+        with TelemetryWriter(header, sinks, urgent=True) as telemetry:
             in_front(True)
             start = time.perf_counter() + 0.01
             for k, row in enumerate(rows):
@@ -100,7 +100,7 @@ def in_front(wanted: bool) -> None:
 
 def produce(dt: float, *paths: str) -> None:
     """Push rows for ever, and say each time which one."""
-    telemetry = Telemetry(Header(CHANNELS, dt), [file_sink(path) for path in paths])
+    telemetry = TelemetryWriter(Header(CHANNELS, dt), [file_sink(path) for path in paths])
     telemetry.start()
     row, start = np.zeros(telemetry.header.width), time.monotonic()
     for k in range(10**9):

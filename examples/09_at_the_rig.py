@@ -7,8 +7,7 @@ import tempfile
 from pathlib import Path
 
 import quell as ql
-from quell.realtime import Safety, load, open_device, run_rig
-from quell.realtime.loop import replay
+from quell.realtime import Safety, load, open_device, replay, run_rig
 
 DT = 5e-3
 

@@ -11,7 +11,7 @@ import quell as ql
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.realtime.devices.base import read_measurement, write_command
-from quell.realtime.loop.prepared import Prepared, scenario_of, setpoints
+from quell.realtime.loop.control_loop import ControlLoop, scenario_of, setpoints
 from quell.realtime.loop.safety import Safety
 from quell.realtime.system.clock import pass_time, virtual_clock
 from quell.realtime.telemetry.channels import row_channels
@@ -126,7 +126,7 @@ def adrc(**options: Any) -> ql.ADRC:
 class Outcome(NamedTuple):
     """What a scripted loop did."""
 
-    prepared: Prepared
+    loop: ControlLoop
     rows: Any
     device: ScriptedDevice
 
@@ -156,7 +156,7 @@ def run(
         scenario_of(reference, duration), DT, getattr(controller, "derivatives", 0), approach
     )
     rules = Safety(**{"settle": 10} | safety).rules(controller)
-    prepared = Prepared.of(
+    loop = ControlLoop.of(
         device,
         controller,
         points,
@@ -165,6 +165,6 @@ def run(
         ring(4096, width),
         interpret=interpret,
     )
-    prepared.requests[0] = asked
-    prepared.run()
-    return Outcome(prepared, drain(prepared.books.ring), device)
+    loop.requests[0] = asked
+    loop.run()
+    return Outcome(loop, drain(loop.books.ring), device)

@@ -18,7 +18,7 @@ import pytest
 import quell as ql
 from quell.cli import app as cli
 from quell.cli.commands.run_rig import exit_code
-from quell.realtime.loop.supervisor import Cause
+from quell.realtime.loop.modes import Cause
 from quell.setup import EXAMPLES, load
 
 SHORT = """
@@ -227,21 +227,21 @@ def test_each_way_to_end_has_its_exit_code() -> None:
 
     def ended(cause: Cause) -> int:
         run = SimpleNamespace(
-            completed=cause is Cause.OVER,
+            completed=cause is Cause.COMPLETED,
             changes=(SimpleNamespace(cause=cause), SimpleNamespace(cause=Cause.RAMPED)),
         )
         return exit_code(run)  # type: ignore[arg-type]
 
-    assert ended(Cause.OVER) == 0
-    assert {ended(cause) for cause in (Cause.ASKED, Cause.AT_ONCE)} == {130}
+    assert ended(Cause.COMPLETED) == 0
+    assert {ended(cause) for cause in (Cause.STOP_REQUESTED, Cause.ZERO_REQUESTED)} == {130}
     assert {
         ended(cause)
         for cause in (
             Cause.LOST,
             Cause.STALLED,
-            Cause.ERROR,
+            Cause.TRACKING_ERROR,
             Cause.F_HAT,
-            Cause.SILENT,
+            Cause.NO_MEASUREMENT,
             Cause.WATCHDOG,
         )
     } == {3}

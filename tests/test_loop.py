@@ -14,12 +14,14 @@ import quell as ql
 from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compilations
 from quell.realtime.devices.base import PythonHandle, read_measurement, write_command
-from quell.realtime.loop.loop import run_cycles
-from quell.realtime.loop.prepared import Prepared, scenario_of, setpoints, sliding
+from quell.realtime.loop.control_loop import ControlLoop, scenario_of, setpoints, sliding
+from quell.realtime.loop.cycle import run_cycles
+from quell.realtime.loop.modes import Cause
+from quell.realtime.loop.result import mode_changes
 from quell.realtime.loop.safety import Safety
-from quell.realtime.loop.supervisor import OVERRUNS, Cause, changes
+from quell.realtime.loop.supervisor import OVERRUNS
 from quell.realtime.system.clock import now, pass_time, virtual_clock
-from quell.realtime.system.histogram import BINS, Histogram, count, tally
+from quell.realtime.system.histogram import BINS, Histogram, count_duration, empty_counts
 from quell.realtime.telemetry.channels import LOOP_WIDTH, Event, row_channels
 from quell.realtime.telemetry.ring import drain, ring
 
@@ -112,7 +114,7 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
     width = sum(width for _, width in row_channels(FLAT.channels))
     rows = ring(40_000, width)
     rules = Safety(**{"settle": 1} | safety).rules(FLAT)
-    loop = Prepared.of(
+    loop = ControlLoop.of(
         device,
         FLAT,
         setpoints(scenario_of(0.0, duration), DT, 0, 0.0),
@@ -134,7 +136,7 @@ def test_the_grid_follows_a_devices_clock(drift: float) -> None:
     y = found[:, LOOP_WIDTH - 2]
     np.testing.assert_array_equal(np.diff(y), 1.0)
     assert len(y) > 10_000
-    assert loop.watch.counts[OVERRUNS] == 0
+    assert loop.supervisor.counts[OVERRUNS] == 0
 
 
 # Of two cycles one wakes just before the tick, the next one just after.
@@ -164,7 +166,7 @@ def test_after_a_hiccup_of_the_loop_no_measurement_is_old(hiccup: int, k: int) -
 def test_a_device_that_sends_nothing_is_not_started() -> None:
     """It stops before the first cycle, within two seconds, and says why."""
     found, loop = ticks(TickingDevice(1e18), 1.0)
-    assert changes(loop.watch)[:, 2].tolist() == [Cause.SILENT]
+    assert [change.cause for change in mode_changes(loop.supervisor, DT)] == [Cause.NO_MEASUREMENT]
     assert now(loop.clock) < 2.1e9
     assert np.all(found[:, LOOP_WIDTH - 1] == 0.0)
 
@@ -179,7 +181,7 @@ def test_deadlines_that_are_left_out_are_no_blow() -> None:
     k = found["K"]
     assert 3 in np.diff(k) - 1
     assert np.max(np.abs(np.diff(found["U"][:60]))) > 1e-3
-    f_residual = found.rows[:, found.prepared.books.f_residual]
+    f_residual = found.rows[:, found.loop.books.f_residual]
     np.testing.assert_allclose(f_residual, 0.0, atol=1e-9)
 
 
@@ -267,7 +269,7 @@ def test_a_controller_is_stepped_compiled_though_the_device_is_python(name: str)
     # A driver that raises has measured nothing: NaN, where the line of the script says infinite.
     plain.rows[:, LOOP_WIDTH - 2][np.isinf(plain.rows[:, LOOP_WIDTH - 2])] = math.nan
     np.testing.assert_allclose(half.rows, plain.rows, rtol=1e-9, atol=1e-9)
-    handle = half.prepared.handle
+    handle = half.loop.handle
     assert isinstance(handle, PythonHandle)
     assert (handle.faults[0], str(handle.errors[0])) == (2, "the driver is not well")
     assert int(half["EVENTS"][60]) & Event.MISSED
@@ -284,7 +286,7 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
         setpoints(scenario_of(1.0, 1.0), DT, 0, 0.0),
     )
     width = sum(width for _, width in row_channels(controller.channels))
-    loop = Prepared.of(device, controller, points, rules, virtual_clock(), ring(4096, width))
+    loop = ControlLoop.of(device, controller, points, rules, virtual_clock(), ring(4096, width))
     assert device.handle.at.tolist() == [0, 0]
     for array in named_arrays(loop.state).values():
         assert not np.any(array)
@@ -327,9 +329,9 @@ def test_a_reference_that_is_no_number_is_refused() -> None:
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=300))
 def test_a_histograms_percentiles_are_those_of_what_was_counted(durations: list[int]) -> None:
     """Rounded up, by a thirty-second at most; the longest as it is."""
-    counts = tally()
+    counts = empty_counts()
     for duration in durations:
-        count(counts, duration)
+        count_duration(counts, duration)
     histogram = Histogram.of(counts)
     assert len(histogram) == len(durations)
     assert histogram.max == pytest.approx(1e-9 * max(durations))
@@ -343,9 +345,9 @@ def test_a_histograms_percentiles_are_those_of_what_was_counted(durations: list[
 
 def test_a_histogram_tells_and_shows_itself() -> None:
     """As text, a line for each quarter of a decade, and as a picture; an empty one has nothing to tell."""
-    counts = tally()
+    counts = empty_counts()
     for duration in [20_000] * 990 + [300_000] * 10:
-        count(counts, duration)
+        count_duration(counts, duration)
     histogram = Histogram.of(counts)
     assert (
         histogram.text("lateness")
@@ -361,7 +363,7 @@ def test_a_histogram_tells_and_shows_itself() -> None:
     ]
     ax = histogram.plot()
     assert ax.get_xlabel() == "duration [µs]"
-    empty = Histogram.of(tally())
+    empty = Histogram.of(empty_counts())
     assert math.isnan(empty.p50)
     assert empty.text().endswith("of 0")
     with pytest.raises(ValueError, match="percent = 0"):

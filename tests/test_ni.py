@@ -394,7 +394,7 @@ def test_the_loop_goes_to_its_safe_state_when_the_counter_card_is_lost(rack):
     assert after[:5] == [before[-1]] * 5
     assert after[25:] == [0.0] * len(after[25:])
     assert done.rows.shape[0] < 200
-    assert "-200324" in str(done.prepared.handle.errors[0])
+    assert "-200324" in str(done.loop.handle.errors[0])
     rack.cards["Dev1"].present = True
     shaft.close()
     assert not rack.cards["Dev2"].levels["port0/line0"]

@@ -13,8 +13,8 @@ import quell as ql
 from quell.controllers.baselines import PID, ZV
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.plants.base import advance, measure
+from quell.realtime.loop.modes import Mode
 from quell.realtime.loop.replay import replay
-from quell.realtime.loop.supervisor import Mode
 from quell.realtime.telemetry.channels import Event, row_channels
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.load import load, trajectory_of

@@ -17,9 +17,9 @@ import pytest
 
 import quell as ql
 from quell.realtime import Safety, TwinDevice, load, run_rig
-from quell.realtime.loop.outcome import ModeChange
-from quell.realtime.loop.supervisor import Cause, Mode
-from quell.realtime.system.scheduling import checked_cpu, enter_real_time, quiet_process
+from quell.realtime.loop.modes import Cause, Mode
+from quell.realtime.loop.result import ModeChange
+from quell.realtime.system.scheduling import checked_cpu, enter_real_time, real_time_process
 from quell.realtime.telemetry.sinks import MemorySink
 
 from .scripted import DT, PLANT, adrc
@@ -111,7 +111,7 @@ def test_ctrl_c_ramps_down_and_what_stood_before_is_put_back() -> None:
 
     run = short(device, 60.0, on_change=interrupt)
     assert not run.completed
-    assert [change.cause for change in run.changes][-2:] == [Cause.ASKED, Cause.RAMPED]
+    assert [change.cause for change in run.changes][-2:] == [Cause.STOP_REQUESTED, Cause.RAMPED]
     assert device.written[-1] == 0.0
     assert signal.getsignal(signal.SIGINT) is before
     assert gc.isenabled() == collecting
@@ -130,7 +130,7 @@ def test_a_terminal_that_is_closed_ramps_down_unless_nobody_minds() -> None:
         assert short(Rig(), on_change=close_terminal).completed
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
         run = short(Rig(), 60.0, on_change=close_terminal)
-        assert Cause.ASKED in [change.cause for change in run.changes]
+        assert Cause.STOP_REQUESTED in [change.cause for change in run.changes]
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
     finally:
         signal.signal(signal.SIGHUP, before)
@@ -150,7 +150,10 @@ def test_a_second_ctrl_c_is_zero_at_once() -> None:
         on_change=interrupt,
         safety=Safety(settle=5, hold=10_000, most_overruns=10_000, ramp=100_000),
     )
-    assert [change.cause for change in run.changes][-2:] == [Cause.ASKED, Cause.AT_ONCE]
+    assert [change.cause for change in run.changes][-2:] == [
+        Cause.STOP_REQUESTED,
+        Cause.ZERO_REQUESTED,
+    ]
     assert device.written[-4:] == [0.0] * 4
     assert device.written[-5] != 0.0
 
@@ -317,7 +320,7 @@ def test_what_real_time_scheduling_is_not_permitted_is_said(
     monkeypatch.setattr("quell.realtime.system.scheduling._mlockall", lambda flags: -1)
     monkeypatch.setattr("quell.realtime.system.scheduling._LATENCY", "/dev/no such file")
     interval = sys.getswitchinterval()
-    with quiet_process(50, interpreted=True) as notes:
+    with real_time_process(50, interpreted=True) as notes:
         assert sys.getswitchinterval() < interval
         assert not gc.isenabled()
         enter_real_time(50, 0, notes)

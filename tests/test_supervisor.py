@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 import quell as ql
 from quell.controllers.base import control, set_applied_control, write_row
 from quell.realtime import Safety
-from quell.realtime.loop.outcome import told
-from quell.realtime.loop.supervisor import BEGAN, END, FLUSH, ZERO, Cause, Mode, changes
+from quell.realtime.loop.modes import Cause, Mode, Request
+from quell.realtime.loop.result import mode_changes
+from quell.realtime.loop.supervisor import BEGAN, FLUSH
 from quell.realtime.telemetry.channels import Event
 
 from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
@@ -28,7 +29,7 @@ def modes(outcome: Outcome) -> list[tuple[int, Mode, Cause]]:
     """Return when which mode began, and why."""
     return [
         (round(change.t / DT), change.mode, change.cause)
-        for change in told(changes(outcome.prepared.watch), DT)
+        for change in mode_changes(outcome.loop.supervisor, DT)
     ]
 
 
@@ -67,7 +68,7 @@ def test_nothing_happens_where_nothing_goes_wrong() -> None:
         np.column_stack([run_["x_hat"], run_["f_residual"], run_["f_learned"], run_["status"]]),
     )
     assert modes(outcome)[0] == (SETTLE, Mode.RUN, Cause.SETTLED)
-    check_ended_by(outcome, SETTLE + len(run_), Cause.OVER)
+    check_ended_by(outcome, SETTLE + len(run_), Cause.COMPLETED)
     assert not outcome["EVENTS"][outcome["EVENTS"] != Event.CHANGED].any()
 
 
@@ -98,7 +99,7 @@ def test_a_few_missed_samples_hold_u(value: float, missed: int) -> None:
     assert np.all(outcome["Y"][60 : 60 + missed] == outcome["Y"][59])
     assert modes(outcome)[1:3] == [
         (60, Mode.HOLD, Cause.MISSED),
-        (60 + missed, Mode.RUN, Cause.BACK),
+        (60 + missed, Mode.RUN, Cause.RECOVERED),
     ]
     assert np.all(outcome["EVENTS"].astype(int)[60 : 60 + missed] & Event.MISSED)
     assert outcome["Y"][SETTLE + 300] == pytest.approx(
@@ -128,7 +129,7 @@ def test_a_stall_skips_deadlines_and_never_catches_up() -> None:
     assert int(outcome["EVENTS"][60]) == Event.OVERRUN
     assert outcome["STEP_TIME"][60] == pytest.approx(3.5 * DT)
     assert np.all(outcome["LATENESS"] == 0.0)
-    assert modes(outcome)[1] == (SETTLE + 301, Mode.RAMP, Cause.OVER)
+    assert modes(outcome)[1] == (SETTLE + 301, Mode.RAMP, Cause.COMPLETED)
 
 
 def test_to_oversleep_skips_deadlines_as_well() -> None:
@@ -154,7 +155,7 @@ def test_a_stall_of_too_many_samples_ramps_u_down() -> None:
 def test_one_cycle_after_the_other_that_overruns_ramps_u_down() -> None:
     """``most_overruns`` are put up with, one more is not."""
     enough = run(ScriptedDevice(PLANT, stall=dict.fromkeys(range(60, 65), SAMPLE)))
-    assert modes(enough)[1][2] is Cause.OVER
+    assert modes(enough)[1][2] is Cause.COMPLETED
     outcome = run(ScriptedDevice(PLANT, stall=dict.fromkeys(range(60, 66), SAMPLE)))
     check_ended_by(outcome, 60 + 2 * 6, Cause.OVERRUN)
 
@@ -162,12 +163,12 @@ def test_one_cycle_after_the_other_that_overruns_ramps_u_down() -> None:
 def test_a_device_that_is_not_reached_too_often_is_given_up() -> None:
     """``hold`` commands in a row may fail; what is written after that is the ramp, in case somebody hears it."""
     few = run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 60 + HOLD), 1)))
-    assert modes(few)[1][2] is Cause.OVER
+    assert modes(few)[1][2] is Cause.COMPLETED
     assert np.sum(few["EVENTS"].astype(int) & Event.UNSENT > 0) == HOLD
     check_ended_by(
         run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 3000), 1))),
         60 + HOLD + 1,
-        Cause.UNREACHED,
+        Cause.UNREACHABLE,
     )
 
 
@@ -183,8 +184,10 @@ def test_a_device_that_has_set_u_to_zero_itself_ends_the_run(fault: int) -> None
 
 def test_a_tracking_error_beyond_its_limit_trips() -> None:
     """In the very sample that shows it."""
-    check_ended_by(run(ScriptedDevice(PLANT, y={200: 2.0}), most_error=1.5), 200, Cause.ERROR)
-    assert modes(run(ScriptedDevice(PLANT), most_error=1.5))[1][2] is Cause.OVER
+    check_ended_by(
+        run(ScriptedDevice(PLANT, y={200: 2.0}), most_error=1.5), 200, Cause.TRACKING_ERROR
+    )
+    assert modes(run(ScriptedDevice(PLANT), most_error=1.5))[1][2] is Cause.COMPLETED
 
 
 def test_an_f_hat_beyond_its_limit_trips() -> None:
@@ -203,7 +206,7 @@ def test_a_u_that_stays_at_its_limit_trips() -> None:
     assert np.all(outcome["EVENTS"].astype(int)[SETTLE + 1 : SETTLE + 30] & Event.CLIPPED)
     assert (
         modes(run(ScriptedDevice(PLANT), most_saturated=30, u_min=-1.4, u_max=1.4))[1][2]
-        is Cause.OVER
+        is Cause.COMPLETED
     )
 
 
@@ -253,11 +256,13 @@ def test_a_u_that_is_no_number_is_never_written() -> None:
 
 def test_asked_to_stop_it_ramps_and_asked_again_it_is_zero_at_once() -> None:
     """Before it took over, there is nothing to ramp."""
-    assert modes(run(ScriptedDevice(PLANT), asked=END)) == [
-        (0, Mode.RAMP, Cause.ASKED),
+    assert modes(run(ScriptedDevice(PLANT), asked=Request.RAMP)) == [
+        (0, Mode.RAMP, Cause.STOP_REQUESTED),
         (0, Mode.STOPPED, Cause.RAMPED),
     ]
-    assert modes(run(ScriptedDevice(PLANT), asked=ZERO)) == [(0, Mode.STOPPED, Cause.AT_ONCE)]
+    assert modes(run(ScriptedDevice(PLANT), asked=Request.ZERO)) == [
+        (0, Mode.STOPPED, Cause.ZERO_REQUESTED)
+    ]
 
 
 def test_it_takes_over_only_after_good_samples_in_a_row() -> None:
@@ -305,7 +310,7 @@ def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(
     # Where u was held, it was held.
     held = np.flatnonzero(mode == Mode.HOLD)
     np.testing.assert_array_equal(u[held], u[held - 1])
-    began = outcome.prepared.watch.counts[BEGAN]
+    began = outcome.loop.supervisor.counts[BEGAN]
     assert (began >= SETTLE) == bool(np.any(mode == Mode.RUN))
 
 

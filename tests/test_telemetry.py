@@ -23,7 +23,7 @@ from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.load import load, trajectory_of
 from quell.realtime.telemetry.ring import push
 from quell.realtime.telemetry.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
-from quell.realtime.telemetry.telemetry import Telemetry
+from quell.realtime.telemetry.writer import TelemetryWriter
 from quell.types import Matrix
 from tests.recordings import DT, controller, header_of, rows_of, simulated
 
@@ -48,16 +48,16 @@ def header(run: ql.Trajectory) -> Header:
     return header_of(run, controller())
 
 
-def recorded(header: Header, rows: Matrix, *sinks: Any) -> Telemetry:
+def recorded(header: Header, rows: Matrix, *sinks: Any) -> TelemetryWriter:
     """Send rows through a ring to sinks, as quickly as they find a place."""
-    with Telemetry(header, sinks) as telemetry:
+    with TelemetryWriter(header, sinks) as telemetry:
         offer(telemetry, rows)
     assert telemetry.rows == len(rows)
     assert not telemetry.problems
     return telemetry
 
 
-def offer(telemetry: Telemetry, rows: Matrix) -> None:
+def offer(telemetry: TelemetryWriter, rows: Matrix) -> None:
     """Push rows; wait where the ring is full."""
     for row in rows:
         while not push(telemetry.ring, row):
@@ -231,15 +231,15 @@ def whole_rows(path: Path, rows: Matrix) -> int:
 KILLED = """
 import sys, time, os, signal
 import numpy as np
-from quell.realtime.header import Header
-from quell.realtime.channels import row_channels
-from quell.realtime.ring import push
-from quell.realtime.sinks import file_sink
-from quell.realtime.telemetry import Telemetry
+from quell.realtime.telemetry.header import Header
+from quell.realtime.telemetry.channels import row_channels
+from quell.realtime.telemetry.ring import push
+from quell.realtime.telemetry.sinks import file_sink
+from quell.realtime.telemetry.writer import TelemetryWriter
 
 def begin(dt, count):
     sinks = [file_sink(f"{sys.argv[1]}/{count}.{suffix}") for suffix in ("csv", "mcap")]
-    telemetry = Telemetry(Header(row_channels((("status", 1),)), dt=dt), sinks)
+    telemetry = TelemetryWriter(Header(row_channels((("status", 1),)), dt=dt), sinks)
     telemetry.start()
     go_on(telemetry, 0, count)
     return telemetry
@@ -293,7 +293,7 @@ def test_a_sink_that_fails_is_closed_and_reported_and_the_others_go_on(
 ) -> None:
     """One line says which, and why."""
     broken, kept = Broken(), MemorySink()
-    with Telemetry(header, [broken, kept]) as telemetry:
+    with TelemetryWriter(header, [broken, kept]) as telemetry:
         offer(telemetry, rows)
     assert broken.pieces == 3
     assert len(telemetry.problems) == 1
@@ -307,7 +307,7 @@ def test_a_full_disk_ends_a_recording_and_nothing_else(
 ) -> None:
     """The limit on the size of a file stands for the disk; what was written before can be read."""
     sink, kept = file_sink(tmp_path / f"run.{suffix}"), MemorySink()
-    telemetry = Telemetry(header, [sink, kept])
+    telemetry = TelemetryWriter(header, [sink, kept])
     telemetry.start()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
@@ -340,7 +340,7 @@ class Stuck(MemorySink):
 def test_a_disk_that_hangs_costs_rows_not_time() -> None:
     """Rows that find the ring full are dropped and counted; the recording has a gap where they were."""
     stuck = Stuck()
-    with Telemetry(NARROW, [stuck]) as telemetry:
+    with TelemetryWriter(NARROW, [stuck]) as telemetry:
         capacity = telemetry.ring.rows.shape[0]
         offered = counted(3 * capacity)
         went = sum(push(telemetry.ring, row) for row in offered)
@@ -357,7 +357,7 @@ def test_a_disk_that_hangs_costs_rows_not_time() -> None:
 def test_a_writer_that_does_not_end_is_given_up() -> None:
     """The loop's process is not held up; the result says that rows may be missing."""
     stuck = Stuck()
-    telemetry = Telemetry(NARROW, [stuck])
+    telemetry = TelemetryWriter(NARROW, [stuck])
     telemetry.start()
     offer(telemetry, counted(3))
     telemetry.stop(timeout=0.01)
@@ -383,7 +383,7 @@ def test_what_can_not_be_written_is_refused_before_the_loop_starts(
     for suffix in ("csv", "mcap"):
         (tmp_path / f"old.{suffix}").write_text("precious")
     first = CsvSink(tmp_path / "first.csv")
-    telemetry = Telemetry(NARROW, [first, make(tmp_path)])
+    telemetry = TelemetryWriter(NARROW, [first, make(tmp_path)])
     with pytest.raises(ValueError, match=rule) as refused:
         telemetry.start()
     assert "\n" not in str(refused.value)
@@ -396,7 +396,7 @@ def test_other_suffixes_and_lazy_writers_are_refused() -> None:
     with pytest.raises(ValueError, match=r"path = 'run.txt': must end in .csv or .mcap"):
         file_sink("run.txt")
     with pytest.raises(ValueError, match="period = 2 s: must be at most 0.25 s"):
-        Telemetry(NARROW, period=2)
+        TelemetryWriter(NARROW, period=2)
     with pytest.raises(ValueError, match="channels = .* must begin with k, lateness"):
         Header((("y", 1),), dt=0.1)
 
@@ -517,22 +517,22 @@ def test_the_writer_has_the_priority_that_it_should(
     urgent: bool, permitted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The lowest real-time priority for a loop in Python, where that is permitted; else none, even where it inherits one."""
-    from quell.realtime.telemetry import telemetry
+    from quell.realtime.telemetry import writer as module
 
-    now = [telemetry.os.SCHED_RR]
+    now = [module.os.SCHED_RR]
 
     def ask(thread: int, policy: int, parameters: Any) -> None:
-        if policy != telemetry.os.SCHED_OTHER:
+        if policy != module.os.SCHED_OTHER:
             if not permitted:
                 raise PermissionError(1, "Operation not permitted")
             assert parameters.sched_priority == 1
         now[0] = policy
 
-    monkeypatch.setattr(telemetry.os, "sched_getscheduler", lambda thread: now[0])
-    monkeypatch.setattr(telemetry.os, "sched_setscheduler", ask)
-    with Telemetry(NARROW, [MemorySink()], urgent=urgent) as writer:
+    monkeypatch.setattr(module.os, "sched_getscheduler", lambda thread: now[0])
+    monkeypatch.setattr(module.os, "sched_setscheduler", ask)
+    with TelemetryWriter(NARROW, [MemorySink()], urgent=urgent) as writer:
         offer(writer, counted(3))
-    assert now[0] == (telemetry.os.SCHED_FIFO if urgent and permitted else telemetry.os.SCHED_OTHER)
+    assert now[0] == (module.os.SCHED_FIFO if urgent and permitted else module.os.SCHED_OTHER)
 
 
 def test_a_table_of_times_alone_is_no_recording(tmp_path: Path) -> None:

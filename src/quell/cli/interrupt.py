@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from quell.realtime.system.interrupts import handled
+from quell.realtime.system.interrupts import termination_handler
 
 
 @contextmanager
@@ -23,5 +23,5 @@ def ended_at_once(close: Callable[[], Any]) -> Iterator[None]:
         print("quell: interrupted", file=sys.stderr, flush=True)
         os._exit(128 + number)
 
-    with handled(end):
+    with termination_handler(end):
         yield

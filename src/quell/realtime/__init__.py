@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from quell.realtime.devices.base import Device
     from quell.realtime.devices.registry import open_device
     from quell.realtime.devices.twin import TwinDevice
-    from quell.realtime.loop.outcome import RigRun
     from quell.realtime.loop.replay import replay
+    from quell.realtime.loop.result import RigRun
     from quell.realtime.loop.run import run_rig
     from quell.realtime.loop.safety import Safety
     from quell.realtime.rig.server import Rig

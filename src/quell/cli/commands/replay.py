@@ -14,8 +14,8 @@ from rich.table import Table
 from quell.cli.output import check_places, write_results
 from quell.cli.report import figure_of, print_outcome
 from quell.controllers import ADRC
+from quell.realtime.loop.modes import Mode
 from quell.realtime.loop.replay import replay
-from quell.realtime.loop.supervisor import RUN
 from quell.realtime.telemetry.channels import Event
 from quell.realtime.telemetry.load import load as load_record
 from quell.records import metrics
@@ -90,9 +90,9 @@ def run_replay(
 
 def _controlled(run: Trajectory) -> slice:
     """Return the samples from the first to the last in which the loop ran; all of a record without modes."""
-    if "mode" not in run.names or not np.any(run["mode"] == RUN):
+    if "mode" not in run.names or not np.any(run["mode"] == Mode.RUN):
         return slice(0, len(run))
-    running = np.flatnonzero(run["mode"] == RUN)
+    running = np.flatnonzero(run["mode"] == Mode.RUN)
     return slice(int(running[0]), int(running[-1]) + 1)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from quell.cli.interrupt import ended_at_once
 from quell.realtime.devices.registry import listen, plant_named
 from quell.realtime.rig.server import Rig, checked_seconds
-from quell.realtime.system.interrupts import handled
+from quell.realtime.system.interrupts import termination_handler
 from quell.realtime.system.scheduling import checked_cpu, checked_priority
 from quell.realtime.wire.frames import REFUSALS
 
@@ -43,7 +43,7 @@ def run_rig(
     ):
         with ended_at_once(listener.close):  # it may take a minute the first time
             rig.prepare()
-        with handled(lambda *_: rig.stop()):
+        with termination_handler(lambda *_: rig.stop()):
             print(f"{plant} at {listener.url}: {_described(**settings)}", flush=True)
             notes = rig.run(seconds, priority=priority, cpu=cpu)
     _tell(rig)

@@ -19,9 +19,9 @@ from quell.cli.report import figure_of, judge, print_judgement, print_outcome
 from quell.experiments.common.figures import save_figure
 from quell.files import without_gaps
 from quell.realtime.devices.registry import open_device
-from quell.realtime.loop.outcome import ModeChange, RigRun
+from quell.realtime.loop.modes import Ending
+from quell.realtime.loop.result import ModeChange, RigRun
 from quell.realtime.loop.run import run_rig
-from quell.realtime.loop.supervisor import Cause
 from quell.realtime.telemetry import csv_file
 from quell.realtime.telemetry.sinks import LiveSink, file_sink
 from quell.setup import EXAMPLES, Setup, made, read
@@ -162,7 +162,7 @@ def exit_code(run: RigRun) -> int:
     """Return 0 where a run came to its end, 130 where it was asked to stop, 3 where a limit or a fault ended it."""
     if run.completed:
         return DONE
-    asked = any(change.cause in (Cause.ASKED, Cause.AT_ONCE) for change in run.changes)
+    asked = any(change.cause.ending is Ending.REQUESTED for change in run.changes)
     return INTERRUPTED if asked else TRIPPED
 
 
@@ -217,7 +217,7 @@ def _as_json(run: RigRun) -> dict[str, Any]:
             "tally": run.tally._asdict(),
             "counters": run.counters,
             "changes": [
-                {"t": change.t, "mode": change.mode.name, "cause": change.cause.words}
+                {"t": change.t, "mode": change.mode.name, "cause": change.cause.text}
                 for change in run.changes
             ],
             "notes": list(run.notes),

@@ -23,7 +23,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.kernels.dispatch import compiled, compiling, for_types
-from quell.realtime.loop.supervisor import RUN
+from quell.realtime.loop.modes import Mode
 from quell.records.trajectory import Trajectory
 from quell.simulation.driver import check_part
 from quell.types import Matrix, Status, Vector
@@ -90,7 +90,7 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
         )
     channels = (*_TOLD, *controller.channels)
     log = np.empty((len(run), sum(width for _, width in channels)))
-    began = int(np.argmax(run["mode"] == RUN)) if "mode" in run.names else 0
+    began = int(np.argmax(run["mode"] == Mode.RUN)) if "mode" in run.names else 0
     with np.errstate(over="ignore", invalid="ignore"), compiling(design):
         status = for_types(_follow, design)(
             design, state, _NO_DERIVATIVES, r, y, measured, u, began, log

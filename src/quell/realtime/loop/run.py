@@ -13,22 +13,30 @@ from typing import Any
 from numpy.typing import NDArray
 
 from quell.realtime.devices.base import Device, PythonHandle, handle_of
-from quell.realtime.loop.outcome import ModeChange, RigRun, scenario_part, tally_of, told, unkept
-from quell.realtime.loop.prepared import Prepared, scenario_of, setpoints
+from quell.realtime.loop.control_loop import ControlLoop, scenario_of, setpoints
+from quell.realtime.loop.modes import Request
+from quell.realtime.loop.result import (
+    ModeChange,
+    RigRun,
+    mode_changes,
+    scenario_part,
+    tally_of,
+    unkept,
+)
 from quell.realtime.loop.safety import Safety
-from quell.realtime.loop.supervisor import CYCLES, END, ZERO, changes
+from quell.realtime.loop.supervisor import CYCLES
 from quell.realtime.system.clock import system_clock
-from quell.realtime.system.interrupts import handled
+from quell.realtime.system.interrupts import termination_handler
 from quell.realtime.system.scheduling import (
     checked_cpu,
     checked_priority,
     enter_real_time,
-    quiet_process,
+    real_time_process,
 )
 from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.sinks import MemorySink, file_sink
-from quell.realtime.telemetry.telemetry import Sink, Telemetry
+from quell.realtime.telemetry.writer import Sink, TelemetryWriter
 from quell.simulation.driver import check_part
 
 # The main thread looks after the loop so often [s].
@@ -117,21 +125,25 @@ def run_rig(
             raise ValueError(
                 f"telemetry = {str(telemetry)!r}: must be a list of files and sinks, be it of one"
             )
-        writer = Telemetry(header, [memory, *(_sink(place) for place in telemetry)])
+        writer = TelemetryWriter(header, [memory, *(_sink(place) for place in telemetry)])
         if isinstance(handle, PythonHandle):
             handle.device.read()  # what it complains of comes before anything else
-        loop = Prepared.of(device, controller, points, rules, system_clock(spin), writer.ring)
+        loop = ControlLoop.of(device, controller, points, rules, system_clock(spin), writer.ring)
         writer.urgent = loop.interpreted and priority > 1
         _restart_session(device)
         writer.header = replace(header, started=time.time_ns())
         # The signals come first: who is impatient shall not lose the end of the record.
-        with _signals(loop.requests), writer, quiet_process(priority, loop.interpreted) as notes:
+        with (
+            _signals(loop.requests),
+            writer,
+            real_time_process(priority, loop.interpreted) as notes,
+        ):
             _supervised(
                 loop, controller.dt, priority, cpu, notes, on_change or (lambda change: None)
             )
             device.close()  # before the record is finished, which may take its time
     record = memory.trajectory()
-    watch = loop.watch
+    state = loop.supervisor
     if course.disturbances or course.noise != 0.0:
         notes.append(
             "disturbances and noise of the scenario are left to the rig, which has its own"
@@ -141,22 +153,22 @@ def run_rig(
             f"the device raised {int(loop.handle.faults[0])} errors, the last of them: {loop.handle.errors[0]!r}"
         )
     return RigRun(
-        trajectory=scenario_part(record, watch, points.r.size),
+        trajectory=scenario_part(record, state, points.r.size),
         record=record,
         timing=loop.timing,
-        changes=told(changes(watch), controller.dt),
-        tally=tally_of(watch, writer.dropped),
+        changes=mode_changes(state, controller.dt),
+        tally=tally_of(state, writer.dropped),
         counters=dict(getattr(device, "counters", {})),
         notes=(
             *notes,
-            *unkept(watch, controller.dt),
+            *unkept(state, controller.dt),
             *(f"telemetry: {problem}" for problem in writer.problems),
         ),
     )
 
 
 def _supervised(
-    loop: Prepared,
+    loop: ControlLoop,
     dt: float,
     priority: int,
     cpu: int | None,
@@ -183,14 +195,14 @@ def _supervised(
     try:
         while thread.is_alive() and not hung:
             thread.join(_LOOK)
-            for change in told(changes(loop.watch, seen), dt):
+            for change in mode_changes(loop.supervisor, dt, seen):
                 seen += 1
                 on_change(change)
-            if loop.watch.counts[CYCLES] != cycles or not loop.interpreted:
-                cycles, moved = int(loop.watch.counts[CYCLES]), time.monotonic()
+            if loop.supervisor.counts[CYCLES] != cycles or not loop.interpreted:
+                cycles, moved = int(loop.supervisor.counts[CYCLES]), time.monotonic()
             hung = time.monotonic() - moved > max(_HUNG, _HUNG_SAMPLES * dt)
     except BaseException:
-        loop.requests[0] = max(int(loop.requests[0]), END)
+        loop.requests[0] = max(int(loop.requests[0]), Request.RAMP)
         thread.join(max(_HUNG, (loop.rules.ramp + _HUNG_SAMPLES) * dt))
         raise
     if hung:
@@ -222,10 +234,12 @@ def _signals(requests: NDArray[Any]) -> Iterator[None]:
     """Let what ends other programs ask the loop to ramp down, and a second time for zero at once; in the main thread only."""
 
     def ask(number: int, frame: Any) -> None:
-        requests[0] = ZERO if requests[0] == END else max(int(requests[0]), END)
+        requests[0] = (
+            Request.ZERO if requests[0] == Request.RAMP else max(int(requests[0]), Request.RAMP)
+        )
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    with handled(ask):
+    with termination_handler(ask):
         yield

@@ -17,108 +17,20 @@ All of it is arithmetic on two arrays, so that it can be tried out sample by sam
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quell.kernels.dispatch import is_finite, kernel
-from quell.realtime.telemetry.ring import load_acquire, store_release
+from quell.realtime.loop.modes import Cause, Mode, Request
+from quell.realtime.system.atomics import store_release
 from quell.types import Vector
 
-START, RUN, HOLD, RAMP, STOPPED = range(5)
-(
-    NONE,
-    SETTLED,
-    MISSED,
-    BACK,
-    LOST,
-    STALLED,
-    OVERRUN,
-    UNREACHED,
-    WATCHDOG,
-    ERROR,
-    F_HAT,
-    SATURATED,
-    NOT_A_NUMBER,
-    ASKED,
-    AT_ONCE,
-    OVER,
-    RAMPED,
-    SILENT,
-    UNSETTLED,
-) = range(19)
-# What the main thread asks for: to ramp down, or zero at once.
-GO_ON, END, ZERO = range(3)
 # So many more zeros are written once u is zero.
 FLUSH = 3
-
-
 # To settle may take so many times as many samples as it has to.
 _LONGEST_START = 10
-
-
-class Mode(IntEnum):
-    """State of the supervisor, the channel ``mode``."""
-
-    START = START
-    RUN = RUN
-    HOLD = HOLD
-    RAMP = RAMP
-    STOPPED = STOPPED
-
-
-class Cause(IntEnum):
-    """Why the mode changed; ``words`` says it."""
-
-    NONE = NONE
-    SETTLED = SETTLED
-    MISSED = MISSED
-    BACK = BACK
-    LOST = LOST
-    STALLED = STALLED
-    OVERRUN = OVERRUN
-    UNREACHED = UNREACHED
-    WATCHDOG = WATCHDOG
-    ERROR = ERROR
-    F_HAT = F_HAT
-    SATURATED = SATURATED
-    NOT_A_NUMBER = NOT_A_NUMBER
-    ASKED = ASKED
-    AT_ONCE = AT_ONCE
-    OVER = OVER
-    RAMPED = RAMPED
-    SILENT = SILENT
-    UNSETTLED = UNSETTLED
-
-    @property
-    def words(self) -> str:
-        """The cause, as a clause."""
-        return _WORDS[self]
-
-
-_WORDS = {
-    Cause.NONE: "it began",
-    Cause.SETTLED: "enough good samples were seen",
-    Cause.MISSED: "no measurement came, or one that is no number",
-    Cause.BACK: "a good measurement came",
-    Cause.LOST: "too many samples in a row were missed: look at the device and the wire",
-    Cause.STALLED: "the loop itself stood still for too many samples: look at the load of the machine",
-    Cause.OVERRUN: "too many cycles in a row took longer than a sample: take a longer dt, or less work",
-    Cause.UNREACHED: "the device could not be reached too often in a row: look at the wire",
-    Cause.WATCHDOG: "the device has set u to zero for good: commands did not arrive in time, or it was ended",
-    Cause.ERROR: "|r − y| went beyond most_error",
-    Cause.F_HAT: "|f_hat| went beyond most_f",
-    Cause.SATURATED: "u lay at a limit for longer than most_saturated samples",
-    Cause.NOT_A_NUMBER: "the controller's u was no number",
-    Cause.ASKED: "it was asked to stop",
-    Cause.AT_ONCE: "it was asked to stop at once",
-    Cause.OVER: "the scenario is over",
-    Cause.RAMPED: "u is zero",
-    Cause.SILENT: "no measurement ever came: is the device running?",
-    Cause.UNSETTLED: "there were never enough good samples in a row to begin with",
-}
 
 
 class Rules(NamedTuple):
@@ -139,7 +51,7 @@ class Rules(NamedTuple):
     most_overruns: int
 
 
-# Places of Watch.counts.
+# Places of SupervisorState.counts.
 (
     MODE,
     SAMPLES,  # good ones in START; done in RAMP and STOPPED
@@ -160,14 +72,14 @@ class Rules(NamedTuple):
     TRIPPED,  # whether the device has set u to zero for good
 ) = range(17)
 COUNTS = 17
-# Places of Watch.values.
+# Places of SupervisorState.values.
 U, FROM, Y, GAP = range(4)
 VALUES = 4
 # So many changes of mode are kept; the last places are not for HOLD and back.
 _KEPT, _RESERVED = 4096, 4
 
 
-class Watch(NamedTuple):
+class SupervisorState(NamedTuple):
     """What the supervisor remembers."""
 
     counts: NDArray[np.int64]
@@ -178,27 +90,27 @@ class Watch(NamedTuple):
     """(·, 3): k, mode, cause."""
 
 
-def watch() -> Watch:
+def initial_state() -> SupervisorState:
     """Return what the supervisor knows before the first cycle."""
-    memory = Watch(
+    state = SupervisorState(
         np.zeros(COUNTS, dtype=np.int64), np.zeros(VALUES), np.zeros((_KEPT, 3), dtype=np.int64)
     )
-    memory.counts[BEGAN] = -1
-    memory.values[Y] = np.nan
-    return memory
+    state.counts[BEGAN] = -1
+    state.values[Y] = np.nan
+    return state
 
 
 @kernel
-def change(watch: Watch, k: int, mode: int, cause: int) -> None:
+def change_mode(state: SupervisorState, k: int, mode: int, cause: int) -> None:
     """Go over to another mode, and note why."""
-    counts = watch.counts
+    counts = state.counts
     counts[MODE], counts[SAMPLES] = mode, 0
-    if mode == RAMP:
-        watch.values[FROM] = watch.values[U]
+    if mode == Mode.RAMP:
+        state.values[FROM] = state.values[U]
     number = counts[CHANGES]
-    kept = watch.changes.shape[0]
-    if number < kept - _RESERVED or (number < kept and mode >= RAMP):
-        watch.changes[number, 0], watch.changes[number, 1], watch.changes[number, 2] = (
+    kept = state.changes.shape[0]
+    if number < kept - _RESERVED or (number < kept and mode >= Mode.RAMP):
+        state.changes[number, 0], state.changes[number, 1], state.changes[number, 2] = (
             k,
             mode,
             cause,
@@ -207,12 +119,14 @@ def change(watch: Watch, k: int, mode: int, cause: int) -> None:
 
 
 @kernel
-def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, samples: int) -> None:
+def update_mode(
+    rules: Rules, state: SupervisorState, k: int, y: float, request: int, samples: int
+) -> None:
     """Choose the mode for this cycle, before the controller's step.
 
-    ``y`` is the measurement, ``asked`` what the main thread wants, ``samples`` how many the scenario has.
+    ``y`` is the measurement, ``request`` what the main thread wants, ``samples`` how many the scenario has.
     """
-    counts, values = watch.counts, watch.values
+    counts, values = state.counts, state.values
     good = is_finite(y)
     if good:
         values[Y] = y
@@ -220,90 +134,87 @@ def judge(rules: Rules, watch: Watch, k: int, y: float, asked: int, samples: int
         counts[BLIND] += 1
         counts[MISSES] += 1
     mode = counts[MODE]
-    if asked == ZERO and mode != STOPPED:
-        change(watch, k, STOPPED, AT_ONCE)
-    elif mode <= HOLD:
-        cause = _cause(rules, watch, k, asked, samples)
-        if cause != NONE:
-            change(watch, k, RAMP, cause)
-        elif mode == START:
+    if request == Request.ZERO and mode != Mode.STOPPED:
+        change_mode(state, k, Mode.STOPPED, Cause.ZERO_REQUESTED)
+    elif mode <= Mode.HOLD:
+        cause = _cause_to_end(rules, state, k, request, samples)
+        if cause != Cause.NONE:
+            change_mode(state, k, Mode.RAMP, cause)
+        elif mode == Mode.START:
             if not good:
                 counts[SAMPLES] = 0
             elif counts[SAMPLES] >= rules.settle:
-                change(watch, k, RUN, SETTLED)
+                change_mode(state, k, Mode.RUN, Cause.SETTLED)
                 counts[BEGAN] = k
             else:
                 counts[SAMPLES] += 1
-        elif good and mode == HOLD:
-            change(watch, k, RUN, BACK)
-        elif not good and mode == RUN:
-            change(watch, k, HOLD, MISSED)
+        elif good and mode == Mode.HOLD:
+            change_mode(state, k, Mode.RUN, Cause.RECOVERED)
+        elif not good and mode == Mode.RUN:
+            change_mode(state, k, Mode.HOLD, Cause.MISSED)
     if good:
         counts[BLIND] = counts[SLEPT] = 0
 
 
 @kernel
-def _cause(rules: Rules, watch: Watch, k: int, asked: int, samples: int) -> int:
+def _cause_to_end(rules: Rules, state: SupervisorState, k: int, request: int, samples: int) -> int:
     """Return why it has to end, as far as that is known before the controller's step."""
-    counts = watch.counts
-    cause = NONE
-    if asked == END:
-        cause = ASKED
+    counts = state.counts
+    cause = Cause.NONE
+    if request == Request.RAMP:
+        cause = Cause.STOP_REQUESTED
     elif counts[BLIND] > rules.hold:
-        cause = STALLED if counts[SLEPT] > rules.hold else LOST
+        cause = Cause.STALLED if counts[SLEPT] > rules.hold else Cause.LOST
     elif counts[FAILED] > rules.hold:
-        cause = UNREACHED
+        cause = Cause.UNREACHABLE
     elif counts[IN_A_ROW] > rules.most_overruns:
-        cause = OVERRUN
+        cause = Cause.OVERRUN
     elif counts[TRIPPED] != 0:
-        cause = WATCHDOG
-    elif counts[MODE] == START and k > _LONGEST_START * (rules.settle + 100):
-        cause = UNSETTLED
+        cause = Cause.WATCHDOG
+    elif counts[MODE] == Mode.START and k > _LONGEST_START * (rules.settle + 100):
+        cause = Cause.UNSETTLED
     elif counts[BEGAN] >= 0 and k - counts[BEGAN] >= samples:
-        cause = OVER
+        cause = Cause.COMPLETED
     return cause
 
 
 @kernel
-def decide(rules: Rules, watch: Watch, k: int, wished: float, r: float, f_hat: float) -> float:
+def supervised_output(
+    rules: Rules, state: SupervisorState, k: int, wished: float, r: float, f_hat: float
+) -> float:
     """Return the u to apply, given what the controller wishes; in RUN, trip where a limit is passed.
 
     ``r`` is the reference of this sample, ``f_hat`` the estimate after it, zero where the controller has none.
     """
-    counts, values = watch.counts, watch.values
+    counts, values = state.counts, state.values
     u = 0.0
-    if counts[MODE] == RUN:
+    if counts[MODE] == Mode.RUN:
         u = min(max(wished, rules.low), rules.high)
         counts[AT_LIMIT] = counts[AT_LIMIT] + 1 if u == rules.low or u == rules.high else 0
         if not is_finite(wished):
-            change(watch, k, RAMP, NOT_A_NUMBER)
+            change_mode(state, k, Mode.RAMP, Cause.NOT_A_NUMBER)
         elif not abs(r - values[Y]) <= rules.most_error:
-            change(watch, k, RAMP, ERROR)
+            change_mode(state, k, Mode.RAMP, Cause.TRACKING_ERROR)
         elif not abs(f_hat) <= rules.most_f:
-            change(watch, k, RAMP, F_HAT)
+            change_mode(state, k, Mode.RAMP, Cause.F_HAT)
         elif counts[AT_LIMIT] > rules.most_saturated:
-            change(watch, k, RAMP, SATURATED)
-    elif counts[MODE] == HOLD:
+            change_mode(state, k, Mode.RAMP, Cause.SATURATED)
+    elif counts[MODE] == Mode.HOLD:
         u = values[U]
-    if counts[MODE] == RAMP:
+    if counts[MODE] == Mode.RAMP:
         counts[SAMPLES] += 1
         left = rules.ramp - counts[SAMPLES]
         u = values[FROM] * left / rules.ramp
         if left <= 0 or values[FROM] == 0.0:
             u = 0.0
-            change(watch, k, STOPPED, RAMPED)
-    elif counts[MODE] == STOPPED:
+            change_mode(state, k, Mode.STOPPED, Cause.RAMPED)
+    elif counts[MODE] == Mode.STOPPED:
         counts[SAMPLES] += 1
     values[U] = u
     return u
 
 
 @kernel
-def finished(watch: Watch) -> bool:
+def finished(state: SupervisorState) -> bool:
     """Tell whether u is zero and was written often enough."""
-    return watch.counts[MODE] == STOPPED and watch.counts[SAMPLES] > FLUSH
-
-
-def changes(watch: Watch, first: int = 0) -> NDArray[np.int64]:
-    """Return the changes of mode (·, 3) from number ``first`` on, while the loop may be running."""
-    return watch.changes[first : load_acquire(watch.counts, CHANGES)].copy()
+    return state.counts[MODE] == Mode.STOPPED and state.counts[SAMPLES] > FLUSH

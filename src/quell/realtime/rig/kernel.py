@@ -30,9 +30,10 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import compiled, is_finite, kernel
 from quell.plants.base import advance, measure
+from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.clock import now, wait_until
-from quell.realtime.system.histogram import count
-from quell.realtime.telemetry.ring import Ring, load_acquire, push
+from quell.realtime.system.histogram import count_duration
+from quell.realtime.telemetry.ring import Ring, push
 from quell.realtime.wire import frames
 from quell.realtime.wire.frames import Buffer, Endpoint
 from quell.realtime.wire.transport import connect_to_sender, receive, reply, send
@@ -242,7 +243,7 @@ def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
                 break
             time = wait_until(clock, deadline)
             late = time - deadline
-            count(rig.lateness, late)
+            count_duration(rig.lateness, late)
             if late > period:
                 rig.counts[CAUGHT_UP] += 1
         tick(rig, time)

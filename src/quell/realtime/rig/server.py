@@ -15,15 +15,16 @@ from quell import checks
 from quell.kernels.dispatch import for_types
 from quell.realtime.rig import kernel as kernels
 from quell.realtime.rig.kernel import RigModel, serve
+from quell.realtime.system.atomics import store_release
 from quell.realtime.system.clock import system_clock
-from quell.realtime.system.histogram import Histogram, tally
+from quell.realtime.system.histogram import Histogram, empty_counts
 from quell.realtime.system.scheduling import (
     checked_cpu,
     checked_priority,
     enter_real_time,
-    quiet_process,
+    real_time_process,
 )
-from quell.realtime.telemetry.ring import drain, dropped, ring, store_release
+from quell.realtime.telemetry.ring import drain, dropped, ring
 from quell.realtime.wire import frames
 from quell.realtime.wire.transport import send
 from quell.simulation.driver import check_part
@@ -124,7 +125,7 @@ class Rig:
             row=np.zeros(len(kernels.LOG)),
             log=ring(max(round(_ROOM / dt), 100) if log is not None else 1, len(kernels.LOG)),
             logged=log is not None,
-            lateness=tally(),
+            lateness=empty_counts(),
             stop=np.zeros(1, dtype=np.int64),
         )
         self._file = None if log is None else _opened(log)
@@ -212,7 +213,7 @@ class Rig:
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
         self.prepare()
         raised: list[BaseException] = []
-        with quiet_process(priority, False) as notes:
+        with real_time_process(priority, False) as notes:
 
             def work() -> None:
                 try:

@@ -28,13 +28,13 @@ LONGEST = BINS
 _BAR = 48
 
 
-def tally() -> NDArray[np.int64]:
+def empty_counts() -> NDArray[np.int64]:
     """Return an empty histogram (BINS + 1,) for ``count``."""
     return np.zeros(BINS + 1, dtype=np.int64)
 
 
 @kernel
-def count(tally: NDArray[np.int64], nanoseconds: int) -> None:
+def count_duration(tally: NDArray[np.int64], nanoseconds: int) -> None:
     """Count a duration [ns]."""
     size, place = max(nanoseconds, 0), 0
     while size >= _LINEAR:

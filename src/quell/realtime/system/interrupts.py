@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 
-def ending_signals() -> list[signal.Signals]:
+def termination_signals() -> list[signal.Signals]:
     """Return the signals that end a program that does not mind them: Ctrl-C, SIGTERM, and SIGHUP, unless that is ignored (nohup)."""
     hang_up = getattr(signal, "SIGHUP", None)
     more = [] if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN else [hang_up]
@@ -16,9 +16,9 @@ def ending_signals() -> list[signal.Signals]:
 
 
 @contextmanager
-def handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
+def termination_handler(handler: Callable[[int, Any], None]) -> Iterator[None]:
     """Let ``handler`` hear these signals instead of whoever did; in the main thread only."""
-    before = {number: signal.signal(number, handler) for number in ending_signals()}
+    before = {number: signal.signal(number, handler) for number in termination_signals()}
     try:
         yield
     finally:

@@ -43,7 +43,7 @@ def checked_cpu(cpu: int | None) -> int | None:
 
 
 @contextmanager
-def quiet_process(priority: int, interpreted: bool) -> Iterator[list[str]]:
+def real_time_process(priority: int, interpreted: bool) -> Iterator[list[str]]:
     """Around the loop, in the main thread: lock the memory, keep processors awake and the garbage collector out.
 
     Yields a list for what is to be told.

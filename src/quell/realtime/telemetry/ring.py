@@ -8,16 +8,14 @@ being read. Where the ring is full, the newest row is dropped and counted.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba.core import types as nb_types
-from numba.core.cgutils import get_item_pointer
-from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 from quell import checks
 from quell.kernels.dispatch import compiled, kernel
+from quell.realtime.system.atomics import load_acquire, store_release
 from quell.types import Matrix, Vector
 
 # Sixteen words apart: no two of them on one cache line, nor on the pair of lines that processors fetch together.
@@ -93,51 +91,3 @@ def _take(ring: Ring, out: Matrix) -> None:
         for i in range(rows.shape[1]):
             out[k, i] = rows[place, i]
     store_release(ends, TAIL, tail + count)
-
-
-def load_acquire(words: IntVector, index: int) -> int:
-    """Read a word that another thread writes: what it wrote before that word is there to be read after this.
-
-    Interpreted it is a plain read: there the interpreter's lock keeps the order.
-    """
-    return int(words[index])
-
-
-def store_release(words: IntVector, index: int, value: int) -> None:
-    """Write a word that another thread reads: what was written before is there for it once it sees the word."""
-    words[index] = value
-
-
-def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
-    return get_item_pointer(
-        context, builder, kind, context.make_array(kind)(context, builder, array), [index]
-    )
-
-
-@intrinsic
-def _load_acquire(typing_context: Any, words: Any, index: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        word = _address(context, builder, signature.args[0], values[0], values[1])
-        return builder.load_atomic(word, "acquire", align=8)
-
-    return nb_types.int64(words, nb_types.int64), generate
-
-
-@intrinsic
-def _store_release(typing_context: Any, words: Any, index: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        word = _address(context, builder, signature.args[0], values[0], values[1])
-        builder.store_atomic(values[2], word, "release", align=8)
-        return context.get_dummy_value()
-
-    return nb_types.void(words, nb_types.int64, nb_types.int64), generate
-
-
-@overload(load_acquire, strict=False)
-def _compiled_load(words: Any, index: Any) -> Any:
-    return lambda words, index: _load_acquire(words, index)
-
-
-@overload(store_release, strict=False)
-def _compiled_store(words: Any, index: Any, value: Any) -> Any:
-    return lambda words, index, value: _store_release(words, index, value)

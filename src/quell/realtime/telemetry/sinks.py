@@ -13,7 +13,7 @@ from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.live import LiveSink
 from quell.realtime.telemetry.load import trajectory_of
 from quell.realtime.telemetry.mcap_file import McapSink
-from quell.realtime.telemetry.telemetry import Sink
+from quell.realtime.telemetry.writer import Sink
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix
 

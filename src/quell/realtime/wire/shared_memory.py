@@ -35,8 +35,8 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.kernels.dispatch import kernel
+from quell.realtime.system.atomics import load_acquire, store_release
 from quell.realtime.system.clock import SystemClock, now, system_clock, wait_until
-from quell.realtime.telemetry.ring import load_acquire, store_release
 from quell.realtime.wire.frames import HELLO, LENGTH, Buffer
 from quell.realtime.wire.transport import connect_to_sender, receive, reply, send, wait_for_frame
 from quell.realtime.wire.wire import WireDevice

@@ -13,10 +13,18 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.kernels.dispatch import compiling, for_types, interpreted
 from quell.realtime.devices.base import PythonHandle, handle_of
-from quell.realtime.loop.bound import bound, warm
-from quell.realtime.loop.loop import Books, Pace, Setpoints, pace, run_cycles
-from quell.realtime.loop.supervisor import FLUSH, MODE, SAMPLES, STOPPED, Rules, Watch, watch
-from quell.realtime.system.histogram import Histogram, Timing, tally
+from quell.realtime.loop.compiled_controller import bound, warm
+from quell.realtime.loop.cycle import Books, Pace, Setpoints, pace, run_cycles
+from quell.realtime.loop.modes import Mode
+from quell.realtime.loop.supervisor import (
+    FLUSH,
+    MODE,
+    SAMPLES,
+    Rules,
+    SupervisorState,
+    initial_state,
+)
+from quell.realtime.system.histogram import Histogram, Timing, empty_counts
 from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.ring import Ring
 from quell.records.record import columns_of, in_steps
@@ -90,7 +98,7 @@ def sliding(dt: float, time: float, derivatives: int) -> Matrix:
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class ControlLoop:
     """A loop that is compiled and has not begun."""
 
     handle: Any
@@ -98,7 +106,7 @@ class Prepared:
     design: Any
     state: Any
     rules: Rules
-    watch: Watch
+    supervisor: SupervisorState
     setpoints: Setpoints
     pace: Pace
     books: Books
@@ -116,7 +124,7 @@ class Prepared:
         ring: Ring,
         *,
         interpret: bool = False,
-    ) -> Prepared:
+    ) -> ControlLoop:
         """Put together a device, a controller that begins with nothing learned, and what it has to follow; compile it.
 
         The loop is interpreted where the device needs it, but the controller is compiled all the same; unless ``interpret`` wants both as
@@ -140,12 +148,18 @@ class Prepared:
             for name in ("f_learned", "f_residual")
         )
         books = Books(
-            ring, row, f_learned, f_residual, tally(), tally(), np.zeros(1, dtype=np.int64)
+            ring,
+            row,
+            f_learned,
+            f_residual,
+            empty_counts(),
+            empty_counts(),
+            np.zeros(1, dtype=np.int64),
         )
         due = pace(controller.dt, getattr(device, "paced", False))
         as_python = interpret or isinstance(handle, PythonHandle)
         prepared = cls(
-            handle, clock, design, state, rules, watch(), setpoints, due, books, as_python
+            handle, clock, design, state, rules, initial_state(), setpoints, due, books, as_python
         )
         prepared._compile()
         return prepared
@@ -170,7 +184,7 @@ class Prepared:
                     self.design,
                     self.state,
                     self.rules,
-                    self.watch,
+                    self.supervisor,
                     self.setpoints,
                     self.pace,
                     self.books,
@@ -179,9 +193,9 @@ class Prepared:
 
     def _compile(self) -> None:
         """Compile by a run that is over before it begins."""
-        over = copy.deepcopy(self.watch)
-        over.counts[MODE], over.counts[SAMPLES] = STOPPED, FLUSH + 1
-        Prepared(**{**vars(self), "watch": over}).run()
+        over = copy.deepcopy(self.supervisor)
+        over.counts[MODE], over.counts[SAMPLES] = Mode.STOPPED, FLUSH + 1
+        ControlLoop(**{**vars(self), "supervisor": over}).run()
 
     @property
     def timing(self) -> Timing:

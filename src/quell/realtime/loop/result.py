@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell.realtime.loop.modes import Cause, Ending, Mode
 from quell.realtime.loop.supervisor import (
     BEGAN,
     CHANGES,
@@ -17,10 +18,9 @@ from quell.realtime.loop.supervisor import (
     OVERRUNS,
     SKIPPED,
     UNSENT,
-    Cause,
-    Mode,
-    Watch,
+    SupervisorState,
 )
+from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.histogram import Timing
 from quell.records.trajectory import Trajectory
 
@@ -35,7 +35,7 @@ class ModeChange(NamedTuple):
 
     def __str__(self) -> str:
         """Say it in a sentence."""
-        return f"{self.t:9.3f} s  {self.mode.name}: {self.cause.words}"
+        return f"{self.t:9.3f} s  {self.mode.name}: {self.cause.text}"
 
 
 class Tally(NamedTuple):
@@ -94,7 +94,7 @@ class RigRun:
     @property
     def completed(self) -> bool:
         """Whether the scenario was run to its end."""
-        return any(change.cause is Cause.OVER for change in self.changes)
+        return any(change.cause.ending is Ending.COMPLETED for change in self.changes)
 
     @property
     def verdict(self) -> str:
@@ -129,35 +129,36 @@ class RigRun:
         )
 
 
-def tally_of(watch: Watch, rows_lost: int) -> Tally:
+def tally_of(state: SupervisorState, rows_lost: int) -> Tally:
     """Return what the supervisor counted."""
     cycles, overruns, skipped, missed, clipped, unsent = (
-        int(watch.counts[place]) for place in (CYCLES, OVERRUNS, SKIPPED, MISSES, CLIPPED, UNSENT)
+        int(state.counts[place]) for place in (CYCLES, OVERRUNS, SKIPPED, MISSES, CLIPPED, UNSENT)
     )
     return Tally(cycles, overruns, skipped, missed, clipped, unsent, rows_lost)
 
 
-def told(rows: Any, dt: float) -> tuple[ModeChange, ...]:
-    """Return rows (·, 3) of k, mode and cause in words."""
+def mode_changes(state: SupervisorState, dt: float, first: int = 0) -> tuple[ModeChange, ...]:
+    """Return the changes of mode from number ``first`` on; the loop may be running meanwhile."""
+    rows = state.changes[first : load_acquire(state.counts, CHANGES)]
     return tuple(ModeChange(k * dt, Mode(mode), Cause(cause)) for k, mode, cause in rows.tolist())
 
 
-def unkept(watch: Watch, dt: float) -> tuple[str, ...]:
+def unkept(state: SupervisorState, dt: float) -> tuple[str, ...]:
     """Say where there were more changes of mode than are kept."""
-    kept = int(watch.counts[CHANGES])
-    limit = watch.changes.shape[0]
+    kept = int(state.counts[CHANGES])
+    limit = state.changes.shape[0]
     return (
         ()
         if kept < limit - 4
         else (
-            f"only the first {kept} changes of mode, until {watch.changes[kept - 1, 0] * dt:.3f} s, were kept",
+            f"only the first {kept} changes of mode, until {state.changes[kept - 1, 0] * dt:.3f} s, were kept",
         )
     )
 
 
-def scenario_part(record: Trajectory, watch: Watch, samples: int) -> Trajectory:
+def scenario_part(record: Trajectory, state: SupervisorState, samples: int) -> Trajectory:
     """Return those samples of a record that are the scenario's."""
-    k, began = record["k"], int(watch.counts[BEGAN])
+    k, began = record["k"], int(state.counts[BEGAN])
     mine = (
         np.flatnonzero((k >= began) & (k < began + samples))
         if began >= 0

@@ -1,4 +1,4 @@
-"""Telemetry: rows leave the loop through a ring, and another thread writes them down.
+"""TelemetryWriter: rows leave the loop through a ring, and another thread writes them down.
 
 The loop puts a row into the ring each cycle and never waits. The writer's thread empties the ring some twenty times a second and hands the
 rows to its sinks: files, or whoever watches. A sink that fails (disk full, no permission) is closed and reported; the loop, and the other
@@ -55,7 +55,7 @@ class Sink(Protocol):
         """End the recording."""
 
 
-class Telemetry:
+class TelemetryWriter:
     """A ring for a loop's rows, and the thread that takes them out.
 
     Used as a context manager it starts and stops itself.
@@ -147,7 +147,7 @@ class Telemetry:
         if self._thread.is_alive():
             self._report(f"writing did not end within {timeout:g} s; the last rows may be missing")
 
-    def __enter__(self) -> Telemetry:
+    def __enter__(self) -> TelemetryWriter:
         self.start()
         return self
 

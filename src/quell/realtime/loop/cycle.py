@@ -27,6 +27,7 @@ from quell.controllers.base import (
 )
 from quell.kernels.dispatch import compiled, is_finite, kernel
 from quell.realtime.devices.base import read_measurement, write_command
+from quell.realtime.loop.modes import Cause, Mode, Request
 from quell.realtime.loop.supervisor import (
     BEGAN,
     BLIND,
@@ -35,29 +36,26 @@ from quell.realtime.loop.supervisor import (
     CYCLES,
     FAILED,
     GAP,
-    GO_ON,
     IN_A_ROW,
     MODE,
     OVERRUNS,
-    RUN,
-    SILENT,
     SKIPPED,
     SLEPT,
-    STOPPED,
     TRIPPED,
     UNSENT,
     UNSURE,
     Rules,
+    SupervisorState,
     U,
-    Watch,
     Y,
-    change,
-    decide,
+    change_mode,
     finished,
-    judge,
+    supervised_output,
+    update_mode,
 )
+from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.clock import now, wait_until
-from quell.realtime.system.histogram import count
+from quell.realtime.system.histogram import count_duration
 from quell.realtime.telemetry.channels import (
     EVENTS,
     LATENESS,
@@ -71,7 +69,7 @@ from quell.realtime.telemetry.channels import MODE as ROW_MODE
 from quell.realtime.telemetry.channels import R as ROW_R
 from quell.realtime.telemetry.channels import U as ROW_U
 from quell.realtime.telemetry.channels import Y as ROW_Y
-from quell.realtime.telemetry.ring import Ring, load_acquire, push
+from quell.realtime.telemetry.ring import Ring, push
 from quell.types import Matrix, Vector
 
 # A paced device has so long to send its first measurement; in between it is looked whether somebody wants to stop [ns].
@@ -142,18 +140,18 @@ def run_cycles(
     design: Any,
     state: Any,
     rules: Rules,
-    watch: Watch,
+    supervisor: SupervisorState,
     setpoints: Setpoints,
     pace: Pace,
     books: Books,
 ) -> None:
     """Run until the supervisor has stopped the device."""
-    counts, row = watch.counts, books.row
+    counts, row = supervisor.counts, books.row
     origin = 0
-    if not finished(watch):
-        origin = _first_deadline(handle, clock, watch, pace, books.requests)
+    if not finished(supervisor):
+        origin = _first_deadline(handle, clock, supervisor, pace, books.requests)
     k = left_out = 0
-    while not finished(watch):
+    while not finished(supervisor):
         deadline = origin + int(k * pace.period)
         woke = wait_until(clock, deadline)
         lateness = woke - deadline
@@ -165,7 +163,7 @@ def run_cycles(
         origin += shift
         changes = counts[CHANGES]
         clipped = counts[CLIPPED]
-        u = _steer(design, state, rules, watch, setpoints, books, k, left_out, y)
+        u = _steer(design, state, rules, supervisor, setpoints, books, k, left_out, y)
         fault = write_command(handle, u)
         unsent = fault == 1
         counts[FAILED] = counts[FAILED] + 1 if unsent else 0
@@ -190,12 +188,12 @@ def run_cycles(
             + (_UNSENT if unsent else 0)
             + (_CHANGED if counts[CHANGES] > changes else 0)
         )
-        row[ROW_Y] = watch.values[Y]
+        row[ROW_Y] = supervisor.values[Y]
         row[Y_MEASURED] = y
         row[ROW_U] = u
         push(books.ring, row)
-        count(books.lateness, lateness)
-        count(books.step, step)
+        count_duration(books.lateness, lateness)
+        count_duration(books.step, step)
         _skip(counts, missed_next)
         left_out = missed_next
         k += 1 + missed_next
@@ -203,7 +201,7 @@ def run_cycles(
 
 @kernel
 def _first_deadline(
-    handle: Any, clock: Any, watch: Watch, pace: Pace, requests: NDArray[np.int64]
+    handle: Any, clock: Any, supervisor: SupervisorState, pace: Pace, requests: NDArray[np.int64]
 ) -> int:
     """Return when cycle 0 is due [ns]: a sample from now, or from a paced device's next tick."""
     begin = now(clock)
@@ -212,7 +210,7 @@ def _first_deadline(
     read_measurement(handle, clock, begin)  # what is there already is of no tick that is known
     while (
         now(clock) < begin + max(_FIRST, int(5.0 * pace.period))
-        and load_acquire(requests, 0) == GO_ON
+        and load_acquire(requests, 0) == Request.NONE
     ):
         before = now(clock)
         y, _ = read_measurement(handle, clock, before + max(_LOOK, int(2.0 * pace.period)))
@@ -221,7 +219,7 @@ def _first_deadline(
             return after + int(pace.period)
         if after == before:  # it does not wait, and no time passes
             break
-    change(watch, 0, STOPPED, SILENT)
+    change_mode(supervisor, 0, Mode.STOPPED, Cause.NO_MEASUREMENT)
     return now(clock) + int(pace.period)
 
 
@@ -264,7 +262,7 @@ def _steer(
     design: Any,
     state: Any,
     rules: Rules,
-    watch: Watch,
+    supervisor: SupervisorState,
     setpoints: Setpoints,
     books: Books,
     k: int,
@@ -275,17 +273,17 @@ def _steer(
 
     Of the ``left_out`` deadlines before k the controller is told first, as far as they are not the end of the run.
     """
-    counts, values, row = watch.counts, watch.values, books.row
-    judge(rules, watch, k, y, load_acquire(books.requests, 0), setpoints.r.size)
+    counts, values, row = supervisor.counts, supervisor.values, books.row
+    update_mode(rules, supervisor, k, y, load_acquire(books.requests, 0), setpoints.r.size)
     first = k - min(left_out, rules.hold)
-    if counts[MODE] == RUN and counts[BEGAN] == k:
+    if counts[MODE] == Mode.RUN and counts[BEGAN] == k:
         bumpless_transfer(design, state)
         values[GAP] = y - setpoints.r[0]
         first = k
-    awake = counts[MODE] != STOPPED and is_finite(values[Y])
+    awake = counts[MODE] != Mode.STOPPED and is_finite(values[Y])
     r, wished, f_hat = 0.0, 0.0, 0.0
     for i in range(first, k + 1):
-        r = _reference(design, state, setpoints, watch, i)
+        r = _reference(design, state, setpoints, supervisor, i)
         if awake:
             wished = control(design, state, r, y if i == k else np.nan)
             if i < k:
@@ -293,21 +291,23 @@ def _steer(
     write_row(design, state, row[LOOP_WIDTH:])
     if books.f_learned >= 0:
         f_hat = row[books.f_learned] + row[books.f_residual]
-    u = decide(rules, watch, k, wished, r, f_hat)
+    u = supervised_output(rules, supervisor, k, wished, r, f_hat)
     if awake and u != wished:
         set_applied_control(design, state, u)
-        counts[CLIPPED] += counts[MODE] == RUN
+        counts[CLIPPED] += counts[MODE] == Mode.RUN
     row[ROW_R] = r
     return u
 
 
 @kernel
-def _reference(design: Any, state: Any, setpoints: Setpoints, watch: Watch, k: int) -> float:
+def _reference(
+    design: Any, state: Any, setpoints: Setpoints, supervisor: SupervisorState, k: int
+) -> float:
     """Return the reference of this sample, and tell the controller its derivatives; where y is, before the scenario begins."""
-    if watch.counts[BEGAN] < 0:
-        return watch.values[Y]
-    i = min(k - watch.counts[BEGAN], setpoints.r.size - 1)
-    gap = watch.values[GAP] if i < setpoints.slide.shape[0] else 0.0
+    if supervisor.counts[BEGAN] < 0:
+        return supervisor.values[Y]
+    i = min(k - supervisor.counts[BEGAN], setpoints.r.size - 1)
+    gap = supervisor.values[GAP] if i < setpoints.slide.shape[0] else 0.0
     r = setpoints.r[i]
     if gap != 0.0:
         r += gap * setpoints.slide[i, 0]
