@@ -134,9 +134,9 @@ def _narrow(controller: Any, low: float, high: float) -> None:
     """Give a controller, or the one behind its prefilter, other limits."""
     inner = controller.controller if isinstance(controller, room.Prefiltered) else controller
     inner._limits = controller.limits._replace(low=low, high=high)
-    inner._begin()
+    inner._initialise()
     if inner is not controller:
-        controller._begin()
+        controller._initialise()
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

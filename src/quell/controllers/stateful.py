@@ -1,4 +1,4 @@
-"""What every controller of this package shares: a running state, one sample at a time, saved, restored, copied, sent."""
+"""The base class of all controllers of this package: a running state that can be stepped, saved, restored and copied."""
 
 from __future__ import annotations
 
@@ -14,35 +14,41 @@ from quell.controllers.compiled_step import entry_point, pack, step_packed
 from quell.controllers.limits import Limits
 from quell.kernels.dispatch import compiling, for_types
 
-# What only this process can use, or what can be made anew.
-_MADE_ANEW = ("parameters", "_state", "_arrays", "_packed", "_step")
+# Attributes that are made again in a copy: compiled functions and shared arrays belong to one process.
+_NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step")
 
 
 class StatefulController:
-    """A controller with a running state of its own, which ``step`` moves on and ``simulate`` leaves alone.
+    """A controller with its own running state, which ``step`` advances and ``simulate`` does not touch.
 
-    A subclass sets what it is made from, then calls ``_begin``. It has ``_prepare_design``, which makes ``parameters`` from that, and
-    ``initial_state``. Where a part of its state lies outside of arrays, it says so in ``_outside``, ``_snapshots`` and ``_recall``.
+    A subclass sets its attributes, then calls ``_initialise``. It defines ``_update_parameters``, which makes ``parameters`` from them,
+    and ``initial_state``. If a field of the state refers to an object outside of its arrays, the subclass also defines
+    ``_external_fields``, ``_external_snapshots`` and ``_restore_external``.
     """
 
     parameters: Any
-    """What the compiled functions need, a NamedTuple."""
+    """Parameters of the compiled functions, a NamedTuple."""
     _state: Any
     _limits: Limits
     _packed: Any
     _step: Callable[[Any, float, float], float]
 
-    def _begin(self) -> None:
-        self._prepare_design()
-        self._adopt(self.initial_state())
+    def _initialise(self) -> None:
+        self._update_parameters()
+        self._use_state(self.initial_state())
 
-    def _adopt(self, state: Any) -> None:
-        """Run on ``state`` from here on."""
+    def _use_state(self, state: Any) -> None:
+        """Run on ``state`` from now on."""
         self._state = state
         self._arrays = named_arrays(state)
         self._packed = None
 
-    def _prepare_design(self) -> None:
+    def _pack_again(self) -> None:
+        """Update the arguments of the compiled step after a change of the parameters."""
+        if self._packed is not None:
+            self._packed = pack(self.parameters, self._state)
+
+    def _update_parameters(self) -> None:
         raise NotImplementedError
 
     def initial_state(self) -> Any:
@@ -53,7 +59,7 @@ class StatefulController:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
         dispatcher = for_types(step_packed, self.parameters)
         self._packed = pack(self.parameters, self._state)
-        # The first call is made on a state of its own: it must not count as a sample.
+        # The first call runs on another state, because it must not count as a sample.
         with compiling(self.parameters):
             dispatcher(pack(self.parameters, self.initial_state()), 0.0, 0.0)
         self._step = entry_point(dispatcher, self._packed, 0.0, 0.0)
@@ -61,10 +67,10 @@ class StatefulController:
     def step(self, r: float, y: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
 
-        A value that is not finite is replaced by the last good one, or by what an observer expects, and said in ``status``. The returned
-        value is taken for applied; limits belong in ``u_min``, ``u_max`` and ``rate_limit``, not behind the controller.
+        A value that is not finite is replaced by the last finite one, or by the one that an observer expects; ``status`` reports it. The
+        controller assumes that the returned value is applied: set limits by ``u_min``, ``u_max`` and ``rate_limit``.
 
-        The first call compiles, or loads; ``prepare`` does that beforehand.
+        The first call compiles, or loads from the disk cache; call ``prepare`` to do that beforehand.
         """
         if self._packed is None:
             self.prepare()
@@ -74,44 +80,43 @@ class StatefulController:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
 
     def applied(self, u: float) -> None:
-        """Say what was really applied [u-unit] since the last ``step``, where something behind the controller changed it.
+        """Correct the control signal that was applied since the last ``step`` [u-unit], if it is not the one that was returned.
 
-        To be called before the next ``step``. Limits that are known beforehand belong in ``u_min``, ``u_max`` and ``rate_limit``.
+        Call it before the next ``step``. Limits that are known beforehand belong in ``u_min``, ``u_max`` and ``rate_limit``.
 
         Raises
         ------
         ValueError
-            where u is not finite.
+            for a u that is not finite.
         """
         set_applied_control(self.parameters, self._state, checks.finite("u", u))
 
     @property
     def limits(self) -> Limits:
-        """What the control signal keeps to: ``low`` and ``high`` [u-unit], and ``most_change`` in a sample."""
+        """Limits of the control signal: ``low`` and ``high`` [u-unit], and ``most_change`` in a sample."""
         return self._limits
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what only this process can use, so that controllers can be copied and sent to other processes."""
-        return {name: value for name, value in vars(self).items() if name not in _MADE_ANEW} | {
-            "state": self.state
-        }
+        """Return what a copy, also one in another process, is made from."""
+        kept = {name: value for name, value in vars(self).items() if name not in _NOT_COPIED}
+        return kept | {"state": self.state}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update({name: value for name, value in kept.items() if name != "state"})
-        # Parameters may hold addresses of compiled functions, and arrays of a state may share memory: both are made anew, not copied.
-        self._begin()
+        # Parameters may hold addresses of compiled functions, and arrays of a state may share memory: make both again.
+        self._initialise()
         self.state = kept["state"]
 
     def reset(self) -> None:
-        """Go back to the state before the first sample; what was learned is forgotten."""
+        """Return to the state before the first sample and forget what was learned."""
         self.state = self._saved(self.initial_state())
 
     @property
     def state(self) -> dict[str, NDArray[Any]]:
-        """The whole running state as named arrays, copied: ``numpy.savez(file, **controller.state)`` keeps it.
+        """The whole running state as copies of named arrays: ``numpy.savez(file, **controller.state)`` saves it.
 
-        Assigning such a dictionary restores it; a ``ValueError`` names what does not fit, and nothing has changed then. A learner that is
-        a Python object is in it as an array () of objects, which is good in this process; quell does not pickle or unpickle it.
+        Assign such a dictionary to restore it; a ``ValueError`` names what does not fit, and then nothing has changed. A learner that is
+        a Python object appears as an array () of objects, which is valid in this process; quell does not pickle or unpickle it.
         """
         return self._saved(self._state)
 
@@ -122,7 +127,7 @@ class StatefulController:
         checked = {}
         snapshots = {}
         for name, array in self._arrays.items():
-            if name in self._outside:
+            if name in self._external_fields:
                 snapshots[name] = np.asarray(saved[name])[()]
                 continue
             try:
@@ -134,30 +139,29 @@ class StatefulController:
                     f"state[{name!r}] has shape {checked[name].shape}: must have {array.shape}"
                 )
         if snapshots:
-            self._recall(self._state, snapshots)
+            self._restore_external(self._state, snapshots)
         for name, value in checked.items():
             self._arrays[name][...] = value
 
     @property
-    def _outside(self) -> tuple[str, ...]:
-        """Names of what stands for something outside of the state's arrays."""
+    def _external_fields(self) -> tuple[str, ...]:
+        """Names of state entries that refer to an object outside of the state."""
         return ()
 
-    def _snapshots(self, state: Any) -> dict[str, Any]:
-        """Return what stands outside of the arrays of ``state``, by name."""
+    def _external_snapshots(self, state: Any) -> dict[str, Any]:
+        """Return copies of the objects that ``state`` refers to, by name."""
         return {}
 
-    def _recall(self, state: Any, snapshots: Mapping[str, Any]) -> None:
-        """Put back what ``_snapshots`` returned."""
+    def _restore_external(self, state: Any, snapshots: Mapping[str, Any]) -> None:
+        """Restore what ``_external_snapshots`` returned."""
 
     def _saved(self, state: Any) -> dict[str, NDArray[Any]]:
         saved: dict[str, NDArray[Any]] = {
             name: array.copy() for name, array in named_arrays(state).items()
         }
-        for name, snapshot in self._snapshots(state).items():
-            box = np.empty((), dtype=object)
-            box[()] = snapshot
-            saved[name] = box
+        for name, snapshot in self._external_snapshots(state).items():
+            saved[name] = np.empty((), dtype=object)
+            saved[name][()] = snapshot
         return saved
 
 

@@ -1,4 +1,4 @@
-"""Active disturbance rejection control: an ESO, the law around it (``law.py``) and, where there is one, a learner."""
+"""The ADRC controller: an ESO, the control law around it (``law.py``) and an optional learner with a guard."""
 
 from __future__ import annotations
 
@@ -9,59 +9,69 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc.estimate import Estimate
-from quell.controllers.adrc.handover import HandOver
-from quell.controllers.adrc.law import F_LEARNED, LOOP, STATUS, AdrcDesign, AdrcState, U, law_gains
+from quell.controllers.adrc.estimate import Estimate, read_estimate
+from quell.controllers.adrc.handover import (
+    change_design,
+    check_replacement,
+    check_structure,
+    manual_operation,
+    samples_to_settle,
+    start_at_rest,
+)
+from quell.controllers.adrc.law import (
+    BUMPLESS,
+    LOOP,
+    STARTED,
+    WISHED,
+    AdrcDesign,
+    AdrcState,
+    U,
+    law_gains,
+)
 from quell.controllers.base import set_reference_derivatives
-from quell.controllers.compiled_step import pack
 from quell.controllers.design_checks import warn_if_unwise
 from quell.controllers.limits import checked_limits
-from quell.guard import (
-    GUARD_CHANNELS,
-    Guard,
-    Reason,
-    UnguardedDesign,
-    UnguardedMemory,
-    write_channels,
-)
-from quell.learners.base import Learner, NoLearner, coefficients, validated_design
+from quell.controllers.stateful import StatefulController
+from quell.guard import GUARD_CHANNELS, Guard, UnguardedDesign, UnguardedMemory
+from quell.learners.base import Learner, NoLearner, validated_design
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
-from quell.types import Status
 
 
-class ADRC(HandOver):
+class ADRC(StatefulController):
     """Active disturbance rejection control around an ESO, with or without a learner.
 
-    The object is immutable in all but its running state: ``step`` moves that on, ``simulate`` leaves it alone and uses a state of its own.
+    All but the running state is immutable, except through ``retune``. ``step`` advances the running state; ``simulate`` does not touch
+    it and uses a state of its own.
 
     Parameters
     ----------
     observer
-        model-free or model-based; it brings order, b0 and dt.
+        model-free or model-based; it sets order, b0 and dt.
     omega_c
         controller bandwidth [rad/s]: all poles of the ideal loop lie at −omega_c.
     learner
-        what feeds f forward; none by default.
+        predicts f and feeds it forward; none by default.
     guard
-        what gives a learner the authority it has earned; none by default: then a learner has all of it.
+        limits the learner to the authority that it has earned; without one the learner has full authority.
     feedforward
-        whether the reference's derivatives are fed forward: ``simulate`` takes them from the signal, ``step`` from its caller. The ideal
-        loop then follows the reference without lag.
+        whether to feed the reference's derivatives forward. ``simulate`` takes them from the signal, ``step`` from its arguments. The
+        ideal loop then follows the reference without lag.
     u_min, u_max
         limits of the control signal [u-unit].
     rate_limit
-        how fast it may move, in either direction [u-unit/s].
+        largest rate of the control signal, in either direction [u-unit/s].
     half_gain
-        whether to halve the gains k of the law, reference included, not the cancellation of f: half the gain from noise in x̂, a loop that
-        settles to 2 % in 2.0, 1.4, 1.2 and 1.0 times the time for orders 1 to 4 (Herbst, Hempel, Göhrt & Streif 2020, arXiv 2003.03986).
+        whether to halve the gains k of the law, reference included, but not the cancellation of f. The gain from noise in x̂ is halved,
+        and the loop settles to 2 % in 2.0, 1.4, 1.2 and 1.0 times the time for orders 1 to 4 (Herbst, Hempel, Göhrt & Streif 2020,
+        arXiv 2003.03986).
 
     Raises
     ------
     ValueError
-        for a bandwidth that is not positive, limits in the wrong order, a rate limit that is not positive; for an observer of a plant with
-        zeros that are not in the left half plane.
+        for a bandwidth or rate limit that is not positive, limits in the wrong order, and an observer of a plant with zeros outside of
+        the left half plane.
 
     Examples
     --------
@@ -105,37 +115,29 @@ class ADRC(HandOver):
             raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
         self.feedforward = checks.flag("feedforward", feedforward)
         self.half_gain = checks.flag("half_gain", half_gain)
-        self._learned_at = self.omega_c
+        self._learner_omega_c = self.omega_c  # the learner keeps its scales when omega_c is retuned
         self._limits = checked_limits(u_min, u_max, rate_limit, observer.dt)
-        self._begin()
+        self._initialise()
         warn_if_unwise(observer, self.omega_c)
 
-    @property
-    def _law(self) -> ADRC:
-        return self
+    def _update_parameters(self) -> None:
+        self.parameters = self._design(self.observer, self.omega_c)
+        self.features = self.learner.feature_names(self.observer.order)
 
-    def _rebind(self) -> None:
-        if self._packed is not None:
-            self._packed = pack(self.parameters, self._state)
-
-    def _prepare_design(self) -> None:
-        observer = self.observer
-        law = law_gains(observer.degree, self.omega_c) * (0.5 if self.half_gain else 1.0)
-        self.parameters = AdrcDesign(
+    def _design(self, observer: ESO, omega_c: float) -> AdrcDesign:
+        law = law_gains(observer.degree, omega_c) * (0.5 if self.half_gain else 1.0)
+        return AdrcDesign(
             eso=observer.model,
             law=np.append(law, np.zeros(observer.order - observer.degree)),
             cancel=observer.cancel,
             cancel_f=observer.cancel_f,
-            fade=math.exp(-self.omega_c * observer.dt),
+            fade=math.exp(-omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,
-            learner=validated_design(
-                self.learner, observer, self._learned_at
-            ),  # its scales stay, whatever the loop is retuned to
+            learner=validated_design(self.learner, observer, self._learner_omega_c),
             lag=NO_LAG if isinstance(self.learner, NoLearner) else lag_of(observer),
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer),
         )
-        self.features = self.learner.feature_names(observer.order)
 
     @property
     def dt(self) -> float:
@@ -144,12 +146,12 @@ class ADRC(HandOver):
 
     @property
     def derivatives(self) -> int:
-        """How many derivatives of the reference are fed forward."""
+        """Number of derivatives of the reference that are fed forward."""
         return self.observer.degree if self.feedforward else 0
 
     @property
     def channels(self) -> tuple[tuple[str, int], ...]:
-        """Name and width of what ``report`` writes, in order."""
+        """Name and width of each recorded channel, in order."""
         return (
             ("x_hat", self.observer.order),
             ("f_residual", 1),
@@ -161,109 +163,197 @@ class ADRC(HandOver):
 
     def initial_state(self) -> AdrcState:
         """Return a state before the first sample, with nothing learned."""
-        order = self.observer.order
+        design = self.parameters
         return AdrcState(
             z=np.zeros(self.observer.states),
-            seen=np.zeros(order + 1),
+            seen=np.zeros(self.observer.order + 1),
             reference=np.zeros(self.derivatives),
             loop=np.zeros(LOOP),
-            learner=self.learner.memory(self.parameters.learner),
-            shadow=lag_memory(self.parameters.lag, 1),
+            learner=self.learner.memory(design.learner),
+            shadow=lag_memory(design.lag, 1),
             guard=UnguardedMemory(np.zeros(0))
             if self.guard is None
-            else self.guard.memory(self.parameters.guard),
+            else self.guard.memory(design.guard),
         )
 
     def step(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
 
-        With ``feedforward``, r', r'', … may follow [y-unit/s^i]; those not given, or not finite, are zero.
+        With ``feedforward``, r', r'', … may follow [y-unit/s^i]; missing ones, and those that are not finite, count as zero.
 
-        In the place of a measurement that is not finite stands the one that the observer expects, in that of a reference the last good
-        one; ``estimate.status`` says so. The observer takes the returned value for applied; limits belong in ``u_min``, ``u_max`` and
-        ``rate_limit``, not behind the controller; else see ``applied``.
+        A measurement that is not finite is replaced by the one that the observer expects, a reference by the last finite one;
+        ``estimate.status`` reports it. The observer assumes that the returned value is applied: set limits by ``u_min``, ``u_max`` and
+        ``rate_limit``, or call ``applied`` with what was applied.
 
-        The first call compiles, or loads; ``prepare`` does that beforehand.
+        The first call compiles, or loads from the disk cache; call ``prepare`` to do that beforehand.
 
         Raises
         ------
         ValueError
-            for derivatives that there is no use for.
+            for more derivatives than are fed forward.
         TypeError
-            for a value that is no number.
+            for a value that is not a number.
         """
         if self._packed is None:
             self.prepare()
-        if self.feedforward:
-            self._feed(derivatives)
-        elif derivatives:
-            raise ValueError(
-                f"step was given {len(derivatives)} derivatives of the reference: make the controller with feedforward=True"
-            )
+        if derivatives or self.feedforward:
+            self._set_derivatives(derivatives)
         try:
             return self._step(self._packed, r, y)
         except TypeError:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
 
-    def _feed(self, derivatives: tuple[float, ...]) -> None:
-        if len(derivatives) > self.observer.degree:
+    def _set_derivatives(self, derivatives: tuple[float, ...]) -> None:
+        if len(derivatives) > self.derivatives:
+            rule = (
+                f"it uses {self.derivatives} at most"
+                if self.feedforward
+                else "make the controller with feedforward=True"
+            )
             raise ValueError(
-                f"step was given {len(derivatives)} derivatives of the reference: there is use for {self.observer.degree} at most"
+                f"step was given {len(derivatives)} derivatives of the reference: {rule}"
             )
         set_reference_derivatives(
             self.parameters, self._state, np.array(derivatives, dtype=np.float64)
         )
 
+    def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
+        """Start at a plant that rests at ``y`` under the control signal ``u``: the next ``step`` continues from ``u`` without a bump.
+
+        What was learned is kept. A controller that is not started begins at its first sample with f̂ = 0, which is right for a plant at
+        rest without load and makes a bump under load.
+
+        Parameters
+        ----------
+        y
+            measurement [y-unit].
+        u
+            control signal that holds the plant there [u-unit]; outside of the limits, the next step jumps to them.
+        r
+            reference of the next step [y-unit]; ``y`` by default. With another one u still continues without a jump, and the move begins
+            with the observer's own dynamics.
+
+        Raises
+        ------
+        ValueError
+            for a value that is not finite.
+        """
+        y, u = checks.finite("y", y), checks.finite("u", u)
+        goal = y if r is None else checks.finite("r", r)
+        start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), y, u, goal)
+
+    def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
+        """Take one sample in manual operation: the observer receives ``u``, which someone else applies until the next sample.
+
+        Parameters
+        ----------
+        r, y, derivatives
+            as for ``step``.
+        u
+            applied control signal [u-unit]; not limited.
+
+        Returns
+        -------
+        float
+            the control signal that the controller would have applied; ``hand_over`` bridges the difference.
+
+        Raises
+        ------
+        ValueError
+            as ``step``, and for a u that is not finite.
+        """
+        with manual_operation(self._state, checks.finite("u", u)):
+            self.step(r, y, *derivatives)
+        return float(self._state.loop[WISHED])
+
+    def hand_over(self) -> None:
+        """End manual operation: the next ``step`` continues from the u of the last ``track``, whatever the reference is.
+
+        Raises
+        ------
+        ValueError
+            before the first sample.
+        """
+        if self._state.loop[STARTED] == 0.0:
+            raise ValueError(
+                "hand_over: there was no sample yet; call track(r, y, u) in manual operation, or start(y, u)"
+            )
+        self._state.loop[BUMPLESS] = 1.0
+
+    def increment(self, r: float, y: float, *derivatives: float) -> float:
+        """Take one sample: return the change of the control signal [u-unit], within the limits of magnitude and rate.
+
+        For actuators that take increments (steppers, valves, a drive that holds its set point). The law is that of ``step`` (Herbst,
+        arXiv 1908.04610, section IV, shows that the two are one). If the actuator's position is not known, ``start(y)`` takes it as
+        zero, f̂ includes the difference, and limits of magnitude refer to that zero.
+        """
+        before = float(self._state.loop[U])
+        return self.step(r, y, *derivatives) - before
+
+    def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
+        """Change bandwidths while running, without a bump; allowed in every sample, so that gains can be scheduled.
+
+        The control signal continues from where the old gains would have it, and the difference decays with the new ``omega_c``. A faster
+        observer still moves it in the middle of a motion, by its own better estimate. What was learned is kept. A call takes some
+        milliseconds, because the designs are sampled again.
+
+        Parameters
+        ----------
+        omega_c
+            new controller bandwidth [rad/s]; unchanged by default.
+        observer
+            new observer of the same order, form, structure and sample time, with another ``omega_o``, ``b0`` or model; unchanged by
+            default. For a plant with zeros, or with a separate input for f, only ``omega_o`` may change.
+
+        Raises
+        ------
+        ValueError
+            for an observer of another kind, for a change of b0 or model that a learner's coefficients or the state do not allow, and for
+            a bandwidth that is not positive. The controller is then unchanged.
+        """
+        new_omega_c = (
+            self.omega_c if omega_c is None else checks.positive("omega_c", omega_c, "rad/s")
+        )
+        new_observer = self.observer if observer is None else observer
+        if observer is not None:
+            check_replacement(self.observer, observer, not isinstance(self.learner, NoLearner))
+        old, new = self.parameters, self._design(new_observer, new_omega_c)
+        check_structure(old, new)
+        self.observer, self.omega_c, self.parameters = new_observer, new_omega_c, new
+        warn_if_unwise(new_observer, new_omega_c)
+        change_design(old, new, self._state)
+        self._pack_again()
+
     @property
-    def _outside(self) -> tuple[str, ...]:
+    def _external_fields(self) -> tuple[str, ...]:
         return tuple(f"learner.{name}" for name in getattr(self.learner, "external_fields", ()))
 
-    def _snapshots(self, state: AdrcState) -> dict[str, Any]:
-        if not self._outside:
+    def _external_snapshots(self, state: AdrcState) -> dict[str, Any]:
+        if not self._external_fields:
             return {}
         snapshot = self.learner.snapshot(state.learner)  # type: ignore[attr-defined]
         return {f"learner.{name}": value for name, value in snapshot.items()}
 
-    def _recall(self, state: AdrcState, snapshots: Mapping[str, Any]) -> None:
+    def _restore_external(self, state: AdrcState, snapshots: Mapping[str, Any]) -> None:
         named = {name.removeprefix("learner."): value for name, value in snapshots.items()}
         self.learner.recall(state.learner, named)  # type: ignore[attr-defined]
 
     @property
     def estimate(self) -> Estimate:
-        """What the controller knows after its last step."""
+        """Estimates and status after the last step."""
         return self.read(self._state)
 
     def read(self, state: AdrcState) -> Estimate:
-        """Return what is known in ``state``."""
-        order = self.observer.order
-        theta = np.zeros(len(self.features))
-        coefficients(self.parameters.learner, state.learner, theta)
-        learned, residual = float(state.loop[F_LEARNED]), float(state.seen[order])
-        return Estimate(
-            x=state.seen[:order].copy(),
-            f=learned + residual,
-            f_learned=learned,
-            f_residual=residual,
-            theta=dict(zip(self.features, theta.tolist(), strict=True)),
-            u=float(state.loop[U]),
-            status=Status(int(state.loop[STATUS])),
-            **self._guard_report(state),
-        )
-
-    def _guard_report(self, state: AdrcState) -> dict[str, Any]:
-        told = np.zeros(len(GUARD_CHANNELS))
-        if write_channels(self.parameters.guard, state.guard, told) == 0:
-            return {}
-        named = dict(zip([name for name, _ in GUARD_CHANNELS], told.tolist(), strict=True))
-        return named | {"reason": Reason(int(named["reason"]))}
+        """Return the estimates and the status in ``state``."""
+        return read_estimate(self.parameters, state, self.features)
 
 
 def _check_zeros(observer: ESO) -> None:
-    """Refuse a plant whose zeros the law must not cancel: u makes y^(r) what it should be, and the zeros from u are poles of u."""
+    """Check that the inverse of the plant is stable: u makes y^(r) what it should be, and the zeros from u become poles of u."""
     unstable = observer.plant.unstable_zeros
     if unstable.size:
         raise ValueError(
             f"observer: the plant has zeros from u at {format_roots(unstable)} rad/s, not in the left half plane; ADRC inverts the plant, "
-            "so that u would grow, or swing, without end while y looks well; control another output, or take a controller that does not "
+            "so that u would grow or oscillate without end while y looks well; control another output, or use a controller that does not "
             "invert the plant (linear-quadratic, for instance)"
         )

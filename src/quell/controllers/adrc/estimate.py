@@ -1,19 +1,23 @@
-"""What a controller knows after a step."""
+"""The estimates of an ADRC controller after a step."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from quell.guard import Reason
+import numpy as np
+
+from quell.controllers.adrc.law import F_LEARNED, STATUS, AdrcDesign, AdrcState, U
+from quell.guard import GUARD_CHANNELS, Reason, write_channels
+from quell.learners.base import coefficients
 from quell.types import Status, Vector
 
 
 class Estimate(NamedTuple):
-    """What the controller knows after a step."""
+    """Estimates and status of an ADRC controller after a step."""
 
     x: Vector
-    """(n,): y and its derivatives, less what u and f feed through where the plant has zeros; ``observer.states_of`` maps them back."""
+    """(n,): y and its derivatives, without what u and f feed through if the plant has zeros; see ``observer.states_of``."""
     f: float
     """Total disturbance [y-unit/s^n; with zeros in its way y-unit/s^f_degree]: ``f_learned + f_residual``."""
     f_learned: float
@@ -23,14 +27,37 @@ class Estimate(NamedTuple):
     theta: dict[str, float]
     """The learner's coefficients by feature."""
     u: float
-    """The control signal applied."""
+    """The applied control signal."""
     status: Status
-    """What the step had to report."""
+    """Status flags of the step."""
     authority: float = 1.0
-    """Share of its output that the guard lets a learner have."""
+    """Share of its output that the guard allows the learner."""
     error_plain: float = math.nan
-    """RMS of what an ESO without learner would have missed of f, as the guard has it [y-unit/s^n]."""
+    """RMS error in f of an ESO without learner, as the guard estimates it [y-unit/s^n]."""
     error_learned: float = math.nan
-    """The same had the learner had full authority."""
+    """The same for the learner with full authority."""
     reason: Reason = Reason.TRUSTED
-    """Why the authority is what it is."""
+    """Reason for the authority."""
+
+
+def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...]) -> Estimate:
+    """Return the estimates in ``state``, with the learner's coefficients named by ``features``."""
+    order = design.law.size
+    theta = np.zeros(len(features))
+    coefficients(design.learner, state.learner, theta)
+    learned, residual = float(state.loop[F_LEARNED]), float(state.seen[order])
+    guarded: dict[str, Any] = {}
+    row = np.zeros(len(GUARD_CHANNELS))
+    if write_channels(design.guard, state.guard, row):
+        guarded = dict(zip((name for name, _ in GUARD_CHANNELS), row.tolist(), strict=True))
+        guarded["reason"] = Reason(int(guarded["reason"]))
+    return Estimate(
+        x=state.seen[:order].copy(),
+        f=learned + residual,
+        f_learned=learned,
+        f_residual=residual,
+        theta=dict(zip(features, theta.tolist(), strict=True)),
+        u=float(state.loop[U]),
+        status=Status(int(state.loop[STATUS])),
+        **guarded,
+    )

@@ -162,7 +162,7 @@ class LinearController(StatefulController):
         self.dt = checks.positive("dt", dt, "s")
         self.name = name
         self._limits = checked_limits(u_min, u_max, rate_limit, self.dt)
-        self._begin()
+        self._initialise()
 
     @classmethod
     def from_transfer_function(
@@ -223,7 +223,7 @@ class LinearController(StatefulController):
         law = sampled_law(system, dt, method=method, prewarp=prewarp, tracking_time=tracking_time)
         return LinearController(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
 
-    def _prepare_design(self) -> None:
+    def _update_parameters(self) -> None:
         self.parameters = LinearDesign(self.law, rest_state(self.law), self._limits)
 
     def initial_state(self) -> LinearState:

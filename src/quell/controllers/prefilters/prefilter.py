@@ -13,8 +13,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from quell import checks
 from quell.controllers.adrc.adrc import ADRC
-from quell.controllers.adrc.handover import HandOver
+from quell.controllers.adrc.handover import manual_operation
+from quell.controllers.adrc.law import WISHED, U
 from quell.controllers.base import (
     bumpless_transfer,
     control,
@@ -24,10 +26,10 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.compiled_step import pack
 from quell.controllers.limits import Limits
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import generic, is_finite
+from quell.observers.eso import ESO
 from quell.types import Status, Vector
 
 _REFERENCE_HELD = int(Status.REFERENCE_HELD)
@@ -137,7 +139,7 @@ def _bumpless_transfer(design: PrefilteredDesign, state: PrefilteredState) -> No
     bumpless_transfer(design.controller, state.controller)
 
 
-class Prefiltered(HandOver):
+class Prefiltered(StatefulController):
     """A controller that follows a prefiltered reference.
 
     The prefilter starts at rest at the first good measurement, so that a reference that stands elsewhere from the first sample on is a
@@ -185,43 +187,58 @@ class Prefiltered(HandOver):
             )
         self.controller = copy.copy(controller)
         self.prefilter = prefilter
-        self._begin()
+        self._initialise()
 
-    def _begin(self) -> None:
-        super()._begin()
+    def _initialise(self) -> None:
+        super()._initialise()
         # One running state: what is done to the controller is done to what runs here.
         if isinstance(self.controller, StatefulController):
-            self.controller._adopt(self._state.controller)
+            self.controller._use_state(self._state.controller)
 
     @property
-    def _law(self) -> ADRC:
-        if isinstance(self.controller, ADRC):
+    def _hands_over(self) -> ADRC | Prefiltered:
+        if isinstance(self.controller, ADRC | Prefiltered):
             return self.controller
-        if isinstance(self.controller, Prefiltered):
-            return self.controller._law
         raise ValueError(
             f"controller = {type(self.controller).__name__}: only an ADRC starts under load, hands over and is retuned"
         )
 
-    def _rebind(self) -> None:
-        if isinstance(self.controller, Prefiltered):
-            self.controller._rebind()
-        self.parameters = self.parameters._replace(controller=self.controller.parameters)
-        if self._packed is not None:
-            self._packed = pack(self.parameters, self._state)
+    @property
+    def _adrc(self) -> ADRC:
+        inner = self._hands_over
+        return inner if isinstance(inner, ADRC) else inner._adrc
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
         """Start where the plant rests, see ``ADRC.start``; the prefilter comes to rest at ``y``."""
-        if isinstance(self.controller, Prefiltered):
-            self.controller.start(y, u, r)
-        else:
-            super().start(y, u, r)
+        self._hands_over.start(y, u, r)
         state = self._state
         settle(self.parameters.prefilter, state.prefilter, float(y))
         state.loop[_STARTED] = state.loop[_REFERENCED] = 1.0
         state.loop[_R] = float(y if r is None else r)
 
-    def _prepare_design(self) -> None:
+    def track(self, r: float, y: float, u: float) -> float:
+        """Take one sample in manual operation, see ``ADRC.track``."""
+        state = self._adrc._state
+        with manual_operation(state, checks.finite("u", u)):
+            self.step(r, y)
+        return float(state.loop[WISHED])
+
+    def hand_over(self) -> None:
+        """End manual operation, see ``ADRC.hand_over``."""
+        self._hands_over.hand_over()
+
+    def increment(self, r: float, y: float) -> float:
+        """Take one sample and return the change of the control signal, see ``ADRC.increment``."""
+        before = float(self._adrc._state.loop[U])
+        return self.step(r, y) - before
+
+    def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
+        """Change bandwidths while running, see ``ADRC.retune``."""
+        self._hands_over.retune(omega_c=omega_c, observer=observer)
+        self.parameters = self.parameters._replace(controller=self.controller.parameters)
+        self._pack_again()
+
+    def _update_parameters(self) -> None:
         self.parameters = PrefilteredDesign(
             self.controller.parameters, self.prefilter.design(self.dt)
         )
@@ -275,17 +292,19 @@ class Prefiltered(HandOver):
         return self.controller.read(state.controller)
 
     @property
-    def _outside(self) -> tuple[str, ...]:
-        return tuple(f"controller.{name}" for name in getattr(self.controller, "_outside", ()))
+    def _external_fields(self) -> tuple[str, ...]:
+        return tuple(
+            f"controller.{name}" for name in getattr(self.controller, "_external_fields", ())
+        )
 
-    def _snapshots(self, state: PrefilteredState) -> dict[str, Any]:
-        if not self._outside:
+    def _external_snapshots(self, state: PrefilteredState) -> dict[str, Any]:
+        if not self._external_fields:
             return {}
         saved = self.controller._saved(state.controller)
-        return {name: saved[name.removeprefix("controller.")][()] for name in self._outside}
+        return {name: saved[name.removeprefix("controller.")][()] for name in self._external_fields}
 
-    def _recall(self, state: PrefilteredState, snapshots: Mapping[str, Any]) -> None:
-        self.controller._recall(
+    def _restore_external(self, state: PrefilteredState, snapshots: Mapping[str, Any]) -> None:
+        self.controller._restore_external(
             state.controller,
             {name.removeprefix("controller."): value for name, value in snapshots.items()},
         )
