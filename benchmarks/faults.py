@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 import quell as ql
-from quell.files import without_gaps, write_json
+from quell.files import nonfinite_to_none, write_json
 from quell.realtime import Safety, load, open_device, run_rig
 from quell.realtime.loop.modes import Cause, Mode
 from quell.realtime.loop.supervisor import FLUSH
@@ -349,7 +349,7 @@ def main() -> None:
     bad = sum(bool(found["wrong"]) for found in results)
     print(f"{len(results)} trials, {bad} with something wrong")
     if options.json is not None:
-        write_json(options.json, without_gaps(results))
+        write_json(options.json, nonfinite_to_none(results))
     sys.exit(1 if bad else 0)
 
 

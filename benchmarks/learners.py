@@ -23,7 +23,7 @@ import quell as ql
 from quell.controllers.base import control
 from quell.experiments.two_mass_spring import setup as study
 from quell.features import RBF, Bias, Input, RandomFourier, State
-from quell.kernels.dispatch import compiled, for_types
+from quell.kernels.dispatch import compiled, dispatcher_for
 from quell.learners.online.model import infer, learn
 
 TRIALS = 11
@@ -146,7 +146,7 @@ def steps(design: Any, state: Any, r: Any, y: Any) -> float:
 
 def stepping(controller: ql.ADRC, r: np.ndarray, y: np.ndarray) -> Any:
     """Return what calls the controller alone."""
-    dispatcher = for_types(steps, controller.parameters)
+    dispatcher = dispatcher_for(steps, controller.parameters)
     return lambda: dispatcher(controller.parameters, controller.initial_state(), r, y)
 
 

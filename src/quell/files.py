@@ -79,12 +79,12 @@ def csv_rows(text: str, where: str, between: str = ",") -> list[tuple[int, list[
     return [(number, row) for number, row in rows if any(row)]
 
 
-def without_gaps(value: Any) -> Any:
+def nonfinite_to_none(value: Any) -> Any:
     """Return a value for ``write_json``: None in the place of each number that is not finite, lists in that of tuples."""
     if isinstance(value, dict):
-        return {key: without_gaps(part) for key, part in value.items()}
+        return {key: nonfinite_to_none(part) for key, part in value.items()}
     if isinstance(value, tuple | list):
-        return [without_gaps(part) for part in value]
+        return [nonfinite_to_none(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -36,6 +36,12 @@ class Controller(Protocol):
         """Return the state before the first sample: a NamedTuple of arrays."""
 
 
+def check_controller(value: Any, name: str = "controller") -> None:
+    """Raise a ``ValueError`` if ``value``, the argument ``name``, is not a controller."""
+    if isinstance(value, type) or not hasattr(value, "initial_state"):
+        raise ValueError(f"{name} = {value!r}: must be a controller, for example quell.ADRC(...)")
+
+
 @generic
 def control(controller: Any, state: Any, r: float, y: float) -> float:
     """Take one sample: the control signal to apply for the reference ``r`` and the measurement ``y``."""

@@ -136,7 +136,7 @@ def checked_design(features: Features, order: int) -> Any:
     if isinstance(features, Joined):
         checked_design(features.first, order)
         checked_design(features.second, order)
-    elif validation.of_users(features):
+    elif validation.is_user_defined(features):
         _try_block(features, order)
     return features.design(order)
 
@@ -145,7 +145,7 @@ def _try_block(block: Features, order: int) -> None:
     name = type(block).__name__
     what = f"{name}.design({order})"
     parameters = validation.attempt(what, "design takes the plant's order", block.design, order)
-    validation.named_tuple(what, parameters, "numbers and arrays")
+    validation.check_named_tuple(what, parameters, "numbers and arrays")
     names = validation.attempt(
         f"{name}.names({order})", "names takes the plant's order", block.names, order
     )
@@ -157,12 +157,12 @@ def _try_block(block: Features, order: int) -> None:
         raise ValueError(
             f"{name}.names({order}) returns {names!r}: must return a tuple with a name for each feature"
         )
-    validation.registered(name, parameters, write, unit)
+    validation.check_registered(name, parameters, write, unit)
     rule = (
         f"it is given x ({order},), u, and room for {len(names)} features, as many as it has names"
     )
     ones, marks = np.ones(order + 2), (7e77, -7e77)
-    for function, arguments in ((write, (validation.wave(order), 0.5)), (unit, (ones,))):
+    for function, arguments in ((write, (validation.sample_values(order), 0.5)), (unit, (ones,))):
         written = []
         for mark in marks:
             out = np.full(len(names), mark)

@@ -11,7 +11,13 @@ import numpy as np
 from numba.core import types as nb_types
 
 from quell.features.base import Features, unit, write
-from quell.kernels.function_pointers import POINTER, NotCompilableError, call, inner, machine_code
+from quell.kernels.function_pointers import (
+    POINTER,
+    NotCompilableError,
+    call,
+    compile_cfunc,
+    jit_user_function,
+)
 from quell.types import Vector
 
 _SIGNATURE = nb_types.void(POINTER, nb_types.float64, POINTER)
@@ -97,8 +103,8 @@ def _machine_code(function: Callable[..., Any], order: int, count: int) -> Any:
             out[j] = found[j]
 
     try:
-        compiled = inner(function)
-        return machine_code(_SIGNATURE, features)
+        compiled = jit_user_function(function)
+        return compile_cfunc(_SIGNATURE, features)
     except NotCompilableError as error:
         raise ValueError(
             f"function can't be compiled by Numba: {error}; it must be a plain function of numbers"

@@ -195,7 +195,7 @@ class Identified:
 
     def to_json(self) -> dict[str, Any]:
         """Return the results for ``quell.files.write_json``: no records, and None for what is not finite."""
-        from quell.files import without_gaps
+        from quell.files import nonfinite_to_none
 
         left = self.residuals
         value = {
@@ -231,7 +231,7 @@ class Identified:
             "converged": self.converged,
             "method": self.method,
         }
-        found: dict[str, Any] = without_gaps(value)
+        found: dict[str, Any] = nonfinite_to_none(value)
         return found
 
 

@@ -1,51 +1,40 @@
 """Generic functions over NamedTuple types, compiled and interpreted alike.
 
-An algorithm is written once, as a plain function of immutable parameters (a NamedTuple of floats and arrays) and explicit state
-(a NamedTuple of arrays). Three decorators are all there is:
+An algorithm is written once, as a plain function of immutable parameters (a NamedTuple of floats and
+arrays) and explicit state (a NamedTuple of arrays), under one of these decorators:
 
 ``kernel``
     a plain helper; interpreted when called from Python, inlined when called from compiled code.
 ``generic``
-    a function with one implementation for each NamedTuple type of its first argument. The choice is made by the type: when
-    compiling by Numba's overload resolution, so it costs nothing at run time; when interpreting by a dictionary.
+    a function with one implementation for each NamedTuple type of its first argument. Compiled code
+    selects it by Numba's overload resolution, which costs nothing at run time; interpreted code by
+    a dictionary.
 ``compiled``
-    an entry point, compiled once for each combination of types and cached on disk.
-
-Numba's own disk cache looks only at the file a function stands in. A kernel here calls kernels in other files, so the cache
-directory is named after a hash of all of the package's sources (and Numba's version): an edit anywhere starts a new one.
+    an entry point, compiled once for each combination of types and cached on disk (``cache``).
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
-import os
-import re
-import shutil
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import numba
-import platformdirs
-from numba.core import config as numba_config
 from numba.core import types as nb_types
-from numba.core.errors import NumbaError
 from numba.extending import overload, register_jitable
 
+from quell.kernels.cache import code_cache
 from quell.kernels.linking import KERNEL_OPTIONS
+from quell.kernels.user_types import add_user_type, uses_user_types
 
 F = TypeVar("F", bound=Callable[..., Any])
 P = ParamSpec("P")
-R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
 
 
 class Generic(Protocol[P, R_co]):
-    """A generic function: called as its declaration says, with one implementation for each type of its first argument."""
+    """A generic function: called as declared, with one implementation for each type of its first argument."""
 
     __name__: str
     implementations: dict[type, Callable[..., Any]]
@@ -57,18 +46,16 @@ class Generic(Protocol[P, R_co]):
         """Return a decorator that makes a function the implementation for ``cls``."""
 
 
-# Fused multiply-add and re-ordered sums, but NaN and Inf keep their meaning: guards test for them. Inlining is forced because a
-# NamedTuple of arrays is passed as some eighty words, which costs more than most kernels do.
+# Fused multiply-add and re-ordered sums are allowed, but NaN and Inf keep their meaning: guards test
+# for them. Inlining is forced because a NamedTuple of arrays is passed as some eighty words, which
+# costs more than most kernels do.
 OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "reassoc", "nsz"},
     "error_model": "numpy",
     "forceinline": True,
 }
 
-_CACHES_KEPT = 4
 _LARGEST = sys.float_info.max
-# Types with implementations from outside of this package, and what they are called in messages.
-_FOREIGN: dict[type, str] = {}
 
 
 def kernel(function: F) -> F:
@@ -76,39 +63,42 @@ def kernel(function: F) -> F:
     return register_jitable(**OPTIONS, **KERNEL_OPTIONS)(function)
 
 
-def generic(declaration: Callable[P, R]) -> Generic[P, R]:
-    """Make a generic function out of its declaration, whose docstring is the contract.
+def generic(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
+    """Make a generic function from its declaration, whose docstring is the contract.
 
-    ``declaration.register(Type)`` decorates the implementation for the NamedTuple ``Type`` of the first argument;
-    ``declaration.implementations`` is the table of them. What is registered for ``object`` serves all types without one of their own.
+    ``declaration.register(Type)`` decorates the implementation for the NamedTuple ``Type`` of the
+    first argument; ``declaration.implementations`` is the table of them. The one for ``object`` is
+    used for all types without their own.
 
     Raises
     ------
     TypeError
         on a call, when no implementation is registered for the first argument's type.
     """
-    table: dict[type, Callable[..., Any]] = {}
+    name = declaration.__name__
+    table: dict[type | None, Callable[..., Any]] = {}
 
     @functools.wraps(declaration)
     def call(head: Any, *rest: Any) -> Any:
         implementation = table.get(type(head)) or table.get(object)
         if implementation is None:
-            raise TypeError(_no_implementation(declaration.__name__, type(head).__name__))
+            cls = type(head).__name__
+            raise TypeError(
+                f"{name}() has no implementation for {cls}; register one with "
+                f"@{name}.register({cls}) before the first run"
+            )
         return implementation(head, *rest)
 
     def resolve(head: Any, *rest: Any) -> Any:
-        cls = (
-            getattr(head, "instance_class", None)
-            if isinstance(head, nb_types.BaseNamedTuple)
-            else None
-        )
-        return table.get(cls) or table.get(object)  # type: ignore[arg-type]
+        is_named_tuple = isinstance(head, nb_types.BaseNamedTuple)
+        cls = getattr(head, "instance_class", None) if is_named_tuple else None
+        return table.get(cls) or table.get(object)
 
     def register(cls: type) -> Callable[[F], F]:
         def add(implementation: F) -> F:
             table[cls] = implementation
             if not implementation.__module__.startswith("quell."):
-                _FOREIGN.setdefault(cls, cls.__name__)
+                add_user_type(cls)
             return implementation
 
         return add
@@ -116,167 +106,62 @@ def generic(declaration: Callable[P, R]) -> Generic[P, R]:
     overload(call, strict=False, jit_options=OPTIONS | KERNEL_OPTIONS)(resolve)
     call.register = register  # type: ignore[attr-defined]
     call.implementations = table  # type: ignore[attr-defined]
-    return cast("Generic[P, R]", call)
+    return cast("Generic[P, R_co]", call)
 
 
 @kernel
 def is_finite(value: float) -> bool:
-    """Say whether ``value`` is a number.
+    """Return whether ``value`` is finite.
 
-    ``math.isfinite`` will not do in compiled code: it asks whether ``x − x`` is a number, and where x is itself a sum, reordering sums
-    makes that zero before it is asked. A comparison stays.
+    ``math.isfinite`` is wrong in compiled code: it tests whether x − x is a number, and if x is itself
+    a sum, re-ordering makes x − x zero before the test. A comparison stays as it is.
     """
     return abs(value) <= _LARGEST
 
 
 def compiled(function: F) -> F:
-    """Compile an entry point for the types it is called with; keep the code on disk; release the interpreter while it runs.
+    """Compile an entry point for the types it is called with; it releases the interpreter while it runs.
 
-    Reference counting is switched off: it would cost more than the arithmetic, and without it Numba refuses to compile whatever
-    allocates memory, so that compiled kernels provably do not.
+    Reference counting is switched off: it would cost more than the arithmetic, and without it Numba
+    refuses to compile code that allocates memory, which proves that kernels allocate none.
     """
     return _dispatcher(function, nogil=True, _nrt=False)
 
 
 def compiled_call(function: F) -> F:
-    """Compile an entry point for calls one at a time from Python, on a handle (``structref``): counts references, keeps the interpreter."""
+    """Compile an entry point for single calls from Python with a ``structref`` argument.
+
+    It counts references and keeps the interpreter.
+    """
     return _dispatcher(function)
 
 
-def for_types(entry: Any, *arguments: Any) -> Any:
+def dispatcher_for(entry: Any, *arguments: Any) -> Any:
     """Return the dispatcher of an entry point to call with ``arguments``.
 
-    Where one of their types, at any depth, has implementations outside of this package, it is one without disk cache: the cache would not
-    notice that those have changed.
+    If the user has registered implementations for one of their types, at any depth, it has no disk
+    cache: the cache would not notice an edit of those implementations.
     """
-    return (
-        entry.uncached
-        if _FOREIGN and any(_is_foreign(argument) for argument in arguments)
-        else entry
-    )
-
-
-def call_it(cls: type, name: str) -> None:
-    """Call a type from outside of this package ``name`` in messages: its user knows the class that makes it better."""
-    if cls in _FOREIGN:
-        _FOREIGN[cls] = name
-
-
-@contextmanager
-def compiling(*arguments: Any) -> Iterator[None]:
-    """Around the first call of an entry point with ``arguments``: what Numba says of code from outside of this package, in a line.
-
-    Raises
-    ------
-    ValueError
-        where such code can't be compiled, or allocates memory.
-    """
-    try:
-        yield
-    except NumbaError as error:
-        told = _blame(str(error)) if any(map(_is_foreign, arguments)) else ""
-        if not told:
-            raise
-        raise ValueError(told) from None
-
-
-# What Numba says before it comes to the point.
-_PREAMBLE = re.compile(
-    r"\W*$|There are \d|- Of which|Overload in|With argument|Rejected as|- Resolution|(\w+Error: )?Failed in nopython"
-)
-
-
-def _blame(text: str) -> str:
-    """Return what is wrong with the innermost function from outside of this package that Numba was at; nothing where there is none."""
-    names = {cls.__name__: name for cls, name in _FOREIGN.items()}
-    calls = [found for found in re.finditer(r">>> (\w+)\((\w+)\(", text) if found[2] in names]
-    if not calls:
-        return ""
-    rest = text[calls[-1].end() :]
-    lines = [line.strip() for line in rest.splitlines()[1:]]
-    reason = next(
-        (line for line in lines if not _PREAMBLE.match(line)), "no reason given"
-    ).removesuffix(" found for signature:")
-    fault = (
-        "allocates memory"
-        if "NRT required" in rest or "Only accept returning of array" in rest
-        else "can not be compiled"
-    )
-    return (
-        f"{names[calls[-1][2]]}.{calls[-1][1]} (for {calls[-1][2]}) {fault} ({reason}): use loops over numbers and arrays that are there "
-        "from the start, as fields of the memory; no new arrays, no lists, no slices that are assigned to. "
-        "simulate(..., interpret=True) runs it as Python"
-    )
+    return entry.uncached if any(map(uses_user_types, arguments)) else entry
 
 
 def compilations(entry: Any) -> int:
-    """Return how many times an entry point was compiled in this process, rather than loaded from the disk cache."""
+    """Return how many times an entry point was compiled in this process, not loaded from the disk."""
     return int(sum(entry.stats.cache_misses.values()))
 
 
-def _is_foreign(value: Any) -> bool:
-    return type(value) in _FOREIGN or (isinstance(value, tuple) and any(map(_is_foreign, value)))
-
-
-def _dispatcher(function: Any, **options: Any) -> Any:
-    """Return a dispatcher with disk cache, where that can be had; ``uncached`` is its twin without."""
-    options |= OPTIONS
-    uncached = numba.njit(function, **options)
-    if cache_path() is None:
-        uncached.uncached = uncached
-        return uncached
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = str(cache_path())
-    try:
-        cached = numba.njit(function, cache=True, **options)
-    finally:
-        numba_config.CACHE_DIR = before
-    cached.uncached = uncached
-    return cached
-
-
 def interpreted(function: Any) -> Any:
-    """Return the plain Python function behind a compiled entry point (itself, where there is nothing behind it)."""
+    """Return the plain Python function of a compiled entry point; a plain function itself."""
     return getattr(function, "py_func", function)
 
 
-@functools.cache
-def cache_path() -> Path | None:
-    """Return the directory of this version's compiled code, made if need be; None where there is no place to write to.
-
-    It lies under ``NUMBA_CACHE_DIR`` when that is set, else under the user's cache directory.
-    """
-    digest = hashlib.sha256(numba.__version__.encode())
-    package = Path(__file__).parents[1]
-    for source in sorted(package.rglob("*.py")):
-        digest.update(source.relative_to(package).as_posix().encode())
-        digest.update(source.read_bytes())
-    root = Path(
-        os.environ.get("NUMBA_CACHE_DIR") or Path(platformdirs.user_cache_dir("quell")) / "compiled"
-    )
-    path = root / f"quell-{digest.hexdigest()[:16]}"
-    try:
-        fresh = not path.is_dir()
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-        if fresh:
-            _forget_old_caches(root, path)
-    except OSError:
-        return None
-    return path
-
-
-def _forget_old_caches(root: Path, current: Path) -> None:
-    """Remove all but the newest few caches of other versions of the package."""
-    others = sorted(
-        (p for p in root.glob("quell-*") if p != current),
-        key=lambda p: p.stat().st_mtime,
-        reverse=True,
-    )
-    for stale in others[_CACHES_KEPT - 1 :]:
-        shutil.rmtree(stale, ignore_errors=True)
-
-
-def _no_implementation(name: str, type_name: str) -> str:
-    return f"{name}() has no implementation for {type_name}; register one with @{name}.register({type_name}) before the first run"
+def _dispatcher(function: Any, **options: Any) -> Any:
+    """Return a dispatcher with a disk cache if possible; its attribute ``uncached`` is one without."""
+    options |= OPTIONS
+    dispatcher = numba.njit(function, **options)
+    dispatcher.uncached = dispatcher
+    cache = code_cache(function)
+    if cache is not None:
+        dispatcher.uncached = numba.njit(function, **options)
+        dispatcher._cache = cache  # what ``cache=True`` does with Numba's own
+    return dispatcher

@@ -95,8 +95,8 @@ class NotCompilableError(Exception):
     """Numba can't compile a user's function; the message says why, in a line."""
 
 
-def inner(function: Callable[..., Any]) -> Any:
-    """Return a user's function for use inside of one given to ``machine_code``.
+def jit_user_function(function: Callable[..., Any]) -> Any:
+    """Return a user's function for use inside of one given to ``compile_cfunc``.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def inner(function: Callable[..., Any]) -> Any:
         raise NotCompilableError(str(error)) from error
 
 
-def machine_code(signature: Any, function: Callable[..., Any]) -> Any:
+def compile_cfunc(signature: Any, function: Callable[..., Any]) -> Any:
     """Return a compiled function with an ``address``.
 
     Raises

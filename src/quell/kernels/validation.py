@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from quell.kernels.dispatch import Generic, call_it
+from quell.kernels.dispatch import Generic
+from quell.kernels.user_types import set_display_name
 
 UNKNOWN = object()
 """What a function returns is not known: numbers decide, and those of the trial were no good ones."""
 
 
-def of_users(thing: Any) -> bool:
+def is_user_defined(thing: Any) -> bool:
     """Return whether the class of ``thing`` is from outside of this package."""
     return not type(thing).__module__.startswith("quell.")
 
@@ -40,10 +41,10 @@ def attempt_kernel(what: str, rule: str, function: Callable[..., Any], *argument
         raise
 
 
-def registered(name: str, parameters: Any, *functions: Generic[Any, Any]) -> None:
+def check_registered(name: str, parameters: Any, *functions: Generic[Any, Any]) -> None:
     """Say which of these generic functions have nothing registered for the type of ``parameters``, which belongs to ``name``."""
     cls = type(parameters)
-    call_it(cls, name)
+    set_display_name(cls, name)
     missing = [
         f.__name__
         for f in functions
@@ -56,19 +57,19 @@ def registered(name: str, parameters: Any, *functions: Generic[Any, Any]) -> Non
         )
 
 
-def named_tuple(what: str, value: Any, of: str) -> Any:
+def check_named_tuple(what: str, value: Any, of: str) -> Any:
     """Return ``value`` if it is a NamedTuple; ``of`` says what of."""
     if not (isinstance(value, tuple) and hasattr(value, "_fields")):
         raise ValueError(f"{what} returns {type(value).__name__}: must return a NamedTuple of {of}")
     return value
 
 
-def arrays(what: str, memory: Any, nested: bool) -> None:
+def check_arrays(what: str, memory: Any, nested: bool) -> None:
     """Say which field of a NamedTuple is no array of numbers; NamedTuples may stand among them where ``nested``."""
-    named_tuple(what, memory, "arrays")
+    check_named_tuple(what, memory, "arrays")
     for name, value in zip(memory._fields, memory, strict=True):
         if nested and isinstance(value, tuple):
-            arrays(f"{what}.{name}", value, nested)
+            check_arrays(f"{what}.{name}", value, nested)
         elif not (
             isinstance(value, np.ndarray) and value.dtype.kind in ("f" if nested else "fiub")
         ):
@@ -80,7 +81,7 @@ def arrays(what: str, memory: Any, nested: bool) -> None:
             )
 
 
-def number(what: str, value: Any) -> None:
+def check_number(what: str, value: Any) -> None:
     """Say so where a function does not return one number."""
     if not isinstance(value, int | float | np.integer | np.floating):
         shape = (
@@ -89,6 +90,6 @@ def number(what: str, value: Any) -> None:
         raise ValueError(f"{what} returns {type(value).__name__}{shape}: must return one number")
 
 
-def wave(size: int, start: float = 1.0) -> Any:
+def sample_values(size: int, start: float = 1.0) -> Any:
     """Return some numbers within [−1, 1] (size,)."""
     return np.sin(start + np.arange(size))

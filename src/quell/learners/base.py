@@ -95,19 +95,19 @@ def validated_design(learner: Any, observer: ESO, omega_c: float) -> Any:
     ValueError
         that names the learner's class and the rule, for whatever is wrong.
     """
-    if not validation.of_users(learner):
+    if not validation.is_user_defined(learner):
         return learner.design(observer, omega_c)
     name, order = type(learner).__name__, observer.order
     what = f"{name}.design(observer, {omega_c:g})"
     parameters = validation.attempt(
         what, "design takes (observer, omega_c)", learner.design, observer, omega_c
     )
-    validation.named_tuple(what, parameters, "numbers and arrays")
-    validation.registered(name, parameters, adapt, predict, commit, restart, coefficients)
+    validation.check_named_tuple(what, parameters, "numbers and arrays")
+    validation.check_registered(name, parameters, adapt, predict, commit, restart, coefficients)
     memory = validation.attempt(
         f"{name}.memory(...)", "memory takes (parameters)", learner.memory, parameters
     )
-    validation.arrays(f"{name}.memory", memory, nested=True)
+    validation.check_arrays(f"{name}.memory", memory, nested=True)
     names = validation.attempt(
         f"{name}.feature_names({order})",
         "feature_names takes the plant's order",
@@ -118,7 +118,7 @@ def validated_design(learner: Any, observer: ESO, omega_c: float) -> Any:
         raise ValueError(
             f"{name}.feature_names({order}) returns {names!r}: must return a tuple with a name for each coefficient"
         )
-    seen, rule = validation.wave(order + 1), "docs/extend says what it is given"
+    seen, rule = validation.sample_values(order + 1), "docs/extend says what it is given"
     validation.attempt_kernel(
         f"{name}: adapt", rule, adapt, parameters, memory, seen, 0.9, 0.5, 0.1
     )
@@ -131,7 +131,7 @@ def validated_design(learner: Any, observer: ESO, omega_c: float) -> Any:
                 f"{name}: predict returns {predicted!r}: must return (constant, slope), two numbers"
             )
         for label, value in zip(("constant", "slope"), predicted, strict=True):
-            validation.number(f"{name}: predict, {label},", value)
+            validation.check_number(f"{name}: predict, {label},", value)
     validation.attempt_kernel(f"{name}: commit", rule, commit, parameters, memory, seen, 0.5, 0.1)
     validation.attempt_kernel(
         f"{name}: coefficients",

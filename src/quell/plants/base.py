@@ -57,10 +57,13 @@ class PlantWrapper:
         return bool(self.plant.compiled)
 
 
-def check_plant(plant: Any, example: str) -> None:
-    """Check that ``plant`` is one; the message names an ``example``."""
-    if isinstance(plant, type) or not hasattr(plant, "sampled"):
-        raise ValueError(f"plant = {plant!r}: must be a plant, for example {example}")
+def check_plant(value: Any, name: str = "plant") -> None:
+    """Raise a ``ValueError`` if ``value``, the argument ``name``, is not a plant."""
+    if isinstance(value, type) or not hasattr(value, "sampled"):
+        raise ValueError(
+            f"{name} = {value!r}: must be a plant, for example quell.plants.two_mass_spring() "
+            "or quell.plants.LinearPlant.of(model)"
+        )
 
 
 @generic

@@ -10,7 +10,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.plants.base import Plant
+from quell.plants.base import Plant, check_plant
 
 
 class PlantBatch(Sequence[Plant]):
@@ -36,10 +36,7 @@ class PlantBatch(Sequence[Plant]):
         if not self._plants:
             raise ValueError("plants has no entries: a batch must hold at least one plant")
         for i, plant in enumerate(self._plants):
-            if isinstance(plant, type) or not hasattr(plant, "sampled"):
-                raise ValueError(
-                    f"plant[{i}] = {plant!r}: must be a plant, for example quell.plants.LinearPlant.of(model)"
-                )
+            check_plant(plant, f"plant[{i}]")
             for what, (mine, first) in {
                 "kind": (type(plant).__name__, type(self._plants[0]).__name__),
                 "order": (plant.order, self._plants[0].order),

@@ -91,7 +91,7 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
     >>> late.order
     6
     """
-    check_plant(plant, "quell.plants.two_mass_spring()")
+    check_plant(plant)
     checks.positive("delay", delay, "s")
     samples = checks.samples("delay", delay, checks.positive("dt", dt, "s"))
     return DelayedPlant(plant, samples, float(dt))

@@ -89,5 +89,5 @@ def encoded(plant: Plant, counts: int) -> EncodedPlant:
     >>> round(seen.resolution, 7)
     0.0003927
     """
-    check_plant(plant, "quell.plants.torsional_identified()")
+    check_plant(plant)
     return EncodedPlant(plant, checks.whole("counts", counts, 1))

@@ -18,9 +18,9 @@ from quell.kernels.function_pointers import (
     POINTER,
     NotCompilableError,
     call,
+    compile_cfunc,
     evaluate,
-    inner,
-    machine_code,
+    jit_user_function,
 )
 from quell.plants.base import advance, measure
 from quell.types import Vector
@@ -212,8 +212,8 @@ class NonlinearPlant:
             return h(numba.carray(px, (n,)))
 
         try:
-            f, h = inner(self.f), inner(self._measured)
-            return machine_code(_RATE_SIGNATURE, rate), machine_code(_OUTPUT_SIGNATURE, output)
+            f, h = jit_user_function(self.f), jit_user_function(self._measured)
+            return compile_cfunc(_RATE_SIGNATURE, rate), compile_cfunc(_OUTPUT_SIGNATURE, output)
         except NotCompilableError as error:
             self._warn(str(error))
             return None

@@ -12,7 +12,7 @@ from typing import Any
 from quell import checks
 from quell.controllers import Prefiltered
 from quell.controllers.base import Controller
-from quell.files import without_gaps
+from quell.files import nonfinite_to_none
 from quell.plants import Plant
 from quell.setup.build import Builder, linear_part
 from quell.setup.description import Description, describe, read
@@ -60,7 +60,7 @@ class Setup:
 
     def as_json(self) -> dict[str, Any]:
         """Return what the file has, for ``quell.files.write_json``; in the place of an infinite number is None."""
-        kept: dict[str, Any] = without_gaps(self.description.model_dump(exclude_unset=True))
+        kept: dict[str, Any] = nonfinite_to_none(self.description.model_dump(exclude_unset=True))
         return kept
 
     def needed(self, table: str) -> Any:

@@ -19,7 +19,8 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.kernels.dispatch import compiled, compiling, for_types, interpreted
+from quell.kernels.dispatch import compiled, dispatcher_for, interpreted
+from quell.kernels.user_types import explain_compile_errors
 from quell.plants.base import Plant, advance, measure
 from quell.records.record import first_sample_at, in_steps
 from quell.signals import Signal
@@ -185,7 +186,7 @@ class Loop:
         self.done = self.status = self.until_next = 0
         as_python = interpret or not plant.compiled
         self._block, self._to_rest = (
-            interpreted(f) if as_python else for_types(f, model, self.design)
+            interpreted(f) if as_python else dispatcher_for(f, model, self.design)
             for f in (run_block, start_from_rest)
         )
 
@@ -198,7 +199,10 @@ class Loop:
         """Run a stretch, write every ``every``-th sample into ``log`` from ``row`` on, and return the next row."""
         first, dt, from_rest, r, derivatives, w, noise = stretch
         # An interpreted loop that diverges would warn of every overflow; the status says it once.
-        with np.errstate(over="ignore", invalid="ignore"), compiling(self.model, self.design):
+        with (
+            np.errstate(over="ignore", invalid="ignore"),
+            explain_compile_errors(self.model, self.design),
+        ):
             if from_rest:
                 self.x[:] = self.x0
                 self._to_rest(self.design, self.state)

@@ -17,7 +17,7 @@ from quell.cli.interrupt import ended_at_once
 from quell.cli.output import check_places, write_results
 from quell.cli.report import figure_of, judge, print_judgement, print_outcome
 from quell.experiments.common.figures import save_figure
-from quell.files import without_gaps
+from quell.files import nonfinite_to_none
 from quell.realtime.devices.registry import open_device
 from quell.realtime.loop.modes import Ending
 from quell.realtime.loop.result import ModeChange, RigRun
@@ -207,7 +207,7 @@ def _timing_figure(run: RigRun, setup: Setup, folder: Path) -> list[Path]:
 
 
 def _as_json(run: RigRun) -> dict[str, Any]:
-    found: dict[str, Any] = without_gaps(
+    found: dict[str, Any] = nonfinite_to_none(
         {
             "completed": run.completed,
             "timing": {

@@ -24,7 +24,7 @@ from quell.analysis.margins import Margins
 from quell.experiments.acc.controllers import DT, OURS, designs
 from quell.experiments.acc.criteria import MOST_Y
 from quell.experiments.acc.loops import unstable
-from quell.files import without_gaps
+from quell.files import nonfinite_to_none
 from quell.parallel import in_parallel
 from quell.plants import two_mass_spring
 from quell.records.trajectory import Trajectory
@@ -61,7 +61,7 @@ class CaseResult:
     def to_json(self) -> dict[str, Any]:
         """Return numbers for ``json.dump``; what is infinite is None."""
         plain = asdict(self) | {"margins": self.margins._asdict()}
-        return dict(without_gaps(plain))
+        return dict(nonfinite_to_none(plain))
 
 
 def study_cases() -> dict[str, CaseResult]:

@@ -16,7 +16,7 @@ import numpy as np
 from quell import checks
 from quell.experiments.stress import adversaries, random_loops
 from quell.experiments.stress.random_loops import END, LOAD_AT, Loop
-from quell.files import without_gaps
+from quell.files import nonfinite_to_none
 from quell.guard import Guard
 from quell.learners import Harmonic, Learner
 from quell.parallel import in_parallel
@@ -81,7 +81,7 @@ class Result:
             "adversarial": summary(self.hostile),
             "honest": summary(self.of(HONEST)),
             "kinds": {kind: summary(self.of(kind)) for kind in self.kinds if kind != HONEST},
-            "worst": [without_gaps(asdict(outcome)) for outcome in worst],
+            "worst": [nonfinite_to_none(asdict(outcome)) for outcome in worst],
         }
 
 

@@ -46,20 +46,20 @@ def validated_design(model: Any, features: int, dt: float) -> Any:
     ValueError
         that names the model's class and the rule, for whatever is wrong.
     """
-    if not validation.of_users(model):
+    if not validation.is_user_defined(model):
         return model.design(features, dt)
     name, rule = (
         type(model).__name__,
         f"it is shown {features} features, of shape ({features},), and learns and predicts one number",
     )
     what = f"{name}.design({features}, {dt:g})"
-    parameters = validation.named_tuple(
+    parameters = validation.check_named_tuple(
         what,
         validation.attempt(what, "design takes (features, dt)", model.design, features, dt),
         "numbers and arrays",
     )
-    validation.registered(name, parameters, infer, learn)
-    validation.arrays(
+    validation.check_registered(name, parameters, infer, learn)
+    validation.check_arrays(
         f"{name}.memory",
         validation.attempt(
             f"{name}.memory(...)", "memory takes (parameters)", model.memory, parameters
@@ -68,12 +68,12 @@ def validated_design(model: Any, features: int, dt: float) -> Any:
     )
     memory = packed(model.memory(parameters))[0]
     for i in range(3):
-        shown = validation.wave(features, 1.0 + i)
+        shown = validation.sample_values(features, 1.0 + i)
         predicted = validation.attempt_kernel(
             f"{name}: infer", rule, infer, parameters, memory, shown
         )
         if predicted is not validation.UNKNOWN:
-            validation.number(f"{name}: infer", predicted)
+            validation.check_number(f"{name}: infer", predicted)
         validation.attempt_kernel(f"{name}: learn", rule, learn, parameters, memory, shown, 0.5)
     return parameters
 

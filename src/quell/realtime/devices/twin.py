@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
-from quell.kernels.dispatch import compiled, for_types
-from quell.plants.base import advance, measure
+from quell.kernels.dispatch import compiled, dispatcher_for
+from quell.plants.base import advance, check_plant, measure
 from quell.realtime.devices.base import read_measurement, write_command
-from quell.simulation.driver import check_part
 from quell.types import Vector
 
 
@@ -83,7 +82,7 @@ class TwinDevice:
     lost = False
 
     def __init__(self, plant: Any, dt: float, x0: ArrayLike | None = None) -> None:
-        check_part("plant", plant)
+        check_plant(plant)
         self.dt = checks.positive("dt", dt, "s")
         order = plant.order
         x = np.zeros(order) if x0 is None else checks.vector("x0", x0, order)
@@ -108,14 +107,14 @@ class TwinDevice:
         """Return y [y-unit]."""
         if self.handle is None:
             return float(measure(self._handle.plant, self._handle.x))
-        return float(for_types(_read, self.handle)(self.handle))
+        return float(dispatcher_for(_read, self.handle)(self.handle))
 
     def write(self, u: float) -> None:
         """Apply u [u-unit] for a sample."""
         if self.handle is None:
             write_command(self._handle, float(u))
         else:
-            for_types(_write, self.handle)(self.handle, float(u))
+            dispatcher_for(_write, self.handle)(self.handle, float(u))
 
     def close(self) -> None:
         """Do nothing: there is nothing to give free."""

@@ -8,7 +8,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from quell.controllers import base
-from quell.kernels.dispatch import compiled, compiling, for_types
+from quell.kernels.dispatch import compiled, dispatcher_for
+from quell.kernels.user_types import explain_compile_errors
 from quell.types import Vector
 
 
@@ -53,7 +54,7 @@ def bound(design: Any) -> BoundControl:
     return BoundControl(
         design,
         *(
-            for_types(entry, design)
+            dispatcher_for(entry, design)
             for entry in (
                 _control,
                 _set_reference_derivatives,
@@ -67,7 +68,7 @@ def bound(design: Any) -> BoundControl:
 
 def warm(controller: BoundControl, state: Any, derivatives: Vector, row: Vector) -> None:
     """Compile everything, or load it, by a sample on a ``state`` that is for nothing else."""
-    with compiling(controller.design):
+    with explain_compile_errors(controller.design):
         base.control(controller, state, 0.0, 0.0)
         base.set_reference_derivatives(controller, state, derivatives)
         base.set_applied_control(controller, state, 0.0)

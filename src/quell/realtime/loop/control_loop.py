@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.kernels.dispatch import compiling, for_types, interpreted
+from quell.kernels.dispatch import dispatcher_for, interpreted
+from quell.kernels.user_types import explain_compile_errors
 from quell.realtime.devices.base import PythonHandle, handle_of
 from quell.realtime.loop.compiled_controller import bound, warm
 from quell.realtime.loop.cycle import Books, Pace, Setpoints, pace, run_cycles
@@ -174,9 +175,12 @@ class ControlLoop:
         entry = (
             interpreted(run_cycles)
             if self.interpreted
-            else for_types(run_cycles, self.handle, self.clock, self.design)
+            else dispatcher_for(run_cycles, self.handle, self.clock, self.design)
         )
-        with np.errstate(over="ignore", invalid="ignore"), compiling(self.handle, self.design):
+        with (
+            np.errstate(over="ignore", invalid="ignore"),
+            explain_compile_errors(self.handle, self.design),
+        ):
             entry(
                 *(
                     self.handle,

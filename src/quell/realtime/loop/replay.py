@@ -16,16 +16,17 @@ from quell import checks
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
+    check_controller,
     control,
     set_applied_control,
     set_reference_derivatives,
     status_flags,
     write_row,
 )
-from quell.kernels.dispatch import compiled, compiling, for_types
+from quell.kernels.dispatch import compiled, dispatcher_for
+from quell.kernels.user_types import explain_compile_errors
 from quell.realtime.loop.modes import Mode
 from quell.records.trajectory import Trajectory
-from quell.simulation.driver import check_part
 from quell.types import Matrix, Status, Vector
 
 _TOLD = (("r", 1), ("y", 1), ("y_measured", 1), ("u", 1), ("u_wished", 1))
@@ -61,7 +62,7 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
         for what is no Trajectory, a run that lacks r, y, y_measured or u or does not have all samples, one without a single measurement,
         another sample time, and ``u_before`` for a controller that is no ADRC.
     """
-    check_part("controller", controller)
+    check_controller(controller)
     if not isinstance(run, Trajectory):
         raise ValueError(
             f"run = {run!r}: must be a Trajectory, for example quell.realtime.load('run.mcap')"
@@ -91,8 +92,8 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     channels = (*_TOLD, *controller.channels)
     log = np.empty((len(run), sum(width for _, width in channels)))
     began = int(np.argmax(run["mode"] == Mode.RUN)) if "mode" in run.names else 0
-    with np.errstate(over="ignore", invalid="ignore"), compiling(design):
-        status = for_types(_follow, design)(
+    with np.errstate(over="ignore", invalid="ignore"), explain_compile_errors(design):
+        status = dispatcher_for(_follow, design)(
             design, state, _NO_DERIVATIVES, r, y, measured, u, began, log
         )
     return Trajectory(

@@ -12,6 +12,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from quell.controllers.base import check_controller
 from quell.realtime.devices.base import Device, PythonHandle, handle_of
 from quell.realtime.loop.control_loop import ControlLoop, scenario_of, setpoints
 from quell.realtime.loop.modes import Request
@@ -37,7 +38,6 @@ from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.sinks import MemorySink, file_sink
 from quell.realtime.telemetry.writer import Sink, TelemetryWriter
-from quell.simulation.driver import check_part
 
 # The main thread looks after the loop so often [s].
 _LOOK = 0.05
@@ -107,7 +107,7 @@ def run_rig(
     handle = handle_of(device)
     with ExitStack() as stack:
         stack.callback(device.close)
-        check_part("controller", controller)
+        check_controller(controller)
         _check_dt(device, controller.dt)
         rules = (Safety() if safety is None else safety).rules(controller)
         course = scenario_of(scenario, duration)

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from quell import checks
-from quell.kernels.dispatch import for_types
+from quell.kernels.dispatch import dispatcher_for
+from quell.plants.base import check_plant
 from quell.realtime.rig import kernel as kernels
 from quell.realtime.rig.kernel import RigModel, serve
 from quell.realtime.system.atomics import store_release
@@ -27,7 +28,6 @@ from quell.realtime.system.scheduling import (
 from quell.realtime.telemetry.ring import drain, dropped, ring
 from quell.realtime.wire import frames
 from quell.realtime.wire.transport import send
-from quell.simulation.driver import check_part
 
 # The log is written so often [s], and has room for so many seconds.
 _WRITE_EVERY = 0.05
@@ -92,7 +92,7 @@ class Rig:
         x0: Any = None,
         log: str | Path | None = None,
     ) -> None:
-        check_part("plant", plant)
+        check_plant(plant)
         dt = checks.positive("dt", dt, "s")
         if not _SHORTEST <= dt <= _LONGEST:
             raise ValueError(f"dt = {dt!r} s: must be from {_SHORTEST:g} to {_LONGEST:g} s")
@@ -277,7 +277,7 @@ class Rig:
         return dropped(self.model.log) if self.model.logged else 0
 
     def _serve(self, most: int, paced: bool) -> None:
-        for_types(serve, self.model, self._clock)(self.model, self._clock, most, paced)
+        dispatcher_for(serve, self.model, self._clock)(self.model, self._clock, most, paced)
 
     def _write(self) -> None:
         if self._writer is None or self._file is None or self._file.closed:

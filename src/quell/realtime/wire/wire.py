@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from numba import typeof
 
 from quell import checks
-from quell.kernels.dispatch import compiled, for_types, is_finite, kernel
+from quell.kernels.dispatch import compiled, dispatcher_for, is_finite, kernel
 from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.system.clock import SystemClock, now, system_clock
 from quell.realtime.wire import frames
@@ -276,12 +276,14 @@ class WireDevice:
         if not self._compiled:  # that may take seconds, and is not to be part of a cycle
             self._compiled = True
             for entry, arguments in ((fetch_one, (self._clock, 0)), (put_one, (0.0,))):
-                for_types(entry, self.handle).compile(tuple(map(typeof, (self.handle, *arguments))))
+                dispatcher_for(entry, self.handle).compile(
+                    tuple(map(typeof, (self.handle, *arguments)))
+                )
         y, _ = self._call(fetch_one, self._clock, time.monotonic_ns() + round(1e9 * seconds))
         return float(y)
 
     def _call(self, entry: Any, *arguments: Any) -> Any:
-        return for_types(entry, self.handle, *arguments)(self.handle, *arguments)
+        return dispatcher_for(entry, self.handle, *arguments)(self.handle, *arguments)
 
     def _check_open(self) -> None:
         if not self._open:

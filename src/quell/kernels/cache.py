@@ -1,0 +1,161 @@
+"""The disk cache of compiled code.
+
+Numba's own cache checks only the file that an entry point is in. Kernels call kernels of other files,
+so each version of them has a folder of its own, named by a hash of all files that compiled code can
+depend on. Files of the cache that are damaged or can not be written lead to a new compilation.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numba
+import platformdirs
+from numba.core import config as numba_config
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+
+# Versions kept: the current one and those of a few other branches or environments. Chosen by hand.
+_VERSIONS_KEPT = 4
+# Marks a folder as one that quell may remove, and tells backup programs to skip it (bford.info/cachedir).
+_MARKER_NAME = "CACHEDIR.TAG"
+_MARKER = (
+    "Signature: 8a477f597d28d172789f06886806bc55\n"
+    "# Compiled code of the Python package quell; it is made anew when it is missing.\n"
+)
+# A file with one of these has kernels.
+_KERNEL_MARKS = (b"@kernel", b"@compiled", b"@generic", b".register(")
+_IMPORT = re.compile(rb"\nfrom (quell[\w.]*) import (\([^)]*\)|.*)")
+_NAME = re.compile(rb"\w+")
+
+
+@functools.cache
+def cache_path() -> Path | None:
+    """Return the folder of this version's compiled code; None if it can't be created or written to.
+
+    It is in ``quell-compiled`` under ``NUMBA_CACHE_DIR`` if that is set, else under the user's cache
+    directory. Folders of older versions are removed; only folders with quell's marker file are.
+    """
+    root = os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_dir("quell")
+    versions = Path(root) / "quell-compiled"
+    path = versions / cache_key(Path(__file__).parents[1])
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        # Checks for write access, and makes the folder the one that was used last.
+        with tempfile.TemporaryFile(dir=path):
+            pass
+        if not (path / _MARKER_NAME).exists():
+            (path / _MARKER_NAME).write_text(_MARKER, encoding="utf-8")
+            _remove_old_versions(versions, path)
+    except OSError:
+        return None
+    return path
+
+
+def cache_key(package: Path) -> str:
+    """Return the hash of Numba's version and of the sources that compiled code of ``package`` can depend on."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for module, source in sorted(kernel_sources(package).items()):
+        digest.update(module.encode() + b"\0" + source + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def kernel_sources(package: Path) -> dict[str, bytes]:
+    """Return names and sources of the modules that have kernels and of all that these import.
+
+    Imports inside functions do not count: a kernel can use only what its module imports.
+    """
+    sources = {}
+    for folder, _, names in os.walk(package):
+        module = os.path.relpath(folder, package.parent).replace(os.sep, ".")
+        for name in names:
+            if name.endswith(".py"):
+                key = module if name == "__init__.py" else f"{module}.{name[:-3]}"
+                sources[key] = Path(folder, name).read_bytes()
+    found = {name for name, text in sources.items() if any(mark in text for mark in _KERNEL_MARKS)}
+    todo = list(found)
+    while todo:
+        for module_bytes, names_bytes in _IMPORT.findall(sources[todo.pop()]):
+            module = module_bytes.decode()
+            for name in _NAME.findall(names_bytes):
+                submodule = f"{module}.{name.decode()}"
+                imported = submodule if submodule in sources else module
+                if imported in sources and imported not in found:
+                    found.add(imported)
+                    todo.append(imported)
+    return {name: sources[name] for name in found}
+
+
+def code_cache(function: Callable[..., Any]) -> FunctionCache | None:
+    """Return the disk cache of an entry point; None if there is no place for it."""
+    folder = cache_path()
+    if folder is None:
+        return None
+    before = numba_config.CACHE_DIR
+    numba_config.CACHE_DIR = str(folder)
+    try:
+        return _FaultTolerantCache(function)
+    except (RuntimeError, OSError):  # no place for the files of this function, or no source file
+        return None
+    finally:
+        numba_config.CACHE_DIR = before
+
+
+class _FilesInCacheDirectory(CompileResultCacheImpl):
+    """Numba's cache files, in ``CACHE_DIR`` only: Numba's other places are not named by our key."""
+
+    _locator_classes = CompileResultCacheImpl._locator_classes[:1]
+
+
+class _FaultTolerantCache(FunctionCache):
+    """Numba's cache of a function; faults of its files are never errors."""
+
+    _impl_class = _FilesInCacheDirectory
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        # Numba numbers the data files. Two processes, or an index that was lost, can give one number to
+        # two signatures, and then the code of the wrong one is loaded.
+        self._cache_file._data_name = lambda number: (
+            f"{self._impl.filename_base}.{uuid.uuid4().hex}.nbc"
+        )
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return compiled code from the disk; None if there is none, or if it can't be read."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # unpickling a damaged file can raise anything
+            try:
+                self.flush()
+            except OSError:
+                self.disable()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Write compiled code to the disk if that is possible: the disk may be full."""
+        with suppress(OSError):
+            super().save_overload(sig, data)
+
+
+def _remove_old_versions(versions: Path, current: Path) -> None:
+    """Remove the folders of ``versions`` that have quell's marker, but for the ones used last."""
+    old = [path for path in versions.iterdir() if path != current and _is_ours(path)]
+    old.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in old[_VERSIONS_KEPT - 1 :]:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        return (path / _MARKER_NAME).read_text(encoding="utf-8") == _MARKER
+    except (OSError, UnicodeDecodeError):
+        return False

@@ -1,0 +1,155 @@
+"""The disk cache of compiled code: what it keeps, what it removes, and faults of its files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import quell
+from quell.kernels import cache
+
+PACKAGE = Path(quell.__file__).parent
+# One step of a controller; prints u and how many entry points were compiled for it.
+STEP = """
+import quell as ql
+from quell.controllers.compiled_step import step_packed
+from quell.kernels.dispatch import compilations
+controller = ql.ADRC(ql.ESO.model_free(1, 1.0, 10.0, 0.01), 1.0)
+print(controller.step(1.0, 0.0), compilations(step_packed))
+"""
+
+
+def step(cache_directory: Path, before: str = "") -> str:
+    """Return what ``STEP`` prints in a process of its own."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache_directory)}
+    command = [sys.executable, "-c", before + STEP]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    return run.stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache directory with the code of one step."""
+    directory = tmp_path_factory.mktemp("cache")
+    assert step(directory) == "1.0 1"
+    return directory
+
+
+@pytest.fixture
+def copy(filled: Path, tmp_path: Path) -> Path:
+    """A copy of ``filled`` that a test may damage."""
+    return Path(shutil.copytree(filled, tmp_path / "cache"))
+
+
+def test_a_second_process_loads_the_code(copy: Path) -> None:
+    """Nothing is compiled."""
+    assert step(copy) == "1.0 0"
+
+
+def test_folders_of_the_user_are_never_removed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """``NUMBA_CACHE_DIR`` may be a project's folder with names like ours."""
+    theirs = [tmp_path / f"quell-{name}" for name in ("figures", "data", "a", "b", "c", "d")]
+    theirs += [tmp_path / "quell-compiled" / name for name in ("notes", "0123456789abcdef")]
+    for folder in theirs:
+        folder.mkdir(parents=True)
+        (folder / "precious.txt").write_text("mine")
+    (theirs[-1] / "CACHEDIR.TAG").write_text("Signature: 8a477f597d28d172789f06886806bc55")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    path = cache.cache_path.__wrapped__()
+    assert path is not None
+    assert path.is_relative_to(tmp_path)
+    assert all((folder / "precious.txt").exists() for folder in theirs)
+
+
+def test_only_the_versions_used_last_are_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Old versions do not pile up, and the current one is never removed."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    paths = []
+    for i in range(8):
+        monkeypatch.setattr(cache, "cache_key", lambda package, i=i: f"version{i}")
+        paths.append(cache.cache_path.__wrapped__())
+        os.utime(paths[-1], (i, i))
+    assert [path.exists() for path in paths] == [False] * 4 + [True] * 4
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc", "nb?"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
+def test_damaged_files_lead_to_a_new_compilation(copy: Path, suffix: str, share: float) -> None:
+    """Truncated or empty, index or data; afterwards the cache is whole again."""
+    files = list(copy.rglob(f"*.{suffix}"))
+    assert files
+    for file in files:
+        content = file.read_bytes()
+        file.write_bytes(content[: int(share * len(content))])
+    assert step(copy) == "1.0 1"
+    assert step(copy) == "1.0 0"
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_unreadable_files_lead_to_a_new_compilation(copy: Path, suffix: str) -> None:
+    """A folder in the place of a file can neither be read nor replaced."""
+    for file in copy.rglob(f"*.{suffix}"):
+        file.unlink()
+        file.mkdir()
+    assert step(copy) == "1.0 1"
+
+
+def test_with_a_full_disk_the_code_is_compiled_in_each_process(tmp_path: Path) -> None:
+    """The limit on the size of files makes every longer write fail."""
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))\n"
+    assert step(tmp_path, before=limit) == "1.0 1"
+    assert step(tmp_path) == "1.0 1"
+    assert step(tmp_path) == "1.0 0"
+
+
+def test_without_a_place_for_the_cache_the_code_is_compiled_in_each_process(tmp_path: Path) -> None:
+    """A directory can't be created under a file."""
+    (tmp_path / "file").write_text("")
+    assert step(tmp_path / "file" / "cache") == "1.0 1"
+
+
+def test_the_key_changes_only_with_what_compiled_code_depends_on(tmp_path: Path) -> None:
+    """Kernels and all that their files import; not the command line, studies and plots."""
+    ignore = shutil.ignore_patterns("__pycache__")
+    package = Path(shutil.copytree(PACKAGE, tmp_path / "quell", ignore=ignore))
+    before = cache.cache_key(package)
+    assert before == cache.cache_key(PACKAGE)
+
+    def key_changes_with(path: str) -> bool:
+        file = package / path
+        source = file.read_bytes()
+        file.write_bytes(source + b"\n")
+        changes = cache.cache_key(package) != before
+        file.write_bytes(source)
+        return changes
+
+    with_kernels = ["guard.py", "plants/linear.py", "kernels/dispatch.py", "simulation/driver.py"]
+    imported = ["types.py", "checks.py", "kernels/linking.py", "kernels/function_pointers.py"]
+    others = [
+        "cli/app.py",
+        "experiments/torsional/study.py",
+        "records/plotting.py",
+        "setup/build.py",
+    ]
+    assert all(map(key_changes_with, with_kernels + imported))
+    assert not any(map(key_changes_with, others))
+
+
+def test_every_module_with_compiled_code_is_part_of_the_key() -> None:
+    """Numba's decorators are used in modules that the key covers."""
+    covered = cache.kernel_sources(PACKAGE)
+    for file in PACKAGE.rglob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        if "\nimport numba" in text or "\nfrom numba" in text:
+            module = ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts)
+            assert module.removesuffix(".__init__") in covered
