@@ -12,7 +12,8 @@ from quell import checks
 from quell.controllers.base import set_applied_control
 from quell.controllers.compiled_step import entry_point, pack, step_packed
 from quell.controllers.limits import Limits
-from quell.kernels.dispatch import compiling, for_types
+from quell.kernels.dispatch import dispatcher_for
+from quell.kernels.user_types import explain_compile_errors
 
 # Attributes that are made again in a copy: compiled functions and shared arrays belong to one process.
 _NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step")
@@ -57,10 +58,10 @@ class StatefulController:
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
-        dispatcher = for_types(step_packed, self.parameters)
+        dispatcher = dispatcher_for(step_packed, self.parameters)
         self._packed = pack(self.parameters, self._state)
         # The first call runs on another state, because it must not count as a sample.
-        with compiling(self.parameters):
+        with explain_compile_errors(self.parameters):
             dispatcher(pack(self.parameters, self.initial_state()), 0.0, 0.0)
         self._step = entry_point(dispatcher, self._packed, 0.0, 0.0)
 
