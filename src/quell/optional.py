@@ -1,4 +1,4 @@
-"""Packages that only some rigs need."""
+"""Import of packages that only extras of quell install."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import importlib
 from typing import Any
 
 
-def needed(module: str, extra: str, purpose: str) -> Any:
-    """Import a third-party module, or say which extra brings it.
+def import_extra(module: str, extra: str, purpose: str) -> Any:
+    """Import a third-party module for a ``purpose``; return it.
 
     Raises
     ------
     ImportError
-        where it is missing.
+        if it can't be imported; the message names the extra that installs it.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
-            f'{purpose} needs {module}, which can\'t be imported ({error}): pip install "quell[{extra}]"'
+            f"{purpose} needs {module}, which can't be imported ({error}): pip install 'quell[{extra}]'"
         ) from error

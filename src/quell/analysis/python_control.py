@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from quell import checks
 from quell.analysis.frequency_response import System
+from quell.optional import import_extra
 from quell.types import Matrix, Vector
 
 if TYPE_CHECKING:
@@ -29,7 +29,9 @@ _PARTS = ("P", "C_r", "C_y", "L")
 def state_space(loop: LoopAnalysis, name: str) -> Any:
     """Return a part of the loop as a ``control.StateSpace``; see ``LoopAnalysis.system``."""
     N, B, C, D = _named(loop, name)
-    return _control().ss(N + np.eye(N.shape[0]), B[:, None], C[None, :], D, loop.dt)
+    return import_extra("control", "control", "a python-control system").ss(
+        N + np.eye(N.shape[0]), B[:, None], C[None, :], D, loop.dt
+    )
 
 
 def transfer_function(loop: LoopAnalysis, name: str) -> Any:
@@ -50,7 +52,7 @@ def transfer_function(loop: LoopAnalysis, name: str) -> Any:
         abs(part[-1]) < _ROUNDING * np.max(np.abs(part)) for part in (numerator, denominator)
     ):
         numerator, denominator = numerator[:-1], denominator[:-1]
-    return _control().tf(
+    return import_extra("control", "control", "a python-control system").tf(
         np.trim_zeros(numerator, "f") if np.any(numerator) else [0.0], denominator, loop.dt
     )
 
@@ -83,12 +85,3 @@ def _part(loop: LoopAnalysis, name: str) -> System:
     big: Matrix = np.block([[P.N, np.zeros((n, m))], [np.outer(C_y.B, P.C), N]])
     into: Vector = np.concatenate([P.B, np.zeros(m)])
     return System(big, into, np.concatenate([C_y.D * P.C, C_y.C]), 0.0)
-
-
-def _control() -> Any:
-    try:
-        return importlib.import_module("control")
-    except ImportError as error:
-        raise ImportError(
-            f"systems of python-control need python-control ({error}): pip install 'quell[control]'"
-        ) from error

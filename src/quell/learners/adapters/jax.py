@@ -8,7 +8,8 @@ from typing import Any, Unpack
 import numpy as np
 
 from quell import checks
-from quell.learners.adapters.python import Options, PythonModel, needed
+from quell.learners.adapters.python import Options, PythonModel
+from quell.optional import import_extra
 from quell.types import Matrix, Vector
 
 
@@ -40,8 +41,11 @@ class JaxModel(PythonModel):
     def __init__(
         self, module: Any, optimizer: Any = None, *, steps: int = 1, **options: Unpack[Options]
     ) -> None:
-        needed("jax", "jax")
-        equinox, optax = needed("equinox", "jax"), needed("optax", "jax")
+        import_extra("jax", "jax", "a JAX learner")
+        equinox, optax = (
+            import_extra("equinox", "jax", "a JAX learner"),
+            import_extra("optax", "jax", "a JAX learner"),
+        )
         if not (isinstance(module, equinox.Module) and callable(module)):
             raise ValueError(
                 f"module = {module!r}: must be an equinox.Module that can be called with an array (p,)"
@@ -60,7 +64,7 @@ class JaxModel(PythonModel):
 
 class _Module:
     def __init__(self, module: Any, optimizer: Any, steps: int) -> None:
-        equinox = needed("equinox", "jax")
+        equinox = import_extra("equinox", "jax", "a JAX learner")
         self.module, self.optimizer, self.steps = module, optimizer, steps
         self.moments = optimizer.init(equinox.filter(module, equinox.is_inexact_array))
 
@@ -92,7 +96,10 @@ class _Module:
 @functools.cache
 def _compiled() -> tuple[Any, Any]:
     """Return a gradient step and a prediction; made when first used, as JAX takes a while to import."""
-    jax, equinox = needed("jax", "jax"), needed("equinox", "jax")
+    jax, equinox = (
+        import_extra("jax", "jax", "a JAX learner"),
+        import_extra("equinox", "jax", "a JAX learner"),
+    )
 
     def loss(module: Any, rows: Any, wanted: Any, weights: Any) -> Any:
         output = jax.vmap(module)(rows)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypedDict, Unpack
@@ -183,13 +182,3 @@ class PythonModel:
                 f"({', '.join(names)}) and must learn and predict one number: fit it to that, or choose other features"
             ) from error
         self._tried.add(width)
-
-
-def needed(module: str, extra: str) -> Any:
-    """Import a third-party module, or say which extra brings it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f"{module} is needed for this learner and can't be imported ({error}): pip install 'quell[{extra}]'"
-        ) from error

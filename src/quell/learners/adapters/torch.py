@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any, Unpack
 
 from quell import checks
-from quell.learners.adapters.python import Options, PythonModel, needed
+from quell.learners.adapters.python import Options, PythonModel
+from quell.optional import import_extra
 from quell.types import Matrix, Vector
 
 
@@ -42,7 +43,7 @@ class TorchModel(PythonModel):
         steps: int = 1,
         **options: Unpack[Options],
     ) -> None:
-        torch = needed("torch", "torch")
+        torch = import_extra("torch", "torch", "a PyTorch learner")
         if not isinstance(module, torch.nn.Module):
             raise ValueError(f"module = {module!r}: must be a torch.nn.Module")
         parameters = list(module.parameters())
@@ -79,7 +80,7 @@ class _Module:
         self.kind = next(module.parameters()).dtype
 
     def learn(self, features: Matrix, targets: Vector) -> None:
-        torch = needed("torch", "torch")
+        torch = import_extra("torch", "torch", "a PyTorch learner")
         rows, wanted = (torch.from_numpy(array).to(self.kind) for array in (features, targets))
         self.module.train()
         for _ in range(self.steps):
@@ -93,7 +94,7 @@ class _Module:
             self.optimizer.step()
 
     def predict(self, features: Vector) -> Any:
-        torch = needed("torch", "torch")
+        torch = import_extra("torch", "torch", "a PyTorch learner")
         self.module.eval()
         with torch.no_grad():
             return self.module(torch.from_numpy(features.reshape(1, -1)).to(self.kind)).numpy()

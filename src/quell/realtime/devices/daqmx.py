@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from quell.optional import import_extra
+
 # Codes of NIDAQmx.h: those of a wrong argument, and what mends each; then those of the world outside.
 _ARGUMENTS = {
     -200220: "the names of the cards that are there: NI MAX, or nidaqmx.system.System.local().devices",
@@ -30,19 +32,9 @@ def driver() -> Any:
     ImportError
         where it is not installed.
     """
-    try:
-        import nidaqmx
-        import nidaqmx.constants
-        import nidaqmx.stream_readers
-        import nidaqmx.stream_writers
-        import nidaqmx.system
-        import nidaqmx.system.watchdog
-        import nidaqmx.types
-    except ImportError as error:
-        raise ImportError(
-            f"nidaqmx is needed for the cards of NI and can't be imported ({error}): pip install 'quell[ni]'"
-        ) from error
-    return nidaqmx
+    for module in ("constants", "stream_readers", "stream_writers", "system.watchdog", "types"):
+        import_extra(f"nidaqmx.{module}", "ni", "a card of NI")
+    return import_extra("nidaqmx", "ni", "a card of NI")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.optional import needed
+from quell.optional import import_extra
 from quell.realtime.telemetry.channels import EVENTS, K
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.ros_message import SCHEMA, TOPIC, definition, log_time, messages
@@ -54,7 +54,7 @@ class LiveSink:
 
     def open(self, header: Header) -> None:
         """Begin to listen."""
-        foxglove = needed("foxglove", "telemetry", "watching live")
+        foxglove = import_extra("foxglove", "telemetry", "watching live")
         self._header = header
         self._context = context = foxglove.Context()  # a channel is closed with it
         self._apart, self._next, self._events = (

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.optional import needed
+from quell.optional import import_extra
 from quell.realtime.telemetry.channels import K
 from quell.realtime.telemetry.csv_file import check_new
 from quell.realtime.telemetry.header import Header
@@ -86,8 +86,8 @@ class McapSink:
 
     def open(self, header: Header) -> None:
         """Begin the file; the header is on disk at once."""
-        foxglove = needed("foxglove", "telemetry", "an MCAP file")
-        mcap = needed("foxglove.mcap", "telemetry", "an MCAP file")
+        foxglove = import_extra("foxglove", "telemetry", "an MCAP file")
+        mcap = import_extra("foxglove.mcap", "telemetry", "an MCAP file")
         check_new(self.path)
         self._header = header
         self._context = context = foxglove.Context()  # a channel is closed with it
@@ -141,7 +141,7 @@ def read_mcap(path: Path) -> tuple[Header, Matrix]:
     ImportError
         where the package mcap is missing.
     """
-    needed("mcap", "telemetry", "reading an MCAP file")
+    import_extra("mcap", "telemetry", "reading an MCAP file")
     header: Header | None = None
     schemas: dict[int, str] = {}
     topics: dict[int, tuple[str, str | None]] = {}

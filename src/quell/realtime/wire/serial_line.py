@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.optional import import_extra
 from quell.realtime.system.libc import external
 from quell.realtime.wire import cobs
 from quell.realtime.wire.frames import LENGTH, Buffer
@@ -272,12 +273,7 @@ def _opened(url: str, path: str, baud: int) -> Any:
         raise ValueError(
             f"device = {url!r}: serial lines are for Linux; elsewhere give run_rig a device of your own around pyserial"
         )
-    try:
-        import serial
-    except ImportError as error:
-        raise ImportError(
-            f"pyserial is needed for serial lines and can't be imported ({error}): pip install 'quell[serial]'"
-        ) from error
+    serial = import_extra("serial", "serial", "a serial line")
     try:
         port = serial.Serial(path, baud, timeout=0.0, write_timeout=0.0, exclusive=True)
     except (
