@@ -72,7 +72,7 @@ class RigProcess:
         command = [
             sys.executable,
             "-m",
-            "quell.cli.app",
+            "quell",
             "rig",
             "--device",
             "udp://127.0.0.1:0",

@@ -51,7 +51,7 @@ def rig(wire: str, priority: int) -> Iterator[str]:
     command = [
         sys.executable,
         "-m",
-        "quell.cli.app",
+        "quell",
         "rig",
         "--device",
         url,

@@ -31,10 +31,10 @@ def main() -> None:
     bare = best([*python, "pass"], 7)
     rows = [
         ("import quell", best([*python, "import quell"], 7) - bare, 0.3),
-        ("quell --help", best([sys.executable, "-m", "quell.cli.app", "--help"], 7), 0.6),
+        ("quell --help", best([sys.executable, "-m", "quell", "--help"], 7), 0.6),
         (
             "quell reproduce two-mass, cache warm, with figures",
-            best([sys.executable, "-m", "quell.cli.app", "reproduce", "two-mass"], 4),
+            best([sys.executable, "-m", "quell", "reproduce", "two-mass"], 4),
             5.0,
         ),
     ]

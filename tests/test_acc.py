@@ -311,17 +311,10 @@ def test_a_sweep_of_the_cubic_part_may_go_through_zero() -> None:
 
 def test_samples_are_read_or_drawn(tmp_path: Path) -> None:
     """Not both."""
-    from quell.cli.commands.acc import reproduce_acc
+    from quell.cli.commands.acc import acc
 
     (tmp_path / "a.csv").write_text(HEADER + "1,1,1,0,1,0.01\n")
     with pytest.raises(
         ValueError, match="--samples reads plants, --count, --spread and --seed are for drawing"
     ):
-        reproduce_acc(
-            samples=tmp_path / "a.csv",
-            count=5,
-            spread=None,
-            seed=None,
-            json_file=None,
-            figures=None,
-        )
+        acc(samples=tmp_path / "a.csv", count=5)

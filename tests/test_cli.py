@@ -13,7 +13,7 @@ import pytest
 def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own."""
     return subprocess.run(
-        [sys.executable, "-m", "quell.cli.app", *arguments],
+        [sys.executable, "-m", "quell", *arguments],
         cwd=cwd,
         capture_output=True,
         text=True,
@@ -44,7 +44,7 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
         cwd=tmp_path,
     )
     assert shown.returncode == 0, shown.stderr
-    assert "What the paper claims" in shown.stdout
+    assert "Claims of section IV" in shown.stdout
     assert "nan" not in shown.stdout.lower()
     result = json.loads((tmp_path / "out.json").read_text())
     assert set(result) >= {"settings", "controllers", "claims"}

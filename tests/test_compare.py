@@ -120,7 +120,7 @@ def test_a_mistake_is_named(wrong: object, message: str) -> None:
 def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own."""
     return subprocess.run(
-        [sys.executable, "-m", "quell.cli.app", "compare", *arguments],
+        [sys.executable, "-m", "quell", "compare", *arguments],
         cwd=cwd,
         capture_output=True,
         text=True,

@@ -9,61 +9,24 @@ from pathlib import Path
 
 import pytest
 
-# The order of the folders: each may import itself and what stands before it. ``__init__`` after a folder's
-# name is the file that gathers the folder's public names. A new folder needs an entry here.
-ORDER = [
-    "types",
-    "checks",
-    "files",
-    "parallel",
-    "optional",
-    "kernels",
-    "lti",
-    "signals",
-    "observers",
-    "plants",
-    "features",
-    "learners",
-    "learners.kalman",
-    "learners.regression",
-    "learners.gradient",
-    "learners.online",
-    "learners.adapters",
-    "learners.__init__",
-    "guard",
-    "controllers",
-    "controllers.linear",
-    "controllers.adrc",
-    "controllers.prefilters",
-    "controllers.baselines",
-    "controllers.__init__",
-    "records",
-    "simulation",
-    "analysis",
-    "identification",
-    "realtime.system",
-    "realtime.telemetry",
-    "realtime.devices",
-    "realtime.wire",
-    "realtime.loop",
-    "realtime.rig",
-    "realtime.__init__",
-    "setup",
-    "experiments.common",
-    "experiments.two_mass_spring",
-    "experiments.torsional",
-    "experiments.compare",
-    "experiments.acc",
-    "experiments.stress",
-    "experiments.__init__",
-    "__init__",
-    "cli.options",
-    "cli.output",
-    "cli.report",
-    "cli.interrupt",
-    "cli.commands",
-    "cli",
-]
+# The order of the folders: each may import itself and whatever stands before it. "x.__init__" is the file
+# that gathers the public names of folder x and its subfolders. A new folder needs an entry here.
+ROWS = (
+    ("types", "checks", "files", "parallel", "optional", "kernels"),
+    ("lti", "signals", "observers", "plants", "features"),
+    ("learners", "learners.kalman", "learners.regression", "learners.gradient", "learners.online"),
+    ("learners.adapters", "learners.__init__", "guard"),
+    ("controllers", "controllers.linear", "controllers.adrc", "controllers.prefilters"),
+    ("controllers.baselines", "controllers.__init__"),
+    ("records", "simulation", "analysis", "identification"),
+    ("realtime.system", "realtime.telemetry", "realtime.devices", "realtime.wire"),
+    ("realtime.loop", "realtime.rig", "realtime.__init__", "setup"),
+    ("experiments.common", "experiments.two_mass_spring", "experiments.torsional"),
+    ("experiments.compare", "experiments.acc", "experiments.stress", "experiments.__init__"),
+    ("__init__", "cli.options", "cli.output", "cli.report", "cli.interrupt", "cli.commands"),
+    ("cli", "__main__"),
+)
+ORDER = [folder for row in ROWS for folder in row]
 
 ROOT = Path(importlib.util.find_spec("quell").origin or "").parent
 

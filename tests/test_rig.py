@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quell.cli.commands.rig import run_rig
+from quell.cli.commands.rig import rig as run_rig
 from quell.realtime.devices.registry import listen, open_device
 
 # A tick so long that a machine with much else to do still keeps the session alive.
@@ -28,7 +28,7 @@ def rig(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     command = [
         sys.executable,
         "-m",
-        "quell.cli.app",
+        "quell",
         "rig",
         "--plant",
         "two-mass",
@@ -149,8 +149,8 @@ def test_bad_input_is_a_line_and_exit_code_2() -> None:
         ({"log": Path("/nowhere/x.csv")}, "log = '/nowhere/x.csv': can't be written"),
         ({"seconds": -1.0}, "--seconds = -1.0"),
         ({"priority": 100}, "priority = 100"),
-        ({"settings": SETTINGS | {"dt": 0.0}}, "dt = 0.0"),
-        ({"settings": SETTINGS | {"watchdog": 0}}, "watchdog = 0"),
+        ({"dt": 0.0}, "dt = 0.0"),
+        ({"watchdog": 0}, "watchdog = 0"),
     ],
 )
 def test_what_is_wrong_is_named(
@@ -160,14 +160,11 @@ def test_what_is_wrong_is_named(
     given = {
         "device": "udp://127.0.0.1:0",
         "plant": "two-mass",
-        "settings": SETTINGS,
         "seconds": 1.0,
-        "log": None,
         "priority": 0,
-        "cpu": None,
     }
     with pytest.raises(ValueError) as raised:
-        run_rig(**{**given, **changed})
+        run_rig(**{**given, **SETTINGS, **changed})
     assert message in str(raised.value)
     assert capsys.readouterr().out == ""
 
@@ -178,12 +175,4 @@ def test_a_port_that_is_taken_is_named() -> None:
         closing(listen("udp://127.0.0.1:0")) as first,
         pytest.raises(ValueError, match="can't listen there"),
     ):
-        run_rig(
-            device=first.url,
-            plant="two-mass",
-            settings=SETTINGS,
-            seconds=1.0,
-            log=None,
-            priority=0,
-            cpu=None,
-        )
+        run_rig(device=first.url, plant="two-mass", seconds=1.0, priority=0, **SETTINGS)

@@ -1,4 +1,4 @@
-"""Ctrl-C, and what else ends a program, while code is compiled or loaded."""
+"""Ctrl-C and other signals that end a program, while code is compiled or loaded."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from quell.realtime.system.interrupts import termination_handler
-
 
 @contextmanager
-def ended_at_once(close: Callable[[], Any]) -> Iterator[None]:
-    """Let a signal ``close`` what is open and end the process; the exit code is 128 and the signal's number.
+def exit_on_signal(close: Callable[[], Any]) -> Iterator[None]:
+    """Make signals that end a program call ``close`` and exit with 128 plus the signal's number.
 
-    An exception might be lost instead: compiling and loading run through callbacks that swallow them.
+    An exception could be lost: compiling and loading run through callbacks that ignore exceptions.
     """
+    from quell.realtime.system.interrupts import termination_handler
 
     def end(number: int, frame: Any) -> None:
         close()

@@ -1,16 +1,17 @@
-"""Arguments that the commands read alike."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter, Token
 
 
-def whole(kind: Any, tokens: Sequence[Token]) -> int:
-    """Read a whole number; the parser's own conversion would round 1.5 to 2 without a word."""
+def whole_number(kind: Any, tokens: Sequence[Token]) -> int:
+    """Return the whole number in an option; the parser's own conversion would round 1.5 to 2."""
     text = tokens[0].value
     try:
         return int(text)
@@ -18,7 +19,44 @@ def whole(kind: Any, tokens: Sequence[Token]) -> int:
         raise ValueError(f"{tokens[0].keyword} = {text!r}: must be a whole number") from None
 
 
-Whole = Annotated[int, Parameter(converter=whole)]
-WholeOrNone = Annotated[int | None, Parameter(converter=whole)]
-JsonFile = Annotated[Path | None, Parameter(name="--json")]
-Figures = Annotated[Path | None, Parameter(negative_none="no-")]
+Whole = Annotated[int, Parameter(converter=whole_number)]
+WholeOrNone = Annotated[int | None, Parameter(converter=whole_number)]
+Switch = Annotated[bool, Parameter(negative="")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Outputs:
+    """Files that a command writes.
+
+    Parameters
+    ----------
+    json
+        Write all results and settings to this file, for programs.
+    figures
+        Put the figures into this folder, as PNG and SVG.
+    """
+
+    json: Annotated[Path | None, Parameter(name="--json")] = None
+    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RunOutputs(Outputs):
+    """Files that a command writes which runs a setup.
+
+    Parameters
+    ----------
+    json
+        Write metrics, events and settings to this file, for programs.
+    figures
+        Put the figures into this folder, as PNG and SVG.
+    save
+        Write the whole record to this file, which `Trajectory.load` reads.
+    """
+
+    save: Path | None = None
+
+
+OUTPUTS, RUN_OUTPUTS = Outputs(), RunOutputs()

@@ -1,92 +1,160 @@
-"""What all commands do around their work: places are looked at before it, told of while it goes on, written to after it."""
+"""Output of commands: tables, progress bars, result files."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, ProgressColumn, TextColumn
-from rich.progress import Progress as ProgressBar
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
+from rich.table import Table
 
-from quell.controllers import Controller
-from quell.experiments.common.figures import make_folder
-from quell.files import check_writable, write_json
-from quell.kernels.dispatch import compilations
-from quell.plants import Plant
-from quell.simulation import Scenario, simulate
-from quell.simulation.driver import run_block
-from quell.types import Progress
+from quell.cli.options import Outputs, RunOutputs
+
+if TYPE_CHECKING:
+    from quell.controllers import Controller
+    from quell.plants import Plant
+    from quell.records.trajectory import Trajectory
+    from quell.types import Progress as ProgressCallback
+
+COMPILING = "simulating (the first run compiles for some seconds)"
+"""Label of a progress bar until the first samples are done."""
 
 
-def check_places(json_file: Path | None, figures: Path | None, record: Path | None = None) -> None:
-    """Say what can't be written to before the work is done; make the folder.
+class Column(NamedTuple):
+    """A column of a table of scores.
+
+    Attributes
+    ----------
+    key : str
+        key of the score.
+    heading : str
+        heading of the column, with the unit.
+    factor : float
+        factor from the score's unit to the column's.
+    form : str
+        format of the number.
+    """
+
+    key: str
+    heading: str
+    factor: float
+    form: str
+
+    def cell(self, scores: Mapping[str, Any]) -> str:
+        """Return the score as text, a dash where it is missing."""
+        return number(scores.get(self.key), self.form, self.factor)
+
+
+def number(value: float | None, form: str, factor: float = 1.0) -> str:
+    """Return ``factor * value`` in a format, a dash for None."""
+    return "–" if value is None else format(factor * value, form)
+
+
+def table(title: str, *headings: str, left: int = 1, **options: Any) -> Table:
+    """Return an empty table whose first ``left`` columns are text and whose others are numbers."""
+    made = Table(title=escape(title), title_justify="left", box=SIMPLE_HEAD, **options)
+    for i, heading in enumerate(headings):
+        made.add_column(escape(heading), justify="left" if i < left else "right", no_wrap=i >= left)
+    return made
+
+
+def yes_or_no(holds: bool) -> str:
+    """Return a cell that shows whether a claim holds."""
+    return "[green]yes[/]" if holds else "[red]no[/]"
+
+
+def print_diverged(console: Console, runs: Mapping[str, Trajectory]) -> None:
+    """Print the message of each run that diverged."""
+    for name, run in runs.items():
+        if run.diverged:
+            print_line(console, f"{name}: {run.message}")
+
+
+def print_line(console: Console, text: str) -> None:
+    """Print text as it is: without markup, and without line breaks at the console's width."""
+    console.print(escape(text), soft_wrap=True)
+
+
+def check_outputs(outputs: Outputs) -> None:
+    """Check, before the work is done, that the results can be written; create the figures' folder.
 
     Raises
     ------
     ValueError
-        for a file that can't be written, or a folder that can't be made.
+        for a file that cannot be written, or a folder that cannot be created.
     """
-    for file in (json_file, record):
+    from quell.experiments.common.figures import make_folder
+    from quell.files import check_writable
+
+    for file in (outputs.json, outputs.save if isinstance(outputs, RunOutputs) else None):
         if file is not None:
             check_writable(file)
-    if figures is not None:
-        make_folder(figures)
+    if outputs.figures is not None:
+        make_folder(outputs.figures)
 
 
 def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -> None:
-    """Compile the loops that a study needs, or load them; where that takes long, say so and how long it took."""
+    """Compile the loops of a study, or load them from the cache; print how long compiling took."""
+    from quell.kernels.dispatch import compilations
+    from quell.simulation import Scenario, simulate
+    from quell.simulation.driver import run_block
+
     began = time.perf_counter()
-    with console.status(
-        "Compiling what is not in the cache: some ten seconds, once for this version."
-    ):
+    with console.status("Compiling what is not in the cache: some ten seconds, once."):
         for plant, controller in loops:
-            simulate(
-                plant,
-                controller,
-                Scenario(duration=10 * controller.dt, rest_at=(5 * controller.dt,)),
-            )
-    compiled = compilations(run_block)
-    if compiled:
-        console.print(
-            f"First run of this version: {compiled} loops compiled in {time.perf_counter() - began:.1f} s, and kept for later runs."
-        )
+            dt = controller.dt
+            simulate(plant, controller, Scenario(duration=10 * dt, rest_at=(5 * dt,)))
+    if compiled := compilations(run_block):
+        took = time.perf_counter() - began
+        console.print(f"Compiled {compiled} loops in {took:.1f} s; later runs use them.")
 
 
 @contextmanager
 def progress_bar(
     console: Console, first: str = "simulating", *more: ProgressColumn, width: int = 0
-) -> Iterator[Progress]:
-    """Show a bar while the work goes on; ``first`` stands at it until something is told, in ``width`` places at least."""
-    with ProgressBar(
-        TextColumn(f"{{task.description:<{width}}}"),
-        BarColumn(),
-        *more,
-        console=console,
-        transient=True,
-    ) as bar:
+) -> Iterator[ProgressCallback]:
+    """Show a progress bar while the work goes on, and return the callback that moves it.
+
+    Parameters
+    ----------
+    console
+        where to print.
+    first
+        label of the bar until the first call.
+    more
+        further columns of the bar.
+    width
+        least width of the label.
+    """
+    label = TextColumn(f"{{task.description:<{width}}}")
+    with Progress(label, BarColumn(), *more, console=console, transient=True) as bar:
         task = bar.add_task(first, total=1.0)
         yield lambda what, share: bar.update(task, description=what, completed=share)
 
 
+def write_record(console: Console, run: Trajectory, path: Path | None, name: str) -> None:
+    """Write a record where that is asked for, and print where it is."""
+    if path is not None and len(run):
+        run.save(path)
+        print_line(console, f"{name}: {path}")
+
+
 def write_results(
-    console: Console,
-    value: Any,
-    json_file: Path | None,
-    paths: Sequence[Path],
-    figures: Path | None,
+    console: Console, results: dict[str, Any], outputs: Outputs, figures: Sequence[Path]
 ) -> None:
-    """Write the results, where they are wanted, and say where they and the figures ``paths`` are."""
-    if paths:
-        names = sorted({path.stem for path in paths})
+    """Write the results to the JSON file, if any; print where they and the figures are."""
+    from quell.files import write_json
+
+    if figures:
+        names = sorted({path.stem for path in figures})
         noun = "Figures" if len(names) > 1 else "Figure"
-        console.print(
-            f"{noun}: {', '.join(names)} (PNG and SVG) in {escape(str(figures))}/", soft_wrap=True
-        )
-    if json_file is not None:
-        write_json(json_file, value)
-        console.print(f"Results: {escape(str(json_file))}", soft_wrap=True)
+        print_line(console, f"{noun}: {', '.join(names)} (PNG and SVG) in {outputs.figures}/")
+    if outputs.json is not None:
+        write_json(outputs.json, results)
+        print_line(console, f"Results: {outputs.json}")

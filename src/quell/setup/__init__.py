@@ -82,7 +82,8 @@ def load(path: str | os.PathLike[str]) -> Setup:
     Raises
     ------
     SetupError
-        with a line for each mistake: the file, the key's path, the value and the rule, or the nearest known name.
+        with a line for each mistake: the file, the key's path, the value and the rule, or the
+        nearest known name.
 
     Examples
     --------

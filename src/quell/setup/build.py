@@ -38,7 +38,8 @@ class Builder:
         path
             where it stands in the file.
         **context
-            what the rest of the file has for it; it is given what it takes and does not have itself. What is None is not there.
+            what the rest of the file has for it; it is given what it takes and does not have
+            itself. What is None is not there.
 
         Raises
         ------

@@ -57,7 +57,8 @@ def mistakes(name: str, error: ValidationError, data: Any) -> SetupError:
             lines.append(f"{path}: missing")
         elif kind == "union_tag_invalid" and isinstance(value, Mapping):
             lines.append(
-                f"{path}.kind = {_short(value['kind'])}: unknown; {nearest(str(value['kind']), _tags(context))}"
+                f"{path}.kind = {_short(value['kind'])}: unknown; "
+                f"{nearest(str(value['kind']), _tags(context))}"
             )
         elif kind in ("union_tag_not_found", "union_tag_invalid"):
             lines.append(

@@ -1,6 +1,7 @@
 """A table of a setup file is a call: ``kind`` says of what, every other key is a parameter under the name that it has in Python.
 
-The models of the tables are made from signatures, so that what can be called can be written: a new learner works by existing.
+The models of the tables are made from signatures, so that what can be called can be written: a new
+learner works by existing.
 """
 
 from __future__ import annotations

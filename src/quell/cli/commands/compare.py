@@ -1,22 +1,19 @@
-"""``quell compare``: run chosen controllers on one plant, print, write."""
+"""``quell compare``."""
 
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
-from typing import Any
+from math import inf
+from typing import TYPE_CHECKING, Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from quell.analysis import analyse
-from quell.cli.output import check_places, progress_bar, write_results
-from quell.experiments.compare import figures as compare_figure
-from quell.experiments.compare import study as compare
-from quell.experiments.compare.study import BAND, END, FORCE, FORCE_AT, Benchmark, Comparison
-from quell.plants import two_mass_spring
+from quell.cli.options import OUTPUTS, Outputs, Whole
+from quell.cli.output import COMPILING, check_outputs, progress_bar, table, write_results
+
+if TYPE_CHECKING:
+    from quell.controllers import Controller
+    from quell.experiments.compare.study import Benchmark, Comparison
 
 _COLUMNS = (
     ("overshoot", "over-\nshoot\n[%]", 100.0, 2),
@@ -25,54 +22,73 @@ _COLUMNS = (
     ("rms", "RMS\n[m]", 1.0, 4),
     ("control_variation", "vari-\nation\n[N]", 1.0, 2),
 )
-# A number may take so many places, for the table to fit into 80.
-_PLACES = 6
+# Characters of a number, so that the table fits into a terminal of 80 columns.
+_WIDTH = 6
 
 
-def run_compare(
-    *, controllers: str, settings: Benchmark, json_file: Path | None, figures: Path | None
+def compare(
+    *,
+    controllers: str = "mf-eso,mb-eso,l-eso,pid,pi-notch,lqg,resonance-ratio",
+    m1: float = 1.0,
+    m2: float = 1.0,
+    k: float = 1.0,
+    dt: float = 1e-3,
+    u_max: float = inf,
+    seed: Whole = 0,
+    outputs: Outputs = OUTPUTS,
 ) -> None:
-    """Run the comparison, print its table, write what was asked for.
+    """Compare controllers on two masses and a spring: a step, a force on the load, noise.
 
-    Raises
-    ------
-    ValueError
-        for an unknown controller, or a place that can't be written to.
+    All are designed for m1 = m2 = k = 1.
+
+    Parameters
+    ----------
+    controllers
+        Names of controllers, with commas between; zv+ or zvd+ before a name shapes its reference,
+        as in zv+lqg.
+    m1
+        Mass that is pushed, as it really is [kg].
+    m2
+        Mass that is measured [kg].
+    k
+        Stiffness of the spring [N/m].
+    dt
+        Sample time [s].
+    u_max
+        Limit of the control force, either way [N].
+    seed
+        Seed of the measurement noise.
     """
+    from quell.experiments.compare import figures, study
+
+    settings = study.Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
     names = list(dict.fromkeys(name.strip() for name in controllers.split(",") if name.strip()))
     if not names:
         raise ValueError(
-            f"controllers = {controllers!r}: must be names with commas between, of {', '.join(compare.NAMES)}"
+            f"controllers = {controllers!r}: must be names with commas between, of "
+            f"{', '.join(study.NAMES)}"
         )
-    # What can't be designed or written is said before the work is done.
-    stable = {
-        name: _stable(compare.controller(name, settings.dt, settings.u_max), settings)
-        for name in names
-    }
-    check_places(json_file, figures)
+    stable = {name: _is_stable(study.controller(name, dt, u_max), settings) for name in names}
+    check_outputs(outputs)
     console = Console()
-    what = "simulating (the first run compiles for some seconds)"
-    with progress_bar(console, what) as progress:
-        result = compare.two_mass(settings, names, partial(progress, what))
+    with progress_bar(console, COMPILING) as report:
+        result = study.two_mass(settings, names, partial(report, COMPILING))
     _print(console, result, settings, stable)
-    paths = compare_figure.save(result, figures) if figures is not None else []
-    about = {
-        "m1": settings.m1,
-        "m2": settings.m2,
-        "k": settings.k,
-        "dt": settings.dt,
-        "seed": settings.seed,
-    }
-    limit = {} if settings.u_max == float("inf") else {"u_max": settings.u_max}
-    found = result.to_json()
-    for name, told in found["controllers"].items():
-        told["stable"] = stable[name]
-    write_results(console, {"settings": about | limit, **found}, json_file, paths, figures)
+    paths = figures.save(result, outputs.figures) if outputs.figures else []
+    about = {"m1": m1, "m2": m2, "k": k, "dt": dt, "seed": seed}
+    limit = {} if u_max == inf else {"u_max": u_max}
+    results = result.to_json()
+    for name, scores in results["controllers"].items():
+        scores["stable"] = stable[name]
+    write_results(console, {"settings": about | limit, **results}, outputs, paths)
 
 
-def _stable(controller: Any, settings: Benchmark) -> bool | None:
-    """Return whether the linear loop is stable; None for a controller that learns, whose loop is not one."""
-    inner = getattr(controller, "controller", controller)  # a prefilter is outside of the loop
+def _is_stable(controller: Controller, settings: Benchmark) -> bool | None:
+    """Return whether the loop is stable; None for a controller that learns, as it is not linear."""
+    from quell.analysis import analyse
+    from quell.plants import two_mass_spring
+
+    inner: Any = getattr(controller, "controller", controller)  # a prefilter is outside of the loop
     if inner.features:
         return None
     return bool(analyse(two_mass_spring(settings.m1, settings.m2, settings.k), inner).stable)
@@ -81,14 +97,12 @@ def _stable(controller: Any, settings: Benchmark) -> bool | None:
 def _print(
     console: Console, result: Comparison, settings: Benchmark, stable: dict[str, bool | None]
 ) -> None:
+    from quell.experiments.compare.study import BAND, END, FORCE, FORCE_AT
+
     title = f"Designed for m1 = m2 = k = 1, run on {settings.m1:g}, {settings.m2:g}, {settings.k:g}"
-    table = Table(
-        title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
-    )
-    table.add_column("controller", no_wrap=True)
-    for _, heading, _, _ in _COLUMNS:
-        table.add_column(escape(heading), justify="right", no_wrap=True)
-    table.add_column("status")
+    headings = [heading for _, heading, _, _ in _COLUMNS]
+    rows = table(title, "controller", *headings, padding=(0, 1, 0, 0), pad_edge=False)
+    rows.add_column("status")
     for name, score in result.scores.items():
         values = [(score[key], factor, decimals) for key, _, factor, decimals in _COLUMNS]
         cells = [
@@ -101,22 +115,23 @@ def _print(
             status = f"[red]diverged {run.ended:.0f} s[/]"
         elif stable[name] is False:
             status = "[red]unstable[/]"
-        table.add_row(escape(name), *cells, status)
-    console.print(table)
-    limit = "u not limited" if settings.u_max == float("inf") else f"|u| up to {settings.u_max:g} N"
+        rows.add_row(name, *cells, status)
+    console.print(rows)
+    limit = "u not limited" if settings.u_max == inf else f"|u| up to {settings.u_max:g} N"
     console.print(
-        f"Unit step from rest, judged until {FORCE_AT:g} s (settling ±{100.0 * BAND:g} %); {FORCE:g} N on m2 from then on (peak). "
-        f"RMS and variation: all {END:g} s. dt = {settings.dt:g} s, {limit}. –: not reached. "
-        "Unstable: the linear loop has a pole that grows, be it slowly.",
+        f"Unit step from rest, judged until {FORCE_AT:g} s (settling ±{100.0 * BAND:g} %); "
+        f"{FORCE:g} N on m2 from then on (peak). RMS and variation: all {END:g} s. "
+        f"dt = {settings.dt:g} s, {limit}. –: not reached. "
+        "Unstable: the linear loop has a growing pole, perhaps a slow one.",
         soft_wrap=True,
     )
 
 
 def _short(value: float, decimals: int) -> str:
-    """Return a number in few places: with as many of the decimals as there is room for, where a loop is unstable as 4.9e4."""
-    for left in range(decimals, -1, -1):
-        text = f"{value:.{left}f}"
-        if len(text) <= _PLACES:
+    """Return a number with at most ``decimals`` decimals in few characters; large ones as 4.9e4."""
+    for count in range(decimals, -1, -1):
+        text = f"{value:.{count}f}"
+        if len(text) <= _WIDTH:
             return text
     digits, _, power = f"{value:.1e}".partition("e")
     return f"{digits}e{int(power)}"

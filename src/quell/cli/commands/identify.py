@@ -1,56 +1,75 @@
-"""``quell identify`` and ``quell excite``: read or design, print, write."""
+"""``quell identify``."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from quell.cli.output import check_places, write_results
-from quell.experiments.common.figures import make_folder, save_figure
-from quell.files import check_writable
-from quell.identification.excitation import excitation
-from quell.identification.identify import identify
-from quell.identification.measured import read_record
-from quell.identification.result import Identified, Root, percent
+from quell.cli.options import OUTPUTS, Outputs, Whole, WholeOrNone
+from quell.cli.output import check_outputs, print_line, table, write_results
+
+if TYPE_CHECKING:
+    from quell.identification import Identified, Root
+
+_HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad/s]", "damping")
 
 
-def run_identify(
-    *,
+def identify(
     data: Path,
-    order: int,
-    zeros: int,
-    integrators: int | None,
-    columns: str,
-    dt: float | None,
-    delay: float,
-    max_delay: float | None,
-    friction: bool,
-    held_out: float,
-    horizon: int,
-    json_file: Path | None,
-    figures: Path | None,
+    *,
+    order: Whole = 4,
+    zeros: Whole = 0,
+    integrators: WholeOrNone = None,
+    columns: str = "",
+    dt: float | None = None,
+    delay: float = 0.0,
+    max_delay: float | None = None,
+    friction: bool = False,
+    held_out: float = 0.3,
+    horizon: Whole = 10,
+    outputs: Outputs = OUTPUTS,
 ) -> None:
-    """Identify a transfer function from a file, print its tables, write what was asked for.
+    """Fit a continuous transfer function to recorded input and output.
 
-    Raises
-    ------
-    ValueError
-        for a file that is no record, settings out of range, or a place that can't be written to.
+    Parameters
+    ----------
+    data
+        CSV file of the record, with or without a line of names; commas, semicolons or tabs between.
+    order
+        Number of poles.
+    zeros
+        Number of zeros.
+    integrators
+        Number of poles at s = 0; by default one if the slowest pole cannot be distinguished from
+        it.
+    columns
+        Names or numbers (from 1 on) of the columns: t,u,y by default, or t,u,y,r with the external
+        input of a closed loop.
+    dt
+        Sample time [s] of a record without times; columns are then u,y by default.
+    delay
+        Delay of u [s].
+    max_delay
+        Search the delay from --delay up to this [s].
+    friction
+        Estimate Coulomb friction, too.
+    held_out
+        Share of the record, at its end, on which the model is judged.
+    horizon
+        Number of samples of the prediction ahead.
     """
-    names = (
-        tuple(name.strip() for name in columns.split(","))
-        if columns
-        else (("u", "y") if dt is not None else ("t", "u", "y"))
-    )
+    from quell.identification import identify, read_record
+
+    names = tuple(name.strip() for name in columns.split(",")) if columns else ("t", "u", "y")
+    if dt is not None and not columns:
+        names = ("u", "y")
     record = read_record(data, names, dt)
-    check_places(json_file, figures)
+    check_outputs(outputs)
     console = Console()
-    with console.status("Searching; the first time of a version some seconds to compile."):
-        found = identify(
+    with console.status("Searching; the first time, code is compiled for some seconds."):
+        model = identify(
             record.u,
             record.y,
             record.dt,
@@ -63,87 +82,45 @@ def run_identify(
             horizon=horizon,
             reference=record.reference,
         )
-    _print(console, found, data.name)
-    paths = _drawn(found, figures) if figures is not None else []
-    write_results(console, found.to_json(), json_file, paths, figures)
+    _print(console, model, data.name)
+    paths = _save_figure(model, outputs.figures) if outputs.figures else []
+    write_results(console, model.to_json(), outputs, paths)
 
 
-def run_excite(
-    *,
-    kind: str,
-    low: float,
-    high: float,
-    duration: float,
-    dt: float,
-    u_min: float,
-    u_max: float,
-    seed: int,
-    out: Path,
-) -> None:
-    """Design an excitation, print what it is, write it as CSV.
-
-    Raises
-    ------
-    ValueError
-        for settings out of range, or a file that can't be written.
-    """
-    check_writable(out)
-    design = excitation(kind, (low, high), duration, dt, u_min, u_max, seed=seed)
-    design.save(out)
-    console = Console()
-    console.print(escape(design.describe()), soft_wrap=True)
-    console.print(f"Samples: {escape(str(out))}, {design.u.size} of t,u", soft_wrap=True)
-
-
-def _drawn(found: Identified, folder: Path) -> list[Path]:
+def _save_figure(model: Identified, folder: Path) -> list[Path]:
     import matplotlib.pyplot as plt
 
-    axes = found.plot()
+    from quell.experiments.common.figures import save_figure
+
+    figure = model.plot()[0].figure
     try:
-        return save_figure(axes[0].figure, make_folder(folder), "identified")
+        return save_figure(figure, folder, "identified")
     finally:
-        plt.close(axes[0].figure)
+        plt.close(figure)
 
 
-def _print(console: Console, found: Identified, source: str) -> None:
-    told = found.describe().splitlines()
-    console.print(f"{escape(source)}: {found.y.size} samples, dt = {found.dt:g} s", soft_wrap=True)
-    console.print(escape("\n".join(told[:2])), soft_wrap=True)
-    roots = Table(title="Poles and zeros", title_justify="left", box=SIMPLE_HEAD)
-    roots.add_column("")
-    for heading in (
-        "real\n[rad/s]",
-        "imag\n[rad/s]",
-        "± real",
-        "± imag",
-        "size\n[rad/s]",
-        "damping",
-    ):
-        roots.add_column(escape(heading), justify="right", no_wrap=True)
-    for what, which in (("pole", found.poles), ("zero", found.zeros)):
-        for root in which:
-            roots.add_row(what, *_cells(root))
+def _print(console: Console, model: Identified, source: str) -> None:
+    from quell.identification.result import percent
+
+    lines = model.describe().splitlines()
+    print_line(console, f"{source}: {model.y.size} samples, dt = {model.dt:g} s")
+    print_line(console, "\n".join(lines[:2]))
+    roots = table("Poles and zeros", "", *_HEADINGS)
+    for name, group in (("pole", model.poles), ("zero", model.zeros)):
+        for root in group:
+            roots.add_row(name, *_cells(root))
     console.print(roots)
-    fits = Table(title="Fit (NRMSE)", title_justify="left", box=SIMPLE_HEAD)
-    fits.add_column("on")
-    fits.add_column("%", justify="right")
-    for name, value in found.fits.items():
-        ahead = f" {found.horizon} samples ahead" if name.endswith("predicted") else ""
+    fits = table("Fit (NRMSE)", "on", "%")
+    for name, value in model.fits.items():
+        ahead = f" {model.horizon} samples ahead" if name.endswith("predicted") else ""
         fits.add_row(name + ahead, percent(value))
     console.print(fits)
-    rest = told[next(i for i, line in enumerate(told) if line.startswith("constant force")) :]
-    console.print(
-        escape("\n".join(line for line in rest if not line.startswith("fit, "))), soft_wrap=True
-    )
+    rest = lines[next(i for i, line in enumerate(lines) if line.startswith("constant force")) :]
+    print_line(console, "\n".join(line for line in rest if not line.startswith("fit, ")))
 
 
 def _cells(root: Root) -> tuple[str, ...]:
+    place = (f"{part:.6g}" for part in (root.value.real, root.value.imag))
+    spread = (f"{part:.2g}" for part in (root.real_std, root.imag_std))
     damping = "–" if root.value == 0.0 else f"{root.damping:.4f}"
-    return (
-        f"{root.value.real:.6g}",
-        f"{root.value.imag:.6g}",
-        f"{root.real_std:.2g}",
-        f"{root.imag_std:.2g}",
-        f"{root.omega:.6g}",
-        damping,
-    )
+    return (*place, *spread, f"{root.omega:.6g}", damping)

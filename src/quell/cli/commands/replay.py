@@ -1,131 +1,124 @@
-"""``quell replay``: a recorded run through a setup's controller, offline."""
+"""``quell replay``."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from quell.cli.output import check_places, write_results
-from quell.cli.report import figure_of, print_outcome
-from quell.controllers import ADRC
-from quell.realtime.loop.modes import Mode
-from quell.realtime.loop.replay import replay
-from quell.realtime.telemetry.channels import Event
-from quell.realtime.telemetry.load import load as load_record
-from quell.records import metrics
-from quell.records.plotting import draw
-from quell.records.trajectory import Trajectory
-from quell.setup import EXAMPLES, load
-from quell.setup.errors import refused
+from quell.cli.options import RUN_OUTPUTS, RunOutputs
+from quell.cli.output import check_outputs, number, print_line, table, write_record, write_results
+from quell.cli.report import print_outcome, save_run_figure
+
+if TYPE_CHECKING:
+    from quell.records.trajectory import Trajectory
+
+_HEADINGS = ("RMS of f̂", "RMS of residual", "learned share\n[%]", "RMS of x̂1 − y")
+_FACTORS = (1.0, 1.0, 100.0, 1.0)
 
 
-def run_replay(
-    *,
-    record: Path,
-    path: Path | None,
-    json_file: Path | None,
-    figures: Path | None,
-    save: Path | None,
-) -> None:
-    """Replay it, print what differs, write what was asked for.
+def replay(record: Path, setup: Path | None = None, *, outputs: RunOutputs = RUN_OUTPUTS) -> None:
+    """Run a setup's observer and learner on a recorded run, and compare the estimates.
 
-    Raises
-    ------
-    ValueError
-        for a record or a setup that can't be read, or that do not fit together.
+    Parameters
+    ----------
+    record
+        File that `quell run-rig` recorded, ending in .mcap or .csv.
+    setup
+        The file of the controller, in TOML, with the record's sample time; by default that of
+        `quell run-rig`.
     """
-    setup = load(EXAMPLES / "torsional_rig.toml" if path is None else path)
-    check_places(json_file, figures, save)
+    from quell.controllers import ADRC
+    from quell.realtime import load as load_record
+    from quell.realtime import replay as replay_record
+    from quell.records import metrics
+    from quell.setup import EXAMPLES, load
+    from quell.setup.errors import refused
+
+    given = load(setup or EXAMPLES / "torsional_rig.toml")
+    check_outputs(outputs)
     recorded = load_record(record)
-    try:
-        told = replay(
-            recorded, cast(ADRC, setup.controller)
-        )  # what else it may be, replay itself says no to
+    try:  # replay refuses a controller that is no ADRC
+        replayed = replay_record(recorded, cast(ADRC, given.controller))
     except ValueError as error:
-        raise refused(setup.file, "", error, ()) from None
+        raise refused(given.file, "", error, ()) from None
     console = Console()
     part = _controlled(recorded)
-    scores = {name: _score(run, part) for name, run in (("recorded", recorded), ("replayed", told))}
-    _print(console, f"{record.name} through {setup.title}", scores)
-    gaps = (
-        np.flatnonzero(recorded["events"].astype(np.int64) & Event.GAP)
-        if "events" in recorded.names
-        else np.zeros(0)
-    )
-    if gaps.size:
-        first = recorded.t[gaps[0]]
-        console.print(
-            f"{gaps.size} of {len(recorded)} samples were skipped by the loop, the first at {first:.3f} s: to the replay, as to the loop, "
-            "they are samples without a measurement.",
-            soft_wrap=True,
-        )
-    differs = metrics.rms((told["u_wished"] - told["u"])[part])
+    scores = {"recorded": _scores(recorded, part), "replayed": _scores(replayed, part)}
+    rows = table(f"{record.name} through {given.title}", "", *_HEADINGS)
+    for name, values in scores.items():
+        pairs = zip(values.values(), _FACTORS, strict=True)
+        rows.add_row(name, *(number(value, ".4g", factor) for value, factor in pairs))
+    console.print(rows)
+    _print_gaps(console, recorded)
+    difference = metrics.rms((replayed["u_wished"] - replayed["u"])[part])
     console.print(
-        f"Wished u less applied u, RMS: {differs:.4g}. Judged: the {part.stop - part.start} samples under control."
+        f"Wished u less applied u, RMS: {difference:.4g}. Judged: the {part.stop - part.start} "
+        "samples under control."
     )
-    learned = print_outcome(console, told)
-    paths = (
-        figure_of(told, setup.title, figures, f"{record.stem}-replayed", _wished)
-        if figures is not None
-        else []
-    )
-    if save is not None:
-        told.save(save)
-        console.print(f"Replay: {escape(str(save))}", soft_wrap=True)
-    about = {"record": str(record), "title": setup.title, "dt": recorded.dt}
-    found = {
+    learned = print_outcome(console, replayed)
+    paths = []
+    if outputs.figures:
+        name = f"{record.stem}-replayed"
+        paths = save_run_figure(replayed, given.title, outputs.figures, name, _draw_wished)
+    write_record(console, replayed, outputs.save, "Replay")
+    results = {
+        "record": str(record),
+        "title": given.title,
+        "dt": recorded.dt,
         "scores": scores,
-        "u_wished_rms": differs,
+        "u_wished_rms": difference,
         "learned": learned,
-        "setup": setup.as_json(),
+        "setup": given.as_json(),
     }
-    write_results(console, about | found, json_file, paths, figures)
+    write_results(console, results, outputs, paths)
 
 
 def _controlled(run: Trajectory) -> slice:
-    """Return the samples from the first to the last in which the loop ran; all of a record without modes."""
-    if "mode" not in run.names or not np.any(run["mode"] == Mode.RUN):
+    """Return the samples in which the loop ran; all of a record without modes."""
+    from quell.realtime.loop.modes import Mode
+
+    if "mode" not in run.names or Mode.RUN not in run["mode"]:
         return slice(0, len(run))
-    running = np.flatnonzero(run["mode"] == Mode.RUN)
+    running = (run["mode"] == Mode.RUN).nonzero()[0]
     return slice(int(running[0]), int(running[-1]) + 1)
 
 
-def _score(run: Trajectory, part: slice) -> dict[str, float | None]:
-    """Return the RMS of what is estimated of f, of what is left of it to the observer, and of x̂_1 less y."""
-    found: dict[str, float | None] = {}
-    for key, name in (("f", "f_hat"), ("residual", "f_residual")):
-        known = name in run.names
-        found[key] = metrics.rms(run[name][part]) if known else None
-    found["share_learned"] = (
-        None if not found["f"] else 1.0 - (found["residual"] or 0.0) / found["f"]
-    )
-    found["innovation"] = (
-        metrics.rms(run["x_hat"][part, 0] - run["y"][part]) if "x_hat" in run.names else None
-    )
-    return found
+def _scores(run: Trajectory, part: slice) -> dict[str, float | None]:
+    """Return the RMS of the estimate of f, of the observer's part of it, and of the innovation."""
+    from quell.records import metrics
+
+    def rms(name: str) -> float | None:
+        return metrics.rms(run[name][part]) if name in run.names else None
+
+    f, residual = rms("f_hat"), rms("f_residual")
+    known = "x_hat" in run.names
+    return {
+        "f": f,
+        "residual": residual,
+        "share_learned": 1.0 - (residual or 0.0) / f if f else None,
+        "innovation": metrics.rms(run["x_hat"][part, 0] - run["y"][part]) if known else None,
+    }
 
 
-def _print(console: Console, title: str, scores: dict[str, dict[str, float | None]]) -> None:
-    table = Table(title=escape(title), title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("")
-    for heading in ("RMS of f̂", "RMS of residual", "learned share\n[%]", "RMS of x̂1 − y"):
-        table.add_column(escape(heading), justify="right", no_wrap=True)
-    for name, score in scores.items():
-        factors = (1.0, 1.0, 100.0, 1.0)
-        cells = [
-            "–" if value is None else f"{factor * value:.4g}"
-            for value, factor in zip(score.values(), factors, strict=True)
-        ]
-        table.add_row(name, *cells)
-    console.print(table)
+def _print_gaps(console: Console, recorded: Trajectory) -> None:
+    from quell.realtime.telemetry.channels import Event
+
+    if "events" not in recorded.names:
+        return
+    gaps = (recorded["events"].astype(int) & Event.GAP).nonzero()[0]
+    if gaps.size:
+        print_line(
+            console,
+            f"{gaps.size} of {len(recorded)} samples were skipped by the loop, the first at "
+            f"{recorded.t[gaps[0]]:.3f} s: "
+            "to the replay, as to the loop, they are samples without a measurement.",
+        )
 
 
-def _wished(run: Trajectory, axes: Any) -> None:
+def _draw_wished(run: Trajectory, axes: Any) -> None:
+    from quell.records.plotting import draw
+
     draw(axes[1], run.t, run["u_wished"], label="u wished", color="C3", linewidth=0.8)
     axes[1].legend(loc="upper right", fontsize="small")

@@ -1,37 +1,66 @@
-"""``quell rig``: be the device, until somebody says stop."""
+"""``quell rig``."""
 
 from __future__ import annotations
 
 import math
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from quell.cli.interrupt import ended_at_once
-from quell.realtime.devices.registry import listen, plant_named
-from quell.realtime.rig.server import Rig, checked_seconds
-from quell.realtime.system.interrupts import termination_handler
-from quell.realtime.system.scheduling import checked_cpu, checked_priority
-from quell.realtime.wire.frames import REFUSALS
+from quell.cli.interrupt import exit_on_signal
+from quell.cli.options import Whole, WholeOrNone
+
+if TYPE_CHECKING:
+    from quell.realtime import Rig
 
 
-def run_rig(
+def rig(
     *,
     device: str,
-    plant: str,
-    settings: dict[str, Any],
-    seconds: float | None,
-    log: Path | None,
-    priority: int,
-    cpu: int | None,
+    plant: str = "torsional",
+    dt: float = 1e-3,
+    watchdog: Whole = 20,
+    u_max: float = math.inf,
+    rest: bool = True,
+    seconds: float | None = None,
+    log: Path | None = None,
+    priority: Whole = 50,
+    cpu: WholeOrNone = None,
 ) -> None:
-    """Run the rig, and say at the end how it went.
+    """Run a simulated plant as the device at the other end of a wire.
 
-    Raises
-    ------
-    ValueError
-        for arguments out of range, a URL at which nothing can listen, or a log that can't be written.
+    It has a clock and a watchdog of its own.
+
+    Parameters
+    ----------
+    device
+        Address to listen at: udp://127.0.0.1:5005 (this computer only; another address of this
+        computer for other computers), shm://NAME, or serial:///dev/ttyX.
+    plant
+        Name of the plant, for example torsional; the message for an unknown name lists all names.
+    dt
+        Length of a tick [s].
+    watchdog
+        After so many ticks in a row without a new command u is zero until a new session.
+    u_max
+        Limit of the commands, either way [V, N].
+    rest
+        Start each session from rest, or where the last one left the plant.
+    seconds
+        How long to run [s]; until interrupted by default.
+    log
+        Write each tick to this CSV file: y, u as applied, the command as it came, state.
+    priority
+        SCHED_FIFO priority of the ticks, 1 to 99; 0 for ordinary scheduling. A note at the end says
+        what is not permitted.
+    cpu
+        Number of the processor for the ticks; any by default.
     """
+    from quell.realtime.devices.registry import listen, plant_named
+    from quell.realtime.rig.server import Rig, checked_seconds
+    from quell.realtime.system.interrupts import termination_handler
+    from quell.realtime.system.scheduling import checked_cpu, checked_priority
+
     model = plant_named(plant, "--plant")
     if seconds is not None:
         checked_seconds("--seconds", seconds)
@@ -39,38 +68,40 @@ def run_rig(
     checked_cpu(cpu)
     with (
         closing(listen(device)) as listener,
-        Rig(model, listener=listener, log=log, **settings) as rig,
+        Rig(
+            model, dt, listener=listener, watchdog=watchdog, u_max=u_max, rest=rest, log=log
+        ) as server,
     ):
-        with ended_at_once(listener.close):  # it may take a minute the first time
-            rig.prepare()
-        with termination_handler(lambda *_: rig.stop()):
-            print(f"{plant} at {listener.url}: {_described(**settings)}", flush=True)
-            notes = rig.run(seconds, priority=priority, cpu=cpu)
-    _tell(rig)
+        with exit_on_signal(listener.close):  # compiling may take a minute the first time
+            server.prepare()
+        with termination_handler(lambda *_: server.stop()):
+            limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
+            print(
+                f"{plant} at {listener.url}: a tick every {dt:g} s, "
+                f"u = 0 after {watchdog} ticks without a "
+                f"command{limit}{', from rest' if rest else ''}",
+                flush=True,
+            )
+            notes = server.run(seconds, priority=priority, cpu=cpu)
+    _print_counters(server)
     for note in notes:
         print(note)
 
 
-def _described(dt: float, watchdog: int, u_max: float, rest: bool) -> str:
-    limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
-    return f"a tick every {dt:g} s, u = 0 after {watchdog} ticks without a command{limit}{', from rest' if rest else ''}"
+def _print_counters(server: Rig) -> None:
+    from quell.realtime.wire.frames import REFUSALS
 
-
-def _tell(rig: Rig) -> None:
-    """Print what was counted."""
-    counted = rig.counters
-    late = ", ".join(f"{name} {1e6 * value:.0f}" for name, value in rig.lateness.summary().items())
-    refused = ", ".join(f"{name} {counted[name]}" for name in REFUSALS if counted[name]) or "none"
+    count = server.counters
+    late = ", ".join(f"{key} {1e6 * value:.0f}" for key, value in server.lateness.summary().items())
+    refused = ", ".join(f"{name} {count[name]}" for name in REFUSALS if count[name]) or "none"
     print(
-        f"ticks: {counted['ticks']}, of which late by more than one: {counted['caught_up']}; lateness [us]: {late}"
+        f"ticks: {count['ticks']}, of which late by more than one: {count['caught_up']}; lateness "
+        f"[us]: {late}\n"
+        f"sessions: {count['sessions']}, refused: {count['refused']}, ended by the watchdog: "
+        f"{count['watchdog']}\n"
+        f"commands: {count['accepted']}, largest |u| {server.largest:.6g}, "
+        f"cut to the limit: {count['clipped']}, never used: {count['skipped']}\n"
+        f"frames that were not accepted: {refused}"
     )
-    print(
-        f"sessions: {counted['sessions']}, refused: {counted['refused']}, ended by the watchdog: {counted['watchdog']}"
-    )
-    cut, unused = counted["clipped"], counted["skipped"]
-    print(
-        f"commands: {counted['accepted']}, largest |u| {rig.largest:.6g}, cut to the limit: {cut}, never used: {unused}"
-    )
-    print(f"frames that were not accepted: {refused}")
-    if rig.unlogged:
-        print(f"the log lacks {rig.unlogged} ticks: it could not be written as quickly")
+    if server.unlogged:
+        print(f"the log lacks {server.unlogged} ticks: it could not be written as quickly")

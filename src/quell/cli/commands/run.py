@@ -1,4 +1,4 @@
-"""``quell run``: simulate what a setup file describes, print, draw, write."""
+"""``quell run``."""
 
 from __future__ import annotations
 
@@ -6,63 +6,66 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
 
-from quell.cli.output import check_places, progress_bar, write_results
-from quell.cli.report import figure_of, judge, print_judgement, print_outcome
-from quell.setup import SetupError, load
-from quell.simulation.simulate import simulate
+from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch
+from quell.cli.output import COMPILING, check_outputs, progress_bar, write_record, write_results
+from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
 
 
-def run_setup(
-    *, path: Path, json_file: Path | None, figures: Path | None, save: Path | None
+def run(
+    setup: Path | None = None, *, example: Switch = False, outputs: RunOutputs = RUN_OUTPUTS
 ) -> None:
-    """Run it, print its metrics, write what was asked for.
+    """Simulate the plant, controller and scenario of a setup file.
 
-    Raises
-    ------
-    ValueError
-        for a mistake in the file, with a line for each, or a place that can't be written to.
+    Parameters
+    ----------
+    setup
+        The file, in TOML; docs/setup has all keys.
+    example
+        Print such a file, and do no more.
     """
-    setup = load(path)
-    plant, scenario = setup.needed("plant"), setup.needed("scenario")
+    from quell.setup import EXAMPLES, SetupError, load
+    from quell.simulation import simulate
+
+    if example:
+        print((EXAMPLES / "two_mass.toml").read_text(encoding="utf-8"), end="")
+        return
+    if setup is None:
+        raise ValueError("setup: missing; must be a TOML file, and quell run --example prints one")
+    given = load(setup)
+    plant, scenario = given.needed("plant"), given.needed("scenario")
     late = [
-        (i, window["start"])
-        for i, window in enumerate(setup.windows)
+        f"{given.file}: metrics[{i}].start = {window['start']:g}: "
+        f"must be less than the scenario's duration, {scenario.duration:g} s"
+        for i, window in enumerate(given.windows)
         if window.get("start", 0.0) >= scenario.duration
     ]
     if late:
-        rule = f"must be less than the scenario's duration, {scenario.duration:g} s"
-        raise SetupError(
-            [f"{setup.file}: metrics[{i}].start = {start:g}: {rule}" for i, start in late]
-        )
-    check_places(json_file, figures, save)
+        raise SetupError(late)
+    check_outputs(outputs)
     console = Console()
-    with progress_bar(
-        console, what := "simulating (the first run compiles for some seconds)"
-    ) as progress:
+    with progress_bar(console, COMPILING) as report:
         try:
-            run = simulate(plant, setup.controller, scenario, progress=partial(progress, what))
+            result = simulate(
+                plant, given.controller, scenario, progress=partial(report, COMPILING)
+            )
         except ValueError as error:
-            raise SetupError([f"{setup.file}: {error}"]) from None
-    scores = judge(run, setup)
-    print_judgement(console, f"{setup.title}: {run.plant}, dt = {run.dt:g} s", scores)
-    learned = print_outcome(console, run)
-    paths = figure_of(run, setup.title, figures, path.stem) if figures is not None else []
-    if save is not None:
-        run.save(save)
-        console.print(f"Record: {escape(str(save))}", soft_wrap=True)
-    about = {
-        "title": setup.title,
-        "plant": run.plant,
-        "dt": run.dt,
-        "status": run.status.name or "OK",
-        "diverged": run.diverged,
-    }
-    write_results(
-        console,
-        {**about, "metrics": scores, "learned": learned, "setup": setup.as_json()},
-        json_file,
-        paths,
-        figures,
+            raise SetupError([f"{given.file}: {error}"]) from None
+    scores = windowed_metrics(result, given)
+    print_metrics(console, f"{given.title}: {result.plant}, dt = {result.dt:g} s", scores)
+    learned = print_outcome(console, result)
+    paths = (
+        save_run_figure(result, given.title, outputs.figures, setup.stem) if outputs.figures else []
     )
+    write_record(console, result, outputs.save, "Record")
+    results = {
+        "title": given.title,
+        "plant": result.plant,
+        "dt": result.dt,
+        "status": result.status.name or "OK",
+        "diverged": result.diverged,
+        "metrics": scores,
+        "learned": learned,
+        "setup": given.as_json(),
+    }
+    write_results(console, results, outputs, paths)

@@ -1,133 +1,188 @@
-"""``quell run-rig``: close a setup's controller around its device, tell what happens, print how it went."""
+"""``quell run-rig``."""
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from quell.cli.interrupt import ended_at_once
-from quell.cli.output import check_places, write_results
-from quell.cli.report import figure_of, judge, print_judgement, print_outcome
-from quell.experiments.common.figures import save_figure
-from quell.files import nonfinite_to_none
-from quell.realtime.devices.registry import open_device
-from quell.realtime.loop.modes import Ending
-from quell.realtime.loop.result import ModeChange, RigRun
-from quell.realtime.loop.run import run_rig
-from quell.realtime.telemetry import csv_file
-from quell.realtime.telemetry.sinks import LiveSink, file_sink
-from quell.setup import EXAMPLES, Setup, made, read
-from quell.setup.errors import refused
+from quell.cli.interrupt import exit_on_signal
+from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, WholeOrNone
+from quell.cli.output import check_outputs, print_line, table, write_record, write_results
+from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
+
+if TYPE_CHECKING:
+    from quell.realtime import LiveSink, RigRun
+    from quell.realtime.loop.result import ModeChange
+    from quell.setup import Setup
 
 DONE, TRIPPED, INTERRUPTED = 0, 3, 130
-"""Exit codes: the scenario was run to its end; a limit or a fault ended it, safely; it was asked to stop."""
+"""Exit codes of a run to its end, of one that a limit or fault ended, of one the user stopped."""
 
 
-def run_setup(
+def run_rig(
+    setup: Path | None = None,
     *,
-    path: Path | None,
-    changes: Mapping[tuple[str, str], Any],
-    telemetry: tuple[Path, ...],
-    live: int | None,
-    json_file: Path | None,
-    figures: Path | None,
-    save: Path | None,
-) -> int:
-    """Run it, print, write what was asked for; return the exit code.
+    example: Switch = False,
+    device: str | None = None,
+    seconds: float | None = None,
+    omega_c: float | None = None,
+    omega_o: float | None = None,
+    spin: float | None = None,
+    priority: WholeOrNone = None,
+    mcap: Path | None = None,
+    csv: Path | None = None,
+    live: WholeOrNone = None,
+    outputs: RunOutputs = RUN_OUTPUTS,
+) -> None:
+    """Run a setup in real time around a device, for instance the twin that `quell rig` is.
 
-    ``changes`` are values, by table and key, that take the place of the file's; those that are None are none.
+    The exit code is 0 where the scenario was run to its end, 3 where a limit or a fault ended it,
+    130 after Ctrl-C; u was ramped to zero in each case. It is 2 for an error in the arguments.
 
-    Raises
-    ------
-    ValueError
-        for a mistake in the file, with a line for each, a place that can't be written to, or a device that is none.
-    OSError
-        where the device can't be reached.
+    Parameters
+    ----------
+    setup
+        The file, in TOML; by default the paper's torsional experiment with an L-ESO, at
+        udp://127.0.0.1:5005.
+    example
+        Print that file, and do no more.
+    device
+        Device in place of the file's: udp://HOST:PORT, shm://NAME, serial:///dev/ttyACM0, ni://,
+        twin:torsional.
+    seconds
+        Duration in place of the scenario's [s].
+    omega_c
+        Controller bandwidth in place of the file's [rad/s].
+    omega_o
+        Observer bandwidth in place of the file's [rad/s].
+    spin
+        Keep the processor busy for so long before each deadline [s].
+    priority
+        Real-time priority, 1 to 99, where permitted; 0 for none.
+    mcap
+        Write the record to this file, ending in .mcap, while the loop runs; Foxglove and
+        PlotJuggler read it.
+    csv
+        The same, ending in .csv.
+    live
+        Port for Foxglove and PlotJuggler to watch at.
     """
-    name, data = read(EXAMPLES / "torsional_rig.toml" if path is None else path)
-    setup = made(name, changed(data, changes))
-    scenario, arguments = setup.needed("scenario"), dict(setup.needed("rig"))
-    check_places(json_file, figures, save)
-    files = [*map(Path, arguments.pop("telemetry", ())), *telemetry]
-    for file in files:
-        check_new(file)
-    port = arguments.pop("live") if live is None else live
+    from quell.setup import EXAMPLES
+
+    file = setup or EXAMPLES / "torsional_rig.toml"
+    if example:
+        print((EXAMPLES / "torsional_rig.toml").read_text(encoding="utf-8"), end="")
+        return
+    changes = {
+        ("rig", "device"): device,
+        ("rig", "spin"): spin,
+        ("rig", "priority"): priority,
+        ("scenario", "duration"): seconds,
+        ("controller", "omega_c"): omega_c,
+        ("observer", "omega_o"): omega_o,
+    }
+    files = [path for path in (mcap, csv) if path is not None]
+    if code := _run(file, changes, files, live, outputs):
+        sys.exit(code)
+
+
+def _run(
+    file: Path,
+    changes: Mapping[tuple[str, str], Any],
+    files: list[Path],
+    port: int | None,
+    outputs: RunOutputs,
+) -> int:
+    """Run the loop, print and write its results; return the exit code."""
+    from quell.realtime import LiveSink
+    from quell.setup import made, read
+
+    name, data = read(file)
+    setup = made(name, _changed(data, changes))
+    scenario, options = setup.needed("scenario"), dict(setup.needed("rig"))
+    check_outputs(outputs)
+    files = [*map(Path, options.pop("telemetry", ())), *files]
+    for path in files:
+        check_recording(path)
+    live = options.pop("live")
+    port = live if port is None else port
+    url, dt = options.pop("device"), setup.controller.dt
     console = Console()
-    what = f"{setup.title}: {arguments['device']}, dt = {setup.controller.dt:g} s, for {scenario.duration:g} s. Ctrl-C ramps u to zero."
-    console.print(escape(what), soft_wrap=True)
-    run = _closed(console, setup, arguments, files, None if port is None else LiveSink(port))
+    print_line(
+        console,
+        f"{setup.title}: {url}, dt = {dt:g} s, for {scenario.duration:g} s. Ctrl-C ramps u to "
+        "zero.",
+    )
+    sink = None if port is None else LiveSink(port)
+    run = _close_loop(console, setup, url, options, files, sink)
     if run is None:
         return TRIPPED
-    scores = judge(run.trajectory, setup)
-    _print(console, run)
-    print_judgement(console, f"{setup.title}: the scenario", scores)
-    learned = print_outcome(console, run.trajectory)
+    record = run.trajectory
+    scores = windowed_metrics(record, setup)
+    _print_timing(console, run)
+    print_metrics(console, f"{setup.title}: the scenario", scores)
+    learned = print_outcome(console, record)
     paths = []
-    if figures is not None and len(run.trajectory):
-        paths = [
-            *figure_of(run.trajectory, setup.title, figures, Path(name).stem),
-            *_timing_figure(run, setup, figures),
-        ]
-    if save is not None and len(run.trajectory):
-        run.trajectory.save(save)
-        console.print(f"Record: {escape(str(save))}", soft_wrap=True)
+    if outputs.figures and len(record):
+        paths = save_run_figure(record, setup.title, outputs.figures, Path(name).stem)
+        paths += _save_timing_figure(run, setup, outputs.figures)
+    write_record(console, record, outputs.save, "Record")
     code = exit_code(run)
-    about = {
+    results = {
         "title": setup.title,
-        "device": arguments["device"],
-        "dt": setup.controller.dt,
+        "device": url,
+        "dt": dt,
         "verdict": run.verdict,
         "exit_code": code,
+        **_as_json(run),
+        "metrics": scores,
+        "learned": learned,
+        "setup": setup.as_json(),
     }
-    write_results(
-        console,
-        about | _as_json(run) | {"metrics": scores, "learned": learned, "setup": setup.as_json()},
-        json_file,
-        paths,
-        figures,
-    )
+    write_results(console, results, outputs, paths)
     return code
 
 
-def _closed(
+def _close_loop(
     console: Console,
     setup: Setup,
-    arguments: dict[str, Any],
+    url: str,
+    options: dict[str, Any],
     files: list[Path],
     live: LiveSink | None,
 ) -> RigRun | None:
-    """Close the loop and tell of each change of mode; None where the device's driver hung in the middle of it."""
-    url, options = (
-        arguments["device"],
-        {key: value for key, value in arguments.items() if key not in ("device", "live")},
-    )
+    """Run the loop and print each change of mode; return None where the device failed."""
+    from quell.realtime import open_device, run_rig
+    from quell.setup.errors import refused
+
     began = False
 
-    def tell(change: ModeChange) -> None:
+    def print_change(change: ModeChange) -> None:
         nonlocal began
         if live is not None and not began:
             console.print(f"Live: {live.url}")
         began = True
-        console.print(escape(str(change)), soft_wrap=True)
+        print_line(console, str(change))
 
-    # The port first: where it is taken no file is begun.
+    # The port first: where it is in use no file is created.
     sinks: list[Any] = [*([] if live is None else [live]), *files]
     try:
         device = open_device(url, setup.controller.dt)
-        with ended_at_once(device.close):
+        with exit_on_signal(device.close):
             return run_rig(
-                device, setup.controller, setup.scenario, telemetry=sinks, on_change=tell, **options
+                device,
+                setup.controller,
+                setup.scenario,
+                telemetry=sinks,
+                on_change=print_change,
+                **options,
             )
     except ValueError as error:
-        raise refused(setup.file, "rig", error, [*arguments]) from None
+        raise refused(setup.file, "rig", error, ["device", *options]) from None
     except ConnectionError as error:
         if not began:
             raise
@@ -135,65 +190,69 @@ def _closed(
         return None
 
 
-def changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
-    """Return a file's tables with other values for some keys."""
+def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
+    """Return a file's tables with other values for some keys; None changes nothing."""
     tables = {
         key: dict(value) if isinstance(value, Mapping) else value for key, value in data.items()
     }
-    for (table, key), value in changes.items():
-        if value is not None and isinstance(tables.setdefault(table, {}), dict):
-            tables[table][key] = value
+    for (table_name, key), value in changes.items():
+        if value is not None and isinstance(tables.setdefault(table_name, {}), dict):
+            tables[table_name][key] = value
     return tables
 
 
-def check_new(file: Path) -> None:
-    """Say that a recording can't be made, before the device is woken.
+def check_recording(file: Path) -> None:
+    """Check that a recording can be written, before the device is opened.
 
     Raises
     ------
     ValueError
-        for another suffix than ``.mcap`` and ``.csv``, a file that is there, and a place that can't be written to.
+        for another suffix than ``.mcap`` and ``.csv``, an existing file, and a place that cannot be
+        written to.
     """
+    from quell.realtime.telemetry.csv_file import check_new
+    from quell.realtime.telemetry.sinks import file_sink
+
     file_sink(file)
-    csv_file.check_new(file)
+    check_new(file)
 
 
 def exit_code(run: RigRun) -> int:
-    """Return 0 where a run came to its end, 130 where it was asked to stop, 3 where a limit or a fault ended it."""
+    """Return the exit code of a run."""
+    from quell.realtime.loop.modes import Ending
+
     if run.completed:
         return DONE
     asked = any(change.cause.ending is Ending.REQUESTED for change in run.changes)
     return INTERRUPTED if asked else TRIPPED
 
 
-def _print(console: Console, run: RigRun) -> None:
-    table = Table(title="Punctuality", title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("[µs]")
-    for heading in ("p50", "p99", "p99.9", "max"):
-        table.add_column(heading, justify="right")
-    for label, histogram in (("lateness", run.timing.lateness), ("step time", run.timing.step)):
-        cells = [
-            "–" if math.isnan(value) else f"{1e6 * value:.1f}"
-            for value in histogram.summary().values()
-        ]
-        table.add_row(label, *cells)
-    console.print(table)
-    for label, histogram in (("Lateness", run.timing.lateness), ("Step time", run.timing.step)):
+def _print_timing(console: Console, run: RigRun) -> None:
+    histograms = {"lateness": run.timing.lateness, "step time": run.timing.step}
+    rows = table("Punctuality", "[µs]", "p50", "p99", "p99.9", "max")
+    for label, histogram in histograms.items():
+        values = [1e6 * value for value in histogram.summary().values()]
+        rows.add_row(label, *("–" if value != value else f"{value:.1f}" for value in values))
+    console.print(rows)
+    for label, histogram in histograms.items():
         bars = "\n".join(histogram.text().splitlines()[1:])
-        console.print(f"{label}, cycles (bars are logarithmic):\n{bars}\n", highlight=False)
-    console.print(f"Loop: {_counted(run.tally._asdict())}", soft_wrap=True)
+        heading = f"{label.capitalize()}, cycles (bars are logarithmic):"
+        console.print(f"{heading}\n{bars}\n", highlight=False)
+    print_line(console, f"Loop: {_counted(run.tally._asdict())}")
     if run.counters:
-        console.print(f"Device: {_counted(run.counters)}", soft_wrap=True)
+        print_line(console, f"Device: {_counted(run.counters)}")
     for note in run.notes:
-        console.print(escape(f"Note: {note}"), soft_wrap=True)
+        print_line(console, f"Note: {note}")
 
 
 def _counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
 
 
-def _timing_figure(run: RigRun, setup: Setup, folder: Path) -> list[Path]:
+def _save_timing_figure(run: RigRun, setup: Setup, folder: Path) -> list[Path]:
     import matplotlib.pyplot as plt
+
+    from quell.experiments.common.figures import save_figure
 
     figure, axes = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
     run.timing.plot(axes)
@@ -207,20 +266,21 @@ def _timing_figure(run: RigRun, setup: Setup, folder: Path) -> list[Path]:
 
 
 def _as_json(run: RigRun) -> dict[str, Any]:
-    found: dict[str, Any] = nonfinite_to_none(
+    from quell.files import nonfinite_to_none
+
+    changes = [
+        {"t": change.t, "mode": change.mode.name, "cause": change.cause.text}
+        for change in run.changes
+    ]
+    timing = {"lateness": run.timing.lateness.summary(), "step": run.timing.step.summary()}
+    results: dict[str, Any] = nonfinite_to_none(
         {
             "completed": run.completed,
-            "timing": {
-                "lateness": run.timing.lateness.summary(),
-                "step": run.timing.step.summary(),
-            },
+            "timing": timing,
             "tally": run.tally._asdict(),
             "counters": run.counters,
-            "changes": [
-                {"t": change.t, "mode": change.mode.name, "cause": change.cause.text}
-                for change in run.changes
-            ],
+            "changes": changes,
             "notes": list(run.notes),
         }
     )
-    return found
+    return results

@@ -1,105 +1,99 @@
-"""``quell reproduce torsional``: run, print, write."""
+"""``quell reproduce torsional``."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
-from quell.cli.output import check_places, compile_loops, progress_bar, write_results
-from quell.experiments.torsional import figures as torsional_figures
-from quell.experiments.torsional import setup as torsional
-from quell.experiments.torsional import study as torsional_study
-from quell.experiments.torsional.setup import PLANTS, Settings
-from quell.experiments.torsional.study import Result
+from quell.cli.options import OUTPUTS, Outputs, Whole
+from quell.cli.output import (
+    Column,
+    check_outputs,
+    compile_loops,
+    print_diverged,
+    progress_bar,
+    table,
+    write_results,
+    yes_or_no,
+)
+
+if TYPE_CHECKING:
+    from quell.experiments.torsional.study import Case, Result
 
 _COLUMNS = (
-    ("overshoot", "overshoot [%]", 100.0, ".3f"),
-    ("settling_time", "settling [s]", 1.0, ".3f"),
-    ("control_variation", "variation [V]", 1.0, ".0f"),
+    Column("overshoot", "overshoot [%]", 100.0, ".3f"),
+    Column("settling_time", "settling [s]", 1.0, ".3f"),
+    Column("control_variation", "variation [V]", 1.0, ".0f"),
 )
 
 
-def reproduce_torsional(
-    *, dt: float, seed: int, json_file: Path | None, figures: Path | None
-) -> None:
-    """Run the experiment, print its tables, write what was asked for.
+def torsional(*, dt: float = 1e-3, seed: Whole = 0, outputs: Outputs = OUTPUTS) -> None:
+    """Run the torsional testbed's experiment on its twin, with every claim judged.
 
-    Raises
-    ------
-    ValueError
-        for settings out of range, or a place that can't be written to.
+    Parameters
+    ----------
+    dt
+        Sample time [s].
+    seed
+        Seed of the positions between two edges of the encoder in which the runs start.
     """
-    settings = Settings(dt=dt, seed=seed)
-    check_places(json_file, figures)
+    from quell.experiments.torsional import figures, setup, study
+
+    settings = setup.Settings(dt=dt, seed=seed)
+    check_outputs(outputs)
     console = Console()
-    loops = [
-        (torsional.plant(kind), law)
-        for kind in PLANTS
-        for law in torsional.controllers(settings, *torsional.CASES[0]).values()
-    ]
-    compile_loops(console, loops)
-    with progress_bar(console, width=15) as progress:
-        result = torsional_study.run(settings, progress)
-        paths = torsional_figures.save(result, figures, progress) if figures is not None else []
-    _print(console, result)
-    write_results(console, result.to_json(), json_file, paths, figures)
-
-
-def _print(console: Console, result: Result) -> None:
-    about = f"dt = {result.settings.dt:g} s, medians of {torsional.STARTS} starts, seed {result.settings.seed}"
+    controllers = setup.controllers(settings, *setup.CASES[0]).values()
+    compile_loops(
+        console, [(setup.plant(kind), each) for kind in setup.PLANTS for each in controllers]
+    )
+    with progress_bar(console, width=15) as report:
+        result = study.run(settings, report)
+        paths = figures.save(result, outputs.figures, report) if outputs.figures else []
+    about = f"dt = {dt:g} s, medians of {setup.STARTS} starts, seed {seed}"
     for case in result.cases:
-        table = Table(
-            title=f"omega_c/omega_o = {case.label} rad/s ({about})",
-            title_justify="left",
-            box=SIMPLE_HEAD,
-        )
-        table.add_column("plant", no_wrap=True)
-        table.add_column("controller", no_wrap=True)
-        for _, heading, _, _ in _COLUMNS:
-            table.add_column(escape(heading), justify="right")
-        for kind in PLANTS:
-            for name, scores in case.outcomes[kind].scores.items():
-                values = [_cell(scores[key], factor, form) for key, _, factor, form in _COLUMNS]
-                table.add_row(kind, name, *values, end_section=name == torsional.NAMES[-1])
-        console.print(table)
+        _print_scores(console, case, about)
     console.print(
         "Profile to π in 2 s, after 40 s of training; settling (±0.2 %) from its start.\n"
-        "friction: the twin with Coulomb friction; linear: as the paper identified it. The encoder has 16000 counts.\n"
+        "friction: the twin with Coulomb friction; linear: as the paper identified it. The encoder "
+        "has 16000 counts.\n"
     )
     _print_claims(console, result)
     for case in result.cases:
         for kind, outcome in case.outcomes.items():
-            for name, run in outcome.records.items():
-                if run.diverged:
-                    console.print(f"{case.label}, {kind}, {name}: {run.message}")
+            runs = {f"{case.label}, {kind}, {name}": run for name, run in outcome.records.items()}
+            print_diverged(console, runs)
+    write_results(console, result.to_json(), outputs, paths)
+
+
+def _print_scores(console: Console, case: Case, about: str) -> None:
+    rows = table(
+        f"omega_c/omega_o = {case.label} rad/s ({about})",
+        "plant",
+        "controller",
+        *(column.heading for column in _COLUMNS),
+        left=2,
+    )
+    for kind, outcome in case.outcomes.items():
+        for name, scores in outcome.scores.items():
+            rows.add_row(kind, name, *(column.cell(scores) for column in _COLUMNS))
+        rows.add_section()
+    console.print(rows)
 
 
 def _print_claims(console: Console, result: Result) -> None:
-    title = "Section V's claims: do they hold, with friction / linear?"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("claim")
-    for case in result.cases:
-        table.add_column(case.label, justify="right", no_wrap=True)
-    judged = [
-        tuple(zip(*(case.outcomes[kind].claims for kind in PLANTS), strict=True))
-        for case in result.cases
-    ]
-    for row in zip(*judged, strict=True):
-        cells = [
-            " / ".join("[green]yes[/]" if claim.holds else "[red]no[/]" for claim in pair)
-            for pair in row
-        ]
-        table.add_row(escape(row[0][0].claim), *cells)
-    console.print(table)
+    labels = [case.label for case in result.cases]
+    rows = table("Claims of section V: do they hold, with friction / linear?", "claim", *labels)
+    kinds = [outcome.claims for case in result.cases for outcome in case.outcomes.values()]
+    count = len(kinds) // len(labels)
+    for claims in zip(*kinds, strict=True):
+        answers = [yes_or_no(claim.holds) for claim in claims]
+        cells = [" / ".join(answers[i : i + count]) for i in range(0, len(answers), count)]
+        rows.add_row(escape(claims[0].claim), *cells)
+    console.print(rows)
     console.print(
-        "Overshoots are told apart by a count, settling times by a sample. docs/theory explains each no.\n"
+        "Overshoots that differ by a count, and settling times that differ by a sample, are "
+        "different. "
+        "docs/theory explains each no.\n"
     )
-
-
-def _cell(value: Any, factor: float, form: str) -> str:
-    return "–" if value is None else format(factor * value, form)

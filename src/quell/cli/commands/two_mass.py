@@ -1,112 +1,104 @@
-"""``quell reproduce two-mass``: run, print, write."""
+"""``quell reproduce two-mass``."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from quell import plants
-from quell.cli.output import check_places, compile_loops, progress_bar, write_results
-from quell.experiments.two_mass_spring import figures as two_mass_figures
-from quell.experiments.two_mass_spring import setup as two_mass_spring
-from quell.experiments.two_mass_spring import study as two_mass_study
-from quell.experiments.two_mass_spring.setup import Settings
-from quell.experiments.two_mass_spring.study import Result
+from quell.cli.options import OUTPUTS, Outputs, Whole
+from quell.cli.output import (
+    Column,
+    check_outputs,
+    compile_loops,
+    print_diverged,
+    progress_bar,
+    table,
+    write_results,
+    yes_or_no,
+)
+
+if TYPE_CHECKING:
+    from quell.experiments.two_mass_spring.study import Result
 
 _COLUMNS = (
-    ("overshoot", "overshoot\n[‰]", 1e3, ".2f"),
-    ("settling_time", "settling\n[s]", 1.0, ".2f"),
-    ("disturbance_peak", "peak\n[m]", 1.0, ".4f"),
-    ("disturbance_rms", "RMS\n[m]", 1.0, ".4f"),
-    ("control_variation", "variation\n[N]", 1.0, ".1f"),
+    Column("overshoot", "overshoot\n[‰]", 1e3, ".2f"),
+    Column("settling_time", "settling\n[s]", 1.0, ".2f"),
+    Column("disturbance_peak", "peak\n[m]", 1.0, ".4f"),
+    Column("disturbance_rms", "RMS\n[m]", 1.0, ".4f"),
+    Column("control_variation", "variation\n[N]", 1.0, ".1f"),
 )
 
 
-def reproduce_two_mass(
+def two_mass(
     *,
-    dt: float,
-    seed: int,
-    omega_o: float,
-    reset: bool,
-    json_file: Path | None,
-    figures: Path | None,
+    dt: float = 1e-3,
+    seed: Whole = 0,
+    omega_o: float = 10.0,
+    reset: bool = True,
+    outputs: Outputs = OUTPUTS,
 ) -> None:
-    """Run the study, print its two tables, write what was asked for.
+    """Run the two-mass-spring study: MF-ESO, MB-ESO and L-ESO, with every claim judged.
 
-    Raises
-    ------
-    ValueError
-        for settings out of range, or a place that can't be written to.
+    Parameters
+    ----------
+    dt
+        Sample time [s].
+    seed
+        Seed of the measurement noise.
+    omega_o
+        Observer bandwidth [rad/s].
+    reset
+        Start the loop from rest at 110 s, before the step.
     """
-    settings = Settings(dt=dt, seed=seed, omega_o=omega_o, reset=reset)
-    # What can't be designed or written is said before the work is done.
+    from quell.experiments.two_mass_spring import figures, setup, study
+    from quell.plants import two_mass_spring
+
+    settings = setup.Settings(dt=dt, seed=seed, omega_o=omega_o, reset=reset)
     try:
-        two_mass_spring.controllers(settings)
+        controllers = setup.controllers(settings)
     except ValueError as error:
         raise ValueError(f"{error} (the study goes up to 3 times omega_o)") from None
-    check_places(json_file, figures)
+    check_outputs(outputs)
     console = Console()
-    loops = [
-        (plants.two_mass_spring(), candidate)
-        for candidate in two_mass_spring.controllers(settings).values()
-    ]
-    compile_loops(console, loops)
-    with progress_bar(console, width=15) as progress:
-        result = two_mass_study.run(settings, progress)
-        paths = two_mass_figures.save(result, figures, progress) if figures is not None else []
-    _print(console, result)
-    write_results(console, result.to_json(), json_file, paths, figures)
+    compile_loops(console, [(two_mass_spring(), each) for each in controllers.values()])
+    with progress_bar(console, width=15) as report:
+        result = study.run(settings, report)
+        paths = figures.save(result, outputs.figures, report) if outputs.figures else []
+    _print_claims(console, result)
+    _print_scores(console, result)
+    write_results(console, result.to_json(), outputs, paths)
 
 
-def _print(console: Console, result: Result) -> None:
-    settings = result.settings
-    claims = Table(
-        title="What the paper claims in section IV, and what is measured here",
-        title_justify="left",
-        box=SIMPLE_HEAD,
-    )
-    claims.add_column("claim")
-    for heading in ("paper", "holds when", "measured", "holds"):
-        claims.add_column(heading, justify="right", no_wrap=True)
+def _print_claims(console: Console, result: Result) -> None:
+    title = "Claims of section IV of the paper, and what is measured here"
+    claims = table(title, "claim", "paper", "holds when", "measured", "holds")
     for claim in result.claims:
         paper = claim.paper if isinstance(claim.paper, str) else f"{claim.paper:g}"
         measured = "not reached" if claim.measured is None else _short(claim.measured)
-        name = f"{claim.claim} [{claim.unit}]" if claim.unit else claim.claim
-        claims.add_row(
-            escape(name),
-            paper,
-            claim.rule,
-            measured,
-            "[green]yes[/]" if claim.holds else "[red]no[/]",
-        )
+        name = f"{claim.claim} \\[{claim.unit}]" if claim.unit else claim.claim
+        claims.add_row(name, paper, claim.rule, measured, yes_or_no(claim.holds))
     console.print(claims)
     console.print("docs/theory explains each no.\n")
+
+
+def _print_scores(console: Console, result: Result) -> None:
+    settings = result.settings
     reset = "with" if settings.reset else "without"
-    about = f"dt = {settings.dt:g} s, seed {settings.seed}, omega_o = {settings.omega_o:g} rad/s, {reset} reset"
-    scores = Table(title=f"All controllers ({about})", title_justify="left", box=SIMPLE_HEAD)
-    scores.add_column("controller", no_wrap=True)
-    for _, heading, _, _ in _COLUMNS:
-        scores.add_column(escape(heading), justify="right")
+    about = f"dt = {settings.dt:g} s, seed {settings.seed}, omega_o = {settings.omega_o:g} rad/s"
+    scores = table(
+        f"All controllers ({about}, {reset} reset)",
+        "controller",
+        *(column.heading for column in _COLUMNS),
+    )
     for name, score in result.scores.items():
-        values = [(score[key], factor, form) for key, _, factor, form in _COLUMNS]
-        scores.add_row(
-            name,
-            *(
-                "–" if value is None else format(factor * value, form)
-                for value, factor, form in values
-            ),
-        )
+        scores.add_row(name, *(column.cell(score) for column in _COLUMNS))
     console.print(scores)
     console.print(
-        "Overshoot, settling (±0.2 %) and variation: step, 110–150 s. Peak and RMS of y − 1: force on m2, 170–250 s.\n"
+        "Overshoot, settling (±0.2 %) and variation: step, 110–150 s. Peak and RMS of y − 1: force "
+        "on m2, 170–250 s.\n"
     )
-    for name, run in result.runs.items():
-        if run.diverged:
-            console.print(f"{name}: {run.message}")
+    print_diverged(console, result.runs)
 
 
 def _short(value: float) -> str:
