@@ -17,11 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from quell.realtime import CsvSink, LiveSink, McapSink
 from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.load import load
 from quell.realtime.telemetry.ring import push
-from quell.realtime.telemetry.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
+from quell.realtime.telemetry.sinks import MemorySink, file_sink
 from quell.realtime.telemetry.writer import TelemetryWriter
 
 CHANNELS = row_channels(

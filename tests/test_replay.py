@@ -13,12 +13,12 @@ import quell as ql
 from quell.controllers.baselines import PID, ZV
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.plants.base import advance, measure
+from quell.realtime import CsvSink, McapSink
 from quell.realtime.loop.modes import Mode
 from quell.realtime.loop.replay import replay
 from quell.realtime.telemetry.channels import Event, row_channels
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.load import load, trajectory_of
-from quell.realtime.telemetry.sinks import CsvSink, McapSink
 from tests import scripted
 from tests.recordings import DT, OBSERVER, PLANT, controller, header_of, rows_of, simulated
 from tests.scripted import ScriptedDevice

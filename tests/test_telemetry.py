@@ -18,11 +18,12 @@ import pytest
 import websockets
 
 import quell as ql
+from quell.realtime import CsvSink, LiveSink, McapSink
 from quell.realtime.telemetry.channels import EVENTS, LOOP_WIDTH, Y_MEASURED, Event, K, row_channels
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.load import load, trajectory_of
 from quell.realtime.telemetry.ring import push
-from quell.realtime.telemetry.sinks import CsvSink, LiveSink, McapSink, MemorySink, file_sink
+from quell.realtime.telemetry.sinks import MemorySink, file_sink
 from quell.realtime.telemetry.writer import TelemetryWriter
 from quell.types import Matrix
 from tests.recordings import DT, controller, header_of, rows_of, simulated
@@ -517,7 +518,7 @@ def test_the_writer_has_the_priority_that_it_should(
     urgent: bool, permitted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The lowest real-time priority for a loop in Python, where that is permitted; else none, even where it inherits one."""
-    from quell.realtime.telemetry import writer as module
+    from quell.realtime.system import scheduling as module
 
     now = [module.os.SCHED_RR]
 

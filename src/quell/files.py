@@ -24,6 +24,21 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     _part_of(Path(path)).unlink()
 
 
+def check_new_file(path: Path) -> None:
+    """Check that a recording can be begun at ``path``.
+
+    Raises
+    ------
+    ValueError
+        if the file exists, or can't be written.
+    """
+    if path.exists() and not path.is_dir():
+        raise ValueError(
+            f"path = {str(path)!r}: the file exists; recordings are not overwritten: move it, or choose another name"
+        )
+    check_writable(path)
+
+
 @contextmanager
 def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a path beside ``path`` to write to; put it in the place of ``path`` at the end, or remove it where something failed.

@@ -23,14 +23,16 @@ if TYPE_CHECKING:
     from quell.realtime.loop.run import run_rig
     from quell.realtime.loop.safety import Safety
     from quell.realtime.rig.server import Rig
+    from quell.realtime.telemetry.csv_file import CsvSink
+    from quell.realtime.telemetry.live import LiveSink
     from quell.realtime.telemetry.load import load
-    from quell.realtime.telemetry.sinks import CsvSink, LiveSink, McapSink
+    from quell.realtime.telemetry.mcap_file import McapSink
 
 _HOME = {
-    "CsvSink": "telemetry.sinks",
+    "CsvSink": "telemetry.csv_file",
     "Device": "devices.base",
-    "LiveSink": "telemetry.sinks",
-    "McapSink": "telemetry.sinks",
+    "LiveSink": "telemetry.live",
+    "McapSink": "telemetry.mcap_file",
     "Rig": "rig.server",
     "RigRun": "loop.outcome",
     "Safety": "loop.safety",

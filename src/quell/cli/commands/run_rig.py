@@ -210,11 +210,11 @@ def check_recording(file: Path) -> None:
         for another suffix than ``.mcap`` and ``.csv``, an existing file, and a place that cannot be
         written to.
     """
-    from quell.realtime.telemetry.csv_file import check_new
+    from quell.files import check_new_file
     from quell.realtime.telemetry.sinks import file_sink
 
     file_sink(file)
-    check_new(file)
+    check_new_file(file)
 
 
 def exit_code(run: RigRun) -> int:

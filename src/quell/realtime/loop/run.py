@@ -36,8 +36,8 @@ from quell.realtime.system.scheduling import (
 )
 from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.sinks import MemorySink, file_sink
-from quell.realtime.telemetry.writer import Sink, TelemetryWriter
+from quell.realtime.telemetry.sinks import MemorySink, Sink, file_sink
+from quell.realtime.telemetry.writer import TelemetryWriter
 
 # The main thread looks after the loop so often [s].
 _LOOK = 0.05

@@ -1,4 +1,4 @@
-"""The operating system: clock, scheduling, signals, and histograms of times.
+"""Services of the operating system: clocks, scheduling, signals, atomic words, histograms of durations.
 
-May import ``kernels``, ``checks`` and ``types``.
+May import ``kernels`` and ``checks`` only.
 """

@@ -1,6 +1,7 @@
-"""Time for the loop: the system's own, or one that a test makes up.
+"""Clocks of the loop: the operating system's monotonic clock, and a virtual one for tests.
 
-All times are whole nanoseconds [ns]. A clock is a NamedTuple for which ``now`` and ``wait_until`` are registered.
+All times are integers in nanoseconds [ns]. A clock is a NamedTuple for which ``now`` and ``wait_until`` are
+registered.
 """
 
 from __future__ import annotations
@@ -11,17 +12,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import overload
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quell import checks
 from quell.kernels.dispatch import generic, kernel
 from quell.realtime.system.libc import external
 
+# Constants of Linux: CLOCK_MONOTONIC and TIMER_ABSTIME of <time.h>, EINTR of <errno.h>.
 _MONOTONIC = 1
 _ABSOLUTE = 1
-_SECOND = 1_000_000_000
-# A sleep that a signal ends is taken up again.
 _INTERRUPTED = 4
+
+_SECOND = 1_000_000_000
 
 _clock_gettime = external("clock_gettime", "int", "int", "address")
 _clock_nanosleep = external("clock_nanosleep", "int", "int", "int", "address", "address")
@@ -29,39 +31,38 @@ _clock_nanosleep = external("clock_nanosleep", "int", "int", "int", "address", "
 
 @generic
 def now(clock: Any) -> int:
-    """Return the time [ns], from an origin of the clock's own."""
+    """Return the time [ns] since the clock's own origin."""
     raise TypeError
 
 
 @generic
 def wait_until(clock: Any, deadline: int) -> int:
-    """Return at ``deadline`` [ns], or at once where that is past: the time it is then [ns]."""
+    """Wait until ``deadline`` [ns], not at all if it is past; return the time then [ns]."""
     raise TypeError
 
 
 class SystemClock(NamedTuple):
-    """The system's monotonic clock; make it with ``system_clock``."""
+    """The operating system's monotonic clock; ``system_clock`` makes it."""
 
     spin: int
-    """So long before the deadline it stops sleeping and looks at the time again and again [ns]."""
+    """Time before a deadline from which on it polls the time instead of sleeping [ns]."""
     timespec: NDArray[np.int64]
-    """Room for seconds and nanoseconds (2,)."""
+    """Work array: seconds and nanoseconds (2,)."""
     address: int
-    """Of ``timespec``."""
+    """Address of ``timespec``."""
 
 
 def system_clock(spin: float = 0.0) -> SystemClock:
-    """Return the system's clock; for the last ``spin`` seconds before a deadline it burns the core instead of sleeping.
+    """Return the system's clock, which polls the time for the last ``spin`` [s] before a deadline.
 
     Raises
     ------
     ValueError
-        for a time to spin that is negative.
+        for a negative ``spin``.
     """
     timespec = np.zeros(2, dtype=np.int64)
-    return SystemClock(
-        round(checks.non_negative("spin", spin, "s") * 1e9), timespec, timespec.ctypes.data
-    )
+    nanoseconds = round(checks.non_negative("spin", spin, "s") * 1e9)
+    return SystemClock(nanoseconds, timespec, timespec.ctypes.data)
 
 
 def _read(clock: SystemClock) -> int:
@@ -78,7 +79,7 @@ def _compiled_read(clock: Any) -> Any:
 
 
 def _sleep(clock: SystemClock, deadline: int) -> None:
-    """Sleep until ``deadline``, which is not past."""
+    """Sleep until ``deadline``, which lies in the future."""
     if sys.platform == "linux":
         clock.timespec[0], clock.timespec[1] = divmod(deadline, _SECOND)
         while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, clock.address, 0) == _INTERRUPTED:
@@ -115,15 +116,15 @@ def _wait_until(clock: SystemClock, deadline: int) -> int:
 
 
 class VirtualClock(NamedTuple):
-    """A clock for tests: no time passes but by waiting, and each wait is as late as its script says."""
+    """A clock for tests: time passes only while it waits, and each wait is as late as scripted."""
 
     time: NDArray[np.int64]
-    """What it is now [ns], and how many waits there have been (2,)."""
+    """The time [ns], and the number of waits so far (2,)."""
     late: NDArray[np.int64]
-    """How late each wait ends [ns]; the last entry is for all that follow."""
+    """Lateness of each wait [ns]; the last entry holds for all later ones."""
 
 
-def virtual_clock(late: Any = (0,)) -> VirtualClock:
+def virtual_clock(late: ArrayLike = (0,)) -> VirtualClock:
     """Return a clock at zero whose k-th wait ends ``late[k]`` nanoseconds after its deadline."""
     return VirtualClock(np.zeros(2, dtype=np.int64), np.array(late, dtype=np.int64))
 
@@ -143,5 +144,5 @@ def _virtual_wait(clock: VirtualClock, deadline: int) -> int:
 
 @kernel
 def pass_time(clock: VirtualClock, nanoseconds: int) -> None:
-    """Let time pass on a virtual clock, as if something took so long."""
+    """Advance a virtual clock."""
     clock.time[0] += nanoseconds

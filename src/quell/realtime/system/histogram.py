@@ -1,7 +1,7 @@
-"""How long things took: histograms that the loop fills without allocating, and what is read from them.
+"""Histograms of durations, which the loop fills without allocating memory.
 
-Durations are counted in bins that grow with them: each power of two is divided into 32, so that a bin is at most 3.1 % wide (Gil Tene's
-HdrHistogram is made like this). Up to 64 ns a bin is a nanosecond. The longest duration is kept as it is.
+The width of the bins grows with the duration, as in Gil Tene's HdrHistogram: each power of two is divided into 32
+bins, so that a bin is at most 3.1 % wide. Up to 64 ns a bin is 1 ns wide. The longest duration is stored exactly.
 """
 
 from __future__ import annotations
@@ -17,36 +17,39 @@ from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.types import Vector
 
+# Bins per power of two; a percentile is rounded by at most 1/32 = 3.1 %. Chosen by hand; not tuned further.
 _PARTS = 32
+# Below this duration [ns] a bin is 1 ns wide.
 _LINEAR = 2 * _PARTS
-# Up to some four hours.
+# Powers of two above that: up to 2^44 ns, which is 4.9 hours.
 _OCTAVES = 38
 BINS = _LINEAR + _PARTS * _OCTAVES
-# Behind the bins stands the longest duration.
+# The entry after the bins is the longest duration.
 LONGEST = BINS
 
+# Width of the longest bar in text, in characters: a line then fits into 80 columns.
 _BAR = 48
 
 
 def empty_counts() -> NDArray[np.int64]:
-    """Return an empty histogram (BINS + 1,) for ``count``."""
+    """Return the counts of an empty histogram (BINS + 1,), for ``count_duration``."""
     return np.zeros(BINS + 1, dtype=np.int64)
 
 
 @kernel
-def count_duration(tally: NDArray[np.int64], nanoseconds: int) -> None:
-    """Count a duration [ns]."""
-    size, place = max(nanoseconds, 0), 0
+def count_duration(counts: NDArray[np.int64], nanoseconds: int) -> None:
+    """Add a duration [ns] to a histogram."""
+    size, index = max(nanoseconds, 0), 0
     while size >= _LINEAR:
         size >>= 1
-        place += _PARTS
-    tally[min(place + size, BINS - 1)] += 1
-    if nanoseconds > tally[LONGEST]:
-        tally[LONGEST] = nanoseconds
+        index += _PARTS
+    counts[min(index + size, BINS - 1)] += 1
+    if nanoseconds > counts[LONGEST]:
+        counts[LONGEST] = nanoseconds
 
 
 def _edges() -> Vector:
-    """Return where the bins end [s]; the last one's end is the next one's beginning."""
+    """Return the upper edges of the bins [s]."""
     first = np.arange(1, _LINEAR + 1, dtype=np.float64)
     rest = [
         (np.arange(_PARTS, 2 * _PARTS) + 1.0) * 2.0**octave for octave in range(1, _OCTAVES + 1)
@@ -61,11 +64,11 @@ class Histogram:
     Attributes
     ----------
     counts : (bins,) array
-        how many fell into which bin.
+        number of durations in each bin.
     edges : (bins,) array
-        where each bin ends [s].
+        upper edge of each bin [s].
     max : float
-        the longest [s]; NaN where there was none.
+        longest duration [s]; NaN for an empty histogram.
     """
 
     counts: NDArray[np.int64]
@@ -73,29 +76,29 @@ class Histogram:
     max: float
 
     @classmethod
-    def of(cls, tally: NDArray[np.int64]) -> Histogram:
-        """Return what was counted."""
-        counts = tally[:BINS].copy()
-        return cls(counts, _edges(), float(tally[LONGEST]) * 1e-9 if counts.any() else math.nan)
+    def of(cls, counts: NDArray[np.int64]) -> Histogram:
+        """Return the histogram of what ``count_duration`` counted."""
+        bins = counts[:BINS].copy()
+        return cls(bins, _edges(), float(counts[LONGEST]) * 1e-9 if bins.any() else math.nan)
 
     def __len__(self) -> int:
-        """Return how many durations were counted."""
+        """Return the number of durations."""
         return int(self.counts.sum())
 
     def percentile(self, percent: float) -> float:
-        """Return the duration [s] that so many percent did not exceed, rounded up by at most 3.1 %; NaN where nothing was counted.
+        """Return a percentile [s], rounded up by at most 3.1 %; NaN for an empty histogram.
 
         Raises
         ------
         ValueError
-            for a share outside of (0, 100].
+            for a percentage outside (0, 100].
         """
         if not 0.0 < checks.finite("percent", percent) <= 100.0:
             raise ValueError(f"percent = {percent!r}: must be above 0 and at most 100")
         if not len(self):
             return math.nan
-        needed = math.ceil(round(percent / 100.0 * len(self), 6))
-        return min(float(self.edges[np.searchsorted(np.cumsum(self.counts), needed)]), self.max)
+        rank = math.ceil(round(percent / 100.0 * len(self), 6))
+        return min(float(self.edges[np.searchsorted(np.cumsum(self.counts), rank)]), self.max)
 
     @property
     def p50(self) -> float:
@@ -104,20 +107,20 @@ class Histogram:
 
     @property
     def p99(self) -> float:
-        """What one in a hundred exceeds [s]."""
+        """99th percentile [s]."""
         return self.percentile(99.0)
 
     @property
     def p999(self) -> float:
-        """What one in a thousand exceeds [s]."""
+        """99.9th percentile [s]."""
         return self.percentile(99.9)
 
     def summary(self) -> dict[str, float]:
-        """Return p50, p99, p99.9 and the longest [s]."""
+        """Return p50, p99, p99.9 and the longest duration [s]."""
         return {"p50": self.p50, "p99": self.p99, "p99.9": self.p999, "max": self.max}
 
     def text(self, title: str = "") -> str:
-        """Return the histogram as lines of text, a line for each quarter of a decade that has something in it."""
+        """Return the histogram as text, a line for each quarter of a decade."""
         head = ", ".join(f"{name} {1e6 * value:.3g} µs" for name, value in self.summary().items())
         lines = [f"{title + ': ' if title else ''}{head} of {len(self)}"]
         if not len(self):
@@ -131,23 +134,26 @@ class Histogram:
         return "\n".join(lines)
 
     def plot(self, ax: Any = None, label: str | None = None) -> Any:
-        """Draw how many cycles took longer than so many microseconds, both logarithmic; return the axes.
+        """Plot the share of cycles that took longer than a duration, both logarithmic.
 
         Parameters
         ----------
         ax
-            matplotlib axes to draw into; a new figure by default.
+            matplotlib axes; a new figure by default.
         label
             for the legend.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
         """
         if ax is None:
             import matplotlib.pyplot as plt
 
             _, ax = plt.subplots()
         longer = len(self) - np.cumsum(self.counts)
-        shown = slice(
-            max(int(np.argmax(self.counts > 0)) - 1, 0), int(np.searchsorted(-longer, 0)) + 1
-        )
+        first = max(int(np.argmax(self.counts > 0)) - 1, 0)
+        shown = slice(first, int(np.searchsorted(-longer, 0)) + 1)
         share = np.maximum(longer[shown], 0.5) / max(len(self), 1)
         ax.loglog(1e6 * self.edges[shown], share, drawstyle="steps-post", label=label)
         ax.set(xlabel="duration [µs]", ylabel="share of cycles that took longer")
@@ -157,14 +163,14 @@ class Histogram:
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """How punctual a run was.
+    """Punctuality of a run.
 
     Attributes
     ----------
     lateness : Histogram
-        from a deadline until the loop was awake.
+        time from a deadline until the loop woke.
     step : Histogram
-        from then until u was written, less what was waited for the device: measurement, supervision, controller, command.
+        time from then until u was written, without waiting for the device: measurement, supervisor, controller, command.
     """
 
     lateness: Histogram
@@ -175,7 +181,7 @@ class Timing:
         return f"{self.lateness.text('lateness')}\n{self.step.text('step time')}"
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw both; return the axes."""
+        """Plot both histograms and return the axes."""
         ax = self.step.plot(self.lateness.plot(ax, "lateness"), "step time")
         ax.legend()
         return ax

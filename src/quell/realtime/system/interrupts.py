@@ -1,27 +1,27 @@
-"""The signals that end programs, handled for a while."""
+"""The operating system's signals that end programs, handled for the duration of a ``with`` block."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
-
-
-def termination_signals() -> list[signal.Signals]:
-    """Return the signals that end a program that does not mind them: Ctrl-C, SIGTERM, and SIGHUP, unless that is ignored (nohup)."""
-    hang_up = getattr(signal, "SIGHUP", None)
-    more = [] if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN else [hang_up]
-    return [signal.SIGINT, signal.SIGTERM, *more]
+from types import FrameType
 
 
 @contextmanager
-def termination_handler(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Let ``handler`` hear these signals instead of whoever did; in the main thread only."""
-    before = {number: signal.signal(number, handler) for number in termination_signals()}
+def termination_handler(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Call ``handler`` on Ctrl-C, SIGTERM, and SIGHUP unless that is ignored (nohup).
+
+    Use it in the main thread only. At the end the previous handlers are restored.
+    """
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    hang_up = getattr(signal, "SIGHUP", None)
+    if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
+        numbers.append(hang_up)
+    previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, old in before.items():
-            with suppress(TypeError):  # one that Python did not install
+        for number, old in previous.items():
+            with suppress(TypeError):  # a handler that Python did not install is None here
                 signal.signal(number, old)

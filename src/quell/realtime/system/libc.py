@@ -1,7 +1,7 @@
-"""Functions of the C library, called alike from Python and from compiled code.
+"""Functions of the C library, called from Python and from compiled code alike.
 
-Compiled code calls them by name, so that it can be kept on disk; Python calls them through ``ctypes``. Pointers are passed as addresses:
-``array.ctypes.data`` of an array that lives as long as the call.
+Compiled code refers to them by name, so that it can be cached on disk; Python calls them through ``ctypes``. Pointers
+are passed as addresses: ``array.ctypes.data`` of an array that lives at least as long as the call.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ _KINDS = {
 
 
 def external(name: str, returns: str, *arguments: str) -> Callable[..., int]:
-    """Return the C library's function ``name``; each argument and what it returns is an ``"int"``, a ``"long"`` or an ``"address"``.
+    """Return the C library's function ``name``.
+
+    The types of the arguments and of the result are ``"int"``, ``"long"`` or ``"address"``.
 
     Raises
     ------
     OSError
-        on a call from Python, where the library has no such function.
+        on a call from Python if the library has no such function.
     """
 
     @cache
@@ -36,7 +38,7 @@ def external(name: str, returns: str, *arguments: str) -> Callable[..., int]:
             function = getattr(ctypes.CDLL(None, use_errno=True), name)
         except (AttributeError, TypeError):
             raise OSError(
-                f"{name}: this system's C library has no such function; the real-time loop needs Linux"
+                f"{name}: the C library has no such function; the real-time loop needs Linux"
             ) from None
         function.restype = _KINDS[returns][0]
         function.argtypes = [_KINDS[argument][0] for argument in arguments]

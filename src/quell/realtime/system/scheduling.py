@@ -1,6 +1,6 @@
-"""What keeps the loop's thread from being made to wait: priority, a processor of its own, memory that stays, processors that do not sleep.
+"""Scheduling of the loop's thread and process: priority, processor, locked memory, no deep sleep of processors.
 
-Each is tried; what is refused is said in a sentence, and the run goes on without it.
+What the system refuses is noted in a sentence, and the run goes on without it.
 """
 
 from __future__ import annotations
@@ -10,14 +10,16 @@ import gc
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from quell import checks
 from quell.realtime.system.libc import external
 
+# MCL_CURRENT | MCL_FUTURE of <sys/mman.h> on Linux.
 _CURRENT_AND_FUTURE = 3
 _LATENCY = "/dev/cpu_dma_latency"
-# An interpreted loop gets the interpreter back after so long [s].
+# Python's switch interval while the loop is interpreted [s]: as long as a burst of the telemetry writer.
+# CPython's default, 5 ms, is five cycles at 1 kHz.
 _SWITCH = 1e-4
 
 _mlockall = external("mlockall", "int", "int")
@@ -25,7 +27,7 @@ _munlockall = external("munlockall", "int")
 
 
 def checked_priority(priority: int) -> int:
-    """Return a priority of 0 (ordinary) or 1 to 99 (real time)."""
+    """Return a priority of 0 (ordinary) or 1 to 99 (SCHED_FIFO)."""
     return checks.whole("priority", priority, 0, 99)
 
 
@@ -36,19 +38,16 @@ def checked_cpu(cpu: int | None) -> int | None:
     number = checks.whole("cpu", cpu, 0)
     allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     if number not in allowed:
-        raise ValueError(
-            f"cpu = {cpu!r}: must be one of {', '.join(map(str, allowed))}, which this process may use"
-        )
+        choice = ", ".join(map(str, allowed))
+        raise ValueError(f"cpu = {cpu!r}: must be one of {choice}, which this process may use")
     return number
 
 
 @contextmanager
 def real_time_process(priority: int, interpreted: bool) -> Iterator[list[str]]:
-    """Around the loop, in the main thread: lock the memory, keep processors awake and the garbage collector out.
+    """Lock the memory, keep processors awake and the garbage collector off for a ``with`` block in the main thread.
 
-    Yields a list for what is to be told.
-
-    With a priority of 0 nothing but the collector is touched.
+    Yields a list of notes on what the system permitted. With a priority of 0 only the collector is touched.
     """
     notes: list[str] = []
     collecting, interval = gc.isenabled(), sys.getswitchinterval()
@@ -74,30 +73,31 @@ def real_time_process(priority: int, interpreted: bool) -> Iterator[list[str]]:
 
 def _lock_memory(notes: list[str]) -> bool:
     try:
-        refused = _mlockall(_CURRENT_AND_FUTURE) != 0
+        locked = _mlockall(_CURRENT_AND_FUTURE) == 0
         reason = os.strerror(ctypes.get_errno())
     except OSError as error:
-        refused, reason = True, str(error)
-    if refused:
-        notes.append(
-            f"memory is not locked ({reason}): a page that was swapped out may hold the loop up; run as root or raise ulimit -l"
-        )
-    else:
-        notes.append("memory is locked")
-    return not refused
+        locked, reason = False, str(error)
+    notes.append(
+        "memory is locked"
+        if locked
+        else f"memory is not locked ({reason}): a page that was swapped out may delay the loop; "
+        "run as root or raise ulimit -l"
+    )
+    return locked
 
 
 def _stay_awake(notes: list[str]) -> int | None:
-    """Ask that no processor goes to a sleep from which it takes time to wake, as long as the file that is returned is open.
+    """Forbid the processors deep sleep as long as the returned file is open.
 
-    See the Linux kernel's *PM Quality Of Service Interface*: the file takes the longest latency that is tolerated [µs].
+    See the Linux kernel's *PM Quality Of Service Interface*: the file takes the largest tolerated latency [µs].
     """
     try:
         file = os.open(_LATENCY, os.O_WRONLY)
         os.write(file, (0).to_bytes(4, sys.byteorder))
     except OSError as error:
         notes.append(
-            f"processors may sleep deeply ({error.strerror}): they wake later; run as root, or make {_LATENCY} writable"
+            f"processors may sleep deeply ({error.strerror}) and then wake later; "
+            f"run as root, or make {_LATENCY} writable"
         )
         return None
     notes.append("processors stay awake")
@@ -105,7 +105,7 @@ def _stay_awake(notes: list[str]) -> int | None:
 
 
 def enter_real_time(priority: int, cpu: int | None, notes: list[str]) -> None:
-    """Give the calling thread its priority and its processor; it keeps them until it ends."""
+    """Set priority and processor of the calling thread until it ends."""
     if cpu is not None:
         try:
             os.sched_setaffinity(0, {cpu})
@@ -120,7 +120,23 @@ def enter_real_time(priority: int, cpu: int | None, notes: list[str]) -> None:
         notes.append(f"scheduling is SCHED_FIFO with priority {priority}")
     except PermissionError:
         notes.append(
-            f"priority {priority} is not permitted: others may hold the loop up; run as root, or raise ulimit -r to {priority}"
+            f"priority {priority} is not permitted: other processes may delay the loop; "
+            f"run as root, or raise ulimit -r to {priority}"
         )
     except (OSError, AttributeError) as error:
-        notes.append(f"priority {priority} could not be had ({error}): others may hold the loop up")
+        notes.append(
+            f"priority {priority} is not available ({error}): other processes may delay the loop"
+        )
+
+
+def set_low_priority(real_time: bool) -> None:
+    """Give the calling thread the lowest priority of SCHED_FIFO if ``real_time`` and permitted, else an ordinary one."""
+    if not hasattr(os, "sched_setscheduler"):
+        return
+    if real_time:
+        with suppress(OSError):
+            lowest = os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO))
+            os.sched_setscheduler(0, os.SCHED_FIFO, lowest)
+            return
+    if os.sched_getscheduler(0) != os.SCHED_OTHER:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -1,4 +1,4 @@
-"""Telemetry of the real-time loop: ring buffer, file formats, live connection, and loading of recordings.
+"""Telemetry of the real-time loop: ring buffer, writer thread, file formats, live connection, loading of recordings.
 
 May import ``records`` and ``realtime.system``.
 """

@@ -1,4 +1,4 @@
-"""What a recording says of itself before its first row."""
+"""Header of a recording."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from quell.realtime.telemetry.channels import LOOP_CHANNELS
 from quell.records.record import is_vector
 
 VERSION = 1
-"""Of the recording's layout; a reader refuses others."""
+"""Version of the recording's layout; a reader refuses others."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What is recorded, and of what.
+    """Description of a recording.
 
     Parameters
     ----------
     channels : tuple of (name, width)
-        what a row holds, in order; the first ones are ``LOOP_CHANNELS``.
+        contents of a row, in order; the first ones are ``LOOP_CHANNELS``.
     dt
         sample time [s]: row k belongs to the time ``k dt``.
     features
-        what the entries of ``theta`` multiply.
+        factors of the entries of ``theta``.
     device, controller
-        what was controlled, and by what, in words.
+        names of the device and the controller.
     units
-        of ``y`` and ``u``, for example ``{"y": "rad", "u": "A"}``; where none are given they are ``y-unit`` and ``u-unit``.
+        of ``y`` and ``u``, for example ``{"y": "rad", "u": "A"}``; ``y-unit`` and ``u-unit`` by default.
     notes
-        what else is worth keeping: anything that JSON can hold.
+        anything else that JSON can represent.
     started
-        when the row with k = 0 was due: nanoseconds since 1970, UTC.
+        deadline of the row with k = 0, in nanoseconds since 1970, UTC.
 
     Raises
     ------
     ValueError
-        for a dt that is not positive, and for channels that do not begin as those of a loop.
+        for a dt that is not positive, and for channels that do not begin with those of a loop.
     """
 
     channels: tuple[tuple[str, int], ...]
@@ -55,24 +55,22 @@ class Header:
     def __post_init__(self) -> None:
         checks.positive("dt", self.dt, "s")
         if tuple(self.channels[: len(LOOP_CHANNELS)]) != LOOP_CHANNELS:
-            raise ValueError(
-                f"channels = {self.channels!r}: must begin with {', '.join(name for name, _ in LOOP_CHANNELS)}"
-            )
+            first = ", ".join(name for name, _ in LOOP_CHANNELS)
+            raise ValueError(f"channels = {self.channels!r}: must begin with {first}")
 
     @property
     def width(self) -> int:
-        """How many numbers a row has."""
+        """Number of values in a row."""
         return sum(width for _, width in self.channels)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Name of each of a row's numbers; ``x_hat[0]`` is the first one of a channel of several."""
-        named: list[str] = []
+        """Name of each value in a row; ``x_hat[0]`` is the first entry of a vector channel."""
+        names: list[str] = []
         for name, width in self.channels:
-            named += (
-                [f"{name}[{i}]" for i in range(width)] if is_vector(name, width) else [name] * width
-            )
-        return tuple(named)
+            vector = is_vector(name, width)
+            names += [f"{name}[{i}]" for i in range(width)] if vector else [name] * width
+        return tuple(names)
 
     def to_json(self) -> str:
         """Return the header as JSON."""
@@ -85,19 +83,15 @@ class Header:
         Raises
         ------
         ValueError
-            where the text is something else, or of another version.
+            for any other text, and for another version of the layout.
         """
         try:
-            told = json.loads(text)
-            version = told.pop("quell_recording")
-            told["channels"] = tuple((str(name), int(width)) for name, width in told["channels"])
-            told["features"] = tuple(map(str, told["features"]))
+            fields = json.loads(text)
+            version = fields.pop("quell_recording")
+            fields["channels"] = tuple((str(name), int(w)) for name, w in fields["channels"])
+            fields["features"] = tuple(map(str, fields["features"]))
             if version != VERSION:
-                raise ValueError(
-                    f"is version {version!r} of the layout, this quell reads {VERSION}"
-                )
-            return cls(**told)
+                raise ValueError(f"its layout has version {version!r}, this quell reads {VERSION}")
+            return cls(**fields)
         except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(
-                f"its header is not that of a recording by quell ({error!r})"
-            ) from None
+            raise ValueError(f"its header is not that of a quell recording ({error!r})") from None

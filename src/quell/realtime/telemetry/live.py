@@ -1,7 +1,7 @@
-"""Rows live over a Foxglove WebSocket, for Foxglove and for PlotJuggler's Foxglove bridge.
+"""Rows over a Foxglove WebSocket, for Foxglove and for PlotJuggler's Foxglove bridge.
 
-Who watches is not a recorder: of a quick loop only so many rows a second are sent, and a slow viewer loses the oldest. So that nothing
-passes unseen between two rows that are sent, the later one has the events of all of them.
+A viewer is no recorder: of a fast loop only a limited number of rows per second is sent, and a slow viewer loses the
+oldest. A row that is sent has the events of all rows since the one before, so that none is lost.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ from quell import checks
 from quell.optional import import_extra
 from quell.realtime.telemetry.channels import EVENTS, K
 from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.ros_message import SCHEMA, TOPIC, definition, log_time, messages
+from quell.realtime.telemetry.ros_message import log_rows, open_topic
 from quell.types import Matrix
 
 PORT = 8765
-"""Where viewers look first."""
+"""Default port of Foxglove's viewers."""
 
 
 class LiveSink:
-    """Send rows to whoever connects.
+    """Send rows to connected viewers.
 
     Parameters
     ----------
     port
-        TCP port; 0 takes any that is free.
+        TCP port; 0 takes any free one.
     host
-        address to listen at; only this machine can connect by default. There is no password: whoever can connect can watch, though not
-        act.
+        address to listen at; only this machine can connect by default. There is no password: whoever can connect can
+        watch, but not act.
     rate
-        how many rows a second are sent at most [1/s]; a browser follows a hundred well.
+        largest number of rows per second [1/s]; a browser displays a hundred without delay.
 
     Attributes
     ----------
     url : str
-        what to connect to, once it is open.
+        address for viewers, once the sink is open.
 
     Raises
     ------
@@ -53,18 +53,18 @@ class LiveSink:
         self._server: Any = None
 
     def open(self, header: Header) -> None:
-        """Begin to listen."""
+        """Start to listen."""
         foxglove = import_extra("foxglove", "telemetry", "watching live")
         self._header = header
-        self._context = context = foxglove.Context()  # a channel is closed with it
-        self._apart, self._next, self._events = (
-            max(math.ceil(1.0 / (self.rate * header.dt) - 1e-9), 1),
-            -math.inf,
-            0,
-        )
+        self._context = foxglove.Context()  # kept: a topic is closed with it
+        self._every = max(math.ceil(1.0 / (self.rate * header.dt) - 1e-9), 1)
+        self._next, self._events = -math.inf, 0
         try:
             self._server = foxglove.start_server(
-                name=header.device or "quell", host=self.host, port=self.port, context=context
+                name=header.device or "quell",
+                host=self.host,
+                port=self.port,
+                context=self._context,
             )
         except RuntimeError as error:
             reason = str(error).removeprefix("FoxgloveError: ")
@@ -72,10 +72,7 @@ class LiveSink:
                 f"host = {self.host!r}, port = {self.port}: can't listen there ({reason}); choose another port"
             ) from None
         self.name = self.url = f"ws://{self.host}:{self._server.port}"
-        schema = foxglove.Schema(name=SCHEMA, encoding="ros2msg", data=definition(header).encode())
-        self._channel = foxglove.Channel(
-            TOPIC, schema=schema, message_encoding="cdr", context=context
-        )
+        self._topic = open_topic(foxglove, header, self._context)
 
     def write(self, rows: Matrix) -> None:
         """Send those of the rows that are due."""
@@ -85,15 +82,15 @@ class LiveSink:
             if k >= self._next:
                 row = rows[i : i + 1].copy()
                 row[0, EVENTS], self._events = self._events, 0
-                self._channel.log(messages(row)[0], log_time=log_time(self._header, k))
-                self._next = k + self._apart
+                log_rows(self._topic, self._header, row)
+                self._next = k + self._every
 
     def flush(self) -> None:
-        """Do nothing: what is sent is sent."""
+        """Do nothing: rows are sent at once."""
 
     def close(self) -> None:
         """Stop listening."""
         if self._server is not None:
             server, self._server = self._server, None
-            self._channel.close()
+            self._topic.close()
             server.stop()

@@ -1,8 +1,8 @@
-"""Recordings as MCAP: a message a row on the topic ``/loop`` (see ``ros_message``), and the header as the metadata record ``quell``.
+"""Recordings as MCAP: a message for each row on the topic ``/loop``, and the header as the metadata record ``quell``.
 
-The file is written by foxglove-sdk, in chunks. A chunk is on disk once it is finished, which is done twice a second here, whatever the
-rate, and it is not compressed: the numbers of a loop are mostly noise, of which compression saves a tenth, for milliseconds of work. The
-log time of a message is when its deadline was due.
+The file is written by foxglove-sdk, in chunks. A finished chunk is on disk; here chunks are finished twice a second.
+They are not compressed: the values of a loop are mostly noise, of which compression saves a tenth for milliseconds of
+work (``benchmarks/telemetry.py``). The log time of a message is its deadline.
 """
 
 from __future__ import annotations
@@ -16,53 +16,55 @@ from typing import Any
 
 import numpy as np
 
+from quell.files import check_new_file
 from quell.optional import import_extra
-from quell.realtime.telemetry.channels import K
-from quell.realtime.telemetry.csv_file import check_new
 from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.ros_message import MARK, SCHEMA, TOPIC, definition, log_time, messages
+from quell.realtime.telemetry.ros_message import MARK, SCHEMA, TOPIC, log_rows, open_topic
 from quell.types import Matrix
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = "quell"
 """Name of the metadata record with the header."""
 
-_ON_DISK_EVERY = 0.5  # [s]
-_BLOCK = 4096  # rows are numbers, not objects, from so many on
+# Time between two chunks [s]: with the writer's period of at most 0.25 s, a killed process loses less than 1 s.
+_CHUNK_TIME = 0.5
+# Messages that are converted to an array at once when reading; chosen by hand, not tuned further.
+_BLOCK = 4096
 
 
 class _File:
-    """The file under foxglove's writer, which would keep the reason of a failure to itself and log each message after it.
+    """File for foxglove's writer that keeps the first error instead of raising it.
 
-    So a failure is noted here, and the writer is told that all went well until it is closed.
+    The writer would hide the reason of a failure and log each later message. It is told that all went well;
+    ``error`` holds the failure.
     """
 
     def __init__(self, path: Path) -> None:
         self._raw = path.open("xb", buffering=0)
-        self._place = self._end = 0
+        self._position = self._end = 0
         self.error: OSError | None = None
 
     def write(self, data: bytes) -> int:
-        """Write all of ``data``, or take note of why not."""
+        """Write all of ``data``, or keep the error."""
         rest = memoryview(data)
         try:
             while rest and self.error is None:
                 rest = rest[self._raw.write(rest) :]
         except OSError as error:
             self.error = error
-        self._place += len(data)
-        self._end = max(self._end, self._place)
+        self._position += len(data)
+        self._end = max(self._end, self._position)
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Go to a place: the length of a chunk is written before it when it is finished."""
-        self._place = offset + (0, self._place, self._end)[whence]
+        """Move to a position: the length of a finished chunk is written before it."""
+        self._position = offset + (0, self._position, self._end)[whence]
         if self.error is None:
-            self._raw.seek(self._place)
-        return self._place
+            self._raw.seek(self._position)
+        return self._position
 
     def flush(self) -> None:
-        """Do nothing: all is with the operating system."""
+        """Do nothing: the file has no buffer."""
 
     def close(self) -> None:
         """Close the file."""
@@ -75,7 +77,7 @@ class McapSink:
     Parameters
     ----------
     path
-        where to; a file that is there is not overwritten.
+        file to create; an existing one is not overwritten.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -88,30 +90,25 @@ class McapSink:
         """Begin the file; the header is on disk at once."""
         foxglove = import_extra("foxglove", "telemetry", "an MCAP file")
         mcap = import_extra("foxglove.mcap", "telemetry", "an MCAP file")
-        check_new(self.path)
+        check_new_file(self.path)
         self._header = header
-        self._context = context = foxglove.Context()  # a channel is closed with it
+        self._context = foxglove.Context()  # kept: a topic is closed with it
         self._file = _File(self.path)
-        self._writer = foxglove.open_mcap(
-            self._file, context=context, writer_options=mcap.MCAPWriteOptions(compression=None)
-        )
+        options = mcap.MCAPWriteOptions(compression=None)
+        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
         self._writer.write_metadata(RECORD, {"header": header.to_json()})
-        schema = foxglove.Schema(name=SCHEMA, encoding="ros2msg", data=definition(header).encode())
-        self._channel = foxglove.Channel(
-            TOPIC, schema=schema, message_encoding="cdr", context=context
-        )
+        self._topic = open_topic(foxglove, header, self._context)
         self._writer.flush()
         self._flushed = time.monotonic()
 
     def write(self, rows: Matrix) -> None:
         """Add a message for each row."""
-        for message, k in zip(messages(rows), rows[:, K].tolist(), strict=True):
-            self._channel.log(message, log_time=log_time(self._header, k))
+        log_rows(self._topic, self._header, rows)
         self._check()
 
     def flush(self) -> None:
-        """Finish the chunk, where half a second has passed since the last one."""
-        if time.monotonic() - self._flushed >= _ON_DISK_EVERY:
+        """Finish the chunk if it is half a second old."""
+        if time.monotonic() - self._flushed >= _CHUNK_TIME:
             self._writer.flush()
             self._flushed = time.monotonic()
         self._check()
@@ -120,41 +117,41 @@ class McapSink:
         """Finish the file."""
         if self._writer is not None:
             writer, self._writer = self._writer, None
-            self._channel.close()
+            self._topic.close()
             writer.close()
             self._file.close()
             self._check()
 
     def _check(self) -> None:
-        """Say what the file could not do."""
+        """Raise the error that the file kept."""
         if self._file.error is not None:
             raise self._file.error
 
 
 def read_mcap(path: Path) -> tuple[Header, Matrix]:
-    """Return what a ``McapSink`` wrote, as far as it goes: what comes after the last whole chunk is left out.
+    """Return header and rows of a ``McapSink``'s file, up to its last complete chunk.
 
     Raises
     ------
     ValueError
-        where the file is something else.
+        if the file is not a recording.
     ImportError
-        where the package mcap is missing.
+        if the package mcap is missing.
     """
     import_extra("mcap", "telemetry", "reading an MCAP file")
     header: Header | None = None
     schemas: dict[int, str] = {}
     topics: dict[int, tuple[str, str | None]] = {}
-    rows: list[bytes] = []
+    messages: list[bytes] = []
     blocks: list[Matrix] = []
     for record in _records(path):
         kind = type(record).__name__
         if kind == "Message":
             if topics.get(record.channel_id) == (TOPIC, SCHEMA):
-                rows.append(record.data)
-                if len(rows) == _BLOCK:
-                    blocks.append(_numbers(rows))
-                    rows = []
+                messages.append(record.data)
+                if len(messages) == _BLOCK:
+                    blocks.append(_rows(messages))
+                    messages = []
         elif kind == "Schema":
             schemas[record.id] = record.name
         elif kind == "Channel":
@@ -163,14 +160,14 @@ def read_mcap(path: Path) -> tuple[Header, Matrix]:
             header = Header.from_json(record.metadata.get("header", ""))
     if header is None:
         raise ValueError(f"it has no metadata record {RECORD!r}: it was not recorded by quell")
-    blocks = [block for block in (*blocks, _numbers(rows)) if block.size]
+    blocks = [block for block in (*blocks, _rows(messages)) if block.size]
     if any(block.shape[1] != header.width for block in blocks):
         raise ValueError(f"a message on {TOPIC} is not a row of {header.width} numbers")
     return header, np.concatenate(blocks) if blocks else np.empty((0, header.width))
 
 
-def _numbers(messages: list[bytes]) -> Matrix:
-    """Return the rows (messages, width) that messages hold."""
+def _rows(messages: list[bytes]) -> Matrix:
+    """Return the rows (messages, width) of messages."""
     if not messages:
         return np.empty((0, 0))
     size = len(messages[0])
@@ -178,12 +175,12 @@ def _numbers(messages: list[bytes]) -> Matrix:
         len(message) == size and message.startswith(MARK) for message in messages
     ):
         raise ValueError(f"the messages on {TOPIC} are not rows of the same width")
-    numbers = np.frombuffer(b"".join(message[len(MARK) :] for message in messages), dtype="<f8")
-    return numbers.reshape(len(messages), -1).astype(np.float64)
+    values = np.frombuffer(b"".join(message[len(MARK) :] for message in messages), dtype="<f8")
+    return values.reshape(len(messages), -1).astype(np.float64)
 
 
 def _records(path: Path) -> Iterator[Any]:
-    """Return the records of a file, up to where it ends or makes no sense any more."""
+    """Return the records of a file up to its end or the first that is damaged."""
     from mcap.exceptions import McapError
     from mcap.stream_reader import StreamReader
 

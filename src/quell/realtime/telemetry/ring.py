@@ -1,9 +1,9 @@
-"""A ring between the loop and whoever records it: rows go in on one thread and come out on another, and neither waits.
+"""A ring buffer between the loop and the telemetry writer, which are two threads; neither of them waits.
 
-One producer, one consumer, no lock (Lamport, "Specifying Concurrent Program Modules", ACM TOPLAS 5(2), 1983). ``head`` counts the rows that
-went in, ``tail`` those that came out; each is written by one side only. The producer writes a row and then, as a *release*, the new head;
-the consumer reads the head as an *acquire* and finds the row whole. The same the other way round keeps the producer off rows that are still
-being read. Where the ring is full, the newest row is dropped and counted.
+One producer, one consumer, no lock (Lamport, "Specifying Concurrent Program Modules", ACM TOPLAS 5(2), 1983).
+``HEAD`` counts the rows written, ``TAIL`` those read; each has one writer. The producer writes a row and then, as a
+*release*, the new head; the consumer reads the head as an *acquire* and finds the row complete. The tail keeps the
+producer off rows that are still being read in the same way. If the ring is full, the newest row is dropped and counted.
 """
 
 from __future__ import annotations
@@ -18,26 +18,24 @@ from quell.kernels.dispatch import compiled, kernel
 from quell.realtime.system.atomics import load_acquire, store_release
 from quell.types import Matrix, Vector
 
-# Sixteen words apart: no two of them on one cache line, nor on the pair of lines that processors fetch together.
+# Indices of ``Ring.ends``, 16 words = 128 bytes apart: processors fetch cache lines of 64 bytes, some of them in pairs.
 HEAD, TAIL, DROPPED = 0, 16, 32
 _WORDS = 48
-
-IntVector = NDArray[np.int64]
 
 
 class Ring(NamedTuple):
     """Rows on their way from one thread to another."""
 
     rows: Matrix
-    """(capacity, width); row number k lies at k modulo capacity."""
-    ends: IntVector
-    """At ``HEAD`` how many rows went in, at ``TAIL`` how many came out, at ``DROPPED`` how many found no place."""
+    """(capacity, width); row number k is stored at k modulo capacity."""
+    ends: NDArray[np.int64]
+    """At ``HEAD`` the number of rows written, at ``TAIL`` of those read, at ``DROPPED`` of those dropped."""
 
 
 def ring(capacity: int, width: int) -> Ring:
-    """Return an empty ring for ``capacity`` rows of ``width`` numbers.
+    """Return an empty ring for ``capacity`` rows of ``width`` values.
 
-    Its memory is touched once, so that the first round is as quick as the others.
+    All its memory is written once, so that no page is missing when the loop first uses it.
 
     Raises
     ------
@@ -50,44 +48,44 @@ def ring(capacity: int, width: int) -> Ring:
 
 @kernel
 def push(ring: Ring, row: Vector) -> bool:
-    """Put a row in, on the producer's thread; return whether there was room. It neither waits nor allocates."""
+    """Write a row, on the producer's thread; return whether there was room. It neither waits nor allocates."""
     rows, ends = ring.rows, ring.ends
-    head = ends[HEAD]  # nobody else writes it
+    head = ends[HEAD]  # only this thread writes it
     if head - load_acquire(ends, TAIL) >= rows.shape[0]:
         store_release(ends, DROPPED, ends[DROPPED] + 1)
         return False
-    place = head % rows.shape[0]
+    index = head % rows.shape[0]
     for i in range(rows.shape[1]):
-        rows[place, i] = row[i]
+        rows[index, i] = row[i]
     store_release(ends, HEAD, head + 1)
     return True
 
 
 def drain(ring: Ring) -> Matrix:
-    """Take all rows out that are in, on the consumer's thread: a copy (rows, width), oldest first."""
+    """Remove all rows, on the consumer's thread, and return a copy (rows, width), oldest first."""
     out = np.empty((waiting(ring), ring.rows.shape[1]))
-    _take(ring, out)
+    _read_rows(ring, out)
     return out
 
 
 def waiting(ring: Ring) -> int:
-    """Return how many rows are in; there may be more a moment later."""
+    """Return the number of rows in the ring; the producer may add more meanwhile."""
     return int(ring.ends[HEAD] - ring.ends[TAIL])
 
 
 def dropped(ring: Ring) -> int:
-    """Return how many rows found the ring full."""
+    """Return how many rows were dropped because the ring was full."""
     return int(ring.ends[DROPPED])
 
 
 @compiled
-def _take(ring: Ring, out: Matrix) -> None:
-    """Take ``out``'s number of rows out of the ring; they must be in."""
+def _read_rows(ring: Ring, out: Matrix) -> None:
+    """Move the oldest rows of the ring to ``out``."""
     rows, ends = ring.rows, ring.ends
     tail = ends[TAIL]
     count = min(out.shape[0], load_acquire(ends, HEAD) - tail)
     for k in range(count):
-        place = (tail + k) % rows.shape[0]
+        index = (tail + k) % rows.shape[0]
         for i in range(rows.shape[1]):
-            out[k, i] = rows[place, i]
+            out[k, i] = rows[index, i]
     store_release(ends, TAIL, tail + count)

@@ -1,11 +1,15 @@
-"""A row as a ROS 2 message: PlotJuggler and Foxglove read those without being told anything else, from files and live.
+"""Rows as ROS 2 messages, which PlotJuggler and Foxglove read without configuration, from files and live.
 
-The definition (``ros2msg``) is a line for each channel. The message in plain CDR, little endian (OMG DDSI-RTPS 2.5, 10.2), is four bytes
-that say so, and then the numbers: all of them are 64 bits, so nothing is padded, and arrays of fixed length have no count.
+The definition (``ros2msg``) has a line for each channel. The message in plain CDR, little endian (OMG DDSI-RTPS 2.5,
+10.2), is a mark of four bytes and then the values: all have 64 bits, so nothing is padded, and arrays of fixed length
+have no count.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+from quell.realtime.telemetry.channels import K
 from quell.realtime.telemetry.header import Header
 from quell.records.record import is_vector, meaning
 from quell.types import Matrix
@@ -13,25 +17,27 @@ from quell.types import Matrix
 SCHEMA = "quell/msg/Cycle"
 TOPIC = "/loop"
 MARK = b"\x00\x01\x00\x00"
-"""What a message begins with: plain CDR, little endian, no options."""
+"""First bytes of a message: plain CDR, little endian, no options."""
 
 
 def definition(header: Header) -> str:
-    """Return the definition of a row's message: ``float64 y``, ``float64[3] x_hat``, … with meanings and units as comments."""
+    """Return the definition of a row's message: ``float64 y``, ``float64[3] x_hat``, … with meanings and units."""
     lines = []
     for name, width in header.channels:
         if width:
-            told, unit = meaning(name)
+            text, unit = meaning(name)
             kind = f"float64[{width}]" if is_vector(name, width) else "float64"
-            lines.append(f"{kind} {name}  # {told} [{header.units.get(name, unit)}]")
+            lines.append(f"{kind} {name}  # {text} [{header.units.get(name, unit)}]")
     return "\n".join(lines) + "\n"
 
 
-def messages(rows: Matrix) -> list[bytes]:
-    """Return the message of each row."""
-    return [MARK + row.tobytes() for row in rows.astype("<f8", copy=False)]
+def open_topic(foxglove: Any, header: Header, context: Any) -> Any:
+    """Return a Foxglove channel for rows in a context."""
+    schema = foxglove.Schema(name=SCHEMA, encoding="ros2msg", data=definition(header).encode())
+    return foxglove.Channel(TOPIC, schema=schema, message_encoding="cdr", context=context)
 
 
-def log_time(header: Header, k: float) -> int:
-    """Return when the row of deadline ``k`` was due: nanoseconds since 1970, UTC."""
-    return header.started + round(k * header.dt * 1e9)
+def log_rows(topic: Any, header: Header, rows: Matrix) -> None:
+    """Log a message for each row, at the time of its deadline."""
+    for row, k in zip(rows.astype("<f8", copy=False), rows[:, K].tolist(), strict=True):
+        topic.log(MARK + row.tobytes(), log_time=header.started + round(k * header.dt * 1e9))

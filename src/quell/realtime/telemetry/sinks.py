@@ -1,27 +1,43 @@
-"""Where telemetry goes: files of several kinds, live viewers, memory."""
+"""Sinks, which take the rows of a loop: their protocol, memory, and files by their suffix."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from quell.realtime.telemetry.csv_file import CsvSink
 from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.live import LiveSink
 from quell.realtime.telemetry.load import trajectory_of
 from quell.realtime.telemetry.mcap_file import McapSink
-from quell.realtime.telemetry.writer import Sink
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix
 
-__all__ = ["CsvSink", "LiveSink", "McapSink", "MemorySink", "file_sink"]
+
+class Sink(Protocol):
+    """A receiver of rows; all methods except ``open`` are called on the writer's thread."""
+
+    name: str
+    """Name in messages."""
+
+    def open(self, header: Header) -> None:
+        """Begin a recording; raise a ``ValueError`` with the reason if that is impossible."""
+
+    def write(self, rows: Matrix) -> None:
+        """Take the next rows (rows, width), in order."""
+
+    def flush(self) -> None:
+        """Bring what was taken to where it outlives this process; called after each round of ``write``."""
+
+    def close(self) -> None:
+        """End the recording."""
 
 
 class MemorySink:
-    """Keep rows in memory: some 20 numbers a cycle, which at 1 kHz are 10 MB a minute."""
+    """Keep rows in memory: about 20 values a cycle, which is 10 MB a minute at 1 kHz."""
 
     name = "memory"
 
@@ -30,9 +46,8 @@ class MemorySink:
         self._rows: list[Matrix] = []
 
     def open(self, header: Header) -> None:
-        """Begin anew."""
-        self._header = header
-        self._rows = []
+        """Begin a new recording."""
+        self._header, self._rows = header, []
 
     def write(self, rows: Matrix) -> None:
         """Keep the rows."""
@@ -45,7 +60,7 @@ class MemorySink:
         """Do nothing."""
 
     def trajectory(self) -> Trajectory:
-        """Return what was kept, as ``load`` does for a file."""
+        """Return the recording as ``load`` does for a file."""
         if self._header is None:
             raise ValueError("nothing was recorded yet")
         rows = np.concatenate(self._rows) if self._rows else np.empty((0, self._header.width))
@@ -53,7 +68,7 @@ class MemorySink:
 
 
 def file_sink(path: str | os.PathLike[str]) -> Sink:
-    """Return the sink for a file, by its suffix: ``.csv`` or ``.mcap``.
+    """Return the sink for a file by its suffix, ``.csv`` or ``.mcap``.
 
     Raises
     ------

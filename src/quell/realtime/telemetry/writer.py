@@ -1,90 +1,68 @@
-"""TelemetryWriter: rows leave the loop through a ring, and another thread writes them down.
+"""The telemetry writer: a thread that takes the loop's rows out of a ring and passes them to sinks.
 
-The loop puts a row into the ring each cycle and never waits. The writer's thread empties the ring some twenty times a second and hands the
-rows to its sinks: files, or whoever watches. A sink that fails (disk full, no permission) is closed and reported; the loop, and the other
-sinks, go on.
+The loop puts a row into the ring each cycle and never waits. The writer empties the ring some twenty times a second. A
+sink that fails (disk full, no permission) is closed and reported; the loop and the other sinks go on.
 
-A loop that is Python itself shares the interpreter with the writer. So the writer works in bursts of a tenth of a millisecond and sleeps
-in between. That is not enough on a busy machine, where a thread of ordinary priority may be set aside for milliseconds in the middle of a
-burst, and the interpreter with it: for such a loop the writer takes the lowest real-time priority (``urgent``).
+An interpreted loop shares Python's interpreter with the writer. Therefore the writer works in bursts of 0.1 ms and
+sleeps in between. On a busy machine a thread of ordinary priority may be suspended for milliseconds in the middle of a
+burst, while it holds the interpreter: for such a loop the writer takes the lowest real-time priority (``urgent``).
 """
 
 from __future__ import annotations
 
 import logging
 import math
-import os
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from threading import Event, Thread
-from types import TracebackType
-from typing import Protocol
 
 from quell import checks
+from quell.realtime.system.scheduling import set_low_priority
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.ring import Ring, drain, dropped, ring
+from quell.realtime.telemetry.sinks import Sink
 from quell.types import Matrix
 
 _LOG = logging.getLogger(__name__)
 
-# So many numbers are written in one go, which takes about 0.1 ms, and so long the interpreter is left alone then [s].
+# Values per burst: they take CSV about 0.1 ms (benchmarks/telemetry.py), after which the writer sleeps as long [s].
 _BURST = 100
 _PAUSE = 1e-4
-# The ring holds what comes in so many seconds: a disk may be away as long.
-_PATIENCE = 10.0
+# The ring holds the rows of so many seconds, so that a disk may stall as long; chosen by hand.
+_CAPACITY = 10.0
 _LEAST_ROWS = 256
 
 
-class Sink(Protocol):
-    """Where rows go; all of it is called on the writer's thread but ``open``."""
-
-    name: str
-    """What it is called in messages."""
-
-    def open(self, header: Header) -> None:
-        """Begin a recording; a ``ValueError`` says why that can't be."""
-
-    def write(self, rows: Matrix) -> None:
-        """Take some rows (rows, width), the next ones in order."""
-
-    def flush(self) -> None:
-        """Bring what was taken to where it outlives this process; called after each round of ``write``."""
-
-    def close(self) -> None:
-        """End the recording."""
-
-
 class TelemetryWriter:
-    """A ring for a loop's rows, and the thread that takes them out.
+    """A ring for a loop's rows, and the thread that writes them to sinks.
 
-    Used as a context manager it starts and stops itself.
+    As a context manager it starts and stops itself.
 
     Parameters
     ----------
     header
-        what is recorded.
+        header of the recording.
     sinks
-        where it goes; see ``quell.realtime.telemetry.sinks``.
+        receivers of the rows.
     period
-        how often the ring is emptied [s].
+        time between two rounds of emptying the ring [s].
     urgent
-        whether the loop is Python and has a real-time priority above 1: then the writer takes that of 1, where it is permitted. Else it has
-        none, even where it inherits one.
+        True if the loop is interpreted and has a real-time priority above 1: the writer then takes priority 1 if
+        permitted. Otherwise it takes an ordinary one, even if it would inherit another.
 
     Attributes
     ----------
     ring : Ring
-        what the loop pushes its rows into.
+        where the loop pushes its rows.
     rows : int
-        how many rows were taken out so far.
+        number of rows taken out so far.
     problems : list of str
         which sinks failed, when and why.
 
     Raises
     ------
     ValueError
-        for a period that is not positive or beyond a quarter of a second: a killed process must lose less than one second.
+        for a period that is not positive, or above 0.25 s: a killed process must lose less than one second.
     """
 
     def __init__(
@@ -96,37 +74,37 @@ class TelemetryWriter:
         urgent: bool = False,
     ) -> None:
         self.header, self.period = header, checks.positive("period", period, "s")
-        if period > 0.25:
+        if (
+            period > 0.25
+        ):  # half a second of an MCAP chunk and a quarter here leave a margin of a quarter
             raise ValueError(
                 f"period = {period!r} s: must be at most 0.25 s, or a killed process may lose more than a second"
             )
-        self.ring: Ring = ring(max(_LEAST_ROWS, math.ceil(_PATIENCE / header.dt)), header.width)
+        self.ring: Ring = ring(max(_LEAST_ROWS, math.ceil(_CAPACITY / header.dt)), header.width)
         self.urgent = urgent
         self.rows = 0
         self.problems: list[str] = []
         self._sinks, self._given = list[Sink](), tuple(sinks)
-        self._piece = max(_BURST // header.width, 1)
-        self._stopped, self._thread = (
-            Event(),
-            Thread(target=self._run, name="quell-telemetry", daemon=True),
-        )
+        self._burst = max(_BURST // header.width, 1)
+        self._stopped = Event()
+        self._thread = Thread(target=self._run, name="quell-telemetry", daemon=True)
 
     @property
     def dropped(self) -> int:
-        """How many rows found the ring full and are lost."""
+        """Number of rows that were lost because the ring was full."""
         return dropped(self.ring)
 
     def start(self) -> None:
         """Open all sinks and start writing.
 
-        To be called before the loop's thread takes a real-time priority or a processor of its own: threads inherit both.
+        Call it before the loop's thread takes a real-time priority or a processor of its own: threads inherit both.
 
         Raises
         ------
         ValueError
-            where a sink can't be opened; none is open then.
+            if a sink can't be opened; none is open then.
         ImportError
-            where a sink needs a package that is missing.
+            if a sink needs a package that is missing.
         """
         try:
             for sink in self._given:
@@ -137,11 +115,11 @@ class TelemetryWriter:
                 sink.close()
             self._sinks.clear()
             raise
-        drain(self.ring)  # compiles, or loads
+        drain(self.ring)  # compiles it, or loads it from disk
         self._thread.start()
 
     def stop(self, timeout: float = 10.0) -> None:
-        """Write what is in the ring and close all sinks; a disk that hangs is waited for so long [s]."""
+        """Write what is left in the ring and close all sinks; wait at most ``timeout`` [s] for a disk that hangs."""
         self._stopped.set()
         self._thread.join(timeout)
         if self._thread.is_alive():
@@ -151,39 +129,34 @@ class TelemetryWriter:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _run(self) -> None:
-        _schedule(self.urgent)
+        set_low_priority(real_time=self.urgent)
         while not self._stopped.wait(self.period):
-            self._pass_on()
-        self._pass_on()
+            self._write_rows()
+        self._write_rows()
         for sink in tuple(self._sinks):
             self._attempt(sink, sink.close)
 
-    def _pass_on(self) -> None:
-        """Empty the ring into the sinks, a burst at a time."""
+    def _write_rows(self) -> None:
+        """Empty the ring into the sinks, in bursts."""
         rows = drain(self.ring)
-        for first in range(0, rows.shape[0], self._piece):
-            piece = rows[first : first + self._piece]
+        for first in range(0, rows.shape[0], self._burst):
+            burst = rows[first : first + self._burst]
             for sink in tuple(self._sinks):
-                self._attempt(sink, sink.write, piece)
+                self._attempt(sink, sink.write, burst)
                 time.sleep(_PAUSE)
-            self.rows += piece.shape[0]
+            self.rows += burst.shape[0]
         for sink in tuple(self._sinks):
             self._attempt(sink, sink.flush)
 
-    def _attempt(self, sink: Sink, action: object, *arguments: Matrix) -> None:
-        """Call a method of a sink; close the sink where that fails."""
+    def _attempt(self, sink: Sink, action: Callable[..., None], *arguments: Matrix) -> None:
+        """Call a method of a sink; close the sink if that fails."""
         try:
-            action(*arguments)  # type: ignore[operator]
-        except BaseException as error:  # a panic of a library in Rust is no Exception
+            action(*arguments)
+        except BaseException as error:  # a panic of a library in Rust is not an Exception
             self._sinks.remove(sink)
             why = error.strerror if isinstance(error, OSError) and error.strerror else error
             self._report(f"{sink.name}: {why}; closed after {self.rows} rows")
@@ -195,17 +168,3 @@ class TelemetryWriter:
     def _report(self, problem: str) -> None:
         self.problems.append(problem)
         _LOG.warning("telemetry: %s", problem)
-
-
-def _schedule(urgent: bool) -> None:
-    """Take the lowest real-time priority, or give up one that was inherited."""
-    if not hasattr(os, "sched_setscheduler"):
-        return
-    if urgent:
-        with suppress(OSError):
-            os.sched_setscheduler(
-                0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO))
-            )
-            return
-    if os.sched_getscheduler(0) != os.SCHED_OTHER:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
