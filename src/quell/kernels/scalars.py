@@ -25,7 +25,6 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-
 _DTYPES = {"float": np.float64, "int": np.int64}
 
 
