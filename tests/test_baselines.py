@@ -23,7 +23,7 @@ from quell.controllers.baselines import (
 )
 from quell.controllers.baselines.observer_law import stationary_gain
 from quell.lti.discretize import gramian
-from quell.observers.eso import continuous_gain
+from quell.observers import continuous_gain
 
 TWO_MASS = ql.plants.two_mass_spring()
 LAG = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -1.5]], [0.0, 2.0], [1.0, 0.0])

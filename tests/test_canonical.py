@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.learners.lag import lag_of
-from quell.lti import canonical
+from quell.lti.canonical import canonical
 from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
@@ -304,7 +304,7 @@ def test_what_is_wrong_with_a_plant_is_said(plant: Any, E: Any, message: str) ->
 def test_a_zero_at_the_origin_hides_a_constant_disturbance() -> None:
     """It leaves no trace in y, so no ESO can find it."""
     with pytest.raises(
-        ValueError, match=r"zero at s = 0 \(zeros from u: 0 rad/s\): a constant f leaves no trace"
+        ValueError, match=r"zero at s = 0 \(zeros from u: 0 rad/s\): a constant f does not show"
     ):
         ESO.model_based(([1.0, 0.0], [1.0, 1.0, 1.0]), omega_o=10.0, dt=1e-3)
 

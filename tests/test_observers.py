@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.lti import canonical
+from quell.lti.canonical import canonical
 from quell.observers import continuous_gain
 from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
@@ -235,7 +235,7 @@ def test_a_mistake_in_a_model_free_design_is_named(change: dict[str, object], me
         ),
         (([1.0], 0.0), "b = 0.0: must not be zero"),
         (([-1e12], 1.0), "dt = 0.001 s: too long .* for the plant's fastest pole of 1e[+]12 rad/s"),
-        (([(math.pi / 1e-3) ** 2, 0.0], 1.0), "sampled, the model cannot be observed"),
+        (([(math.pi / 1e-3) ** 2, 0.0], 1.0), "the sampled model cannot be observed"),
         ("two-mass", "plant = 'two-mass': must be a linear plant"),
         ((np.zeros(9), 1.0), "order of the plant = 9: must be a whole number from 1 to 8"),
     ],

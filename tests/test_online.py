@@ -16,7 +16,7 @@ from quell.learners.online.gaussian_process import GaussianProcessModel
 from quell.learners.online.model import infer, learn
 from quell.learners.online.network import Network
 from quell.learners.regression.rls import RlsRule, least_squares_gain
-from quell.observers.eso import FORMS
+from quell.observers.design import FORMS
 from quell.types import Matrix, Vector
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=2e-3)

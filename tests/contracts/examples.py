@@ -16,7 +16,8 @@ import quell as ql
 from quell import learners as learner_room
 from quell.features import RBF, Bias, Input, Polynomial, RandomFourier, State
 from quell.learners.online.model import infer, learn
-from quell.observers.eso import ESO, FORMS
+from quell.observers.design import FORMS
+from quell.observers.eso import ESO
 from quell.plants import registry
 
 from .python_models import python_learners

@@ -101,7 +101,7 @@ def group_delay(observer: ESO) -> float:
     The j-th lag of the chain delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
     """
     if not observer.has_one_pole:
-        return f_lag(scaled_response(observer))
+        return f_lag(scaled_response(observer.model, observer.units))
     lag = _chain(observer)
     stage = np.arange(lag.taps.size)
     return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (

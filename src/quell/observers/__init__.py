@@ -1,6 +1,11 @@
-"""Observers: what estimates the state and the total disturbance."""
+"""Extended state observers: estimates of the plant's state and of the total disturbance.
+
+May import ``lti`` and what stands before it. ``eso.py`` has the class; each kind of observer has
+its own file with parameters and kernels, and only ``noise.py`` imports ``eso.py``.
+"""
 
 from quell.lti.canonical import Canonical, canonical
-from quell.observers.eso import ESO, continuous_gain
+from quell.observers.design import continuous_gain
+from quell.observers.eso import ESO
 
 __all__ = ["ESO", "Canonical", "canonical", "continuous_gain"]

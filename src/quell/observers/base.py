@@ -1,9 +1,10 @@
-"""What the controller asks of an observer.
+"""Generic functions that the controller calls on an observer.
 
-An observer is an ``ESO``: an immutable description with ``order`` n, ``b0``, ``omega_o``, ``dt`` and ``model``, a NamedTuple of
-parameters with ``states``, the length of its running state. That is one vector; entry n of it is a summand of the estimated f, so that a
-controller may shift the estimate there. For the type of ``model`` the functions below are registered; ``acting_control`` only where u is delayed,
-``expected_measurement`` only where the model has no ``transition``, ``input`` and ``feed`` for the first entries of z.
+An observer is an ``ESO``. Its ``model`` is a NamedTuple of parameters with ``states``, the length
+of the running state ``z``. Entry n of ``z`` is a summand of the estimated f, so a controller may
+shift the estimate there. A new kind of model registers ``observe`` and ``begin``; it registers
+``expected_measurement`` if it lacks ``transition``, ``input`` and ``feed`` for the first entries
+of ``z``, and ``acting_control`` if u is delayed.
 """
 
 from __future__ import annotations
@@ -15,22 +16,23 @@ from quell.types import Vector
 
 
 @generic
-def observe(model: Any, z: Vector, seen: Vector, y: float, u: float, f_learned: float) -> None:
-    """Advance the observer's state ``z`` by a sample, and put into ``seen`` (n + 1,) what may be known: ``x̂_1 … x̂_n, Δf̂``.
+def observe(model: Any, z: Vector, estimate: Vector, y: float, u: float, f_learned: float) -> None:
+    """Advance the state ``z`` by a sample and write ``x̂_1 … x̂_n, Δf̂`` into ``estimate`` (n + 1,).
 
-    ``u`` is the control signal that was applied, ``f_learned`` the share of f that was fed forward, over the sample that ends with ``y``.
+    ``u`` is the control signal that was applied, ``f_learned`` the share of f that was fed
+    forward, over the sample that ends with the measurement ``y``.
     """
     raise TypeError
 
 
 @generic
 def expected_measurement(model: Any, z: Vector, u: float, f_learned: float) -> float:
-    """Return the measurement that ``observe`` would find nothing to correct by, for the same ``u`` and ``f_learned``."""
+    """Return the measurement for which ``observe`` makes no correction, given the same inputs."""
     raise TypeError
 
 
 @expected_measurement.register(object)
-def _first_of_the_forecast(model: Any, z: Vector, u: float, f_learned: float) -> float:
+def _predicted_output(model: Any, z: Vector, u: float, f_learned: float) -> float:
     total = model.input[0] * u + model.feed[0] * f_learned
     for j in range(model.feed.size):
         total += model.transition[0, j] * z[j]
@@ -38,35 +40,35 @@ def _first_of_the_forecast(model: Any, z: Vector, u: float, f_learned: float) ->
 
 
 @generic
-def begin(model: Any, z: Vector, seen: Vector, y: float) -> None:
+def begin(model: Any, z: Vector, estimate: Vector, y: float) -> None:
     """Start at rest at the first measurement: ``x̂_1 = y``, all else zero."""
     raise TypeError
 
 
 @generic
 def acting_control(model: Any, z: Vector, u: float) -> float:
-    """Return the control signal that reaches the plant in the sample for which ``u`` is applied: u itself, unless it is delayed."""
+    """Return the u that reaches the plant while ``u`` is applied: ``u`` itself unless delayed."""
     raise TypeError
 
 
 @acting_control.register(object)
-def _acts_at_once(model: Any, z: Vector, u: float) -> float:
+def _not_delayed(model: Any, z: Vector, u: float) -> float:
     return u
 
 
 @kernel
-def predict_state(model: Any, z: Vector, ahead: Vector, u: float, f: float) -> None:
-    """Write ``Φ z + Γ_u u + Γ_f f`` into ``ahead``, both (N,), for a model with ``transition``, ``input`` and ``feed``."""
+def predict_state(model: Any, z: Vector, predicted: Vector, u: float, f: float) -> None:
+    """Write ``Φ z + Γ_u u + Γ_f f`` into ``predicted``, both (N,)."""
     for i in range(z.size):
         total = model.input[i] * u + model.feed[i] * f
         for j in range(z.size):
             total += model.transition[i, j] * z[j]
-        ahead[i] = total
+        predicted[i] = total
 
 
 @kernel
-def begin_at(z: Vector, seen: Vector, y: float) -> None:
-    """Put y into the first entry of both (N,), zero into all others."""
+def begin_at(z: Vector, estimate: Vector, y: float) -> None:
+    """Set the first entry of both vectors (N,) to ``y`` and all others to zero."""
     for i in range(z.size):
-        z[i] = seen[i] = 0.0
-    z[0] = seen[0] = y
+        z[i] = estimate[i] = 0.0
+    z[0] = estimate[0] = y

@@ -1,10 +1,11 @@
-"""A known input delay: the observer is fed the control signal that reaches the plant, not the one that was sent.
+"""A known input delay: the observer is fed the control signal that reaches the plant.
 
-For a plant ``y^(n)(t) = b0 u(t − τ) + f(t)`` with ``τ = d dt``, an ESO that is fed u(t) takes the missing answer for a disturbance and
-works against it; one that is fed ``u(t − τ)`` compares what belongs together (Zhao & Gao, *ISA Transactions* 53, 2014). The law is left
-alone: it acts on estimates of now, and the delay stays in the loop.
+For a plant ``y^(n)(t) = b0 u(t − τ) + f(t)`` with ``τ = d dt``, an ESO that is fed u(t) takes the
+missing response for a disturbance and counteracts it. An ESO that is fed ``u(t − τ)`` compares
+signals of the same time (Zhao & Gao, *ISA Transactions* 53, 2014). The control law does not change:
+it acts on present estimates, and the delay remains in the loop.
 
-The running state is the inner observer's, followed by the last d values of u, the newest first.
+The running state is that of the inner observer, followed by the last d values of u, newest first.
 """
 
 from __future__ import annotations
@@ -15,17 +16,18 @@ from quell import checks
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Vector
 
-# All of them are moved on each sample.
+# The longest delay. All stored values of u are shifted in each sample, so the cost grows with it.
+# Chosen by hand; not tuned further. Its main use is to detect a delay that is not in seconds.
 _MOST_SAMPLES = 10_000
 
 
 class DelayedModel(NamedTuple):
-    """An observer behind a delay of u."""
+    """Parameters of an observer with a delay of u."""
 
     inner: Any
-    """The observer's model."""
+    """Parameters of the observer without delay."""
     size: int
-    """Length of its running state."""
+    """Length of the running state of ``inner``."""
     samples: int
     """d, at least 1."""
 
@@ -37,14 +39,14 @@ class DelayedModel(NamedTuple):
 
 @observe.register(DelayedModel)
 def _observe(
-    model: DelayedModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float
+    model: DelayedModel, z: Vector, estimate: Vector, y: float, u: float, f_learned: float
 ) -> None:
     last = z.size - 1
     arriving = z[last]
     for i in range(last, model.size, -1):
         z[i] = z[i - 1]
     z[model.size] = u
-    observe(model.inner, z[: model.size], seen, y, arriving, f_learned)
+    observe(model.inner, z[: model.size], estimate, y, arriving, f_learned)
 
 
 @expected_measurement.register(DelayedModel)
@@ -53,33 +55,34 @@ def _expected(model: DelayedModel, z: Vector, u: float, f_learned: float) -> flo
 
 
 @begin.register(DelayedModel)
-def _begin(model: DelayedModel, z: Vector, seen: Vector, y: float) -> None:
+def _begin(model: DelayedModel, z: Vector, estimate: Vector, y: float) -> None:
     for i in range(model.size, z.size):
         z[i] = 0.0
-    begin(model.inner, z[: model.size], seen, y)
+    begin(model.inner, z[: model.size], estimate, y)
 
 
 @acting_control.register(DelayedModel)
-def _acting(model: DelayedModel, z: Vector, u: float) -> float:
+def _acting_control(model: DelayedModel, z: Vector, u: float) -> float:
     return z[z.size - 1]
 
 
 def delayed_model(model: Any, delay: float, dt: float) -> Any:
-    """Return ``model`` behind a delay [s] of u; ``model`` itself where there is none.
+    """Return ``model`` with a delay [s] of u; ``model`` itself if the delay is zero.
 
     Raises
     ------
     ValueError
-        where the delay is negative, no whole number of samples, or longer than 10 000 of them.
+        if the delay is negative, no whole number of samples, or longer than 10 000 samples.
     """
     samples = checks.samples("delay", delay, dt)
     if samples > _MOST_SAMPLES:
         raise ValueError(
-            f"delay = {delay!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES} samples; is it in seconds?"
+            f"delay = {delay!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES} samples; "
+            "is it in seconds?"
         )
     return model if samples == 0 else DelayedModel(model, model.states, samples)
 
 
 def without_delay(model: Any) -> Any:
-    """Return an observer's model as it is without a delay of u, to which neither y nor f_L is subject."""
+    """Return an observer's model without its delay of u, which affects neither y nor f_L."""
     return model.inner if isinstance(model, DelayedModel) else model

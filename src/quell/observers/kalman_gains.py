@@ -1,13 +1,15 @@
 """The steady-state Kalman gain of the extended state observer, from variances.
 
-The extended model is taken to be driven by white noise: ``f' = w`` with the density ``drift``, ``x_n' = … + f + v`` with the density
-``jitter``, and y is measured with noise of the variance ``noise`` in each sample. Sampled exactly (Van Loan, *IEEE Trans. Automatic
-Control* 23, 1978)::
+White noise is assumed to drive the extended model: ``f' = w`` with the density ``drift``,
+``x_n' = … + f + v`` with the density ``jitter``. y is measured with noise of the variance ``noise``
+in each sample. Sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23, 1978)::
 
-    Q = ∫_0^dt exp(A s) G exp(Aᵀ s) ds,      P⁻ = Φ (P⁻ − P⁻ Cᵀ (C P⁻ Cᵀ + R)⁻¹ C P⁻) Φᵀ + Q,      L = P⁻ Cᵀ / (C P⁻ Cᵀ + R)
+    Q  = ∫_0^dt exp(A s) G exp(Aᵀ s) ds
+    P⁻ = Φ (P⁻ − P⁻ Cᵀ (C P⁻ Cᵀ + R)⁻¹ C P⁻) Φᵀ + Q,      L = P⁻ Cᵀ / (C P⁻ Cᵀ + R)
 
-With drift alone, and sampled fast, the poles lie in a Butterworth pattern of the radius ``(drift/(noise dt))^(1/2N)`` (symmetric root
-locus of a chain of N integrators; Anderson & Moore, *Optimal Control*, 1990).
+With drift alone and fast sampling, the poles lie in a Butterworth pattern of the radius
+``(drift/(noise dt))^(1/2N)`` (symmetric root locus of a chain of N integrators; Anderson & Moore,
+*Optimal Control*, 1990).
 """
 
 from __future__ import annotations
@@ -21,19 +23,21 @@ from quell.types import Matrix, Vector
 def kalman_gain(
     A: Matrix, dt: float, noise: float, drift: float, jitter: float
 ) -> tuple[Vector, float]:
-    """Return L (N,), in the coordinates of ``A`` (N, N), whose last state is f, and the geometric mean of ``|ln z_i|/dt`` [rad/s].
+    """Return L (N,) and the geometric mean of ``|ln z_i|/dt`` over the poles [rad/s].
 
-    Solved in units of time of the Butterworth pattern's, where neither Φ nor Q nor P has entries of very different size.
+    L is in the coordinates of ``A`` (N, N), whose last state is f. The equation is solved in the
+    time unit of the Butterworth pattern, where the entries of Φ, Q and P have similar sizes.
 
     Raises
     ------
     ValueError
-        where the variances are so far apart that no solution is found.
+        if the variances are so far apart that no solution is found.
     """
     from scipy.linalg import solve_discrete_are
 
     size = A.shape[0]
-    # In sensible units q/(r dt) is the bandwidth to the power 2N; jitter alone would make a pattern of 2n. Take the faster.
+    # With drift alone q/(r dt) is the bandwidth to the power 2N, with jitter alone to the power
+    # 2n. Take the faster one.
     density = noise * dt
     omega = max((drift / density) ** (0.5 / size), (jitter / density) ** (0.5 / (size - 1)))
     scale = omega ** -np.arange(size, dtype=np.float64)
@@ -49,16 +53,15 @@ def kalman_gain(
     except (np.linalg.LinAlgError, ValueError):
         P = np.full((size, size), np.nan)
     gain = P[:, 0] / (P[0, 0] + R[0, 0])
-    poles = (
-        np.linalg.eigvals((np.eye(size) - np.outer(gain, C)) @ phi)
-        if np.all(np.isfinite(gain))
-        else np.array([np.inf])
-    )
+    poles = np.array([np.inf])
+    if np.all(np.isfinite(gain)):
+        poles = np.linalg.eigvals((np.eye(size) - np.outer(gain, C)) @ phi)
     with np.errstate(divide="ignore"):
         rate = float(np.exp(np.mean(np.log(np.abs(np.log(poles.astype(complex)))))))
     if not (np.max(np.abs(poles)) < 1.0 and rate < np.pi):
         raise ValueError(
-            f"noise_variance = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with dt = {dt!r} s: no steady-state gain is found; "
-            f"they ask for about {omega:.3g} rad/s, which should be between 1e-3/dt and 1/dt"
+            f"noise_variance = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with "
+            f"dt = {dt!r} s: no steady-state gain is found; they ask for about {omega:.3g} rad/s, "
+            "which should be between 1e-3/dt and 1/dt"
         )
     return np.asarray(gain / scale), rate / dt

@@ -1,26 +1,32 @@
 """Han's nonlinear extended state observer: a correction that grows slower than its error.
 
-Han, "From PID to active disturbance rejection control", *IEEE Trans. Industrial Electronics* 56, 2009, with his ``fal``::
+Han, "From PID to active disturbance rejection control", *IEEE Trans. Industrial Electronics* 56,
+2009, with his ``fal``::
 
     fal(e, α, δ) = e / δ^(1−α)         |e| ≤ δ
                    |e|^α sign e        |e| > δ
 
-His observer is of Euler's kind; here the model is sampled exactly, as for the linear one, and only the correction is nonlinear::
+Han integrates by Euler's method. Here the model is sampled exactly, as for the linear observer, and
+only the correction is nonlinear::
 
     z⁻ = Φ z + Γ_u u + Γ_f f_L,      e = y − z⁻_1,      z_i = z⁻_i + L_i δ^(1−α_i) fal(e, α_i, δ)
 
-The factor makes the correction ``L_i e`` within ±δ, whatever α: there it is the linear observer of the bandwidth omega_o, and with α = 1
-it is that everywhere. Outside it corrects less: an outlier, or a start far off, is answered more gently. Han's gains are
-``β_i = L_i δ^(1−α_i) / dt``.
+Within ±δ the correction is ``L_i e`` for any α: the linear observer of the bandwidth omega_o. With
+α = 1 it is linear everywhere. Beyond δ it corrects less, so it responds less to an outlier or to a
+wrong initial state. Han's gains are ``β_i = L_i δ^(1−α_i) / dt``.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.observers.base import begin, begin_at, observe, predict_state
+from quell.observers.linear import EsoModel
 from quell.types import Matrix, Vector
 
 
@@ -48,7 +54,10 @@ class NonlinearModel(NamedTuple):
 
 @kernel
 def fal(error: float, alpha: float, delta: float) -> float:
-    """Return Han's ``fal``: the power α of an error, signed, and linear within ±δ, where the power's slope would be without bound."""
+    """Return Han's ``fal``: ``|error|^alpha`` with the sign of ``error``, but linear within ±δ.
+
+    The slope of the power alone would be unbounded at zero.
+    """
     size = abs(error)
     if size <= delta:
         return float(error / delta ** (1.0 - alpha))
@@ -57,19 +66,28 @@ def fal(error: float, alpha: float, delta: float) -> float:
 
 @observe.register(NonlinearModel)
 def _observe(
-    model: NonlinearModel, z: Vector, seen: Vector, y: float, u: float, f_learned: float
+    model: NonlinearModel, z: Vector, estimate: Vector, y: float, u: float, f_learned: float
 ) -> None:
-    predict_state(model, z, seen, u, f_learned)
-    error = y - seen[0]
+    predict_state(model, z, estimate, u, f_learned)
+    error = y - estimate[0]
     for i in range(z.size):
-        seen[i] += (
+        estimate[i] += (
             model.gain[i]
             * model.delta ** (1.0 - model.alpha[i])
             * fal(error, model.alpha[i], model.delta)
         )
-        z[i] = seen[i]
+        z[i] = estimate[i]
 
 
 @begin.register(NonlinearModel)
-def _begin(model: NonlinearModel, z: Vector, seen: Vector, y: float) -> None:
-    begin_at(z, seen, y)
+def _begin(model: NonlinearModel, z: Vector, estimate: Vector, y: float) -> None:
+    begin_at(z, estimate, y)
+
+
+def nonlinear_model(linear: EsoModel, delta: float, alpha: Any) -> NonlinearModel:
+    """Return the nonlinear observer that is ``linear`` within ±delta; see ``ESO.nonlinear``."""
+    delta, size = checks.positive("delta", delta, "y-unit"), linear.states
+    powers = 0.5 ** np.arange(float(size)) if alpha is None else checks.vector("alpha", alpha, size)
+    if not np.all((powers > 0.0) & (powers <= 1.0)):
+        raise ValueError(f"alpha = {alpha!r}: each entry must be above 0 and at most 1")
+    return NonlinearModel(linear.transition, linear.input, linear.feed, linear.gain, powers, delta)

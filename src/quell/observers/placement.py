@@ -1,4 +1,4 @@
-"""Where the poles of an observer go, and the gain that puts them there."""
+"""Pole placement for observers, in terms of ``1 − pole`` to keep full precision near z = 1."""
 
 from __future__ import annotations
 
@@ -7,27 +7,29 @@ import numpy as np
 from quell.types import Matrix, Vector
 
 
-def place_poles(difference: Matrix, rises: Vector) -> Vector:
-    """Return L that puts the eigenvalues of ``(I − L C) Φ``, with C = (1, 0, …), at ``1 − rises`` (Ackermann's formula).
+def place_poles(difference: Matrix, offsets: Vector) -> Vector:
+    """Return L that puts the eigenvalues of ``(I − L C) Φ``, C = (1, 0, …), at ``1 − offsets``.
 
-    ``L = Π (Φ − β_i I) O⁻¹ e_N`` with the rows ``C Φ (Φ − I)^i`` for O: differences instead of powers leave ``O⁻¹ e_N`` as it is
-    and make O triangular for a chain of integrators, where powers would be nearly parallel. They are taken over the largest rise, which
-    makes them O(1) too.
+    Ackermann's formula: ``L = Π (Φ − β_i I) O⁻¹ e_N`` with the rows ``C Φ (Φ − I)^i`` for O.
+    Differences instead of powers do not change ``O⁻¹ e_N`` and make O triangular for a chain of
+    integrators, where powers would be nearly parallel. Dividing by the largest offset makes them
+    O(1).
 
     Parameters
     ----------
     difference
-        ``Φ − I`` (N, N), in coordinates of the observer's own time, so that divided by the largest rise it is O(1).
-    rises
+        ``Φ − I`` (N, N), in the coordinates of the observer's own time, so that it is O(1) after
+        division by the largest offset.
+    offsets
         ``1 − β_i`` (N,), complex ones in conjugate pairs.
 
     Returns
     -------
     array
-        L (N,); NaN where Φ can't be observed through C.
+        L (N,); NaN if Φ can't be observed through C.
     """
     size = difference.shape[0]
-    unit = np.max(np.abs(rises))
+    unit = np.max(np.abs(offsets))
     rate = difference / unit
     rows = np.empty((size, size))
     rows[0] = difference[0]
@@ -38,31 +40,32 @@ def place_poles(difference: Matrix, rises: Vector) -> Vector:
         vector = np.linalg.solve(rows, np.eye(size)[-1])
     except np.linalg.LinAlgError:
         return np.full(size, np.nan)
-    for rise in rises / unit:
-        vector = rate @ vector + rise * vector
+    for offset in offsets / unit:
+        vector = rate @ vector + offset * vector
     gain: Vector = unit * np.real(vector)
     return gain
 
 
 def sampled_zeros(difference: Matrix, zeros: Vector, dt: float) -> Vector:
-    """Return ``1 − ζ`` for the zeros ζ, in the z-plane, that f has to y because the plant has ``zeros`` [rad/s] from f.
+    """Return ``1 − ζ`` for the z-plane zeros ζ from f to y that belong to the plant's ``zeros``.
 
-    They are near ``exp(zeros dt)``, among the finite eigenvalues of the pencil ``[[Φ − I − λ I, Γ], [C, 0]]`` with ``λ = ζ − 1``; its
-    others come with the sampling. Γ is the last column of Φ, which is what a held f does.
+    They are close to ``exp(zeros dt)`` among the finite eigenvalues of the pencil
+    ``[[Φ − I − λ I, Γ], [C, 0]]`` with ``λ = ζ − 1``; the others are due to sampling. Γ, the
+    response to a held f, is the last column of Φ.
 
     Parameters
     ----------
     difference
         ``Φ − I`` of the extended model (N, N), as for ``place_poles``; its last state is f.
     zeros
-        some of the plant's zeros from f, complex ones in conjugate pairs.
+        some of the plant's zeros from f [rad/s], complex ones in conjugate pairs.
     dt
         sample time [s].
 
     Returns
     -------
     array
-        as many, to be used as ``rises``.
+        of the same size, for the ``offsets`` of ``place_poles``.
     """
     from scipy.linalg import eigvals
 
@@ -71,9 +74,9 @@ def sampled_zeros(difference: Matrix, zeros: Vector, dt: float) -> Vector:
     pencil[-1] = np.eye(size)[0]
     found = eigvals(pencil, np.diag(np.append(np.ones(size - 1), 0.0)))
     found = found[np.isfinite(found)]
-    rises = np.empty(zeros.size, dtype=complex)
+    offsets = np.empty(zeros.size, dtype=complex)
     for i, zero in enumerate(zeros):
         nearest = int(np.argmin(np.abs(found - np.expm1(zero * dt))))
-        rises[i] = -found[nearest]
+        offsets[i] = -found[nearest]
         found = np.delete(found, nearest)
-    return rises
+    return offsets

@@ -71,7 +71,13 @@ def samples_to_settle(observer: ESO) -> int:
     """Return the number of samples after which the observer's initial state has no effect; poles kept at slow zeros count."""
     samples = _TIME_CONSTANTS * observer.lag_time / observer.dt
     if not isinstance(without_delay(observer.model), NonlinearModel):
-        slowest = float(np.max(np.abs(np.linalg.eigvals(scaled_response(observer).transition))))
+        slowest = float(
+            np.max(
+                np.abs(
+                    np.linalg.eigvals(scaled_response(observer.model, observer.units).transition)
+                )
+            )
+        )
         samples = (
             max(samples, _TIME_CONSTANTS / -math.log(slowest)) if 0.0 < slowest < 1.0 else samples
         )

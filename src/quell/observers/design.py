@@ -1,0 +1,141 @@
+"""Design of the linear extended state observer: exact sampling and pole placement.
+
+Extended model (paper eqs. (eq_2) and (eq.leso)), states ``z = (x̂_1 … x̂_n, Δf̂)``::
+
+    x_i' = x_{i+1},    x_n' = −a·x + b0 u + f_L + Δf,    Δf' = 0
+
+For a plant with zeros, the observable canonical form ``z' = Ā z + B̄ u + Ē (f_L + Δf)`` of
+``lti/canonical.py`` replaces the first two. It is sampled exactly with zero-order hold.
+
+All eigenvalues of ``(I − L C) Φ`` lie at ``exp(−omega_o dt)`` (the bandwidth parametrisation of
+Gao, ACC 2003, in the z-plane as in Miklosovic, Radke & Gao, ACC 2006). The *reduced* form is the
+current form with one pole at z = 0: ``L_1 = 1`` and ``x̂_1 = y``; the other n poles are those of
+the reduced-order observer, at ``exp(−omega_o dt)``.
+
+With *half gain* the correction is L/2: nearly the same loop for half the gain from noise (Herbst,
+Hempel, Göhrt & Streif, IFAC World Congress 2020, arXiv 2003.03986; Herbst & Madonski, arXiv
+2211.07309).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from quell import checks
+from quell.lti.canonical import Canonical, format_roots
+from quell.lti.discretize import zero_order_hold
+from quell.observers.linear import EsoModel
+from quell.observers.placement import place_poles, sampled_zeros
+from quell.types import Vector
+
+FORMS = ("current", "predictor", "reduced")
+# In the coordinates of the design useful gains are at most O(1); far above, rounding decides where
+# the poles are. Chosen by hand; not tuned further.
+_LARGEST_GAIN = 1e6
+
+
+def design_model(
+    plant: Canonical,
+    b0: float,
+    omega_o: float,
+    dt: float,
+    *,
+    form: str,
+    half_gain: bool,
+    keep_zeros: bool,
+) -> EsoModel:
+    """Return the update of the observer of ``plant`` with the bandwidth ``omega_o``.
+
+    Raises
+    ------
+    ValueError
+        for a ``form`` that does not exist or does not go with ``half_gain``, and for a bandwidth
+        that ``dt`` does not allow.
+    """
+    checks.one_of("form", form, FORMS)
+    if omega_o * dt >= math.pi:
+        raise ValueError(
+            f"omega_o = {omega_o!r} rad/s with dt = {dt!r} s: omega_o * dt = {omega_o * dt:.3g} "
+            "must be below pi, half the sampling rate; lower omega_o or dt"
+        )
+    if checks.flag("half_gain", half_gain) and form == "reduced":
+        raise ValueError(
+            "half_gain = True with form = 'reduced': half the gain is not of reduced order; "
+            "use form='current'"
+        )
+    kept = np.zeros(0)
+    if keep_zeros and plant.matched:
+        kept = plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)]
+    model = _sampled_design(plant, b0, omega_o, dt, form, kept)
+    return model._replace(gain=0.5 * model.gain) if half_gain else model
+
+
+def _sampled_design(
+    plant: Canonical, b0: float, omega_o: float, dt: float, form: str, kept: Vector
+) -> EsoModel:
+    """Sample the extended model and place the poles; ``kept`` are plant zeros that keep a pole.
+
+    The model is sampled in the coordinates ``x_i dt^(i−1)`` and ``f dt^q``, where all entries are
+    O(1). The poles are placed in the coordinates ``x_i/omega_o^(i−1)``, ``f/omega_o^q``. There Φ is
+    close to I, but ``Φ − I`` has full precision because it is computed as ``∫ e^(A t) A dt``.
+    """
+    n, q = plant.a.size, plant.f_degree
+    size = n + 1
+    power = np.append(np.arange(n), q)
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+        A = np.diag(np.ones(size - 1), 1)
+        A[-2, :-1] -= plant.a * dt ** (n - np.arange(n))
+        A[:-1, -1] = plant.E * dt ** (np.arange(n) + 1.0 - q)
+        inputs = np.zeros((size, 2))
+        inputs[:-1, 0] = plant.B / plant.b * dt ** (np.arange(n) + 1.0 - plant.degree)
+        inputs[:, 1] = A[:, -1]
+        phi, (difference, gammas) = zero_order_hold(A, [A, inputs], 1.0)
+        step = omega_o * dt
+        gain = np.full(size, np.nan)
+        if np.all(np.isfinite(phi)):
+            difference *= step ** (power[None, :] - power[:, None])
+            offsets = np.full(size, -math.expm1(-step), dtype=complex)
+            offsets[: kept.size] = sampled_zeros(difference, kept, dt)
+            if form == "reduced":
+                offsets[-1] = 1.0
+            gain = place_poles(difference, offsets) * step**power
+            if form == "reduced" and np.isfinite(gain[0]):
+                gain[0] = 1.0  # exactly; it differs from 1 only by rounding
+    if not np.all(np.abs(gain) < _LARGEST_GAIN):
+        fastest = np.max(np.abs(np.roots([1.0, *plant.a[::-1]])), initial=0.0)
+        zeros = f" or its zeros at {format_roots(plant.zeros)} rad/s" if plant.zeros.size else ""
+        raise ValueError(
+            f"dt = {dt!r} s: too long (or omega_o = {omega_o!r} rad/s too small) for the plant's "
+            f"fastest pole of {fastest:.3g} rad/s{zeros}; the sampled model cannot be observed"
+        )
+    # Back to the plant's coordinates; an input enters with the power of dt of its relative degree.
+    scale = dt**power
+    return EsoModel(
+        transition=np.ascontiguousarray(phi * scale[None, :] / scale[:, None]),
+        input=b0 * (gammas[:, 0] * dt**plant.degree / scale),
+        feed=gammas[:, 1] * dt**q / scale,
+        gain=gain / scale,
+        predictor=form == "predictor",
+    )
+
+
+def continuous_gain(a: Vector, omega_o: float) -> Vector:
+    """Return the gain ``l`` (N,) of the continuous-time ESO with all poles at ``−omega_o``.
+
+    With ``α_i`` the coefficients of ``(s + omega_o)^N`` and
+    ``y^(n) + a_{n−1} y^(n−1) + … = f``, comparing powers of s in ``det(sI − A + lC)`` gives, with
+    ``l_0 = 1``::
+
+        l_i = α_i − Σ_{j<i} a_{n−i+j} l_j   for i = 1 … n,        l_N = omega_o^N
+
+    The paper's Table I has another ``l_5`` (docs/theory, errata). Sampled designs do not use this
+    gain; it is the limit of their ``L/dt``.
+    """
+    n = a.size
+    ell = np.ones(n + 2)
+    for i in range(1, n + 1):
+        ell[i] = math.comb(n + 1, i) * omega_o**i - sum(a[n - i + j] * ell[j] for j in range(i))
+    ell[n + 1] = omega_o ** (n + 1)
+    return ell[1:]

@@ -1,0 +1,55 @@
+"""The update of the linear extended state observer.
+
+Each sample, with the exactly sampled extended model ``Φ, Γ_u, Γ_f``::
+
+    predict   z⁻ = Φ z + Γ_u u + Γ_f f_L          u: the control signal that was applied
+    correct   z  = z⁻ + L (y − z⁻_1)
+
+The *current* form hands ``z`` to the controller. The *predictor* form hands it ``z⁻``, which knows
+y only up to the sample before: one sample of delay more, with the same poles.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from quell.observers.base import begin, begin_at, observe, predict_state
+from quell.types import Matrix, Vector
+
+
+class EsoModel(NamedTuple):
+    """Parameters of the update for order n, with N = n + 1 states."""
+
+    transition: Matrix
+    """Φ (N, N)."""
+    input: Vector
+    """Γ_u (N,)."""
+    feed: Vector
+    """Γ_f (N,)."""
+    gain: Vector
+    """L (N,)."""
+    predictor: bool
+    """Whether the controller gets z⁻ instead of z."""
+
+    @property
+    def states(self) -> int:
+        """Length of the running state."""
+        return int(self.gain.size)
+
+
+@observe.register(EsoModel)
+def _observe(
+    model: EsoModel, z: Vector, estimate: Vector, y: float, u: float, f_learned: float
+) -> None:
+    predict_state(model, z, estimate, u, f_learned)
+    error = y - estimate[0]
+    for i in range(z.size):
+        z[i] = estimate[i] + model.gain[i] * error
+    if not model.predictor:
+        for i in range(z.size):
+            estimate[i] = z[i]
+
+
+@begin.register(EsoModel)
+def _begin(model: EsoModel, z: Vector, estimate: Vector, y: float) -> None:
+    begin_at(z, estimate, y)
