@@ -89,7 +89,7 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
         ("[observer]\nb0 = 'one'", "observer.b0 = 'one': must be a number"),
         ("[controller]\nfeedforward = 1", "controller.feedforward = 1: must be true or false"),
         ("[controller]\nomega_c = true", "controller.omega_c = True: must be a number"),
-        ("[observer]\ndt = 0.01", "observer.dt: unknown; dt has its place at the top of the file"),
+        ("[observer]\ndt = 0.01", "observer.dt: unknown; dt belongs at the top of the file"),
         (
             "[controller]\nlearner = 'rls'",
             "controller.learner: unknown; [learner] is a table of its own",
@@ -144,7 +144,7 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
         ),
         (
             "[controller]\nkind = 'pid'\nkp = 1.0",
-            "observer: a controller of the kind pid has no use for it",
+            "observer: a controller of the kind pid does not use it",
         ),
     ],
 )
@@ -216,7 +216,7 @@ def test_every_learner_that_numbers_suffice_for_has_a_kind() -> None:
     }
     for kind, table in LEARNERS.items():
         learner = setup(f"learner = '{kind}'").controller.learner
-        assert type(learner) is table.make
+        assert type(learner) is table.function
         assert hasattr(ql.learners, type(learner).__name__)
 
 

@@ -1,4 +1,4 @@
-"""From tables to objects."""
+"""A builder: objects from tables."""
 
 from __future__ import annotations
 
@@ -8,80 +8,79 @@ from functools import partial, reduce
 from operator import add
 from typing import Any
 
-from quell.features import Features
-from quell.setup.errors import SetupError, refused
-from quell.setup.schema import Call
-from quell.signals import Signal
+from quell.features.base import Features
+from quell.setup.errors import SetupError, with_path
+from quell.setup.schema import CallTable
+from quell.signals.base import Signal
 
-# Where a plant is a model of one.
+# Keys whose plant is a model: only its linear part is used.
 _MODELS = ("observer.plant", "controller.plant")
 
 
 def linear_part(plant: Any) -> Any:
-    """Return what of a plant can be designed for: of one with friction, say, what it is without."""
+    """Return the part of a plant that a design can use, for example the one without friction."""
     return getattr(plant, "linear", plant)
 
 
 class Builder:
-    """Builds the tables of one file, whose ``name`` is in front of what they are refused for."""
+    """A builder of the tables of one file, whose ``name`` stands at the beginning of its errors."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def build(self, table: Call, path: str, **context: Any) -> Any:
-        """Return what the call that a table is returns.
+    def build(self, table: CallTable, path: str, **context: Any) -> Any:
+        """Return the object that a table describes.
 
         Parameters
         ----------
         table
-            what to build.
+            the table.
         path
-            where it stands in the file.
+            its path in the file.
         **context
-            what the rest of the file has for it; it is given what it takes and does not have
-            itself. What is None is not there.
+            objects of other tables. Those that the table's function takes, and that the table does
+            not have itself, become arguments; None stands for a missing one.
 
         Raises
         ------
         SetupError
-            for what the call refuses, and for what it lacks.
+            for a value that the function refuses, and for an argument that is missing.
         """
-        takes = inspect.signature(table.make).parameters
+        takes = inspect.signature(table.function).parameters
         arguments = {
             key: value for key, value in context.items() if key in takes and value is not None
         }
         inner = {"dt": context["dt"]} if "dt" in context else {}
-        arguments |= {
-            key: self._value(value, f"{path}.{key}", key != "disturbances", inner)
-            for key, value in table.given().items()
-        }
+        for key, value in table.written().items():
+            arguments[key] = self._value(value, f"{path}.{key}", key != "disturbances", inner)
         for key, parameter in takes.items():
+            optional = parameter.default is not parameter.empty
             if (
                 key not in arguments
-                and parameter.default is parameter.empty
+                and not optional
                 and parameter.kind is not parameter.VAR_KEYWORD
             ):
                 raise SetupError([f"{self.name}: {path}: {key} is missing; give a table [{key}]"])
-        return self.attempt(path, [*arguments], partial(table.make, **arguments))
+        return self.attempt(path, [*arguments], partial(table.function, **arguments))
 
     def attempt(
         self, path: str, keys: Sequence[str], action: Callable[..., Any], *arguments: Any
     ) -> Any:
-        """Return what ``action`` returns; what it refuses is told with the path, and the key where it begins with one of ``keys``.
+        """Return ``action(*arguments)``; an error names the path and, if possible, the key.
 
         Raises
         ------
         SetupError
-            in the place of a ``ValueError``.
+            in place of a ``ValueError``.
         """
         try:
             return action(*arguments)
         except ValueError as error:
-            raise refused(self.name, path, error, keys) from None
+            raise with_path(self.name, path, error, keys) from None
 
-    def _value(self, value: Any, path: str, joined: bool, context: dict[str, Any]) -> Any:
-        """Build the tables in a value; features and signals in a list are added up where they are ``joined``."""
-        if isinstance(value, Call):
+    def _value(self, value: Any, path: str, add_up: bool, context: dict[str, Any]) -> Any:
+        """Build the tables in a value; add up the features or signals of a list if ``add_up``."""
+        if isinstance(value, CallTable):
             built = self.build(value, path, **context)
             return linear_part(built) if path in _MODELS else built
         if not isinstance(value, tuple):
@@ -89,6 +88,6 @@ class Builder:
         parts = tuple(
             self._value(part, f"{path}[{i}]", True, context) for i, part in enumerate(value)
         )
-        if not (joined and any(isinstance(part, Features | Signal) for part in parts)):
-            return parts
-        return self.attempt(path, (), reduce, add, parts)
+        if add_up and any(isinstance(part, Features | Signal) for part in parts):
+            return self.attempt(path, (), reduce, add, parts)
+        return parts

@@ -1,4 +1,4 @@
-"""A setup file as tables: what stands in it, before anything is built of it."""
+"""The tables of a setup file, before anything is built of them."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, ValidationError
 
-from quell.setup.errors import SetupError, mistakes
+from quell.setup.errors import SetupError, from_validation
 from quell.setup.schema import Table
 
-if TYPE_CHECKING:  # they are made of signatures, which a type checker does not read
-    from quell.setup.schema import Call as Controller
-    from quell.setup.schema import Call as Guard
-    from quell.setup.schema import Call as Learner
-    from quell.setup.schema import Call as Metrics
-    from quell.setup.schema import Call as Observer
-    from quell.setup.schema import Call as Plant
-    from quell.setup.schema import Call as Prefilter
-    from quell.setup.schema import Call as Rig
-    from quell.setup.schema import Call as Scenario
+if TYPE_CHECKING:  # these types are made at run time, which a type checker cannot follow
+    from quell.setup.schema import CallTable as Controller
+    from quell.setup.schema import CallTable as Guard
+    from quell.setup.schema import CallTable as Learner
+    from quell.setup.schema import CallTable as Metrics
+    from quell.setup.schema import CallTable as Observer
+    from quell.setup.schema import CallTable as Plant
+    from quell.setup.schema import CallTable as Prefilter
+    from quell.setup.schema import CallTable as Rig
+    from quell.setup.schema import CallTable as Scenario
 else:
     from quell.setup.registry import (
         Controller,
@@ -37,44 +37,35 @@ else:
     )
 
 
-class Description(Table):
-    """All that a setup file may hold."""
+def _optional(description: str) -> Any:
+    return Field(None, description=description)
 
-    title: str = Field(
-        "", description="what tables and figures call it; the file's name by default."
-    )
-    dt: float = Field(description="sample time of the loop [s], for all that has one.")
-    plant: Plant | None = Field(
-        None,
-        description="what is controlled, for `quell run`, and for observers that know a model.",
-    )
-    observer: Observer | None = Field(None, description="what an `adrc` controller needs.")
-    controller: Controller = Field(description="what controls.")
-    learner: Learner | None = Field(
-        None, description="what feeds forward what it has learned; none by default."
-    )
-    guard: Guard | None = Field(
-        None, description="what gives the learner the authority it has earned; none by default."
-    )
-    prefilter: Prefilter | None = Field(
-        None, description="what shapes the reference; none by default."
-    )
-    scenario: Scenario | None = Field(None, description="what happens.")
-    rig: Rig | None = Field(
-        None, description="the device, and the limits that keep it safe, for `quell run-rig`."
-    )
+
+class Description(Table):
+    """The tables and keys of a setup file."""
+
+    title: str = Field("", description="title of tables and figures; the file's name by default.")
+    dt: float = Field(description="sample time of the loop and all of its parts [s].")
+    plant: Plant | None = _optional("the plant, for `quell run` and observers with a model.")
+    observer: Observer | None = _optional("the observer of an `adrc` controller.")
+    controller: Controller = Field(description="the controller.")
+    learner: Learner | None = _optional("the learner; none by default.")
+    guard: Guard | None = _optional("the guard of the learner; none by default.")
+    prefilter: Prefilter | None = _optional("the prefilter of the reference; none by default.")
+    scenario: Scenario | None = _optional("the scenario.")
+    rig: Rig | None = _optional("the device and its safety limits, for `quell run-rig`.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which the response is judged."
     )
 
 
 def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
-    """Return a TOML file's name, for messages, and what it holds.
+    """Return the name of a TOML file, for messages, and its content.
 
     Raises
     ------
     SetupError
-        for a file that can't be read, or is not TOML.
+        for a file that cannot be read, or is not TOML.
     """
     name = Path(path).name
     try:
@@ -90,24 +81,24 @@ def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
 
 
 def describe(name: str, data: Mapping[str, Any]) -> Description:
-    """Return the tables of ``data``.
+    """Return the tables of ``data``, the content of the file ``name``.
 
     Raises
     ------
     SetupError
-        with a line for each mistake.
+        with a line for each error.
     """
-    whole = _as_python(data)
+    values = _immutable(data)
     try:
-        return Description.model_validate(whole)
+        return Description.model_validate(values)
     except ValidationError as error:
-        raise mistakes(name, error, whole) from None
+        raise from_validation(name, error, values) from None
 
 
-def _as_python(value: Any) -> Any:
-    """Return the same with tuples in the place of lists, as nothing that is built shall change, and None in that of the text none."""
+def _immutable(value: Any) -> Any:
+    """Return a value with tuples in place of lists, and None in place of the text ``none``."""
     if isinstance(value, Mapping):
-        return {key: _as_python(part) for key, part in value.items()}
+        return {key: _immutable(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return tuple(_as_python(part) for part in value)
+        return tuple(_immutable(part) for part in value)
     return None if value == "none" else value

@@ -1,4 +1,4 @@
-"""What docstrings say of a call and of its parameters."""
+"""Descriptions from docstrings: of a function, and of its parameters."""
 
 from __future__ import annotations
 
@@ -7,36 +7,35 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-
-def summary(call: Callable[..., Any]) -> str:
-    """Return the first sentence, or paragraph, of a docstring."""
-    return " ".join((inspect.getdoc(call) or "").split("\n\n")[0].split())
-
-
-def described(call: Callable[..., Any]) -> dict[str, str]:
-    """Return what the section "Parameters" says of each, by name; a class's bases are asked for what it leaves out."""
-    if isinstance(call, type):
-        told: dict[str, str] = {}
-        for cls in reversed(call.__mro__[:-1]):
-            told |= _section(inspect.cleandoc(cls.__dict__.get("__doc__") or ""))
-        return told
-    return _section(inspect.getdoc(call) or "")
+# A line of names, and the indented lines that describe them.
+_ENTRY = re.compile(r"^(\S[^\n]*)\n((?:[ ]+[^\n]*\n?|\n)+)", re.MULTILINE)
+_PARAMETERS = re.compile(r"^Parameters\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", re.MULTILINE | re.DOTALL)
 
 
-def refers(text: str) -> bool:
-    """Tell whether what a docstring says of a parameter is that another one says it."""
-    return text.startswith("as for")
+def summary(function: Callable[..., Any]) -> str:
+    """Return the first paragraph of a docstring."""
+    return " ".join((inspect.getdoc(function) or "").split("\n\n")[0].split())
 
 
-def _section(text: str) -> dict[str, str]:
-    match = re.search(
-        r"^Parameters\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL
-    )
-    told: dict[str, str] = {}
-    if match:
-        for names, words in re.findall(
-            r"^(\S[^\n]*)\n((?:[ ]+[^\n]*\n?|\n)+)", match[1] + "\n", re.MULTILINE
-        ):
-            for name in names.split(","):
-                told[name.strip().lstrip("*")] = " ".join(re.sub(r"\s*\[\d+\]_", "", words).split())
-    return told
+def parameter_descriptions(function: Callable[..., Any]) -> dict[str, str]:
+    """Return the description of each parameter; a class inherits those of its bases."""
+    if not isinstance(function, type):
+        return _parameters(inspect.getdoc(function) or "")
+    found: dict[str, str] = {}
+    for cls in reversed(function.__mro__[:-1]):
+        found |= _parameters(inspect.cleandoc(cls.__dict__.get("__doc__") or ""))
+    return found
+
+
+def is_reference(description: str) -> bool:
+    """Return whether a description only refers to another one."""
+    return description.startswith("as for")
+
+
+def _parameters(docstring: str) -> dict[str, str]:
+    section = _PARAMETERS.search(docstring)
+    return {
+        name.strip().lstrip("*"): " ".join(re.sub(r"\s*\[\d+\]_", "", text).split())
+        for names, text in (_ENTRY.findall(section[1] + "\n") if section else ())
+        for name in names.split(",")
+    }

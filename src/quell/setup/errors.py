@@ -1,4 +1,4 @@
-"""One line for each mistake in a setup file: the file, the key's path, the value and the rule, or the known name that is nearest."""
+"""Errors of a setup file: one line each, with file, path of the key, value and rule."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from quell.setup.schema import CONTEXT
 
-# What pydantic calls a value of the wrong type, and what should be there.
+# Pydantic's names of type errors, and the type that is expected.
 _TYPES = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -22,35 +22,38 @@ _TYPES = {
 
 
 class SetupError(ValueError):
-    """A setup that can not be used; ``mistakes`` has a line for each."""
+    """A setup that cannot be used; ``mistakes`` has a line for each error."""
 
     def __init__(self, mistakes: Sequence[str]) -> None:
         super().__init__("\n".join(mistakes))
         self.mistakes = tuple(mistakes)
 
 
-def refused(name: str, path: str, error: Exception, keys: Sequence[str]) -> SetupError:
-    """Return what a constructor says of its arguments with the path of their table in front, and of the key where it begins with one."""
-    said = " ".join(str(error).split())
-    begins = any(said.startswith((f"{key} ", f"{key}[", f"{key}:")) for key in keys)
-    return SetupError([f"{name}: {path}{'.' if begins and path else ': ' if path else ''}{said}"])
+def with_path(name: str, path: str, error: Exception, keys: Sequence[str]) -> SetupError:
+    """Return an error with the file's name and the path in front.
+
+    The path includes the key that the message begins with, where that is one of ``keys``.
+    """
+    text = " ".join(str(error).split())
+    begins = any(text.startswith((f"{key} ", f"{key}[", f"{key}:")) for key in keys)
+    return SetupError([f"{name}: {path}{'.' if begins and path else ': ' if path else ''}{text}"])
 
 
-def mistakes(name: str, error: ValidationError, data: Any) -> SetupError:
-    """Return what is wrong with the tables and keys of the file ``name``, which holds ``data``."""
+def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
+    """Return the errors in the tables and keys of the file ``name``, which holds ``data``."""
     lines: list[str] = []
-    wanted: dict[str, list[str]] = {}
+    expected: dict[str, list[str]] = {}
     for found in error.errors():
         kind, value, context = found["type"], found["input"], found.get("ctx", {})
         path = _path(found["loc"], data, absent=kind == "missing")
         if kind in _TYPES:
             one_of_many = kind == "tuple_type" and isinstance(value, Mapping)
-            wanted.setdefault(f"{path} = {_short(value)}: must be", []).append(
+            expected.setdefault(f"{path} = {_short(value)}: must be", []).append(
                 f"[[{path}]]" if one_of_many else _TYPES[kind]
             )
         elif kind == "unknown":
             lines += [
-                f"{path}{'.' if path else ''}{key}: unknown; {_advice(key, context['known'])}"
+                f"{path}{'.' if path else ''}{key}: unknown; {_hint(key, context['known'])}"
                 for key in context["keys"]
             ]
         elif kind == "missing":
@@ -68,23 +71,20 @@ def mistakes(name: str, error: ValidationError, data: Any) -> SetupError:
             )
         else:
             lines.append(f"{path} = {_short(value)}: {found['msg']}")
-    lines += [f"{line} {' or '.join(dict.fromkeys(types))}" for line, types in wanted.items()]
+    lines += [f"{line} {' or '.join(dict.fromkeys(types))}" for line, types in expected.items()]
     return SetupError([f"{name}: {line}" for line in lines])
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
-    """Return ``did you mean …?`` for a name that is nearly one of the known, and all of them for one that is not."""
+    """Return ``did you mean …?`` with the nearest of the known names, or all of them."""
     near = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {near[0]}?" if near else f"must be one of {', '.join(known)}"
 
 
-def _advice(key: str, known: Sequence[str]) -> str:
+def _hint(key: str, known: Sequence[str]) -> str:
     if key in CONTEXT:
-        return (
-            f"{key} has its place at the top of the file"
-            if key == "dt"
-            else f"[{key}] is a table of its own"
-        )
+        top = f"{key} belongs at the top of the file"
+        return top if key == "dt" else f"[{key}] is a table of its own"
     return nearest(key, known)
 
 
@@ -94,7 +94,11 @@ def _tags(context: Mapping[str, Any]) -> list[str]:
 
 
 def _path(loc: Sequence[str | int], data: Any, absent: bool) -> str:
-    """Return a key's path in the file: its places less the names of choices, which are no keys of ``data``; the last may be absent."""
+    """Return the path of a key in the file, from the location that Pydantic reports.
+
+    A location also has the names of choices, which are no keys of ``data``. The last key may be
+    absent from ``data``.
+    """
     path = ""
     for i, step in enumerate(loc):
         if isinstance(data, Mapping) and (step in data or (absent and i + 1 == len(loc))):

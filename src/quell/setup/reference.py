@@ -1,4 +1,4 @@
-"""All keys of setup files, as tables for people: what the page of the documentation shows."""
+"""Tables of all keys of setup files in Markdown, for the documentation."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any, Union, get_args, get_origin
 
 from pydantic_core import PydanticUndefined
 
-from quell.setup.schema import Call, Table
+from quell.setup.schema import CallTable, Table
 
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
 
 def keys(of: type[Table]) -> list[tuple[str, str, str, str]]:
-    """Return name, type, default and meaning of each key of a table, but for ``kind``."""
+    """Return name, type, default and description of each key of a table, except ``kind``."""
     return [
         (key, _type(field.annotation), _default(field.default), field.description or "")
         for key, field in of.model_fields.items()
@@ -23,18 +23,18 @@ def keys(of: type[Table]) -> list[tuple[str, str, str, str]]:
 
 
 def table(of: type[Table]) -> str:
-    """Return the keys of a table in Markdown; nothing where there are none."""
+    """Return the keys of a table in Markdown; an empty text for a table without keys."""
     bar = r"\|"
     rows = [
-        f"| `{key}` | {kind} | {default} | {words.replace('|', bar)} |"
-        for key, kind, default, words in keys(of)
+        f"| `{key}` | {kind} | {default} | {text.replace('|', bar)} |"
+        for key, kind, default, text in keys(of)
     ]
     return "\n".join(
         ["| key | type | default | |", "|---|---|---|---|", *rows] if rows else []
     ).replace("``", "`")
 
 
-def markdown(kinds: Mapping[str, type[Call]]) -> str:
+def markdown(kinds: Mapping[str, type[CallTable]]) -> str:
     """Return the kinds of a table and their keys in Markdown."""
     return "\n\n".join(
         f"**`{kind}`** {of.__doc__}\n\n{table(of)}".replace("``", "`") for kind, of in kinds.items()

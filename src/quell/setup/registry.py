@@ -1,10 +1,11 @@
-"""Which kinds there are of each table, and what each of them calls."""
+"""The kinds of each table, and the function that each kind calls."""
 
 from __future__ import annotations
 
 import inspect
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from quell import features, guard, learners, signals
@@ -12,58 +13,57 @@ from quell.controllers import ADRC, LinearController, ReferenceModel, TrackingDi
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, NotchPID, ResonanceRatio, Shaper, notch
 from quell.observers import ESO
 from quell.plants import registry as plants
-from quell.realtime.loop import safety
 from quell.realtime.loop.run import run_rig
+from quell.realtime.loop.safety import Safety as RigSafety
 from quell.records.trajectory import Trajectory
-from quell.setup.schema import Call, call, list_of, one_of
+from quell.setup.schema import CallTable, call_table, list_of, one_of
 from quell.simulation.scenario import Scenario as SimulationScenario
 
 
 def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
-    """Return what ``quell run-rig`` closes a loop around, and how.
+    """Return the arguments of ``quell run-rig``.
 
     Parameters
     ----------
     device
-        URL of the device: ``udp://127.0.0.1:5005``, ``serial:///dev/ttyACM0``, ``ni://``, ``twin:torsional``, …
+        URL of the device: ``udp://127.0.0.1:5005``, ``serial:///dev/ttyACM0``, ``ni://``,
+        ``twin:torsional``, …
     live
         port at which Foxglove and PlotJuggler can watch, 8765 for instance; none by default.
     telemetry
-        files that the record is written to, ending in ``.mcap`` or ``.csv``; from the folder where the command is run.
+        files for the record, ending in ``.mcap`` or ``.csv``; relative to the folder where the
+        command is run.
     """
     return {"device": device, "live": live, **options}
 
 
-def _calls(
-    made: Mapping[str, Callable[..., Any]],
+def _call_tables(
+    functions: Mapping[str, Callable[..., Any]],
     types: Mapping[str, Any] | None = None,
-    words: Mapping[str, str] | None = None,
-) -> dict[str, type[Call]]:
-    return {kind: call(kind, make, types=types, words=words) for kind, make in made.items()}
+    descriptions: Mapping[str, str] | None = None,
+) -> dict[str, type[CallTable]]:
+    return {
+        kind: call_table(kind, function, types=types, descriptions=descriptions)
+        for kind, function in functions.items()
+    }
 
 
-def _discovered(room: Any, *methods: str, but: type | None = None) -> dict[str, Callable[..., Any]]:
-    """Return the public classes of a room that numbers suffice for: those whose parameters all have defaults."""
-    found: dict[str, Callable[..., Any]] = {}
-    for name in room.__all__:
-        cls = getattr(room, name)
-        if (
-            not isinstance(cls, type)
-            or cls is but
-            or not all(hasattr(cls, method) for method in methods)
-        ):
+def _public_classes(folder: Any, *methods: str, but: type | None = None) -> dict[str, Any]:
+    """Return the public classes of a folder whose parameters all have defaults, by kind."""
+    found = {}
+    for name in folder.__all__:
+        cls = getattr(folder, name)
+        if not isinstance(cls, type) or cls is but or not all(map(partial(hasattr, cls), methods)):
             continue
-        if all(
-            parameter.default is not parameter.empty
-            for parameter in inspect.signature(cls).parameters.values()
-        ):
+        parameters = inspect.signature(cls).parameters.values()
+        if all(parameter.default is not parameter.empty for parameter in parameters):
             kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()  # gaussian-process, nlms
             found[kind] = cls
     return found
 
 
-def _in_time(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
-    """Return what makes a signal of this class, with another one in its place from some time on."""
+def _switchable(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
+    """Return a function that makes a signal of a class, which may switch to another one."""
 
     def make(
         until: float | None = None, then: signals.Signal | float | None = None, **parameters: Any
@@ -73,7 +73,8 @@ def _in_time(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
             return signal
         if until is None or then is None:
             raise ValueError(
-                "only one of until and then: must be both, the time [s] and the signal or number that holds from it on"
+                "only one of until and then: must be both, "
+                "the time [s] and the signal or number that holds from it on"
             )
         return signal.until(until, then)
 
@@ -87,14 +88,16 @@ def _in_time(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
     return make
 
 
-# A plant may be in a plant, and a signal in a signal: their types are known by name until all of their tables are there.
-PLANTS = _calls(plants.PLANTS, {"plant": "Plant"})
-_IN_TIME = {
-    "until": "the end of it [s], where `then` takes over.",
-    "then": "the signal, or number, from `until` on.",
+# A plant may contain a plant, and a signal a signal: their types are names until all tables exist.
+PLANTS = _call_tables(plants.PLANTS, {"plant": "Plant"})
+_SWITCHING = {
+    "until": "time at which `then` takes over [s].",
+    "then": "signal or number from `until` on.",
 }
 SIGNALS = {
-    kind: call(kind, _in_time(cls), types={"then": "Signal | None"}, words=_IN_TIME)
+    kind: call_table(
+        kind, _switchable(cls), types={"then": "Signal | None"}, descriptions=_SWITCHING
+    )
     for kind, cls in signals.KINDS.items()
 }
 Plant: Any = one_of(PLANTS)
@@ -104,10 +107,10 @@ for _model in (*PLANTS.values(), *SIGNALS.values()):
 
 # A controller's or observer's own model of the plant.
 _MODEL = {
-    "plant": "a model of the plant; by default what [plant] has, less what is not linear in it.",
+    "plant": "model of the plant; by default the linear part of [plant].",
     "E": "how f enters; as u by default.",
 }
-OBSERVERS = _calls(
+OBSERVERS = _call_tables(
     {
         "model-free": ESO.model_free,
         "model-based": ESO.model_based,
@@ -118,27 +121,35 @@ OBSERVERS = _calls(
     {"plant": Plant | None},
     _MODEL,
 )
-FEATURES = _calls(_discovered(features, "design", "names", but=features.Features))
-LEARNERS = _calls(
-    _discovered(learners, "design", "memory"), {"features": list_of(one_of(FEATURES)) | None}
+FEATURES = _call_tables(_public_classes(features, "design", "names", but=features.Features))
+LEARNERS = _call_tables(
+    _public_classes(learners, "design", "memory"), {"features": list_of(one_of(FEATURES)) | None}
 )
-Notch = call("notch", notch.Notch.at, sole=True)
+Notch = call_table("notch", notch.Notch.at, only=True)
 CONTROLLERS = {
-    "adrc": call("adrc", ADRC),
-    "pid": call("pid", PID, passed_on=(LinearController,)),
-    "pid-simc": call("pid-simc", PID.simc, passed_on=(PID, LinearController)),
-    "pid-simc-double-integrator": call(
-        "pid-simc-double-integrator", PID.simc_double_integrator, passed_on=(PID, LinearController)
+    "adrc": call_table("adrc", ADRC),
+    "pid": call_table("pid", PID, forwards_to=(LinearController,)),
+    "pid-simc": call_table("pid-simc", PID.simc, forwards_to=(PID, LinearController)),
+    "pid-simc-double-integrator": call_table(
+        "pid-simc-double-integrator",
+        PID.simc_double_integrator,
+        forwards_to=(PID, LinearController),
     ),
-    "notch-pid": call(
-        "notch-pid", NotchPID, passed_on=(PID, LinearController), types={"notch": Notch}
+    "notch-pid": call_table(
+        "notch-pid", NotchPID, forwards_to=(PID, LinearController), types={"notch": Notch}
     ),
-    "lqg": call(
-        "lqg", LQG, passed_on=(LinearController,), types={"plant": Plant | None}, words=_MODEL
+    "lqg": call_table(
+        "lqg",
+        LQG,
+        forwards_to=(LinearController,),
+        types={"plant": Plant | None},
+        descriptions=_MODEL,
     ),
-    "resonance-ratio": call("resonance-ratio", ResonanceRatio, passed_on=(LinearController,)),
+    "resonance-ratio": call_table(
+        "resonance-ratio", ResonanceRatio, forwards_to=(LinearController,)
+    ),
 }
-PREFILTERS = _calls(
+PREFILTERS = _call_tables(
     {
         "reference-model": ReferenceModel,
         "tracking-differentiator": TrackingDifferentiator,
@@ -149,20 +160,20 @@ PREFILTERS = _calls(
 )
 Observer, Learner, Prefilter = one_of(OBSERVERS), one_of(LEARNERS), one_of(PREFILTERS)
 Controller = one_of(CONTROLLERS, default="adrc")
-Guard = call("guard", guard.Guard, sole=True)
-Scenario = call(
+Guard = call_table("guard", guard.Guard, only=True)
+Scenario = call_table(
     "scenario",
     SimulationScenario,
-    sole=True,
+    only=True,
     types={"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)},
 )
-Metrics = call("metrics", Trajectory.metrics, sole=True)
-Safety = call("safety", safety.Safety, sole=True)
-Rig = call(
+Metrics = call_table("metrics", Trajectory.metrics, only=True)
+Safety = call_table("safety", RigSafety, only=True)
+Rig = call_table(
     "rig",
     rig,
-    sole=True,
-    passed_on=(run_rig,),
+    only=True,
+    forwards_to=(run_rig,),
     types={"safety": Safety | None, "telemetry": list_of(str)},
     without=("duration", "on_change"),
 )

@@ -1,14 +1,14 @@
-"""A table of a setup file is a call: ``kind`` says of what, every other key is a parameter under the name that it has in Python.
+"""Tables of a setup file as Pydantic models, made from the signatures of functions.
 
-The models of the tables are made from signatures, so that what can be called can be written: a new
-learner works by existing.
+A table is a call: its key ``kind`` names a function, and every other key is a parameter of it. A
+new learner, for example, needs no entry anywhere: its table is made from its signature.
 """
 
 from __future__ import annotations
 
 import inspect
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin
 
 from pydantic import (
@@ -23,113 +23,100 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from quell.setup.docstrings import described, refers, summary
+from quell.setup.docstrings import is_reference, parameter_descriptions, summary
 
-# Parameters for which a table has no key: the rest of the file has them.
 CONTEXT = ("dt", "observer", "learner", "guard")
+"""Parameters that are no keys of a table, because other tables of the file give them."""
+
+_VARIABLE = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
 class Table(BaseModel):
-    """What all tables have in common: no key that nothing uses, no text taken for a number, nothing changed after reading."""
+    """A table: unknown keys are errors, types are not converted, values are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     @model_validator(mode="before")
     @classmethod
-    def _know(cls, data: Any) -> Any:
-        unknown = (
-            [key for key in data if key not in cls.model_fields]
-            if isinstance(data, Mapping)
-            else []
-        )
+    def _refuse_unknown(cls, data: Any) -> Any:
+        keys = data if isinstance(data, Mapping) else ()
+        unknown = [key for key in keys if key not in cls.model_fields]
         if unknown:
-            raise PydanticCustomError(
-                "unknown", "unknown", {"keys": unknown, "known": [*cls.model_fields]}
-            )
+            context = {"keys": unknown, "known": [*cls.model_fields]}
+            raise PydanticCustomError("unknown", "unknown", context)
         return data
 
-    def given(self) -> dict[str, Any]:
-        """Return what the file has in this table, but for ``kind``."""
-        return {
-            key: getattr(self, key)
-            for key in type(self).model_fields
-            if key in self.model_fields_set and key != "kind"
-        }
+    def written(self) -> dict[str, Any]:
+        """Return the keys that the file has in this table, except ``kind``."""
+        keys = (key for key in type(self).model_fields if key in self.model_fields_set)
+        return {key: getattr(self, key) for key in keys if key != "kind"}
 
 
-class Call(Table):
-    """A table that is a call."""
+class CallTable(Table):
+    """A table that is a call of a function."""
 
-    make: ClassVar[Callable[..., Any]]
-    """Of what."""
-    called: ClassVar[str]
-    """The name of its kind."""
+    function: ClassVar[Callable[..., Any]]
+    """The function."""
+    kind_name: ClassVar[str]
+    """The value of its key ``kind``."""
     context: ClassVar[tuple[str, ...]]
-    """Those of its parameters that the rest of the file has."""
+    """The parameters that other tables of the file give."""
 
 
-def call(
+def call_table(
     kind: str,
-    make: Callable[..., Any],
+    function: Callable[..., Any],
     *,
-    sole: bool = False,
-    passed_on: Sequence[Callable[..., Any]] = (),
+    only: bool = False,
+    forwards_to: Sequence[Callable[..., Any]] = (),
     types: Mapping[str, Any] | None = None,
-    words: Mapping[str, str] | None = None,
+    descriptions: Mapping[str, str] | None = None,
     without: Sequence[str] = (),
-) -> type[Call]:
-    """Return the model of a table whose keys are the parameters of ``make``.
+) -> type[CallTable]:
+    """Return the model of a table whose keys are the parameters of ``function``.
 
     Parameters
     ----------
     kind
-        its name.
-    make
-        what is called.
-    sole
-        whether it is the only kind of its table, which then has no key ``kind``.
-    passed_on
-        what it passes its ``**options`` on to: their keyword-only parameters are keys too.
+        the name of the kind.
+    function
+        the function.
+    only
+        the table has no other kinds, and no key ``kind``.
+    forwards_to
+        functions that ``function`` forwards its ``**options`` to: their keyword-only parameters are
+        keys, too.
     types
-        of the keys that are tables themselves, by name.
-    words
-        on keys of which the docstring says nothing, by name.
+        types of keys that are tables, by name.
+    descriptions
+        descriptions that are not in the docstring, by name.
     without
-        parameters that are not for files.
+        parameters that are no keys.
     """
-    found: dict[str, Any] = (
-        {} if sole else {"kind": (Literal[kind], Field(kind, description="which one."))}
-    )
-    context: list[str] = []
-    told = {
-        key: text
-        for function in (*reversed(passed_on), make)
-        for key, text in described(function).items()
-        if not refers(text)
-    }
-    told |= words or {}
-    for function in (make, *passed_on):
-        for parameter in _parameters(function):
-            key = parameter.name
-            if (
-                key in found
-                or key in ("self", *without)
-                or parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
-            ):
+    fields: dict[str, Any] = {}
+    if not only:
+        fields["kind"] = (Literal[kind], Field(kind, description="which one."))
+    known: dict[str, str] = {}
+    for called in (*reversed(forwards_to), function):
+        described = parameter_descriptions(called).items()
+        known |= {
+            key: text for key, text in described if not is_reference(text) or key not in known
+        }
+    known |= descriptions or {}
+    context = []
+    for called in (function, *forwards_to):
+        for key, parameter in inspect.signature(called).parameters.items():
+            if key in fields or key in ("self", *without) or parameter.kind in _VARIABLE:
                 continue
             if key in CONTEXT:
-                context += [key] if function is make else []
-            elif function is make or parameter.kind is parameter.KEYWORD_ONLY:
-                annotation = (
-                    types[key]
-                    if types and key in types
-                    else _plain(_evaluated(parameter.annotation, function))
-                )
-                text = told.get(key) or described(function).get(key, "")
-                found[key] = (annotation, Field(_default(parameter, annotation), description=text))
-    model = create_model(kind, __base__=Call, __doc__=summary(make), **found)
-    model.called = kind
-    model.make = staticmethod(make)
+                context += [key] if called is function else []
+            elif called is function or parameter.kind is parameter.KEYWORD_ONLY:
+                kind_of_value = (types or {}).get(key) or _toml_type(_annotation(parameter, called))
+                default = _default(parameter, kind_of_value)
+                fields[key] = (kind_of_value, Field(default, description=known.get(key, "")))
+    model = create_model(kind, __base__=CallTable, __doc__=summary(function), **fields)
+    model.kind_name = kind
+    model.function = staticmethod(function)
     model.context = tuple(context)
     return model
 
@@ -141,37 +128,33 @@ def one_of(
     number: bool = False,
     several: Any = None,
 ) -> Any:
-    """Return the type of a table of one of several kinds; a text in its place is the kind of a table without other keys.
+    """Return the type of a table of one of several kinds; a text in its place is its kind.
 
     Parameters
     ----------
     tables
-        by kind.
+        the tables, by kind.
     default
-        the kind of a table that does not say.
+        the kind of a table without the key ``kind``.
     number
-        whether a number may stand in its place.
+        allow a number in place of the table.
     several
-        what may stand in a list in its place.
+        type of the entries of a list in place of the table; no list by default.
     """
 
     def tag(value: Any) -> str | None:
-        if isinstance(value, Call):
-            return value.called
+        if isinstance(value, CallTable):
+            return value.kind_name
         if isinstance(value, Mapping):
             return value.get("kind", default)
-        return (
-            "list"
-            if isinstance(value, tuple) and several is not None
-            else "number"
-            if number
-            else None
-        )
+        if isinstance(value, tuple) and several is not None:
+            return "list"
+        return "number" if number else None
 
     choices: list[Any] = [Annotated[model, Tag(kind)] for kind, model in tables.items()]
     choices += [Annotated[float, Tag("number")]] if number else []
     choices += [Annotated[list_of(several), Tag("list")]] if several is not None else []
-    return Annotated[_union(choices), Discriminator(tag), BeforeValidator(_table)]
+    return Annotated[_union(choices), Discriminator(tag), BeforeValidator(_text_to_table)]
 
 
 def list_of(kind: Any) -> Any:
@@ -179,31 +162,25 @@ def list_of(kind: Any) -> Any:
     return tuple[kind, ...]
 
 
-def _table(value: Any) -> Any:
+def _text_to_table(value: Any) -> Any:
     return {"kind": value} if isinstance(value, str) else value
 
 
-def _parameters(function: Callable[..., Any]) -> Iterable[inspect.Parameter]:
-    return inspect.signature(function).parameters.values()
-
-
-def _evaluated(annotation: Any, function: Callable[..., Any]) -> Any:
-    """Return an annotation that is a text as what it means; Any where only type checkers know that."""
+def _annotation(parameter: inspect.Parameter, function: Callable[..., Any]) -> Any:
+    """Return the type of a parameter; Any where only type checkers can evaluate the annotation."""
+    annotation = parameter.annotation
     if not isinstance(annotation, str):
         return annotation
-    written = (
-        inspect.getattr_static(function, "__init__")
-        if isinstance(function, type)
-        else inspect.unwrap(function)
-    )
+    is_class = isinstance(function, type)
+    home = inspect.getattr_static(function, "__init__") if is_class else inspect.unwrap(function)
     try:
-        return eval(annotation, written.__globals__)
+        return eval(annotation, home.__globals__)
     except (NameError, AttributeError):
         return Any
 
 
 def _default(parameter: inspect.Parameter, annotation: Any) -> Any:
-    """Return the default of a key; what the rest of the file may have, and its type says so, is not asked for."""
+    """Return the default of a key; None for a key that may be None: other tables may give it."""
     if parameter.default is not parameter.empty:
         return parameter.default
     return None if type(None) in get_args(annotation) else ...
@@ -213,11 +190,11 @@ def _union(kinds: Sequence[Any]) -> Any:
     return Union[tuple(kinds)]  # noqa: UP007  # there may be any number of them
 
 
-def _plain(annotation: Any) -> Any:
-    """Return the type of a number, a text or a list of such as it is, and Any for all else: what is called looks at that itself."""
+def _toml_type(annotation: Any) -> Any:
+    """Return the type of numbers, texts and lists of them; Any for all else."""
     if annotation in (float, int, bool, str, None, types.NoneType, ...):
         return annotation
-    origin, inside = get_origin(annotation), [_plain(part) for part in get_args(annotation)]
+    origin, inside = get_origin(annotation), [_toml_type(part) for part in get_args(annotation)]
     if Any in inside or not inside:
         return Any
     if origin in (Union, types.UnionType):

@@ -34,7 +34,7 @@ def replay(record: Path, setup: Path | None = None, *, outputs: RunOutputs = RUN
     from quell.realtime import replay as replay_record
     from quell.records import metrics
     from quell.setup import EXAMPLES, load
-    from quell.setup.errors import refused
+    from quell.setup.errors import with_path
 
     given = load(setup or EXAMPLES / "torsional_rig.toml")
     check_outputs(outputs)
@@ -42,7 +42,7 @@ def replay(record: Path, setup: Path | None = None, *, outputs: RunOutputs = RUN
     try:  # replay refuses a controller that is no ADRC
         replayed = replay_record(recorded, cast(ADRC, given.controller))
     except ValueError as error:
-        raise refused(given.file, "", error, ()) from None
+        raise with_path(given.file, "", error, ()) from None
     console = Console()
     part = _controlled(recorded)
     scores = {"recorded": _scores(recorded, part), "replayed": _scores(replayed, part)}

@@ -157,7 +157,7 @@ def _close_loop(
 ) -> RigRun | None:
     """Run the loop and print each change of mode; return None where the device failed."""
     from quell.realtime import open_device, run_rig
-    from quell.setup.errors import refused
+    from quell.setup.errors import with_path
 
     began = False
 
@@ -182,7 +182,7 @@ def _close_loop(
                 **options,
             )
     except ValueError as error:
-        raise refused(setup.file, "rig", error, ["device", *options]) from None
+        raise with_path(setup.file, "rig", error, ["device", *options]) from None
     except ConnectionError as error:
         if not began:
             raise

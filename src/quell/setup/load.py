@@ -1,0 +1,150 @@
+"""A setup: the objects that a file describes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from quell import checks
+from quell.controllers.base import Controller
+from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.files import nonfinite_to_none
+from quell.plants.base import Plant
+from quell.setup.build import Builder, linear_part
+from quell.setup.description import Description, describe, read
+from quell.setup.errors import SetupError
+from quell.simulation.scenario import Scenario
+
+EXAMPLES = Path(__file__).parent / "examples"
+"""The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """The objects that a setup file describes.
+
+    Attributes
+    ----------
+    file : str
+        name of the file.
+    title : str
+        title of tables and figures.
+    controller
+        the controller, behind its prefilter if it has one; its ``dt`` is the loop's.
+    plant
+        the plant, or None.
+    scenario : Scenario
+        the scenario, or None.
+    rig : dict
+        the arguments of ``run_rig`` and ``live``, or None.
+    windows : tuple of dict
+        for each window in which the response is judged the arguments of ``Trajectory.metrics``.
+    description : Description
+        the file's own tables.
+    """
+
+    file: str
+    title: str
+    controller: Controller
+    plant: Plant | None
+    scenario: Scenario | None
+    rig: dict[str, Any] | None
+    windows: tuple[dict[str, Any], ...]
+    description: Description
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the file's tables for ``quell.files.write_json``; infinite numbers become None."""
+        tables: dict[str, Any] = nonfinite_to_none(self.description.model_dump(exclude_unset=True))
+        return tables
+
+    def needed(self, table: str) -> Any:
+        """Return the object of an optional table.
+
+        Raises
+        ------
+        SetupError
+            where the file does not have the table.
+        """
+        if getattr(self, table) is None:
+            raise SetupError([f"{self.file}: {table}: missing; give a table [{table}]"])
+        return getattr(self, table)
+
+
+def load(path: str | os.PathLike[str]) -> Setup:
+    r"""Read a TOML file and build the objects that it describes.
+
+    Raises
+    ------
+    SetupError
+        with a line for each error: the file, the key's path, the value and the rule, or the nearest
+        known name.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> text = "dt = 0.01\ncontroller = {omega_c = 2.0}\n"
+    >>> text += "observer = {kind = 'model-free', order = 2, b0 = 1.0, omega_0 = 9.0}"
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "rig.toml"
+    ...     _ = path.write_text(text)
+    ...     load(path)
+    Traceback (most recent call last):
+        ...
+    quell.setup.errors.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
+    """
+    return made(*read(path))
+
+
+def made(name: str, data: Mapping[str, Any]) -> Setup:
+    """Build the objects that ``data`` describes: the content of a TOML file called ``name``.
+
+    Raises
+    ------
+    SetupError
+        as ``load``.
+    """
+    tables, builder = describe(name, data), Builder(name)
+    dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
+
+    def build(key: str, **context: Any) -> Any:
+        table = getattr(tables, key)
+        return None if table is None else builder.build(table, key, dt=dt, **context)
+
+    plant = build("plant")
+    model = linear_part(plant)
+    parts = {key: build(key, plant=model) for key in ("observer", "learner", "guard")}
+    kind, used = tables.controller.kind_name, tables.controller.context
+    unused = [key for key, part in parts.items() if part is not None and key not in used]
+    if unused:
+        lines = [
+            f"{name}: {key}: a controller of the kind {kind} does not use it" for key in unused
+        ]
+        raise SetupError(lines)
+    controller = build("controller", plant=model, **parts)
+    prefilter, scenario, rig = build("prefilter"), build("scenario"), build("rig")
+    if prefilter is not None:
+        controller = builder.attempt("prefilter", (), Prefiltered, controller, prefilter)
+    if scenario is not None and plant is not None:
+        builder.attempt("scenario", ("disturbances",), scenario.seeded_signals, plant.disturbances)
+    windows = tuple(window.written() for window in tables.metrics)
+    for i, window in enumerate(windows):
+        builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
+    title = tables.title or name.removesuffix(".toml").replace("_", " ")
+    return Setup(name, title, controller, plant, scenario, rig, windows, tables)
+
+
+def _check_window(
+    start: float = 0.0, stop: float | None = None, target: float | None = None, band: float = 0.002
+) -> None:
+    """Check the arguments of ``Trajectory.metrics`` before the run."""
+    checks.finite("start", start)
+    if stop is not None:
+        checks.interval("start", start, "stop", stop)
+    if target is not None:
+        checks.finite("target", target)
+    checks.positive("band", band)
