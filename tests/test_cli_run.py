@@ -341,6 +341,6 @@ main()"""
         [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert tried.returncode == 2
-    assert tried.stderr.startswith("quell: pyserial is needed")
+    assert tried.stderr.startswith("quell: a serial line needs serial, which")
     assert tried.stderr.count("\n") == 1
     assert "quell[serial]" in tried.stderr
