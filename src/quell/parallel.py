@@ -20,7 +20,8 @@ def in_parallel(
 ) -> list[Any]:
     """Run jobs on all cores, or in so many threads, and return their results in order; compiled loops release the interpreter.
 
-    ``progress`` is called with the share that is done. Where a job fails, or the run is interrupted, those not yet begun are dropped.
+    ``progress`` is called with the share that is done. Where a job fails, or the run is
+    interrupted, those not yet begun are dropped.
     """
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         futures = [pool.submit(job) for job in jobs]
@@ -39,8 +40,9 @@ def in_parallel(
 def one_blas_thread() -> Iterator[None]:
     """Around many operations on small matrices: keep BLAS from starting threads for them.
 
-    OpenBLAS splits even the solution of seven equations between its threads, and where another program has a core, each call then waits for
-    the operating system: ten milliseconds instead of ten microseconds.
+    OpenBLAS splits even the solution of seven equations between its threads, and where another
+    program has a core, each call then waits for the operating system: ten milliseconds instead of
+    ten microseconds.
     """
     # What is set holds for the whole process, so two at a time could restore each other's setting.
     with _LIMITING, _blas().limit(limits=1, user_api="blas"):

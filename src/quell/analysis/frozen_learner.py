@@ -31,7 +31,7 @@ from quell.learners.base import (
     predict,
     restart,
 )
-from quell.records.record import first_sample_at
+from quell.records.sample_times import first_sample_at
 from quell.records.trajectory import Trajectory
 from quell.types import Vector
 

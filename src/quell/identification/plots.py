@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quell.records.plotting import draw
+from quell.records.plotting import draw_line
 
 if TYPE_CHECKING:
     from quell.identification.result import Identified
@@ -89,8 +89,8 @@ def _draw_bode(found: Identified, gain: Any, phase: Any, coherence: Any) -> None
 
 def _draw_output(found: Identified, output: Any, error: Any) -> None:
     t, split = found.t, found.held_from
-    draw(output, t, found.y, color="0.6", linewidth=2.5, label="measured")
-    draw(
+    draw_line(output, t, found.y, color="0.6", linewidth=2.5, label="measured")
+    draw_line(
         output,
         t[:split],
         found.simulated[:split],
@@ -98,9 +98,9 @@ def _draw_output(found: Identified, output: Any, error: Any) -> None:
         linewidth=1.0,
         label=f"simulated, {found.fits['estimation']:.2f} %",
     )
-    draw(error, t[:split], (found.y - found.simulated)[:split], color="C0", linewidth=0.8)
+    draw_line(error, t[:split], (found.y - found.simulated)[:split], color="C0", linewidth=0.8)
     if split < t.size:
-        draw(
+        draw_line(
             output,
             t[split:],
             found.simulated[split:],
@@ -108,7 +108,7 @@ def _draw_output(found: Identified, output: Any, error: Any) -> None:
             linewidth=1.0,
             label=f"held out, {found.fits['held out']:.2f} %",
         )
-        draw(error, t[split:], (found.y - found.simulated)[split:], color="C1", linewidth=0.8)
+        draw_line(error, t[split:], (found.y - found.simulated)[split:], color="C1", linewidth=0.8)
     output.set_ylabel("output")
     output.legend(fontsize="small")
     error.set_ylabel("error")

@@ -1,8 +1,9 @@
 """The disk cache of compiled code.
 
-Numba's own cache checks only the file that an entry point is in. Kernels call kernels of other files,
-so each version of them has a folder of its own, named by a hash of all files that compiled code can
-depend on. Files of the cache that are damaged or can not be written lead to a new compilation.
+Numba's own cache checks only the file that an entry point is in. Kernels call kernels of other
+files, so each version of them has a folder of its own, named by a hash of all files that compiled
+code can depend on. Files of the cache that are damaged or can not be written lead to a new
+compilation.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache
 
 # Versions kept: the current one and those of a few other branches or environments. Chosen by hand.
 _VERSIONS_KEPT = 4
-# Marks a folder as one that quell may remove, and tells backup programs to skip it (bford.info/cachedir).
+# Marks a folder as one that quell may remove, and tells backup programs to skip it
+# (bford.info/cachedir).
 _MARKER_NAME = "CACHEDIR.TAG"
 _MARKER = (
     "Signature: 8a477f597d28d172789f06886806bc55\n"
@@ -42,8 +44,9 @@ _NAME = re.compile(rb"\w+")
 def cache_path() -> Path | None:
     """Return the folder of this version's compiled code; None if it can't be created or written to.
 
-    It is in ``quell-compiled`` under ``NUMBA_CACHE_DIR`` if that is set, else under the user's cache
-    directory. Folders of older versions are removed; only folders with quell's marker file are.
+    It is in ``quell-compiled`` under ``NUMBA_CACHE_DIR`` if that is set, else under the user's
+    cache directory. Folders of older versions are removed; only folders with quell's marker file
+    are.
     """
     root = os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_dir("quell")
     versions = Path(root) / "quell-compiled"
@@ -123,8 +126,8 @@ class _FaultTolerantCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        # Numba numbers the data files. Two processes, or an index that was lost, can give one number to
-        # two signatures, and then the code of the wrong one is loaded.
+        # Numba numbers the data files. Two processes, or an index that was lost, can give one
+        # number to two signatures, and then the code of the wrong one is loaded.
         self._cache_file._data_name = lambda number: (
             f"{self._impl.filename_base}.{uuid.uuid4().hex}.nbc"
         )

@@ -1,7 +1,7 @@
 """Generic functions over NamedTuple types, compiled and interpreted alike.
 
-An algorithm is written once, as a plain function of immutable parameters (a NamedTuple of floats and
-arrays) and explicit state (a NamedTuple of arrays), under one of these decorators:
+An algorithm is written once, as a plain function of immutable parameters (a NamedTuple of floats
+and arrays) and explicit state (a NamedTuple of arrays), under one of these decorators:
 
 ``kernel``
     a plain helper; interpreted when called from Python, inlined when called from compiled code.
@@ -46,9 +46,9 @@ class Generic(Protocol[P, R_co]):
         """Return a decorator that makes a function the implementation for ``cls``."""
 
 
-# Fused multiply-add and re-ordered sums are allowed, but NaN and Inf keep their meaning: guards test
-# for them. Inlining is forced because a NamedTuple of arrays is passed as some eighty words, which
-# costs more than most kernels do.
+# Fused multiply-add and re-ordered sums are allowed, but NaN and Inf keep their meaning: guards
+# test for them. Inlining is forced because a NamedTuple of arrays is passed as some eighty words,
+# which costs more than most kernels do.
 OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "reassoc", "nsz"},
     "error_model": "numpy",
@@ -113,8 +113,8 @@ def generic(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
 def is_finite(value: float) -> bool:
     """Return whether ``value`` is finite.
 
-    ``math.isfinite`` is wrong in compiled code: it tests whether x − x is a number, and if x is itself
-    a sum, re-ordering makes x − x zero before the test. A comparison stays as it is.
+    ``math.isfinite`` is wrong in compiled code: it tests whether x − x is a number, and if x is
+    itself a sum, re-ordering makes x − x zero before the test. A comparison stays as it is.
     """
     return abs(value) <= _LARGEST
 

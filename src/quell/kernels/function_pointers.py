@@ -1,8 +1,9 @@
 """Functions of the user's own, called by address.
 
-A user's function is compiled by Numba on its own, and parameters hold its address: one driver is compiled for all such functions, and kept
-on disk. ``call`` and ``evaluate`` jump to an address from compiled code, and do the same by ``ctypes`` from Python. Whoever holds an
-address must keep the compiled function as long; addresses mean nothing in another process.
+A user's function is compiled by Numba on its own, and parameters hold its address: one driver is
+compiled for all such functions, and kept on disk. ``call`` and ``evaluate`` jump to an address from
+compiled code, and do the same by ``ctypes`` from Python. Whoever holds an address must keep the
+compiled function as long; addresses mean nothing in another process.
 """
 
 from __future__ import annotations
@@ -104,7 +105,8 @@ def jit_user_function(function: Callable[..., Any]) -> Any:
         where it is no plain function: a bound method, a callable object.
     """
     try:
-        # Division by zero gives inf, as in numpy: an exception could not leave compiled code from here.
+        # Division by zero gives inf, as in numpy: an exception could not leave compiled code from
+        # here.
         return numba.njit(getattr(function, "py_func", function), error_model="numpy")
     except TypeError as error:
         raise NotCompilableError(str(error)) from error

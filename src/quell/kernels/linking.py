@@ -1,9 +1,11 @@
 """Kernels are linked into what calls them, and made machine code there only.
 
-Left to itself, Numba takes every function it meets through all of LLVM: what it calls is inlined, the whole optimised twice, made machine
-code and wrapped for calls from C. A kernel is called by compiled code alone and always inlined, so a loop was optimised again at each level
-of its calls, for code that nobody runs. Here a kernel gets the passes over one function at a time, which keep its code small, and the rest
-is left to the entry point it ends up in. This halves the time a loop takes to compile; the loop is as fast.
+Left to itself, Numba takes every function it meets through all of LLVM: what it calls is inlined,
+the whole optimised twice, made machine code and wrapped for calls from C. A kernel is called by
+compiled code alone and always inlined, so a loop was optimised again at each level of its calls,
+for code that nobody runs. Here a kernel gets the passes over one function at a time, which keep its
+code small, and the rest is left to the entry point it ends up in. This halves the time a loop takes
+to compile; the loop is as fast.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import AnnotateTypes
 
-# What Numba calls the variables that point to a function's environment: what its ``print`` makes Python objects with.
+# What Numba calls the variables that point to a function's environment: what its ``print`` makes
+# Python objects with.
 _ENVIRONMENT = "_ZN08NumbaEnv"
 
 
@@ -72,8 +75,9 @@ class KernelCompiler(CompilerBase):
         return [passes]
 
 
-# For ``overload`` and ``register_jitable``. What this stands on is no promise of Numba's: with versions that it was not tried with, kernels
-# take Numba's own way, which gives the same code and takes twice as long.
+# For ``overload`` and ``register_jitable``. What this stands on is no promise of Numba's: with
+# versions that it was not tried with, kernels take Numba's own way, which gives the same code and
+# takes twice as long.
 _TRIED = ("0.68.",)
 KERNEL_OPTIONS: dict[str, Any] = (
     {"no_cfunc_wrapper": True, "pipeline_class": KernelCompiler}

@@ -13,8 +13,9 @@
     state.loop[0].u = 1.0           # the same statement in a kernel and in Python
     loop = state.loop[0]            # refers to the record, does not copy it
 
-Where all fields are floats, ``state.loop.view(np.float64)`` is the record as a vector. Fields may have any names but those that Python
-itself needs of a NumPy scalar (``dtype``, ``view``, ``copy`` …).
+Where all fields are floats, ``state.loop.view(np.float64)`` is the record as a vector. Fields may
+have any names but those that Python itself needs of a NumPy scalar (``dtype``, ``view``, ``copy``
+…).
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class Scalars(np.void):  # type: ignore[misc]  # the stubs call it final, NumPy 
     """Base class of a record; a subclass annotates its fields with ``float`` or ``int`` (64 bits), under postponed annotations."""
 
     def __init_subclass__(cls) -> None:
-        # Properties, as np.record's own attribute access takes 2.5 times as long in an interpreted loop.
+        # Properties, as np.record's own attribute access takes 2.5 times as long in an interpreted
+        # loop.
         for name in cls.__annotations__:
             setattr(cls, name, _field(name))
 

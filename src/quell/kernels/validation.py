@@ -1,6 +1,7 @@
 """Trying what a user has written, interpreted and on a fresh memory, so that mistakes are named before anything is compiled.
 
-Each error names the user's class and the rule. What belongs to this package is not tried: its tests do that.
+Each error names the user's class and the rule. What belongs to this package is not tried: its tests
+do that.
 """
 
 from __future__ import annotations

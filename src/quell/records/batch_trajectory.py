@@ -1,4 +1,4 @@
-"""What a batch of runs returns."""
+"""The record of a batch of runs."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.records.record import Record, channels_in, read_dataset
+from quell.records.channels import Channels
+from quell.records.record import Record, read_dataset, record_fields
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix, Status, Vector
 
 if TYPE_CHECKING:
     import xarray
 
-# What each run has one value of, as the file calls it.
+# Name, description and unit in a file of the values that each run has one of.
 _PER_RUN = {
     "lengths": ("number of samples recorded", "1"),
     "run_status": ("all status flags of the run (quell.Status)", "1"),
@@ -31,37 +32,39 @@ _PER_RUN = {
 class BatchTrajectory(Record):
     """The record of a batch of runs.
 
-    ``runs["y"]`` is a channel: (runs, samples), or (runs, samples, width) for ``w``, ``x``, ``x_hat`` and ``theta``; ``runs.t`` are their
-    times [s]. After the end of a run that diverged its samples are NaN; ``runs.run(i)`` is the i-th run as a ``Trajectory``.
+    ``runs["y"]`` is a channel: (runs, samples), or (runs, samples, width) for ``w``, ``x``,
+    ``x_hat`` and ``theta``; ``runs.t`` are their times [s]. After the end of a run that diverged,
+    its samples are NaN. ``runs.run(i)`` is the i-th run as a ``Trajectory``.
 
     Attributes
     ----------
     log : (runs, samples, columns) array
         the recorded channels side by side.
     channels : tuple of (name, width)
-        what the columns are, in order.
+        the columns, in order.
     dt : float
-        sample time of the runs [s]; recorded was every ``every``-th sample.
+        sample time of the runs [s]; every ``every``-th sample was recorded.
     lengths : (runs,) array
-        how many samples of each run were recorded.
+        number of recorded samples of each run.
     status : (runs,) array
-        all ``Status`` flags that any step of a run reported, and ``DIVERGED`` where it ended early; ``message`` sums them up.
+        all ``Status`` flags that any step of a run reported, and ``DIVERGED`` if it ended early;
+        ``message`` is their summary.
     ended : (runs,) array
-        when each run ended [s].
+        time at which each run ended [s].
     limit : (runs,) array
-        the ``|y|`` at which it would have been ended [y-unit].
+        the ``|y|`` beyond which a run would have been ended [y-unit].
     plant : str
         name of the plants.
     parameters : dict of (runs,) arrays
-        in which the plants differ.
+        the parameters in which the plants differ.
     features : tuple of str
-        what the entries of ``theta`` multiply.
+        names of the features that the entries of ``theta`` multiply.
     final_states : tuple
-        the controllers' states at the end; ``controller.read(runs.final_states[i])`` puts one in words.
+        the controllers' states at the end; ``controller.read(runs.final_states[i])`` explains one.
     """
 
     log: Matrix
-    channels: tuple[tuple[str, int], ...]
+    channels: Channels
     dt: float
     every: int
     lengths: NDArray[np.int64]
@@ -80,24 +83,24 @@ class BatchTrajectory(Record):
 
     @property
     def message(self) -> str:
-        """How many runs reported what, and when the first diverged."""
+        """The number of runs that reported each flag, and the time at which the first diverged."""
         counts = {flag: int(np.count_nonzero(self.status & int(flag))) for flag in Status if flag}
-        told = [
+        sentences = [
             f"{count} of {len(self)} runs: {flag.message}"
             for flag, count in counts.items()
             if count
         ]
         if np.any(self.diverged):
             first = int(np.argmin(np.where(self.diverged, self.ended, np.inf)))
-            told.append(f"The first to diverge was run {first}, at {self.ended[first]:.6g} s.")
-        return " ".join(told) or f"All is well in all {len(self)} runs."
+            sentences.append(f"The first to diverge was run {first}, at {self.ended[first]:.6g} s.")
+        return " ".join(sentences) or f"All is well in all {len(self)} runs."
 
     def __len__(self) -> int:
         """Return the number of runs."""
         return int(self.log.shape[0])
 
     def run(self, i: int) -> Trajectory:
-        """Return the i-th run, as far as it went, with the channels that were recorded."""
+        """Return the i-th run, to its end, with the channels that were recorded."""
         checks.whole("i", i, 0, len(self) - 1)
         return Trajectory(
             log=self.log[i, : self.lengths[i]],
@@ -120,94 +123,86 @@ class BatchTrajectory(Record):
         target: float | None = None,
         band: float = 0.002,
     ) -> dict[str, Vector]:
-        """Judge each run in the window ``[start, stop)`` [s] as ``Trajectory.metrics`` does.
+        """Return measures of each run in the window ``[start, stop)`` [s], as ``Trajectory.metrics`` does.
 
-        A run that diverged within the window is judged by what there is of it; ``diverged`` says which. One that ended before the window is
-        NaN throughout. So is whatever is not defined in a run while it is in others.
+        For a run that diverged within the window, its samples up to there count; see ``diverged``.
+        All measures of a run that ended before the window are NaN, and so are those that are
+        defined for other runs only.
 
         Parameters
         ----------
         start, stop
             the window [s]; to the end of the record by default.
         target
-            where y should go [y-unit]; each run's reference at the end of the window by default.
+            final value that y should reach [y-unit]; each run's reference at the end of the window
+            by default.
         band
-            half width of the settling band, as a fraction of the move.
+            half width of the settling band, as a fraction of the step.
 
         Returns
         -------
         dict
-            of arrays (runs,), by the names and in the units of ``Trajectory.metrics``: ``peak_error`` and ``rms`` [y-unit], ``iae``
-            [y-unit s], ``ise`` [y-unit² s], ``itae`` [y-unit s²], ``control_variation`` [u-unit]; for a step ``overshoot`` (fraction of the
-            move), ``settling_time`` and ``rise_time`` [s].
+            of arrays (runs,): ``peak_error`` and ``rms`` [y-unit], ``iae`` [y-unit s], ``ise``
+            [y-unit² s], ``itae`` [y-unit s²], ``control_variation`` [u-unit]; for a step
+            ``overshoot`` (fraction of the step), ``settling_time`` and ``rise_time`` [s].
 
         Raises
         ------
         ValueError
-            as ``Trajectory.metrics``; where runs ended before the window, only if all did.
+            as ``Trajectory.metrics``; because of runs that ended before the window, only if all
+            did.
         """
         window = self.window(start, np.inf if stop is None else stop)
-        there = np.flatnonzero((self.lengths > window.start) | ~self.diverged)
-        judged = {
-            int(i): self.run(int(i)).metrics(start, stop, target=target, band=band)
-            for i in (there if there.size else [0])
-        }
-        names = list(dict.fromkeys(name for found in judged.values() for name in found))
-        nothing: dict[str, float] = {}
-        return {
-            name: np.array([judged.get(i, nothing).get(name, np.nan) for i in range(len(self))])
-            for name in names
-        }
+        reached = np.flatnonzero((self.lengths > window.start) | ~self.diverged).tolist()
+        found: dict[str, Vector] = {}
+        for i in reached or [0]:  # if no run reached the window, the first one raises the error
+            measures = self.run(i).metrics(start, stop, target=target, band=band)
+            for name, value in measures.items():
+                found.setdefault(name, np.full(len(self), np.nan))[i] = value
+        return found
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw output and control signal: the median, where half, nine tenths and all of the runs lie, and when others diverged.
+        """Draw output and control signal: median, bands of the runs, and when others diverged.
 
         Parameters
         ----------
         axes
-            two matplotlib axes to draw into; a new figure by default.
+            two matplotlib axes; a new figure by default.
         """
         from quell.records.plotting import plot_batch
 
-        return plot_batch(self, axes)
+        return plot_batch(self, self.diverged, self.ended, axes)
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return the record as an ``xarray.Dataset`` over ``run`` and ``time``, with the plants' parameters as coordinates of ``run``.
+        """Return the record as an ``xarray.Dataset`` over ``run`` and ``time``.
 
-        A parameter that is called as a channel is, is the coordinate ``plant_<name>``.
+        The plants' parameters are coordinates of ``run``; one that has a channel's name is the
+        coordinate ``plant_<name>``.
         """
         data = self._dataset(("run", "time"), {"plant": self.plant, "message": self.message})
         taken = {*map(str, data.variables), *map(str, data.dims), *_PER_RUN}
-        per_run = zip(
-            _PER_RUN.items(), (self.lengths, self.status, self.ended, self.limit), strict=True
-        )
+        values_per_run = (self.lengths, self.status, self.ended, self.limit)
         coordinates: dict[str, Any] = {"run": ("run", np.arange(len(self)))}
-        coordinates |= {
-            name: ("run", values, {"long_name": about, "units": unit})
-            for (name, (about, unit)), values in per_run
-        }
+        for (name, (about, unit)), values in zip(_PER_RUN.items(), values_per_run, strict=True):
+            coordinates[name] = ("run", values, {"long_name": about, "units": unit})
         for name, values in self.parameters.items():
-            coordinates[f"plant_{name}" if name in taken else name] = (
-                "run",
-                values,
-                {"parameter": name},
-            )
+            key = f"plant_{name}" if name in taken else name
+            coordinates[key] = ("run", values, {"parameter": name})
         return data.assign_coords(coordinates)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> BatchTrajectory:
-        """Read back what ``save`` wrote (all but ``final_states``).
+        """Return the record that ``save`` wrote, without ``final_states``.
 
         Raises
         ------
         ValueError
-            where the file is not such a record.
+            if the file is not such a record.
         """
-        data = read_dataset(
-            path, "BatchTrajectory.save", ("run", "time"), {"dt", "every", "plant", *_PER_RUN}
-        )
+        required = {"dt", "every", "plant", *_PER_RUN}
+        data = read_dataset(path, "BatchTrajectory.save", ("run", "time"), required)
         return cls(
-            **channels_in(data, axes=2),
+            **record_fields(data, axes=2),
             lengths=data["lengths"].values,
             status=data["run_status"].values,
             ended=data["ended"].values,

@@ -1,7 +1,7 @@
-"""What a response is judged by. Times in seconds, values in the unit of y; every function takes plain arrays.
+"""Measures of a response: times in seconds, values in the unit of y, from plain finite arrays.
 
-Integrals are trapezoidal. A record must be whole for the control variation: thinned by ``record_every`` the integrals stay close, the
-variation does not. Records must be finite.
+Integrals are trapezoidal. With ``record_every`` the integrals stay close, but the control variation
+is right only for a complete record.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from quell.types import Vector
 
 
 def overshoot(y: Vector, target: float, initial: float = 0.0) -> float:
-    """Return how far y goes beyond ``target``, as a fraction of the move from ``initial``; 0.0 where it never does."""
+    """Return how far y goes beyond ``target``, as a fraction of the step from ``initial``; 0.0 if it never does."""
     move = checks.nonzero("target - initial", target - initial, "there is no move to overshoot")
     return max(float(np.max((_record(y) - target) / move)), 0.0)
 
@@ -23,9 +23,10 @@ def overshoot(y: Vector, target: float, initial: float = 0.0) -> float:
 def settling_time(
     t: Vector, y: Vector, target: float, band: float = 0.002, initial: float = 0.0
 ) -> float:
-    """Return how long after ``t[0]`` y enters for good the band around ``target``, ``band`` times the move wide to either side [s].
+    """Return the time after ``t[0]`` from which on y stays near ``target`` [s].
 
-    0.0 where y never leaves the band, NaN where it is outside of it at the end.
+    Near means closer than ``band`` times the step. 0.0 if y never leaves this band, NaN if it is
+    outside at the end.
     """
     t, y = _pair(t, y)
     width = checks.positive("band", band) * abs(
@@ -40,7 +41,7 @@ def settling_time(
 
 
 def rise_time(t: Vector, y: Vector, target: float, initial: float = 0.0) -> float:
-    """Return the time from 10 % to 90 % of the move, between samples by interpolation [s]; NaN where y does not get there."""
+    """Return the time from 10 % to 90 % of the step, interpolated [s]; NaN if y does not reach it."""
     t, y = _pair(t, y)
     done = (y - initial) / checks.nonzero(
         "target - initial", target - initial, "there is no move to rise"
@@ -54,7 +55,7 @@ def peak(error: Vector) -> float:
 
 
 def rms(error: Vector) -> float:
-    """Return the root of the mean of e²."""
+    """Return the root mean square of e."""
     return float(np.sqrt(np.mean(np.square(_record(error)))))
 
 
@@ -77,7 +78,7 @@ def itae(t: Vector, error: Vector) -> float:
 
 
 def control_variation(u: Vector) -> float:
-    """Return ``Σ |u_k − u_{k−1}|``: how much the actuator has to travel [u-unit]."""
+    """Return ``Σ |u_k − u_{k−1}|``, the travel of the actuator [u-unit]."""
     return float(np.sum(np.abs(np.diff(_record(u)))))
 
 
@@ -96,11 +97,13 @@ def _record(values: Any) -> Vector:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1 or array.size == 0:
         raise ValueError(
-            f"record has shape {array.shape}: must be a vector of at least one sample; widen the window of time"
+            f"record has shape {array.shape}: must be a vector of at least one sample; "
+            "widen the window of time"
         )
     if not np.all(np.isfinite(array)):
+        sample = int(np.argmin(np.isfinite(array)))
         raise ValueError(
-            f"record has a value that is not finite at sample {int(np.argmin(np.isfinite(array)))}: judge what comes before it"
+            f"record has a value that is not finite at sample {sample}: take only what is before it"
         )
     return array
 
@@ -108,5 +111,5 @@ def _record(values: Any) -> Vector:
 def _pair(t: Any, values: Any) -> tuple[Vector, Vector]:
     t, values = _record(t), _record(values)
     if t.size != values.size:
-        raise ValueError(f"t has {t.size} samples, the record {values.size}: must be as many")
+        raise ValueError(f"t has {t.size} samples, the record {values.size}: must be the same")
     return t, values

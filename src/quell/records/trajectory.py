@@ -1,4 +1,4 @@
-"""What a run returns."""
+"""The record of one run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from quell import checks
 from quell.records import metrics
-from quell.records.record import Record, channels_in, read_dataset
+from quell.records.channels import Channels
+from quell.records.record import Record, read_dataset, record_fields
 from quell.types import Matrix, Status
 
 if TYPE_CHECKING:
@@ -22,33 +23,35 @@ if TYPE_CHECKING:
 class Trajectory(Record):
     """The record of one run.
 
-    ``run["y"]`` is a channel: (samples,), or (samples, width) for ``w``, ``x``, ``x_hat`` and ``theta``; ``run.t`` are its times [s].
-    Besides what was recorded there is ``f_hat = f_learned + f_residual``.
+    ``run["y"]`` is a channel: (samples,), or (samples, width) for ``w``, ``x``, ``x_hat`` and
+    ``theta``; ``run.t`` are its times [s]. ``f_hat = f_learned + f_residual`` is computed.
 
     Attributes
     ----------
     log : (samples, columns) array
         all channels side by side.
     channels : tuple of (name, width)
-        what the columns are, in order.
+        the columns, in order.
     dt : float
-        sample time of the run [s]; recorded was every ``every``-th sample.
+        sample time of the run [s]; every ``every``-th sample was recorded.
     status : Status
-        all flags that any step reported, and ``DIVERGED`` where the run ended early; ``message`` puts it in words.
+        all flags that any step reported, and ``DIVERGED`` if the run ended early; ``message``
+        explains them.
     ended : float
-        when the run ended [s].
+        time at which the run ended [s].
     limit : float
-        the ``|y|`` at which it would have been ended [y-unit].
+        the ``|y|`` beyond which the run would have been ended [y-unit].
     plant : str
-        its name.
+        name of the plant.
     features : tuple of str
-        what the entries of ``theta`` multiply.
+        names of the features that the entries of ``theta`` multiply.
     final_state
-        the controller's state at the end, a NamedTuple; ``controller.read(run.final_state)`` puts it in words.
+        the controller's state at the end, a NamedTuple; ``controller.read(run.final_state)``
+        explains it.
     """
 
     log: Matrix
-    channels: tuple[tuple[str, int], ...]
+    channels: Channels
     dt: float
     every: int = 1
     status: Status = Status.OK
@@ -65,10 +68,13 @@ class Trajectory(Record):
 
     @property
     def message(self) -> str:
-        """What happened, when, and what to do."""
+        """All that the run reported, with times, and what to do."""
         if not self.diverged:
             return self.status.message
-        return f"|y| went beyond limit = {self.limit:.3g}, or was no number, at {self.ended:.6g} s. {self.status.message}"
+        return (
+            f"|y| went beyond limit = {self.limit:.3g}, or was no number, at {self.ended:.6g} s. "
+            f"{self.status.message}"
+        )
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -82,34 +88,35 @@ class Trajectory(Record):
         target: float | None = None,
         band: float = 0.002,
     ) -> dict[str, float]:
-        """Judge the response in the window ``[start, stop)`` [s] as a step from its first value of y.
+        """Return measures of the response in ``[start, stop)`` [s], as a step from its first y.
 
         Parameters
         ----------
         start, stop
-            the window; to the end of the record by default.
+            the window [s]; to the end of the record by default.
         target
-            where y should go; the reference at the end of the window by default.
+            final value that y should reach; the reference at the end of the window by default.
         band
-            half width of the settling band, as a fraction of the move.
+            half width of the settling band, as a fraction of the step.
 
         Returns
         -------
         dict
-            ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y, and ``control_variation``; and, where the reference steps at the
-            start of the window or ``target`` is given: ``overshoot`` (fraction of the move), ``settling_time`` and ``rise_time`` [s]
-            (NaN where y does not get there).
+            ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y, and ``control_variation``;
+            if the reference steps at the start of the window or ``target`` is given, also
+            ``overshoot`` (fraction of the step), ``settling_time`` and ``rise_time`` [s], NaN if y
+            does not reach the target.
 
         Raises
         ------
         ValueError
-            where the window holds no sample: for instance because the run ended before it.
+            if the window has no sample, for instance because the run ended before it.
         """
         part = self.window(start, np.inf if stop is None else stop)
         if part.start >= len(self) or part.stop <= part.start:
             raise ValueError(
-                f"start = {start!r}, stop = {stop!r}: the record ends at {self.ended:.6g} s ({self.message}); "
-                "the window must hold at least one sample"
+                f"start = {start!r}, stop = {stop!r}: the record ends at {self.ended:.6g} s "
+                f"({self.message}); the window must hold at least one sample"
             )
         t, y, u = self.t[part], self["y"][part], self["u"][part]
         error = self["r"][part] - y
@@ -132,7 +139,10 @@ class Trajectory(Record):
         }
 
     def _steps_at(self, part: slice, goal: float) -> bool:
-        """Tell whether the reference goes to ``goal`` at the start of a window, give or take a sample, and stays; 0 s is such a start."""
+        """Return whether the reference steps to ``goal`` at the start of a window and stays there.
+
+        The step may be a sample off; at 0 s there always is one.
+        """
         r = self["r"]
         stays = bool(np.all(r[part.start + 1 : part.stop] == goal))
         return stays and (
@@ -140,42 +150,41 @@ class Trajectory(Record):
         )
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw output and reference, control signal, estimates of f and, where there is a guard, what it did; return the axes.
+        """Draw output, control signal, estimates of f and, with a guard, its authority; return the axes.
 
         Parameters
         ----------
         axes
-            three matplotlib axes to draw into, or four for a run with a guard; a new figure by default.
+            three matplotlib axes, or four for a run with a guard; a new figure by default.
         """
-        from quell.records.plotting import plot_trajectory
+        from quell.records.plotting import plot_run
 
-        return plot_trajectory(self, axes)
+        return plot_run(self, self.ended if self.diverged else None, axes)
 
     def to_xarray(self) -> xarray.Dataset:
         """Return the record as an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
-        about = {
+        attributes = {
             "plant": self.plant,
             "status": int(self.status),
             "ended": self.ended,
             "limit": self.limit,
             "message": self.message,
         }
-        return self._dataset(("time",), about)
+        return self._dataset(("time",), attributes)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trajectory:
-        """Read back what ``save`` wrote (all but ``final_state``).
+        """Return the record that ``save`` wrote, without ``final_state``.
 
         Raises
         ------
         ValueError
-            where the file is not such a record.
+            if the file is not such a record.
         """
-        data = read_dataset(
-            path, "Trajectory.save", ("time",), {"dt", "every", "status", "ended", "plant"}
-        )
+        required = {"dt", "every", "status", "ended", "plant"}
+        data = read_dataset(path, "Trajectory.save", ("time",), required)
         return cls(
-            **channels_in(data, axes=1),
+            **record_fields(data, axes=1),
             status=Status(int(data.attrs["status"])),
             ended=float(data.attrs["ended"]),
             limit=float(data.attrs.get("limit", math.inf)),

@@ -13,11 +13,12 @@ from quell import checks
 from quell.parallel import in_parallel, one_blas_thread
 from quell.plants.batch import PlantBatch
 from quell.records.batch_trajectory import BatchTrajectory
-from quell.records.record import columns_of, names_of
+from quell.records.channels import columns_of, readable_names
 from quell.simulation.driver import Course, Loop, Stretch, channels_of, check_part, pieces
 
 _RECORDED = ("r", "y", "u")
-# Runs in a job: enough that a thread seldom comes back for more, few enough that progress is told and no thread is left waiting.
+# Runs in a job: enough that a thread seldom comes back for more, few enough that progress is told
+# and no thread is left waiting.
 _RUNS_AT_ONCE = 16
 
 
@@ -179,7 +180,7 @@ def _wanted(
     record: Sequence[str], channels: tuple[tuple[str, int], ...]
 ) -> tuple[tuple[str, int], ...]:
     """Return the channels of a log that are to be kept, in the log's order."""
-    names = names_of(channels)
+    names = readable_names(channels)
     asked = set(names if record == "all" else [record] if isinstance(record, str) else record)
     for name in asked:
         checks.one_of("record", name, (*names, "all"))

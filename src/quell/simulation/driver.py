@@ -22,11 +22,12 @@ from quell.controllers.base import (
 from quell.kernels.dispatch import compiled, dispatcher_for, interpreted
 from quell.kernels.user_types import explain_compile_errors
 from quell.plants.base import Plant, advance, measure
-from quell.records.record import first_sample_at, in_steps
+from quell.records.sample_times import first_sample_at, in_steps
 from quell.signals import Signal
 from quell.types import Matrix, Status, Vector
 
-# Signals are evaluated so many samples at a time: enough to make Python's share small, few enough to stay in cache.
+# Signals are evaluated so many samples at a time: enough to make Python's share small, few enough
+# to stay in cache.
 _BLOCK = 8192
 # Time in steps of dt is exact to a part in a thousand of a step up to here.
 _MOST_SAMPLES = 10**12
@@ -62,8 +63,9 @@ def run_block(
 ) -> tuple[int, int, int, int]:
     """Run ``r.size`` samples from the time ``t0``; write every ``every``-th into ``log`` from ``row`` on.
 
-    Returns how many samples were run (fewer than asked where the loop diverged: ``|y|`` beyond ``limit``, or not finite), the next row,
-    how many samples are left until it is written, and all status flags that were seen.
+    Returns how many samples were run (fewer than asked where the loop diverged: ``|y|`` beyond
+    ``limit``, or not finite), the next row, how many samples are left until it is written, and all
+    status flags that were seen.
     """
     inputs = w.shape[1]
     status = 0

@@ -21,7 +21,8 @@ class Scenario:
     reference
         what y has to follow [y-unit]; a signal or a number.
     disturbances
-        one signal or number for each disturbance input of the plant, in its order; missing ones are zero.
+        one signal or number for each disturbance input of the plant, in its order; missing ones are
+        zero.
     noise
         what is added to y before the controller sees it; none by default.
     duration
@@ -29,15 +30,16 @@ class Scenario:
     x0
         the plant's state at the start; zero by default.
     rest_at
-        times [s] at which the plant is put back to ``x0`` and the controller starts from rest, with what it has learned.
+        times [s] at which the plant is put back to ``x0`` and the controller starts from rest, with
+        what it has learned.
     seed
         which noise; the same seed gives the same bits.
 
     Raises
     ------
     ValueError
-        for a duration that is not positive, a seed below zero, something that is no signal, or ``rest_at`` times that do not increase
-        within the duration.
+        for a duration that is not positive, a seed below zero, something that is no signal, or
+        ``rest_at`` times that do not increase within the duration.
     """
 
     reference: Signal | float = 0.0
@@ -75,6 +77,7 @@ class Scenario:
             )
         given = (as_signal(self.reference), *map(as_signal, self.disturbances))
         noise = as_signal(self.noise).seeded(self.seed)
-        # The noise takes the seed itself, so that its bits do not depend on how many disturbances there are.
+        # The noise takes the seed itself, so that its bits do not depend on how many disturbances
+        # there are.
         reference, *disturbances = seeded_apart(given, self.seed)
         return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise

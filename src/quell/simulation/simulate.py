@@ -59,24 +59,29 @@ def simulate(
 ) -> Trajectory | BatchTrajectory:
     """Run a controller on a plant through a scenario; or many of them, each on its own, on all cores.
 
-    The controller starts with nothing learned, on a state of its own: neither it nor the plant is changed.
+    The controller starts with nothing learned, on a state of its own: neither it nor the plant is
+    changed.
 
     Parameters
     ----------
     plant, controller, scenario
-        what to run; the sample time is the controller's. A linear plant may also be given as ``LinearPlant.of`` takes it, for example as
-        ``(numerator, denominator)``: numbers in a tuple or a list are one plant. Where one of the three is a sequence of plants
-        (``quell.plants.batch``, or a list of them), controllers or scenarios, it is a
-        batch: a run for each of its entries, the others the same in all runs or a sequence of the same length. Run i is, bit for bit, what
-        ``simulate`` gives for the i-th plant, controller and scenario alone. So all runs of one scenario have the same noise; for other
-        noise give a sequence of scenarios with other seeds. All runs of a batch have the same sample time and duration.
+        what to run; the sample time is the controller's. A linear plant may also be given as
+        ``LinearPlant.of`` takes it, for example as ``(numerator, denominator)``: numbers in a tuple
+        or a list are one plant. Where one of the three is a sequence of plants
+        (``quell.plants.batch``, or a list of them), controllers or scenarios, it is a batch: a run
+        for each of its entries, the others the same in all runs or a sequence of the same length.
+        Run i is, bit for bit, what ``simulate`` gives for the i-th plant, controller and scenario
+        alone. So all runs of one scenario have the same noise; for other noise give a sequence of
+        scenarios with other seeds. All runs of a batch have the same sample time and duration.
     record_every
         keep every so-many-th sample; the memory used is that of the record.
     limit
-        the run ends early, with ``Status.DIVERGED``, where ``|y|`` goes beyond it or is not finite [y-unit]; by default at a million
-        times the largest of 1, ``|x0|`` and the reference in the first samples.
+        the run ends early, with ``Status.DIVERGED``, where ``|y|`` goes beyond it or is not finite
+        [y-unit]; by default at a million times the largest of 1, ``|x0|`` and the reference in the
+        first samples.
     interpret
-        run the same functions as plain Python, the plant's too, to debug; about a thousand times slower.
+        run the same functions as plain Python, the plant's too, to debug; about a thousand times
+        slower.
     progress
         called with the share done, 0 to 1, every few thousand samples, or every few runs.
     record
@@ -92,8 +97,8 @@ def simulate(
     Raises
     ------
     ValueError
-        for arguments out of range, a plant that ``LinearPlant.of`` refuses, an x0 of the wrong size, more disturbances than the plant has
-        inputs, or runs that do not fit into one batch.
+        for arguments out of range, a plant that ``LinearPlant.of`` refuses, an x0 of the wrong
+        size, more disturbances than the plant has inputs, or runs that do not fit into one batch.
     """
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)

@@ -118,7 +118,7 @@ def _print_gaps(console: Console, recorded: Trajectory) -> None:
 
 
 def _draw_wished(run: Trajectory, axes: Any) -> None:
-    from quell.records.plotting import draw
+    from quell.records.plotting import draw_line
 
-    draw(axes[1], run.t, run["u_wished"], label="u wished", color="C3", linewidth=0.8)
+    draw_line(axes[1], run.t, run["u_wished"], label="u wished", color="C3", linewidth=0.8)
     axes[1].legend(loc="upper right", fontsize="small")

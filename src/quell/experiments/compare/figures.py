@@ -10,7 +10,7 @@ import numpy as np
 
 from quell.experiments.common.figures import make_folder, save_figure
 from quell.experiments.compare.study import Comparison
-from quell.records.plotting import draw as line
+from quell.records.plotting import draw_line
 
 
 def draw(result: Comparison) -> Any:
@@ -20,13 +20,13 @@ def draw(result: Comparison) -> Any:
     figure = Figure(figsize=(10.0, 7.0), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     first = next(iter(result.runs.values()))
-    line(above, first.t, first["r"], color="0.3", linestyle="--", linewidth=1.0, label="r")
+    draw_line(above, first.t, first["r"], color="0.3", linestyle="--", linewidth=1.0, label="r")
     loudness = {name: float(np.sum(np.abs(np.diff(run["u"])))) for name, run in result.runs.items()}
     for i, (name, run) in enumerate(result.runs.items()):
         label = f"{name} (diverged)" if run.diverged else name
         style = {"color": f"C{i % 10}", "linewidth": 1.3, "linestyle": "-" if i < 10 else "--"}
-        line(above, run.t, run["y"], label=label, **style)
-        line(
+        draw_line(above, run.t, run["y"], label=label, **style)
+        draw_line(
             below,
             run.t,
             run["u"],

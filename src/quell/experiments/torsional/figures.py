@@ -26,7 +26,7 @@ from quell.experiments.torsional.setup import (
 )
 from quell.experiments.torsional.study import Case, Result
 from quell.plants import torsional_identified
-from quell.records.plotting import draw
+from quell.records.plotting import draw_line
 from quell.records.trajectory import Trajectory
 
 _STYLES: Mapping[str, dict[str, Any]] = {
@@ -157,7 +157,7 @@ def _learning(case: Case) -> Any:
     # f = −(b0/b) a·x + (1 − b0/b)(…): what the plant itself would have, its gain being b and not b0.
     numbers = -torsional_identified().A[-1] * B0 / float(torsional_identified().B[-1, 0])
     for i, feature in enumerate(run.features[:3]):
-        draw(above, run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
+        draw_line(above, run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         above.axhline(-numbers[i], color=f"C{i}", linestyle=":", linewidth=1.2)
     above.set_ylim(-4000.0, 2000.0)
     above.set_title(
@@ -170,7 +170,9 @@ def _learning(case: Case) -> Any:
         ("f_learned", "learned"),
         ("f_residual", "residual"),
     ):
-        draw(below, run.t, _smooth(run[channel], run.dt * run.every), label=label, linewidth=1.0)
+        draw_line(
+            below, run.t, _smooth(run[channel], run.dt * run.every), label=label, linewidth=1.0
+        )
     below.set_title("total disturbance as L-ESO has it, averaged over 20 ms", fontsize="medium")
     below.set_ylabel("f [rad/s⁴]")
     below.set_ylim(-2e4, 2e4)
@@ -199,5 +201,5 @@ def _line(
     """Draw ``factor`` times a channel less ``offset``, in a span of time from the profile's start."""
     part = run.window(PROFILE_AT + span[0], PROFILE_AT + span[1])
     if part.stop > part.start:
-        draw(ax, run.t[part] - PROFILE_AT, factor * (run[channel][part] - offset), **style)
+        draw_line(ax, run.t[part] - PROFILE_AT, factor * (run[channel][part] - offset), **style)
     ax.set_xlim(*span)

@@ -13,7 +13,7 @@ from quell.experiments.common.figures import STYLES, legend_label, save_figures,
 from quell.experiments.two_mass_spring.gradient_range import HORIZON, Trial
 from quell.experiments.two_mass_spring.setup import END, FORCE_AT, L1, MB, MF, STEP_AT, L
 from quell.experiments.two_mass_spring.study import Result
-from quell.records.plotting import draw
+from quell.records.plotting import draw_line
 from quell.records.trajectory import Trajectory
 
 # The paper's figures begin here, and zoom into these.
@@ -60,7 +60,9 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
             run = result.runs[name]
             part = run.window(start, stop)
             if part.stop > part.start:
-                draw(ax, run.t[part], run[channel][part], label=legend_label(name, run), **style)
+                draw_line(
+                    ax, run.t[part], run[channel][part], label=legend_label(name, run), **style
+                )
         ax.set_xlim(start, stop)
         ax.set_xlabel("time [s]")
     axes["all"].set_ylabel(label)
@@ -83,7 +85,7 @@ def _learning(result: Result) -> Any:
     figure = wide_figure(8.0)
     axes = figure.subplots(3, 1, sharex=True)
     for i, feature in enumerate(run.features):
-        draw(axes[0], run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
+        draw_line(axes[0], run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         if feature in _TRUE_THETA:
             axes[0].axhline(_TRUE_THETA[feature], color=f"C{i}", linestyle=":", linewidth=1.0)
     axes[0].set_ylim(-3.0, 1.5)
@@ -95,12 +97,12 @@ def _learning(result: Result) -> Any:
         (run["f_learned"], "learned"),
         (run["f_residual"], "residual"),
     ):
-        draw(axes[1], run.t, values, label=label, linewidth=1.0)
-    draw(axes[1], run.t, truth, label="true f", color="black", linestyle=":", linewidth=1.0)
+        draw_line(axes[1], run.t, values, label=label, linewidth=1.0)
+    draw_line(axes[1], run.t, truth, label="true f", color="black", linestyle=":", linewidth=1.0)
     axes[1].set_title("total disturbance as L-ESO has it", fontsize="medium")
     for name in (MF, MB, L):
         other = result.runs[name]
-        draw(
+        draw_line(
             axes[2],
             other.t,
             other["f_hat"] - _true_disturbance(other, known=name == MB),

@@ -28,7 +28,8 @@ from quell.realtime.loop.supervisor import (
 from quell.realtime.system.histogram import Histogram, Timing, empty_counts
 from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.ring import Ring
-from quell.records.record import columns_of, in_steps
+from quell.records.channels import columns_of
+from quell.records.sample_times import in_steps
 from quell.signals import Signal, as_signal
 from quell.simulation.scenario import Scenario
 from quell.types import Matrix

@@ -10,7 +10,7 @@ from typing import Any
 
 from quell import checks
 from quell.realtime.telemetry.channels import LOOP_CHANNELS
-from quell.records.record import is_vector
+from quell.records.channels import is_vector
 
 VERSION = 1
 """Version of the recording's layout; a reader refuses others."""

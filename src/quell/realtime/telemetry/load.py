@@ -11,7 +11,7 @@ from quell.realtime.telemetry.channels import EVENTS, LATENESS, STEP_TIME, Y_MEA
 from quell.realtime.telemetry.csv_file import read_csv
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.mcap_file import MAGIC, read_mcap
-from quell.records.record import columns_of
+from quell.records.channels import columns_of
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix, Status
 

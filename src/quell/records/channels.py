@@ -1,0 +1,66 @@
+"""The channels of a record: names, columns, descriptions and units."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+Channels: TypeAlias = tuple[tuple[str, int], ...]
+"""Name and width of the channels that are side by side in a log, in order."""
+
+# Channels that are vectors even if their width is one.
+_VECTORS = ("w", "x", "x_hat", "theta")
+# Description and unit.
+_DESCRIPTIONS = {
+    "r": ("reference", "y-unit"),
+    "r_shaped": ("reference behind the prefilter", "y-unit"),
+    "y": ("output", "y-unit"),
+    "y_measured": ("output as measured, with noise", "y-unit"),
+    "u": ("control signal as applied", "u-unit"),
+    "u_wished": ("control signal before limits", "u-unit"),
+    "w": ("disturbances", "w-unit"),
+    "x": ("state of the plant", "state-unit"),
+    "x_hat": ("estimated output and its derivatives", "y-unit/s^i"),
+    "f_residual": ("residual total disturbance estimated by the observer", "y-unit/s^n"),
+    "f_learned": ("total disturbance fed forward by the learner", "y-unit/s^n"),
+    "f_hat": ("estimated total disturbance", "y-unit/s^n"),
+    "authority": ("share of its output that the guard lets the learner have", "1"),
+    "error_plain": ("RMS of what an ESO without learner would have missed of f", "y-unit/s^n"),
+    "error_learned": (
+        "RMS of what would be missed with the learner at full authority",
+        "y-unit/s^n",
+    ),
+    "reason": ("why the authority is what it is (quell.guard.Reason)", "1"),
+    "status": ("status flags of the step", "1"),
+    "theta": ("coefficients of the learner", "y-unit/s^n per feature-unit"),
+    "k": ("index of the deadline", "1"),
+    "lateness": ("wake-up behind the deadline", "s"),
+    "step_time": ("from the wake-up until u was written", "s"),
+    "mode": ("state of the supervisor", "1"),
+    "events": ("what befell the cycle (quell.realtime.telemetry.channels.Event)", "1"),
+}
+
+
+def describe(name: str) -> tuple[str, str]:
+    """Return a channel's description and unit."""
+    return _DESCRIPTIONS.get(name, (name, "1"))
+
+
+def is_vector(name: str, width: int) -> bool:
+    """Return whether a channel has an axis for its entries, although it may have only one in this run."""
+    return width > 1 or name in _VECTORS
+
+
+def readable_names(channels: Channels) -> tuple[str, ...]:
+    """Return the names of the channels that can be read: those with columns, and ``f_hat`` if it can be computed."""
+    recorded = tuple(name for name, width in channels if width)
+    return (*recorded, "f_hat") if {"f_learned", "f_residual"} <= set(recorded) else recorded
+
+
+def columns_of(channels: Channels, name: str) -> slice:
+    """Return the columns of a channel in a log."""
+    start = 0
+    for channel, width in channels:
+        if channel == name:
+            return slice(start, start + width)
+        start += width
+    raise KeyError(name)
