@@ -11,7 +11,7 @@ from typing import Any
 
 from quell.realtime.telemetry.channels import K
 from quell.realtime.telemetry.header import Header
-from quell.records.record import is_vector, meaning
+from quell.records.channels import describe, is_vector
 from quell.types import Matrix
 
 SCHEMA = "quell/msg/Cycle"
@@ -25,7 +25,7 @@ def definition(header: Header) -> str:
     lines = []
     for name, width in header.channels:
         if width:
-            text, unit = meaning(name)
+            text, unit = describe(name)
             kind = f"float64[{width}]" if is_vector(name, width) else "float64"
             lines.append(f"{kind} {name}  # {text} [{header.units.get(name, unit)}]")
     return "\n".join(lines) + "\n"
