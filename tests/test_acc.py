@@ -17,14 +17,20 @@ from quell.analysis import analyse, linear_law
 from quell.analysis.linearise import closed_loop_matrix
 from quell.cli.app import app
 from quell.cli.commands.acc import _print_cases
-from quell.experiments.acc import controllers as acc_controllers
-from quell.experiments.acc import samples as acc_samples
-from quell.experiments.acc import study as acc
-from quell.experiments.acc.cases import CaseResult, study_cases
-from quell.experiments.acc.controllers import DT, MB, MF, PUBLISHED, L, designs
-from quell.experiments.acc.criteria import interval, judge
-from quell.experiments.acc.loops import unstable
-from quell.experiments.acc.published import judge_published
+from quell.experiments import acc
+from quell.experiments.acc import (
+    DT,
+    PUBLISHED,
+    CaseResult,
+    controllers,
+    designs,
+    interval,
+    judge,
+    judge_published,
+    study_cases,
+    unstable,
+)
+from quell.experiments.acc.controllers import MB, MF, L
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
 
@@ -93,9 +99,7 @@ def test_samples_are_read_by_name_whatever_their_order(tmp_path: Path) -> None:
         "tau, note, lambda, k_nonlin, k_lin, m2, m1\n6,x,5,-4,3,2,1\n\n"
     )
     for name in ("a.csv", "b.csv"):
-        np.testing.assert_array_equal(
-            acc_samples.read(tmp_path / name), [[1.0, 2.0, 3.0, -4.0, 5.0, 6.0]]
-        )
+        np.testing.assert_array_equal(acc.read(tmp_path / name), [[1.0, 2.0, 3.0, -4.0, 5.0, 6.0]])
 
 
 @pytest.mark.parametrize(
@@ -137,16 +141,16 @@ def test_each_mistake_in_a_file_of_samples_has_an_error_of_its_own(
     """It names file, line and column."""
     (tmp_path / "bad.csv").write_text(text)
     with pytest.raises(ValueError, match=rf"samples = .*bad.csv'.*{told}"):
-        acc_samples.read(tmp_path / "bad.csv")
+        acc.read(tmp_path / "bad.csv")
     with pytest.raises(ValueError, match="can't be read as a text file"):
-        acc_samples.read(tmp_path / "none.csv")
+        acc.read(tmp_path / "none.csv")
 
 
 def test_drawn_samples_are_of_the_published_kind_and_repeatable() -> None:
     """Medians and the ends of the quantiles; a spread of 3 is three times as wide; all plants can be built."""
-    small, wide = acc_samples.generated(2000), acc_samples.generated(2000, 3.0)
-    np.testing.assert_array_equal(small, acc_samples.generated(2000))
-    assert np.any(small != acc_samples.generated(2000, seed=1))
+    small, wide = acc.generated(2000), acc.generated(2000, 3.0)
+    np.testing.assert_array_equal(small, acc.generated(2000))
+    assert np.any(small != acc.generated(2000, seed=1))
     np.testing.assert_allclose(
         np.median(small, axis=0), [1.017, 1.008, 1.012, 0.019, 0.999, 0.0079], atol=0.01
     )
@@ -154,9 +158,9 @@ def test_drawn_samples_are_of_the_published_kind_and_repeatable() -> None:
     np.testing.assert_allclose(np.log(wide[:, 0]), 3.0 * np.log(small[:, 0]))
     np.testing.assert_allclose(wide[:, 3], 3.0 * small[:, 3])
     for row in wide[:50]:
-        acc_samples.plant(row, cubic=True)
+        acc.plant(row, cubic=True)
     with pytest.raises(ValueError, match=r"spread = 9.0: must be at most 5"):
-        acc_samples.generated(10, 9.0)
+        acc.generated(10, 9.0)
 
 
 def test_a_plant_fails_for_any_of_four_reasons_and_passes_on_the_limits() -> None:
@@ -225,7 +229,7 @@ def test_ours_fail_less_than_the_published_on_drawn_plants_without_and_with_the_
     None
 ):
     """On 60 plants three times as uncertain: the published 40 % and more, ours less than half of the best of them."""
-    samples = acc_samples.generated(60, 3.0, seed=5)
+    samples = acc.generated(60, 3.0, seed=5)
     for cubic in (False, True):
         published = min(
             np.mean(judge_published(design, samples, cubic).fails) for design in PUBLISHED.values()
@@ -268,7 +272,7 @@ def test_the_command_writes_what_programs_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The keys are fixed, rates lie in their intervals; without the baselines, whose loops would be compiled for this alone."""
-    monkeypatch.setattr(acc_controllers, "BASELINES", {})
+    monkeypatch.setattr(controllers, "BASELINES", {})
     (tmp_path / "few.csv").write_text(HEADER + "1,1,1,0.1,1,0.01\n0.9,1.1,0.95,-0.1,0.9,0.02\n")
     where = ["--json", str(tmp_path / "out.json"), "--no-figures"]
     with pytest.raises(SystemExit, match="0"):

@@ -13,9 +13,8 @@ import pytest
 
 import quell as ql
 from quell.cli.app import app
-from quell.experiments.compare import figures as compare_figure
-from quell.experiments.compare import study as compare
-from quell.experiments.compare.study import FORCE, FORCE_AT, Benchmark
+from quell.experiments import compare
+from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
 
 LAG = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
 
@@ -64,7 +63,7 @@ def test_a_run_that_diverges_is_shown_as_one() -> None:
     assert result.runs["wrong sign"].diverged
     assert set(result.scores["wrong sign"].values()) == {None}
     assert result.scores["right"]["settling_time"] is not None
-    figure = compare_figure.draw(result)
+    figure = compare.draw(result)
     assert "wrong sign (diverged)" in figure.axes[0].get_legend_handles_labels()[1]
     assert figure.axes[0].get_ylim()[1] < 1e5
 

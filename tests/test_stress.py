@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.experiments.stress import adversaries, random_loops
-from quell.experiments.stress import study as stress
+from quell.experiments import stress
 
 
 def test_without_a_guard_the_trial_is_lost() -> None:
@@ -25,7 +24,7 @@ def test_the_same_seed_gives_the_same_trial() -> None:
     one, again, other = (stress.run(12, 2, seed, guard=ql.Guard()) for seed in (1, 1, 2))
     assert [o.ratio for o in one.outcomes] == [o.ratio for o in again.outcomes]
     assert [o.ratio for o in one.outcomes] != [o.ratio for o in other.outcomes]
-    assert one.kinds == [*adversaries.KINDS, stress.HONEST]
+    assert one.kinds == [*stress.KINDS, stress.HONEST]
 
 
 def test_results_are_plain_data() -> None:
@@ -35,7 +34,7 @@ def test_results_are_plain_data() -> None:
     assert json.loads(json.dumps(found)) == found
     assert set(found) == {"settings", "adversarial", "honest", "kinds", "worst"}
     assert found["adversarial"]["runs"] == 12
-    assert list(found["kinds"]) == list(adversaries.KINDS)
+    assert list(found["kinds"]) == list(stress.KINDS)
     assert set(found["honest"]["load_ratio"]) == {"median", "p90", "p99", "max"}
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
@@ -43,7 +42,7 @@ def test_results_are_plain_data() -> None:
 
 def test_loops_are_drawn_within_their_ranges(rng: np.random.Generator) -> None:
     """And b0 is off by as much as it says."""
-    for loop in random_loops.draw(50, rng):
+    for loop in stress.draw_loops(50, rng):
         assert 0.5 <= loop.m1 <= 2.0
         assert 0.3 <= loop.k <= 3.0
         assert loop.dt in (1e-3, 2e-3, 5e-3)
@@ -51,11 +50,11 @@ def test_loops_are_drawn_within_their_ranges(rng: np.random.Generator) -> None:
         assert loop.controller().parameters.b0 == pytest.approx(loop.gain_error * b)
 
 
-@pytest.mark.parametrize("kind", adversaries.KINDS)
+@pytest.mark.parametrize("kind", stress.KINDS)
 def test_every_kind_of_adversary_runs_as_it_was_drawn(kind: str, rng: np.random.Generator) -> None:
     """Each draw is another learner, with a short run to show."""
-    loop = random_loops.draw(1, rng)[0]
-    one, other = (adversaries.draw(kind, rng) for _ in range(2))
+    loop = stress.draw_loops(1, rng)[0]
+    one, other = (stress.draw_adversary(kind, rng) for _ in range(2))
     assert repr(one) != repr(other)
     run = ql.simulate(
         loop.plant, loop.controller(one, ql.Guard()), ql.Scenario(ql.signals.Sinusoid(), 2.0)
@@ -81,4 +80,4 @@ def test_mistakes_are_named(arguments: tuple[int, int, int], message: str) -> No
 def test_an_unknown_kind_is_refused(rng: np.random.Generator) -> None:
     """With the list of those there are."""
     with pytest.raises(ValueError, match="kind"):
-        adversaries.draw("bad mood", rng)
+        stress.draw_adversary("bad mood", rng)

@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quell.experiments.acc import samples as acc_samples
-from quell.experiments.acc import study as acc
-from quell.experiments.acc.controllers import PUBLISHED, designs
-from quell.experiments.acc.published import judge_published
+from quell.experiments import acc
+from quell.experiments.acc import PUBLISHED, designs, judge_published
 
 SAMPLES = Path(__file__).resolve().parents[3] / "shared" / "benchmarks" / "acc" / "theta_small.csv"
 pytestmark = pytest.mark.skipif(
@@ -27,7 +25,7 @@ pytestmark = pytest.mark.skipif(
 )
 def test_the_published_designs_fail_as_often_as_listed(name: str, rate: float) -> None:
     """To the last of 1000 plants, strictly read, with a horizon of 25 s."""
-    found = judge_published(PUBLISHED[name], acc_samples.read(SAMPLES), cubic=False, duration=25.0)
+    found = judge_published(PUBLISHED[name], acc.read(SAMPLES), cubic=False, duration=25.0)
     assert np.mean(found.fails) == rate
 
 
@@ -36,5 +34,5 @@ def test_the_published_designs_fail_as_often_as_listed(name: str, rate: float) -
 @pytest.mark.xdist_group("acc")
 def test_each_of_ours_stays_below_the_bar(name: str, spring: str, bar: float) -> None:
     """0.5 % without, 1 % with the cubic spring; measured: none at all."""
-    found = acc.judge_sampled(designs()[name], acc_samples.read(SAMPLES), acc.SPRINGS[spring])
+    found = acc.judge_sampled(designs()[name], acc.read(SAMPLES), acc.SPRINGS[spring])
     assert np.mean(found.fails) <= bar

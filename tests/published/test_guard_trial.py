@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.experiments.stress import study as stress
+from quell.experiments import stress
 from quell.experiments.two_mass_spring import setup as study
 from quell.parallel import in_parallel
 

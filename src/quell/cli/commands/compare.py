@@ -13,7 +13,7 @@ from quell.cli.output import COMPILING, check_outputs, progress_bar, table, writ
 
 if TYPE_CHECKING:
     from quell.controllers import Controller
-    from quell.experiments.compare.study import Benchmark, Comparison
+    from quell.experiments.compare import Benchmark, Comparison
 
 _COLUMNS = (
     ("overshoot", "over-\nshoot\n[%]", 100.0, 2),
@@ -59,20 +59,20 @@ def compare(
     seed
         Seed of the measurement noise.
     """
-    from quell.experiments.compare import figures, study
+    from quell.experiments.compare import benchmark, figures
 
-    settings = study.Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
+    settings = benchmark.Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
     names = list(dict.fromkeys(name.strip() for name in controllers.split(",") if name.strip()))
     if not names:
         raise ValueError(
             f"controllers = {controllers!r}: must be names with commas between, of "
-            f"{', '.join(study.NAMES)}"
+            f"{', '.join(benchmark.NAMES)}"
         )
-    stable = {name: _is_stable(study.controller(name, dt, u_max), settings) for name in names}
+    stable = {name: _is_stable(benchmark.controller(name, dt, u_max), settings) for name in names}
     check_outputs(outputs)
     console = Console()
     with progress_bar(console, COMPILING) as report:
-        result = study.two_mass(settings, names, partial(report, COMPILING))
+        result = benchmark.two_mass(settings, names, partial(report, COMPILING))
     _print(console, result, settings, stable)
     paths = figures.save(result, outputs.figures) if outputs.figures else []
     about = {"m1": m1, "m2": m2, "k": k, "dt": dt, "seed": seed}
@@ -97,7 +97,7 @@ def _is_stable(controller: Controller, settings: Benchmark) -> bool | None:
 def _print(
     console: Console, result: Comparison, settings: Benchmark, stable: dict[str, bool | None]
 ) -> None:
-    from quell.experiments.compare.study import BAND, END, FORCE, FORCE_AT
+    from quell.experiments.compare import BAND, END, FORCE, FORCE_AT
 
     title = f"Designed for m1 = m2 = k = 1, run on {settings.m1:g}, {settings.m2:g}, {settings.k:g}"
     headings = [heading for _, heading, _, _ in _COLUMNS]

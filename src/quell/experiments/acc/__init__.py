@@ -1,1 +1,35 @@
-"""The ACC robust-control benchmark: published designs and ours on a thousand uncertain plants."""
+"""The ACC robust-control benchmark: published controllers and ours on a thousand uncertain plants."""
+
+from quell.experiments.acc.cases import CaseResult, study_cases
+from quell.experiments.acc.controllers import DT, PUBLISHED, TransferFunction, designs
+from quell.experiments.acc.criteria import Judged, interval, judge
+from quell.experiments.acc.figures import against_spread, save
+from quell.experiments.acc.published import judge_published
+from quell.experiments.acc.samples import generated, plant, read, widened
+from quell.experiments.acc.stability import unstable
+from quell.experiments.acc.study import SPRINGS, Result, judge_sampled, records, run
+
+__all__ = [
+    "DT",
+    "PUBLISHED",
+    "SPRINGS",
+    "CaseResult",
+    "Judged",
+    "Result",
+    "TransferFunction",
+    "against_spread",
+    "designs",
+    "generated",
+    "interval",
+    "judge",
+    "judge_published",
+    "judge_sampled",
+    "plant",
+    "read",
+    "records",
+    "run",
+    "save",
+    "study_cases",
+    "unstable",
+    "widened",
+]

@@ -1,4 +1,4 @@
-"""When a plant of the ACC benchmark fails, and how sure a share of failures is."""
+"""The failure criterion of the ACC benchmark, and the confidence interval of a failure rate."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from quell.experiments.acc.controllers import MOST_U
 from quell.types import Matrix, Vector
 
 SETTLED_AT, MOST_Y = 15.0, 0.1
+"""Time from which on y must stay small [s], and its limit [m], of Rocchetta, Crespo & Kenny (DSCC 2019)."""
 DURATION = 30.0
-# A control signal that lies on its limit is not beyond it.
+"""Duration of a run [s]: theirs is 25 s; chosen longer, so that slowly growing loops show."""
+# Relative to 0.5 N: a control signal on its limit is not beyond it, whatever the rounding.
 _ROUNDING = 1e-9
 
 
 class Judged(NamedTuple):
-    """What a sample of plants made of one controller; each array (count,)."""
+    """Runs of one controller on a sample of plants; each array (count,)."""
 
     late_peak: Vector
-    """Largest ``|y|`` from 15 s on [m]; infinite where the loop is unstable."""
+    """Largest ``|y|`` from 15 s on [m]; infinite for an unstable loop."""
     most_u: Vector
     """Largest ``|u|`` [N]."""
 
     @property
     def fails(self) -> NDArray[np.bool_]:
-        """Which plants fail, strictly read: unstable, ``|y| > 0.1`` at any time from 15 s on, or ``|u| > 0.5`` at any time."""
-        held = (self.late_peak <= MOST_Y) & (self.most_u <= MOST_U + _ROUNDING)
-        return ~held  # what is no number fails
+        """Whether each plant fails: unstable, ``|y| > 0.1`` at any time from 15 s on, or ``|u| > 0.5`` at any time; NaN fails."""
+        return ~((self.late_peak <= MOST_Y) & (self.most_u <= MOST_U + _ROUNDING))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the failure rate, its interval and why plants fail, for ``json.dump``."""
+        """Return the failure rate, its interval and the reasons, for ``json.dump``."""
         failures, count = int(np.sum(self.fails)), self.fails.size
         return {
             "failure_rate": failures / count,
@@ -42,9 +43,9 @@ class Judged(NamedTuple):
 
 
 def judge(t: Vector, y: Matrix, u: Matrix, unstable: NDArray[np.bool_]) -> Judged:
-    """Judge records ``y`` and ``u``, (count, samples), at the times ``t``; where a run ended early they are not numbers.
+    """Judge the records ``y`` and ``u`` (count, samples) at the times ``t``; they are NaN after an early end of a run.
 
-    ``unstable`` (count,) tells which loops have a pole that grows, be it so slowly that the records do not show it.
+    ``unstable`` (count,) marks loops with an unstable pole, which may be too slow to show in the records.
     """
     late = np.max(np.abs(y[:, t >= SETTLED_AT - 1e-9]), axis=1)
     return Judged(
@@ -54,7 +55,7 @@ def judge(t: Vector, y: Matrix, u: Matrix, unstable: NDArray[np.bool_]) -> Judge
 
 
 def interval(failures: int, count: int) -> tuple[float, float]:
-    """Return the 95 % confidence interval of a failure probability (Clopper & Pearson 1934: never too narrow)."""
+    """Return the 95 % confidence interval of a failure probability (Clopper & Pearson, *Biometrika* 26, 1934; never too narrow)."""
     from scipy.stats import binomtest
 
     found = binomtest(failures, count).proportion_ci(0.95, method="exact")

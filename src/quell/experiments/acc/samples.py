@@ -1,10 +1,10 @@
 """Uncertain plants of the ACC benchmark: read from a file, or drawn.
 
-A sample is a row ``(m1, m2, k_lin, k_nonlin, lambda, tau)``: masses [kg], stiffness [N/m] and its cubic part [N/m³], effectiveness and lag
-[s] of the actuator. ``generated`` draws more of the kind that Rocchetta, Crespo & Kenny (DSCC 2019) published: each parameter has the
-quantiles of their 1000 samples of small uncertainty, and spring, cubic part and effectiveness go together as they do there (a Gaussian
-copula with their rank correlations). What it leaves out is that light and heavy m1 both tend to go with soft springs; that makes it a
-little harsher than the original.
+A sample is a row ``(m1, m2, k_lin, k_nonlin, lambda, tau)``: masses [kg], stiffness [N/m] and its cubic part [N/m³],
+effectiveness and lag [s] of the actuator. ``generated`` draws samples like those that Rocchetta, Crespo & Kenny (DSCC 2019)
+published: each parameter has the quantiles of their 1000 samples of small uncertainty; spring, cubic part and effectiveness
+have the rank correlations of theirs (a Gaussian copula). In the original, light and heavy m1 also tend to have soft
+springs; without that the drawn samples are a little harsher.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from quell.types import Matrix, Vector
 
 COLUMNS = ("m1", "m2", "k_lin", "k_nonlin", "lambda", "tau")
 NOMINAL = np.array([1.0, 1.0, 1.0, 0.0, 1.0, 0.0065])
-"""The actuator's lag is a few milliseconds where all is well; uncertainty only adds to it."""
+"""The nominal plant; the lag is about the least of the published ones, as uncertainty only adds to it."""
 
-# Beyond these no such plant is, and its loop's poles are rounding.
+# Largest value (and the inverse of the smallest), and least lag [s]: far beyond real plants; chosen by hand, as the poles
+# of such loops are lost in rounding.
 _MOST, _LEAST_LAG = 1e6, 1e-9
 _UNITS = {"m1": "kg", "m2": "kg", "k_lin": "N/m", "tau": "s"}
-# Quantiles of the published samples, one row a parameter.
+# Quantiles of the published samples, one row for each parameter.
 _LEVELS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
 _QUANTILES = (
     (0.748, 0.781, 0.868, 0.951, 1.017, 1.056, 1.071, 1.084, 1.093),
@@ -35,23 +36,29 @@ _QUANTILES = (
     (0.736, 0.798, 0.871, 0.945, 0.999, 1.050, 1.102, 1.150, 1.215),
     (0.0062, 0.0063, 0.0065, 0.0069, 0.0079, 0.0108, 0.0183, 0.0315, 0.0803),
 )
-# Between k_lin, k_nonlin and lambda.
+# Rank correlations of k_lin, k_nonlin and lambda in the published samples.
 _CORRELATIONS = ((1.0, 0.94, 0.76), (0.94, 1.0, 0.71), (0.76, 0.71, 1.0))
+# Chosen by hand: beyond it, the quantiles are far outside of the published ones.
 _MOST_SPREAD = 5.0
+# Least lag of a drawn plant [s]: chosen by hand, below the nominal lag.
+_LEAST_DRAWN_LAG = 1e-3
 
 
 def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
-    """Draw ``count`` samples, (count, 6); the same seed gives the same.
+    """Draw samples; the same seed gives the same samples.
 
     Parameters
     ----------
     count
-        how many, at least one.
+        number of samples.
     spread
-        how far they are from nominal: 1 for the published small uncertainty, up to 5. What must be positive is widened as a factor
-        (``value^spread``), the cubic part and the lag linearly.
+        distance from nominal: 1 for the published small uncertainty, up to 5; see ``widened``.
     seed
-        of the generator.
+        seed of the random numbers.
+
+    Returns
+    -------
+    (count, 6) array
 
     Raises
     ------
@@ -76,7 +83,7 @@ def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
 
 
 def widened(samples: Matrix, spread: float) -> Matrix:
-    """Return samples ``spread`` times as far from nominal, masses, stiffness and effectiveness in proportion, the rest in difference."""
+    """Return samples ``spread`` times as far from nominal: cubic part and lag linearly, the others as a factor, ``value^spread``."""
     wide = np.empty_like(samples)
     for j in range(6):
         wide[:, j] = (
@@ -84,36 +91,35 @@ def widened(samples: Matrix, spread: float) -> Matrix:
             if j in (3, 5)
             else samples[:, j] ** spread
         )
-    wide[:, 5] = np.maximum(wide[:, 5], 1e-3)
+    wide[:, 5] = np.maximum(wide[:, 5], _LEAST_DRAWN_LAG)
     return wide
 
 
 def read(path: str | os.PathLike[str]) -> Matrix:
     """Read samples from a CSV file, (count, 6).
 
-    The first line names the columns, in any order: ``m1, m2, k_lin, k_nonlin, lambda, tau``, or ``theta_1`` to ``theta_6`` as published.
-    Other columns are left alone.
+    The first line names the columns, in any order: ``m1, m2, k_lin, k_nonlin, lambda, tau``, or ``theta_1`` to ``theta_6`` as
+    published. Other columns are ignored.
 
     Raises
     ------
     ValueError
-        where the file can't be read, a column is missing, or a value is no number or out of range; it names line and column.
+        if the file can't be read, a column is missing, or a value is no number or out of range; it names line and column.
     """
     where = f"samples = {os.fspath(path)!r}"
     rows = csv_rows(read_text(path, where), where)
     if len(rows) < 2:
         raise ValueError(f"{where}: must have a line of column names and at least one sample")
     header = [cell.lstrip("\\") for cell in rows[0][1]]
-    places = [_place(where, header, j) for j in range(6)]
-    return np.array(
-        [
-            [_value(where, number, row, place, j) for j, place in enumerate(places)]
-            for number, row in rows[1:]
-        ]
-    )
+    places = [_column(where, header, j) for j in range(6)]
+    samples = [
+        [_value(where, number, row, place, j) for j, place in enumerate(places)]
+        for number, row in rows[1:]
+    ]
+    return np.array(samples)
 
 
-def _place(where: str, header: list[str], j: int) -> int:
+def _column(where: str, header: list[str], j: int) -> int:
     names = (COLUMNS[j], f"theta_{j + 1}")
     found = [i for i, name in enumerate(header) if name in names]
     if len(found) != 1:
@@ -128,7 +134,7 @@ def _value(where: str, number: int, row: list[str], place: int, j: int) -> float
     name = COLUMNS[j]
     text = row[place].strip() if place < len(row) else ""
     try:
-        value = float(text.replace("_", "?"))  # which Python would read over
+        value = float(text.replace("_", "?"))  # Python accepts 1_000
     except ValueError:
         raise ValueError(f"{where}, line {number}: {name} = {text!r}: must be a number") from None
     try:
@@ -148,6 +154,6 @@ def _value(where: str, number: int, row: list[str], place: int, j: int) -> float
 
 
 def plant(sample: Vector, cubic: bool) -> LinearPlant | CubicSpringPlant:
-    """Return the plant of one sample; with ``cubic`` one with a cubic part, be that zero, so that all are of one kind."""
+    """Return the plant of a sample; with ``cubic`` always one with a cubic part, even if that is zero, so that all have one type."""
     m1, m2, k, k_cubic, effectiveness, lag = map(float, sample)
     return lagged_two_mass_spring(m1, m2, k, k_cubic if cubic else None, effectiveness, lag)

@@ -1,1 +1,1 @@
-"""What all experiments use: judged claims and figures."""
+"""Parts that several experiments use: judged claims, scores and figures. It imports no experiment."""

@@ -1,25 +1,35 @@
-"""Figures as files: each as PNG and SVG, whole or not at all."""
+"""Figures as files: PNG and SVG, each written completely or not at all."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from quell.files import written_atomically
 from quell.records.trajectory import Trajectory
+from quell.types import Progress
 
-# How the paper's three controllers are drawn in every figure.
 STYLES: dict[str, dict[str, Any]] = {
     "MF-ESO": {"color": "#c1440e", "linewidth": 1.2},
     "MB-ESO": {"color": "#2a6f97", "linewidth": 2.4, "alpha": 0.55},
     "L-ESO": {"color": "black", "linewidth": 1.2},
 }
+"""Line styles of the paper's three controllers, in all figures."""
+PAPER_STYLE = {"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}
+"""Settings of matplotlib for the figures of the paper's experiments."""
+
+
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure [inch] that is laid out automatically, independent of ``pyplot``."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def wide_figure(height: float) -> Any:
-    """Return an empty figure, apart from any that the user has open; its margins are fixed, as measuring them takes longer than drawing."""
+    """Return an empty figure with fixed margins, as an automatic layout takes longer than drawing; independent of ``pyplot``."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, height))
@@ -31,30 +41,42 @@ def wide_figure(height: float) -> Any:
 
 
 def legend_label(name: str, run: Trajectory) -> str:
-    """Return what a legend calls a run."""
+    """Return the name of a run for a legend."""
     return f"{name} (diverged at {run.ended:.3g} s)" if run.diverged else name
 
 
 def make_folder(folder: str | os.PathLike[str]) -> Path:
-    """Return a folder for figures, made if need be; a ``ValueError`` says why it can't be."""
-    where = Path(folder)
+    """Create a folder for figures if it does not exist.
+
+    Raises
+    ------
+    ValueError
+        if it can't be created.
+    """
+    path = Path(folder)
     try:
-        where.mkdir(parents=True, exist_ok=True)
+        path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(
-            f"figures = {str(where)!r}: must be a folder that can be made ({error.strerror})"
+            f"figures = {str(path)!r}: must be a folder that can be made ({error.strerror})"
         ) from None
-    return where
+    return path
 
 
-def save_figure(figure: Any, where: Path, name: str) -> list[Path]:
-    """Write a figure to ``where`` as PNG and SVG; return the paths. The same figure gives the same files."""
+def save_figure(figure: Any, folder: str | os.PathLike[str], name: str) -> list[Path]:
+    """Write a figure into ``folder`` as PNG and SVG; return the paths. Equal figures give equal files.
+
+    Raises
+    ------
+    ValueError
+        if the folder can't be created.
+    """
     import matplotlib
 
-    written = []
+    place, written = make_folder(folder), []
     with matplotlib.rc_context({"svg.hashsalt": "quell"}):
         for suffix in ("png", "svg"):
-            path = where / f"{name}.{suffix}"
+            path = place / f"{name}.{suffix}"
             with written_atomically(path) as part:
                 figure.savefig(part, dpi=130, metadata={"Date": None} if suffix == "svg" else None)
             written.append(path)
@@ -62,25 +84,41 @@ def save_figure(figure: Any, where: Path, name: str) -> list[Path]:
 
 
 def save_figures(
-    figures: Iterable[tuple[str, Any]],
-    count: int,
+    drawings: Mapping[str, Callable[[], Any]],
     folder: str | os.PathLike[str],
-    progress: Callable[[str, float], None],
+    progress: Progress | None = None,
+    style: Any = None,
 ) -> list[Path]:
-    """Write ``count`` figures with their names, in the studies' style, into ``folder``, made if need be; return the paths.
+    """Draw figures and write each as PNG and SVG.
+
+    Parameters
+    ----------
+    drawings
+        functions that return a figure, by the name of the file.
+    folder
+        created if it does not exist.
+    progress
+        called before each figure.
+    style
+        settings of matplotlib.
+
+    Returns
+    -------
+    list of Path
+        the files.
 
     Raises
     ------
     ValueError
-        where the folder can't be made.
+        if the folder can't be created.
     """
     import matplotlib
 
-    where = make_folder(folder)
+    report = progress or (lambda part, share: None)
     written = []
-    with matplotlib.rc_context({"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}):
-        for i, (name, figure) in enumerate(figures):
-            progress("figures", i / count)
-            written += save_figure(figure, where, name)
-    progress("figures", 1.0)
+    with matplotlib.rc_context(style):
+        for i, (name, draw) in enumerate(drawings.items()):
+            report("figures", i / len(drawings))
+            written += save_figure(draw(), folder, name)
+    report("figures", 1.0)
     return written

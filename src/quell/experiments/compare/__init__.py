@@ -1,13 +1,31 @@
-"""Controllers side by side on one plant."""
+"""Controllers side by side: on any plant, and on the two-mass-spring benchmark as ``quell compare`` shows it."""
 
-from quell.experiments.compare.study import (
+from quell.experiments.compare.benchmark import (
+    END,
+    FORCE,
+    FORCE_AT,
+    NAMES,
     Benchmark,
-    Comparison,
-    compare,
     controller,
     scenario,
-    score,
     two_mass,
 )
+from quell.experiments.compare.figures import draw, save
+from quell.experiments.compare.study import BAND, Comparison, compare, score
 
-__all__ = ["Benchmark", "Comparison", "compare", "controller", "scenario", "score", "two_mass"]
+__all__ = [
+    "BAND",
+    "END",
+    "FORCE",
+    "FORCE_AT",
+    "NAMES",
+    "Benchmark",
+    "Comparison",
+    "compare",
+    "controller",
+    "draw",
+    "save",
+    "scenario",
+    "score",
+    "two_mass",
+]

@@ -3,38 +3,33 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import make_folder, save_figure
+from quell.experiments.common.figures import new_figure, save_figures
 from quell.experiments.compare.study import Comparison
 from quell.records.plotting import draw_line
 
 
 def draw(result: Comparison) -> Any:
-    """Return the figure: y and r above, u below, quiet ones in front; what would dwarf the others is cut off."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 7.0), layout="constrained")
+    """Return the figure: y and r above, u below with quiet signals in front; extreme values are cut off."""
+    figure = new_figure(10.0, 7.0)
     above, below = figure.subplots(2, 1, sharex=True)
     first = next(iter(result.runs.values()))
     draw_line(above, first.t, first["r"], color="0.3", linestyle="--", linewidth=1.0, label="r")
-    loudness = {name: float(np.sum(np.abs(np.diff(run["u"])))) for name, run in result.runs.items()}
+    variation = {name: np.sum(np.abs(np.diff(run["u"]))) for name, run in result.runs.items()}
+    quietest_first = sorted(variation, key=variation.__getitem__)
     for i, (name, run) in enumerate(result.runs.items()):
         label = f"{name} (diverged)" if run.diverged else name
         style = {"color": f"C{i % 10}", "linewidth": 1.3, "linestyle": "-" if i < 10 else "--"}
+        depth = 3.0 - quietest_first.index(name) / len(quietest_first)
         draw_line(above, run.t, run["y"], label=label, **style)
-        draw_line(
-            below,
-            run.t,
-            run["u"],
-            zorder=3.0 - sorted(loudness, key=loudness.__getitem__).index(name) / len(loudness),
-            **style,
-        )
+        draw_line(below, run.t, run["u"], zorder=depth, **style)
     for ax, channel, title in ((above, "y", "output"), (below, "u", "control signal")):
-        ax.set_ylim(*_window([run[channel] for run in result.runs.values()]))
+        ax.set_ylim(*_limits([run[channel] for run in result.runs.values()]))
         ax.set_ylabel(title)
         ax.grid(alpha=0.3)
     above.legend(fontsize="small", ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
@@ -43,18 +38,15 @@ def draw(result: Comparison) -> Any:
 
 
 def save(result: Comparison, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write the figure into ``folder``, made if need be; return the paths."""
-    return save_figure(draw(result), make_folder(folder), "compare")
+    """Write the figure into ``folder``, which is created if need be; return the paths."""
+    return save_figures({"compare": partial(draw, result)}, folder)
 
 
-def _window(signals: list[Any]) -> tuple[float, float]:
-    """Return limits of an axis that hold all signals but what is far beyond the usual."""
-    low, high = (
-        float(np.median([np.min(s) for s in signals])),
-        float(np.median([np.max(s) for s in signals])),
-    )
+def _limits(signals: list[Any]) -> tuple[float, float]:
+    """Return limits of an axis that hold all signals, except for values far beyond the median of the extremes."""
+    low, high = (float(np.median([pick(s) for s in signals])) for pick in (np.min, np.max))
     room = 1.5 * max(high - low, 1e-9)
-    held = [np.clip(s, low - room, high + room) for s in signals]
-    low, high = min(float(np.min(s)) for s in held), max(float(np.max(s)) for s in held)
+    clipped = [np.clip(s, low - room, high + room) for s in signals]
+    low, high = min(float(np.min(s)) for s in clipped), max(float(np.max(s)) for s in clipped)
     margin = 0.05 * max(high - low, 1e-9)
     return low - margin, high + margin

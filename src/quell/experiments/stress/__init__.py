@@ -1,1 +1,25 @@
-"""The trial of the guard: hostile and honest learners in random loops beside MF-ESO."""
+"""The trial of the guard: hostile and honest learners in random loops, beside MF-ESO."""
+
+from quell.experiments.stress.adversaries import KINDS, Adversary, draw_adversary
+from quell.experiments.stress.figures import draw, save
+from quell.experiments.stress.random_loops import Loop, draw_loops
+from quell.experiments.stress.study import HONEST, Outcome, Result, errors, run, run_one, summary
+from quell.experiments.stress.turncoat import Turncoat
+
+__all__ = [
+    "HONEST",
+    "KINDS",
+    "Adversary",
+    "Loop",
+    "Outcome",
+    "Result",
+    "Turncoat",
+    "draw",
+    "draw_adversary",
+    "draw_loops",
+    "errors",
+    "run",
+    "run_one",
+    "save",
+    "summary",
+]

@@ -1,8 +1,8 @@
-"""Random loops: two-mass-spring plants that one untuned design has to serve.
+"""Random loops: two-mass-spring plants, all controlled by one design without tuning.
 
-Masses in [0.5, 2] kg, stiffness in [0.3, 3] N/m, b0 off by a factor in [0.6, 1.6], sample times of 1, 2 and 5 ms, a load on m2 of
-0.1 to 1.5 rad/s and 0.1 to 2 N; omega_c = 1 and omega_o = 10 rad/s for all. From rest the output follows sin t for 60 s, then a unit step;
-the load acts from 90 s on.
+Masses in [0.5, 2] kg, stiffness in [0.3, 3] N/m, b0 wrong by a factor in [0.6, 1.6], sample times of 1, 2 and 5 ms, a load
+on m2 of 0.1 to 1.5 rad/s and 0.1 to 2 N; omega_c = 1 and omega_o = 10 rad/s for all. From rest the output follows sin t for
+60 s, then a unit step; the load acts from 90 s on.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from quell.signals import BandLimitedNoise, Sinusoid, Step
 from quell.simulation.scenario import Scenario
 
 STEP_AT, LOAD_AT, END = 60.0, 90.0, 150.0
+"""Start of the step and of the load, end of a run [s]: chosen by hand, a guard has time to trust a learner before each."""
 REFERENCE = Sinusoid().until(STEP_AT, then=Step(at=STEP_AT))
 
 
 @dataclass(frozen=True)
 class Loop:
-    """One plant, its sample time, its load and how wrong the design's b0 is."""
+    """One plant with its sample time, its load and the error of the design's b0."""
 
     m1: float
     m2: float
@@ -34,11 +35,11 @@ class Loop:
     """b0 / b."""
     dt: float
     omega: float
-    """Of the load [rad/s]."""
+    """Frequency of the load [rad/s]."""
     amplitude: float
-    """Of the load [N]."""
+    """Amplitude of the load [N]."""
     seed: int
-    """Of the noise."""
+    """Seed of the noise."""
 
     @property
     def plant(self) -> LinearPlant:
@@ -47,7 +48,7 @@ class Loop:
 
     @property
     def scenario(self) -> Scenario:
-        """What happens to it."""
+        """Reference, load and noise."""
         return Scenario(
             reference=REFERENCE,
             disturbances=(0.0, Sinusoid(self.amplitude, self.omega, start=LOAD_AT)),
@@ -59,15 +60,11 @@ class Loop:
     def controller(self, learner: Learner | None = None, guard: Guard | None = None) -> ADRC:
         """Return the design that all loops share, with a learner and a guard."""
         b0 = self.gain_error * self.k / (self.m1 * self.m2)
-        return ADRC(
-            ESO.model_free(order=4, b0=b0, omega_o=10.0, dt=self.dt),
-            omega_c=1.0,
-            learner=learner,
-            guard=guard,
-        )
+        observer = ESO.model_free(order=4, b0=b0, omega_o=10.0, dt=self.dt)
+        return ADRC(observer, omega_c=1.0, learner=learner, guard=guard)
 
 
-def draw(count: int, rng: np.random.Generator) -> list[Loop]:
+def draw_loops(count: int, rng: np.random.Generator) -> list[Loop]:
     """Return ``count`` random loops."""
     return [
         Loop(

@@ -1,7 +1,8 @@
-"""The guard's trial: learners that mean no good, and one that does, in random loops, each beside plain MF-ESO on the same seed.
+"""The guard's trial: hostile learners, and an honest one, in random loops, each beside plain MF-ESO with the same seed.
 
-Errors are those of y against what the loop is designed to do, the response of ``(omega_c/(s + omega_c))^n`` to r, so that the design's own
-lag hides nothing. A run's ratio is its RMS error over that of MF-ESO: over the whole run, and over the 60 s of load.
+Errors are those of y against the response that the loop is designed for, ``(omega_c/(s + omega_c))^n`` times r, so that
+they do not contain the lag of the design. The ratio of a run is its RMS error divided by that of MF-ESO: over the whole
+run, and over the 60 s of load.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.experiments.stress import adversaries, random_loops
-from quell.experiments.stress.random_loops import END, LOAD_AT, Loop
+from quell.experiments.stress import random_loops
+from quell.experiments.stress.adversaries import KINDS, draw_adversary
+from quell.experiments.stress.random_loops import END, LOAD_AT, REFERENCE, Loop, draw_loops
 from quell.files import nonfinite_to_none
 from quell.guard import Guard
 from quell.learners import Harmonic, Learner
@@ -24,18 +26,19 @@ from quell.simulation.simulate import simulate
 from quell.types import Vector
 
 HONEST = "honest"
-# From here on "late" counts [s].
-LATE_AT = LOAD_AT + 50.0
-# Beyond this |y| a loop that has to hold 1 m counts as unstable [m].
-LIMIT = 100.0
-# Every so many seconds a sample is kept.
-_KEEP = 0.02
+# Start of the "late" part of the load [s]: chosen by hand, learners have learned the load by then.
+_LATE_AT = LOAD_AT + 50.0
+# A loop that has to hold 1 m counts as unstable beyond this |y| [m].
+_LIMIT = 100.0
+# Time between recorded samples [s]: a multiple of all sample times.
+_RECORD_DT = 0.02
+# More runs take days.
 _MOST_RUNS = 1_000_000
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one run; ratios are NaN where one of the two loops is unstable."""
+    """The result of one run; ratios are NaN if one of the two loops is unstable."""
 
     kind: str
     loop: Loop
@@ -63,12 +66,12 @@ class Result:
 
     @property
     def hostile(self) -> list[Outcome]:
-        """All but the honest ones."""
+        """Outcomes of all learners but the honest one."""
         return [outcome for outcome in self.outcomes if outcome.kind != HONEST]
 
     @property
     def kinds(self) -> list[str]:
-        """The kinds of learners there are, in order."""
+        """The kinds of learners in the trial, in order."""
         return list(dict.fromkeys(outcome.kind for outcome in self.outcomes))
 
     def to_json(self) -> dict[str, Any]:
@@ -86,19 +89,18 @@ class Result:
 
 
 def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Return counts, and quantiles of the ratios (None where there are none)."""
+    """Return counts, and quantiles of the ratios; None for the quantiles of no numbers."""
+    lost = [o for o in outcomes if o.unstable and not o.plain_unstable]
     found: dict[str, Any] = {
         "runs": len(outcomes),
         "unstable": sum(o.unstable for o in outcomes),
         "plain_unstable": sum(o.plain_unstable for o in outcomes),
-        "unstable_where_plain_is_stable": sum(
-            o.unstable and not o.plain_unstable for o in outcomes
-        ),
+        "unstable_where_plain_is_stable": len(lost),
     }
+    shares = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
     for name in ("ratio", "load_ratio", "late_ratio"):
         values = np.array([getattr(o, name) for o in outcomes])
         values = values[np.isfinite(values)]
-        shares = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
         found[name] = {
             key: float(np.quantile(values, share)) if values.size else None
             for key, share in shares.items()
@@ -120,22 +122,22 @@ def run(
     Parameters
     ----------
     runs
-        how many adversarial runs; all kinds in turn.
+        number of runs with hostile learners; all kinds in turn.
     honest
-        how many runs with ``learner``.
+        number of runs with ``learner``.
     seed
-        of all that is random.
+        seed of all random numbers.
     guard
-        the guard; None to see what happens without.
+        the guard; None for a trial without.
     learner
         the honest learner, ``Harmonic()`` by default.
     progress
-        called with the share that is done.
+        called with the finished share, 0 to 1.
 
     Raises
     ------
     ValueError
-        for numbers out of range, or where there is nothing to run.
+        for numbers out of range, or if there is nothing to run.
     """
     checks.whole("runs", runs, 0, _MOST_RUNS)
     checks.whole("honest", honest, 0, _MOST_RUNS)
@@ -145,13 +147,13 @@ def run(
             "runs = 0, honest = 0: at least one must be positive, or there is nothing to run"
         )
     rng = np.random.default_rng(seed)
-    kinds = [adversaries.KINDS[i % len(adversaries.KINDS)] for i in range(runs)]
+    kinds = [KINDS[i % len(KINDS)] for i in range(runs)]
     jobs = [
-        partial(one, kind, loop, adversaries.draw(kind, rng), guard)
-        for kind, loop in zip(kinds, random_loops.draw(runs, rng), strict=True)
+        partial(run_one, kind, loop, draw_adversary(kind, rng), guard)
+        for kind, loop in zip(kinds, draw_loops(runs, rng), strict=True)
     ]
     good = Harmonic() if learner is None else learner
-    jobs += [partial(one, HONEST, loop, good, guard) for loop in random_loops.draw(honest, rng)]
+    jobs += [partial(run_one, HONEST, loop, good, guard) for loop in draw_loops(honest, rng)]
     settings = {
         "runs": runs,
         "honest": honest,
@@ -164,7 +166,7 @@ def run(
     return Result(settings, in_parallel(jobs, progress))
 
 
-def one(kind: str, loop: Loop, learner: Learner, guard: Guard | None) -> Outcome:
+def run_one(kind: str, loop: Loop, learner: Learner, guard: Guard | None) -> Outcome:
     """Run one loop with a learner, and without."""
     plain, learned = errors(loop, None, None), errors(loop, learner, guard)
     ratios = (
@@ -178,16 +180,14 @@ def one(kind: str, loop: Loop, learner: Learner, guard: Guard | None) -> Outcome
 def errors(
     loop: Loop, learner: Learner | None, guard: Guard | None
 ) -> tuple[float, float, float] | None:
-    """Return the RMS errors over the whole run, under load and late; None where the loop is unstable."""
-    every = round(_KEEP / loop.dt)
-    done = simulate(
-        loop.plant, loop.controller(learner, guard), loop.scenario, record_every=every, limit=LIMIT
-    )
-    if done.diverged:
+    """Return the RMS errors over the whole run, under load, and late; None if the loop is unstable."""
+    every, controller = round(_RECORD_DT / loop.dt), loop.controller(learner, guard)
+    run = simulate(loop.plant, controller, loop.scenario, record_every=every, limit=_LIMIT)
+    if run.diverged:
         return None
-    away = done["y"] - _ideal(len(done))
-    windows = (slice(None), done.window(LOAD_AT, END + _KEEP), done.window(LATE_AT, END + _KEEP))
-    whole, load, late = (float(np.sqrt(np.mean(away[window] ** 2))) for window in windows)
+    error, end = run["y"] - _ideal(len(run)), END + _RECORD_DT
+    windows = (slice(None), run.window(LOAD_AT, end), run.window(_LATE_AT, end))
+    whole, load, late = (float(np.sqrt(np.mean(error[window] ** 2))) for window in windows)
     return whole, load, late
 
 
@@ -196,6 +196,5 @@ def _ideal(samples: int) -> Vector:
     """Return the response of four poles at −1 rad/s to the scenario's reference."""
     from scipy.signal import lsim
 
-    t = np.arange(samples) * _KEEP
-    reference = random_loops.REFERENCE(t)
-    return np.asarray(lsim(([1.0], [1.0, 4.0, 6.0, 4.0, 1.0]), reference, t)[1])
+    t = np.arange(samples) * _RECORD_DT
+    return np.asarray(lsim(([1.0], [1.0, 4.0, 6.0, 4.0, 1.0]), REFERENCE(t), t)[1])

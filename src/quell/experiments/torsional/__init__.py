@@ -1,1 +1,34 @@
-"""The paper's hardware experiment on a twin of its torsional testbed, every claim judged."""
+"""The paper's hardware experiment on a simulated twin of its torsional testbed, every claim judged."""
+
+from quell.experiments.torsional.figures import save
+from quell.experiments.torsional.setup import (
+    CASES,
+    NAMES,
+    PLANTS,
+    STARTS,
+    Settings,
+    controllers,
+    model_off,
+    plant,
+    scenarios,
+    score,
+)
+from quell.experiments.torsional.study import Case, Outcome, Result, run
+
+__all__ = [
+    "CASES",
+    "NAMES",
+    "PLANTS",
+    "STARTS",
+    "Case",
+    "Outcome",
+    "Result",
+    "Settings",
+    "controllers",
+    "model_off",
+    "plant",
+    "run",
+    "save",
+    "scenarios",
+    "score",
+]

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import STYLES, legend_label, save_figures, wide_figure
+from quell.experiments.common.figures import (
+    PAPER_STYLE,
+    STYLES,
+    legend_label,
+    save_figures,
+    wide_figure,
+)
 from quell.experiments.torsional.setup import (
     B0,
     BAND,
@@ -28,6 +35,7 @@ from quell.experiments.torsional.study import Case, Result
 from quell.plants import torsional_identified
 from quell.records.plotting import draw_line
 from quell.records.trajectory import Trajectory
+from quell.types import Progress, Vector
 
 _STYLES: Mapping[str, dict[str, Any]] = {
     MF: STYLES[MF],
@@ -36,109 +44,71 @@ _STYLES: Mapping[str, dict[str, Any]] = {
     L: STYLES[L],
 }
 _HEADINGS = {FRICTION: "with friction", LINEAR: "linear"}
-# From the profile's start [s]: the move, where y reaches π, and how near it is then, in bands.
-_MOVE, _ARRIVAL, _NEAR = (0.0, 4.0), (1.9, 6.0), 4.0
+# From the profile's start [s]: the move, and the time around the arrival at π.
+_MOVE, _ARRIVAL = (0.0, 4.0), (1.9, 6.0)
+# Half height of the axes around π [%]: four settling bands.
+_NEAR = 100.0 * 4.0 * BAND
+# Time over which f is averaged [s]: chosen by hand.
 _SMOOTHED = 0.02
 
 
-def save(
-    result: Result, folder: str | os.PathLike[str], progress: Callable[[str, float], None]
-) -> list[Path]:
-    """Draw all figures into ``folder``, made if need be, each as PNG and SVG; return the paths.
+def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
+    """Draw all figures into ``folder``, each as PNG and SVG; return the paths.
 
     Raises
     ------
     ValueError
-        where the folder can't be made.
+        if the folder can't be created.
     """
-    return save_figures(_figures(result), 3, folder, progress)
-
-
-def _figures(result: Result) -> Iterator[tuple[str, Any]]:
-    yield "torsional-position", _position(result)
-    yield "torsional-control", _control(result)
-    yield "torsional-learning", _learning(result.cases[-1])
+    drawings = {
+        "torsional-position": partial(_position, result),
+        "torsional-control": partial(_control, result),
+        "torsional-learning": partial(_learning, result.cases[-1]),
+    }
+    return save_figures(drawings, folder, progress, PAPER_STYLE)
 
 
 def _position(result: Result) -> Any:
-    """Draw the upper disk's angle: the move, and the arrival on either plant."""
+    """Draw the upper disk's angle: the move, and the arrival on both plants."""
     figure = wide_figure(8.4)
     figure.subplots_adjust(top=0.93, hspace=0.2)
     rows = figure.subplots(len(result.cases), 3, squeeze=False)
-    for case, axes in zip(result.cases, rows, strict=True):
+    for case, (move, *arrivals) in zip(result.cases, rows, strict=True):
         runs = case.outcomes[FRICTION].records
         for name, style in _STYLES.items():
-            _line(
-                axes[0],
-                runs[name],
-                "y",
-                _MOVE,
-                1.0,
-                0.0,
-                label=legend_label(name, runs[name]),
-                **style,
-            )
-        _line(
-            axes[0],
-            runs[MF],
-            "r",
-            _MOVE,
-            1.0,
-            0.0,
-            label="r",
-            color="0.3",
-            linestyle=":",
-            linewidth=1.0,
-        )
-        axes[0].set_ylabel(f"{case.label}\nupper disk [rad]")
-        for ax, kind in zip(axes[1:], PLANTS, strict=True):
+            run = runs[name]
+            _line(move, run, run["y"], _MOVE, label=legend_label(name, run), **style)
+        reference = {"label": "r", "color": "0.3", "linestyle": ":", "linewidth": 1.0}
+        _line(move, runs[MF], runs[MF]["r"], _MOVE, **reference)
+        move.set_ylabel(f"{case.label}\nupper disk [rad]")
+        for ax, kind in zip(arrivals, PLANTS, strict=True):
             for name, style in _STYLES.items():
-                _line(
-                    ax,
-                    case.outcomes[kind].records[name],
-                    "y",
-                    _ARRIVAL,
-                    100.0 / TARGET,
-                    TARGET,
-                    **style,
-                )
+                run = case.outcomes[kind].records[name]
+                _line(ax, run, 100.0 / TARGET * (run["y"] - TARGET), _ARRIVAL, **style)
             ax.axhspan(-100.0 * BAND, 100.0 * BAND, color="0.9", zorder=0)
-            ax.set_ylim(-100.0 * _NEAR * BAND, 100.0 * _NEAR * BAND)
+            ax.set_ylim(-_NEAR, _NEAR)
     rows[0, 0].set_title("with friction", fontsize="medium")
     for ax, kind in zip(rows[0, 1:], PLANTS, strict=True):
         ax.set_title(f"distance from π [%], {_HEADINGS[kind]}", fontsize="medium")
     rows[0, 0].legend(fontsize="x-small", loc="lower right")
     for ax in rows[-1]:
         ax.set_xlabel("time from the profile's start [s]")
-    figure.suptitle(
-        "Upper disk along the trapezoid to π, for each omega_c/omega_o [rad/s]; grey: ±0.2 %",
-        fontsize="medium",
-        y=0.995,
-    )
+    title = "Upper disk along the trapezoid to π, for each omega_c/omega_o [rad/s]; grey: ±0.2 %"
+    figure.suptitle(title, fontsize="medium", y=0.995)
     return figure
 
 
 def _control(result: Result) -> Any:
-    """Draw the control signal on either plant."""
+    """Draw the control signal on both plants."""
     figure = wide_figure(8.4)
     figure.subplots_adjust(left=0.1, hspace=0.1, wspace=0.05)
     rows = figure.subplots(len(result.cases), 2, squeeze=False, sharex=True, sharey="row")
     for case, axes in zip(result.cases, rows, strict=True):
         for ax, kind in zip(axes, PLANTS, strict=True):
-            runs = case.outcomes[kind].records
-            # The quieter in front.
-            for name in (MF, L, MB):
-                style = _STYLES[name] | {"linewidth": 0.7, "alpha": 0.8}
-                _line(
-                    ax,
-                    runs[name],
-                    "u",
-                    (0.0, END - PROFILE_AT),
-                    1.0,
-                    0.0,
-                    label=legend_label(name, runs[name]),
-                    **style,
-                )
+            for name in (MF, L, MB):  # the quietest in front
+                run, style = case.outcomes[kind].records[name], _STYLES[name]
+                style = style | {"linewidth": 0.7, "alpha": 0.8, "label": legend_label(name, run)}
+                _line(ax, run, run["u"], (0.0, END - PROFILE_AT), **style)
         axes[0].set_ylabel(f"{case.label}\ncontrol signal [V]")
     for ax, kind in zip(rows[0], PLANTS, strict=True):
         ax.set_title(_HEADINGS[kind], fontsize="medium")
@@ -149,21 +119,19 @@ def _control(result: Result) -> Any:
 
 
 def _learning(case: Case) -> Any:
-    """Draw what L-ESO learned on the plant with friction, in terms of the paper's model, and how it splits up f."""
+    """Draw the coefficients of L-ESO on the plant with friction, and the parts of its estimate of f."""
     run = case.outcomes[FRICTION].records[L]
     figure = wide_figure(7.2)
     figure.subplots_adjust(left=0.1)
     above, below = figure.subplots(2, 1)
-    # f = −(b0/b) a·x + (1 − b0/b)(…): what the plant itself would have, its gain being b and not b0.
+    # The identified plant's own coefficients, f = −(b0/b) a·x + (1 − b0/b)(…), as its gain is b and not b0.
     numbers = -torsional_identified().A[-1] * B0 / float(torsional_identified().B[-1, 0])
     for i, feature in enumerate(run.features[:3]):
         draw_line(above, run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         above.axhline(-numbers[i], color=f"C{i}", linestyle=":", linewidth=1.2)
     above.set_ylim(-4000.0, 2000.0)
-    above.set_title(
-        f"coefficients of L-ESO at {case.label} with friction; dotted: the identified plant's, for b0",
-        fontsize="medium",
-    )
+    title = f"coefficients of L-ESO at {case.label} with friction; dotted: the identified plant's, for b0"
+    above.set_title(title, fontsize="medium")
     above.set_ylabel("theta")
     for channel, label in (
         ("f_hat", "estimate"),
@@ -184,22 +152,16 @@ def _learning(case: Case) -> Any:
     return figure
 
 
-def _smooth(values: Any, dt: float) -> Any:
+def _smooth(values: Vector, dt: float) -> Vector:
     width = max(round(_SMOOTHED / dt), 1)
     return np.convolve(values, np.full(width, 1.0 / width), mode="same")
 
 
 def _line(
-    ax: Any,
-    run: Trajectory,
-    channel: str,
-    span: tuple[float, float],
-    factor: float,
-    offset: float,
-    **style: Any,
+    ax: Any, run: Trajectory, values: Vector, span: tuple[float, float], **style: Any
 ) -> None:
-    """Draw ``factor`` times a channel less ``offset``, in a span of time from the profile's start."""
+    """Draw values of a run in a span of time from the profile's start [s]."""
     part = run.window(PROFILE_AT + span[0], PROFILE_AT + span[1])
     if part.stop > part.start:
-        draw_line(ax, run.t[part] - PROFILE_AT, factor * (run[channel][part] - offset), **style)
+        draw_line(ax, run.t[part] - PROFILE_AT, values[part], **style)
     ax.set_xlim(*span)

@@ -1,14 +1,14 @@
 """The paper's hardware experiment (section V) on the twin: the ECP 205 torsional testbed under MF-ESO, MB-ESO and L-ESO.
 
-From rest the upper disk follows (π/2) sin(π t/2) for 40 s, in which a learner learns; then the loop starts from rest again, with what
-was learned, and follows a trapezoidal profile to π within 2 s. The output is what an encoder of 16 000 counts counts. Two plants:
-*friction*, the twin with Coulomb friction, converter and current limit, and *linear*, the transfer function that the paper identified,
-behind the encoder.
+From rest the upper disk follows (π/2) sin(π t/2) for 40 s, while a learner learns; then the loop starts from rest again,
+with what was learned, and follows a trapezoidal profile to π within 2 s. The output comes from an encoder of 16 000 counts.
+There are two plants: *friction*, the twin with Coulomb friction, converter and current limit, and *linear*, the transfer
+function that the paper identified, behind the encoder.
 
-What the paper leaves open: the training takes 40 s; the profile speeds up and brakes for 0.5 s each; the settling band is ±0.2 % of the
-move, and settling is counted from the profile's start, as in the two-mass study; the observers are those of that study too. u is limited to
-what the drive can do, and the observers are told. A run's only chance is where between two edges of the encoder it starts; so there are
-several, and figures are medians of them.
+The paper leaves open: the duration of the training (40 s here), the ramps of the profile (0.5 s each), the settling band
+(±0.2 % of the move; settling counts from the profile's start, as in the two-mass study), and the observers (those of that
+study). u is limited to the range of the drive, and the observers get the limited u. The only random quantity is the start
+between two edges of the encoder; results are medians over several starts.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers import ADRC
+from quell.experiments.common.scores import METRICS, Scores, step_scores
 from quell.guard import Guard
 from quell.learners import Kalman
 from quell.observers import ESO
@@ -30,13 +31,18 @@ from quell.signals import Sinusoid, Trapezoid
 from quell.simulation.scenario import Scenario
 
 PROFILE_AT, END = 40.0, 50.0
+"""Start of the profile, end of the experiment [s]; see above."""
 TARGET, MOVE_TIME, RAMP_TIME = math.pi, 2.0, 0.5
 BAND = 0.002
+"""Half width of the settling band, as a fraction of the move; see above."""
 COUNTS = 16_000
+"""Counts per turn of the encoder, of the paper."""
 B0 = 5.5e4
+"""The paper's b0 of MF-ESO and L-ESO [rad/(V s⁴)]; the identified plant has 4.6e4."""
 STARTS = 5
-# omega_c and omega_o [rad/s]: as the paper has them, the other way round, and where the claims hold best.
+"""Number of starts: chosen by hand, an odd number for medians."""
 CASES = ((90.0, 40.0), (40.0, 90.0), (20.0, 90.0))
+"""omega_c and omega_o [rad/s]: as in the paper, exchanged, and where the claims hold best (docs/torsional)."""
 
 MF, MB, L = "MF-ESO", "MB-ESO", "L-ESO"
 MB_OFF, LG = "MB-ESO (10 % off)", "L-ESO (guarded)"
@@ -44,27 +50,27 @@ NAMES = (MF, MB, L, MB_OFF, LG)
 FRICTION, LINEAR = "friction", "linear"
 PLANTS = (FRICTION, LINEAR)
 
-# At 5 ms the fastest of the loops is still one.
+# Longest sample time [s]: at 5 ms the fastest loop still works; chosen with a margin to it.
 _LONGEST_DT = 2e-3
-# About 5 GB of records.
+# Shortest sample time [s]: about 5 GB of records.
 _SHORTEST_DT = 1e-4
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What may be varied.
+    """The parameters of the experiment that may be varied.
 
     Parameters
     ----------
     dt
         sample time [s].
     seed
-        of where the runs start, between two edges of the encoder.
+        seed of the starts between two edges of the encoder.
 
     Raises
     ------
     ValueError
-        for a value that no experiment can be made with.
+        for a value that allows no experiment.
     """
 
     dt: float = 1e-3
@@ -84,33 +90,29 @@ def plant(kind: str) -> Plant:
 
 
 def scenarios(settings: Settings, kind: str) -> list[Scenario]:
-    """Return the experiment once for each start: both disks turned by the same part of a count."""
+    """Return the scenario for each start; both disks are turned by the same fraction of a count."""
     training = Sinusoid(amplitude=0.5 * math.pi, omega=0.5 * math.pi)
     profile = Trapezoid(distance=TARGET, duration=MOVE_TIME, ramp_time=RAMP_TIME, start=PROFILE_AT)
-    what = Scenario(
+    scenario = Scenario(
         reference=training.until(PROFILE_AT, then=profile), duration=END, rest_at=(PROFILE_AT,)
     )
     rest = np.array([1.0, float(kind == FRICTION), 0.0, 0.0]) * math.tau / COUNTS
     parts = np.random.default_rng(settings.seed).uniform(-0.5, 0.5, STARTS)
-    return [replace(what, x0=part * rest) for part in parts]
+    return [replace(scenario, x0=part * rest) for part in parts]
 
 
 def model_off(share: float = 0.1) -> LinearPlant:
-    """Return the identified model with coefficients too large by a share, and a gain too small by it."""
-    numerator, denominator = (
-        [4.6e4 * (1.0 - share)],
-        np.array([1.901, 1683.0, 1812.0, 0.1032]) * (1.0 + share),
-    )
+    """Return the identified model with coefficients too large, and a gain too small, by a share."""
+    numerator = [4.6e4 * (1.0 - share)]
+    denominator = np.array([1.901, 1683.0, 1812.0, 0.1032]) * (1.0 + share)
     return LinearPlant.of((numerator, [1.0, *denominator]), name="torsional plant, not quite")
 
 
 def controllers(settings: Settings, omega_c: float, omega_o: float) -> dict[str, ADRC]:
-    """Return the controllers by name, with bandwidths in rad/s; there is one learner for all cases, ``Kalman()``, with nothing tuned."""
+    """Return the controllers by name, with bandwidths in rad/s; the learner is ``Kalman()`` without tuning in all cases."""
     free = ESO.model_free(order=4, b0=B0, omega_o=omega_o, dt=settings.dt)
-    exact, off = (
-        ESO.model_based(model, omega_o=omega_o, dt=settings.dt)
-        for model in (torsional_identified(), model_off())
-    )
+    exact = ESO.model_based(torsional_identified(), omega_o=omega_o, dt=settings.dt)
+    off = ESO.model_based(model_off(), omega_o=omega_o, dt=settings.dt)
     most = torsional().u_max
 
     def law(observer: ESO, learner: Kalman | None = None, guard: Guard | None = None) -> ADRC:
@@ -125,30 +127,17 @@ def controllers(settings: Settings, omega_c: float, omega_o: float) -> dict[str,
     }
 
 
-def score(run: Trajectory) -> dict[str, float | None]:
-    """Return the metrics of the profile, over [40, 50] s; None where the run did not get there, or y not into its band.
+def score(run: Trajectory) -> Scores:
+    """Return the scores of the profile, over [40, 50] s; None if the run ended too early, or y did not settle.
 
-    Overshoot (a fraction of π), settling time [s] from the profile's start, control variation [V], and the RMS of y − r [rad].
-    ``disturbance_peak`` and ``disturbance_rms`` are None: nothing but friction disturbs.
+    Overshoot (a fraction of π), settling time [s] from the profile's start, control variation [V], and the RMS of y − r
+    [rad]. ``disturbance_peak`` and ``disturbance_rms`` are None: nothing but friction disturbs.
     """
-    found: dict[str, float | None] = dict.fromkeys(
-        (
-            "overshoot",
-            "settling_time",
-            "disturbance_peak",
-            "disturbance_rms",
-            "control_variation",
-            "rms_from_step",
-        )
-    )
-    if run.ended < END - 2 * run.dt:
-        return found
-    part = run.window(PROFILE_AT, END + 0.5 * run.dt)
-    t, y = run.t[part], run["y"][part]
-    settling = metrics.settling_time(t, y, TARGET, BAND)
-    return found | {
-        "overshoot": metrics.overshoot(y, TARGET),
-        "settling_time": None if math.isnan(settling) else settling,
-        "control_variation": metrics.control_variation(run["u"][part]),
-        "rms_from_step": metrics.rms(y - run["r"][part]),
-    }
+    found: Scores = dict.fromkeys(METRICS)
+    if run.ended >= END - 2 * run.dt:
+        part = run.window(PROFILE_AT, END + 0.5 * run.dt)
+        y = run["y"][part]
+        found |= step_scores(run.t[part], y, TARGET, BAND)
+        found["control_variation"] = metrics.control_variation(run["u"][part])
+        found["rms_from_step"] = metrics.rms(y - run["r"][part])
+    return found

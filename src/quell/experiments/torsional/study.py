@@ -1,4 +1,4 @@
-"""The torsional experiment as a whole: run it, measure what the paper claims of it, judge."""
+"""The torsional experiment: run it, measure the values that the paper claims, judge the claims."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from functools import partial
 from typing import Any
 
 from quell.controllers import ADRC
-from quell.experiments.common.claims import Claim
+from quell.experiments.common.claims import Claim, ratio
+from quell.experiments.common.scores import Scores, ended_early
 from quell.experiments.torsional.setup import (
     BAND,
     CASES,
@@ -34,35 +35,32 @@ from quell.parallel import in_parallel
 from quell.plants import Plant
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
+from quell.types import Progress
 
-Scores = Mapping[str, float | None]
-# One count of the encoder as a fraction of the move: what an overshoot can be told apart by. Overshoots are whole counts but for rounding.
-COUNT = 2.0 / COUNTS * (1.0 + 1e-6)
+# One count of the encoder as a fraction of the move, the resolution of an overshoot. Overshoots are whole counts, up to
+# rounding, for which there is the last factor.
+_COUNT = 2.0 / COUNTS * (1.0 + 1e-6)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out on one plant."""
+    """The results on one plant."""
 
     records: Mapping[str, Trajectory]
-    """Of the first start."""
+    """Records of the first start."""
     scores: Mapping[str, Scores]
-    """Medians over the starts."""
+    """Medians over the starts, by controller."""
     spread: Mapping[str, Mapping[str, tuple[float, float] | None]]
-    """Least and largest."""
+    """Least and largest score over the starts."""
     claims: tuple[Claim, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain dictionaries and lists; what could not be measured is None."""
-        messages = {name: run.message for name, run in self.records.items() if run.diverged}
+        """Return plain dictionaries and lists; None for values that were not measured."""
         return {
             "controllers": {name: dict(score) for name, score in self.scores.items()},
             "spread": {name: dict(spread) for name, spread in self.spread.items()},
             "claims": [asdict(claim) for claim in self.claims],
-            "ended_early": {
-                name: {"at": self.records[name].ended, "message": text}
-                for name, text in messages.items()
-            },
+            "ended_early": ended_early(self.records),
         }
 
 
@@ -80,7 +78,7 @@ class Case:
         return f"{self.omega_c:g}/{self.omega_o:g}"
 
     def to_json(self) -> dict[str, Any]:
-        """Return the plant with friction at the top, and the linear one below its name."""
+        """Return the results: with friction at the top level, of the linear plant under its name."""
         bandwidths = {"omega_c": self.omega_c, "omega_o": self.omega_o}
         return (
             bandwidths
@@ -92,7 +90,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Result:
-    """What came out, case by case."""
+    """The results, case by case."""
 
     settings: Settings
     cases: tuple[Case, ...]
@@ -113,68 +111,43 @@ class Result:
         }
 
 
-def run(settings: Settings, progress: Callable[[str, float], None] | None = None) -> Result:
-    """Run the experiment.
-
-    Parameters
-    ----------
-    settings
-        what is varied.
-    progress
-        called with what is being done and the share of it that is.
-    """
-    progress = progress or (lambda what, share: None)
+def run(settings: Settings, progress: Progress | None = None) -> Result:
+    """Run the experiment."""
+    progress = progress or (lambda part, share: None)
     jobs = {
         (case, kind, name): partial(_starts, plant(kind), controller, scenarios(settings, kind))
         for case in CASES
         for kind in PLANTS
         for name, controller in controllers(settings, *case).items()
     }
-    done = dict(
-        zip(
-            jobs,
-            in_parallel(jobs.values(), lambda share: progress("simulating", share)),
-            strict=True,
-        )
-    )
+    done = dict(zip(jobs, in_parallel(jobs.values(), partial(progress, "simulating")), strict=True))
 
     def outcome(case: tuple[float, float], kind: str) -> Outcome:
-        mine = {
-            name: found
-            for (its, plant_kind, name), found in done.items()
-            if (its, plant_kind) == (case, kind)
-        }
+        mine = {name: found for (*at, name), found in done.items() if at == [case, kind]}
         scores = {name: _over_starts(found, statistics.median) for name, (_, found) in mine.items()}
-        spread = {
-            name: _over_starts(found, lambda values: (min(values), max(values)))
-            for name, (_, found) in mine.items()
-        }
-        return Outcome(
-            {name: first for name, (first, _) in mine.items()},
-            scores,
-            spread,
-            tuple(_claims(scores, settings.dt)),
-        )
+        spread = {name: _over_starts(found, _range) for name, (_, found) in mine.items()}
+        records = {name: first for name, (first, _) in mine.items()}
+        return Outcome(records, scores, spread, tuple(_claims(scores, settings.dt)))
 
-    return Result(
-        settings,
-        tuple(Case(*case, {kind: outcome(case, kind) for kind in PLANTS}) for case in CASES),
-    )
+    cases = (Case(*case, {kind: outcome(case, kind) for kind in PLANTS}) for case in CASES)
+    return Result(settings, tuple(cases))
 
 
 def _starts(
-    what: Plant, controller: ADRC, courses: Sequence[Scenario]
+    plant: Plant, controller: ADRC, starts: Sequence[Scenario]
 ) -> tuple[Trajectory, list[Scores]]:
     """Run a controller from all starts; return the first record, and all scores."""
-    first = simulate(what, controller, courses[0])
-    return first, [
-        score(first),
-        *(score(simulate(what, controller, course)) for course in courses[1:]),
-    ]
+    first = simulate(plant, controller, starts[0])
+    others = (simulate(plant, controller, start) for start in starts[1:])
+    return first, [score(first), *map(score, others)]
+
+
+def _range(values: list[float]) -> tuple[float, float]:
+    return min(values), max(values)
 
 
 def _over_starts(scores: Sequence[Scores], summary: Callable[[list[float]], Any]) -> dict[str, Any]:
-    """Summarise each metric over the starts; one that a single start lacks is lacking."""
+    """Summarise each score over the starts; None if a start does not have it."""
     columns = {key: [score[key] for score in scores] for key in scores[0]}
     return {
         key: None if None in values else summary([v for v in values if v is not None])
@@ -183,26 +156,19 @@ def _over_starts(scores: Sequence[Scores], summary: Callable[[list[float]], Any]
 
 
 def _claims(scores: Mapping[str, Scores], dt: float) -> Iterable[Claim]:
-    """Judge the paper's two observations: L-ESO has the least overshoot and settles first, and moves u less than MF-ESO, more than MB-ESO.
+    """Judge the paper's two observations.
 
-    Overshoots are told apart by a count of the encoder, settling times by a sample.
+    L-ESO has the least overshoot and settles first; its control variation is below MF-ESO's and above MB-ESO's. Overshoots
+    differ by at least a count of the encoder, settling times by a sample.
     """
-    for key, what, unit, least in (
-        ("overshoot", "overshoot", "", COUNT),
+    for key, name, unit, resolution in (
+        ("overshoot", "overshoot", "", _COUNT),
         ("settling_time", "settling", "s", dt),
     ):
         for other in (MF, MB_OFF, MB):
             rival = scores[other][key]
-            yield Claim.at_most(
-                f"{L}: {what} ≤ {other}'s",
-                "best",
-                scores[L][key],
-                None if rival is None else rival + least,
-                unit,
-            )
-    mine = scores[L]["control_variation"]
+            most = None if rival is None else rival + resolution
+            yield Claim.at_most(f"{L}: {name} ≤ {other}'s", "best", scores[L][key], most, unit)
     for other, judge in ((MF, Claim.below_one), (MB, Claim.above_one)):
-        rival = scores[other]["control_variation"]
-        yield judge(
-            f"{L}: variation over {other}'s", None if mine is None or not rival else mine / rival
-        )
+        value = ratio(scores[L]["control_variation"], scores[other]["control_variation"])
+        yield judge(f"{L}: variation over {other}'s", value)

@@ -1,1 +1,28 @@
 """The paper's simulation study on two masses and a spring, every claim judged."""
+
+from quell.experiments.two_mass_spring.figures import save
+from quell.experiments.two_mass_spring.gradient_range import Trial, stable_up_to, trials
+from quell.experiments.two_mass_spring.setup import (
+    Settings,
+    controller,
+    controllers,
+    gradient_rate,
+    scenario,
+    score,
+)
+from quell.experiments.two_mass_spring.study import Result, run
+
+__all__ = [
+    "Result",
+    "Settings",
+    "Trial",
+    "controller",
+    "controllers",
+    "gradient_rate",
+    "run",
+    "save",
+    "scenario",
+    "score",
+    "stable_up_to",
+    "trials",
+]

@@ -1,0 +1,28 @@
+"""Stability of the benchmark's loops while no limit holds: for many plants at once, as ``analysis`` is for one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.analysis.linearise import closed_loop_matrix, linear_law
+from quell.parallel import one_blas_thread
+from quell.plants import CubicSpringPlant, LinearPlant
+
+
+def unstable(
+    plants: Sequence[LinearPlant | CubicSpringPlant], controller: Any
+) -> NDArray[np.bool_]:
+    """Return for each plant whether its loop is unstable around y = 0, where a cubic spring has no effect, with nothing learned."""
+    law = linear_law(controller)
+    inner = law.A + np.outer(law.B_u, law.C)
+    linear = [p.linear if isinstance(p, CubicSpringPlant) else p for p in plants]
+    with one_blas_thread():
+        sampled = [plant.sampled(controller.dt) for plant in linear]
+        loops = np.array(
+            [closed_loop_matrix(s.transition, s.input, s.output, law, inner) for s in sampled]
+        )
+        return np.asarray(np.max(np.abs(np.linalg.eigvals(loops)), axis=1) >= 1.0)

@@ -1,0 +1,41 @@
+"""Scores of runs, as numbers for tables and JSON files; None stands for a number that a run does not have."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from quell.records import metrics
+from quell.records.trajectory import Trajectory
+from quell.types import Vector
+
+Scores = dict[str, float | None]
+
+METRICS = (
+    "overshoot",
+    "settling_time",
+    "disturbance_peak",
+    "disturbance_rms",
+    "control_variation",
+    "rms_from_step",
+)
+"""Names of the scores in the experiments of the paper."""
+
+
+def step_scores(t: Vector, y: Vector, target: float, band: float, initial: float = 0.0) -> Scores:
+    """Return overshoot (fraction) and settling time [s] of a move; the latter is None if y does not settle."""
+    settling = metrics.settling_time(t, y, target, band, initial)
+    return {
+        "overshoot": metrics.overshoot(y, target, initial),
+        "settling_time": None if math.isnan(settling) else settling,
+    }
+
+
+def ended_early(runs: Mapping[str, Trajectory]) -> dict[str, dict[str, Any]]:
+    """Return time and message of the runs that diverged, by name."""
+    return {
+        name: {"at": run.ended, "message": run.message}
+        for name, run in runs.items()
+        if run.diverged
+    }
