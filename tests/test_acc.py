@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 import quell as ql
 from quell.analysis import analyse, linear_law
-from quell.analysis.linearise import closed_loop_matrix
+from quell.analysis.subsystems import closed_loop_matrix
 from quell.cli.app import app
 from quell.cli.commands.acc import _print_cases
 from quell.experiments import acc

@@ -1,4 +1,7 @@
-"""Analysis of loops: poles, margins, sensitivity functions, what noise does; as systems of python-control, and as pictures."""
+"""Analysis of loops: poles, margins, sensitivity functions and noise, also as systems of python-control and as plots.
+
+May import ``simulation``, ``records``, ``controllers`` and what they import.
+"""
 
 from quell.analysis.advice import advise
 from quell.analysis.frozen_learner import Frozen, frozen

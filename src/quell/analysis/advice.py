@@ -1,4 +1,4 @@
-"""What makes a loop unwise, with numbers: sampling, noise, lags, and too little margin."""
+"""Findings about a design, with numbers: sampling, noise, lags, and too little margin."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
+from quell.controllers.base import Controller
 from quell.controllers.design_checks import Finding, sampling_findings
+from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
 
-# RMS of u, as a share of its range: six standard deviations are then 30 % of it.
+# RMS of u as a share of its range: six standard deviations are then 30 % of it. Chosen by hand.
 _NOISE = 0.05
-# A chain of four integrators with omega_o = 10 omega_c has 0.41, with 3 omega_c 0.24.
+# Between the loops of a chain of four integrators with omega_o = 10 omega_c, 0.41, and with 3 omega_c, 0.24.
 _LEAST_MODULUS = 0.3
-# What a lag may leave of the modulus margin.
-_LEFT = 0.8
+# Share of the modulus margin that a lag must leave. Chosen by hand.
+_LAG_LEAVES = 0.8
 
 
 def advise(
-    controller: Any,
+    controller: Controller,
     plant: Any = None,
     *,
     noise_std: float | None = None,
@@ -29,47 +31,47 @@ def advise(
     delay: float = 0.0,
     at: Any = None,
 ) -> list[Finding]:
-    """Say what makes a design unwise, with the number, its limit, and what to do.
+    """Return the weak points of a design, each with its number, the limit, and what to do.
 
     Parameters
     ----------
     controller
-        an ``ADRC``, or a linear controller.
+        an ``ADRC`` or a linear controller.
     plant
-        what it is to control, linear (see ``analyse``); by default the plant that an ADRC's observer assumes, with the delay that it knows
-        of, which is kind to it.
+        linear plant to control (see ``analyse``); by default the plant that an ADRC's observer assumes, with the delay that it knows,
+        which is the most favourable one.
     noise_std
-        standard deviation of the measurement noise, taken for white [y-unit]. It is judged by what it does to u as a share of ``u_max −
-        u_min``; so a controller without limits is not judged.
+        standard deviation of the measurement noise, assumed white [y-unit]. It is judged by its effect on u as a share of ``u_max −
+        u_min``; without limits it is not judged.
     actuator_lag
-        time constant of the actuator [s], where the plant does not have it.
+        time constant of the actuator [s], if the plant does not include it.
     delay
-        dead time of actuator, transport, calculation [s]; what the observer assumes comes on top of it where no plant is given.
+        dead time of actuator, transport and calculation [s]; without a plant it adds to the one that the observer assumes.
     at
-        when the learner is frozen; see ``analyse``.
+        instant at which the learner is frozen; see ``analyse``.
 
     Returns
     -------
     list of Finding
-        in the order sampling, margin, lag, noise; empty where nothing was found.
+        in the order sampling, margin, lag, noise; empty if nothing was found.
 
     Raises
     ------
     ValueError
         as ``analyse``; without a plant for a controller that assumes none.
     """
-    observer, known_delay = getattr(controller, "observer", None), 0.0
+    observer: ESO | None = getattr(controller, "observer", None)
+    known_delay = 0.0
     if plant is None:
         if observer is None:
             raise ValueError(
                 "plant = None: this controller does not say which plant it is made for; give one"
             )
         plant, known_delay = _assumed_plant(observer)
-    actuator_lag, delay = (
-        checks.non_negative("actuator_lag", actuator_lag, "s"),
-        checks.non_negative("delay", delay, "s"),
-    )
-    found = [] if observer is None else sampling_findings(observer, controller.omega_c)
+    actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")
+    delay = checks.non_negative("delay", delay, "s")
+    omega_c = getattr(controller, "omega_c", math.nan)
+    found = [] if observer is None else sampling_findings(observer, omega_c)
     loop = analyse(plant, controller, at=at, delay=known_delay)
     if not loop.stable:
         return [
@@ -88,8 +90,8 @@ def advise(
     return found
 
 
-def _assumed_plant(observer: Any) -> tuple[LinearPlant, float]:
-    """Return the plant that an observer is made for, in its canonical form, with b0 for its gain; and the delay before it [s]."""
+def _assumed_plant(observer: ESO) -> tuple[LinearPlant, float]:
+    """Return the plant that an observer assumes, in its canonical form with the gain b0, and the delay before it [s]."""
     known = observer.plant
     A = np.diag(np.ones(observer.order - 1), 1)
     A[-1] = -known.a
@@ -101,28 +103,22 @@ def _assumed_plant(observer: Any) -> tuple[LinearPlant, float]:
 
 def _unstable(loop: LoopAnalysis, when: str, what_to_do: str) -> Finding:
     size = float(max(abs(loop.poles)))
-    return Finding(
-        "stability",
-        size,
-        1.0,
-        f"the loop is unstable {when}, with a pole at |z| = {size:.6g}: {what_to_do}",
-    )
+    message = f"the loop is unstable {when}, with a pole at |z| = {size:.6g}: {what_to_do}"
+    return Finding("stability", size, 1.0, message)
 
 
-def _judge_margin(loop: LoopAnalysis, observer: Any) -> list[Finding]:
+def _judge_margin(loop: LoopAnalysis, observer: ESO | None) -> list[Finding]:
     margins = loop.margins
     if margins.modulus >= _LEAST_MODULUS:
         return []
     what_to_do = (
         "detune it" if observer is None else "raise omega_o (noise permitting) or lower omega_c"
     )
-    return [
-        Finding(
-            *("margin", margins.modulus, _LEAST_MODULUS),
-            f"modulus margin {margins.modulus:.3g} is below {_LEAST_MODULUS:g} (phase margin {margins.phase:.1f}°, "
-            f"worst at {margins.modulus_omega:.3g} rad/s): {what_to_do}",
-        )
-    ]
+    message = (
+        f"modulus margin {margins.modulus:.3g} is below {_LEAST_MODULUS:g} (phase margin {margins.phase:.1f}°, "
+        f"worst at {margins.modulus_omega:.3g} rad/s): {what_to_do}"
+    )
+    return [Finding("margin", margins.modulus, _LEAST_MODULUS, message)]
 
 
 def _judge_lag(
@@ -130,32 +126,31 @@ def _judge_lag(
 ) -> list[Finding]:
     parts = (("an actuator lag", actuator_lag), ("a delay", delay))
     cause = " and ".join(f"{what} of {1e3 * time:.3g} ms" for what, time in parts if time > 0.0)
+    before, after = loop.margins, late.margins
     if not late.stable:
+        what_to_do = "shorten it, or lower omega_o and omega_c together"
         return [
             _unstable(
                 late,
                 f"with {cause}",
-                f"its delay margin is {1e3 * loop.margins.delay:.3g} ms; shorten it, or lower omega_o and omega_c together",
+                f"its delay margin is {1e3 * before.delay:.3g} ms; {what_to_do}",
             )
         ]
-    before, after = loop.margins, late.margins
-    if after.modulus >= _LEFT * before.modulus:
+    if after.modulus >= _LAG_LEAVES * before.modulus:
         return []
-    # An infinite phase margin, of a loop whose gain never is 1, has no angle to lose.
+    # Without a crossover the phase margin is infinite, and there is no angle to lose.
     at = before.phase_omega
     cost = math.degrees(math.atan(at * actuator_lag) + at * delay)
     angle = "" if math.isnan(at) else f", {cost:.1f}° at the crossover of {at:.3g} rad/s,"
-    return [
-        Finding(
-            *("lag", after.modulus, _LEFT * before.modulus),
-            f"{cause}{angle} leaves a phase margin of {after.phase:.1f}° of {before.phase:.1f}°, a modulus margin of "
-            f"{after.modulus:.3g} of {before.modulus:.3g}: shorten it, let the controller know of it, "
-            "or lower omega_o and omega_c together",
-        )
-    ]
+    message = (
+        f"{cause}{angle} leaves a phase margin of {after.phase:.1f}° of {before.phase:.1f}°, a modulus margin of "
+        f"{after.modulus:.3g} of {before.modulus:.3g}: shorten it, let the controller know of it, "
+        "or lower omega_o and omega_c together"
+    )
+    return [Finding("lag", after.modulus, _LAG_LEAVES * before.modulus, message)]
 
 
-def _judge_noise(loop: LoopAnalysis, controller: Any, noise: float) -> list[Finding]:
+def _judge_noise(loop: LoopAnalysis, controller: Controller, noise: float) -> list[Finding]:
     limits = getattr(controller.parameters, "limits", None)
     u_range = math.inf if limits is None else limits.high - limits.low
     rms = noise * loop.noise_to_control
@@ -163,18 +158,15 @@ def _judge_noise(loop: LoopAnalysis, controller: Any, noise: float) -> list[Find
     if share <= _NOISE:
         return []
     what_to_do = "lower the gains"
-    if hasattr(controller, "omega_c"):
+    observer: ESO | None = getattr(controller, "observer", None)
+    if observer is not None:
         # Noise in f̂ grows with the power n + 1/2 of omega_o.
-        lower = controller.observer.omega_o * (_NOISE / share) ** (
-            1.0 / (controller.observer.order + 0.5)
-        )
+        lower = observer.omega_o * (_NOISE / share) ** (1.0 / (observer.order + 0.5))
         what_to_do = (
             f"lower omega_o to about {lower:.2g} rad/s, and omega_c with it, or measure better"
         )
-    return [
-        Finding(
-            *("noise", share, _NOISE),
-            f"noise of {noise:.3g} RMS in y makes u move by {rms:.3g} RMS, {100.0 * share:.3g} % of its range of {u_range:.3g}; "
-            f"{100.0 * _NOISE:g} % is about what an actuator stands: {what_to_do}",
-        )
-    ]
+    message = (
+        f"noise of {noise:.3g} RMS in y makes u move by {rms:.3g} RMS, {100.0 * share:.3g} % of its range of {u_range:.3g}; "
+        f"{100.0 * _NOISE:g} % is about what an actuator stands: {what_to_do}"
+    )
+    return [Finding("noise", share, _NOISE, message)]

@@ -1,8 +1,8 @@
-"""Frequency responses of sampled systems, and the frequencies at which to look.
+"""Frequency responses of sampled systems, and the frequencies at which to evaluate them.
 
-No polynomial is ever formed: poles of an observer lie on top of each other close to z = 1, where the roots of a polynomial of degree 5
-move by the fifth root of its rounding. A response is a linear solve, ``C (ζI − N)⁻¹ B + D`` with ``ζ = e^(jω dt) − 1`` and ``N = A − I``,
-so that what is slow is not the difference of two numbers near one.
+No polynomial is formed: poles of an observer coincide close to z = 1, where the roots of a polynomial of degree 5 move by the fifth root
+of its rounding errors. A response is a linear solve, ``C (ζI − N)⁻¹ B + D`` with ``ζ = e^(jω dt) − 1`` and ``N = A − I``, so that slow
+dynamics are not the difference of two numbers near one.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ from quell.types import Matrix, Vector
 
 Complex = NDArray[np.complex128]
 
-_PER_DECADE = 60
-# Beside a pole, in units of its damping; beside one without damping, in units of its frequency.
-_BESIDE = np.array([0.0, 0.1, 0.3, 1.0, 3.0])
-_UNDAMPED = np.logspace(-6.0, -1.0, 11)
+# The grid only brackets extrema and sign changes, which ``margins`` then refines; chosen by hand.
+_POINTS_PER_DECADE = 60
+# Points beside a resonance, in units of its damping.
+_BESIDE_DAMPED = np.array([0.0, 0.1, 0.3, 1.0, 3.0])
+# Points beside a resonance without damping, as shares of its frequency.
+_BESIDE_UNDAMPED = np.logspace(-6.0, -1.0, 11)
 
 
 class System(NamedTuple):
-    """``x⁺ − x = N x + B u``, ``y = C x + D u``; one input, one output."""
+    """A sampled system of one input and one output: ``x⁺ − x = N x + B u``, ``y = C x + D u``."""
 
     N: Matrix
     B: Vector
@@ -33,7 +35,7 @@ class System(NamedTuple):
 
     @classmethod
     def balanced(cls, N: Matrix, B: Vector, C: Vector, D: float) -> System:
-        """Return the system with states scaled by powers of two to one size, which is exact."""
+        """Return the system with states scaled to similar size by powers of two, which is exact."""
         from scipy.linalg import matrix_balance
 
         if N.shape[0] == 0:
@@ -48,7 +50,7 @@ def response(system: System, omega: Any, dt: float) -> Complex:
     Raises
     ------
     ValueError
-        at a frequency where there is a pole.
+        at the frequency of a pole.
     """
     zeta = np.expm1(1j * np.atleast_1d(omega) * dt)
     if system.N.shape[0] == 0:
@@ -69,7 +71,7 @@ def in_s_plane(shifted: Complex, dt: float) -> Complex:
     """Return ``log(z)/dt`` for poles given as z − 1; a pole at z = 0, a sample of memory, is at −inf."""
     with np.errstate(divide="ignore"):
         size = np.where(
-            np.abs(1.0 + shifted) < 1e-7,
+            np.abs(1.0 + shifted) < 1e-7,  # z = 0, found as an eigenvalue of a defective matrix
             -np.inf,
             0.5 * np.log1p(2.0 * shifted.real + np.abs(shifted) ** 2),
         )
@@ -79,15 +81,15 @@ def in_s_plane(shifted: Complex, dt: float) -> Complex:
 
 
 def frequencies(poles: Complex, dt: float) -> Vector:
-    """Return frequencies [rad/s] up to half the sampling rate, dense where the poles (in the s-plane) are."""
+    """Return frequencies [rad/s] up to half the sampling rate, dense near the poles (in the s-plane)."""
     top = math.pi / dt
     size = np.abs(poles)
-    finite = size[(size > 1e-9 * top) & (size < top)]
+    finite = size[(size > 1e-9 * top) & (size < top)]  # smaller ones are integrators, to rounding
     bottom = 1e-2 * float(np.min(finite, initial=0.1 * top))
-    grid = [np.geomspace(bottom, top, math.ceil(_PER_DECADE * math.log10(top / bottom)) + 1)]
+    grid = [np.geomspace(bottom, top, math.ceil(_POINTS_PER_DECADE * math.log10(top / bottom)) + 1)]
     for pole in poles[np.isfinite(poles) & (poles.imag > 0.0)]:
         center, damping = pole.imag, abs(pole.real)
-        away = damping * _BESIDE if damping > 1e-6 * center else center * _UNDAMPED
+        away = damping * _BESIDE_DAMPED if damping > 1e-6 * center else center * _BESIDE_UNDAMPED
         grid += [center - away, center + away]
     omega = np.unique(np.concatenate(grid))
     kept: Vector = omega[(omega >= bottom) & (omega <= top)]

@@ -1,15 +1,15 @@
-"""A learner frozen at an instant: what it feeds back of the state and the control signal.
+"""A learner frozen at an instant: its feedback of the state and the control signal.
 
-Around what it sees at that instant, a learner that learns no more is
+Around its inputs at that instant, a learner that no longer learns is
 
     f_L = const + g · (x̂_1 … x̂_n, Δf̂) + h u_before + s u
 
-For features that are the state, u and a constant that is exact everywhere, with g = θ. For any other learner (a network, a Gaussian
-process, polynomials) it holds for small motions: g and h are central differences of its own ``predict``. The constant, and whatever turns
-by itself (oscillators), is a feedforward: it moves the loop but does not close it, so no margin depends on it.
+For features that are the state, u and a constant, this is exact everywhere, with g = θ. For any other learner (a network, a Gaussian
+process, polynomials) it holds for small motions: g and h are central differences of its own ``predict``. The constant, and autonomous
+features (oscillators), are a feedforward: they move the loop but do not close it, so no margin depends on them.
 
-A guard multiplies all of it with the learner's authority β. Where it clips the output (``Reason.OUT_OF_BOUNDS``, ``TOO_FAST``), less is fed
-back than is taken here.
+A guard multiplies all of it by the learner's authority β. When it clips the output (``Reason.OUT_OF_BOUNDS``, ``TOO_FAST``), the true
+feedback is smaller than the one computed here.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.base import Controller
 from quell.guard import UnguardedDesign
 from quell.learners.base import (
     NoLearner,
@@ -35,13 +37,14 @@ from quell.records.sample_times import first_sample_at
 from quell.records.trajectory import Trajectory
 from quell.types import Vector
 
-# Central differences over so much of the size of a signal: they err by its square.
+# Step of the central differences, relative to the size of a signal; their relative error is of the order of its square, 1e-8.
 _STEP = 1e-4
 _FEEDFORWARD = ("bias", "sin", "cos")
+_USE_STATE = "pass the scenario to loops_over_time, or the final_state of a run that ends then"
 
 
 class Frozen(NamedTuple):
-    """A learner that learns no more, for a plant of order n, with its authority."""
+    """A learner that no longer learns, for a plant of order n, with its authority."""
 
     gain: Vector
     """g (n + 1,), for x̂_1 … x̂_n and Δf̂."""
@@ -61,25 +64,23 @@ def _predict(
     return constant, learner.slope
 
 
-# It learns as little as no learner does, and has no more to remember.
-adapt.register(Frozen)(adapt.implementations[NoLearnerDesign])
-commit.register(Frozen)(commit.implementations[NoLearnerDesign])
-restart.register(Frozen)(restart.implementations[NoLearnerDesign])
-coefficients.register(Frozen)(coefficients.implementations[NoLearnerDesign])
+# Everything else is as without a learner.
+for _generic in (adapt, commit, restart, coefficients):
+    _generic.register(Frozen)(_generic.implementations[NoLearnerDesign])
 
 
-def frozen(controller: Any, run: Any = None, t: float | None = None) -> Frozen:
-    """Freeze a controller's learner: as it is now, as it was at the end of a run, or at any time of it.
+def frozen(controller: Controller, run: Any = None, t: float | None = None) -> Frozen:
+    """Freeze a controller's learner: in its present state, at the end of a run, or at any time of it.
 
     Parameters
     ----------
     controller
         an ``ADRC``.
     run
-        a ``Trajectory`` of it; or a state of it, for instance ``run.final_state``; by default the state the controller itself is in.
+        a ``Trajectory`` of it, or a state of it, for instance ``run.final_state``; by default the controller's own state.
     t
-        at which time of the run [s]; by default its end. What the learner had found by then is read from the record, so its features must
-        be states, u, a constant and sinusoids. Freeze any other at the end of a run that ends then.
+        time of the run [s]; by default its end. The coefficients at that time come from the record, so the learner's features must be
+        states, u, a constant and sinusoids. Freeze any other learner at the end of a run that ends at that time.
 
     Returns
     -------
@@ -89,12 +90,12 @@ def frozen(controller: Any, run: Any = None, t: float | None = None) -> Frozen:
     Raises
     ------
     ValueError
-        where the record does not say what the learner had found, or the time is not in it; for a learner that calls a Python model, whose
-        answer is held between calls.
+        if the record does not hold the learner's coefficients, or not the time; for a learner that calls a Python model, whose answer is
+        held between calls.
     """
-    if not hasattr(controller, "observer"):
+    if not isinstance(controller, ADRC):
         raise ValueError(
-            f"controller = {controller!r}: must be an ADRC, only that has a learner to freeze"
+            f"controller = {controller!r}: must be an ADRC, which is the only one with a learner to freeze"
         )
     if run is None:
         return _from_state(controller, controller._state)
@@ -105,7 +106,7 @@ def frozen(controller: Any, run: Any = None, t: float | None = None) -> Frozen:
     return _from_record(controller, run, run.ended if t is None else checks.finite("t", t))
 
 
-def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
+def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
     row = first_sample_at(t, run.every * run.dt, len(run))
     if not (t >= 0.0 and row < len(run)):
         raise ValueError(f"t = {t!r}: must be a time of the record, from 0 to {run.t[-1]:g} s")
@@ -116,8 +117,7 @@ def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
         )
     if not (run.features or isinstance(controller.learner, NoLearner)):
         raise ValueError(
-            f"t = {t!r}: {type(controller.learner).__name__} has no coefficients to record; "
-            "pass the scenario to loops_over_time, or the final_state of a run that ends then"
+            f"t = {t!r}: {type(controller.learner).__name__} has no coefficients to record; {_USE_STATE}"
         )
     gain, slope = np.zeros(order + 1), 0.0
     states = {f"x{i + 1}": i for i in range(order)}
@@ -128,31 +128,25 @@ def _from_record(controller: Any, run: Trajectory, t: float) -> Frozen:
             slope += float(theta)
         elif not name.startswith(_FEEDFORWARD):
             raise ValueError(
-                f"t = {t!r}: the feature {name!r} is not linear, its coefficient alone says nothing; "
-                "pass the scenario to loops_over_time, or the final_state of a run that ends then"
+                f"t = {t!r}: the feature {name!r} is not linear, so its coefficient does not give a gain; {_USE_STATE}"
             )
-    return _heard(
-        controller,
-        gain,
-        0.0,
-        slope,
-        float(run["authority"][row]) if "authority" in run.names else 1.0,
-    )
+    authority = float(run["authority"][row]) if "authority" in run.names else 1.0
+    return _with_authority(controller, gain, 0.0, slope, authority)
 
 
-def _from_state(controller: Any, state: Any) -> Frozen:
+def _from_state(controller: ADRC, state: Any) -> Frozen:
     if hasattr(controller.learner, "external_fields"):
         raise ValueError(
             f"learner = {type(controller.learner).__name__}: a Python model is asked once a period and its answer held, "
             "so it has no gain at an instant; analyse the loop without it"
         )
-    learner, memory = controller.parameters.learner, copied(state.learner)
+    learner, memory = controller.parameters.learner, copy_state(state.learner)
     known = controller.read(state)
     seen, u = np.append(known.x, known.f_residual), known.u
-    sizes = _sizes(controller, memory, seen, u)
+    sizes = _signal_sizes(controller, memory, seen, u)
 
     def output(seen: Vector, before: float) -> float:
-        constant, slope = predict(learner, copied(memory), seen, before)
+        constant, slope = predict(learner, copy_state(memory), seen, before)
         return constant + slope * u
 
     def derivative(i: int) -> float:
@@ -160,20 +154,21 @@ def _from_state(controller: Any, state: Any) -> Frozen:
         moved = [np.append(seen, u) for _ in range(2)]
         moved[0][i] += step
         moved[1][i] -= step
-        return (output(moved[0][:-1], moved[0][-1]) - output(moved[1][:-1], moved[1][-1])) / float(
-            moved[0][i] - moved[1][i]
-        )
+        difference = output(moved[0][:-1], moved[0][-1]) - output(moved[1][:-1], moved[1][-1])
+        return difference / float(moved[0][i] - moved[1][i])
 
     gains = [derivative(i) for i in range(seen.size + 1)]
-    slope = float(predict(learner, copied(memory), seen, u)[1])
-    return _heard(controller, np.array(gains[:-1]), gains[-1], slope, known.authority)
+    slope = float(predict(learner, copy_state(memory), seen, u)[1])
+    return _with_authority(controller, np.array(gains[:-1]), gains[-1], slope, known.authority)
 
 
-def _heard(controller: Any, gain: Vector, before: float, slope: float, authority: float) -> Frozen:
-    """Return what a guard lets through: β times all of it; a slope outside of its interval counts for the u before."""
+def _with_authority(
+    controller: ADRC, gain: Vector, before: float, slope: float, authority: float
+) -> Frozen:
+    """Return β times all of it; a slope outside of the guard's interval acts on the u before."""
     if not (np.all(np.isfinite(gain)) and math.isfinite(before) and math.isfinite(slope)):
         raise ValueError(
-            "learner: its output is not a number at this instant; there is nothing to analyse"
+            "learner: its output is not finite at this instant, so there is nothing to analyse"
         )
     gain, before, slope = authority * gain, authority * before, authority * slope
     guard = controller.parameters.guard
@@ -185,9 +180,10 @@ def _heard(controller: Any, gain: Vector, before: float, slope: float, authority
     return Frozen(gain, float(before), float(slope))
 
 
-def _sizes(controller: Any, memory: Any, seen: Vector, u: float) -> Vector:
-    """Return about how large x̂_1 … x̂_n, Δf̂ and u are: as the learner has found, or from how it is now."""
+def _signal_sizes(controller: ADRC, memory: Any, seen: Vector, u: float) -> Vector:
+    """Return the sizes of x̂_1 … x̂_n, Δf̂ and u: the scales that the learner found, or an estimate from the present values."""
     scale = np.asarray(getattr(memory, "scale", ()))
+    # A scale is at its floor, 1e-100 (``features.scaling``), until its signal was seen.
     if scale.shape == (seen.size + 1,) and np.all(scale > 1e-90):
         return np.append(scale[:-2], scale[[-1, -2]])
     ladder = float(controller.omega_c) ** np.arange(seen.size)
@@ -195,10 +191,6 @@ def _sizes(controller: Any, memory: Any, seen: Vector, u: float) -> Vector:
     return np.append(length * ladder, abs(u) or length * ladder[-1] / abs(controller.observer.b0))
 
 
-def copied(state: Any) -> Any:
+def copy_state(state: Any) -> Any:
     """Return a copy of a nested NamedTuple of arrays."""
-    return (
-        type(state)(*(copied(value) for value in state))
-        if isinstance(state, tuple)
-        else np.array(state)
-    )
+    return type(state)(*map(copy_state, state)) if isinstance(state, tuple) else np.array(state)

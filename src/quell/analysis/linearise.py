@@ -1,9 +1,9 @@
-"""The linear law that a controller is while no limit holds, in discrete time and exact.
+"""The exact linear law in discrete time that a controller is without limits.
 
-It is not derived but asked for: a controller without limits is a linear map from its state, r and y to its next state and u, so unit
-vectors through its own ``control`` give the matrices, whatever the form of its observer. The unit is 2⁻⁶⁰, which is the same to the last
-bit for what is linear, and small enough for what is linear for small errors only. Entries of the state that never reach u, or that
-nothing reaches (records, filters for learning), are left out.
+It is measured, not derived: without limits a controller is a linear map from its state, r and y to its next state and u, so unit vectors
+through its own ``control`` give the matrices, for any form of observer. The unit is 2⁻⁶⁰: scaling by it is exact for a linear map, and
+it is small enough for a map that is linear for small errors only. State entries that do not reach u, or that nothing reaches (records,
+filters for learning), are left out.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.analysis.frozen_learner import Frozen, copied, frozen
-from quell.controllers.base import control
+from quell.analysis.frozen_learner import Frozen, copy_state, frozen
+from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.base import Controller, control
 from quell.controllers.limits import Limits
 from quell.controllers.linear.law import LinearLaw
 from quell.guard import UnguardedDesign, UnguardedMemory
@@ -23,51 +24,53 @@ from quell.learners.base import NoLearnerMemory
 from quell.types import Matrix, Vector
 
 _UNIT = 2.0**-60
-_FREE = Limits(-math.inf, math.inf, math.inf)
+_UNLIMITED = Limits(-math.inf, math.inf, math.inf)
 
 
-def linear_law(controller: Any, at: Any = None) -> LinearLaw:
+def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     """Return the linear law of a controller, its learner frozen.
 
     Parameters
     ----------
     controller
-        an ``ADRC``, or a linear controller, which has its law already.
+        an ``ADRC``, or a linear controller, whose own law is returned.
     at
-        when the learner is frozen: a ``Frozen``, a run or a state of the controller (then at its end); by default as it is now.
+        instant at which the learner is frozen: a ``Frozen``, a run or a state of the controller (its end); by default the present state.
 
     Returns
     -------
     LinearLaw
-        without limits it does what the controller does, but for a constant feedforward of the learner and for the first sample, at which an
-        ADRC takes the measurement for its state: they agree from ``y = 0`` on.
+        equal to the controller without limits, except for a constant feedforward of the learner and for the first sample, at which an
+        ADRC takes the measurement as its state; from ``y = 0`` on they agree.
 
     Raises
     ------
     ValueError
-        for something that has no linear law, or one that changes from sample to sample.
+        for a controller without a linear law, or with one that changes from sample to sample.
     """
     if hasattr(controller, "law"):
-        law: LinearLaw = controller.law
-        return law
-    if not (hasattr(controller, "observer") and hasattr(controller, "initial_state")):
+        given: LinearLaw = controller.law
+        return given
+    if not isinstance(controller, ADRC):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     learner = at if isinstance(at, Frozen) else frozen(controller, at)
-    design = controller.parameters._replace(learner=learner, guard=UnguardedDesign(), limits=_FREE)
+    design = controller.parameters._replace(
+        learner=learner, guard=UnguardedDesign(), limits=_UNLIMITED
+    )
     nothing = np.zeros(0)
     state = controller.initial_state()._replace(
         learner=NoLearnerMemory(nothing), guard=UnguardedMemory(nothing)
     )
     control(design, state, 0.0, 0.0)
-    law = _asked(design, state)
+    law = _measured_law(design, state)
     control(design, state, 0.0, 0.0)
-    again = _asked(design, state)
+    again = _measured_law(design, state)
     if not all(
         np.array_equal(np.asarray(one), np.asarray(other))
         for one, other in zip(law, again, strict=True)
     ):
         raise ValueError(
-            f"controller = {controller!r}: its law changes from sample to sample, so there is no linear one"
+            f"controller = {controller!r}: its law changes from sample to sample, so it has no linear law"
         )
     if not all(np.all(np.isfinite(part)) for part in law):
         raise ValueError(
@@ -76,22 +79,9 @@ def linear_law(controller: Any, at: Any = None) -> LinearLaw:
     return law
 
 
-def closed_loop_matrix(A: Matrix, B: Vector, C: Vector, law: LinearLaw, inner: Matrix) -> Matrix:
-    """Return a sampled plant and the law around it, which no limit cuts, as one matrix; the plant's states first.
-
-    ``inner`` is ``law.A + B_u C``, the law with what it wishes applied. A and it are both as they are, or both less the unit matrix.
-    """
-    return np.block(
-        [
-            [A + law.D_y * np.outer(B, C), np.outer(B, law.C)],
-            [np.outer(law.B_y + law.B_u * law.D_y, C), inner],
-        ]
-    )
-
-
-def _asked(design: Any, origin: Any) -> LinearLaw:
+def _measured_law(design: Any, origin: Any) -> LinearLaw:
     """Return the law around a state ``origin`` that no limit and no flag is about to change."""
-    held = [design._replace(limits=Limits(u, u, math.inf)) for u in (0.0, _UNIT)]
+    fixed_u = [design._replace(limits=Limits(u, u, math.inf)) for u in (0.0, _UNIT)]
     places = [
         (i, where)
         for i, array in enumerate(_arrays(origin))
@@ -102,7 +92,7 @@ def _asked(design: Any, origin: Any) -> LinearLaw:
     def respond(
         design: Any, place: Any = None, r: float = 0.0, y: float = 0.0
     ) -> tuple[Vector, float]:
-        state = copied(origin)
+        state = copy_state(origin)
         arrays = _arrays(state)
         if place is not None:
             arrays[place[0]][place[1]] = _UNIT
@@ -110,22 +100,15 @@ def _asked(design: Any, origin: Any) -> LinearLaw:
             u = control(design, state, r, y)
         return np.array([arrays[i][where] for i, where in places]) / _UNIT, u / _UNIT
 
-    # What the state becomes is asked with u held at zero, what u would be without a limit.
-    A = np.array([respond(held[0], place)[0] for place in places]).T
+    # The next state is measured with u fixed at zero by the limits, u without limits.
+    A = np.array([respond(fixed_u[0], place)[0] for place in places]).T
     C = np.array([respond(design, place)[1] for place in places])
-    B_r, D_r = respond(held[0], r=_UNIT)[0], respond(design, r=_UNIT)[1]
-    B_y, D_y = respond(held[0], y=_UNIT)[0], respond(design, y=_UNIT)[1]
-    B_u = respond(held[1])[0]
+    B_r, D_r = respond(fixed_u[0], r=_UNIT)[0], respond(design, r=_UNIT)[1]
+    B_y, D_y = respond(fixed_u[0], y=_UNIT)[0], respond(design, y=_UNIT)[1]
+    B_u = respond(fixed_u[1])[0]
     keep = np.flatnonzero(_reached(A.T, C) & _reached(A, np.abs(B_r) + np.abs(B_y) + np.abs(B_u)))
-    return LinearLaw(
-        np.ascontiguousarray(A[np.ix_(keep, keep)]),
-        B_r[keep],
-        B_y[keep],
-        B_u[keep],
-        C[keep],
-        D_r,
-        D_y,
-    )
+    kept_A = np.ascontiguousarray(A[np.ix_(keep, keep)])
+    return LinearLaw(kept_A, B_r[keep], B_y[keep], B_u[keep], C[keep], D_r, D_y)
 
 
 def _reached(A: Matrix, start: Vector) -> NDArray[np.bool_]:

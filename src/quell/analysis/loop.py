@@ -1,7 +1,7 @@
-"""A loop of a linear plant and a controller at one instant: poles, margins, what noise does to u, sensitivity functions.
+"""The loop of a linear plant and a controller at one instant: poles, margins, noise in u, sensitivity functions.
 
-In discrete time, at the controller's samples, with d a load at the plant's input, n the noise of the measurement and w the plant's
-disturbances::
+In discrete time, at the controller's samples, with a load d at the plant's input, the noise n of the measurement and the plant's
+disturbances w::
 
     u = C_r r − C_y (y + n)        y = P (u + d) + P_w w        L = P C_y        S = 1/(1 + L),  T = 1 − S
 
@@ -18,44 +18,52 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.frequency_response import Complex, System, frequencies, in_s_plane, response
-from quell.analysis.linearise import closed_loop_matrix, linear_law
+from quell.analysis.linearise import linear_law
 from quell.analysis.margins import Margins, least, margins
+from quell.analysis.python_control import state_space, transfer_function
 from quell.analysis.sampled_plant import SampledPlant, sampled_plant
+from quell.analysis.subsystems import closed_loop, closed_loop_matrix, law_matrix, subsystem
+from quell.controllers.base import Controller
 from quell.controllers.linear.law import LinearLaw
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.types import Matrix, Vector
 
 
 def analyse(
-    plant: Any, controller: Any, *, at: Any = None, delay: float = 0.0, actuator_lag: float = 0.0
+    plant: Any,
+    controller: Controller,
+    *,
+    at: Any = None,
+    delay: float = 0.0,
+    actuator_lag: float = 0.0,
 ) -> LoopAnalysis:
-    """Analyse the loop of a linear plant and a controller, while no limit holds, its learner frozen.
+    """Analyse the loop of a linear plant and a controller, without limits and with its learner frozen.
 
     Parameters
     ----------
     plant
         a ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction``, or ``(num, den)`` in powers of s.
     controller
-        an ``ADRC``, or a linear controller; one behind a prefilter is analysed without that.
+        an ``ADRC`` or a linear controller; a prefilter in front of it is left out.
     at
-        when its learner is frozen: a ``Frozen`` from ``frozen(controller, run, t)``, or a run or state of the controller (then at its end);
-        by default as the controller is now, which for a new one is with nothing learned.
+        instant at which its learner is frozen: a ``Frozen`` from ``frozen(controller, run, t)``, or a run or state of the controller
+        (its end); by default the present state, which for a new controller has learned nothing.
     delay
-        dead time that the loop has besides [s].
+        additional dead time of the loop [s].
     actuator_lag
         time constant of a first-order lag between u and the plant [s].
 
     Returns
     -------
     LoopAnalysis
-        calculated where it is asked for.
+        computed on access.
 
     Raises
     ------
     ValueError
-        for a plant that is not linear or answers at once, a controller without linear law, a delay of more than 200 samples.
+        for a plant that is not linear or has direct feedthrough, a controller without a linear law, a delay of more than 200 samples.
     """
-    while isinstance(controller, Prefiltered):  # what comes before the loop is not in it
+    while isinstance(controller, Prefiltered):
         controller = controller.controller
     if not (
         hasattr(controller, "dt")
@@ -64,23 +72,19 @@ def analyse(
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     dt = float(controller.dt)
     sampled = sampled_plant(plant, dt, delay, actuator_lag)
-    return LoopAnalysis(
-        sampled,
-        linear_law(controller, at),
-        dt,
-        _b_over_b0(sampled, getattr(controller, "observer", None)),
+    observer = getattr(controller, "observer", None)
+    # b and b0 are comparable if they are gains to the same derivative of y.
+    comparable = observer is not None and observer.degree in sampled.b
+    b_over_b0 = (
+        sampled.b[observer.degree] / float(observer.b0)
+        if observer is not None and comparable
+        else None
     )
-
-
-def _b_over_b0(plant: SampledPlant, observer: Any) -> float | None:
-    """Return the plant's gain over the nominal one, where both are gains to the same derivative of y."""
-    if observer is None or observer.degree not in plant.b:
-        return None
-    return plant.b[observer.degree] / float(observer.b0)
+    return LoopAnalysis(sampled, linear_law(controller, at), dt, b_over_b0)
 
 
 class LoopAnalysis:
-    """What can be said of a loop of a sampled plant and a linear law; made by ``analyse``.
+    """The loop of a sampled plant and a linear law; made by ``analyse``.
 
     Attributes
     ----------
@@ -91,24 +95,24 @@ class LoopAnalysis:
     dt : float
         sample time [s].
     b_over_b0 : float or None
-        the plant's gain over the b0 of the controller; None where there is no b0, where the plant was given sampled, and where u does not
-        reach the derivative of y first that the controller takes for it.
+        the plant's gain over the b0 of the controller; None without b0, for a plant that was given sampled, and if the first derivative
+        of y that u reaches is not the one that the controller assumes.
     """
 
     def __init__(
         self, plant: SampledPlant, law: LinearLaw, dt: float, b_over_b0: float | None = None
     ) -> None:
         self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
-        self._N = law.A - np.eye(law.A.shape[0]) + np.outer(law.B_u, law.C)
-        self._P = System.balanced(plant.N, plant.B, plant.C, 0.0)
-        self._C_y = System.balanced(self._N, law.B_y + law.B_u * law.D_y, -law.C, -law.D_y)
-        self._C_r = System.balanced(self._N, law.B_r + law.B_u * law.D_r, law.C, law.D_r)
+        self._N = law_matrix(law)
+        self._open = {
+            name: System.balanced(*subsystem(plant, law, name)) for name in ("P", "C_r", "C_y")
+        }
 
     def __repr__(self) -> str:
         return f"LoopAnalysis of {self.plant.N.shape[0]} + {self.law.A.shape[0]} states at dt = {self.dt:g} s:\n{self.summary()}"
 
     def summary(self) -> str:
-        """Return what matters in a few lines."""
+        """Return margins and noise gain in a few lines."""
         if not self.stable:
             return f"unstable: a pole at |z| = {np.max(np.abs(self.poles)):.6g}"
         m, (noise, peak) = self.margins, (self.noise_to_control, self.noise_to_control_peak)
@@ -134,8 +138,9 @@ class LoopAnalysis:
         )
 
     def _shifted_poles(self, gain: float = 1.0) -> Complex:
-        poles: Complex = np.linalg.eigvals(self.closed_loop_matrix(gain)).astype(np.complex128)
-        return poles
+        """Return the closed-loop poles as z − 1, the slowest first."""
+        shifted: Complex = np.linalg.eigvals(self.closed_loop_matrix(gain)).astype(np.complex128)
+        return shifted[np.argsort(np.abs(shifted), kind="stable")]
 
     def _stable_with(self, gain: float) -> bool:
         shifted = self._shifted_poles(gain)
@@ -144,15 +149,13 @@ class LoopAnalysis:
     @cached_property
     def poles(self) -> Complex:
         """Closed-loop poles in the z-plane, the slowest first."""
-        shifted = self._shifted_poles()
-        poles: Complex = 1.0 + shifted[np.argsort(np.abs(shifted), kind="stable")]
+        poles: Complex = 1.0 + self._shifted_poles()
         return poles
 
     @cached_property
     def s_poles(self) -> Complex:
         """The same as ``log(z)/dt`` [rad/s], to compare with a design in continuous time; a pole at z = 0 is at −inf."""
-        shifted = self._shifted_poles()
-        return in_s_plane(shifted[np.argsort(np.abs(shifted), kind="stable")], self.dt)
+        return in_s_plane(self._shifted_poles(), self.dt)
 
     @cached_property
     def stable(self) -> bool:
@@ -163,12 +166,12 @@ class LoopAnalysis:
 
     @cached_property
     def omega(self) -> Vector:
-        """Frequencies [rad/s] at which to draw, up to half the sampling rate; dense where poles are."""
-        loose = [
+        """Frequencies [rad/s] for plots, up to half the sampling rate; dense near poles."""
+        open_loop = [
             in_s_plane(np.linalg.eigvals(N).astype(np.complex128), self.dt)
             for N in (self.plant.N, self._N)
         ]
-        return frequencies(np.concatenate([self.s_poles, *loose]), self.dt)
+        return frequencies(np.concatenate([self.s_poles, *open_loop]), self.dt)
 
     def response(self, name: str, omega: Any) -> Complex:
         """Return a frequency response.
@@ -191,10 +194,8 @@ class LoopAnalysis:
             for another name.
         """
         checks.one_of("name", name, ("P", "C_r", "C_y", "L", "S", "T", "PS", "CS", "closed_loop"))
-        if name in ("P", "C_r", "C_y"):
-            return response(
-                {"P": self._P, "C_r": self._C_r, "C_y": self._C_y}[name], omega, self.dt
-            )
+        if name in self._open:
+            return response(self._open[name], omega, self.dt)
         L = self._loop(omega)
         if name == "L":
             return L
@@ -203,17 +204,13 @@ class LoopAnalysis:
             return S
         if name == "T":
             return L * S
-        return (
-            S
-            * {
-                "PS": lambda: self.response("P", omega),
-                "CS": lambda: self.response("C_y", omega),
-                "closed_loop": lambda: self.response("P", omega) * self.response("C_r", omega),
-            }[name]()
-        )
+        if name == "CS":
+            return S * self.response("C_y", omega)
+        P = self.response("P", omega)
+        return S * P if name == "PS" else S * (P * self.response("C_r", omega))
 
     def _loop(self, omega: Any) -> Complex:
-        return response(self._P, omega, self.dt) * response(self._C_y, omega, self.dt)
+        return self.response("P", omega) * self.response("C_y", omega)
 
     # ---- margins
 
@@ -224,9 +221,9 @@ class LoopAnalysis:
 
     @cached_property
     def b_range(self) -> tuple[float, float]:
-        """Between which values of b/b0 the loop is stable, b being the plant's input gain, its dynamics as they are.
+        """Values of b/b0 between which the loop is stable, with b the plant's input gain and unchanged dynamics.
 
-        Where ``b_over_b0`` is None, it is in units of the gain that the plant has.
+        If ``b_over_b0`` is None, it is in units of the plant's present gain.
         """
         relative = 1.0 if self.b_over_b0 is None else self.b_over_b0
         low, high = sorted(relative * factor for factor in self.margins.gain)
@@ -236,24 +233,23 @@ class LoopAnalysis:
 
     @cached_property
     def noise_to_control(self) -> float:
-        """Standard deviation of u for white measurement noise of standard deviation 1 in every sample; infinite for an unstable loop."""
+        """Standard deviation of u for white measurement noise of standard deviation 1; infinite for an unstable loop."""
         if not self.stable:
             return math.inf
-        N, B, C, D = self.closed_loop("n", "u")
-        return math.sqrt(_h2_squared(System.balanced(N, B, C, D)))
+        return math.sqrt(_h2_squared(System.balanced(*self.closed_loop("n", "u"))))
 
     @cached_property
     def noise_to_control_peak(self) -> float:
-        """Largest factor by which a sinusoid in the measurement is seen in u; infinite for an unstable loop."""
+        """Largest gain from a sinusoid in the measurement to u; infinite for an unstable loop."""
         if not self.stable:
             return math.inf
-        inverse, _ = least(
-            lambda w: 1.0 / np.abs(self.response("CS", w)),
-            self.omega,
-            1.0 / np.abs(self.response("CS", self.omega)),
-        )
+
+        def inverse(omega: Vector) -> Vector:
+            return 1.0 / np.abs(self.response("CS", omega))
+
+        lowest, _ = least(inverse, self.omega, inverse(self.omega))
         top = float(np.abs(self.response("CS", [math.pi / self.dt]))[0])
-        return max(1.0 / inverse, top)
+        return max(1.0 / lowest, top)
 
     # ---- state space
 
@@ -277,28 +273,7 @@ class LoopAnalysis:
         ValueError
             for another source or target.
         """
-        P, law = self.plant, self.law
-        sources = ("r", "d", "n", *(f"w{i + 1}" for i in range(P.E.shape[1])))
-        checks.one_of("source", source, sources)
-        checks.one_of("target", target, ("y", "u", "e"))
-        m = law.A.shape[0]
-        u_direct = {"r": law.D_r, "n": law.D_y}.get(source, 0.0)
-        if source in ("r", "n"):
-            into = law.B_r if source == "r" else law.B_y
-            B = np.concatenate([P.B * u_direct, into + law.B_u * u_direct])
-        else:
-            B = np.concatenate([P.B if source == "d" else P.E[:, int(source[1:]) - 1], np.zeros(m)])
-        if target == "u":
-            return System(
-                self.closed_loop_matrix(), B, np.concatenate([law.D_y * P.C, law.C]), u_direct
-            )
-        C = np.concatenate([P.C, np.zeros(m)])
-        return System(
-            self.closed_loop_matrix(),
-            B,
-            C if target == "y" else -C,
-            float(target == "e" and source == "r"),
-        )
+        return closed_loop(self.plant, self.law, source, target)
 
     def system(self, name: str) -> Any:
         """Return a part of the loop, or a closed loop, as a ``control.StateSpace`` in discrete time.
@@ -312,22 +287,18 @@ class LoopAnalysis:
         Raises
         ------
         ImportError
-            where python-control is missing.
+            without python-control.
         """
-        from quell.analysis.python_control import state_space
-
-        return state_space(self, name)
+        return state_space(subsystem(self.plant, self.law, name), self.dt)
 
     def transfer_function(self, name: str) -> Any:
         """Return the same as a ``control.TransferFunction``: polynomials in z.
 
-        Good to read. Poles that lie together near z = 1 are not to be had from coefficients in double precision: with omega_o dt = 0.12 the
-        step response of P, C_r and C_y, closed by python-control in state space, is right to 1e-9 up to order 3 and to 3e-8 for order 4;
-        that of the closed loop as one fraction to 1e-9, 1e-6 and 3e-3 for orders 2, 3 and 4. ``system`` is right for all.
+        Use it to read, and ``system`` to compute: coefficients in double precision do not determine poles that lie close together near
+        z = 1. With omega_o dt = 0.12 the step response of P, C_r and C_y, closed by python-control in state space, is exact to 1e-9 up to
+        order 3 and to 3e-8 for order 4; that of the closed loop as one fraction to 1e-9, 1e-6 and 3e-3 for orders 2, 3 and 4.
         """
-        from quell.analysis.python_control import transfer_function
-
-        return transfer_function(self, name)
+        return transfer_function(subsystem(self.plant, self.law, name), self.dt)
 
 
 def _h2_squared(system: System) -> float:
@@ -336,10 +307,10 @@ def _h2_squared(system: System) -> float:
     Only positive terms are added, so nothing cancels; after k rounds 2ᵏ samples are summed.
     """
     M, X = system.N + np.eye(system.N.shape[0]), np.outer(system.B, system.B)
-    for _ in range(64):
+    for _ in range(64):  # 2⁶⁴ samples: no stable loop in double precision is slower
         more = M @ X @ M.T
         X = X + more
-        if np.max(np.abs(more)) <= 1e-16 * np.max(np.abs(X)):
+        if np.max(np.abs(more)) <= 1e-16 * np.max(np.abs(X)):  # below the unit roundoff
             break
         M = M @ M
     return float(system.C @ X @ system.C) + system.D**2

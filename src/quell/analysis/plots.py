@@ -1,4 +1,4 @@
-"""Pictures of loops: Bode plot, gang of four, margins over time or bandwidth."""
+"""Plots of loops: Bode plot, gang of four, margins over time or bandwidth."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import numpy as np
 from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.analysis.sweeps import loops_over_omega_o
+from quell.controllers.base import Controller
+
+_AID = {"color": "0.5", "linewidth": 0.8}
 
 
 def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
-    """Draw gain and phase of the loop ``L = P C_y`` with its margins; return the axes.
+    """Plot gain and phase of the loop ``L = P C_y`` with its margins; return the axes.
 
-    The margins' numbers are written into a figure of its own only: beside a second loop they would lie on top of each other.
+    The margins' numbers are written only into a new figure: with a second loop they would overlap.
 
     Parameters
     ----------
@@ -31,7 +34,7 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     ValueError
         for another number of axes.
     """
-    alone = axes is None
+    new_figure = axes is None
     top, low = axes = _axes(axes, 2, 1)
     # At half the sampling rate itself a sampled plant may have a zero, and no phase.
     omega = loop.omega[:-1]
@@ -42,39 +45,31 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     phase -= 360.0 * np.ceil(np.interp(crossing, omega, phase) / 360.0)
     (line,) = top.loglog(omega, np.abs(L), **style)
     low.semilogx(omega, phase, color=line.get_color())
-    top.axhline(1.0, color="0.5", linewidth=0.8)
-    low.axhline(-180.0, color="0.5", linewidth=0.8)
+    top.axhline(1.0, **_AID)
+    low.axhline(-180.0, **_AID)
+
+    def mark(ax: Any, omega: float, ends: tuple[float, float], text: str, middle: float) -> None:
+        ax.vlines(omega, *ends, color=line.get_color(), linewidth=2.5, alpha=0.6)
+        if new_figure:
+            ax.annotate(text, (omega, middle), xytext=(5, -3), textcoords="offset points")
+
     if np.isfinite(margins.phase_omega):
         at = float(np.interp(margins.phase_omega, omega, phase))
-        low.vlines(
-            margins.phase_omega, -180.0, at, color=line.get_color(), linewidth=2.5, alpha=0.6
-        )
-        if alone:
-            low.annotate(
-                f"{margins.phase:.0f}°",
-                (margins.phase_omega, 0.5 * (at - 180.0)),
-                xytext=(5, -3),
-                textcoords="offset points",
-            )
+        mark(low, margins.phase_omega, (-180.0, at), f"{margins.phase:.0f}°", 0.5 * (at - 180.0))
     for factor, at in zip(margins.gain, margins.gain_omega, strict=True):
         if np.isfinite(at):
-            top.vlines(
-                at, *sorted((1.0, 1.0 / factor)), color=line.get_color(), linewidth=2.5, alpha=0.6
-            )
-            if alone:
-                top.annotate(
-                    f"{factor:.2g}", (at, factor**-0.5), xytext=(5, -3), textcoords="offset points"
-                )
+            ends = min(1.0, 1.0 / factor), max(1.0, 1.0 / factor)
+            mark(top, at, ends, f"{factor:.2g}", factor**-0.5)
     _limit_ratio(top, np.abs(L))
     low.set_ylim(max(float(np.min(phase)), -720.0) - 20.0, min(float(np.max(phase)), 180.0) + 20.0)
     for ax, label in zip(axes, ("|L|", "phase of L [°]"), strict=True):
-        _finish(ax, loop, label)
+        _finish(ax, label, loop)
     low.set_xlabel("ω [rad/s]")
     return axes
 
 
 def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
-    """Draw the sizes of S, T, PS (load to y) and CS (noise to u); return the four axes, in this order.
+    """Plot the gains of S, T, PS (load to y) and CS (noise to u); return the four axes, in this order.
 
     Parameters
     ----------
@@ -91,19 +86,20 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any
         for another number of axes.
     """
     axes = _axes(axes, 2, 2)
-    for ax, name, meaning in zip(
-        axes,
-        ("S", "T", "PS", "CS"),
-        ("", "", ": load at the plant's input to y", ": measurement noise to u"),
-        strict=True,
-    ):
-        size = np.abs(loop.response(name, loop.omega))
-        ax.loglog(loop.omega, size, **style)
-        _limit_ratio(ax, size)
+    meanings = {
+        "S": "",
+        "T": "",
+        "PS": ": load at the plant's input to y",
+        "CS": ": measurement noise to u",
+    }
+    for ax, (name, meaning) in zip(axes, meanings.items(), strict=True):
+        gain = np.abs(loop.response(name, loop.omega))
+        ax.loglog(loop.omega, gain, **style)
+        _limit_ratio(ax, gain)
         if name in ("S", "T"):
-            ax.axhline(1.0, color="0.5", linewidth=0.8)
+            ax.axhline(1.0, **_AID)
         ax.set_title(f"|{name}|{meaning}", fontsize="medium")
-        _finish(ax, loop, "")
+        _finish(ax, "", loop)
     for ax in axes[2:]:
         ax.set_xlabel("ω [rad/s]")
     return axes
@@ -112,7 +108,7 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any
 def plot_margins_over_time(
     times: Any, loops: Sequence[LoopAnalysis], axes: Any = None, **style: Any
 ) -> Any:
-    """Draw the margins of the loop with its learner frozen at each instant; return the axes.
+    """Plot the margins of the loop with its learner frozen at each instant; return the axes.
 
     Parameters
     ----------
@@ -137,12 +133,12 @@ def plot_margins_over_time(
 
 def plot_margins_against_omega_o(
     plant: Any,
-    make_controller: Callable[[float], Any],
+    make_controller: Callable[[float], Controller],
     omegas: Any,
     axes: Any = None,
     **lags: float,
 ) -> Any:
-    """Draw the margins, and what noise does to u, over the observer's bandwidth; return the axes.
+    """Plot the margins, and the noise in u, over the observer's bandwidth; return the axes.
 
     Parameters
     ----------
@@ -161,8 +157,7 @@ def plot_margins_against_omega_o(
     axes = _axes(axes, 4, 1)
     _plot_margins(omegas, loops, axes[:3], {})
     axes[3].loglog(omegas, [loop.noise_to_control if loop.stable else np.nan for loop in loops])
-    axes[3].set_ylabel("RMS of u per\nRMS of noise")
-    axes[3].grid(alpha=0.3)
+    _finish(axes[3], "RMS of u per\nRMS of noise")
     for ax in axes:
         ax.set_xscale("log")
     axes[3].set_xlabel("omega_o [rad/s]")
@@ -175,31 +170,27 @@ def _plot_margins(x: Any, loops: Sequence[LoopAnalysis], axes: Any, style: dict[
             f"loops has {len(loops)} entries: must have one for each of the {len(x)} abscissae"
         )
     axes = _axes(axes, 3, 1)
-    modulus, disk, phase = (
-        np.array([getattr(loop.margins, name) for loop in loops])
-        for name in ("modulus", "disk", "phase")
-    )
-    axes[0].plot(x, modulus, **({"label": "modulus margin"} | style))
-    axes[0].plot(x, disk, **({"label": "disk margin"} | style))
-    axes[0].set_ylim(0.0, None)
-    axes[1].plot(x, phase, **style)
-    axes[1].set_ylim(0.0, None)
+    for ax, name in ((axes[0], "modulus"), (axes[0], "disk"), (axes[1], "phase")):
+        legend = {} if name == "phase" else {"label": f"{name} margin"}
+        ax.plot(x, [getattr(loop.margins, name) for loop in loops], **(legend | style))
+    for ax in axes[:2]:
+        ax.set_ylim(0.0, None)
     low, high = np.array([loop.b_range if loop.stable else (np.nan, np.nan) for loop in loops]).T
+    # A range may begin at zero or be infinite, which a logarithmic axis does not show.
     axes[2].fill_between(x, np.maximum(low, 1e-3), np.minimum(high, 1e3), alpha=0.3, **style)
     axes[2].set_yscale("log")
-    axes[2].axhline(1.0, color="0.5", linewidth=0.8)
+    axes[2].axhline(1.0, **_AID)
     gain = "gain" if any(loop.b_over_b0 is None for loop in loops) else "b/b0"
     for ax, label in zip(
         axes, ("margin", "phase margin [°]", f"{gain} for which\nit is stable"), strict=True
     ):
-        ax.set_ylabel(label)
-        ax.grid(alpha=0.3)
+        _finish(ax, label)
     axes[0].legend(fontsize="small")
     return axes
 
 
 def _axes(axes: Any, rows: int, columns: int) -> Any:
-    """Return the axes as a list, in a new figure where there are none."""
+    """Return the axes as a list; those of a new figure for None."""
     if axes is None:
         import matplotlib.pyplot as plt
 
@@ -212,7 +203,7 @@ def _axes(axes: Any, rows: int, columns: int) -> Any:
 
 
 def _limit_ratio(ax: Any, size: Any) -> None:
-    """Leave out what is more than six decades off: poles on the axis and zeros of a size."""
+    """Limit the axis to six decades about the median: poles on the imaginary axis and zeros reach further."""
     finite = size[np.isfinite(size) & (size > 0.0)]
     middle = float(np.median(finite))
     ax.set_ylim(
@@ -221,7 +212,9 @@ def _limit_ratio(ax: Any, size: Any) -> None:
     )
 
 
-def _finish(ax: Any, loop: LoopAnalysis, label: str) -> None:
-    ax.axvline(np.pi / loop.dt, color="0.7", linestyle=":", linewidth=1.0)
+def _finish(ax: Any, label: str, loop: LoopAnalysis | None = None) -> None:
+    """Add label and grid and, for a ``loop``, a line at half its sampling rate."""
+    if loop is not None:
+        ax.axvline(np.pi / loop.dt, color="0.7", linestyle=":", linewidth=1.0)
     ax.set_ylabel(label)
     ax.grid(alpha=0.3)

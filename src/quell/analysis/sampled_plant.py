@@ -1,7 +1,7 @@
-"""A plant as the controller sees it: sampled with zero-order hold, with dead time and actuator lag if there are any.
+"""The plant as the controller sees it: sampled with zero-order hold, with dead time and actuator lag.
 
-Matrices are kept as ``A − I``: a double integrator sampled at 1 ms differs from the unit matrix in the sixth digit, and all that is slow
-is in that difference.
+Matrices are kept as ``A − I``: a double integrator sampled at 1 ms differs from the unit matrix in the sixth digit, and all slow dynamics
+are in that difference.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from quell.lti.models import TransferFunction, leading_gain, read_model, to_stat
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
-# A dead time of more samples makes matrices too large to be quick.
+# Limit on the number of states that a dead time adds; the cost of eigenvalues grows with its cube. Chosen by hand.
 _MOST_SAMPLES = 200
 
 
@@ -33,7 +33,7 @@ class SampledPlant(NamedTuple):
     C: Vector
     """(n,)."""
     b: dict[int, float]
-    """What u adds to y^(k), by k, where that is the first derivative it reaches."""
+    """Gain from u to y^(k), by k, for the first derivative that u reaches."""
 
 
 def sampled_plant(
@@ -44,18 +44,18 @@ def sampled_plant(
     Parameters
     ----------
     plant
-        whatever ``LinearPlant.of`` takes; a system of python-control or scipy.signal may be sampled already, with the same dt.
+        anything that ``LinearPlant.of`` takes; a system of python-control or scipy.signal may be sampled already, with the same dt.
     dt
         sample time [s].
     delay
-        dead time before u gets to the plant [s]; any fraction of a sample.
+        dead time before the plant's input [s]; any fraction of a sample.
     actuator_lag
         time constant of a first-order lag between u and the plant [s].
 
     Raises
     ------
     ValueError
-        for what is no such plant, for one that answers to u at once, or for a dead time of more than 200 samples.
+        for an object that is not such a plant, direct feedthrough, or a dead time of more than 200 samples.
     """
     delay = checks.non_negative("delay", delay, "s")
     actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")
@@ -76,22 +76,19 @@ def sampled_plant(
     if actuator_lag > 0.0:
         n = A.shape[0]
         A = np.block([[A, B], [np.zeros((1, n)), np.full((1, 1), -1.0 / actuator_lag)]])
-        B, C, E = (
-            np.vstack([np.zeros_like(B), [[1.0 / actuator_lag]]]),
-            np.append(C, 0.0),
-            np.vstack([E, np.zeros((1, E.shape[1]))]),
-        )
+        B = np.vstack([np.zeros_like(B), [[1.0 / actuator_lag]]])
+        C, E = np.append(C, 0.0), np.vstack([E, np.zeros((1, E.shape[1]))])
     if delay > _MOST_SAMPLES * dt:
         raise ValueError(
             f"delay = {delay!r} s: must be at most {_MOST_SAMPLES} samples of dt = {dt!r} s"
         )
     samples = math.floor(delay / dt * (1.0 + 1e-12))
     late = max(delay - samples * dt, 0.0)
-    if late < 1e-12 * dt:
+    if late < 1e-12 * dt:  # a whole number of samples, to rounding
         late = 0.0
     identity = np.eye(A.shape[0])
     _, (whole, gamma_w) = zero_order_hold(A, [identity, E], dt)
-    # Of a held u the first part of a sample is still the one before.
+    # The first part of each sample still sees the control signal before.
     _, (rest,) = zero_order_hold(A, [identity], dt - late)
     before = (whole - rest) @ B
     return _delayed(A @ whole, rest @ B, before, C, gamma_w, samples, gains)
@@ -107,26 +104,22 @@ def _delayed(
     gains: dict[int, float],
 ) -> SampledPlant:
     """Append the control signals that have not arrived yet as states, the newest last."""
-    waiting = samples + bool(np.any(before))
-    n = N.shape[0]
-    size = n + waiting
-    big, B = np.zeros((size, size)), np.zeros(size)
-    big[:n, :n] = N
+    n, waiting = N.shape[0], samples + bool(np.any(before))
+    A, B = np.zeros((n + waiting, n + waiting)), np.zeros(n + waiting)
+    A[:n, :n] = N
     for i in range(waiting):
-        big[n + i, n + i] = -1.0
+        A[n + i, n + i] = -1.0
         if i + 1 < waiting:
-            big[n + i, n + i + 1] = 1.0
+            A[n + i, n + i + 1] = 1.0
     if waiting:
         B[-1] = 1.0
     if waiting > samples:
-        big[:n, n] = before[:, 0]
-        if samples:
-            big[:n, n + 1] = now[:, 0]
-        else:
-            B[:n] = now[:, 0]
-    elif waiting:
-        big[:n, n] = now[:, 0]
+        A[:n, n] = before[:, 0]
+    # The state from which ``now`` arrives; without one, u itself.
+    at = n + waiting - samples
+    if samples:
+        A[:n, at] = now[:, 0]
     else:
         B[:n] = now[:, 0]
-    pad = np.zeros((waiting, E.shape[1]))
-    return SampledPlant(big, B, np.vstack([E, pad]), np.append(C, np.zeros(waiting)), gains)
+    E = np.vstack([E, np.zeros((waiting, E.shape[1]))])
+    return SampledPlant(A, B, E, np.append(C, np.zeros(waiting)), gains)

@@ -9,25 +9,26 @@ from typing import Any
 from quell import checks
 from quell.analysis.frozen_learner import frozen
 from quell.analysis.loop import LoopAnalysis, analyse
+from quell.controllers.base import Controller
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
 
 
 def loops_over_time(
-    plant: Any, controller: Any, run: Any, times: Any, **lags: float
+    plant: Any, controller: Controller, run: Any, times: Any, **lags: float
 ) -> list[LoopAnalysis]:
     """Analyse the loop with its learner frozen at several instants.
 
-    Each is the loop that there would be if nothing more were learned from then on. That all of them are stable does not prove the
-    stability of the loop that learns (docs/analysis).
+    Each is the loop that would follow if nothing more were learned. That all of them are stable does not prove that the loop with a
+    learner that learns is stable (docs/analysis).
 
     Parameters
     ----------
     plant, controller
-        as for ``analyse``; ``plant`` has to be one that can be simulated where a scenario is given.
+        as for ``analyse``; with a scenario the plant must be one that can be simulated.
     run
-        a ``Trajectory``, whose record says what the learner had found; or the ``Scenario`` of a run, which is simulated up to each time,
-        and does for every learner.
+        a ``Trajectory``, whose record holds the learner's coefficients; or the ``Scenario`` of a run, which is simulated up to each
+        instant and works for every learner.
     times
         instants [s].
     lags
@@ -43,20 +44,19 @@ def loops_over_time(
     ValueError
         as ``frozen`` and ``analyse``; for a time outside of the run, or a scenario in which the loop diverges before it.
     """
-    instants = checks.vector("times", times)
+    instants = checks.vector("times", times).tolist()
     if isinstance(run, Trajectory):
-        return [
-            analyse(plant, controller, at=frozen(controller, run, t), **lags)
-            for t in instants.tolist()
-        ]
+        return [analyse(plant, controller, at=frozen(controller, run, t), **lags) for t in instants]
     if not isinstance(run, Scenario):
         raise ValueError(f"run = {run!r}: must be a Trajectory or a Scenario")
     loops = []
-    for t in instants.tolist():
+    for t in instants:
         if not 0.0 < t <= run.duration:
             raise ValueError(f"times has {t!r}: must lie within (0, duration = {run.duration!r}] s")
         until = replace(run, duration=t, rest_at=tuple(at for at in run.rest_at if at < t))
-        record = simulate(plant, controller, until, record_every=10**9)
+        record = simulate(
+            plant, controller, until, record_every=10**9
+        )  # only the final state is used
         if record.diverged:
             raise ValueError(f"times has {t!r}: the loop diverged at {record.ended:.6g} s")
         loops.append(analyse(plant, controller, at=record, **lags))
@@ -64,7 +64,7 @@ def loops_over_time(
 
 
 def loops_over_omega_o(
-    plant: Any, make_controller: Callable[[float], Any], omegas: Any, **lags: float
+    plant: Any, make_controller: Callable[[float], Controller], omegas: Any, **lags: float
 ) -> list[LoopAnalysis]:
     """Analyse designs with several observer bandwidths.
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.analysis.linearise import closed_loop_matrix, linear_law
+from quell.analysis.linearise import linear_law
+from quell.analysis.subsystems import closed_loop_matrix
 from quell.parallel import one_blas_thread
 from quell.plants import CubicSpringPlant, LinearPlant
 
