@@ -1,16 +1,18 @@
-"""From a model of any kind to the observable canonical form that an ESO is built on.
+"""The observable canonical form of a linear model, on which an ESO is built.
 
     S = [C; C A; …; C A^(n−1)]        z = S x,    z' = Ā z + B̄ u + Ē f,    y = z_1
 
-with ``Ā = S A S⁻¹`` a companion matrix (last row −a), and ``B̄ = S B``, ``Ē = S E`` the Markov parameters ``C A^(i−1) B`` and
-``C A^(i−1) E`` (paper, eq. (transform), which has the case where both are zero but for their last entries). What u and f feed through on
-the way is not in z, so nothing has to be differentiated:
+``Ā = S A S⁻¹`` is a companion matrix (last row −a). ``B̄ = S B`` and ``Ē = S E`` are the Markov
+parameters ``C A^(i−1) B`` and ``C A^(i−1) E`` (paper, eq. (transform), for the case in which only
+their last entries are nonzero). z excludes the feedthrough of u and f, so nothing has to be
+differentiated:
 
     z_i = y^(i−1) − Σ_{j<i} (B̄_j u^(i−1−j) + Ē_j f^(i−1−j))
 
-The first entry of B̄ that is not zero is the r-th, r being the relative degree from u to y: ``y^(r) = z_{r+1} + B̄_r u + Ē_r f``, or
-``−a·z + …`` for r = n. The n − r zeros from u are the eigenvalues of what is left of the plant while u holds y at zero: of the last n − r
-rows and columns of ``Ā − B̄ e_{r+1}ᵀ/B̄_r``. The same with Ē gives the zeros from f.
+The first nonzero entry of B̄ is the r-th, where r is the relative degree from u to y:
+``y^(r) = z_{r+1} + B̄_r u + Ē_r f``, or ``−a·z + …`` for r = n. The n − r zeros from u are the
+eigenvalues of the dynamics that remain while u holds y at zero: of the last n − r rows and columns
+of ``Ā − B̄ e_{r+1}ᵀ/B̄_r``. The same with Ē gives the zeros from f.
 """
 
 from __future__ import annotations
@@ -22,25 +24,33 @@ import numpy as np
 from quell.lti.models import ZERO_TOLERANCE, StateSpace, TransferFunction, read_model
 from quell.types import Matrix, Vector
 
-# A state that y shows less than this is not put into larger units: it is not seen.
-_NOT_SEEN = 1e-8
-# Of coefficients, to the power of the fastest pole that they have as unit.
+# The thresholds below separate rounding errors from properties of the model. They were chosen by
+# hand between the unit roundoff of 1e-16 and 1, and not tuned further.
+
+# A state that y shows less than this is not scaled up: it counts as unobservable.
+_UNOBSERVABLE = 1e-8
+# Coefficients below this, in units of powers of the fastest pole and times the condition, are zero.
 _ROUNDING = 1e-13
 # Below this ratio of singular values the balanced observability matrix counts as rank deficient.
 _RANK_TOLERANCE = 1e-10
-# A zero this much slower than the plant's fastest pole or zero counts as one at s = 0.
+# A zero slower than this share of the plant's fastest pole or zero counts as one at s = 0.
 _AT_REST = 1e-9
+# Zeros with less relative damping than this count as not in the left half plane.
+_LEAST_DAMPING = 1e-6
 
 
 class Canonical(NamedTuple):
-    """A plant in observable canonical form, ``z = S x``; without zeros it is ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u + f``."""
+    """A plant in observable canonical form, ``z = S x``.
+
+    Without zeros it is ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u + f``.
+    """
 
     a: Vector
     """(n,) [1/s^(n−i)]."""
     b: float
     """Gain from u to y^(degree) [y-unit / u-unit / s^degree]."""
     S: Matrix
-    """(n, n): from the user's states to z; the identity for a plant given without states."""
+    """(n, n), from the user's states to z; the identity for a plant given without states."""
     B: Vector
     """S B (n,): zero before entry ``degree``, which is b."""
     E: Vector
@@ -50,11 +60,11 @@ class Canonical(NamedTuple):
     f_degree: int
     """Relative degree from f to y; f is measured in y-unit/s^f_degree."""
     f_gain: float
-    """f is this times the disturbance that enters through E (through B, in units of u, where there is no E)."""
+    """f divided by the disturbance that enters through E (through B, in units of u, without E)."""
     zeros: Vector
     """The n − degree zeros from u to y [rad/s], complex."""
     condition: float
-    """Largest over smallest singular value of S with rows of length 1: from 1e10 on the plant counts as unobservable."""
+    """Condition number of S with rows of length 1; from 1e10 on the plant is unobservable."""
 
     @property
     def matched(self) -> bool:
@@ -63,25 +73,28 @@ class Canonical(NamedTuple):
 
     @property
     def unstable_zeros(self) -> Vector:
-        """Those of the zeros that are not in the left half plane, or damped by less than a millionth."""
-        return self.zeros[self.zeros.real >= -1e-6 * np.abs(self.zeros)]
+        """The zeros that are not in the left half plane, or have a damping of less than 1e-6."""
+        return self.zeros[self.zeros.real >= -_LEAST_DAMPING * np.abs(self.zeros)]
 
 
 def canonical(plant: Any, E: Any = None) -> Canonical:
-    """Bring a plant with one input and one output to observable canonical form, and check what an ESO needs of it.
+    """Return a plant with one input and output in observable canonical form, checked for an ESO.
 
     Parameters
     ----------
     plant
         one of
 
-        * a plant with ``A`` (n, n), ``B`` (n, 1), ``C`` (1, n): ``LinearPlant``, ``control.StateSpace``; D must be zero,
-        * matrices ``(A, B, C)``, or ``(A, B, E, C)`` as in the paper's eq. (1); B, E and C may be vectors,
-        * ``control.TransferFunction``, or the pair ``(numerator, denominator)`` of sequences in descending powers of s,
+        * a plant with ``A`` (n, n), ``B`` (n, 1), ``C`` (1, n): ``LinearPlant``,
+          ``control.StateSpace``; D must be zero,
+        * matrices ``(A, B, C)``, or ``(A, B, E, C)`` as in the paper's eq. (1); B, E and C may be
+          vectors,
+        * ``control.TransferFunction``, or the pair ``(numerator, denominator)`` of sequences in
+          descending powers of s,
         * the pair ``(a, b)`` with a number b: ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u``.
     E
-        where the disturbance enters: a column (n,) or (n, 1), or the index of one of the plant's own disturbance inputs. By default it
-        enters where u does.
+        input of the disturbance: a column (n,) or (n, 1), or the index of one of the plant's own
+        disturbance inputs. By default it enters where u does.
 
     Returns
     -------
@@ -90,9 +103,10 @@ def canonical(plant: Any, E: Any = None) -> Canonical:
     Raises
     ------
     ValueError
-        each with its own message: the plant is not observable from y (assumption 1 of the paper), u or the disturbance does not reach y,
-        a disturbance with a channel of its own has invariant zeros to y (assumption 3), a transfer function is improper or biproper, the
-        model is of discrete time, shapes do not fit.
+        if the plant is not observable from y (assumption 1 of the paper), u or the disturbance does
+        not reach y, a disturbance with an input of its own has invariant zeros to y (assumption 3),
+        a transfer function is improper or biproper, the model is of discrete time, or shapes do not
+        fit.
 
     Examples
     --------
@@ -101,15 +115,13 @@ def canonical(plant: Any, E: Any = None) -> Canonical:
     (1, [-3.0], [1.0, 2.6])
     """
     model = read_model(plant, E)
-    return (
-        _from_transfer_function(model)
-        if isinstance(model, TransferFunction)
-        else _from_state_space(model)
-    )
+    if isinstance(model, TransferFunction):
+        return _from_transfer_function(model)
+    return _from_state_space(model)
 
 
 def _from_transfer_function(model: TransferFunction) -> Canonical:
-    """Divide the numerator by the denominator: the quotient's powers of 1/s are the Markov parameters."""
+    """Divide the numerator by the denominator: the powers of 1/s have the Markov parameters."""
     n = model.a.size
     B = np.empty(n)
     for k in range(n):
@@ -118,46 +130,41 @@ def _from_transfer_function(model: TransferFunction) -> Canonical:
 
 
 def _from_state_space(model: StateSpace) -> Canonical:
-    A, n = model.A, model.B.size
-    # In states of such units that rows and columns of A are of one size: whether y shows them must not depend on the user's units.
-    A, units = _balanced(A)
+    from scipy.linalg import matrix_balance
+
+    # Balanced states (Parlett & Reinsch, Numer. Math. 13, 1969): whether y shows a state must not
+    # depend on the user's units.
+    n = model.B.size
+    A, (units, _) = matrix_balance(model.A, permute=False, separate=True)
     S = np.empty((n, n))
     S[0] = model.C * units
     for i in range(1, n):
         S[i] = S[i - 1] @ A
-    # Rows of one size, whatever the unit of time; and columns, for states that nothing ties to the others.
+    # Scale rows, for the unit of time, and columns, for states that are coupled to no others.
     rows = np.maximum(np.linalg.norm(S, axis=1), np.finfo(float).tiny)
     columns = np.maximum(np.linalg.norm(S / rows[:, None], axis=0), np.finfo(float).tiny)
-    balanced = S / rows[:, None] / np.where(columns > _NOT_SEEN, columns, 1.0)
+    balanced = S / rows[:, None] / np.where(columns > _UNOBSERVABLE, columns, 1.0)
     singular = np.linalg.svd(balanced, compute_uv=False)
     if not singular[-1] > _RANK_TOLERANCE * singular[0]:
         rank = int(np.sum(singular > _RANK_TOLERANCE * singular[0]))
+        ratio = singular[-1] / max(singular[0], 1e-300)
         raise ValueError(
             f"plant is not observable from y: its observability matrix has rank {rank}, not {n} "
-            f"(smallest over largest singular value {singular[-1] / max(singular[0], 1e-300):.1e}); "
+            f"(smallest over largest singular value {ratio:.1e}); "
             "measure another output or reduce the model"
         )
-    # Row n of the companion matrix: C A^n = −a S. What is no more than its rounding is zero.
+    # Row n of the companion matrix, C A^n = −a S. Entries of the size of their rounding are zero.
     condition = float(singular[0] / singular[-1])
     a = -np.linalg.solve((S / rows[:, None]).T, S[-1] @ A) / rows
     fastest = float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
     a[np.abs(a) <= _ROUNDING * condition * fastest ** (n - np.arange(n))] = 0.0
     S = S / units
-    return _assemble(
-        a, _markov(S, model.B), None if model.E is None else _markov(S, model.E), S, condition
-    )
-
-
-def _balanced(A: Matrix) -> tuple[Matrix, Vector]:
-    """Return A in balanced states (Parlett & Reinsch, *Numer. Math.* 13, 1969), and what one unit of each is in the user's."""
-    from scipy.linalg import matrix_balance
-
-    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
-    return balanced, scale
+    E = None if model.E is None else _markov(S, model.E)
+    return _assemble(a, _markov(S, model.B), E, S, condition)
 
 
 def _markov(S: Matrix, column: Vector) -> Vector:
-    """Return ``S column``, without what is only the rounding of sums that cancel."""
+    """Return ``S column``, with entries of the size of their rounding set to zero."""
     markov = S @ column
     markov[np.abs(markov) <= ZERO_TOLERANCE * (np.abs(S) @ np.abs(column))] = 0.0
     return markov
@@ -170,39 +177,29 @@ def _assemble(a: Vector, B: Vector, E: Vector | None, S: Matrix, condition: floa
             f"b = 0: u does not reach y through any of the {n} states (B or the output is wrong)"
         )
     degree = int(np.flatnonzero(B)[0]) + 1
-    b = float(B[degree - 1])
-    # The same channel, up to a factor.
     E = B if E is None or _parallel(E, B) else E
     if not np.any(E):
         raise ValueError(
-            f"E: the disturbance does not reach y through any of the {n} states; it can be neither estimated nor does it matter"
+            f"E: the disturbance does not reach y through any of the {n} states; it can not be "
+            "estimated and does not matter"
         )
     f_degree = int(np.flatnonzero(E)[0]) + 1
     if E is not B and f_degree < n:
         raise ValueError(
-            f"E: the disturbance has invariant zeros to y (assumption 3), {format_roots(_zeros(a, E))} rad/s, its relative degree is {f_degree} "
-            f"and not {n}; leave E out (f then enters where u does), or measure another output"
+            f"E: the disturbance has invariant zeros to y (assumption 3), "
+            f"{format_roots(_zeros(a, E))} rad/s, its relative degree is {f_degree} and not {n}; "
+            "leave E out (f then enters where u does), or measure another output"
         )
-    return Canonical(
-        a,
-        b,
-        S,
-        B,
-        E / E[f_degree - 1],
-        degree,
-        f_degree,
-        float(E[f_degree - 1]),
-        _zeros(a, B),
-        condition,
-    )
+    b, f_gain = float(B[degree - 1]), float(E[f_degree - 1])
+    zeros = _zeros(a, B)
+    return Canonical(a, b, S, B, E / f_gain, degree, f_degree, f_gain, zeros, condition)
 
 
 def _parallel(one: Vector, other: Vector) -> bool:
+    """Return whether two vectors are equal up to a factor."""
     at = np.flatnonzero(other)[0]
-    return bool(
-        one[at] != 0.0
-        and np.allclose(one, other * (one[at] / other[at]), rtol=ZERO_TOLERANCE, atol=0.0)
-    )
+    multiple = other * (one[at] / other[at])
+    return bool(one[at] != 0.0 and np.allclose(one, multiple, rtol=ZERO_TOLERANCE, atol=0.0))
 
 
 def _zeros(a: Vector, column: Vector) -> Vector:
@@ -221,10 +218,10 @@ def _zeros(a: Vector, column: Vector) -> Vector:
     return zeros[np.argsort(zeros.real, kind="stable")]
 
 
-def format_roots(zeros: Vector) -> str:
-    """Return zeros as text, conjugate pairs as one."""
-    told = []
-    for z in zeros[zeros.imag >= 0.0].tolist():
-        real = f"{z.real:.4g}" if abs(z.real) > 1e-9 * abs(z) or z == 0.0 else ""
-        told.append(real + (f"±{z.imag:.4g}j" if z.imag > 0.0 else ""))
-    return ", ".join(told)
+def format_roots(roots: Vector) -> str:
+    """Return poles or zeros as text, conjugate pairs as one."""
+    texts = []
+    for root in roots[roots.imag >= 0.0].tolist():
+        real = f"{root.real:.4g}" if abs(root.real) > 1e-9 * abs(root) or root == 0.0 else ""
+        texts.append(real + (f"±{root.imag:.4g}j" if root.imag > 0.0 else ""))
+    return ", ".join(texts)

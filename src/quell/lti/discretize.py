@@ -1,4 +1,4 @@
-"""Exact sampling: of inputs that are held, and of what adds up between samples."""
+"""Exact sampling of linear models: held inputs, and integrals of quadratic forms."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from quell.types import Matrix
 
 
 def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Matrix, list[Matrix]]:
-    """Sample ``x' = A x + Σ B_i u_i`` exactly, every ``u_i`` held over a sample.
+    """Sample ``x' = A x + Σ B_i u_i`` exactly, with every ``u_i`` held over a sample.
 
-    All matrices come out of one exponential (Van Loan, *IEEE Trans. Automatic Control* 23, 1978)::
+    One matrix exponential gives all (Van Loan, *IEEE Trans. Automatic Control* 23, 1978)::
 
         exp([[A, B], [0, 0]] dt) = [[Φ, Γ], [0, I]]
 
@@ -50,8 +50,8 @@ def gramian(A: Matrix, Q: Matrix, dt: float) -> Matrix:
 
         exp([[−A, Q], [0, Aᵀ]] dt) = [[·, G], [0, Φᵀ]],      ∫ = Φ G
 
-    For white noise of density Q on x' it is the covariance a sample. With Aᵀ in place of A it is the weight of x(0) in the cost
-    ``∫ xᵀ Q x dt`` of a sample.
+    For white noise of density Q on x' it is the covariance added in a sample. With Aᵀ in place of A
+    it is the weight of x(0) in the cost ``∫ xᵀ Q x dt`` of a sample.
 
     Parameters
     ----------

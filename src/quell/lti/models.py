@@ -1,6 +1,7 @@
-"""What a user may give for a plant, brought to one of two shapes: matrices, or a polynomial over a polynomial.
+"""Linear models as users give them, converted to state space or a transfer function.
 
-The only place that knows: ``canonical`` and ``LinearPlant.of`` read with it, and all that takes a linear plant reads with one of the two.
+``canonical`` and ``LinearPlant.of`` read models with ``read_model``; whatever takes a linear plant
+uses one of the two.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ import numpy as np
 from quell import checks
 from quell.types import Matrix, Vector
 
-# A leading coefficient of a numerator that is below this share of the others, at the plant's own rate, is the rounding of a conversion.
+# Leading coefficients of a numerator below this share of the largest one, at the rate of the
+# fastest pole, are rounding errors of a conversion. Chosen by hand; not tuned further.
 _ROUNDING = 1e-10
-# Markov parameters below this share of their own bound count as zero.
+# Markov parameters below this share of the bound on their rounding count as zero. Chosen by hand
+# above the unit roundoff of 1e-16; not tuned further.
 ZERO_TOLERANCE = 1e-9
 
 
@@ -29,11 +32,14 @@ class StateSpace(NamedTuple):
     C: Vector
     """(n,)."""
     E: Vector | None
-    """(n,): where the disturbance enters; None: where u does."""
+    """(n,), the input of the disturbance; None if it enters where u does."""
 
 
 class TransferFunction(NamedTuple):
-    """``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = c_{n−1} u^(n−1) + … + c_0 u``; for a sampled model shifts in place of derivatives."""
+    """``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = c_{n−1} u^(n−1) + … + c_0 u``.
+
+    For a sampled model, shifts replace derivatives.
+    """
 
     a: Vector
     """(n,)."""
@@ -42,79 +48,70 @@ class TransferFunction(NamedTuple):
 
 
 def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace | TransferFunction:
-    """Return what ``plant`` is, checked.
+    """Return ``plant`` as a checked model.
 
     Parameters
     ----------
     plant
-        see ``LinearPlant.of`` for what it may be.
+        see ``LinearPlant.of`` for the accepted kinds.
     E
-        where the disturbance enters, if that is not where u does; see ``canonical``.
+        input of the disturbance, if it does not enter where u does; see ``canonical``.
     dt
-        a model in discrete time may be given too, if this is its sample time [s]; by default none may.
+        sample time [s]; if given, a discrete-time model with this sample time is accepted too.
 
     Raises
     ------
     ValueError
-        naming what does not fit.
+        if the model is of no known kind or its parts do not fit.
     """
     if isinstance(plant, list):
         plant = tuple(plant)
     if isinstance(plant, tuple) and len(plant) in (3, 4):
-        A, B, C = plant[0], plant[1], plant[-1]
-        if len(plant) == 3:
-            return _state_space(A, B, C, None if E is None else _channel(E, None))
-        if E is not None:
-            raise ValueError(
-                "E is given twice: in plant = (A, B, E, C) and as an argument; leave one out"
-            )
-        _check_four(A, C)
-        return _state_space(A, B, C, _channel(plant[2], None))
+        return _from_matrices(plant, E)
     if all(hasattr(plant, name) for name in "ABC"):
         _check_time(plant, dt)
-        if hasattr(plant, "D") and np.any(np.asarray(plant.D) != 0.0):
+        D = np.asarray(getattr(plant, "D", 0.0))
+        if np.any(D != 0.0):
             raise ValueError(
-                f"D = {np.asarray(plant.D).tolist()}: must be zero, the output may not follow the input at once"
+                f"D = {D.tolist()}: must be zero, the output may not follow the input at once"
             )
-        return _state_space(
-            plant.A, plant.B, plant.C, None if E is None else _channel(E, getattr(plant, "E", None))
-        )
+        return _state_space(plant.A, plant.B, plant.C, _column(E, getattr(plant, "E", None)))
     if E is not None:
         raise ValueError(
-            "E: only a plant with states, given by matrices, has a place for a disturbance of its own; leave E out"
+            "E: only a plant with states, given by matrices, has an input for the disturbance; "
+            "leave E out"
         )
     if isinstance(plant, tuple) and len(plant) == 2:
-        if np.ndim(plant[1]) == 0:
-            a = checks.vector("a", plant[0])
-            b = checks.nonzero("b", plant[1], "or the input does not reach the plant")
-            return TransferFunction(a, np.append(b, np.zeros(a.size - 1)))
-        return _transfer_function(*plant)
-    if all(
-        hasattr(plant, name) for name in ("zeros", "poles", "gain", "to_tf")
-    ):  # scipy.signal.ZerosPolesGain
-        plant = plant.to_tf()
+        if np.ndim(plant[1]) != 0:
+            return _transfer_function(*plant)
+        a = checks.vector("a", plant[0])
+        b = checks.nonzero("b", plant[1], "or the input does not reach the plant")
+        return TransferFunction(a, np.append(b, np.zeros(a.size - 1)))
+    if all(hasattr(plant, name) for name in ("zeros", "poles", "gain", "to_tf")):
+        plant = plant.to_tf()  # scipy.signal.ZerosPolesGain
     if hasattr(plant, "num") and hasattr(plant, "den"):
         _check_time(plant, dt)
-        if np.ndim(plant.num) == 1:  # as scipy.signal has them
+        if np.ndim(plant.num) == 1:  # scipy.signal
             return _transfer_function(plant.num, plant.den)
-        outputs, inputs = len(plant.num), len(plant.num[0])
-        if (outputs, inputs) != (1, 1):
-            raise ValueError(
-                f"plant has {(outputs, inputs)} outputs and inputs: must have one of each"
-            )
+        size = len(plant.num), len(plant.num[0])
+        if size != (1, 1):
+            raise ValueError(f"plant has {size} outputs and inputs: must have one of each")
         return _transfer_function(plant.num[0][0], plant.den[0][0])
     raise ValueError(
-        f"plant = {plant!r}: must be a linear plant or control.StateSpace (with A, B, C), matrices (A, B, C) or (A, B, E, C), "
-        "a control.TransferFunction, (numerator, denominator) or (a, b); a nonlinear one has to be linearised first"
+        f"plant = {plant!r}: must be a linear plant or control.StateSpace (with A, B, C), matrices "
+        "(A, B, C) or (A, B, E, C), a control.TransferFunction, (numerator, denominator) or "
+        "(a, b); a nonlinear plant has to be linearised first"
     )
 
 
 def to_state_space(model: TransferFunction) -> StateSpace:
-    """Return a transfer function with states, in observable companion form; its coefficients are taken as they are, so nothing is rounded.
+    """Return ``model`` in observable companion form, with its coefficients unchanged.
 
-    Without zeros y and its derivatives, ``x_i' = x_{i+1}``, ``x_n' = −a·x + c_0 u``. With zeros, where those would jump with u,
-    ``x_1 = y`` and ``x_i' = x_{i+1} − a_{n−i} x_1 + c_{n−i} u``. The z of ``canonical`` would be rounded here: its Markov parameters hold
-    the slow zeros of a plant with a pole at 10000 rad/s as differences of numbers 1e8 times as large.
+    Without zeros the states are y and its derivatives: ``x_i' = x_{i+1}``, ``x_n' = −a·x + c_0 u``.
+    With zeros, where derivatives would jump with u, ``x_1 = y`` and
+    ``x_i' = x_{i+1} − a_{n−i} x_1 + c_{n−i} u``. The z of ``canonical`` would add rounding errors:
+    its Markov parameters contain the slow zeros of a plant with a pole at 10000 rad/s as
+    differences of numbers 1e8 times as large.
     """
     a, c = model
     n = a.size
@@ -129,34 +126,33 @@ def to_state_space(model: TransferFunction) -> StateSpace:
 
 
 def is_linear_model(value: Any) -> bool:
-    """Return whether ``value`` is of a kind that ``read_model`` knows: an object with matrices or polynomials, or numbers in a tuple or list."""
+    """Return whether ``value`` looks like a model for ``read_model``: by attributes or numbers."""
     if isinstance(value, tuple | list):
-        return len(value) > 0 and isinstance(
-            value[0], int | float | np.number | np.ndarray | tuple | list
-        )
+        numbers = int | float | np.number | np.ndarray | tuple | list
+        return len(value) > 0 and isinstance(value[0], numbers)
+    kinds = (("A", "B", "C"), ("num", "den"), ("zeros", "poles", "gain"))
     return not isinstance(value, type) and any(
-        all(hasattr(value, name) for name in names)
-        for names in (("A", "B", "C"), ("num", "den"), ("zeros", "poles", "gain"))
+        all(hasattr(value, name) for name in names) for names in kinds
     )
 
 
 def leading_gain(A: Matrix, column: Matrix, C: Matrix) -> tuple[float, int] | None:
-    """Return the first Markov parameter that is not zero, ``b = C A^(ν−1) column``, and the relative degree ν.
+    """Return the first nonzero Markov parameter, ``b = C A^(ν−1) column``, and its ν.
 
     Parameters
     ----------
     A
         (n, n), in 1/s.
     column
-        (n, 1), where the input enters: B, or a column of E.
+        (n, 1), the input: B, or a column of E.
     C
         (1, n).
 
     Returns
     -------
     tuple or None
-        b in y-unit / input-unit / s^ν, and ν from 1 to n; None where the input does not reach y. What is below 1e-9 of
-        ``|C| |A|^(ν−1) |column|`` is the rounding of sums that cancel.
+        b in y-unit / input-unit / s^ν, and the relative degree ν from 1 to n; None if the input
+        does not reach y. Values below 1e-9 of ``|C| |A|^(ν−1) |column|`` are rounding errors.
     """
     row, bound = C[0], np.abs(C[0])
     for degree in range(1, A.shape[0] + 1):
@@ -177,22 +173,42 @@ def check_matrices(A: Any, B: Any, C: Any) -> tuple[Matrix, Matrix, Matrix]:
     return A, B, C
 
 
+def _from_matrices(plant: tuple[Any, ...], E: Any) -> StateSpace:
+    """Read ``(A, B, C)`` or ``(A, B, E, C)``."""
+    A, B, C = plant[0], plant[1], plant[-1]
+    if len(plant) == 4:
+        if E is not None:
+            raise ValueError(
+                "E is given twice: in plant = (A, B, E, C) and as an argument; leave one out"
+            )
+        # scipy and python-control have (A, B, C, D); then C has another shape or is a zero D.
+        fits = np.size(C) == checks.matrix("A", A).shape[0]
+        if not fits or not np.any(C):
+            what = "is zero" if fits else f"has shape {np.shape(C)}"
+            raise ValueError(
+                f"C, the last of four, {what}: four entries are (A, B, E, C), not (A, B, C, D); "
+                "D must be zero, leave it out"
+            )
+        E = plant[2]
+    return _state_space(A, B, C, _column(E, None))
+
+
 def _state_space(A: Any, B: Any, C: Any, E: Any) -> StateSpace:
     A, B, C = check_matrices(A, B, C)
-    n = A.shape[0]
     if E is not None:
-        E = checks.matrix("E", E, n, 1)[:, 0]
+        E = checks.matrix("E", E, A.shape[0], 1)[:, 0]
         if not np.any(E):
             raise ValueError("E is zero: the disturbance must enter somewhere")
     return StateSpace(A, B[:, 0], C[0], E)
 
 
-def _channel(E: Any, columns: Any) -> Any:
-    """Return ``E`` as a column; an index counts the plant's own disturbance inputs ``columns``."""
+def _column(E: Any, columns: Any) -> Any:
+    """Return ``E`` as a column; an index selects one of the plant's disturbance ``columns``."""
     if isinstance(E, int | np.integer) and not isinstance(E, bool):
         if columns is None:
             raise ValueError(
-                f"E = {E!r}: this plant has no disturbance inputs of its own to count; give the column (n,)"
+                f"E = {E!r}: this plant has no disturbance inputs of its own to count; give the "
+                "column (n,)"
             )
         return np.asarray(columns)[:, [checks.whole("E", E, 0, np.shape(columns)[1] - 1)]]
     return np.reshape(E, (-1, 1)) if np.ndim(E) == 1 else E
@@ -200,26 +216,25 @@ def _channel(E: Any, columns: Any) -> Any:
 
 def _transfer_function(numerator: Any, denominator: Any) -> TransferFunction:
     """Read coefficients in descending powers of s."""
-    num, den = (
-        np.trim_zeros(checks.vector("numerator", numerator), "f"),
-        np.trim_zeros(checks.vector("denominator", denominator), "f"),
-    )
+    num = np.trim_zeros(checks.vector("numerator", numerator), "f")
+    den = np.trim_zeros(checks.vector("denominator", denominator), "f")
     if num.size == 0:
         raise ValueError("numerator is zero: the input must reach the output")
     if den.size < 2:
         raise ValueError(
-            f"denominator has degree {max(den.size - 1, 0)}: must be at least 1, or the plant has no state"
+            f"denominator has degree {max(den.size - 1, 0)}: must be at least 1, or the plant has "
+            "no state"
         )
     num = _without_rounding(num, den)
     if num.size > den.size:
         raise ValueError(
-            f"transfer function is improper: its numerator has degree {num.size - 1}, its denominator {den.size - 1}; "
-            "no plant differentiates its input"
+            f"transfer function is improper: its numerator has degree {num.size - 1}, its "
+            f"denominator {den.size - 1}; no plant differentiates its input"
         )
     if num.size == den.size:
         raise ValueError(
-            f"transfer function is biproper: numerator and denominator have degree {den.size - 1}, so y follows u at once; "
-            "model the lag of the actuator or the sensor too"
+            f"transfer function is biproper: numerator and denominator have degree {den.size - 1}, "
+            "so y follows u at once; model the lag of the actuator or the sensor too"
         )
     c = np.zeros(den.size - 1)
     c[: num.size] = num[::-1] / den[0]
@@ -227,22 +242,12 @@ def _transfer_function(numerator: Any, denominator: Any) -> TransferFunction:
 
 
 def _without_rounding(num: Vector, den: Vector) -> Vector:
-    """Return the numerator without leading coefficients that only a conversion from state space has left there."""
+    """Return ``num`` without leading coefficients left over by a conversion from state space."""
     rate = np.max(np.abs(np.roots(den)))
     if rate == 0.0:
         return num
     size = np.abs(num) * rate ** np.arange(num.size - 1.0, -1.0, -1.0)
     return num[int(np.argmax(size > _ROUNDING * np.max(size))) :]
-
-
-def _check_four(A: Any, C: Any) -> None:
-    """Check that four matrices end with C: scipy's and python-control's order ends with D."""
-    n = checks.matrix("A", A).shape[0]
-    if np.size(C) != n or not np.any(C):
-        what = "is zero" if np.size(C) == n else f"has shape {np.shape(C)}"
-        raise ValueError(
-            f"C, the last of four, {what}: four entries are (A, B, E, C), not (A, B, C, D); D must be zero, leave it out"
-        )
 
 
 def _check_time(plant: Any, dt: float | None) -> None:
@@ -251,9 +256,10 @@ def _check_time(plant: Any, dt: float | None) -> None:
         return
     if dt is None:
         raise ValueError(
-            f"plant has a sample time, dt = {own!r}: must be a continuous-time model; it is sampled here"
+            f"plant has a sample time, dt = {own!r}: must be in continuous time; quell samples it"
         )
     if own is True or not math.isclose(own, dt, rel_tol=1e-9):
         raise ValueError(
-            f"plant has a sample time of {own!r}: must be in continuous time, or sampled at the controller's dt = {dt!r} s"
+            f"plant has a sample time of {own!r}: must be in continuous time, or sampled at the "
+            f"controller's dt = {dt!r} s"
         )
