@@ -128,8 +128,9 @@ def to_state_space(model: TransferFunction) -> StateSpace:
 def is_linear_model(value: Any) -> bool:
     """Return whether ``value`` looks like a model for ``read_model``: by attributes or numbers."""
     if isinstance(value, tuple | list):
-        numbers = int | float | np.number | np.ndarray | tuple | list
-        return len(value) > 0 and isinstance(value[0], numbers)
+        return len(value) > 0 and isinstance(
+            value[0], int | float | np.number | np.ndarray | tuple | list
+        )
     kinds = (("A", "B", "C"), ("num", "den"), ("zeros", "poles", "gain"))
     return not isinstance(value, type) and any(
         all(hasattr(value, name) for name in names) for names in kinds
