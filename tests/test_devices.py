@@ -297,14 +297,14 @@ def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(
     """Over UDP a frame may not arrive, in shared memory the hello may take its place: the goodbye is said again, and the rig serves."""
     here = bench(wire)
     device, said = here.open(), []
-    say = device._say
+    say = device._send
 
     def lossy(kind: int, value: float, session: int) -> None:
         said.append(kind)
         if said.count(frames.GOODBYE) != 1 or kind != frames.GOODBYE:
             say(kind, value, session)
 
-    monkeypatch.setattr(device, "_say", lossy)
+    monkeypatch.setattr(device, "_send", lossy)
     thread = threading.Thread(target=device.restart_session)
     thread.start()
     while thread.is_alive():
@@ -387,7 +387,7 @@ def test_an_address_that_cannot_be_reached_is_named() -> None:
     """Not only its error."""
     with pytest.raises(ConnectionError, match="udp://255.255.255.255:5005: can't be reached"):
         UdpDevice("udp://255.255.255.255:5005", DT)
-    with pytest.raises(ValueError, match="the host 'a{70}.com' is not known"):
+    with pytest.raises(ValueError, match="the host 'a{70}.com' is unknown"):
         listen(f"udp://{70 * 'a'}.com:5005")
 
 
@@ -445,7 +445,7 @@ def test_a_rig_serves_one_session_at_a_time(wire: str, bench: Callable[..., Benc
     here = bench(wire)
     device = here.open()
     here.cycle(device, law, 3)
-    with pytest.raises(ConnectionError, match="another session is alive"):
+    with pytest.raises(ConnectionError, match="another session is active"):
         here.open(timeout=0.3, meanwhile=lambda: device.write(law(device.read())))
     here.cycle(device, law, 3)
     assert here.rig.state == "live"
@@ -670,7 +670,8 @@ def test_spoiled_frames_break_the_rule_they_are_meant_to(kind: str, rule: str) -
         (data,) = spoiler.frames(packed(frames.COMMAND, k, 0, 1.0))
         frame = frames.buffer()
         frame.bytes[: len(data)] = np.frombuffer(data[:48], dtype=np.uint8)[: frame.bytes.size]
-        frames.accept(frame, min(len(data), 48), own)
+        if frames.is_well_formed(frame, min(len(data), 48), own.counters):
+            frames.accept(frame, own)
     assert frames.counts_by_name(own.counters)[rule] == 50
 
 

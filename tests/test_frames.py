@@ -20,7 +20,6 @@ from quell.realtime.wire.frames import (
     COMMAND,
     GOODBYE,
     MEASUREMENT,
-    accept,
     buffer,
     counts_by_name,
     crc32,
@@ -34,7 +33,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "wire.md"
 
 @compiled
 def _accept(frame: Any, size: int, own: Any) -> bool:
-    return accept(frame, size, own)
+    return frames.is_well_formed(frame, size, own.counters) and frames.accept(frame, own)
 
 
 @compiled
@@ -73,11 +72,11 @@ def packed(
     return head + struct.pack("<I", zlib.crc32(head))
 
 
-def offered(own: Any, data: bytes, entry: Any = accept) -> bool:
+def offered(own: Any, data: bytes, entry: Any = None) -> bool:
     """Offer what was received to ``own``, as a link would put it into its buffer."""
     frame = buffer()
     frame.bytes[: len(data)] = np.frombuffer(data[: frame.bytes.size], dtype=np.uint8)
-    return bool(entry(frame, min(len(data), frame.bytes.size), own))
+    return bool((entry or interpreted(_accept))(frame, min(len(data), frame.bytes.size), own))
 
 
 def refused_as(own: Any) -> str:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.realtime.devices.base import Device, handle_of, read_measurement, write_command
-from quell.realtime.devices.ni import NiDevice, ni_device
+from quell.realtime.devices.ni.device import NiDevice, ni_device
 from quell.realtime.devices.twin import TwinDevice
 from quell.realtime.system.clock import virtual_clock
 
@@ -140,7 +140,7 @@ def test_the_output_is_zero_before_and_after(rack):
 def test_the_output_is_zero_when_python_ends():
     """Also where nobody closed the device: here the program ends by an exception."""
     program = (
-        "from quell.realtime.devices.ni import NiDevice\n"
+        "from quell.realtime.devices.ni.device import NiDevice\n"
         "from tests.daqmx_standin import Card, Rack; from nidaqmx._lib import lib_importer as library\n"
         "import atexit\n"
         "rack = Rack(Dev1=Card(counters=1), Dev2=Card(outputs=1))\n"
@@ -187,7 +187,7 @@ def test_the_card_s_watchdog_stops_the_motor_when_the_loop_does_not_write(rack):
     rack.pass_time(0.011)
     assert rack.cards["Dev3"].volts["ao0"] == 0.0
     assert not rack.cards["Dev3"].levels["port0/line0"]
-    with pytest.raises(OSError, match="-200678.*the loop came too late; reset the card"):
+    with pytest.raises(OSError, match="-200678.*because the loop was late; reset the card"):
         device.write(2.0)
     with pytest.warns(
         RuntimeWarning, match="Dev3/ao0 can't be set to zero, switch the amplifier off"
@@ -216,9 +216,9 @@ def test_a_card_without_watchdog_is_refused_in_words_that_help(rack):
     [
         (
             {"counter": "Dev9/ctr0"},
-            r"counter = 'Dev9/ctr0': .*-200220: the names of the cards that are there",
+            r"counter = 'Dev9/ctr0': .*-200220: for the cards present see NI MAX",
         ),
-        ({"counter": "Dev1/ctr7"}, r"counter = 'Dev1/ctr7': .*-200170: counters are called like"),
+        ({"counter": "Dev1/ctr7"}, r"counter = 'Dev1/ctr7': .*-200170: counters have names like"),
         ({"output": "Dev1/ao0"}, r"output = 'Dev1/ao0' from -10 to 10 V: .*-200170"),
         (
             {"volts": 2.0},
@@ -245,7 +245,7 @@ def test_bad_arguments_are_named_in_one_line(rack, arguments, says):
 
 def test_a_card_that_another_program_holds_is_said_so(rack, device):
     """Two devices can't have one output."""
-    with pytest.raises(OSError, match="-50103: another program holds the card: close it"):
+    with pytest.raises(OSError, match="-50103: another program uses the card: close it"):
         NiDevice("Dev1/ctr1", "Dev2/ao0")
     device.write(1.0)
     assert rack.cards["Dev2"].volts["ao0"] == pytest.approx(1.0, abs=1e-3)

@@ -125,7 +125,9 @@ class Stream:
         """Return the values of all frames that have come and are accepted."""
         values = []
         while (size := receive(self.there, self.frame)) >= 0:
-            if frames.accept(self.frame, size, endpoint):
+            if not frames.is_well_formed(self.frame, size, endpoint.counters):
+                continue
+            if frames.accept(self.frame, endpoint):
                 values.append(float(self.frame.doubles[3]))
         return values
 
@@ -359,12 +361,13 @@ def test_a_frame_must_fit_into_a_sample():
     """420 bits at 115200 baud are 3.6 ms: too long for 1 ms; for 5 ms it fits, but not there and back."""
     with pytest.raises(
         ValueError,
-        match="a frame takes 3.65 ms at 115200 baud: too long for a sample; take at least 420000 baud",
+        match="a frame takes 3.65 ms at 115200 baud, which is longer than a sample; give at least 420000 baud",
     ):
         SerialDevice("serial:///dev/null?baud=115200", DT)
     with (
         pytest.warns(
-            ql.DesignWarning, match="u acts a sample later than it might; from 168000 baud on"
+            ql.DesignWarning,
+            match="u acts a sample later than it could; it does not from 168000 baud on",
         ),
         pytest.raises(ValueError),
     ):
@@ -393,7 +396,7 @@ def test_ports_that_are_none_are_refused(url, says):
 
 def test_a_port_has_one_user(rig):
     """The second is told that there is a first."""
-    with opened(rig) as device, pytest.raises(ValueError, match="another program has it"):
+    with opened(rig) as device, pytest.raises(ValueError, match="another program uses it"):
         SerialDevice(device.url, DT)
 
 
@@ -412,7 +415,7 @@ def test_other_systems_are_told_what_to_do(monkeypatch):
     """The line is read through functions that only Linux has."""
     monkeypatch.setattr("sys.platform", "win32")
     with pytest.raises(
-        ValueError, match="serial lines are for Linux; elsewhere give run_rig a device of your own"
+        ValueError, match="serial lines need Linux; elsewhere give run_rig a device of your own"
     ):
         SerialDevice("serial://COM3", DT)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from quell import checks
 from quell.plants.base import Plant
 from quell.plants.cubic_spring import lagged_two_mass_spring
 from quell.plants.delay import delayed
@@ -60,3 +61,14 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
     "encoded": encoded,
 }
 """Plants that a setup file can have, by their ``kind``."""
+
+
+def named_plant(name: str, argument: str = "plant") -> Plant:
+    """Return the plant of ``TESTBEDS`` with this name; errors call the name ``argument``.
+
+    Raises
+    ------
+    ValueError
+        for an unknown name.
+    """
+    return TESTBEDS[checks.one_of(argument, name, tuple(TESTBEDS))]()

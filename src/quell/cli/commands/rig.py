@@ -56,12 +56,13 @@ def rig(
     cpu
         Number of the processor for the ticks; any by default.
     """
-    from quell.realtime.devices.registry import listen, plant_named
+    from quell.plants.registry import named_plant
+    from quell.realtime.devices.registry import listen
     from quell.realtime.rig.server import Rig, checked_seconds
     from quell.realtime.system.interrupts import termination_handler
     from quell.realtime.system.scheduling import checked_cpu, checked_priority
 
-    model = plant_named(plant, "--plant")
+    model = named_plant(plant, "--plant")
     if seconds is not None:
         checked_seconds("--seconds", seconds)
     checked_priority(priority)

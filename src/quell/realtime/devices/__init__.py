@@ -1,4 +1,4 @@
-"""Devices: what a loop reads y from and writes u to, and how a URL names one.
+"""Devices: what the loop reads y from and writes u to, and the table of their URLs.
 
-May import ``plants``, ``simulation``, and ``realtime.system``.
+May import ``plants`` and ``realtime.system``.
 """

@@ -1,12 +1,12 @@
-"""What the loop asks of a device, be it metal, a twin in this process or one at the other end of a wire.
+"""The interface between the loop and a device: a plant in hardware, simulated, or behind a wire.
 
-A device is an object with ``read() -> y``, ``write(u)`` and ``close()``: whoever writes those three has a device. One that can be used
-without Python says so by a ``handle``: a NamedTuple for whose type ``read_measurement`` and ``write_command`` are registered below, and which the loop then calls
-from compiled code; ``read`` and ``write`` are the same two, called from Python. A device without a ``handle`` gets a ``PythonHandle``, and
-the loop around it runs as Python.
+A device is an object with ``read() -> y``, ``write(u)`` and ``close()``. A device that can be used
+from compiled code also has a ``handle``: a NamedTuple for whose type ``read_measurement`` and
+``write_command`` are registered. Any other device gets a ``PythonHandle``, and the loop around it
+runs as Python.
 
-Some devices have a clock of their own: they send a measurement at each of their ticks, whether one asks or not (``paced`` is True). For
-those ``read_measurement`` waits for the next tick. Others answer whenever they are asked.
+A device with its own clock sends a measurement at each of its ticks; its attribute ``paced`` is
+True, and ``read_measurement`` waits for the next tick. Other devices answer at any time.
 """
 
 from __future__ import annotations
@@ -25,52 +25,64 @@ class Device(Protocol):
     """A plant that can be read and written, one sample at a time."""
 
     def read(self) -> float:
-        """Return the newest measurement [y-unit], NaN where none has come in time."""
+        """Return the newest measurement [y-unit], NaN if none has come in time."""
 
     def write(self, u: float) -> None:
         """Apply the control signal ``u`` [u-unit] until the next one."""
 
     def close(self) -> None:
-        """Set u to zero, and give the device free; calling it twice does no harm."""
+        """Set u to zero and release the device; a second call does nothing."""
+
+
+class Listener(Protocol):
+    """The device's end of a wire; ``listen`` of the registry makes it from a URL."""
+
+    url: str
+    transport: Any
+    """The functions of ``quell.realtime.wire.transport`` are registered for its type."""
+
+    def close(self) -> None:
+        """Release the wire."""
 
 
 @generic
 def read_measurement(handle: Any, clock: Any, until: int) -> tuple[float, int]:
-    """Return the newest measurement [y-unit] and how long it was waited for [ns].
+    """Return the newest measurement [y-unit] and the time spent waiting for it [ns].
 
-    A measurement is returned once. Where there is none that is new, a paced handle waits for one until the time ``until`` [ns] of ``clock``;
-    NaN where none has come, or where the device sent one.
+    Each measurement is returned once. If there is no new one, the handle of a paced device waits
+    until the time ``until`` [ns] of ``clock``. NaN if none has come, or if the device has sent NaN.
     """
     raise TypeError
 
 
 @generic
 def write_command(handle: Any, u: float) -> int:
-    """Apply ``u`` [u-unit]; return 0, 1 where the device can't be reached, or more where it has set u to zero for good."""
+    """Apply ``u`` [u-unit]; return 0, 1 if it can't be sent, more if the device keeps u at zero."""
     raise TypeError
 
 
 class PythonHandle(NamedTuple):
-    """A device of which only Python can make use."""
+    """A device that only Python can use."""
 
-    device: Any
+    device: Device
     errors: list[Exception]
-    """What it raised last: at most one."""
+    """The exception that it raised last, if any."""
     faults: NDArray[np.int64]
-    """How often it raised something (1,)."""
+    """Number of exceptions that it raised (1,)."""
 
 
-def handle_of(device: Any) -> Any:
-    """Return the handle of a device, or one through Python where it has none.
+def handle_of(device: Device) -> Any:
+    """Return the handle of a device, a ``PythonHandle`` if it has none.
 
     Raises
     ------
     ValueError
-        for something that is no device.
+        for an object that is not a device.
     """
     if isinstance(device, type) or not isinstance(device, Device):
         raise ValueError(
-            f"device = {device!r}: must have read(), write(u) and close(), for example quell.realtime.TwinDevice(plant, dt)"
+            f"device = {device!r}: must have read(), write(u) and close(), "
+            "for example quell.realtime.TwinDevice(plant, dt)"
         )
     handle = getattr(device, "handle", None)
     return PythonHandle(device, [], np.zeros(1, dtype=np.int64)) if handle is None else handle
@@ -80,8 +92,8 @@ def handle_of(device: Any) -> Any:
 def _read_measurement(handle: PythonHandle, clock: Any, until: int) -> tuple[float, int]:
     try:
         return float(handle.device.read()), 0
-    except Exception as error:  # whatever a driver raises, the loop has to go on to its safe action
-        _note(handle, error)
+    except Exception as error:  # whatever a driver raises, the loop must go on to its safe action
+        _count_error(handle, error)
         return math.nan, 0
 
 
@@ -90,11 +102,11 @@ def _write_command(handle: PythonHandle, u: float) -> int:
     try:
         handle.device.write(float(u))
     except Exception as error:
-        _note(handle, error)
+        _count_error(handle, error)
         return 1
     return 0
 
 
-def _note(handle: PythonHandle, error: Exception) -> None:
+def _count_error(handle: PythonHandle, error: Exception) -> None:
     handle.faults[0] += 1
     handle.errors[:] = [error]

@@ -1,91 +1,96 @@
-"""Devices and rigs by their URL."""
+"""Devices by their URL, in one table.
+
+A new device needs its own file and an entry in ``SCHEMES``. The entries name modules as text, so
+that only the device in use is imported; the command line reads the table for its help.
+"""
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from quell import checks
-from quell.plants.base import Plant
-from quell.plants.registry import TESTBEDS
-from quell.realtime.devices.base import handle_of
+if TYPE_CHECKING:
+    from quell.realtime.devices.base import Device, Listener
 
-# Scheme: where it is, the loop's end and the device's end of it, and an example.
-_SCHEMES: dict[str, tuple[str, str, str | None, str]] = {
-    "udp": ("quell.realtime.wire.udp", "UdpDevice", "UdpListener", "udp://127.0.0.1:5005"),
-    "shm": ("quell.realtime.wire.shared_memory", "SharedDevice", "SharedListener", "shm://rig"),
-    "serial": (
-        "quell.realtime.wire.serial_line",
-        "SerialDevice",
-        "SerialListener",
-        "serial:///dev/ttyACM0",
-    ),
-    "ni": ("quell.realtime.devices.ni", "ni_device", None, "ni://Dev1/ctr0+Dev2/ao0"),
-    "twin": ("quell.realtime.devices.registry", "twin", None, "twin:torsional"),
+
+class Scheme(NamedTuple):
+    """The devices whose URLs begin with one word."""
+
+    example: str
+    description: str
+    module: str
+    """Module below ``quell.realtime``."""
+    device: str
+    """Name there of the loop's end, which is called with URL and sample time."""
+    listener: str = ""
+    """Name there of the device's end, which is called with the URL; empty if there is none."""
+
+
+# fmt: off
+SCHEMES = {
+    "udp": Scheme("udp://127.0.0.1:5005", "a rig or your own device, over a network",
+                  "wire.udp", "UdpDevice", "UdpListener"),
+    "shm": Scheme("shm://rig", "a rig in another process, through shared memory",
+                  "wire.shared_memory", "SharedMemoryDevice", "SharedMemoryListener"),
+    "serial": Scheme("serial:///dev/ttyACM0", "a microcontroller at a serial port",
+                     "wire.serial_line", "SerialDevice", "SerialListener"),
+    "ni": Scheme("ni://Dev1/ctr0+Dev2/ao0", "cards of National Instruments",
+                 "devices.ni.device", "ni_device"),
+    "twin": Scheme("twin:torsional", "a simulated plant in this process",
+                   "devices.twin", "twin_device"),
 }
+# fmt: on
 
 
-def open_device(device: Any, dt: float) -> Any:
-    """Return the device that a URL names.
+def examples(listening: bool = False) -> str:
+    """Return an example of each URL; if ``listening``, of those at which a rig can listen."""
+    schemes = [scheme for scheme in SCHEMES.values() if scheme.listener or not listening]
+    return ", ".join(scheme.example for scheme in schemes)
+
+
+def open_device(device: str | Device, dt: float) -> Any:
+    """Return the device of a URL.
 
     Parameters
     ----------
     device
-        ``udp://HOST:PORT``, ``shm://NAME``, ``serial:///dev/…``, ``ni://…``, or ``twin:NAME`` for
-        a plant in this process, on which u acts at once (``twin:torsional``; the names are in
-        ``quell.plants.registry.TESTBEDS``); an object with ``read``, ``write`` and ``close`` is
-        returned as it is.
+        a URL: ``udp://HOST:PORT``, ``shm://NAME``, ``serial:///dev/…``, ``ni://…``, or
+        ``twin:NAME`` for a plant in this process, on which u acts at once (``twin:torsional``; the
+        names are in ``quell.plants.registry.TESTBEDS``). An object with ``read``, ``write`` and
+        ``close`` is returned as it is.
     dt
         sample time [s].
 
     Raises
     ------
     ValueError
-        for a URL that names no device, or something that is none.
+        for a URL of no known device, or an object that is not a device.
     ConnectionError
-        where the device does not answer.
+        if the device does not answer.
     """
+    from quell.realtime.devices.base import handle_of
+
     if not isinstance(device, str):
         handle_of(device)
         return device
-    return _part(device, 1)(device, dt)
+    return _end(device, listening=False)(device, dt)
 
 
-def listen(url: str) -> Any:
-    """Return the device's end of the wire that a URL names, for a ``Rig``.
+def listen(url: str) -> Listener:
+    """Return the device's end of the wire with this URL, for a ``Rig``.
 
     Raises
     ------
     ValueError
         for a URL at which nothing can listen.
     """
-    return _part(url, 2)(url)
+    found: Listener = _end(url, listening=True)(url)
+    return found
 
 
-def twin(url: str, dt: float) -> Any:
-    """Return ``twin:NAME``, a plant in this process as a device."""
-    from quell.realtime.devices.twin import TwinDevice
-
-    return TwinDevice(plant_named(url.partition(":")[2], "device"), dt)
-
-
-def plant_named(name: str, argument: str = "plant") -> Plant:
-    """Return the plant of this name, with its own parameters.
-
-    Raises
-    ------
-    ValueError
-        for a name that is not known.
-    """
-    return TESTBEDS[checks.one_of(argument, name, tuple(TESTBEDS))]()
-
-
-def _part(url: str, which: int) -> Any:
-    known = {scheme: entry for scheme, entry in _SCHEMES.items() if entry[which] is not None}
-    scheme = url.partition(":")[0]
-    if scheme not in known:
-        raise ValueError(
-            f"device = {url!r}: must be like {', '.join(entry[3] for entry in known.values())}"
-        )
-    home = known[scheme]
-    return getattr(importlib.import_module(home[0]), str(home[which]))
+def _end(url: str, listening: bool) -> Any:
+    scheme = SCHEMES.get(url.partition(":")[0])
+    if scheme is None or (listening and not scheme.listener):
+        raise ValueError(f"device = {url!r}: must be like {examples(listening)}")
+    module = importlib.import_module(f"quell.realtime.{scheme.module}")
+    return getattr(module, scheme.listener if listening else scheme.device)

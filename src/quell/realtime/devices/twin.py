@@ -1,4 +1,4 @@
-"""A plant in this process as a device: it has no clock, and moves on by a sample whenever u is written."""
+"""A plant in this process as a device: it has no clock, and advances by a sample at each write."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.kernels.dispatch import compiled, dispatcher_for
-from quell.plants.base import advance, check_plant, measure
+from quell.plants.base import Plant, advance, check_plant, measure
+from quell.plants.registry import named_plant
 from quell.realtime.devices.base import read_measurement, write_command
 from quell.types import Vector
 
@@ -19,10 +20,10 @@ class TwinHandle(NamedTuple):
 
     plant: Any
     x: Vector
-    """The plant's state (n,)."""
+    """State of the plant (n,)."""
     scratch: Vector
     w: Vector
-    """Its disturbances: zero (m,)."""
+    """Disturbances: zero (m,)."""
     t: Vector
     """Samples since the start, and the sample time [s] (2,)."""
 
@@ -50,9 +51,10 @@ def _write(handle: TwinHandle, u: float) -> None:
 
 
 class TwinDevice:
-    """A simulated plant: ``read`` measures it, ``write(u)`` takes it a sample further.
+    """A simulated plant: ``read`` measures it, ``write(u)`` advances it by a sample.
 
-    A u acts at once. Over a wire it acts a sample later: with ``quell.plants.delayed(plant, dt, dt)`` this device does as those do.
+    u acts at once. Over a wire it acts a sample later; ``quell.plants.delayed(plant, dt, dt)`` adds
+    the same delay to this device.
 
     Parameters
     ----------
@@ -61,12 +63,12 @@ class TwinDevice:
     dt
         sample time [s].
     x0
-        its state at the start; zero by default.
+        state at the start (n,); zero by default.
 
     Raises
     ------
     ValueError
-        for something that is no plant, a sample time that is not positive, or an x0 of another size.
+        if ``plant`` is not a plant, dt is not positive, or x0 has the wrong size.
 
     Examples
     --------
@@ -81,26 +83,25 @@ class TwinDevice:
     paced = False
     lost = False
 
-    def __init__(self, plant: Any, dt: float, x0: ArrayLike | None = None) -> None:
+    def __init__(self, plant: Plant, dt: float, x0: ArrayLike | None = None) -> None:
         check_plant(plant)
         self.dt = checks.positive("dt", dt, "s")
         order = plant.order
         x = np.zeros(order) if x0 is None else checks.vector("x0", x0, order)
+        scratch, w = np.zeros(6 * order), np.zeros(plant.disturbances)
         model = plant.sampled(dt, not plant.compiled)
-        self._handle = TwinHandle(
-            model, x, np.zeros(6 * order), np.zeros(plant.disturbances), np.array([0.0, dt])
-        )
-        # Without a line the loop around it runs as Python.
+        self._handle = TwinHandle(model, x, scratch, w, np.array([0.0, dt]))
+        # Without a public handle the loop runs as Python.
         self.handle = self._handle if plant.compiled else None
 
     @property
     def counters(self) -> dict[str, int]:
-        """Samples written so far."""
+        """Number of samples written."""
         return {"written": int(self._handle.t[0])}
 
     @property
     def x(self) -> Vector:
-        """The plant's state, as a copy (n,)."""
+        """State of the plant, as a copy (n,)."""
         return self._handle.x.copy()
 
     def read(self) -> float:
@@ -117,4 +118,9 @@ class TwinDevice:
             dispatcher_for(_write, self.handle)(self.handle, float(u))
 
     def close(self) -> None:
-        """Do nothing: there is nothing to give free."""
+        """Do nothing: there is nothing to release."""
+
+
+def twin_device(url: str, dt: float) -> TwinDevice:
+    """Return the device ``twin:NAME``: a plant of ``quell.plants.registry.TESTBEDS``."""
+    return TwinDevice(named_plant(url.partition(":")[2], "device"), dt)

@@ -1,24 +1,26 @@
-"""The device's side of the wire: a simulated plant with a clock of its own, a watchdog and one session at a time.
+"""The device's side of a wire: a simulated plant with a clock, a watchdog and sessions.
 
 At each tick k the rig
 
-1. takes what has come since the last tick: the newest valid command is the u from now on;
+1. reads what has come since the last tick: the newest valid command is u from now on;
 2. samples y_k and sends it;
 3. applies u over ``[t_k, t_k + dt]``.
 
-So a u that answers y_k acts from the tick k + 1 on: one sample late, as ``quell.plants.delayed(plant, dt, dt)`` has it. Ticks that the rig
-slept over are caught up, none is skipped: where the plant goes depends on nothing but which command was there at which tick.
+So a u that answers y_k acts from the tick k + 1 on: one sample late, as in
+``quell.plants.delayed(plant, dt, dt)``. If the rig is late, it makes up for the missed ticks and
+skips none: the motion of the plant depends only on the command at each tick.
 
-=========  ===========================================================================================================================
-state      what it means
-=========  ===========================================================================================================================
-idle       no session: u = 0, nothing is sent
-waiting    a hello was answered: measurements are sent, u = 0 until the first command
-live       u is the last command
-tripped    for ``watchdog`` ticks in a row no fresh, finite command has come: u = 0 until a new session, whatever comes
-=========  ===========================================================================================================================
+=======  ========================================================================================
+state    meaning
+=======  ========================================================================================
+idle     no session: u = 0, nothing is sent
+waiting  a hello was answered: measurements are sent, u = 0 until the first command
+live     u is the last command
+tripped  no fresh, finite command for ``watchdog`` ticks in a row: u = 0 until a new session
+=======  ========================================================================================
 
-A hello begins a session, where none is live, nor has been waiting for less than ``patience`` ticks; a goodbye ends it.
+A hello begins a session, unless one is live or has been waiting for less than ``patience`` ticks. A
+goodbye ends it.
 """
 
 from __future__ import annotations
@@ -36,28 +38,28 @@ from quell.realtime.system.histogram import count_duration
 from quell.realtime.telemetry.ring import Ring, push
 from quell.realtime.wire import frames
 from quell.realtime.wire.frames import Buffer, Endpoint
-from quell.realtime.wire.transport import connect_to_sender, receive, reply, send
-from quell.realtime.wire.wire import MOST_AT_ONCE
+from quell.realtime.wire.transport import MOST_AT_ONCE, connect_to_sender, receive, reply, send
 from quell.types import Vector
 
 IDLE, WAITING, LIVE, TRIPPED = range(4)
 STATES = ("idle", "waiting", "live", "tripped")
 
-# In long ticks it looks so often whether it is to end [ns].
-_LOOK = 100_000_000
+# Longest wait before ``stop`` is checked again [ns]: 0.1 s, short for a person. Chosen by hand.
+_CHECK_STOP_EVERY = 100_000_000
 
-# Entries of ``RigModel.counts``: state, ticks without a fresh command, ticks in all, ticks since the plant was at rest, and how often what.
+# Entries of ``RigModel.counts``: state, ticks without a fresh command, all ticks, ticks since the
+# plant was at rest, sessions, refused hellos, trips of the watchdog, clipped commands, late ticks.
 STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP = range(9)
-# Entries of ``RigModel.signals``: u applied, the newest command of this tick, the largest |command| of all.
+# Entries of ``RigModel.signals``: u applied, newest command of this tick, largest |command| so far.
 APPLIED, COMMANDED, LARGEST = range(3)
 
 LOG = ("tick", "t", "session", "state", "y", "u", "command")
-"""What a row of the log has: number of the tick and its time [s], session, state (0 idle … 3 tripped), y, u as applied, and the command
-that came in this tick, NaN where none has."""
+"""Columns of the log: number of the tick and its time [s], session, state (0 idle … 3 tripped), y,
+u as applied, and the command that came in this tick, NaN if none has."""
 
 
 class RigModel(NamedTuple):
-    """All that a tick needs."""
+    """Parameters and state of the rig."""
 
     plant: Any
     transport: Any
@@ -65,13 +67,13 @@ class RigModel(NamedTuple):
     inbox: Buffer
     outbox: Buffer
     dt: float
-    """[s]."""
+    """Time between ticks [s]."""
     u_max: float
     """Largest |u| that is applied [u-unit]."""
     watchdog: int
-    """Ticks."""
+    """Ticks without a fresh command before u is set to zero."""
     patience: int
-    """Ticks that a session has for its first command before another may take its place."""
+    """Ticks that a session has for its first command before another may replace it."""
     rest: bool
     """Whether each session starts from ``x0``."""
     x: Vector
@@ -84,18 +86,18 @@ class RigModel(NamedTuple):
     log: Ring
     logged: bool
     lateness: NDArray[np.int64]
-    """A ``tally``: how late ticks were."""
+    """Histogram of how late ticks were, see ``system.histogram``."""
     stop: NDArray[np.int64]
-    """Not zero: ``serve`` is to end (1,)."""
+    """``serve`` ends if this is not zero (1,)."""
 
 
 @kernel
 def tick(rig: RigModel, time: int) -> None:
-    """Let one tick pass; the rig's clock shows ``time`` [ns]."""
+    """Perform one tick; the rig's clock shows ``time`` [ns]."""
     counts, signals = rig.counts, rig.signals
     signals[COMMANDED] = np.nan
-    fresh = _hear(rig, time)
-    _watch(rig, fresh)
+    fresh = _receive_command(rig, time)
+    _update_watchdog(rig, fresh)
     y = measure(rig.plant, rig.x)
     if counts[STATE] != IDLE:
         state = frames.WATCHDOG_TRIPPED if counts[STATE] == TRIPPED else 0
@@ -103,57 +105,49 @@ def tick(rig: RigModel, time: int) -> None:
         if send(rig.transport, rig.outbox) != 0:
             rig.endpoint.counters[frames.NOT_SENT] += 1
     if rig.logged:
-        _note(rig, y)
+        _log(rig, y)
     advance(rig.plant, rig.x, rig.scratch, counts[SINCE_REST] * rig.dt, signals[APPLIED], rig.w)
     counts[SINCE_REST] += 1
     counts[TICKS] += 1
 
 
 @kernel
-def _hear(rig: RigModel, time: int) -> bool:
-    """Take what has come; tell whether a fresh, finite command was in it."""
-    counters, frame = rig.endpoint.counters, rig.inbox
-    u, news = 0.0, 0
+def _receive_command(rig: RigModel, time: int) -> bool:
+    """Read all frames that have come; return whether a fresh, finite command was among them."""
+    own, frame, signals = rig.endpoint, rig.inbox, rig.signals
+    u, accepted = 0.0, 0
     for _ in range(MOST_AT_ONCE):
         size = receive(rig.transport, frame)
         if size < 0:
             break
-        if not frames.is_well_formed(frame, size, counters):
+        if not frames.is_well_formed(frame, size, own.counters):
             continue
         kind = frame.bytes[3]
         if kind == frames.HELLO:
-            if _greet(rig, time):
-                news = 0
+            if _answer_hello(rig, time):
+                accepted = 0
         elif kind == frames.GOODBYE:
-            _part(rig)
+            _end_session(rig)
         elif rig.counts[STATE] == IDLE:
-            counters[frames.WRONG_SESSION] += 1
-        elif frames.accept_well_formed(frame, rig.endpoint):
+            own.counters[frames.WRONG_SESSION] += 1
+        elif frames.accept(frame, own):
             value = frame.doubles[3]
             if is_finite(value):
                 u = value
-                news += 1
-                rig.signals[LARGEST] = max(rig.signals[LARGEST], abs(value))
-    if news > 1:
-        counters[frames.SKIPPED] += news - 1
-    if (
-        news > rig.endpoint.most_age
-    ):  # they may have waited in a queue that was full: the newest of them need not be new
-        counters[frames.STALE] += 1
+                accepted += 1
+                signals[LARGEST] = max(signals[LARGEST], abs(value))
+    if frames.is_backlog(own, accepted) or accepted == 0 or rig.counts[STATE] == IDLE:
         return False
-    if news == 0 or rig.counts[STATE] == IDLE:
-        return False
-    rig.signals[COMMANDED] = u
+    signals[COMMANDED] = u
     if rig.counts[STATE] != TRIPPED:
-        rig.signals[APPLIED] = min(max(u, -rig.u_max), rig.u_max)
+        signals[APPLIED] = min(max(u, -rig.u_max), rig.u_max)
         if abs(u) > rig.u_max:
             rig.counts[CLIPPED] += 1
     return True
 
 
 @kernel
-def _watch(rig: RigModel, fresh: bool) -> None:
-    """Let the watchdog look at this tick."""
+def _update_watchdog(rig: RigModel, fresh: bool) -> None:
     counts = rig.counts
     if counts[STATE] == WAITING and fresh:
         counts[STATE] = LIVE
@@ -166,17 +160,17 @@ def _watch(rig: RigModel, fresh: bool) -> None:
 
 
 @kernel
-def _greet(rig: RigModel, time: int) -> bool:
-    """Answer a hello; tell whether a session begins with it."""
+def _answer_hello(rig: RigModel, time: int) -> bool:
+    """Answer a hello; return whether it begins a session."""
     counts, own = rig.counts, rig.endpoint
     session, dt = int(rig.inbox.words[1]), rig.inbox.doubles[3]
     known = session == own.numbers[frames.SESSION]
     state, begins = 0, False
     if session == 0 or (known and (counts[STATE] == IDLE or counts[STATE] == TRIPPED)):
-        own.counters[frames.WRONG_SESSION] += 1  # a session that is over does not come back
+        own.counters[frames.WRONG_SESSION] += 1  # a session that has ended can't begin again
         return False
     if not known:
-        if not abs(dt - rig.dt) <= 1e-9 * rig.dt:
+        if not abs(dt - rig.dt) <= 1e-9 * rig.dt:  # a tolerance for rounding; also refuses NaN
             state = frames.OTHER_DT
         elif counts[STATE] == LIVE or (counts[STATE] == WAITING and counts[SILENT] < rig.patience):
             state = frames.BUSY
@@ -201,20 +195,18 @@ def _greet(rig: RigModel, time: int) -> bool:
 
 
 @kernel
-def _part(rig: RigModel) -> None:
-    """Hear a goodbye."""
-    if (
-        rig.counts[STATE] != IDLE
-        and int(rig.inbox.words[1]) == rig.endpoint.numbers[frames.SESSION]
-    ):
+def _end_session(rig: RigModel) -> None:
+    """End the session if the goodbye received belongs to it."""
+    own = rig.endpoint
+    if rig.counts[STATE] != IDLE and int(rig.inbox.words[1]) == own.numbers[frames.SESSION]:
         rig.counts[STATE] = IDLE
     else:
-        rig.endpoint.counters[frames.WRONG_SESSION] += 1
+        own.counters[frames.WRONG_SESSION] += 1
 
 
 @kernel
-def _note(rig: RigModel, y: float) -> None:
-    """Write the tick's row into the log."""
+def _log(rig: RigModel, y: float) -> None:
+    """Write the tick's row to the log."""
     counts, row = rig.counts, rig.row
     row[0] = counts[TICKS]
     row[1] = counts[TICKS] * rig.dt
@@ -228,7 +220,10 @@ def _note(rig: RigModel, y: float) -> None:
 
 @compiled
 def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
-    """Let a tick pass every dt until ``rig.stop`` says so, or ``most`` have (all, where it is below zero); where not ``paced``, at once."""
+    """Tick until ``rig.stop`` is set, or ``most`` times if it is not negative.
+
+    If ``paced``, there is one tick each dt; otherwise they follow each other at once.
+    """
     begin = now(clock)
     period = 1e9 * rig.dt
     k = 0
@@ -237,8 +232,8 @@ def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
         if paced:
             deadline = begin + int(np.rint(k * period))
             time = now(clock)
-            while deadline - time > _LOOK and load_acquire(rig.stop, 0) == 0:
-                time = wait_until(clock, time + _LOOK)
+            while deadline - time > _CHECK_STOP_EVERY and load_acquire(rig.stop, 0) == 0:
+                time = wait_until(clock, time + _CHECK_STOP_EVERY)
             if load_acquire(rig.stop, 0) != 0:
                 break
             time = wait_until(clock, deadline)

@@ -1,19 +1,20 @@
-"""The rig as an object: it listens, ticks on a thread of its own, writes its log, and says at the end how it went."""
+"""The rig: it listens at a wire, ticks on its own thread, writes its log and counts events."""
 
 from __future__ import annotations
 
-import csv
 import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Self, TextIO
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.kernels.dispatch import dispatcher_for
-from quell.plants.base import check_plant
+from quell.plants.base import Plant, check_plant
+from quell.realtime.devices.base import Listener
 from quell.realtime.rig import kernel as kernels
 from quell.realtime.rig.kernel import RigModel, serve
 from quell.realtime.system.atomics import store_release
@@ -28,28 +29,19 @@ from quell.realtime.system.scheduling import (
 from quell.realtime.telemetry.ring import drain, dropped, ring
 from quell.realtime.wire import frames
 from quell.realtime.wire.transport import send
+from quell.types import Vector
 
-# The log is written so often [s], and has room for so many seconds.
+# Time between two writes to the log, and the time that its buffer holds [s]. Chosen by hand.
 _WRITE_EVERY = 0.05
-_ROOM = 5.0
-# A session whose first command does not come keeps others out for so long [s]: its loop may have to be compiled.
+_BUFFERED = 5.0
+# Time that a new session is protected while its first command is missing [s]: its loop may have to
+# be compiled first. Chosen by hand; not tuned further.
 _PATIENCE = 60.0
-# Sample times that a wire and a clock can make sense of [s], and silence that still counts by the frames' own numbers.
+# Range of dt [s] and largest watchdog [ticks]; far beyond any use, against slips of the pen.
 _SHORTEST, _LONGEST = 1e-6, 100.0
 _MOST_TICKS = 1_000_000
-# Thirty years [s].
-_EVER = 1e9
-
-
-class Listener(Protocol):
-    """The device's end of a wire; ``quell.realtime.devices.registry.listen`` makes it of a URL."""
-
-    url: str
-    transport: Any
-    """For whose type the functions of ``quell.realtime.wire.transport`` are registered."""
-
-    def close(self) -> None:
-        """Give it free."""
+# Longest run [s]: thirty years, so that the number of ticks fits into an integer.
+_LONGEST_RUN = 1e9
 
 
 class Rig:
@@ -58,21 +50,23 @@ class Rig:
     Parameters
     ----------
     plant
-        any plant that is compiled.
+        any compiled plant.
     dt
-        its tick [s].
+        time between ticks [s].
     listener
         its end of the wire; ``close`` closes it.
     watchdog
-        after so many ticks in a row without a fresh, finite command u is set to zero until a new session.
+        number of ticks in a row without a fresh, finite command after which u is zero until a new
+        session.
     u_max
         larger commands are cut to it [u-unit].
     rest
         whether each session starts from ``x0``, or from where the last one left the plant.
     x0
-        the plant's state at the start; zero by default.
+        the plant's state at the start (n,); zero by default.
     log
-        a CSV file for each tick's y, u, command and state (``quell.realtime.rig.kernel.LOG``); what was there is overwritten.
+        CSV file for y, u, command and state of each tick (``quell.realtime.rig.kernel.LOG``); an
+        existing file is overwritten.
 
     Raises
     ------
@@ -82,14 +76,14 @@ class Rig:
 
     def __init__(
         self,
-        plant: Any,
+        plant: Plant,
         dt: float,
         listener: Listener,
         *,
         watchdog: int = 20,
         u_max: float = np.inf,
         rest: bool = True,
-        x0: Any = None,
+        x0: ArrayLike | None = None,
         log: str | Path | None = None,
     ) -> None:
         check_plant(plant)
@@ -98,7 +92,7 @@ class Rig:
             raise ValueError(f"dt = {dt!r} s: must be from {_SHORTEST:g} to {_LONGEST:g} s")
         if not plant.compiled:
             raise ValueError(
-                f"plant = {plant!r}: must be one that is compiled; this one runs as Python only"
+                f"plant = {plant!r}: must be a compiled plant; this one runs only as Python"
             )
         u_max = u_max if u_max == np.inf else checks.positive("u_max", u_max)
         watchdog = checks.whole("watchdog", watchdog, 1, _MOST_TICKS)
@@ -123,21 +117,18 @@ class Rig:
             counts=np.zeros(9, dtype=np.int64),
             signals=np.zeros(3),
             row=np.zeros(len(kernels.LOG)),
-            log=ring(max(round(_ROOM / dt), 100) if log is not None else 1, len(kernels.LOG)),
+            log=ring(max(round(_BUFFERED / dt), 100) if log is not None else 1, len(kernels.LOG)),
             logged=log is not None,
             lateness=empty_counts(),
             stop=np.zeros(1, dtype=np.int64),
         )
         self._file = None if log is None else _opened(log)
-        self._writer = None if self._file is None else csv.writer(self._file, lineterminator="\n")
-        if self._writer is not None:
-            self._writer.writerow(kernels.LOG)
-        self._log_failed = ""
+        self._log_failure = ""
         self._clock = system_clock()
         self._open = True
 
     @property
-    def x(self) -> Any:
+    def x(self) -> Vector:
         """The plant's state, as a copy (n,)."""
         return self.model.x.copy()
 
@@ -148,8 +139,7 @@ class Rig:
 
     @property
     def counters(self) -> dict[str, int]:
-        """How many frames of loops met which fate, see ``quell.realtime.wire.frames``; and what else happened how often."""
-        counts = self.model.counts
+        """Number of frames by result, see ``quell.realtime.wire.frames``, and of other events."""
         more = {
             "sessions": kernels.SESSIONS,
             "refused": kernels.REFUSED,
@@ -159,23 +149,28 @@ class Rig:
             "caught_up": kernels.CAUGHT_UP,
         }
         return frames.counts_by_name(self.model.endpoint.counters) | {
-            name: int(counts[index]) for name, index in more.items()
+            name: int(self.model.counts[index]) for name, index in more.items()
         }
 
     @property
     def largest(self) -> float:
-        """Largest ``|command|`` that came [u-unit], whether it was applied or not."""
+        """Largest ``|command|`` received [u-unit], applied or not."""
         return float(self.model.signals[kernels.LARGEST])
 
     @property
     def lateness(self) -> Histogram:
-        """How late ticks were [s], for all that ``run`` timed."""
+        """Lateness of the ticks in ``run`` [s]."""
         return Histogram.of(self.model.lateness)
 
+    @property
+    def unlogged(self) -> int:
+        """Ticks that are missing in the log because it could not be written fast enough."""
+        return dropped(self.model.log) if self.model.logged else 0
+
     def tick(self, count: int = 1) -> None:
-        """Let ``count`` ticks pass at once, without a clock: for tests that go step by step."""
+        """Perform ``count`` ticks at once, without a clock: for tests that go step by step."""
         self._serve(count, False)
-        self._write()
+        self._write_log()
 
     def prepare(self) -> None:
         """Compile what ``run`` needs, or load it from the disk."""
@@ -184,32 +179,32 @@ class Rig:
     def run(
         self, seconds: float | None = None, *, priority: int = 0, cpu: int | None = None
     ) -> list[str]:
-        """Tick in real time until ``stop`` is called, from a signal or another thread, or for so long [s].
+        """Tick in real time for ``seconds``, or until a signal or another thread calls ``stop``.
 
-        The ticks are on a thread of their own, which needs no Python; the calling one writes the log.
+        The ticks run on their own thread, which needs no Python; the calling thread writes the log.
 
         Parameters
         ----------
         seconds
-            for how long; until ``stop`` by default.
+            duration [s]; by default until ``stop``.
         priority
-            SCHED_FIFO priority of the ticks, 1 to 99, together with locked memory; 0 leaves all that alone.
+            SCHED_FIFO priority of the ticks, 1 to 99, together with locked memory; 0 for neither.
         cpu
-            number of the processor that the ticks are to have; any by default.
+            number of the processor for the ticks; any by default.
 
         Returns
         -------
         list of str
-            what was permitted of that, and what was not, in sentences.
+            sentences about which of these requests the system has granted.
 
         Raises
         ------
         ValueError
             for arguments out of range.
         """
-        most = (
-            -1 if seconds is None else max(round(checked_seconds("seconds", seconds) / self.dt), 1)
-        )
+        most = -1
+        if seconds is not None:
+            most = max(round(checked_seconds("seconds", seconds) / self.dt), 1)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
         self.prepare()
         raised: list[BaseException] = []
@@ -219,7 +214,7 @@ class Rig:
                 try:
                     enter_real_time(priority, cpu, notes)
                     self._serve(most, True)
-                    self._part()  # at once: each sample that the loop waits in vain it holds u
+                    self._end_session()  # at once: the loop holds u while it waits for measurements
                 except BaseException as error:
                     raised.append(error)
 
@@ -228,15 +223,15 @@ class Rig:
             try:
                 while thread.is_alive():
                     thread.join(_WRITE_EVERY)
-                    self._write()
+                    self._write_log()
             finally:
                 self.stop()
                 thread.join()
-                self._write()
+                self._write_log()
         if raised:
             raise raised[0]
-        if self._log_failed:
-            notes.append(self._log_failed)
+        if self._log_failure:
+            notes.append(self._log_failure)
         return notes
 
     def stop(self) -> None:
@@ -244,68 +239,65 @@ class Rig:
         store_release(self.model.stop, 0, 1)
 
     def close(self) -> None:
-        """End the session, if there is one, and give the wire free; calling it twice does no harm."""
+        """End the session, if there is one, and release the wire; a second call does nothing."""
         if not self._open:
             return
         self._open = False
-        self._part()
+        self._end_session()
         self.listener.close()
         if self._file is not None:
-            self._write()
+            self._write_log()
             self._file.close()
 
-    def _part(self) -> None:
-        """Say goodbye, if there is a session."""
-        model = self.model
-        if model.counts[kernels.STATE] != kernels.IDLE:
-            session = int(model.endpoint.numbers[frames.SESSION])
-            frames.write_frame(
-                model.outbox, frames.GOODBYE, session, 0, 0, time.monotonic_ns(), 0.0, frames.GONE
-            )
-            send(model.transport, model.outbox)
-            model.counts[kernels.STATE] = kernels.IDLE
-
-    def __enter__(self) -> Rig:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @property
-    def unlogged(self) -> int:
-        """Ticks that are missing in the log, because it could not be written quickly enough."""
-        return dropped(self.model.log) if self.model.logged else 0
+    def _end_session(self) -> None:
+        """Send a goodbye if there is a session."""
+        model = self.model
+        if model.counts[kernels.STATE] == kernels.IDLE:
+            return
+        session, now = int(model.endpoint.numbers[frames.SESSION]), time.monotonic_ns()
+        frames.write_frame(model.outbox, frames.GOODBYE, session, 0, 0, now, 0.0, frames.GONE)
+        send(model.transport, model.outbox)
+        model.counts[kernels.STATE] = kernels.IDLE
 
     def _serve(self, most: int, paced: bool) -> None:
         dispatcher_for(serve, self.model, self._clock)(self.model, self._clock, most, paced)
 
-    def _write(self) -> None:
-        if self._writer is None or self._file is None or self._file.closed:
+    def _write_log(self) -> None:
+        if self._file is None or self._file.closed:
             return
         try:
             for row in drain(self.model.log):
                 k, t, session, state, *values = row.tolist()
-                self._writer.writerow(
-                    [int(k), f"{t:.9g}", int(session), int(state), *map(repr, values)]
-                )
+                cells = f"{int(k)},{t:.9g},{int(session)},{int(state)}"
+                self._file.write(",".join((cells, *map(repr, values))) + "\n")
             self._file.flush()
-        except OSError as error:  # a full disk is no reason to leave the loop alone
-            self._log_failed = f"the log was given up: {error.strerror}"
+        except OSError as error:  # a full disk must not end the loop
+            self._log_failure = f"the log was given up: {error.strerror}"
             with suppress(OSError):
                 self._file.close()
 
 
 def checked_seconds(name: str, seconds: float) -> float:
-    """Return for how long a rig is to run [s]."""
-    if checks.positive(name, seconds, "s") > _EVER:
+    """Return the duration of a run [s], at most thirty years."""
+    if checks.positive(name, seconds, "s") > _LONGEST_RUN:
         raise ValueError(
-            f"{name} = {seconds!r}: must be at most {_EVER:g} s; leave it out to run until interrupted"
+            f"{name} = {seconds!r}: must be at most {_LONGEST_RUN:g} s; "
+            "leave it out to run until interrupted"
         )
     return seconds
 
 
-def _opened(path: str | Path) -> Any:
+def _opened(path: str | Path) -> TextIO:
+    """Return the open log, with its header written."""
     try:
-        return Path(path).open("w", encoding="utf-8", newline="")
+        file = Path(path).open("w", encoding="utf-8", newline="")  # noqa: SIM115  closed by Rig
     except OSError as error:
         raise ValueError(f"log = {str(path)!r}: can't be written ({error.strerror})") from None
+    file.write(",".join(kernels.LOG) + "\n")
+    return file

@@ -1,4 +1,4 @@
-"""Devices at the other end of a wire: frames, UDP, shared memory and serial lines.
+"""Devices at the other end of a wire: frames, sessions and transports.
 
 May import ``realtime.devices.base``, ``realtime.system`` and ``realtime.telemetry``.
 """

@@ -1,10 +1,13 @@
-"""Frames on a stream of bytes: consistent overhead byte stuffing.
+"""Frames on a stream of bytes: consistent overhead byte stuffing (COBS).
 
-A byte that is zero ends each packet, and no byte inside of one is zero: a receiver that joins late, or has missed or invented bytes, is in
-step again at the next zero. A packet is a sequence of blocks; each is a code n, 1 … 255, and n − 1 bytes that are not zero, and stands for
-these bytes and, but for n = 255 and for the last one, a zero behind them. n ≤ 254 bytes become n + 1, and n + 2 with the zero at the end.
+A zero byte ends each packet, and no byte inside a packet is zero. A receiver that joins late, or
+has lost or gained bytes, is synchronised again at the next zero. A packet is a sequence of blocks:
+a code n, 1 … 255, followed by n − 1 non-zero bytes. The block stands for these bytes followed by a
+zero; there is no zero after the last block and after blocks with n = 255. Up to 254 bytes become
+one byte more, two with the final zero.
 
-Source: S. Cheshire, M. Baker: Consistent Overhead Byte Stuffing. IEEE/ACM Transactions on Networking 7 (1999) 159-172, section III.
+Source: S. Cheshire, M. Baker: Consistent Overhead Byte Stuffing. IEEE/ACM Transactions on
+Networking 7 (1999) 159-172, section III.
 """
 
 from __future__ import annotations
@@ -14,16 +17,17 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import kernel
 
-# What ``decode`` returns for bytes that are no packet.
 INVALID = -1
+"""Returned by ``decode`` for bytes that are not a packet."""
+# The largest code; its block has no zero after it (section III of the source).
 _LONGEST = 255
 
 
 @kernel
 def encode(data: NDArray[np.uint8], size: int, out: NDArray[np.uint8]) -> int:
-    """Write the packet for the first ``size`` bytes into ``out``, the zero at its end included; return its length.
+    """Write the packet of ``size`` bytes with its final zero to ``out``; return its length.
 
-    ``out`` has room for size + size // 254 + 2 bytes.
+    ``out`` needs room for size + size // 254 + 2 bytes.
     """
     code_at, length = 0, 1
     for i in range(size):
@@ -41,9 +45,9 @@ def encode(data: NDArray[np.uint8], size: int, out: NDArray[np.uint8]) -> int:
 
 @kernel
 def decode(packet: NDArray[np.uint8], size: int, out: NDArray[np.uint8]) -> int:
-    """Write what a packet of ``size`` bytes, without the zero at its end, stands for into ``out``; return how many bytes that is.
+    """Decode a packet of ``size`` bytes, without its final zero, to ``out``; return the length.
 
-    ``BROKEN`` where it is no packet: a block reaches beyond the end, or a byte is zero.
+    Return ``INVALID`` if a block reaches beyond the end or a byte is zero.
     """
     i, length = 0, 0
     while i < size:

@@ -1,26 +1,28 @@
-"""The frame that carries one number from a device to the loop, or back: 40 bytes, the same on every wire.
+"""The frame that carries one number between a device and the loop: 40 bytes on every wire.
 
-======  ====  ==========  ==========================================================================================================
-offset  size  type        what
-======  ====  ==========  ==========================================================================================================
-0       2     bytes       ``QL``
-2       1     uint8       version of this table: 1
-3       1     uint8       kind: 1 measurement, 2 command, 3 hello, 4 welcome, 5 goodbye
-4       4     uint32      session: drawn by the loop for each run; never 0
-8       4     uint32      number of the frame: the sender's own count of ticks or cycles, from 1 on, modulo 2^32
-12      4     uint32      answers: number of the newest frame that the sender has accepted of the other side; 0 where there was none
-16      8     int64       time: the sender's monotonic clock [ns]
-24      8     float64     value: y [y-unit], u [u-unit]; hello and welcome: the sample time [s]
-32      4     uint32      state of the sender: 0, or flags: 1 the watchdog has set u to zero; in a welcome that refuses: 2 another session
-                          is alive, 4 the device has another sample time; in a goodbye of the device: 8
-36      4     uint32      CRC-32 of the 36 bytes before (IEEE 802.3: that of zlib, Ethernet, PNG)
-======  ====  ==========  ==========================================================================================================
+======  ====  =======  ==========================================================================
+offset  size  type     content
+======  ====  =======  ==========================================================================
+0       2     bytes    ``QL``
+2       1     uint8    version of the protocol: 1
+3       1     uint8    kind: 1 measurement, 2 command, 3 hello, 4 welcome, 5 goodbye
+4       4     uint32   session: drawn by the loop for each run, never 0
+8       4     uint32   number of the frame: the sender's count of ticks or cycles from 1, mod 2^32
+12      4     uint32   answers: number of the newest frame accepted from the other side; 0 if none
+16      8     int64    time: the sender's monotonic clock [ns]
+24      8     float64  value: y [y-unit], u [u-unit]; in hello and welcome the sample time [s]
+32      4     uint32   state flags of the sender: 1 its watchdog has set u to zero (measurement);
+                       2 another session is active, 4 the sample time differs (welcome); 8 the
+                       device has ended the session (goodbye)
+36      4     uint32   CRC-32 of the 36 bytes before it (IEEE 802.3, as in zlib, Ethernet and PNG)
+======  ====  =======  ==========================================================================
 
-All little-endian. A receiver accepts a measurement or a command only where it has this length, these first three bytes, the CRC, the kind
-it expects, its session, and a number that is newer than that of the last one it accepted (modulo 2^32, RFC 1982); and what it answers must
-not be longer ago than ``most_age`` frames, nor be still to come. All others are counted by the rule that they break.
+All numbers are little-endian. Hello, welcome and goodbye have the number 0 and answer nothing.
 
-Hello, welcome and goodbye have the number 0 and answer nothing.
+A receiver accepts a measurement or a command if its length, its first three bytes and its CRC are
+right, its kind is the expected one, its session is the receiver's, its number is newer than the
+last accepted one (modulo 2^32, RFC 1982), and the frame it answers was sent at most ``most_age``
+frames ago. Each rejected frame is counted under the first rule that it breaks.
 """
 
 from __future__ import annotations
@@ -37,26 +39,15 @@ VERSION = 1
 MEASUREMENT, COMMAND, HELLO, WELCOME, GOODBYE = range(1, 6)
 WATCHDOG_TRIPPED, BUSY, OTHER_DT, GONE = 1, 2, 4, 8
 
-# Entries of the counters.
 REFUSALS = ("malformed", "version", "kind", "session", "duplicated", "reordered", "stale")
 COUNTERS = ("accepted", *REFUSALS, "not_finite", "skipped", "not_sent")
-# Skipped are frames that were never used: lost, or overtaken by a newer one before they were looked at.
-(
-    ACCEPTED,
-    MALFORMED,
-    WRONG_VERSION,
-    WRONG_KIND,
-    WRONG_SESSION,
-    DUPLICATED,
-    REORDERED,
-    STALE,
-    NOT_FINITE,
-    SKIPPED,
-    NOT_SENT,
-) = range(11)
+"""Names of the counters. ``skipped`` frames were lost, or replaced by a newer one before use."""
+ACCEPTED, MALFORMED, WRONG_VERSION, WRONG_KIND, WRONG_SESSION = range(5)
+DUPLICATED, REORDERED, STALE, NOT_FINITE, SKIPPED, NOT_SENT = range(5, 11)
 
 _MAGIC = int.from_bytes(b"QL", "little")
-_ROUND = 1 << 32
+# Frame numbers are 32 bits wide.
+_MODULUS = 1 << 32
 
 
 def _crc_table() -> NDArray[np.uint32]:
@@ -73,46 +64,45 @@ _CRC = _crc_table()
 
 
 class Buffer(NamedTuple):
-    """Room for a frame, seen as bytes and as numbers; all share memory."""
+    """Memory for a frame as bytes and as numbers; all arrays share it."""
 
     bytes: NDArray[np.uint8]
-    """(48,): what is longer than a frame has to be seen to be."""
+    """(48,): longer than a frame, so that a datagram that is too long is noticed."""
     shorts: NDArray[np.uint16]
     words: NDArray[np.uint32]
     longs: NDArray[np.int64]
     doubles: NDArray[np.float64]
     address: int
-    """Of the first byte."""
+    """Address of the first byte."""
 
 
 def buffer() -> Buffer:
-    """Return room for a frame and a little more."""
+    """Return an empty buffer for a frame."""
     raw = np.zeros(LENGTH // 8 + 1).view(np.uint8)
-    return Buffer(
-        raw, raw.view("<u2"), raw.view("<u4"), raw.view("<i8"), raw.view("<f8"), raw.ctypes.data
-    )
+    shorts, words = raw.view("<u2"), raw.view("<u4")
+    return Buffer(raw, shorts, words, raw.view("<i8"), raw.view("<f8"), raw.ctypes.data)
 
 
 class Endpoint(NamedTuple):
-    """What one side knows of its traffic with the other."""
+    """The session as one side sees it; make it with ``endpoint``."""
 
     expects: int
     """The kind it accepts: MEASUREMENT or COMMAND."""
     most_age: int
-    """What answers a frame that was sent more than so many frames ago is stale."""
+    """A frame is stale if it answers one that was sent more than this number of frames ago."""
     numbers: NDArray[np.int64]
-    """Session, number of the last frame sent, number of the last one accepted, what that answered, its state (5,)."""
+    """Session, number of the last frame sent, number of the last one accepted, the number that this
+    one answered, and its state flags (5,)."""
     counters: NDArray[np.int64]
-    """How many frames met which fate (11,), see ``COUNTERS``."""
+    """Number of frames for each name in ``COUNTERS`` (11,)."""
 
 
 SESSION, SENT, RECEIVED, ANSWERED, STATE = range(5)
 
 
 def endpoint(expects: int, session: int, most_age: int) -> Endpoint:
-    """Return a peer that has heard nothing yet."""
-    numbers = np.zeros(5, dtype=np.int64)
-    numbers[SESSION] = session
+    """Return an endpoint that has neither sent nor received a frame."""
+    numbers = np.array([session, 0, 0, 0, 0], dtype=np.int64)
     return Endpoint(expects, most_age, numbers, np.zeros(len(COUNTERS), dtype=np.int64))
 
 
@@ -136,13 +126,13 @@ def write_frame(
     value: float,
     state: int,
 ) -> None:
-    """Write a frame."""
+    """Write a frame to ``out``."""
     out.shorts[0] = _MAGIC
     out.bytes[2] = VERSION
     out.bytes[3] = kind
     out.words[1] = session
-    out.words[2] = number % _ROUND
-    out.words[3] = answers % _ROUND
+    out.words[2] = number % _MODULUS
+    out.words[3] = answers % _MODULUS
     out.longs[2] = time
     out.doubles[3] = value
     out.words[8] = state
@@ -150,8 +140,18 @@ def write_frame(
 
 
 @kernel
+def write_next_frame(
+    out: Buffer, own: Endpoint, kind: int, time: int, value: float, state: int
+) -> None:
+    """Write the next frame of the session to ``out``."""
+    numbers = own.numbers
+    numbers[SENT] += 1
+    write_frame(out, kind, numbers[SESSION], numbers[SENT], numbers[RECEIVED], time, value, state)
+
+
+@kernel
 def is_well_formed(frame: Buffer, size: int, counters: NDArray[np.int64]) -> bool:
-    """Tell whether the first ``size`` bytes are a whole frame of this version; count it where they are not."""
+    """Return whether the first ``size`` bytes are a frame of this version; count them if not."""
     if (
         size != LENGTH
         or frame.shorts[0] != _MAGIC
@@ -166,34 +166,11 @@ def is_well_formed(frame: Buffer, size: int, counters: NDArray[np.int64]) -> boo
 
 
 @kernel
-def write_next_frame(
-    out: Buffer, own: Endpoint, kind: int, time: int, value: float, state: int
-) -> None:
-    """Write the next frame of a session."""
-    own.numbers[SENT] += 1
-    write_frame(
-        out,
-        kind,
-        own.numbers[SESSION],
-        own.numbers[SENT],
-        own.numbers[RECEIVED],
-        time,
-        value,
-        state,
-    )
+def accept(frame: Buffer, own: Endpoint) -> bool:
+    """Return whether a well-formed frame is a new one of the expected kind; count it in any case.
 
-
-@kernel
-def accept(frame: Buffer, size: int, own: Endpoint) -> bool:
-    """Tell whether the first ``size`` bytes are the news that was expected; count them either way."""
-    return is_well_formed(frame, size, own.counters) and accept_well_formed(frame, own)
-
-
-@kernel
-def accept_well_formed(frame: Buffer, own: Endpoint) -> bool:
-    """Tell whether a well-formed frame is the news that was expected; count it either way.
-
-    Accepted is also a frame whose value is no number: that it came is news. It is counted once more, as ``not_finite``.
+    A frame whose value is not finite is accepted, because it shows that the other side is alive. It
+    is also counted as ``not_finite``.
     """
     counters, numbers = own.counters, own.numbers
     if frame.bytes[3] != own.expects:
@@ -213,9 +190,8 @@ def accept_well_formed(frame: Buffer, own: Endpoint) -> bool:
     counters[SKIPPED] += ahead - 1
     numbers[RECEIVED] += ahead
     numbers[ANSWERED] = int(frame.words[3])
-    numbers[STATE] = int(frame.words[8]) | (
-        numbers[STATE] & GONE
-    )  # a goodbye may be read before what was sent before it
+    # GONE stays set: frames that were sent before a goodbye may be read after it.
+    numbers[STATE] = int(frame.words[8]) | (numbers[STATE] & GONE)
     counters[ACCEPTED] += 1
     if not is_finite(frame.doubles[3]):
         counters[NOT_FINITE] += 1
@@ -223,8 +199,23 @@ def accept_well_formed(frame: Buffer, own: Endpoint) -> bool:
 
 
 @kernel
+def is_backlog(own: Endpoint, accepted: int) -> bool:
+    """Count all but the newest of the frames accepted at once as skipped; return whether too many.
+
+    More than ``most_age`` frames at once may come from a queue that was full. Then even the newest
+    of them may be old; it is counted as stale.
+    """
+    if accepted > 1:
+        own.counters[SKIPPED] += accepted - 1
+    if accepted <= own.most_age:
+        return False
+    own.counters[STALE] += 1
+    return True
+
+
+@kernel
 def start_session(own: Endpoint, session: int) -> None:
-    """Begin anew: nothing sent, nothing heard; what was counted stays."""
+    """Reset all numbers for a new session; the counters continue."""
     for i in range(own.numbers.size):
         own.numbers[i] = 0
     own.numbers[SESSION] = session
@@ -232,10 +223,10 @@ def start_session(own: Endpoint, session: int) -> None:
 
 @kernel
 def _ahead(number: int, of: int) -> int:
-    """Return how far a number modulo 2^32 is ahead of one that counts on, −2^31 … 2^31 − 1."""
-    return (number - of + _ROUND // 2) % _ROUND - _ROUND // 2
+    """Return how far ``number`` (modulo 2^32) is ahead of the count ``of``: −2^31 … 2^31 − 1."""
+    return (number - of + _MODULUS // 2) % _MODULUS - _MODULUS // 2
 
 
 def counts_by_name(counters: Any) -> dict[str, int]:
-    """Return counters by name."""
+    """Return the counters by their names."""
     return dict(zip(COUNTERS, map(int, counters), strict=True))

@@ -1,22 +1,25 @@
 """Frames through shared memory, between processes of one computer.
 
-A mailbox is a file in memory with two slots, each a count and a frame: one for hello, welcome and goodbye, one for measurements or
-commands, of which the newest replaces the last. It has one writer, and whoever reads it looks at the counts. Two of them are a wire:
-``quell-NAME-measurements`` and ``quell-NAME-commands``. Each is locked by the process that writes it for as long as that lives: so a rig
-that was killed leaves nothing that its successor can't take over, and two loops can't write one mailbox.
+A mailbox is a file in memory with two slots. Each slot is a counter and a frame: one slot for
+hello, welcome and goodbye, one for measurements or commands. A new frame replaces the one before
+it. A mailbox has one writer; its reader compares the counters. A wire has two mailboxes,
+``quell-NAME-measurements`` and ``quell-NAME-commands``. The writer's process locks its mailbox as
+long as it lives, so two loops can't write to one mailbox, and a new rig can take over the mailboxes
+of a rig that was killed.
 
-*How it is written* (a sequence lock, see Boehm, "Can seqlocks get along with programming language memory models?", MSPC 2012): the count
-is made odd, then the five words of the frame are stored, then the count is made even; each store is a release. The reader loads the count,
-the words and the count again, each an acquire; where the count was odd or has changed it tries again.
+*Writing* (a sequence lock, see Boehm, "Can seqlocks get along with programming language memory
+models?", MSPC 2012): make the counter odd, store the five words of the frame, make the counter
+even; each store is a release. *Reading:* load the counter, the words and the counter again, each
+load an acquire; try again if the counter was odd or has changed.
 
-======  ====  ===============================================
-offset  size  what
-======  ====  ===============================================
-0       8     count, twice the hellos, welcomes and goodbyes
+======  ====  ====================================================
+offset  size  content
+======  ====  ====================================================
+0       8     counter: twice the number of hellos, welcomes and goodbyes
 8       40    the newest of them
-48      8     count, twice the measurements or commands
+48      8     counter: twice the number of measurements or commands
 56      40    the newest of them
-======  ====  ===============================================
+======  ====  ====================================================
 """
 
 from __future__ import annotations
@@ -33,148 +36,119 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.realtime.system.atomics import load_acquire, store_release
 from quell.realtime.system.clock import SystemClock, now, system_clock, wait_until
+from quell.realtime.wire.device import WireDevice
 from quell.realtime.wire.frames import HELLO, LENGTH, Buffer
-from quell.realtime.wire.transport import connect_to_sender, receive, reply, send, wait_for_frame
-from quell.realtime.wire.wire import WireDevice
+from quell.realtime.wire.transport import receive, send, wait_for_frame
 
 _SLOT = 1 + LENGTH // 8
 _WORDS = 2 * _SLOT
 _FOLDER = Path("/dev/shm")
-# How often it looks for news while it waits [ns].
-_LOOK_EVERY = 20_000
-# Whoever is writing is done after so many looks, or is gone.
-_TRIES = 1000
+# Time between two looks for a frame while waiting [ns]. Chosen by hand; not tuned further.
+_POLL_EVERY = 20_000
+# Attempts to read a frame during a write; after these its writer has died. Chosen by hand.
+_ATTEMPTS = 1000
 
 
 class SharedMemoryTransport(NamedTuple):
     """One end of a wire through shared memory."""
 
     own: NDArray[np.int64]
-    """The mailbox that is written here (12,)."""
+    """The mailbox to write to (12,)."""
     others: NDArray[np.int64]
-    """The one that is read (12,)."""
+    """The mailbox to read from (12,)."""
     seen: NDArray[np.int64]
-    """Counts of the newest frames that were read (2,)."""
+    """Counters of the frames read last (2,)."""
     clock: SystemClock
 
 
 @receive.register(SharedMemoryTransport)
-def _receive(transport: SharedMemoryTransport, frame: Buffer) -> int:
+def _receive(shared: SharedMemoryTransport, frame: Buffer) -> int:
     for slot in range(2):
-        if _look(transport, slot, frame):
+        if _read_slot(shared, slot, frame):
             return LENGTH
     return -1
 
 
 @kernel
-def _look(transport: SharedMemoryTransport, slot: int, frame: Buffer) -> bool:
-    """Take what is new in a slot; tell whether something is."""
+def _read_slot(shared: SharedMemoryTransport, slot: int, frame: Buffer) -> bool:
+    """Read the frame of a slot if it is new; return whether it is."""
     first = slot * _SLOT
-    for _ in range(_TRIES):
-        count = load_acquire(transport.others, first)
-        if count == transport.seen[slot]:
+    for _ in range(_ATTEMPTS):
+        count = load_acquire(shared.others, first)
+        if count == shared.seen[slot]:
             return False
         if count % 2 == 0:
             for i in range(LENGTH // 8):
-                frame.longs[i] = load_acquire(transport.others, first + 1 + i)
-            if load_acquire(transport.others, first) == count:
-                transport.seen[slot] = count
+                frame.longs[i] = load_acquire(shared.others, first + 1 + i)
+            if load_acquire(shared.others, first) == count:
+                shared.seen[slot] = count
                 return True
     return False
 
 
 @send.register(SharedMemoryTransport)
-def _send(transport: SharedMemoryTransport, frame: Buffer) -> int:
+def _send(shared: SharedMemoryTransport, frame: Buffer) -> int:
     first = 0 if frame.bytes[3] >= HELLO else _SLOT
-    writing = (
-        load_acquire(transport.own, first) | 1
-    )  # odd already where the last writer was killed at it
-    store_release(transport.own, first, writing)
+    # The counter is odd already if the last writer was killed while it wrote.
+    writing = load_acquire(shared.own, first) | 1
+    store_release(shared.own, first, writing)
     for i in range(LENGTH // 8):
-        store_release(transport.own, first + 1 + i, frame.longs[i])
-    store_release(transport.own, first, writing + 1)
+        store_release(shared.own, first + 1 + i, frame.longs[i])
+    store_release(shared.own, first, writing + 1)
     return 0
 
 
-@reply.register(SharedMemoryTransport)
-def _reply(transport: SharedMemoryTransport, frame: Buffer) -> int:
-    return send(transport, frame)
-
-
-@connect_to_sender.register(SharedMemoryTransport)
-def _connect_to_sender(transport: SharedMemoryTransport) -> None:
-    pass
-
-
 @wait_for_frame.register(SharedMemoryTransport)
-def _wait_for_frame(transport: SharedMemoryTransport, nanoseconds: int) -> None:
-    time_now = now(transport.clock)
+def _wait_for_frame(shared: SharedMemoryTransport, nanoseconds: int) -> None:
+    time_now = now(shared.clock)
     end = time_now + nanoseconds
     while (
         time_now < end
-        and load_acquire(transport.others, 0) == transport.seen[0]
-        and load_acquire(transport.others, _SLOT) == transport.seen[1]
+        and load_acquire(shared.others, 0) == shared.seen[0]
+        and load_acquire(shared.others, _SLOT) == shared.seen[1]
     ):
-        time_now = wait_until(transport.clock, min(time_now + _LOOK_EVERY, end))
+        time_now = wait_until(shared.clock, min(time_now + _POLL_EVERY, end))
 
 
 class SharedMemoryDevice(WireDevice):
-    """A device in another process of this computer, through shared memory.
+    """A device in another process of this computer, through shared memory: ``shm://NAME``.
 
-    Parameters
-    ----------
-    url
-        ``shm://NAME``, as the rig was given it.
-    dt
-        sample time [s]: that of the device.
-    timeout
-        how long it may take until the device answers [s].
-
-    Raises
-    ------
-    ValueError
-        for a URL that is not of this form, and a sample time that is not the device's.
-    ConnectionError
-        where no device answers, or one that is taken.
+    Parameters and errors are those of ``WireDevice``.
     """
 
-    def __init__(self, url: str, dt: float, timeout: float = 3.0) -> None:
-        measurements, commands = _paths(url)
-        checks.positive("dt", dt, "s")
-        hint = f"start one with: quell rig --device {url}"
-        with ExitStack() as stack:
+    def _connect(self) -> SharedMemoryTransport:
+        url, paths = self.url, _paths(self.url)
+        with ExitStack() as on_failure:
             try:
-                theirs = _Mailbox(measurements)
-                stack.callback(theirs.close)
-                own = _Mailbox(commands)
+                theirs = _Mailbox(paths[0])
+                on_failure.callback(theirs.close)
+                own = _Mailbox(paths[1])
+                on_failure.callback(own.close)
             except FileNotFoundError:
+                hint = self._hint.format(url=url)
                 raise ConnectionError(f"{url}: no device answers; {hint}") from None
             except PermissionError as error:
                 raise ConnectionError(
-                    f"{url}: {error.filename} belongs to another user, who has to run the loop as well"
+                    f"{url}: {error.filename} belongs to another user, who must run the loop too"
                 ) from None
-            stack.pop_all()
+            if not own.lock():
+                raise ConnectionError(f"{url}: another session is active there; end it first")
+            on_failure.pop_all()
         self._boxes = own, theirs
-        if not own.lock():
-            self._free()
-            raise ConnectionError(f"{url}: another session is alive there; end it first")
-        super().__init__(url, _transport(own, theirs), dt, timeout, hint)
+        return _transport(own, theirs)
 
-    def _free(self) -> None:
-        if hasattr(
-            self, "handle"
-        ):  # there was a goodbye: the device is to see it before the next loop's hello takes its place
-            time.sleep(min(2.0 * self.dt, 0.1))
+    def _release(self) -> None:
+        # The device must read the goodbye before the hello of the next loop replaces it.
+        time.sleep(min(2.0 * self.dt, 0.1))
         for box in self._boxes:
             box.close()
 
 
 class SharedMemoryListener:
-    """The device's end of a wire through shared memory; what a rig that was killed has left is taken over.
+    """The device's end of a wire through shared memory; it takes over what a killed rig has left.
 
     Raises
     ------
@@ -183,26 +157,25 @@ class SharedMemoryListener:
     """
 
     def __init__(self, url: str) -> None:
-        paths = _paths(url)
+        self._paths = _paths(url)
         self.url = url
         try:
-            own = _Mailbox(paths[0], make=True)
+            own = _Mailbox(self._paths[0], create=True)
             if not own.lock():
                 own.close()
                 raise ValueError(
-                    f"device = {url!r}: another rig has this name; give another one, or end that rig"
+                    f"device = {url!r}: another rig has this name; give another, or end that rig"
                 )
-            theirs = _Mailbox(paths[1], make=True)
+            theirs = _Mailbox(self._paths[1], create=True)
         except PermissionError as error:
             raise ValueError(
                 f"device = {url!r}: {error.filename} belongs to another user; give another name"
             ) from None
         self._boxes = own, theirs
-        self._paths: tuple[Path, ...] = paths
         self.transport = _transport(own, theirs)
 
     def close(self) -> None:
-        """Remove the mailboxes; a loop that still has them hears nothing more."""
+        """Remove the mailboxes; a loop that still has them open receives nothing more."""
         for path in self._paths:
             path.unlink(missing_ok=True)
         for box in self._boxes:
@@ -213,19 +186,19 @@ class SharedMemoryListener:
 class _Mailbox:
     """A file in memory, as words."""
 
-    def __init__(self, path: Path, make: bool = False) -> None:
-        self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if make else 0), 0o600)
+    def __init__(self, path: Path, create: bool = False) -> None:
+        self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if create else 0), 0o600)
         try:
-            if make:
+            if create:
                 os.ftruncate(self._file, 8 * _WORDS)
             self._memory = mmap.mmap(self._file, 8 * _WORDS)
-        except (OSError, ValueError):  # one that is just being made has no size yet
+        except (OSError, ValueError):  # a file that was created just now has no size yet
             os.close(self._file)
             raise FileNotFoundError(path) from None
         self.words = np.frombuffer(self._memory, dtype=np.int64)
 
     def lock(self) -> bool:
-        """Become its writer; False where another process, or another part of this one, is."""
+        """Become its writer; return False if another process, or another object here, is."""
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -233,28 +206,26 @@ class _Mailbox:
         return True
 
     def close(self) -> None:
-        """Give it, and its lock, free; its memory goes when the last array on it does."""
+        """Release the file and its lock; the memory stays until its last array is gone."""
         if self._file >= 0:
-            fcntl.flock(
-                self._file, fcntl.LOCK_UN
-            )  # the memory has a copy of the descriptor, which would hold it
+            # The memory map has a copy of the descriptor, which would keep the lock.
+            fcntl.flock(self._file, fcntl.LOCK_UN)
             os.close(self._file)
             self._file = -1
 
 
 def _transport(own: _Mailbox, theirs: _Mailbox) -> SharedMemoryTransport:
-    return SharedMemoryTransport(
-        own.words, theirs.words, theirs.words[::_SLOT].copy(), system_clock()
-    )
+    seen = theirs.words[::_SLOT].copy()
+    return SharedMemoryTransport(own.words, theirs.words, seen, system_clock())
 
 
-def _paths(url: str) -> tuple[Path, Path]:
-    """Return where the mailboxes of ``shm://NAME`` are."""
+def _paths(url: str) -> tuple[Path, ...]:
+    """Return the paths of the two mailboxes of ``shm://NAME``: measurements, commands."""
     found = re.fullmatch(r"shm://([A-Za-z0-9_.-]{1,100})", url)
     if found is None:
         raise ValueError(
-            f"device = {url!r}: must be shm://NAME, of letters, digits, and any of . _ -"
+            f"device = {url!r}: must be shm://NAME; the name may have letters, digits, and . _ -"
         )
     if not _FOLDER.is_dir():
         raise ValueError(f"device = {url!r}: this system has no {_FOLDER}; give udp://HOST:PORT")
-    return _FOLDER / f"quell-{found[1]}-measurements", _FOLDER / f"quell-{found[1]}-commands"
+    return tuple(_FOLDER / f"quell-{found[1]}-{kind}" for kind in ("measurements", "commands"))

@@ -1,77 +1,58 @@
-"""One end of a wire: frames go in and come out. Devices and the rig are written once, over what is declared here.
+"""Functions that carry frames: each kind of wire implements them for its transport.
 
-A transport is a NamedTuple; for its type ``receive``, ``send``, ``reply``, ``connect_to_sender`` and ``wait_for_frame`` are registered: see ``udp.py`` for a
-complete example. None of them allocates, and only ``wait_for_frame`` waits.
+A transport is a NamedTuple; ``receive``, ``send`` and ``wait_for_frame`` are registered for its
+type, and ``reply`` and ``connect_to_sender`` if it can have more than one other side. See
+``udp.py`` for a complete example. None of these functions allocates memory, and only
+``wait_for_frame`` waits.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from quell.kernels.dispatch import generic, kernel
-from quell.realtime.system.libc import external
+from quell.kernels.dispatch import generic
 from quell.realtime.wire.frames import Buffer
 
-_SECOND = 1_000_000_000
-_POLLIN = 1
-
-_ppoll = external("ppoll", "int", "address", "long", "address", "address")
+MOST_AT_ONCE = 1024
+"""Packets read at once: a sender that floods the wire can't keep the other side from its cycle.
+Chosen by hand; not tuned further."""
 
 
 @generic
 def receive(transport: Any, frame: Buffer) -> int:
-    """Write what came next into ``frame`` and return how many bytes it has; -1 where nothing is waiting."""
+    """Write the next packet to ``frame``; return its length in bytes, or -1 if none is waiting."""
     raise TypeError
 
 
 @generic
 def send(transport: Any, frame: Buffer) -> int:
-    """Send a frame to the other side; return 0, or another number where it can't be reached."""
-    raise TypeError
-
-
-@generic
-def reply(transport: Any, frame: Buffer) -> int:
-    """Send a frame to whoever sent what was received last; return as ``send``."""
-    raise TypeError
-
-
-@generic
-def connect_to_sender(transport: Any) -> None:
-    """Make whoever sent what was received last the other side."""
+    """Send a frame to the other side; return 0, or another number if it could not be sent."""
     raise TypeError
 
 
 @generic
 def wait_for_frame(transport: Any, nanoseconds: int) -> None:
-    """Wait until something may have come, at most so long [ns]."""
+    """Wait until a packet may have come, at most ``nanoseconds`` [ns]."""
     raise TypeError
 
 
-class Descriptor(NamedTuple):
-    """A file descriptor that can be waited for; make it with ``descriptor``."""
-
-    fd: int
-    words: NDArray[np.int64]
-    """Room for a pollfd, seconds and nanoseconds (3,)."""
-    address: int
-    """Of ``words``."""
+@generic
+def reply(transport: Any, frame: Buffer) -> int:
+    """Send a frame to the sender of the packet received last; return the same as ``send``."""
+    raise TypeError
 
 
-def descriptor(fd: int) -> Descriptor:
-    """Return what ``wait_readable`` needs to know of a file descriptor."""
-    words = np.zeros(3, dtype=np.int64)
-    words[:1].view(np.int32)[0] = fd
-    words[:1].view(np.int16)[2] = _POLLIN
-    return Descriptor(fd, words, words.ctypes.data)
+@generic
+def connect_to_sender(transport: Any) -> None:
+    """Make the sender of the packet received last the other side."""
+    raise TypeError
 
 
-@kernel
-def wait_readable(descriptor: Descriptor, nanoseconds: int) -> None:
-    """Wait until there is something to read, at most so long [ns]."""
-    descriptor.words[1] = nanoseconds // _SECOND
-    descriptor.words[2] = nanoseconds % _SECOND
-    _ppoll(descriptor.address, 1, descriptor.address + 8, 0)
+@reply.register(object)
+def _reply(transport: Any, frame: Buffer) -> int:
+    return send(transport, frame)
+
+
+@connect_to_sender.register(object)
+def _connect_to_sender(transport: Any) -> None:
+    """Do nothing: by default there is only one other side."""

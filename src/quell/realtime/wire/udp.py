@@ -1,7 +1,7 @@
-"""Frames over UDP: a datagram each.
+"""Frames over UDP: one datagram each.
 
-Lost, doubled or overtaking datagrams are what ``frames`` is made for. The device listens at ``udp://HOST:PORT``; the loop's own port is any
-that is free.
+``frames`` handles datagrams that are lost, duplicated or overtaken. The device listens at
+``udp://HOST:PORT``; the loop uses any free port.
 """
 
 from __future__ import annotations
@@ -13,44 +13,36 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from quell import checks
 from quell.realtime.system.libc import external
+from quell.realtime.wire.descriptor import Descriptor, descriptor, wait_readable
+from quell.realtime.wire.device import WireDevice
 from quell.realtime.wire.frames import LENGTH, Buffer
-from quell.realtime.wire.transport import (
-    Descriptor,
-    connect_to_sender,
-    descriptor,
-    receive,
-    reply,
-    send,
-    wait_for_frame,
-    wait_readable,
-)
-from quell.realtime.wire.wire import WireDevice
+from quell.realtime.wire.transport import connect_to_sender, receive, reply, send, wait_for_frame
 
-# Room for an address of either family; what comes behind it is its length.
+# Room for a sockaddr_in (16 bytes) or a sockaddr_in6 (28 bytes); its length is stored behind it.
 _ADDRESS = 32
-# What waits to be read [bytes]: with what the system adds to a datagram, some half a second at 1 kHz.
-_QUEUE = 1 << 20
+# Size of the receive buffer [bytes]: at 1 kHz about half a second of datagrams with the system's
+# overhead, computed and not measured.
+_RECEIVE_BUFFER = 1 << 20
 
 _recvfrom = external("recvfrom", "long", "int", "address", "long", "int", "address", "address")
 _sendto = external("sendto", "long", "int", "address", "long", "int", "address", "int")
 
 
 class UdpTransport(NamedTuple):
-    """One end of a UDP wire; make it with ``udp_link``."""
+    """One end of a UDP wire; make it with ``udp_transport``."""
 
     socket: Descriptor
     other: NDArray[np.int32]
-    """Address of the other side and its length; the length is 0 where the socket is connected."""
+    """Address of the other side and its length; the length is 0 if the socket is connected."""
     sender: NDArray[np.int32]
-    """The same of whoever sent what was received last."""
+    """Address and length of the sender of the last datagram."""
     other_at: int
     sender_at: int
 
 
 def udp_transport(own: socket.socket) -> UdpTransport:
-    """Return the link of a socket that doesn't block."""
+    """Return the transport of a non-blocking socket."""
     other, sender = (np.zeros(_ADDRESS // 4 + 1, dtype=np.int32) for _ in range(2))
     return UdpTransport(
         descriptor(own.fileno()), other, sender, other.ctypes.data, sender.ctypes.data
@@ -58,101 +50,69 @@ def udp_transport(own: socket.socket) -> UdpTransport:
 
 
 @receive.register(UdpTransport)
-def _receive(transport: UdpTransport, frame: Buffer) -> int:
-    transport.sender[_ADDRESS // 4] = _ADDRESS
-    return _recvfrom(
-        transport.socket.fd,
-        frame.address,
-        frame.bytes.size,
-        0,
-        transport.sender_at,
-        transport.sender_at + _ADDRESS,
-    )
+def _receive(udp: UdpTransport, frame: Buffer) -> int:
+    udp.sender[_ADDRESS // 4] = _ADDRESS
+    size, length_at = frame.bytes.size, udp.sender_at + _ADDRESS
+    return _recvfrom(udp.socket.fd, frame.address, size, 0, udp.sender_at, length_at)
 
 
 @send.register(UdpTransport)
-def _send(transport: UdpTransport, frame: Buffer) -> int:
-    size = transport.other[_ADDRESS // 4]
-    sent = _sendto(
-        transport.socket.fd, frame.address, LENGTH, 0, transport.other_at if size > 0 else 0, size
-    )
+def _send(udp: UdpTransport, frame: Buffer) -> int:
+    size = udp.other[_ADDRESS // 4]
+    sent = _sendto(udp.socket.fd, frame.address, LENGTH, 0, udp.other_at if size > 0 else 0, size)
     return 0 if sent == LENGTH else 1
 
 
 @reply.register(UdpTransport)
-def _reply(transport: UdpTransport, frame: Buffer) -> int:
-    sent = _sendto(
-        transport.socket.fd,
-        frame.address,
-        LENGTH,
-        0,
-        transport.sender_at,
-        transport.sender[_ADDRESS // 4],
-    )
+def _reply(udp: UdpTransport, frame: Buffer) -> int:
+    size = udp.sender[_ADDRESS // 4]
+    sent = _sendto(udp.socket.fd, frame.address, LENGTH, 0, udp.sender_at, size)
     return 0 if sent == LENGTH else 1
 
 
 @connect_to_sender.register(UdpTransport)
-def _connect_to_sender(transport: UdpTransport) -> None:
-    for i in range(transport.other.size):
-        transport.other[i] = transport.sender[i]
+def _connect_to_sender(udp: UdpTransport) -> None:
+    for i in range(udp.other.size):
+        udp.other[i] = udp.sender[i]
 
 
 @wait_for_frame.register(UdpTransport)
-def _wait_for_frame(transport: UdpTransport, nanoseconds: int) -> None:
-    wait_readable(transport.socket, nanoseconds)
+def _wait_for_frame(udp: UdpTransport, nanoseconds: int) -> None:
+    wait_readable(udp.socket, nanoseconds)
 
 
 class UdpDevice(WireDevice):
-    """A device that listens at a UDP port, on this computer or another: ``quell rig``, a microcontroller.
+    """A device that listens at a UDP port, for example ``udp://127.0.0.1:5005``.
 
-    Parameters
-    ----------
-    url
-        for example ``udp://127.0.0.1:5005``.
-    dt
-        sample time [s]: that of the device.
-    timeout
-        how long it may take until the device answers [s].
-
-    Raises
-    ------
-    ValueError
-        for a URL that is not of this form, a host that is not known, and a sample time that is not the device's.
-    ConnectionError
-        where no device answers, or one that is taken.
+    It may be ``quell rig`` or a microcontroller, on this computer or another. Parameters and errors
+    are those of ``WireDevice``.
     """
 
-    def __init__(self, url: str, dt: float, timeout: float = 3.0) -> None:
-        family, address = resolved(url)
-        checks.positive("dt", dt, "s")
+    def _connect(self) -> UdpTransport:
+        family, address = resolved(self.url)
         if address[1] == 0:
-            raise ValueError(f"device = {url!r}: must have a port from 1 to 65535")
+            raise ValueError(f"device = {self.url!r}: must have a port from 1 to 65535")
         self._socket = _socket(family)
         try:
             self._socket.connect(address)
         except OSError as error:
             self._socket.close()
-            raise ConnectionError(f"{url}: can't be reached ({error.strerror})") from None
-        super().__init__(
-            url,
-            udp_transport(self._socket),
-            dt,
-            timeout,
-            f"start one with: quell rig --device {url}",
-        )
+            raise ConnectionError(f"{self.url}: can't be reached ({error.strerror})") from None
+        return udp_transport(self._socket)
 
-    def _free(self) -> None:
+    def _release(self) -> None:
         self._socket.close()
 
 
 class UdpListener:
-    """The device's end: a port at which it listens. Port 0 is any that is free; ``url`` has the one it got.
+    """The device's end: a port at which it listens.
+
+    Port 0 takes any free port; ``url`` contains the port taken.
 
     Raises
     ------
     ValueError
-        for a URL that is not of this form, and a port that is taken.
+        for a URL of another form, and if the port is in use.
     """
 
     def __init__(self, url: str) -> None:
@@ -163,14 +123,15 @@ class UdpListener:
         except OSError as error:
             self.socket.close()
             raise ValueError(
-                f"device = {url!r}: can't listen there ({error.strerror}); give another port, or end what has it"
+                f"device = {url!r}: can't listen there ({error.strerror}); "
+                "give another port, or end the program that uses it"
             ) from None
         host, port = self.socket.getsockname()[:2]
         self.url = f"udp://[{host}]:{port}" if ":" in host else f"udp://{host}:{port}"
         self.transport = udp_transport(self.socket)
 
     def close(self) -> None:
-        """Give the port free."""
+        """Release the port."""
         self.socket.close()
 
 
@@ -180,36 +141,29 @@ def resolved(url: str) -> tuple[int, Any]:
     Raises
     ------
     ValueError
-        where it is not of this form, or the host is not known.
+        if the URL does not have this form, or the host is unknown.
     """
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError:
         host = port = None
-    if (
-        host is None
-        or port is None
-        or parts.scheme != "udp"
-        or parts.path
-        or parts.query
-        or parts.fragment
-        or parts.username
-    ):
+    extra = host is None or parts.path or parts.query or parts.fragment or parts.username
+    if extra or port is None or parts.scheme != "udp":
         raise ValueError(
-            f"device = {url!r}: must be udp://HOST:PORT with a port up to 65535, for example udp://127.0.0.1:5005"
+            f"device = {url!r}: must be udp://HOST:PORT with a port up to 65535, "
+            "for example udp://127.0.0.1:5005"
         )
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
-        raise ValueError(
-            f"device = {url!r}: the host {host!r} is not known ({getattr(error, 'strerror', 'no such name')})"
-        ) from None
+        why = getattr(error, "strerror", "no such name")
+        raise ValueError(f"device = {url!r}: the host {host!r} is unknown ({why})") from None
     return found[0][0], found[0][4]
 
 
 def _socket(family: int) -> socket.socket:
     made = socket.socket(family, socket.SOCK_DGRAM)
     made.setblocking(False)
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _QUEUE)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
     return made

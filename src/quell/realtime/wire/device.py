@@ -1,0 +1,237 @@
+"""The base class of devices at the other end of a wire: sessions, reading and writing in Python."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterator
+from typing import Any, Self
+
+from numba import typeof
+
+from quell import checks
+from quell.kernels.dispatch import compiled, dispatcher_for
+from quell.realtime.devices.base import read_measurement, write_command
+from quell.realtime.system.clock import system_clock
+from quell.realtime.wire import frames
+from quell.realtime.wire.handle import GONE, NOT_SENT, TRIPPED, WireHandle, is_own
+from quell.realtime.wire.transport import receive, send, wait_for_frame
+
+# A measurement is stale if it answers a command older than this number of samples, or if more than
+# this number came at once. Chosen by hand; not tuned further.
+_MOST_AGE = 50
+# Time between two hellos [s]. Chosen by hand; not tuned further.
+_HELLO_EVERY = 0.05
+
+_FAULTS = {
+    NOT_SENT: "the command could not be sent",
+    TRIPPED: "the device's watchdog has set u to zero; begin a new session",
+    GONE: "the device has ended the session",
+}
+
+
+@compiled
+def _read(handle: Any, clock: Any, until: int) -> tuple[float, int]:
+    return read_measurement(handle, clock, until)
+
+
+@compiled
+def _write(handle: Any, u: float) -> int:
+    return write_command(handle, u)
+
+
+class WireDevice:
+    """A device at the other end of a wire; a subclass opens the wire and releases it.
+
+    Its attribute ``paced`` is True: the device has its own clock, and ``read`` waits for its next
+    measurement.
+
+    Parameters
+    ----------
+    url
+        URL of the device.
+    dt
+        sample time [s]; the device must have the same.
+    timeout
+        longest time until the device answers [s].
+
+    Raises
+    ------
+    ValueError
+        for a wrong URL, a wire that can't be opened, or if the device has another sample time.
+    ConnectionError
+        if no device answers, or if it has another session.
+    """
+
+    paced = True
+    _hint = "start one with: quell rig --device {url}"
+    """Advice if no device answers."""
+
+    def __init__(self, url: str, dt: float, timeout: float = 3.0) -> None:
+        self.url = url
+        self.dt = checks.positive("dt", dt, "s")
+        own = frames.endpoint(frames.MEASUREMENT, _new_session(), _MOST_AGE)
+        self._clock = system_clock()
+        self.handle = WireHandle(
+            self._connect(), own, frames.buffer(), frames.buffer(), self._clock
+        )
+        self._timeout = timeout
+        self._open, self._compiled = True, False
+        try:
+            self._begin_session()
+        except BaseException:
+            # A device that receives the hello later must not wait for a loop that has gone.
+            self.close()
+            raise
+
+    def _connect(self) -> Any:
+        """Open the wire; return its transport."""
+        raise NotImplementedError
+
+    def _release(self) -> None:
+        """Release the wire."""
+        raise NotImplementedError
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Number of frames from the device by result, see ``quell.realtime.wire.frames``."""
+        return frames.counts_by_name(self.handle.endpoint.counters)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the device's watchdog has set u to zero, or the device has ended the session."""
+        state = self.handle.endpoint.numbers[frames.STATE]
+        return bool(state & (frames.WATCHDOG_TRIPPED | frames.GONE))
+
+    def read(self) -> float:
+        """Return the newest measurement [y-unit]; NaN if none has come for fifty samples."""
+        return self._read_within(_MOST_AGE * self.dt)
+
+    def write(self, u: float) -> None:
+        """Send u [u-unit].
+
+        Raises
+        ------
+        ConnectionError
+            if u could not be sent, or the device will not apply it: its watchdog has set u to zero,
+            or it has ended the session.
+        """
+        self._check_open()
+        fault = dispatcher_for(_write, self.handle)(self.handle, float(u))
+        if fault:
+            raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
+
+    def restart_session(self) -> None:
+        """Replace this session by a new one: a device waits only so long for the first command.
+
+        Raises
+        ------
+        ConnectionError
+            if no device answers.
+        """
+        self._check_open()
+        former = self._session
+        self._send(frames.GOODBYE, 0.0, former)
+        # If a frame replaces the one before it, the device must have time to read the goodbye.
+        time.sleep(min(2.0 * self.dt, _HELLO_EVERY))
+        frames.start_session(self.handle.endpoint, _new_session())
+        self._begin_session(former)
+
+    def tick(self, timeout: float = 1.0) -> int:
+        """Wait for the next measurement; return the monotonic time of its arrival [ns].
+
+        Raises
+        ------
+        ConnectionError
+            if none has come for ``timeout`` [s].
+        """
+        counters = self.handle.endpoint.counters
+        self._read_within(0.0)
+        before = counters[frames.ACCEPTED]
+        self._read_within(timeout)
+        if counters[frames.ACCEPTED] == before:
+            raise ConnectionError(f"{self.url}: no measurement has come for {timeout:g} s")
+        return time.monotonic_ns()
+
+    def close(self) -> None:
+        """Send a goodbye, after which the device sets u to zero; a second call does nothing."""
+        if self._open:
+            self._open = False
+            self._send(frames.GOODBYE, 0.0, self._session)
+            self._release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def _session(self) -> int:
+        return int(self.handle.endpoint.numbers[frames.SESSION])
+
+    def _begin_session(self, former: int = 0) -> None:
+        """Send hellos until a welcome comes.
+
+        If the device is busy, the goodbye of the session ``former`` may have been lost; repeat it.
+        """
+        refusal = 0
+        apart = max(_HELLO_EVERY, 2.0 * self.dt)
+        deadline = time.monotonic() + max(self._timeout, 2.0 * apart)
+        while time.monotonic() < deadline:
+            self._send(frames.HELLO, self.dt, self._session)
+            for state in self._welcomes(apart):
+                if state == 0:
+                    return
+                refusal = state
+                if former:
+                    self._send(frames.GOODBYE, 0.0, former)
+        if refusal & frames.BUSY:
+            raise ConnectionError(
+                f"{self.url}: another session is active there; end it first; "
+                "a session whose loop was killed ends after a minute"
+            )
+        raise ConnectionError(f"{self.url}: no device answers; {self._hint.format(url=self.url)}")
+
+    def _welcomes(self, seconds: float) -> Iterator[int]:
+        """Yield the state flags of each welcome that comes within ``seconds``."""
+        handle, end = self.handle, time.monotonic() + seconds
+        frame, own = handle.inbox, handle.endpoint
+        while (left := end - time.monotonic()) > 0.0:
+            wait_for_frame(handle.transport, round(1e9 * left))
+            while (size := receive(handle.transport, frame)) >= 0:
+                if not frames.is_well_formed(frame, size, own.counters):
+                    continue
+                if not is_own(own, frame, frames.WELCOME):
+                    continue
+                state, dt = int(frame.words[8]), float(frame.doubles[3])
+                if state & frames.OTHER_DT:
+                    raise ValueError(
+                        f"dt = {self.dt!r} s: the device at {self.url} ticks every {dt!r} s; "
+                        "both must be the same"
+                    )
+                yield state
+
+    def _send(self, kind: int, value: float, session: int) -> None:
+        out = self.handle.outbox
+        frames.write_frame(out, kind, session, 0, 0, time.monotonic_ns(), value, 0)
+        send(self.handle.transport, out)
+
+    def _read_within(self, seconds: float) -> float:
+        """Return the newest measurement, or the first that comes within ``seconds``."""
+        self._check_open()
+        handle, clock = self.handle, self._clock
+        if not self._compiled:  # this may take seconds and must not count as waiting
+            self._compiled = True
+            for entry, arguments in ((_read, (clock, 0)), (_write, (0.0,))):
+                dispatcher_for(entry, handle).compile(tuple(map(typeof, (handle, *arguments))))
+        until = time.monotonic_ns() + round(1e9 * seconds)
+        return float(dispatcher_for(_read, handle, clock)(handle, clock, until)[0])
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise ValueError(f"{self.url}: is closed; make a new device")
+
+
+def _new_session() -> int:
+    return secrets.randbelow((1 << 32) - 1) + 1
