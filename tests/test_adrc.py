@@ -303,7 +303,7 @@ def test_the_estimate_says_what_is_known() -> None:
         ),
         (
             lambda: ql.ADRC(OBSERVER, omega_c=1e300),
-            "omega_c = 1e[+]300 rad/s: its power 2 must be a number",
+            "omega_c = 1e[+]300 rad/s: its power 2 must be finite",
         ),
         (
             lambda: setattr(

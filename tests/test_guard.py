@@ -110,9 +110,9 @@ def test_what_is_permitted_lies_within_its_bounds(rng: np.random.Generator) -> N
         assess(design, memory, f_plain)
         wild = rng.random() < 0.3
         constant = f_plain + rng.normal() * (10.0 ** rng.uniform(-3.0, 6.0) if wild else 0.05)
-        memory.record[:3] = 0.5  # the record of one that is always right
+        memory.averages.view(float)[:3] = 0.5  # the record of one that is always right
         permitted, slope, cut_off = limit(design, memory, f_plain, constant, 0.0, 0.0)
-        e, exploded = memory.moment[1], memory.moment[4] == ql.Reason.EXPLODED
+        e, exploded = memory.sample[0].typical_error, memory.sample[0].reason == ql.Reason.EXPLODED
         low, high = min(f_plain - 0.8 * e, 0.0), max(f_plain + 0.8 * e, 0.0)
         assert slope == 0.0
         assert not cut_off
@@ -138,14 +138,16 @@ def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
         limit(design, memory, shown, f, 0.0, 0.0)
         record_output(design, memory, f)
         shown = lag_push(lag, chain, 0, f)
-    qq, qp, pp = memory.record[:3]
+    qq, qp, pp = memory.averages.view(float)[:3]
     assert qp == pytest.approx(qq, rel=1e-6)
     assert pp == pytest.approx(qq, rel=1e-6)
-    assert memory.moment[0] == 1.0
-    assert memory.record[4] == pytest.approx(0.0, abs=1e-9)
+    assert memory.sample[0].authority == 1.0
+    assert memory.averages[0].error_learned == pytest.approx(0.0, abs=1e-9)
     # |q| of a sinusoid: |F (1 − F)| at 0.7 rad/s, with F = (1 + s/10)^-5.
     response = (1.0 + 0.07j) ** -5
-    assert memory.moment[1] == pytest.approx(abs(response * (1.0 - response)), rel=0.1)
+    assert memory.sample[0].typical_error == pytest.approx(
+        abs(response * (1.0 - response)), rel=0.1
+    )
 
 
 def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() -> None:
@@ -161,9 +163,9 @@ def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() 
         assert cut_off == (k == 3000)
         if k == 3000:
             assert (kept, slope) == (0.0, 0.0)
-            assert ql.Reason(int(memory.moment[4])) == ql.Reason.NOT_FINITE
+            assert ql.Reason(int(memory.sample[0].reason)) == ql.Reason.NOT_FINITE
         record_output(design, memory, kept)
-        heard.append(memory.moment[0] > 0.0)
+        heard.append(memory.sample[0].authority > 0.0)
         shown = lag_push(design.lag, chain, 0, f)
     again = 3000 + heard[3001:].index(True)
     assert heard[2999]

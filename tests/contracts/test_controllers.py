@@ -15,7 +15,6 @@ from numba.core.runtime import _nrt_python, rtsys
 import quell as ql
 from quell import controllers as room
 from quell.controllers import baselines as baseline_room
-from quell.controllers.adrc.law import F_LEARNED, U
 from quell.controllers.base import bumpless_transfer
 from quell.controllers.stateful import named_arrays
 from quell.observers.base import expected_measurement
@@ -92,8 +91,8 @@ def awaited(controller: Any, y: float) -> float:
     law = getattr(controller, "controller", controller)
     if not isinstance(law, ql.ADRC):
         return y
-    loop = law._state.loop
-    return expected_measurement(law.parameters.eso, law._state.z, loop[U], loop[F_LEARNED])
+    loop = law._state.loop[0]
+    return expected_measurement(law.parameters.eso, law._state.z, loop.u, loop.f_learned)
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

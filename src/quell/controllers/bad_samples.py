@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from quell.controllers.limits import Limits
 from quell.kernels.dispatch import is_finite, kernel
-from quell.types import Status, Vector
+from quell.types import Status
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 
 
 @kernel
-def hold_last_good(loop: Vector, first: int, r: float, y: float) -> int:
-    """Take in a sample, or hold the last good one in its place; return the status flags of what was held.
+def hold_last_good(loop: Any, r: float, y: float) -> int:
+    """Store a sample in ``loop``, without the values that are not finite; return their status flags.
 
-    Four places of ``loop`` are for it, from ``first`` on: last good r and y, whether there was a good y (which the controller sets when it
-    has started), whether a good r.
+    The fields ``r``, ``y`` and ``has_reference`` of ``loop`` are set. Before the first finite
+    reference r is the last y, so that the loop stays where it is.
     """
     status = 0
     if is_finite(y):
-        loop[first + 1] = y
+        loop.y = y
     else:
         status |= _MEASUREMENT_HELD
     if is_finite(r):
-        loop[first] = r
-        loop[first + 3] = 1.0
+        loop.r = r
+        loop.has_reference = 1.0
     else:
         status |= _REFERENCE_HELD
-        if loop[first + 3] == 0.0:
-            loop[first] = loop[first + 1]  # no reference yet: stay
+        if loop.has_reference == 0.0:
+            loop.r = loop.y
     return status
 
 

@@ -167,11 +167,11 @@ class StatefulController:
 
 
 def named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of a nested NamedTuple by dotted name; the arrays themselves, not copies."""
+    """Return the arrays of a nested NamedTuple by dotted name, not copied; ``Scalars`` as a vector."""
     found: dict[str, NDArray[np.float64]] = {}
     for name, value in state._asdict().items():
         if isinstance(value, tuple):
             found |= named_arrays(value, f"{prefix}{name}.")
         else:
-            found[prefix + name] = value
+            found[prefix + name] = value if value.dtype.names is None else value.view(np.float64)
     return found

@@ -1,9 +1,9 @@
-"""Named scalars of a state: an array of one record, read and written by name in compiled and in interpreted code.
+"""Named scalars of a state: an array of one record, read by name in compiled and interpreted code.
 
 ::
 
     class Loop(Scalars):
-        u: float                    # 0.0 at first
+        u: float
         samples: int
 
     class State(NamedTuple):
@@ -13,28 +13,37 @@
     state.loop[0].u = 1.0           # the same statement in a kernel and in Python
     loop = state.loop[0]            # refers to the record, does not copy it
 
-Where all fields are floats, ``state.loop.view(np.float64)`` is the record as a vector. Fields may
-have any names but those that Python itself needs of a NumPy scalar (``dtype``, ``view``, ``copy``
-…).
+If all fields are floats, ``state.loop.view(np.float64)`` is the record as a vector; ``clear`` and
+the saved state of a controller use that. A field must not have the name of an attribute that NumPy
+needs (``dtype``, ``view``, ``copy`` …).
 """
 
 from __future__ import annotations
 
 from operator import itemgetter
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.kernels.dispatch import kernel
+
+if TYPE_CHECKING:
+    _Record = np.generic  # NumPy's stubs forbid subclasses of np.void, NumPy itself does not
+else:
+    _Record = np.void
+
 _DTYPES = {"float": np.float64, "int": np.int64}
 
 
-class Scalars(np.void):  # type: ignore[misc]  # the stubs call it final, NumPy does not
-    """Base class of a record; a subclass annotates its fields with ``float`` or ``int`` (64 bits), under postponed annotations."""
+class Scalars(_Record):
+    """Base class of a record; a subclass annotates its fields with ``float`` or ``int`` (64 bits).
+
+    Annotations must be postponed (``from __future__ import annotations``).
+    """
 
     def __init_subclass__(cls) -> None:
-        # Properties, as np.record's own attribute access takes 2.5 times as long in an interpreted
-        # loop.
+        # With np.record instead of these properties, interpreted loops take up to twice as long.
         for name in cls.__annotations__:
             setattr(cls, name, _field(name))
 
@@ -50,3 +59,11 @@ def _field(name: str) -> property:
         record[name] = value
 
     return property(itemgetter(name), write)
+
+
+@kernel
+def clear(scalars: NDArray[Any]) -> None:
+    """Set all fields of a record of floats to zero."""
+    values = scalars.view(np.float64)
+    for i in range(values.size):
+        values[i] = 0.0

@@ -18,16 +18,7 @@ from quell.controllers.adrc.handover import (
     samples_to_settle,
     start_at_rest,
 )
-from quell.controllers.adrc.law import (
-    BUMPLESS,
-    LOOP,
-    STARTED,
-    WISHED,
-    AdrcDesign,
-    AdrcState,
-    U,
-    law_gains,
-)
+from quell.controllers.adrc.law import AdrcDesign, AdrcLoop, AdrcState, law_gains
 from quell.controllers.base import set_reference_derivatives
 from quell.controllers.design_checks import warn_if_unwise
 from quell.controllers.limits import checked_limits
@@ -168,7 +159,7 @@ class ADRC(StatefulController):
             z=np.zeros(self.observer.states),
             seen=np.zeros(self.observer.order + 1),
             reference=np.zeros(self.derivatives),
-            loop=np.zeros(LOOP),
+            loop=AdrcLoop.zeros(),
             learner=self.learner.memory(design.learner),
             shadow=lag_memory(design.lag, 1),
             guard=UnguardedMemory(np.zeros(0))
@@ -264,7 +255,7 @@ class ADRC(StatefulController):
         """
         with manual_operation(self._state, checks.finite("u", u)):
             self.step(r, y, *derivatives)
-        return float(self._state.loop[WISHED])
+        return float(self._state.loop[0].u_limited)
 
     def hand_over(self) -> None:
         """End manual operation: the next ``step`` continues from the u of the last ``track``, whatever the reference is.
@@ -274,11 +265,11 @@ class ADRC(StatefulController):
         ValueError
             before the first sample.
         """
-        if self._state.loop[STARTED] == 0.0:
+        if self._state.loop[0].started == 0.0:
             raise ValueError(
                 "hand_over: there was no sample yet; call track(r, y, u) in manual operation, or start(y, u)"
             )
-        self._state.loop[BUMPLESS] = 1.0
+        self._state.loop[0].bumpless = 1.0
 
     def increment(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the change of the control signal [u-unit], within the limits of magnitude and rate.
@@ -287,7 +278,7 @@ class ADRC(StatefulController):
         arXiv 1908.04610, section IV, shows that the two are one). If the actuator's position is not known, ``start(y)`` takes it as
         zero, f̂ includes the difference, and limits of magnitude refer to that zero.
         """
-        before = float(self._state.loop[U])
+        before = float(self._state.loop[0].u)
         return self.step(r, y, *derivatives) - before
 
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.adrc.law import F_LEARNED, STATUS, AdrcDesign, AdrcState, U
+from quell.controllers.adrc.law import AdrcDesign, AdrcState
 from quell.guard import GUARD_CHANNELS, Reason, write_channels
 from quell.learners.base import coefficients
 from quell.types import Status, Vector
@@ -45,7 +45,7 @@ def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...
     order = design.law.size
     theta = np.zeros(len(features))
     coefficients(design.learner, state.learner, theta)
-    learned, residual = float(state.loop[F_LEARNED]), float(state.seen[order])
+    learned, residual = float(state.loop[0].f_learned), float(state.seen[order])
     guarded: dict[str, Any] = {}
     row = np.zeros(len(GUARD_CHANNELS))
     if write_channels(design.guard, state.guard, row):
@@ -57,7 +57,7 @@ def read_estimate(design: AdrcDesign, state: AdrcState, features: tuple[str, ...
         f_learned=learned,
         f_residual=residual,
         theta=dict(zip(features, theta.tolist(), strict=True)),
-        u=float(state.loop[U]),
-        status=Status(int(state.loop[STATUS])),
+        u=float(state.loop[0].u),
+        status=Status(int(state.loop[0].status)),
         **guarded,
     )

@@ -15,23 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.controllers.adrc.law import (
-    BUMPLESS,
-    CONSTANT,
-    F_LEARNED,
-    MANUAL,
-    MANUAL_U,
-    OFFSET,
-    REFERENCED,
-    SLOPE,
-    STARTED,
-    AdrcDesign,
-    AdrcState,
-    R,
-    U,
-    Y,
-    unlimited_u,
-)
+from quell.controllers.adrc.law import AdrcDesign, AdrcState, unlimited_control
 from quell.controllers.base import reset_loop
 from quell.guard import limit
 from quell.kernels.dispatch import compiled
@@ -55,16 +39,16 @@ def start_at_rest(
     """Set the state to rest at y under u, with the reference r; ``samples`` is from ``samples_to_settle``."""
     reset_loop(design, state)
     begin(design.eso, state.z, state.seen, y)
-    loop = state.loop
-    loop[Y], loop[R], loop[U] = y, r, u
-    loop[STARTED] = loop[REFERENCED] = 1.0
+    loop = state.loop[0]
+    loop.y, loop.r, loop.u = y, r, u
+    loop.started = loop.has_reference = 1.0
     _observe_at_rest(design.eso, state.z, state.seen, y, u, 0.0, samples)
     constant, slope = predict(design.learner, state.learner, state.seen, u)
     constant, slope, _ = limit(design.guard, state.guard, 0.0, constant, slope, u)
-    loop[CONSTANT], loop[SLOPE] = constant, slope
-    loop[F_LEARNED] = constant + slope * u
-    _observe_at_rest(design.eso, state.z, state.seen, y, u, loop[F_LEARNED], samples)
-    loop[BUMPLESS] = 1.0
+    loop.constant, loop.slope = constant, slope
+    loop.f_learned = constant + slope * u
+    _observe_at_rest(design.eso, state.z, state.seen, y, u, loop.f_learned, samples)
+    loop.bumpless = 1.0
 
 
 def samples_to_settle(observer: ESO) -> int:
@@ -96,25 +80,25 @@ def _observe_at_rest(
 @contextmanager
 def manual_operation(state: AdrcState, u: float) -> Iterator[None]:
     """Make samples inside the ``with`` block apply ``u`` in place of the law's own control signal."""
-    state.loop[MANUAL], state.loop[MANUAL_U] = 1.0, u
+    state.loop[0].manual, state.loop[0].u_manual = 1.0, u
     try:
         yield
     finally:
-        state.loop[MANUAL] = 0.0
+        state.loop[0].manual = 0.0
 
 
 def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     """Convert a running state to new parameters: the next u goes on from where the old law would have it."""
-    loop, size = state.loop, new.law.size
-    if loop[STARTED] == 0.0:
+    loop, size = state.loop[0], new.law.size
+    if loop.started == 0.0:
         return
-    before = unlimited_u(old, state, loop[CONSTANT], loop[SLOPE])
+    before = unlimited_control(old, state, loop.constant, loop.slope)
     # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
-    acting = acting_control(old.eso, state.z, float(loop[U]))
+    acting = acting_control(old.eso, state.z, float(loop.u))
     change = (old.b0 - new.b0) * acting + (new.cancel - old.cancel) @ state.seen[:size]
     state.z[size] += change
     state.seen[size] += change
-    loop[OFFSET] += before - unlimited_u(new, state, loop[CONSTANT], loop[SLOPE])
+    loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)
 
 
 def check_replacement(old: ESO, new: Any, learns: bool) -> None:

@@ -1,13 +1,16 @@
-"""The law of ADRC, sample by sample: what the observer is told, what the learner adds, what is applied.
+"""The control law of ADRC, sample by sample: observer, learner, guard, law and limits.
 
-    u_0 = k_1 (r − x̂_1) + k_2 (r' − x̂_2) + … + k_m (r^(m−1) − x̂_m) + r^(m),      k_i = C(m, i−1) omega_c^(m−i+1)
-    u   = sat( (u_0 − f_L − Δf̂ + a·x̂) / b0 )
+    u_0 = k_1 (r − x̂_1) + k_2 (r' − x̂_2) + … + k_m (r^(m−1) − x̂_m) + r^(m),
+    u   = sat( (u_0 − f_L − Δf̂ + a·x̂) / b0 ),        k_i = C(m, i−1) omega_c^(m−i+1)
 
-(Gao, ACC 2003; paper eq. (control), with the term ``a·x̂`` that the paper forgets.) The derivatives of r are zero where none are given; m
-is the relative degree from u to y, the plant's order unless it has zeros. With ``f_L = h + s u`` affine in u the loop through u is solved
-instead of closed a sample late: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``. Where u reaches the plant with a delay, learner, guard
-and observer are told of the u that *acts* (``observers.base.acting_control``): ``f_L = h + s u_acting``. The law is the same then, for when the u
-it finds acts, f will have ``s u`` in it.
+(Gao, ACC 2003; paper eq. (control), which lacks the term ``a·x̂``.) Derivatives of r are zero unless
+they are given; m is the relative degree from u to y, which is the plant's order unless it has zeros.
+The feedforward ``f_L = h + s u`` is affine in u, so the loop through u is solved exactly, without a
+delay of one sample: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``.
+
+If u reaches the plant with a delay, learner, guard and observer receive the u that *acts*
+(``observers.base.acting_control``): ``f_L = h + s u_acting``. The law does not change, because f
+contains ``s u`` when the u of this sample acts.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.controllers.bad_samples import control_at_rest, hold_last_good
 from quell.controllers.base import (
@@ -30,6 +34,7 @@ from quell.controllers.base import (
 from quell.controllers.limits import Limits, apply_limits
 from quell.guard import assess, limit, record_output, reset_filters, write_channels
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.scalars import Scalars, clear
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
 from quell.learners.lag import lag_push
 from quell.observers.base import acting_control, begin, expected_measurement, observe
@@ -39,47 +44,49 @@ _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
 _LEARNER_CUT = int(Status.LEARNER_CUT)
 
-_NOTHING = 1e-200
+# A decaying offset below this is set to zero: arithmetic with denormal numbers (below 2.2e-308) is
+# slow. Any value between that and the rounding error of u gives the same u.
+_SMALLEST_OFFSET = 1e-200
 
-LOOP = 15
-"""Length of ``AdrcState.loop``, whose places are:"""
-(
-    U,  # applied
-    F_LEARNED,  # f_L, as the observer is told
-    _F_SHOWN,  # what Δf̂ will show of it
-    R,  # last good reference
-    Y,  # last measurement, or what was expected in the place of one
-    STARTED,  # whether there was one
-    REFERENCED,  # whether there was a reference
-    STATUS,  # of the last sample
-    CONSTANT,  # h of f_L = h + s u
-    SLOPE,  # s
-    WISHED,  # what the law would apply, limits included
-    MANUAL,  # whether somebody else applies u, and it is
-    MANUAL_U,
-    BUMPLESS,  # whether the next u is to go on from this one
-    OFFSET,  # what is still added for that
-) = range(LOOP)
+
+class AdrcLoop(Scalars):
+    """Scalars of the control loop, kept from one sample to the next."""
+
+    u: float  # Applied control signal
+    f_learned: float  # f_L, as the observer receives it
+    f_learned_shown: float  # f_L^F: the share of f_L that Δf̂ lacks at the next sample
+    r: float  # Last finite reference
+    y: float  # Last finite measurement, or the one that the observer expected
+    started: float  # 1 after the first finite measurement, else 0
+    has_reference: float  # 1 after the first finite reference, else 0
+    status: float  # Status flags of the last sample
+    constant: float  # h of f_L = h + s u
+    slope: float  # s of f_L = h + s u
+    u_limited: float  # Control signal of the law after limits; differs from u in manual operation
+    manual: float  # 1 in manual operation, else 0
+    u_manual: float  # Control signal of manual operation
+    bumpless: float  # 1 if the next u is to continue from the last one, else 0
+    offset: float  # Decaying term that is added to u after a bumpless transfer
 
 
 class AdrcDesign(NamedTuple):
     """Parameters of the controller, for a plant of order n; N = n + 1."""
 
     eso: Any
-    """The observer's model, see ``observers.base``."""
+    """Parameters of the observer, see ``observers.base``."""
     law: Vector
     """k (n,); zero from the relative degree on."""
     cancel: Vector
     """a (n,)."""
     cancel_f: float
-    """1 where f enters as u does, else 0."""
+    """1 if f enters where u enters, else 0."""
     fade: float
-    """What is left a sample later of an offset that avoids a bump."""
+    """Factor of the offset from one sample to the next."""
     b0: float
     limits: Limits
     learner: Any
     lag: Any
-    """How f_L shows in Δf̂; without taps where there is no learner."""
+    """Lag filter of f_L; without taps if there is no learner."""
     guard: Any
 
 
@@ -87,111 +94,114 @@ class AdrcState(NamedTuple):
     """State of the controller."""
 
     z: Vector
-    """The observer's."""
+    """State of the observer."""
     seen: Vector
-    """What the law may know of it (N,)."""
+    """Estimates (x̂_1 … x̂_n, Δf̂) of the observer (N,)."""
     reference: Vector
-    """r', …, r^(m) (m,), zero where they are not given; empty where they are not fed forward."""
-    loop: Vector
-    """(LOOP,)."""
+    """r', …, r^(m) (m,), zero if they are not given; empty without feedforward."""
+    loop: NDArray[AdrcLoop]
+    """(1,)."""
     learner: Any
     shadow: Matrix
-    """The lag filter of f_L (1, …)."""
+    """Lag filter of f_L (1, …)."""
     guard: Any
 
 
 @control.register(AdrcDesign)
 def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
-    loop, seen = state.loop, state.seen
-    status = hold_last_good(loop, R, r, y)
+    loop, seen = state.loop[0], state.seen
+    status = hold_last_good(loop, r, y)
     f_plain = 0.0
-    acted = acting_control(design.eso, state.z, loop[U])
-    if loop[STARTED] == 0.0:
-        begin(design.eso, state.z, seen, loop[Y])
+    u_acting = acting_control(design.eso, state.z, loop.u)
+    if loop.started == 0.0:
+        begin(design.eso, state.z, seen, loop.y)
         if status & _MEASUREMENT_HELD != 0:
-            loop[WISHED] = control_at_rest(design.limits)
-            loop[U] = loop[WISHED] if loop[MANUAL] == 0.0 else loop[MANUAL_U]
-            loop[STATUS] = status
-            return loop[U]
-        loop[STARTED] = 1.0
+            loop.u_limited = control_at_rest(design.limits)
+            loop.u = loop.u_limited if loop.manual == 0.0 else loop.u_manual
+            loop.status = status
+            return loop.u
+        loop.started = 1.0
     else:
-        _conclude(design, state, acted)
+        _finish_sample(design, state, u_acting)
         if status & _MEASUREMENT_HELD != 0:
-            # A y that stands still while the plant moves would be taken for a blow; the expected one tells the observer nothing.
-            y = expected_measurement(design.eso, state.z, loop[U], loop[F_LEARNED])
+            # A held y looks like a disturbance while the plant moves; the expected y does not
+            # change the estimates.
+            y = expected_measurement(design.eso, state.z, loop.u, loop.f_learned)
             if is_finite(y):
-                loop[Y] = y
-        observe(design.eso, state.z, seen, loop[Y], loop[U], loop[F_LEARNED])
-        f_plain = seen[seen.size - 1] + loop[_F_SHOWN]
+                loop.y = y
+        observe(design.eso, state.z, seen, loop.y, loop.u, loop.f_learned)
+        f_plain = seen[seen.size - 1] + loop.f_learned_shown
         assess(design.guard, state.guard, f_plain)
         if status & _MEASUREMENT_HELD == 0:
-            adapt(design.learner, state.learner, seen, loop[Y], acted, f_plain)
+            adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
             status |= trouble(design.learner, state.learner)
-    constant, slope = predict(design.learner, state.learner, seen, acted)
-    constant, slope, cut_off = limit(design.guard, state.guard, f_plain, constant, slope, acted)
-    if cut_off:
+    constant, slope = predict(design.learner, state.learner, seen, u_acting)
+    constant, slope, was_cut = limit(design.guard, state.guard, f_plain, constant, slope, u_acting)
+    if was_cut:
         status |= _LEARNER_CUT
         restart(design.learner, state.learner)
-    wished = unlimited_u(design, state, constant, slope)
-    if not is_finite(wished):
+    unlimited = unlimited_control(design, state, constant, slope)
+    if not is_finite(unlimited):
         status |= _OVERFLOWED
         restart(design.learner, state.learner)
         reset_lag_filters(design, state)
-        begin(design.eso, state.z, seen, loop[Y])
-        constant = slope = loop[OFFSET] = 0.0
-        wished = loop[U]
-    if loop[BUMPLESS] != 0.0:
-        loop[OFFSET] = loop[U] - wished
-        loop[BUMPLESS] = 0.0
-    if loop[OFFSET] != 0.0:
-        wished += loop[OFFSET]
-        # Numbers near the end of the range are slow to calculate with.
-        loop[OFFSET] = loop[OFFSET] * design.fade if abs(loop[OFFSET]) > _NOTHING else 0.0
-    u, cut = apply_limits(design.limits, wished, loop[U])
-    loop[WISHED] = u
-    if loop[MANUAL] == 0.0:
+        begin(design.eso, state.z, seen, loop.y)
+        constant = slope = loop.offset = 0.0
+        unlimited = loop.u
+    if loop.bumpless != 0.0:
+        loop.offset = loop.u - unlimited
+        loop.bumpless = 0.0
+    if loop.offset != 0.0:
+        unlimited += loop.offset
+        loop.offset = loop.offset * design.fade if abs(loop.offset) > _SMALLEST_OFFSET else 0.0
+    u, cut = apply_limits(design.limits, unlimited, loop.u)
+    loop.u_limited = u
+    if loop.manual == 0.0:
         status |= cut
     else:
-        u = loop[MANUAL_U]
-    loop[U] = u
-    loop[CONSTANT], loop[SLOPE] = constant, slope
-    loop[F_LEARNED] = constant + slope * acting_control(design.eso, state.z, u)
-    loop[STATUS] = status
+        u = loop.u_manual
+    loop.u = u
+    loop.constant, loop.slope = constant, slope
+    loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
+    loop.status = status
     return u
 
 
 @kernel
-def _conclude(design: AdrcDesign, state: AdrcState, acted: float) -> None:
-    """Take note of the u that acted since the last sample: only now it is sure that nobody has corrected it."""
-    loop = state.loop
-    f_learned = loop[CONSTANT] + loop[SLOPE] * acted
-    loop[F_LEARNED] = f_learned
-    loop[_F_SHOWN] = lag_push(design.lag, state.shadow, 0, f_learned)
-    commit(design.learner, state.learner, state.seen, acted, f_learned)
+def _finish_sample(design: AdrcDesign, state: AdrcState, u_acting: float) -> None:
+    """Update what depends on the u that acted since the last sample.
+
+    This is done one sample later because ``set_applied_control`` may have corrected u meanwhile.
+    """
+    loop = state.loop[0]
+    f_learned = loop.constant + loop.slope * u_acting
+    loop.f_learned = f_learned
+    loop.f_learned_shown = lag_push(design.lag, state.shadow, 0, f_learned)
+    commit(design.learner, state.learner, state.seen, u_acting, f_learned)
     record_output(design.guard, state.guard, f_learned)
 
 
 @kernel
 def reset_lag_filters(design: AdrcDesign, state: AdrcState) -> None:
-    """Empty the filter of f_L, and the guard's."""
+    """Set the lag filters of f_L and of the guard to zero."""
     reset_filters(design.guard, state.guard)
-    state.loop[_F_SHOWN] = 0.0
+    state.loop[0].f_learned_shown = 0.0
     for i in range(state.shadow.shape[1]):
         state.shadow[0, i] = 0.0
 
 
 @kernel
-def unlimited_u(design: AdrcDesign, state: AdrcState, constant: float, slope: float) -> float:
-    """Return the u that the law wants, before limits, for ``f_L = constant + slope · u``."""
+def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slope: float) -> float:
+    """Return the control signal before limits for ``f_L = constant + slope · u``."""
     seen, reference, order = state.seen, state.reference, design.law.size
-    wished = design.law[0] * state.loop[R] - design.cancel_f * (seen[order] + constant)
+    unlimited = design.law[0] * state.loop[0].r - design.cancel_f * (seen[order] + constant)
     if reference.size > 0:
         for i in range(1, reference.size):
-            wished += design.law[i] * reference[i - 1]
-        wished += reference[reference.size - 1]
+            unlimited += design.law[i] * reference[i - 1]
+        unlimited += reference[reference.size - 1]
     for i in range(order):
-        wished += (design.cancel[i] - design.law[i]) * seen[i]
-    return wished / (design.b0 + design.cancel_f * slope)
+        unlimited += (design.cancel[i] - design.law[i]) * seen[i]
+    return unlimited / (design.b0 + design.cancel_f * slope)
 
 
 @set_reference_derivatives.register(AdrcDesign)
@@ -206,21 +216,20 @@ def _write_row(design: AdrcDesign, state: AdrcState, row: Vector) -> None:
     order = design.law.size
     for i in range(order + 1):
         row[i] = state.seen[i]
-    row[order + 1] = state.loop[F_LEARNED]
-    row[order + 2] = state.loop[STATUS]
-    told = write_channels(design.guard, state.guard, row[order + 3 :])
-    coefficients(design.learner, state.learner, row[order + 3 + told :])
+    row[order + 1] = state.loop[0].f_learned
+    row[order + 2] = state.loop[0].status
+    written = write_channels(design.guard, state.guard, row[order + 3 :])
+    coefficients(design.learner, state.learner, row[order + 3 + written :])
 
 
 @status_flags.register(AdrcDesign)
 def _status_flags(design: AdrcDesign, state: AdrcState) -> int:
-    return int(state.loop[STATUS])
+    return int(state.loop[0].status)
 
 
 @reset_loop.register(AdrcDesign)
 def _reset_loop(design: AdrcDesign, state: AdrcState) -> None:
-    for i in range(state.loop.size):
-        state.loop[i] = 0.0
+    clear(state.loop)
     for i in range(state.reference.size):
         state.reference[i] = 0.0
     reset_lag_filters(design, state)
@@ -229,25 +238,33 @@ def _reset_loop(design: AdrcDesign, state: AdrcState) -> None:
 
 @set_applied_control.register(AdrcDesign)
 def _set_applied_control(design: AdrcDesign, state: AdrcState, u: float) -> None:
-    state.loop[U] = u
+    state.loop[0].u = u
 
 
 @bumpless_transfer.register(AdrcDesign)
 def _bumpless_transfer(design: AdrcDesign, state: AdrcState) -> None:
-    loop = state.loop
-    if loop[STARTED] != 0.0:
-        # Without this offset the law, whose reference is where y is, would already have applied something else.
-        loop[OFFSET] = loop[U] - unlimited_u(design, state, loop[CONSTANT], loop[SLOPE])
+    loop = state.loop[0]
+    if loop.started != 0.0:
+        # u continues from the applied value although the law gives another one.
+        loop.offset = loop.u - unlimited_control(design, state, loop.constant, loop.slope)
 
 
 def law_gains(order: int, omega_c: float) -> Vector:
-    """Return ``k_i = C(n, i−1) omega_c^(n−i+1)``, i = 1 … n: all poles of ``s^n + k_n s^(n−1) + … + k_1`` lie at −omega_c."""
+    """Return the gains ``k_i = C(n, i−1) omega_c^(n−i+1)`` (n,) of order n.
+
+    All poles of ``s^n + k_n s^(n−1) + … + k_1`` lie at −omega_c.
+
+    Raises
+    ------
+    ValueError
+        if a gain is not finite.
+    """
     with np.errstate(over="ignore"):
         gains = np.array(
             [math.comb(order, i) * np.float64(omega_c) ** (order - i) for i in range(order)]
         )
     if not np.all(np.isfinite(gains)):
         raise ValueError(
-            f"omega_c = {omega_c!r} rad/s: its power {order} must be a number; lower omega_c"
+            f"omega_c = {omega_c!r} rad/s: its power {order} must be finite; lower omega_c"
         )
     return gains

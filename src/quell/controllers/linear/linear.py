@@ -6,6 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.bad_samples import control_at_rest, hold_last_good
@@ -14,13 +15,11 @@ from quell.controllers.limits import Limits, apply_limits, checked_limits
 from quell.controllers.linear.law import LinearLaw, checked_law, rest_state
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.scalars import Scalars, clear
 from quell.types import Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
-
-# Places in LinearState.loop.
-_U, _WISHED, _R, _Y, _STARTED, _REFERENCED, _STATUS = range(7)
 
 
 class LinearDesign(NamedTuple):
@@ -32,6 +31,18 @@ class LinearDesign(NamedTuple):
     limits: Limits
 
 
+class LinearLoop(Scalars):
+    """Scalars of the control loop, kept from one sample to the next."""
+
+    u: float  # Applied control signal
+    u_unlimited: float  # Control signal of the law before limits
+    r: float  # Last finite reference
+    y: float  # Last finite measurement
+    started: float  # 1 after the first finite measurement, else 0
+    has_reference: float  # 1 after the first finite reference, else 0
+    status: float  # Status flags of the last sample
+
+
 class LinearState(NamedTuple):
     """State of the controller."""
 
@@ -39,8 +50,8 @@ class LinearState(NamedTuple):
     """The law's state (m,)."""
     next: Vector
     """Room for the one after it (m,)."""
-    loop: Vector
-    """(7,): u applied, u wished, last good r and y, whether there was a good y, whether a good r, status."""
+    loop: NDArray[LinearLoop]
+    """(1,)."""
 
 
 @kernel
@@ -51,60 +62,59 @@ def _start(design: LinearDesign, state: LinearState, y: float) -> None:
 
 @control.register(LinearDesign)
 def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> float:
-    law, x, loop = design.law, state.x, state.loop
-    status = hold_last_good(loop, _R, r, y)
-    if loop[_STARTED] == 0.0:
+    law, x, loop = design.law, state.x, state.loop[0]
+    status = hold_last_good(loop, r, y)
+    if loop.started == 0.0:
         if status & _MEASUREMENT_HELD != 0:
-            loop[_U] = loop[_WISHED] = control_at_rest(design.limits)
-            loop[_STATUS] = status
-            return loop[_U]
-        _start(design, state, loop[_Y])
-        loop[_STARTED] = 1.0
-    wished = law.D_r * loop[_R] + law.D_y * loop[_Y]
+            loop.u = loop.u_unlimited = control_at_rest(design.limits)
+            loop.status = status
+            return loop.u
+        _start(design, state, loop.y)
+        loop.started = 1.0
+    wished = law.D_r * loop.r + law.D_y * loop.y
     for i in range(x.size):
         wished += law.C[i] * x[i]
     if not is_finite(wished):
         status |= _OVERFLOWED
-        _start(design, state, loop[_Y])
-        wished = loop[_U]
-    u, cut = apply_limits(design.limits, wished, loop[_U])
+        _start(design, state, loop.y)
+        wished = loop.u
+    u, cut = apply_limits(design.limits, wished, loop.u)
     for i in range(x.size):
-        total = law.B_r[i] * loop[_R] + law.B_y[i] * loop[_Y] + law.B_u[i] * u
+        total = law.B_r[i] * loop.r + law.B_y[i] * loop.y + law.B_u[i] * u
         for j in range(x.size):
             total += law.A[i, j] * x[j]
         state.next[i] = total
     for i in range(x.size):
         x[i] = state.next[i]
-    loop[_U] = u
-    loop[_WISHED] = wished
-    loop[_STATUS] = status | cut
+    loop.u = u
+    loop.u_unlimited = wished
+    loop.status = status | cut
     return u
 
 
 @write_row.register(LinearDesign)
 def _write_row(design: LinearDesign, state: LinearState, row: Vector) -> None:
-    row[0] = state.loop[_WISHED]
-    row[1] = state.loop[_STATUS]
+    row[0] = state.loop[0].u_unlimited
+    row[1] = state.loop[0].status
 
 
 @status_flags.register(LinearDesign)
 def _status_flags(design: LinearDesign, state: LinearState) -> int:
-    return int(state.loop[_STATUS])
+    return int(state.loop[0].status)
 
 
 @reset_loop.register(LinearDesign)
 def _reset_loop(design: LinearDesign, state: LinearState) -> None:
-    for i in range(state.loop.size):
-        state.loop[i] = 0.0
+    clear(state.loop)
 
 
 @set_applied_control.register(LinearDesign)
 def _set_applied_control(design: LinearDesign, state: LinearState, u: float) -> None:
     # The law's state went on with the u that was returned.
-    correction = u - state.loop[_U]
+    correction = u - state.loop[0].u
     for i in range(state.x.size):
         state.x[i] += design.law.B_u[i] * correction
-    state.loop[_U] = u
+    state.loop[0].u = u
 
 
 class LinearController(StatefulController):
@@ -229,9 +239,9 @@ class LinearController(StatefulController):
     def initial_state(self) -> LinearState:
         """Return a state before the first sample."""
         size = self.law.C.size
-        return LinearState(np.zeros(size), np.zeros(size), np.zeros(7))
+        return LinearState(np.zeros(size), np.zeros(size), LinearLoop.zeros())
 
     @property
     def status(self) -> Status:
         """What the last step had to report."""
-        return Status(int(self._state.loop[_STATUS]))
+        return Status(int(self._state.loop[0].status))

@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.handover import manual_operation
-from quell.controllers.adrc.law import WISHED, U
 from quell.controllers.base import (
     bumpless_transfer,
     control,
@@ -29,13 +29,11 @@ from quell.controllers.base import (
 from quell.controllers.limits import Limits
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import generic, is_finite
+from quell.kernels.scalars import Scalars, clear
 from quell.observers.eso import ESO
 from quell.types import Status, Vector
 
 _REFERENCE_HELD = int(Status.REFERENCE_HELD)
-
-# Places in PrefilteredState.loop.
-_SHAPED, _R, _STARTED, _REFERENCED, _STATUS = range(5)
 
 
 class Prefilter(Protocol):
@@ -78,6 +76,16 @@ class PrefilteredDesign(NamedTuple):
     prefilter: Any
 
 
+class PrefilteredLoop(Scalars):
+    """Scalars of the prefilter, kept from one sample to the next."""
+
+    r_shaped: float  # Reference that the controller received
+    r: float  # Last finite reference
+    started: float  # 1 after the first finite measurement, else 0
+    has_reference: float  # 1 after the first finite reference, else 0
+    status: float  # Status flags of the prefilter in the last sample
+
+
 class PrefilteredState(NamedTuple):
     """State of a controller behind a prefilter."""
 
@@ -85,47 +93,46 @@ class PrefilteredState(NamedTuple):
     prefilter: Any
     derivatives: Vector
     """Of the shaped reference, as many as the prefilter knows."""
-    loop: Vector
-    """(5,): shaped reference, last good r, whether there was a good y, whether a good r, status of the prefilter."""
+    loop: NDArray[PrefilteredLoop]
+    """(1,)."""
 
 
 @control.register(PrefilteredDesign)
 def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: float) -> float:
-    loop = state.loop
-    loop[_STATUS] = 0.0
-    if loop[_STARTED] == 0.0 and is_finite(y):
+    loop = state.loop[0]
+    loop.status = 0.0
+    if loop.started == 0.0 and is_finite(y):
         settle(design.prefilter, state.prefilter, y)
-        loop[_STARTED] = 1.0
+        loop.started = 1.0
     if is_finite(r):
-        loop[_R] = r
-        loop[_REFERENCED] = 1.0
+        loop.r = r
+        loop.has_reference = 1.0
     else:
-        loop[_STATUS] = _REFERENCE_HELD
+        loop.status = _REFERENCE_HELD
     shaped = r
-    if loop[_STARTED] != 0.0 and loop[_REFERENCED] != 0.0:
-        shaped = prefilter(design.prefilter, state.prefilter, loop[_R])
+    if loop.started != 0.0 and loop.has_reference != 0.0:
+        shaped = prefilter(design.prefilter, state.prefilter, loop.r)
         if state.derivatives.size > 0:
             slopes(design.prefilter, state.prefilter, state.derivatives)
             set_reference_derivatives(design.controller, state.controller, state.derivatives)
-    loop[_SHAPED] = shaped if is_finite(shaped) else y
+    loop.r_shaped = shaped if is_finite(shaped) else y
     return control(design.controller, state.controller, shaped, y)
 
 
 @write_row.register(PrefilteredDesign)
 def _write_row(design: PrefilteredDesign, state: PrefilteredState, row: Vector) -> None:
-    row[0] = state.loop[_SHAPED]
+    row[0] = state.loop[0].r_shaped
     write_row(design.controller, state.controller, row[1:])
 
 
 @status_flags.register(PrefilteredDesign)
 def _status_flags(design: PrefilteredDesign, state: PrefilteredState) -> int:
-    return status_flags(design.controller, state.controller) | int(state.loop[_STATUS])
+    return status_flags(design.controller, state.controller) | int(state.loop[0].status)
 
 
 @reset_loop.register(PrefilteredDesign)
 def _reset_loop(design: PrefilteredDesign, state: PrefilteredState) -> None:
-    for i in range(state.loop.size):
-        state.loop[i] = 0.0
+    clear(state.loop)
     reset_loop(design.controller, state.controller)
 
 
@@ -213,15 +220,15 @@ class Prefiltered(StatefulController):
         self._hands_over.start(y, u, r)
         state = self._state
         settle(self.parameters.prefilter, state.prefilter, float(y))
-        state.loop[_STARTED] = state.loop[_REFERENCED] = 1.0
-        state.loop[_R] = float(y if r is None else r)
+        state.loop[0].started = state.loop[0].has_reference = 1.0
+        state.loop[0].r = float(y if r is None else r)
 
     def track(self, r: float, y: float, u: float) -> float:
         """Take one sample in manual operation, see ``ADRC.track``."""
         state = self._adrc._state
         with manual_operation(state, checks.finite("u", u)):
             self.step(r, y)
-        return float(state.loop[WISHED])
+        return float(state.loop[0].u_limited)
 
     def hand_over(self) -> None:
         """End manual operation, see ``ADRC.hand_over``."""
@@ -229,7 +236,7 @@ class Prefiltered(StatefulController):
 
     def increment(self, r: float, y: float) -> float:
         """Take one sample and return the change of the control signal, see ``ADRC.increment``."""
-        before = float(self._adrc._state.loop[U])
+        before = float(self._adrc._state.loop[0].u)
         return self.step(r, y) - before
 
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
@@ -274,7 +281,7 @@ class Prefiltered(StatefulController):
             self.controller.initial_state(),
             self.prefilter.memory(self.parameters.prefilter),
             np.zeros(known),
-            np.zeros(5),
+            PrefilteredLoop.zeros(),
         )
 
     @property

@@ -1,0 +1,30 @@
+"""Guard: the authority of a learner.
+
+May import ``learners`` and what they import.
+"""
+
+from quell.guard.base import (
+    GUARD_CHANNELS,
+    UnguardedDesign,
+    UnguardedMemory,
+    assess,
+    limit,
+    record_output,
+    reset_filters,
+    write_channels,
+)
+from quell.guard.guard import Guard
+from quell.guard.reason import Reason
+
+__all__ = [
+    "GUARD_CHANNELS",
+    "Guard",
+    "Reason",
+    "UnguardedDesign",
+    "UnguardedMemory",
+    "assess",
+    "limit",
+    "record_output",
+    "reset_filters",
+    "write_channels",
+]
