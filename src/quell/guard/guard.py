@@ -104,8 +104,8 @@ class GuardAverages(Scalars):
     qq: float  # m_qq
     qp: float  # m_qp
     pp: float  # m_pp
-    error_plain: float  # Mean square of q [(y-unit/s^n)²]
-    error_learned: float  # Mean square of q − p [(y-unit/s^n)²]
+    error_plain: float  # mean square of q [(y-unit/s^n)²]
+    error_learned: float  # mean square of q − p [(y-unit/s^n)²]
 
 
 class GuardSample(Scalars):
@@ -116,7 +116,7 @@ class GuardSample(Scalars):
     output: float  # g [y-unit/s^n]
     f_learned: float  # f_L [y-unit/s^n]
     reason: float  # A ``Reason``
-    samples: float  # Number of samples so far
+    samples: float  # number of samples so far
 
 
 class GuardMemory(NamedTuple):

@@ -52,21 +52,21 @@ _SMALLEST_OFFSET = 1e-200
 class AdrcLoop(Scalars):
     """Scalars of the control loop, kept from one sample to the next."""
 
-    u: float  # Applied control signal
+    u: float  # applied control signal
     f_learned: float  # f_L, as the observer receives it
     f_learned_shown: float  # f_L^F: the share of f_L that Δf̂ lacks at the next sample
-    r: float  # Last finite reference
-    y: float  # Last finite measurement, or the one that the observer expected
+    r: float  # last finite reference
+    y: float  # last finite measurement, or the one that the observer expected
     started: float  # 1 after the first finite measurement, else 0
     has_reference: float  # 1 after the first finite reference, else 0
-    status: float  # Status flags of the last sample
+    status: float  # status flags of the last sample
     constant: float  # h of f_L = h + s u
     slope: float  # s of f_L = h + s u
-    u_limited: float  # Control signal of the law after limits; differs from u in manual operation
+    u_limited: float  # control signal of the law after limits; differs from u in manual operation
     manual: float  # 1 in manual operation, else 0
-    u_manual: float  # Control signal of manual operation
+    u_manual: float  # control signal of manual operation
     bumpless: float  # 1 if the next u is to continue from the last one, else 0
-    offset: float  # Decaying term that is added to u after a bumpless transfer
+    offset: float  # decaying term that is added to u after a bumpless transfer
 
 
 class AdrcDesign(NamedTuple):

@@ -34,13 +34,13 @@ class LinearDesign(NamedTuple):
 class LinearLoop(Scalars):
     """Scalars of the control loop, kept from one sample to the next."""
 
-    u: float  # Applied control signal
-    u_unlimited: float  # Control signal of the law before limits
-    r: float  # Last finite reference
-    y: float  # Last finite measurement
+    u: float  # applied control signal
+    u_unlimited: float  # control signal of the law before limits
+    r: float  # last finite reference
+    y: float  # last finite measurement
     started: float  # 1 after the first finite measurement, else 0
     has_reference: float  # 1 after the first finite reference, else 0
-    status: float  # Status flags of the last sample
+    status: float  # status flags of the last sample
 
 
 class LinearState(NamedTuple):

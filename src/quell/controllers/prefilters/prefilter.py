@@ -79,11 +79,11 @@ class PrefilteredDesign(NamedTuple):
 class PrefilteredLoop(Scalars):
     """Scalars of the prefilter, kept from one sample to the next."""
 
-    r_shaped: float  # Reference that the controller received
-    r: float  # Last finite reference
+    r_shaped: float  # reference that the controller received
+    r: float  # last finite reference
     started: float  # 1 after the first finite measurement, else 0
     has_reference: float  # 1 after the first finite reference, else 0
-    status: float  # Status flags of the prefilter in the last sample
+    status: float  # status flags of the prefilter in the last sample
 
 
 class PrefilteredState(NamedTuple):
