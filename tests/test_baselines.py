@@ -328,7 +328,7 @@ WASHED_OUT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [0.0,
         ),
         (
             lambda: equivalent_pid(ql.ADRC(ql.ESO.model_based(LAG, 10.0, 0.01), 1.0)),
-            "controller has an observer that knows a model",
+            "controller has an observer with a model",
         ),
         (
             lambda: equivalent_pid(

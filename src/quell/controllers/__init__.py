@@ -1,4 +1,8 @@
-"""Controllers: what makes a control signal of a reference and a measurement."""
+"""Controllers: from reference and measurement to the control signal.
+
+Files of this folder itself are the base of ``adrc``, ``linear``, ``prefilters`` and ``baselines``.
+May import ``guard``, ``learners``, ``plants``, ``observers`` and what they import.
+"""
 
 from quell.controllers import baselines
 from quell.controllers.adrc.adrc import ADRC

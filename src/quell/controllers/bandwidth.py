@@ -1,4 +1,4 @@
-"""From a wish to a bandwidth."""
+"""The controller bandwidth for a given settling time."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from quell import checks
 def omega_c_for(settling_time: float, order: int, band: float = 0.02) -> float:
     """Return the controller bandwidth with which the ideal loop settles in a given time.
 
-    The ideal loop ``omega_c^n / (s + omega_c)^n`` answers to a unit step with the regularised incomplete gamma function ``P(n, omega_c
-    t)``, which rises without overshoot, so it is in the band for good where ``P(n, omega_c t) = 1 − band``. For 2 % and n = 1, 2 that is
-    3.91/t and 5.83/t, which Herbst (*Electronics* 2, 2013) rounds to 4/t and 6/t. A real loop, with an observer and a plant other than
-    its model, differs.
+    The unit step response of the ideal loop ``omega_c^n / (s + omega_c)^n`` is the regularised
+    incomplete gamma function ``P(n, omega_c t)``. It rises without overshoot, so the loop settles
+    when ``P(n, omega_c t) = 1 − band``. For 2 % and n = 1, 2 that is 3.91/t and 5.83/t, which Herbst
+    (*Electronics* 2, 2013) rounds to 4/t and 6/t. A real loop, with an observer and a plant that
+    differs from its model, settles in another time.
 
     Parameters
     ----------
     settling_time
-        after which y stays in the band [s].
+        time after which y stays in the band [s].
     order
         order n of the plant.
     band
@@ -39,11 +40,8 @@ def omega_c_for(settling_time: float, order: int, band: float = 0.02) -> float:
     """
     from scipy.special import gammainccinv
 
-    settling_time, order, band = (
-        checks.positive("settling_time", settling_time, "s"),
-        checks.whole("order", order, 1),
-        checks.positive("band", band),
-    )
-    if not band < 1.0:
+    settling_time = checks.positive("settling_time", settling_time, "s")
+    order = checks.whole("order", order, 1)
+    if not checks.positive("band", band) < 1.0:
         raise ValueError(f"band = {band!r}: must be below 1, it is a fraction of the step")
     return float(gammainccinv(order, band)) / settling_time

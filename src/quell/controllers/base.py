@@ -1,8 +1,9 @@
-"""What the driver asks of a controller.
+"""The interface of a controller to the simulation and to the real-time loop.
 
-A controller is an object with ``dt``, ``parameters`` (a NamedTuple), ``initial_state()`` (a NamedTuple of arrays) and ``channels`` (the
-names of what it reports). For the type of its parameters the functions below are registered. A controller that wants derivatives of the
-reference says how many with ``derivatives``.
+A controller is an object with ``dt``, ``parameters`` (a NamedTuple), ``initial_state()`` (a
+NamedTuple of arrays) and ``channels`` (names and widths of what it records). The functions below
+are registered for the type of its parameters. A controller that uses derivatives of the reference
+has their number as ``derivatives``.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from quell.types import Vector
 
 
 class Controller(Protocol):
-    """The part of a controller that the driver uses."""
+    """The part of a controller that simulation and real-time loop use."""
 
     @property
     def dt(self) -> float:
@@ -22,15 +23,15 @@ class Controller(Protocol):
 
     @property
     def parameters(self) -> Any:
-        """What the compiled functions need, a NamedTuple."""
+        """Parameters of the compiled functions, a NamedTuple."""
 
     @property
     def features(self) -> tuple[str, ...]:
-        """What the entries of the channel ``theta`` multiply, where there is one."""
+        """Names of the features whose coefficients the channel ``theta`` holds; empty without it."""
 
     @property
     def channels(self) -> tuple[tuple[str, int], ...]:
-        """Name and width of what ``report`` writes, in order."""
+        """Name and width of each recorded channel, in order."""
 
     def initial_state(self) -> Any:
         """Return the state before the first sample: a NamedTuple of arrays."""
@@ -44,13 +45,13 @@ def check_controller(value: Any, name: str = "controller") -> None:
 
 @generic
 def control(controller: Any, state: Any, r: float, y: float) -> float:
-    """Take one sample: the control signal to apply for the reference ``r`` and the measurement ``y``."""
+    """Take one sample: return the control signal for reference ``r`` and measurement ``y``."""
     raise TypeError
 
 
 @generic
 def set_reference_derivatives(controller: Any, state: Any, derivatives: Vector) -> None:
-    """Take note of the reference's derivatives r', r'', … for the next sample; a controller without use for them does nothing."""
+    """Set r', r'', … for the next sample; ignored by a controller that does not use them."""
     raise TypeError
 
 
@@ -61,7 +62,7 @@ def _ignore_reference_derivatives(controller: Any, state: Any, derivatives: Vect
 
 @generic
 def write_row(controller: Any, state: Any, row: Vector) -> None:
-    """Write what the controller knows, as its ``channels`` say, into ``row``."""
+    """Write the controller's ``channels`` into ``row``."""
     raise TypeError
 
 
@@ -73,28 +74,30 @@ def status_flags(controller: Any, state: Any) -> int:
 
 @generic
 def reset_loop(controller: Any, state: Any) -> None:
-    """Start from rest at the next sample, with what was learned."""
+    """Start from rest at the next sample; what was learned is kept."""
     raise TypeError
 
 
 @generic
 def set_applied_control(controller: Any, state: Any, u: float) -> None:
-    """Say that ``u`` is applied until the next sample, not what the last ``control`` returned.
+    """Replace the control signal of the last ``control`` by the applied ``u``.
 
-    A controller with wide limits that is told of narrower ones, sample after sample, is the controller with the narrower limits.
+    A controller with wide limits that receives, in every sample, what narrower limits leave of its
+    control signal is equal to a controller with those narrower limits.
     """
     raise TypeError
 
 
 @generic
 def bumpless_transfer(controller: Any, state: Any) -> None:
-    """Take over at the next sample from whoever applied u until now: u goes on from there as if the loop had been at rest.
+    """Continue from the applied u at the next sample, as if the loop had been at rest until now.
 
-    Where the reference then is elsewhere, it is a step of the reference. A controller that follows the applied u by itself does nothing.
+    If the reference differs from y, the difference acts as a step of the reference. A controller
+    whose state always follows the applied u needs no implementation.
     """
     raise TypeError
 
 
 @bumpless_transfer.register(object)
-def _follows_by_itself(controller: Any, state: Any) -> None:
+def _follows_applied_control(controller: Any, state: Any) -> None:
     pass

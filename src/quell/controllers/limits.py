@@ -1,4 +1,4 @@
-"""What an actuator does to a control signal, and how the controller knows."""
+"""Limits of the control signal."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _RATE_LIMITED = int(Status.RATE_LIMITED)
 
 
 class Limits(NamedTuple):
-    """Magnitude and rate limits; infinite where there is none."""
+    """Magnitude and rate limits; infinite if there are none."""
 
     low: float
     high: float
     most_change: float
-    """In a sample."""
+    """Largest change in a sample."""
 
 
 def checked_limits(u_min: Any, u_max: Any, rate_limit: Any, dt: float) -> Limits:
@@ -31,10 +31,10 @@ def checked_limits(u_min: Any, u_max: Any, rate_limit: Any, dt: float) -> Limits
 
 
 @kernel
-def apply_limits(limits: Limits, wished: float, before: float) -> tuple[float, int]:
-    """Return the control signal that can be applied after ``before``, and the status flags of what was cut."""
+def apply_limits(limits: Limits, unlimited: float, before: float) -> tuple[float, int]:
+    """Return the control signal that is possible after ``before``, and the status flags."""
     status = 0
-    applied = wished
+    applied = unlimited
     if applied > before + limits.most_change:
         applied = before + limits.most_change
         status = _RATE_LIMITED

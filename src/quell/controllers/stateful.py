@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.base import set_applied_control
-from quell.controllers.compiled_step import entry_point, pack, step_packed
+from quell.controllers.compiled_step import PackedController, entry_point, step_packed
 from quell.controllers.limits import Limits
 from quell.kernels.dispatch import dispatcher_for
 from quell.kernels.user_types import explain_compile_errors
@@ -47,7 +47,7 @@ class StatefulController:
     def _pack_again(self) -> None:
         """Update the arguments of the compiled step after a change of the parameters."""
         if self._packed is not None:
-            self._packed = pack(self.parameters, self._state)
+            self._packed = PackedController(self.parameters, self._state)
 
     def _update_parameters(self) -> None:
         raise NotImplementedError
@@ -59,10 +59,10 @@ class StatefulController:
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
         dispatcher = dispatcher_for(step_packed, self.parameters)
-        self._packed = pack(self.parameters, self._state)
+        self._packed = PackedController(self.parameters, self._state)
         # The first call runs on another state, because it must not count as a sample.
         with explain_compile_errors(self.parameters):
-            dispatcher(pack(self.parameters, self.initial_state()), 0.0, 0.0)
+            dispatcher(PackedController(self.parameters, self.initial_state()), 0.0, 0.0)
         self._step = entry_point(dispatcher, self._packed, 0.0, 0.0)
 
     def step(self, r: float, y: float) -> float:

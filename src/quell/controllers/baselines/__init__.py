@@ -1,4 +1,7 @@
-"""What a practitioner would compare ADRC with, each with its usual design rule and its source."""
+"""Common controllers to compare ADRC with, each with its usual design rule and its source.
+
+May import ``controllers`` with ``adrc``, ``linear`` and ``prefilters``, and what they import.
+"""
 
 from quell.controllers.baselines.equivalent import equivalent_pid
 from quell.controllers.baselines.lqg import LQG

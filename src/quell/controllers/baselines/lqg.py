@@ -7,11 +7,11 @@
 (Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, sections 8.5 and 9; observer_law.py has the filter.) The cost
 is sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23, 1978) and K comes from its Riccati equation.
 
-Weights from two bandwidths: where u reaches y through ν integrators with the gain b, cheap control puts ν poles of the loop in a
-Butterworth pattern of radius ``(b²/ρ)^(1/(2ν))``, and the rest to the plant's zeros; with a random walk of density q at the input and
-measurement noise of density v the filter's N − (n − ν) fast poles have the radius ``(q b²/v)^(1/(2(ν + 1)))`` (Kwakernaak & Sivan,
-*Linear Optimal Control Systems*, 1972, sections 3.8 and 4.4). So ``ρ = b²/omega_c^(2ν)`` and ``q b²/v = omega_o^(2(ν+1))``: for a chain
-of integrators exact, else where both are above the plant's own frequencies.
+The weights follow from two bandwidths. If u reaches y through ν integrators with the gain b, cheap control places ν poles of the loop in
+a Butterworth pattern of radius ``(b²/ρ)^(1/(2ν))``, and the others at the plant's zeros. With a random walk of density q at the input
+and measurement noise of density v the filter's N − (n − ν) fast poles have the radius ``(q b²/v)^(1/(2(ν + 1)))`` (Kwakernaak & Sivan,
+*Linear Optimal Control Systems*, 1972, sections 3.8 and 4.4). So ``ρ = b²/omega_c^(2ν)`` and ``q b²/v = omega_o^(2(ν+1))``: exact for a
+chain of integrators, else valid for bandwidths above the plant's own frequencies.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ class LQG(LinearController):
     Parameters
     ----------
     plant
-        whatever ``LinearPlant.of`` takes; it says which are the states of a transfer function.
+        anything that ``LinearPlant.of`` takes, which defines the states of a transfer function.
     omega_c, omega_o
-        bandwidths of state feedback and filter [rad/s], from which the weights come.
+        bandwidths of state feedback and filter [rad/s], which set the weights.
     dt
         sample time [s].
     Q
         (n, n), symmetric, weight of the state in place of ``C'C`` [1/s of cost].
     rho
-        weight of u² in place of that from ``omega_c``.
+        weight of u², instead of the one from ``omega_c``.
     process_noise
-        (n, n), symmetric, density of white noise on the state's derivatives, besides that of the disturbance's, as a multiple of the
-        density of the measurement's noise [(state-unit/s)²/y-unit²]; none by default. Only the ratio of the two counts.
+        (n, n), symmetric, density of white noise on the state's derivatives, in addition to that of the disturbance, relative to the
+        density of the measurement noise [(state-unit/s)²/y-unit²]; none by default.
     u_min, u_max, rate_limit, name
         as for ``LinearController``.
 
@@ -68,7 +68,7 @@ class LQG(LinearController):
     ------
     ValueError
         for a plant that is not stabilisable from u or not detectable from y, or has a zero at s = 0 (a constant disturbance
-        then does not show in y), and for numbers out of range.
+        then has no effect on y), and for numbers out of range.
 
     Examples
     --------
@@ -93,11 +93,8 @@ class LQG(LinearController):
         linear = LinearPlant.of(plant)
         A, B, C = linear.A, linear.B, linear.C
         n = A.shape[0]
-        omega_c, omega_o = (
-            checks.positive("omega_c", omega_c, "rad/s"),
-            checks.positive("omega_o", omega_o, "rad/s"),
-        )
-        dt = checks.positive("dt", dt, "s")
+        omega_c = checks.positive("omega_c", omega_c, "rad/s")
+        omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         check_reachable(A, B, "plant is not stabilisable from u")
         check_reachable(A.T, C.T, "plant is not detectable from y")
         _check_zero(A, B, C)
@@ -109,33 +106,29 @@ class LQG(LinearController):
         weight = C.T @ C if Q is None else checks.weight("Q", Q, n)
         self.K = _state_gain(A, B, weight, rho, dt)
         self.model = with_disturbance(A, B, C, B, dt)
-        # Densities become variances a sample: that of y over dt, that of the walk times dt; only their ratio counts.
+        # From densities to variances per sample: that of y divided by dt, that of the walk times dt.
         W = np.zeros((n + 1, n + 1))
         W[n, n] = dt * omega_o ** (2 * (degree + 1)) / b**2
         if process_noise is not None:
             W[:n, :n] = gramian(A, checks.weight("process_noise", process_noise, n), dt)
         self.L = stationary_gain(self.model, W, 1.0 / dt)
         phi, gamma = self.model.F[:n, :n], self.model.G[:n]
-        self.N = 1.0 / float(
-            C[0] @ np.linalg.solve(np.eye(n) - phi + np.outer(gamma, self.K), gamma)
-        )
-        super().__init__(
-            feedback_law(self.model, self.L, np.append(self.K, 1.0), self.N),
-            dt,
-            **({"name": "LQG"} | options),
-        )
+        closed_loop = np.eye(n) - phi + np.outer(gamma, self.K)
+        self.N = 1.0 / float(C[0] @ np.linalg.solve(closed_loop, gamma))
+        law = feedback_law(self.model, self.L, np.append(self.K, 1.0), self.N)
+        super().__init__(law, dt, **({"name": "LQG"} | options))
 
 
 def _check_zero(A: Matrix, B: Matrix, C: Matrix) -> None:
     singular = np.linalg.svd(np.block([[A, B], [C, np.zeros((1, 1))]]), compute_uv=False)
-    if singular[-1] <= 1e-12 * singular[0]:
+    if singular[-1] <= 1e-12 * singular[0]:  # singular, to rounding
         raise ValueError(
-            "plant has a zero at s = 0: a constant disturbance does not show in y, nor can y be held at a reference"
+            "plant has a zero at s = 0: a constant disturbance has no effect on y, and y cannot follow a constant reference"
         )
 
 
 def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vector:
-    """Return K (n,) of the sampled regulator whose cost is the integral of ``x'Qx + ρ u²``, u held over a sample."""
+    """Return K (n,) of the sampled regulator with the cost ``∫ x'Qx + ρ u² dt``, u held over a sample."""
     from scipy.linalg import solve_discrete_are
 
     n = A.shape[0]
@@ -149,7 +142,7 @@ def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vecto
         P = solve_discrete_are(phi, gamma, sampled[:n, :n], R, s=S)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ValueError(
-            f"no stabilising state feedback: {error}; every mode that does not fade must show in Q"
+            f"no stabilising state feedback: {error}; Q must weight every mode that does not decay"
         ) from None
     gain: Vector = np.linalg.solve(R + gamma.T @ P @ gamma, gamma.T @ P @ phi + S.T)[0]
     return gain

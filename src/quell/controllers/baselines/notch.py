@@ -5,9 +5,8 @@
     N(s) = (s² + 2 ζ_z ω s + ω²) / (s² + 2 ζ_p ω s + ω²),      |N(jω)| = ζ_z/ζ_p = depth,      −3 dB over about  2 ζ_p ω = width · ω
 
 (Ellis, *Control System Design Guide*, 4th ed. 2012, chapter 9; Vukosavić & Stojić, *IEEE Trans. Industrial Electronics* 45, 1998, for
-drives with torsional resonance.) The filter takes the resonance out of the loop and leaves its damping alone: a plant without friction
-goes on swinging after whatever has set it off from outside. Its lag at low frequencies is that of a delay ``2 (ζ_p − ζ_z)/ω``, which a
-tuning rule has to be told.
+drives with torsional resonance.) The filter removes the resonance from the loop and does not damp it: a plant without friction keeps
+swinging after a disturbance. At low frequencies the filter acts as a delay ``2 (ζ_p − ζ_z)/ω``, which a tuning rule must include.
 """
 
 from __future__ import annotations
@@ -33,16 +32,16 @@ class Notch(NamedTuple):
 
     @classmethod
     def at(cls, omega: float, *, depth: float = 0.1, width: float = 1.0) -> Notch:
-        """Return the notch at ``omega`` [rad/s] that lets ``depth`` of the amplitude through, about ``width · omega`` wide at −3 dB.
+        """Return the notch at ``omega`` with the gain ``depth``, about ``width · omega`` wide at −3 dB.
 
-        The less is known of the resonance, the wider; the wider, the more lag below.
+        A wider notch tolerates a larger error of the resonance and has more lag at low frequencies.
 
         Parameters
         ----------
         omega
             centre [rad/s].
         depth
-            share of the amplitude that passes at the centre, from 0 to below 1.
+            gain at the centre, from 0 to below 1.
         width
             as a share of ``omega``, greater than zero.
 
@@ -54,14 +53,12 @@ class Notch(NamedTuple):
         omega, width = checks.positive("omega", omega, "rad/s"), checks.positive("width", width)
         depth = checks.non_negative("depth", depth)
         if depth >= 1.0:
-            raise ValueError(
-                f"depth = {depth!r}: must be below 1, the share of the amplitude that passes at the centre"
-            )
+            raise ValueError(f"depth = {depth!r}: must be below 1, it is the gain at the centre")
         return cls(omega, 0.5 * depth * width, 0.5 * width)
 
     @property
     def delay(self) -> float:
-        """The delay that it is to low frequencies [s]."""
+        """Equivalent delay at low frequencies [s]."""
         return 2.0 * (self.pole_damping - self.zero_damping) / self.omega
 
     def polynomials(self) -> tuple[list[float], list[float]]:
@@ -74,9 +71,9 @@ class Notch(NamedTuple):
 
 
 class NotchPID(PID):
-    """A PID controller in series with a notch filter, on both its paths; PI + notch with ``kd = 0``.
+    """A PID controller in series with a notch filter; PI + notch with ``kd = 0``.
 
-    It is sampled by Tustin's rule, with the notch where it belongs (prewarped there).
+    It is sampled by Tustin's rule, prewarped at the notch.
 
     Parameters
     ----------
@@ -88,7 +85,7 @@ class NotchPID(PID):
     Raises
     ------
     ValueError
-        as ``PID``, for a notch above half the sampling rate, and for what is no notch.
+        as ``PID``, for a notch above half the sampling rate, and for anything but a notch.
 
     Examples
     --------
@@ -115,12 +112,11 @@ class NotchPID(PID):
             )
         self.notch = notch
         self._prewarp = notch.omega
-        super().__init__(
-            kp, ki, kd, dt=dt, **({"name": "PID + notch" if kd else "PI + notch"} | options)
-        )
+        options = {"name": "PID + notch" if kd else "PI + notch"} | options
+        super().__init__(kp, ki, kd, dt=dt, **options)
 
     def polynomials(self) -> tuple[list[Any], Any]:
-        """Return the numerators from r and from y, and the denominator that they share, in s, highest power first."""
+        """Return the numerators from r and from y and their common denominator, see ``PID``."""
         numerators, denominator = super().polynomials()
         zeros, poles = self.notch.polynomials()
         return [np.polymul(part, zeros) for part in numerators], np.polymul(denominator, poles)

@@ -1,16 +1,16 @@
-"""State feedback of an observer with a disturbance at the plant's input or elsewhere, as one linear law.
+"""State feedback of an observer with a disturbance state, as one linear law.
 
 The sampled plant with a disturbance that is a random walk, z = (x, d)::
 
     z⁺ = F z + G u,    F = [[Φ, Γ_d], [0, 1]],    G = [Γ; 0],    y = H z = C x
 
-Kalman filter in its current form, as the observers of this package, told the u that was applied, and state feedback::
+A Kalman filter in its current form, as the observers of this package, driven by the applied u, and state feedback::
 
     z  = z⁻ + L (y − H z⁻),     L = P H' (H P H' + V)⁻¹,     P from the Riccati equation of (F', H', W, V)
     u  = N r − K z,             z⁻⁺ = F z + G u
 
-Where the innovation is zero at rest, so is ``y − r``, whatever the plant and the disturbance are: d̂ acts as integral action. As it is
-told the applied u, it does not wind up.
+At rest the innovation is zero, and therefore ``y − r`` is zero for any plant and any constant disturbance: d̂ acts as integral action.
+Because the filter receives the applied u, it does not wind up.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from quell.controllers.linear.law import LinearLaw
 from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
-# Relative to their size: below this, singular values and distances to the unit circle count as zero.
+# Relative size below which singular values and distances to the imaginary axis count as zero. Chosen by hand, above rounding errors.
 _TINY = 1e-9
+_HINT = "check the noise densities, dt and the plant's units"
 
 
 class SampledModel(NamedTuple):
@@ -44,32 +45,32 @@ def with_disturbance(A: Matrix, B: Matrix, C: Matrix, E: Matrix, dt: float) -> S
 
 
 def check_reachable(A: Matrix, B: Matrix, what: str) -> None:
-    """Check by the rank of (A − λ, B), for each pole λ that does not fade (Popov, Belevitch, Hautus); ``what`` is the error's beginning.
+    """Check the rank of (A − λ, B) for each pole λ that does not decay (Popov, Belevitch, Hautus).
+
+    The error begins with ``what``.
 
     Raises
     ------
     ValueError
-        naming the mode that B does not reach.
+        for a mode that B does not reach.
     """
     n = A.shape[0]
     for pole in np.linalg.eigvals(A):
         if pole.real >= -_TINY * np.linalg.norm(A):
             singular = np.linalg.svd(np.hstack([A - pole * np.eye(n), B]), compute_uv=False)
             if singular[-1] <= _TINY * singular[0]:
-                raise ValueError(
-                    f"{what}: its mode at s = {pole:.4g} rad/s does not fade by itself"
-                )
+                raise ValueError(f"{what}: its mode at s = {pole:.4g} rad/s does not decay")
 
 
 def stationary_gain(model: SampledModel, W: Matrix, V: float) -> Vector:
-    """Return the gain L (N,) of the stationary Kalman filter, for process noise W (N, N) a sample and measurement variance V.
+    """Return the gain L (N,) of the stationary Kalman filter.
 
-    W in state-unit², V in y-unit²; only their ratio counts.
+    The process noise per sample is W (N, N) [state-unit²], the measurement variance V [y-unit²]; only their ratio counts.
 
     Raises
     ------
     ValueError
-        where the Riccati equation has no solution that makes the filter stable.
+        if the Riccati equation has no solution with a stable filter.
     """
     from scipy.linalg import solve_discrete_are
 
@@ -77,14 +78,10 @@ def stationary_gain(model: SampledModel, W: Matrix, V: float) -> Vector:
     try:
         P = solve_discrete_are(F.T, H[:, None], W, np.array([[V]]))
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(
-            f"no stationary Kalman filter: {error}; look at the noise densities, dt and the plant's units"
-        ) from None
+        raise ValueError(f"no stationary Kalman filter: {error}; {_HINT}") from None
     gain: Vector = P @ H / (H @ P @ H + V)
     if not np.max(np.abs(np.linalg.eigvals(F - np.outer(F @ gain, H)))) < 1.0:
-        raise ValueError(
-            "no stable stationary Kalman filter: look at the noise densities, dt and the plant's units"
-        )
+        raise ValueError(f"no stable stationary Kalman filter: {_HINT}")
     return gain
 
 
@@ -92,6 +89,5 @@ def feedback_law(model: SampledModel, L: Vector, K: Vector, N: float) -> LinearL
     """Return ``u = N r − K z`` with the filter of gain L as a law whose state is z⁻."""
     F, G, H = model
     corrected = np.eye(G.size) - np.outer(L, H)
-    return LinearLaw(
-        F @ corrected, np.zeros(G.size), F @ L, G.copy(), -K @ corrected, N, -float(K @ L)
-    )
+    B_r, D_y = np.zeros(G.size), -float(K @ L)
+    return LinearLaw(F @ corrected, B_r, F @ L, G.copy(), -K @ corrected, N, D_y)

@@ -5,9 +5,9 @@
     U = 1/F(s) · ( k_p (b R − Y) + k_i/s (R − Y) + k_d s (c R − Y) ),        F(s) = 1 + T_f s + (T_f s)²/2
 
 (Åström & Hägglund, *Advanced PID Control*, ISA 2006, sections 3.2 to 3.4: set-point weights b and c, and a filter of second order on
-what is measured rather than one on the derivative alone, so that the controller rolls off. The filter stands before the reference as
-well, which keeps numerator and denominator of both paths alike and changes little where T_f is small.) While u lies at a limit the
-integrator follows it with the tracking time T_t (section 3.5, back-calculation).
+the measurement, not one on the derivative alone, so that the controller rolls off. The reference is filtered as well, so that both
+paths have the same denominator, which makes little difference for small T_f.) While u lies at a limit the integrator follows it with the
+tracking time T_t (section 3.5, back-calculation).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class PID(LinearController):
     Parameters
     ----------
     kp, ki, kd
-        gains of the parallel form [u-unit/y-unit, 1/s of that, s of that]; any sign. ``simc`` and ``simc_double_integrator`` choose them.
+        gains of the parallel form [u-unit/y-unit, the same per s, times s]; any sign. ``simc`` and ``simc_double_integrator`` tune them.
     tf
-        filter time [s], of ``F = 1 + tf s + (tf s)²/2``; or a pair (f1, f2), of ``F = 1 + f1 s + f2 s²``. A derivative needs one.
+        filter time [s], of ``F = 1 + tf s + (tf s)²/2``; or a pair (f1, f2), of ``F = 1 + f1 s + f2 s²``. Required with a derivative.
     b, c
         set-point weights of the proportional and the derivative part, usually 0 to 1.
     tt
@@ -39,14 +39,14 @@ class PID(LinearController):
     dt
         sample time [s].
     setpoint
-        polynomial T(s), highest power first, in place of ``k_d c s² + k_p b s + k_i`` in the reference's path; of degree 3 at most.
+        polynomial T(s), highest power first, for the reference's path instead of ``k_d c s² + k_p b s + k_i``; of degree 3 at most.
     u_min, u_max, rate_limit, name
         as for ``LinearController``.
 
     Raises
     ------
     ValueError
-        for a number out of range, a derivative without filter.
+        for a number out of range, or a derivative without filter.
 
     Examples
     --------
@@ -74,11 +74,8 @@ class PID(LinearController):
         rate_limit: float = math.inf,
         name: str = "PID",
     ) -> None:
-        self.kp, self.ki, self.kd = (
-            checks.finite("kp", kp),
-            checks.finite("ki", ki),
-            checks.finite("kd", kd),
-        )
+        self.kp, self.ki = checks.finite("kp", kp), checks.finite("ki", ki)
+        self.kd = checks.finite("kd", kd)
         self.b, self.c = checks.finite("b", b), checks.finite("c", c)
         self.filter = _filter(tf)
         if self.kd != 0.0 and self.filter == (0.0, 0.0):
@@ -95,14 +92,12 @@ class PID(LinearController):
             raise ValueError(
                 f"setpoint = {setpoint!r}: must be a polynomial in s, highest power first"
             )
-        system = realised(*self.polynomials())
-        law = sampled_law(
-            system, checks.positive("dt", dt, "s"), prewarp=self._prewarp, tracking_time=self.tt
-        )
+        system, dt = realised(*self.polynomials()), checks.positive("dt", dt, "s")
+        law = sampled_law(system, dt, prewarp=self._prewarp, tracking_time=self.tt)
         super().__init__(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
 
     def polynomials(self) -> tuple[list[Any], Any]:
-        """Return the numerators from r and from y, and the denominator that they share, in s, highest power first."""
+        """Return the numerators from r and from y and their common denominator, as polynomials in s."""
         f1, f2 = self.filter
         feedback = [-self.kd, -self.kp, -self.ki]
         if self.ki == 0.0 and self.setpoint[-1] == 0.0:  # no integrator: s cancels
@@ -127,16 +122,17 @@ class PID(LinearController):
         dt: float,
         **options: Any,
     ) -> PID:
-        """Tune for ``gain e^(−θs) / ((τ1 s + 1)(τ2 s + 1))`` by the SIMC rules (Skogestad, *J. Process Control* 13, 2003, eqs. (23)-(25)).
+        """Tune for ``gain e^(−θs) / ((τ1 s + 1)(τ2 s + 1))`` by the SIMC rules.
 
-        In series form ``K_c = τ1 / (gain (τ_c + θ))``, ``τ_I = min(τ1, 4 (τ_c + θ))``, ``τ_D = τ2``; PI without τ2.
+        In series form ``K_c = τ1 / (gain (τ_c + θ))``, ``τ_I = min(τ1, 4 (τ_c + θ))``, ``τ_D = τ2``; PI without τ2 (Skogestad,
+        *J. Process Control* 13, 2003, eqs. (23)-(25)).
 
         Parameters
         ----------
         gain, tau1, theta, tau2
-            of the model [y-unit/u-unit, s, s, s]; to θ belongs half of the sample time.
+            of the model [y-unit/u-unit, s, s, s]; include half of the sample time in θ.
         tau_c
-            time constant of the loop [s]; θ by default, which is as tight as it should be.
+            time constant of the loop [s]; θ by default, the smallest recommended value.
         dt
             sample time [s].
         **options
@@ -145,18 +141,13 @@ class PID(LinearController):
         Raises
         ------
         ValueError
-            for a gain of zero, a time out of range, a loop asked to be infinitely fast (θ = 0 without ``tau_c``), and as ``PID``.
+            for a gain of zero, a time out of range, θ = 0 without ``tau_c``, and as ``PID``.
         """
-        gain, tau1 = (
-            checks.nonzero("gain", gain, "or u does not reach y"),
-            checks.positive("tau1", tau1, "s"),
-        )
-        theta, tau2 = (
-            checks.non_negative("theta", theta, "s"),
-            checks.non_negative("tau2", tau2, "s"),
-        )
-        tight = checks.positive("theta, or tau_c,", theta if tau_c is None else tau_c, "s") + theta
-        return cls._series(tau1 / (gain * tight), min(tau1, 4.0 * tight), tau2, dt, options)
+        gain = checks.nonzero("gain", gain, "or u does not reach y")
+        tau1, theta = checks.positive("tau1", tau1, "s"), checks.non_negative("theta", theta, "s")
+        tau2 = checks.non_negative("tau2", tau2, "s")
+        time = checks.positive("theta, or tau_c,", theta if tau_c is None else tau_c, "s") + theta
+        return cls._series(tau1 / (gain * time), min(tau1, 4.0 * time), tau2, dt, options)
 
     @classmethod
     def simc_double_integrator(
@@ -169,9 +160,9 @@ class PID(LinearController):
         Parameters
         ----------
         gain
-            of the model [y-unit/u-unit/s²]: the acceleration that a unit of u makes.
+            of the model [y-unit/u-unit/s²]: acceleration per unit of u.
         theta
-            its delay [s]; half of the sample time and the filter's lag belong to it.
+            its delay [s]; include half of the sample time and the filter's lag.
         tau_c
             time constant of the loop [s]; θ by default.
         dt
@@ -184,12 +175,10 @@ class PID(LinearController):
         ValueError
             as ``simc``.
         """
-        gain, theta = (
-            checks.nonzero("gain", gain, "or u does not reach y"),
-            checks.non_negative("theta", theta, "s"),
-        )
-        tight = checks.positive("theta, or tau_c,", theta if tau_c is None else tau_c, "s") + theta
-        return cls._series(0.25 / (gain * tight**2), 4.0 * tight, 4.0 * tight, dt, options)
+        gain = checks.nonzero("gain", gain, "or u does not reach y")
+        theta = checks.non_negative("theta", theta, "s")
+        time = checks.positive("theta, or tau_c,", theta if tau_c is None else tau_c, "s") + theta
+        return cls._series(0.25 / (gain * time**2), 4.0 * time, 4.0 * time, dt, options)
 
     @classmethod
     def _series(
@@ -197,9 +186,8 @@ class PID(LinearController):
     ) -> PID:
         """Return the parallel form of ``K (1 + 1/(τ_I s)) (1 + τ_D s)``."""
         options = {"tf": 0.1 * derivative} | options
-        return cls(
-            K * (1.0 + derivative / integral), K / integral, K * derivative, dt=dt, **options
-        )
+        kp = K * (1.0 + derivative / integral)
+        return cls(kp, K / integral, K * derivative, dt=dt, **options)
 
 
 def _filter(tf: Any) -> tuple[float, float]:

@@ -1,23 +1,24 @@
 """Resonance ratio control of two masses and a spring.
 
-The torque of the spring ``T = k (x_1 − x_2)``, fed back to the motor, changes the inertia that the load sees in it from m_1 to m_1/κ::
+The torque of the spring ``T = k (x_1 − x_2)``, fed back to the motor, changes the motor's inertia as seen by the load from m_1 to m_1/κ::
 
     u = m_1 v + (1 − κ) T        so that      x_1'' = v − κ T/m_1,      x_2'' = T/m_2
 
-The resonance then lies at H times the anti-resonance ``ω_a = √(k/m_2)``, with ``H² = 1 + κ m_2/m_1``: H is the resonance ratio, a
-choice. With motor position control ``v = k_p (r_1 − x_1) − k_v x_1'`` the loop's polynomial is::
+The resonance is then at H times the anti-resonance ``ω_a = √(k/m_2)``, with ``H² = 1 + κ m_2/m_1``; the resonance ratio H is a design
+parameter. With motor position control ``v = k_p (r_1 − x_1) − k_v x_1'`` the characteristic polynomial of the loop is::
 
     s⁴ + k_v s³ + (k_p + H² ω_a²) s² + k_v ω_a² s + k_p ω_a²
 
 which for ``H = √5, k_v = 4 ω_a, k_p = ω_a²`` is ``(s + ω_a)⁴`` (Yuki, Murakami & Ohnishi, *IECON* 1993; Hori, Sawada & Chun, *IEEE
 Trans. Industrial Electronics* 46, 1999, with a disturbance observer slow enough for the whole of both masses).
 
-They measure the motor and get T from a disturbance observer there. Here is one measurement, y, the place of either mass: so x_1, x_1'
-and T come from a Kalman filter of both masses with a slow force d on the load (observer_law.py). What d asks for at rest is fed forward::
+They measure the motor and estimate T by a disturbance observer there. Here the only measurement y is the position of either mass, so
+x_1, x_1' and T come from a Kalman filter of both masses with a slow force d on the load (observer_law.py). The reference is corrected for
+d at rest::
 
     r_1 = r − d̂/k − κ d̂/(m_1 k_p)
 
-the twist of the spring that carries d, and what the motor's position control would give way under it.
+that is, for the twist of the spring that carries d, and for the deflection of the motor's position control under it.
 """
 
 from __future__ import annotations
@@ -36,18 +37,18 @@ from quell.plants import two_mass_spring
 
 
 class ResonanceRatio(LinearController):
-    """Resonance ratio control from a single measurement, for ``quell.plants.two_mass_spring``; y then follows r, whichever mass it is.
+    """Resonance ratio control from the position of either mass, for ``quell.plants.two_mass_spring``.
 
     Parameters
     ----------
     m1, m2, k
-        motor and load [kg], spring [N/m], as the design has them; torsional systems have inertias and torques instead.
+        motor and load [kg], spring [N/m] of the design; inertias and torsional stiffness for a torsional system.
     omega_o
-        bandwidth of the filter [rad/s]: that of its pole pattern where it is above the resonance.
+        bandwidth of the filter [rad/s]: the radius of its fastest poles, if above the resonance.
     dt
         sample time [s].
     omega_d
-        how fast the filter follows the force on the load [rad/s]; by default half the anti-resonance.
+        bandwidth of the estimate of the force on the load [rad/s]; by default half the anti-resonance.
     ratio
         H, above 1; √5 by default.
     measured
@@ -58,7 +59,7 @@ class ResonanceRatio(LinearController):
     Attributes
     ----------
     kappa : float
-        κ: the load sees the motor's inertia divided by it.
+        κ, the factor by which the motor's inertia appears smaller to the load.
     K : (4,) array
         gains of (x1, x2, x1', x2').
     L : (5,) array
@@ -94,12 +95,12 @@ class ResonanceRatio(LinearController):
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         if not checks.positive("ratio", ratio) > 1.0:
             raise ValueError(
-                f"ratio = {ratio!r}: must be above 1, the resonance lies above the anti-resonance"
+                f"ratio = {ratio!r}: must be above 1, the resonance is above the anti-resonance"
             )
         antiresonance = math.sqrt(k / m2)
-        self.kappa = round((ratio**2 - 1.0) * m1 / m2, 12)
-        omega_d = (
-            0.5 * antiresonance if omega_d is None else checks.positive("omega_d", omega_d, "rad/s")
+        self.kappa = round((ratio**2 - 1.0) * m1 / m2, 12)  # 4 for √5, not 4.000000000000001
+        omega_d = checks.positive(
+            "omega_d", 0.5 * antiresonance if omega_d is None else omega_d, "rad/s"
         )
         kp, kv = antiresonance**2, 4.0 * antiresonance
         torque = (1.0 - self.kappa) * k
@@ -107,14 +108,13 @@ class ResonanceRatio(LinearController):
         # At rest under d the spring carries it: x1 − x2 = −d/k, u = −d, and y = x2 + c1 (x1 − x2) = r.
         self.K_d = float(1.0 + (self.K[0] * (1.0 - c1) - self.K[1] * c1) / k)
         model = with_disturbance(plant.A, plant.B, plant.C, plant.E[:, 1:], dt)
-        # White noise in the force on the mass that is not measured, and a walk in d that crosses it at omega_d, of such a size that the
-        # filter's fastest poles have the radius omega_o. From the force on the measured mass to y there is an anti-resonance, where that
-        # force does not show: a filter that knew of no other would have undamped poles there.
+        # White noise in the force on the other mass, and a random walk in d that crosses it at omega_d. Their size gives the filter's
+        # fastest poles the radius omega_o. The force on the measured mass alone would not do: at the anti-resonance it has no effect on y,
+        # and the filter would have undamped poles there.
         far = plant.E[:, :1] if measured == "load" else plant.E[:, 1:]
-        reached = [leading_gain(plant.A, column, plant.C) for column in (far, plant.E[:, 1:])]
-        (b_far, degree_far), (b_d, degree_d) = (
-            found for found in reached if found is not None
-        )  # the spring joins both masses
+        gains = [leading_gain(plant.A, column, plant.C) for column in (far, plant.E[:, 1:])]
+        # The spring joins both masses, so no gain is None.
+        (b_far, degree_far), (b_d, degree_d) = (found for found in gains if found is not None)
         density = min(
             omega_o ** (2 * degree_far) / b_far**2,
             omega_o ** (2 * degree_d + 2) / (b_d * omega_d) ** 2,

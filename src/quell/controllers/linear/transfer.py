@@ -1,7 +1,7 @@
-"""From a transfer function in s to a sampled linear law: realisation, sampling, anti-windup.
+"""A sampled linear law from a transfer function in s: realisation, sampling, anti-windup.
 
-Polynomials in z are no way to keep a law: sampled fast, all their roots crowd at z = 1, and a coefficient's last digit moves them. So a
-law is realised in continuous time, in coordinates where entries are O(1), and sampled as a state-space system, where what is kept is
+A law is not stored as polynomials in z: with fast sampling all their roots crowd at z = 1, and a rounding error of a coefficient moves
+them. It is realised in continuous time, in coordinates where entries are O(1), and sampled as a state-space system, whose matrices are
 of the form I + O(dt).
 """
 
@@ -18,8 +18,12 @@ from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
 METHODS = ("tustin", "zoh")
-# Poles this near to the unit circle, or outside of it, do not fade by themselves while u is at a limit.
+# Poles this close to the unit circle, or outside of it, count as integrators: they do not decay while u is at a limit. Chosen by
+# hand, above the rounding error of a pole at 1.
 _MARGINAL = 1e-9
+# Poles and zeros below the one and above the other of these multiples of the fastest pole count as zero and as infinite, which
+# rounding turns into such values. Chosen by hand.
+_ZERO, _INFINITE = 1e-6, 1e6
 
 System = tuple[Matrix, Matrix, Matrix, Matrix]
 
@@ -35,13 +39,13 @@ def as_state_space(num: Any, den: Any = None) -> System:
     Raises
     ------
     ValueError
-        where it has several inputs or outputs, is not proper, or has a sample time.
+        for several inputs or outputs, a transfer function that is not proper, or one with a sample time.
     """
     if den is not None:
         return realised([num], den)
     if getattr(num, "dt", None):
         raise ValueError(
-            f"transfer function has a sample time, dt = {num.dt!r}: must be in continuous time; it is sampled here"
+            f"transfer function has a sample time, dt = {num.dt!r}: must be in continuous time"
         )
     if hasattr(num, "num") and hasattr(num, "den"):
         if np.shape(num.num)[:2] != (1, 1):
@@ -52,12 +56,9 @@ def as_state_space(num: Any, den: Any = None) -> System:
     if all(hasattr(num, name) for name in "ABCD"):
         A = checks.matrix("A", num.A)
         m = A.shape[0]
-        checks.matrix("A", A, m, m)
+        shapes = {"A": (m, m), "B": (m, 1), "C": (1, m), "D": (1, 1)}
         return balanced(
-            A,
-            checks.matrix("B", num.B, m, 1),
-            checks.matrix("C", num.C, 1, m),
-            checks.matrix("D", num.D, 1, 1),
+            *(checks.matrix(name, getattr(num, name), *shapes[name]) for name in "ABCD")
         )
     raise ValueError(
         f"num = {num!r}: must be a polynomial, with den, or a control.TransferFunction or control.StateSpace"
@@ -65,10 +66,10 @@ def as_state_space(num: Any, den: Any = None) -> System:
 
 
 def realised(numerators: list[Any], den: Any) -> System:
-    """Return (A, B, C, D) of one output ``Σ N_i(s)/D(s) · input_i``, of the order of D, in balanced coordinates.
+    """Return (A, B, C, D) of one output ``Σ N_i(s)/D(s) · input_i``, in balanced coordinates.
 
-    It is the observer canonical form in time scaled by the geometric mean of the poles that are not zero, which serves several inputs
-    with no more states than D has roots.
+    It is the observer canonical form, in time scaled by the geometric mean of the poles other than zero. Several inputs need no more
+    states than D has roots.
 
     Raises
     ------
@@ -84,11 +85,11 @@ def realised(numerators: list[Any], den: Any) -> System:
         polynomial = np.trim_zeros(checks.vector("num", given), "f")
         if polynomial.size > m + 1:
             raise ValueError(
-                f"num = {np.asarray(given).tolist()!r}: is of degree {polynomial.size - 1}, den of degree {m}: C(s) must be proper; "
-                "add a filter to what differentiates"
+                f"num = {np.asarray(given).tolist()!r}: is of degree {polynomial.size - 1}, den of degree {m}: "
+                "C(s) must be proper; add a filter"
             )
         row[m + 1 - polynomial.size :] = polynomial
-    last = np.flatnonzero(D)[-1]  # what follows are poles at zero
+    last = np.flatnonzero(D)[-1]  # the coefficients after it stand for poles at zero
     unit = abs(D[last] / D[0]) ** (1.0 / last) if last else 1.0
     powers = unit ** -np.arange(m + 1.0) / D[0]
     D, N = D * powers, N * powers
@@ -98,26 +99,27 @@ def realised(numerators: list[Any], den: Any) -> System:
         A[:, 0] = -D[1:]
     B = (N[:, 1:] - through * D[1:]).T
     C = np.eye(1, m)
-    # x' is by scaled time: s = unit · scaled s.
+    # Back from scaled time: s = unit · scaled s.
     return balanced(unit * A, unit * B, C, through.T.copy())
 
 
 def balanced(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> System:
-    """Scale the states so that A's rows and columns are alike in size, and B and C share what is left."""
+    """Scale the states so that rows and columns of A are of similar size, and B and C too."""
     from scipy.linalg import matrix_balance
 
     if A.shape[0] == 0:
         return A, B, C, D
     A, (scale, _) = matrix_balance(A, permute=False, separate=True)
     B, C = B / scale[:, None], C * scale
-    into, out = float(np.max(np.abs(B))), float(np.max(np.abs(C)))
-    share = math.sqrt(out / into) if into > 0.0 and out > 0.0 else 1.0
-    return A, B * share, C / share, D
+    input_size, output_size = float(np.max(np.abs(B))), float(np.max(np.abs(C)))
+    factor = math.sqrt(output_size / input_size) if input_size > 0.0 and output_size > 0.0 else 1.0
+    return A, B * factor, C / factor, D
 
 
 def tustin(system: System, dt: float, prewarp: float | None = None) -> System:
-    """Sample by the trapezoidal rule: ``s = (z − 1) / (h (z + 1))`` with h = dt/2, or h = tan(ω dt/2)/ω, which is exact at ω.
+    """Sample by the trapezoidal rule ``s = (z − 1) / (h (z + 1))``.
 
+    h = dt/2, or with prewarping at ω h = tan(ω dt/2)/ω, which is exact at ω:
     ``A_d = (I − hA)⁻¹ (I + hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``, ``D_d = D + h C (I − hA)⁻¹ B`` (Franklin, Powell &
     Workman, *Digital Control of Dynamic Systems*, 1998, section 6.1).
 
@@ -161,24 +163,19 @@ def sampled_law(
         else checks.positive("tracking_time", tracking_time, "s")
     )
     back = anti_windup(A, C[0], math.exp(-dt / time))
+    (D_r, D_y) = D[0]
     return LinearLaw(
-        A - np.outer(back, C[0]),
-        B[:, 0] - back * D[0, 0],
-        B[:, 1] - back * D[0, 1],
-        back,
-        C[0],
-        D[0, 0],
-        D[0, 1],
+        A - np.outer(back, C[0]), B[:, 0] - back * D_r, B[:, 1] - back * D_y, back, C[0], D_r, D_y
     )
 
 
 def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
-    """Return the gain B_u (m,) of ``x⁺ = A x + … + B_u (u − u_wished)`` by which a law follows what is applied.
+    """Return the gain B_u (m,) of ``x⁺ = A x + … + B_u (u − u_wished)`` with which a law follows the applied u.
 
-    The law is seen as an observer of its own state with the applied u as measurement (Åström & Wittenmark, *Computer-Controlled
+    The law is treated as an observer of its own state with the applied u as measurement (Åström & Wittenmark, *Computer-Controlled
     Systems*, 1997, section 3.5; Kothare, Campo, Morari & Nett, *Automatica* 30, 1994). Poles on the unit circle or outside of it, which
-    do not fade by themselves, go to ``pole``; the others stay where they are. For a PID controller that is back-calculation: the
-    integrator alone follows, with the tracking time ``−dt / ln(pole)``.
+    do not decay, are moved to ``pole``; the others stay. For a PID controller this is back-calculation: the integrator alone follows,
+    with the tracking time ``−dt / ln(pole)``.
     """
     from scipy.linalg import schur
 
@@ -188,11 +185,11 @@ def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
     block, basis, count = schur(
         A, output="real", sort=lambda re, im=0.0: abs(complex(re, im)) > marginal
     )
-    # What B_u and the law together can't see, C does not show either: it stays.
-    inner, seen = block[:count, :count], C @ basis[:, :count]
+    # The pole placement needs an observable pair; an unobservable block does not reach u and stays.
+    inner, output = block[:count, :count], C @ basis[:, :count]
     rows, power, moved = np.empty((count, count)), np.eye(count), np.eye(count)
     for i in range(count):
-        rows[i] = seen @ power
+        rows[i] = output @ power
         power, moved = power @ (inner - np.eye(count)), moved @ (inner - pole * np.eye(count))
     if count == 0 or np.linalg.matrix_rank(rows) < count:
         return np.zeros(A.shape[0])
@@ -202,23 +199,20 @@ def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
 
 
 def _default_tracking_time(system: System) -> float:
-    """Return the time constant of the slowest zero from y, or of the slowest pole, other than zero [s]."""
+    """Return the time constant of the slowest zero from y, or else of the slowest pole [s]; neither at zero."""
+    from scipy.linalg import eigvals
+
     A, B, C, D = system
     if A.shape[0] == 0:
         return 1.0
-    from scipy.linalg import eigvals
-
     poles = np.linalg.eigvals(A)
     pencil = np.block([[A, B[:, 1:]], [C, D[:, 1:]]])
     zeros = eigvals(pencil, np.diag([*np.ones(A.shape[0]), 0.0]))
-    fastest = max(float(np.max(np.abs(poles))), 1e-300)
+    fastest = float(np.max(np.abs(poles)))
+    lowest, highest = (_ZERO * fastest, _INFINITE * fastest) if fastest > 0.0 else (0.0, math.inf)
     for candidates in (zeros, poles):
         sizes = np.abs(candidates[np.isfinite(candidates)])
-        sizes = (
-            sizes[(sizes > 1e-6 * fastest) & (sizes < 1e6 * fastest)]
-            if np.any(np.abs(poles) > 0.0)
-            else sizes[sizes > 0.0]
-        )
+        sizes = sizes[(sizes > lowest) & (sizes < highest)]
         if sizes.size:
             return float(1.0 / np.min(sizes))
     return 1.0

@@ -1,4 +1,4 @@
 """Prefilters of the reference: reference models, tracking differentiator, input shaping.
 
-May import ``controllers`` (base files only), ``lti`` and ``kernels``.
+May import ``controllers`` (base files, ``adrc``), ``lti`` and ``kernels``.
 """

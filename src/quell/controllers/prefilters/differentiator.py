@@ -5,8 +5,8 @@ Han, *IEEE Trans. Industrial Electronics* 56, 2009, eqs. (10) and (11)::
     v_1⁺ = v_1 + h v_2,      v_2⁺ = v_2 + h fhan(v_1 − r, v_2, r_0, h_0)
 
 ``fhan`` drives the sampled double integrator to the origin in the least time that ``|fhan| ≤ r_0`` allows, and for ``h_0 = h`` without
-overshoot. A larger ``h_0`` smooths, and filters noise in r. The paper prints ``d = h_0 r_0²``, which has the wrong unit; d is compared
-with a position, and is ``r_0 h_0²``.
+overshoot. A larger ``h_0`` gives a smoother transition and filters noise in r. The paper prints ``d = h_0 r_0²``, which has the wrong
+unit: d is compared with a position, so it must be ``r_0 h_0²``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class TrackingMemory(NamedTuple):
 
 @kernel
 def fhan(x1: float, x2: float, r0: float, h0: float) -> float:
-    """Return the acceleration, within ±r0, that takes position ``x1`` and speed ``x2`` to zero soonest."""
+    """Return the acceleration, within ±r0, that takes position ``x1`` and speed ``x2`` to zero fastest."""
     d = r0 * h0 * h0
     a0 = h0 * x2
     y = x1 + a0
@@ -54,9 +54,9 @@ def fhan(x1: float, x2: float, r0: float, h0: float) -> float:
 @prefilter.register(TrackingDesign)
 def _prefilter(design: TrackingDesign, memory: TrackingMemory, r: float) -> float:
     v = memory.v
-    pull = fhan(v[0] - r, v[1], design.acceleration, design.horizon)
+    acceleration = fhan(v[0] - r, v[1], design.acceleration, design.horizon)
     v[0] += design.dt * v[1]
-    v[1] += design.dt * pull
+    v[1] += design.dt * acceleration
     return float(v[0])
 
 
@@ -72,19 +72,19 @@ def _settle(design: TrackingDesign, memory: TrackingMemory, value: float) -> Non
 
 @dataclass(frozen=True)
 class TrackingDifferentiator:
-    """A reference whose second derivative stays within a limit, with its derivative; to be used in ``Prefiltered``.
+    """A prefilter whose output has a bounded second derivative; for use in ``Prefiltered``.
 
     Parameters
     ----------
     acceleration
-        the limit, r_0 [y-unit/s²].
+        largest second derivative, r_0 [y-unit/s²].
     horizon
         h_0 [s]: the sample time (by default) for the shortest transition, larger for a smoother one.
 
     Raises
     ------
     ValueError
-        for a parameter that is not positive, and from ``design`` where the horizon is shorter than a sample.
+        for a parameter that is not positive, and in ``design`` for a horizon shorter than a sample.
 
     Examples
     --------
@@ -105,7 +105,7 @@ class TrackingDifferentiator:
 
     @property
     def derivatives(self) -> int:
-        """How many derivatives it gives: one."""
+        """Number of derivatives of its output: one."""
         return 1
 
     def design(self, dt: float) -> TrackingDesign:
@@ -114,7 +114,7 @@ class TrackingDifferentiator:
         horizon = dt if self.horizon is None else float(self.horizon)
         if horizon < dt:
             raise ValueError(
-                f"horizon = {horizon!r} s with dt = {dt!r} s: must be at least a sample, or the profile would swing"
+                f"horizon = {horizon!r} s with dt = {dt!r} s: must be at least a sample, or the profile would oscillate"
             )
         return TrackingDesign(float(self.acceleration), horizon, dt)
 

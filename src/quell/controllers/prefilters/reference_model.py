@@ -1,10 +1,10 @@
-"""A reference model: a lag between the reference and what the loop is to follow, which knows all its derivatives.
+"""A reference model: a lag between the given reference and the one that the loop follows, with its derivatives.
 
     r_f = ω^m / (s + ω)^m · r,        r_f^(m) = ω^m (r − r_f) − Σ_{i=1}^{m−1} C(m, i) ω^(m−i) r_f^(i)
 
-With as many derivatives as the plant has integrators fed forward, the ideal loop answers to r as the model does, whatever ``omega_c`` is:
-two degrees of freedom, one for the reference and one for what disturbs (Horowitz, *Synthesis of Feedback Systems*, 1963). It is sampled
-with r held.
+If as many derivatives are fed forward as the plant has integrators, the ideal loop responds to r as the model does, for any ``omega_c``:
+two degrees of freedom, one for the reference and one for disturbances (Horowitz, *Synthesis of Feedback Systems*, 1963). The model is
+sampled with zero-order hold.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ReferenceModelDesign(NamedTuple):
     input: Vector
     """(m,)."""
     rates: Vector
-    """What makes r_f^(m) of r and the state (m + 1,)."""
+    """Coefficients of the state and of r in r_f^(m) (m + 1,)."""
     dt: float
 
 
@@ -37,7 +37,7 @@ class ReferenceModelMemory(NamedTuple):
     """State."""
 
     x: Vector
-    """Two times (m,): the state, and room for the next."""
+    """(2 m,): the state, and scratch for the next one."""
     r: Vector
     """(1,): the reference of the last sample."""
 
@@ -79,19 +79,19 @@ def _settle(design: ReferenceModelDesign, memory: ReferenceModelMemory, value: f
 
 @dataclass(frozen=True)
 class ReferenceModel:
-    """A lag of order m at ``omega`` before a controller, to be used in ``Prefiltered``.
+    """A lag of order m at ``omega`` before a controller, for use in ``Prefiltered``.
 
     Parameters
     ----------
     omega
         bandwidth [rad/s].
     order
-        order m, 1 to 8: the plant's order (relative degree) where the controller feeds forward.
+        order m, 1 to 8: with feedforward in the controller, the plant's order (relative degree).
 
     Raises
     ------
     ValueError
-        for a bandwidth that is not positive, and from ``design`` where it is too high for the sample time.
+        for a bandwidth that is not positive, and in ``design`` for one too high for the sample time.
     """
 
     omega: float
@@ -103,7 +103,7 @@ class ReferenceModel:
 
     @property
     def derivatives(self) -> int:
-        """How many derivatives it gives: m."""
+        """Number of derivatives of its output: m."""
         return self.order
 
     def design(self, dt: float) -> ReferenceModelDesign:

@@ -1,4 +1,4 @@
-"""Input shaping: a reference that leaves a vibration behind where it arrives, split such that the parts' vibrations cancel.
+"""Input shaping: the reference is split into delayed parts whose vibrations of a mode cancel.
 
 For a mode ``s² + 2ζω s + ω²`` with ``ω_d = ω √(1 − ζ²)`` and ``K = exp(−ζπ/√(1 − ζ²))`` (Singer & Seering, *ASME J. Dynamic Systems,
 Measurement, and Control* 112, 1990, eqs. (11) and (13))::
@@ -6,12 +6,12 @@ Measurement, and Control* 112, 1990, eqs. (11) and (13))::
     ZV    amplitudes (1, K) / (1 + K)            at the times (0, π/ω_d)
     ZVD   amplitudes (1, 2K, K²) / (1 + K)²      at the times (0, π/ω_d, 2π/ω_d)
 
-ZV leaves no vibration of this very mode; ZVD none to first order in an error of ω. What impulses a_i at t_i leave of a mode, after the
-last and as a share of what one impulse would leave there, is::
+ZV leaves no vibration of exactly this mode, ZVD none to first order in an error of ω. After the last of the impulses a_i at t_i, the
+vibration of a mode, relative to that after a single impulse, is::
 
     V = e^(−ζω t_N) √( (Σ a_i e^(ζω t_i) cos ω_d t_i)² + (Σ a_i e^(ζω t_i) sin ω_d t_i)² )
 
-A time that is no whole number of samples is split over the two samples around it, linearly.
+An impulse between two samples is split over both, linearly.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ from quell import checks
 from quell.controllers.prefilters.prefilter import prefilter, settle
 from quell.types import Vector
 
+# Limit on memory: 80 MB. Chosen by hand.
 _MOST_SAMPLES = 10_000_000
 
 
 class ShaperDesign(NamedTuple):
-    """Impulses on samples; the buffer is one longer than the longest delay."""
+    """Impulses on samples; the buffer is one sample longer than the longest delay."""
 
     delays: NDArray[np.int64]
     """In samples."""
@@ -44,7 +45,7 @@ class ShaperMemory(NamedTuple):
 
     past: Vector
     at: Vector
-    """(1,): where the newest stands."""
+    """(1,): index of the newest."""
 
 
 @prefilter.register(ShaperDesign)
@@ -76,14 +77,14 @@ class Shaper:
     Parameters
     ----------
     times
-        when they come [s], from 0 on, increasing.
+        times of the impulses [s], from 0 on, increasing.
     amplitudes
-        how large they are; they add up to 1.
+        their amplitudes, with the sum 1.
 
     Raises
     ------
     ValueError
-        where they are not as many, do not begin at 0, do not increase, or do not add up to 1.
+        for different numbers of both, times that do not begin at 0 or do not increase, and another sum than 1.
     """
 
     times: tuple[float, ...]
@@ -102,14 +103,14 @@ class Shaper:
         object.__setattr__(self, "amplitudes", tuple(amplitudes.tolist()))
 
     def residual(self, omega: float, zeta: float = 0.0) -> float:
-        """Return the vibration V that is left of a mode after the last impulse: 1 is what a single impulse then would leave."""
+        """Return the vibration V of a mode after the last impulse, relative to that after a single impulse."""
         omega, zeta = _mode(omega, zeta)
         damped = omega * math.sqrt(1.0 - zeta**2)
-        left = sum(
+        vibration = sum(
             a * np.exp(zeta * omega * (t - self.times[-1]) + 1j * damped * t)
             for a, t in zip(self.amplitudes, self.times, strict=True)
         )
-        return float(abs(left))
+        return float(abs(vibration))
 
     def design(self, dt: float) -> ShaperDesign:
         """Return the impulses on samples of ``dt`` [s].
@@ -117,7 +118,7 @@ class Shaper:
         Raises
         ------
         ValueError
-            for a dt that is not positive, or so short that the shaper takes more than ten million samples.
+            for a dt that is not positive, or with which the shaper takes more than ten million samples.
         """
         if self.times[-1] / checks.positive("dt", dt, "s") > _MOST_SAMPLES:
             raise ValueError(
@@ -131,13 +132,10 @@ class Shaper:
                 (before, (1.0 - share) * amplitude),
                 (before + 1, share * amplitude),
             ):
-                if abs(weight) > 1e-12:
+                if abs(weight) > 1e-12:  # the rest of a rounded time
                     weights[place] = weights.get(place, 0.0) + weight
-        return ShaperDesign(
-            np.array(list(weights), dtype=np.int64),
-            np.array(list(weights.values())),
-            max(weights) + 1,
-        )
+        delays = np.array(list(weights), dtype=np.int64)
+        return ShaperDesign(delays, np.array(list(weights.values())), max(weights) + 1)
 
     def memory(self, design: ShaperDesign) -> ShaperMemory:
         """Return a buffer at rest."""
@@ -164,21 +162,21 @@ def ZV(omega: float, zeta: float = 0.0) -> Shaper:  # noqa: N802 - the field's n
 
 
 def ZVD(omega: float, zeta: float = 0.0) -> Shaper:  # noqa: N802
-    """Return the zero-vibration-and-derivative shaper: three impulses, twice as long as ``ZV``, and forgiving.
+    """Return the zero-vibration-and-derivative shaper: three impulses, twice as long as ``ZV`` and more robust.
 
     Parameters and errors as for ``ZV``.
     """
     half, K = _half_period(omega, zeta)
-    return Shaper(
-        (0.0, half, 2.0 * half),
-        (1.0 / (1.0 + K) ** 2, 2.0 * K / (1.0 + K) ** 2, (K / (1.0 + K)) ** 2),
-    )
+    amplitudes = (1.0 / (1.0 + K) ** 2, 2.0 * K / (1.0 + K) ** 2, (K / (1.0 + K)) ** 2)
+    return Shaper((0.0, half, 2.0 * half), amplitudes)
 
 
 def _mode(omega: float, zeta: float) -> tuple[float, float]:
     omega, zeta = checks.positive("omega", omega, "rad/s"), checks.non_negative("zeta", zeta)
     if zeta >= 1.0:
-        raise ValueError(f"zeta = {zeta!r}: must be below 1, what is damped more does not vibrate")
+        raise ValueError(
+            f"zeta = {zeta!r}: must be below 1, a mode with more damping does not vibrate"
+        )
     return omega, zeta
 
 
