@@ -16,7 +16,8 @@ from quell.plants.linear import LinearPlant
 
 # RMS of u as a share of its range: six standard deviations are then 30 % of it. Chosen by hand.
 _NOISE = 0.05
-# Between the loops of a chain of four integrators with omega_o = 10 omega_c, 0.41, and with 3 omega_c, 0.24.
+# Between the loops of a chain of four integrators with omega_o = 10 omega_c, 0.41, and with 3
+# omega_c, 0.24.
 _LEAST_MODULUS = 0.3
 # Share of the modulus margin that a lag must leave. Chosen by hand.
 _LAG_LEAVES = 0.8
@@ -38,15 +39,16 @@ def advise(
     controller
         an ``ADRC`` or a linear controller.
     plant
-        linear plant to control (see ``analyse``); by default the plant that an ADRC's observer assumes, with the delay that it knows,
-        which is the most favourable one.
+        linear plant to control (see ``analyse``); by default the plant that an ADRC's observer
+        assumes, with the delay that it knows, which is the most favourable one.
     noise_std
-        standard deviation of the measurement noise, assumed white [y-unit]. It is judged by its effect on u as a share of ``u_max −
-        u_min``; without limits it is not judged.
+        standard deviation of the measurement noise, assumed white [y-unit]. It is judged by its
+        effect on u as a share of ``u_max − u_min``; without limits it is not judged.
     actuator_lag
         time constant of the actuator [s], if the plant does not include it.
     delay
-        dead time of actuator, transport and calculation [s]; without a plant it adds to the one that the observer assumes.
+        dead time of actuator, transport and calculation [s]; without a plant it adds to the one
+        that the observer assumes.
     at
         instant at which the learner is frozen; see ``analyse``.
 

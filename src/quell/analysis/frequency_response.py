@@ -1,8 +1,9 @@
 """Frequency responses of sampled systems, and the frequencies at which to evaluate them.
 
-No polynomial is formed: poles of an observer coincide close to z = 1, where the roots of a polynomial of degree 5 move by the fifth root
-of its rounding errors. A response is a linear solve, ``C (ζI − N)⁻¹ B + D`` with ``ζ = e^(jω dt) − 1`` and ``N = A − I``, so that slow
-dynamics are not the difference of two numbers near one.
+No polynomial is formed: poles of an observer coincide close to z = 1, where the roots of a
+polynomial of degree 5 move by the fifth root of its rounding errors. A response is a linear solve,
+``C (ζI − N)⁻¹ B + D`` with ``ζ = e^(jω dt) − 1`` and ``N = A − I``, so that slow dynamics are not
+the difference of two numbers near one.
 """
 
 from __future__ import annotations

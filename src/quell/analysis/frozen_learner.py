@@ -4,12 +4,13 @@ Around its inputs at that instant, a learner that no longer learns is
 
     f_L = const + g · (x̂_1 … x̂_n, Δf̂) + h u_before + s u
 
-For features that are the state, u and a constant, this is exact everywhere, with g = θ. For any other learner (a network, a Gaussian
-process, polynomials) it holds for small motions: g and h are central differences of its own ``predict``. The constant, and autonomous
-features (oscillators), are a feedforward: they move the loop but do not close it, so no margin depends on them.
+For features that are the state, u and a constant, this is exact everywhere, with g = θ. For any
+other learner (a network, a Gaussian process, polynomials) it holds for small motions: g and h are
+central differences of its own ``predict``. The constant, and autonomous features (oscillators), are
+a feedforward: they move the loop but do not close it, so no margin depends on them.
 
-A guard multiplies all of it by the learner's authority β. When it clips the output (``Reason.OUT_OF_BOUNDS``, ``TOO_FAST``), the true
-feedback is smaller than the one computed here.
+A guard multiplies all of it by the learner's authority β. When it clips the output
+(``Reason.OUT_OF_BOUNDS``, ``TOO_FAST``), the true feedback is smaller than the one computed here.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ from quell.records.sample_times import first_sample_at
 from quell.records.trajectory import Trajectory
 from quell.types import Vector
 
-# Step of the central differences, relative to the size of a signal; their relative error is of the order of its square, 1e-8.
+# Step of the central differences, relative to the size of a signal; their relative error is of the
+# order of its square, 1e-8.
 _STEP = 1e-4
 _FEEDFORWARD = ("bias", "sin", "cos")
 _USE_STATE = "pass the scenario to loops_over_time, or the final_state of a run that ends then"
@@ -77,10 +79,12 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
     controller
         an ``ADRC``.
     run
-        a ``Trajectory`` of it, or a state of it, for instance ``run.final_state``; by default the controller's own state.
+        a ``Trajectory`` of it, or a state of it, for instance ``run.final_state``; by default the
+        controller's own state.
     t
-        time of the run [s]; by default its end. The coefficients at that time come from the record, so the learner's features must be
-        states, u, a constant and sinusoids. Freeze any other learner at the end of a run that ends at that time.
+        time of the run [s]; by default its end. The coefficients at that time come from the record,
+        so the learner's features must be states, u, a constant and sinusoids. Freeze any other
+        learner at the end of a run that ends at that time.
 
     Returns
     -------
@@ -90,8 +94,8 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
     Raises
     ------
     ValueError
-        if the record does not hold the learner's coefficients, or not the time; for a learner that calls a Python model, whose answer is
-        held between calls.
+        if the record does not hold the learner's coefficients, or not the time; for a learner that
+        calls a Python model, whose answer is held between calls.
     """
     if not isinstance(controller, ADRC):
         raise ValueError(

@@ -1,9 +1,10 @@
 """The exact linear law in discrete time that a controller is without limits.
 
-It is measured, not derived: without limits a controller is a linear map from its state, r and y to its next state and u, so unit vectors
-through its own ``control`` give the matrices, for any form of observer. The unit is 2⁻⁶⁰: scaling by it is exact for a linear map, and
-it is small enough for a map that is linear for small errors only. State entries that do not reach u, or that nothing reaches (records,
-filters for learning), are left out.
+It is measured, not derived: without limits a controller is a linear map from its state, r and y to
+its next state and u, so unit vectors through its own ``control`` give the matrices, for any form of
+observer. The unit is 2⁻⁶⁰: scaling by it is exact for a linear map, and it is small enough for a
+map that is linear for small errors only. State entries that do not reach u, or that nothing reaches
+(records, filters for learning), are left out.
 """
 
 from __future__ import annotations
@@ -35,13 +36,15 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     controller
         an ``ADRC``, or a linear controller, whose own law is returned.
     at
-        instant at which the learner is frozen: a ``Frozen``, a run or a state of the controller (its end); by default the present state.
+        instant at which the learner is frozen: a ``Frozen``, a run or a state of the controller
+        (its end); by default the present state.
 
     Returns
     -------
     LinearLaw
-        equal to the controller without limits, except for a constant feedforward of the learner and for the first sample, at which an
-        ADRC takes the measurement as its state; from ``y = 0`` on they agree.
+        equal to the controller without limits, except for a constant feedforward of the learner and
+        for the first sample, at which an ADRC takes the measurement as its state; from ``y = 0`` on
+        they agree.
 
     Raises
     ------

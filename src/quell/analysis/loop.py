@@ -1,11 +1,12 @@
 """The loop of a linear plant and a controller at one instant: poles, margins, noise in u, sensitivity functions.
 
-In discrete time, at the controller's samples, with a load d at the plant's input, the noise n of the measurement and the plant's
-disturbances w::
+In discrete time, at the controller's samples, with a load d at the plant's input, the noise n of
+the measurement and the plant's disturbances w::
 
     u = C_r r − C_y (y + n)        y = P (u + d) + P_w w        L = P C_y        S = 1/(1 + L),  T = 1 − S
 
-so that the responses are ``r → y: P C_r S``, ``d → y: P S``, ``n → u: −C_y S``, ``n → y: −T``, ``w → y: P_w S``.
+so that the responses are ``r → y: P C_r S``, ``d → y: P S``, ``n → u: −C_y S``, ``n → y: −T``, ``w
+→ y: P_w S``.
 """
 
 from __future__ import annotations
@@ -42,12 +43,14 @@ def analyse(
     Parameters
     ----------
     plant
-        a ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction``, or ``(num, den)`` in powers of s.
+        a ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction``, or ``(num, den)``
+        in powers of s.
     controller
         an ``ADRC`` or a linear controller; a prefilter in front of it is left out.
     at
-        instant at which its learner is frozen: a ``Frozen`` from ``frozen(controller, run, t)``, or a run or state of the controller
-        (its end); by default the present state, which for a new controller has learned nothing.
+        instant at which its learner is frozen: a ``Frozen`` from ``frozen(controller, run, t)``, or
+        a run or state of the controller (its end); by default the present state, which for a new
+        controller has learned nothing.
     delay
         additional dead time of the loop [s].
     actuator_lag
@@ -61,7 +64,8 @@ def analyse(
     Raises
     ------
     ValueError
-        for a plant that is not linear or has direct feedthrough, a controller without a linear law, a delay of more than 200 samples.
+        for a plant that is not linear or has direct feedthrough, a controller without a linear law,
+        a delay of more than 200 samples.
     """
     while isinstance(controller, Prefiltered):
         controller = controller.controller
@@ -95,8 +99,9 @@ class LoopAnalysis:
     dt : float
         sample time [s].
     b_over_b0 : float or None
-        the plant's gain over the b0 of the controller; None without b0, for a plant that was given sampled, and if the first derivative
-        of y that u reaches is not the one that the controller assumes.
+        the plant's gain over the b0 of the controller; None without b0, for a plant that was given
+        sampled, and if the first derivative of y that u reaches is not the one that the controller
+        assumes.
     """
 
     def __init__(
@@ -179,8 +184,8 @@ class LoopAnalysis:
         Parameters
         ----------
         name
-            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"`` (load to y), ``"CS"`` (noise to −u) or ``"closed_loop"`` (r
-            to y).
+            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"`` (load to y), ``"CS"``
+            (noise to −u) or ``"closed_loop"`` (r to y).
         omega
             frequencies [rad/s] (k,).
 
@@ -259,7 +264,8 @@ class LoopAnalysis:
         Parameters
         ----------
         source
-            ``"r"``, ``"d"`` (load at the plant's input), ``"n"`` (noise), or ``"w1"``, ``"w2"``, … (the plant's disturbances).
+            ``"r"``, ``"d"`` (load at the plant's input), ``"n"`` (noise), or ``"w1"``, ``"w2"``, …
+            (the plant's disturbances).
         target
             ``"y"``, ``"u"`` or ``"e"``, which is r − y.
 
@@ -281,8 +287,9 @@ class LoopAnalysis:
         Parameters
         ----------
         name
-            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"``, ``"CS"``, ``"closed_loop"`` (r to y), or ``"source →
-            target"`` as for ``closed_loop``, for example ``"w2 → y"``.
+            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"``, ``"CS"``,
+            ``"closed_loop"`` (r to y), or ``"source → target"`` as for ``closed_loop``, for example
+            ``"w2 → y"``.
 
         Raises
         ------
@@ -294,9 +301,11 @@ class LoopAnalysis:
     def transfer_function(self, name: str) -> Any:
         """Return the same as a ``control.TransferFunction``: polynomials in z.
 
-        Use it to read, and ``system`` to compute: coefficients in double precision do not determine poles that lie close together near
-        z = 1. With omega_o dt = 0.12 the step response of P, C_r and C_y, closed by python-control in state space, is exact to 1e-9 up to
-        order 3 and to 3e-8 for order 4; that of the closed loop as one fraction to 1e-9, 1e-6 and 3e-3 for orders 2, 3 and 4.
+        Use it to read, and ``system`` to compute: coefficients in double precision do not determine
+        poles that lie close together near z = 1. With omega_o dt = 0.12 the step response of P, C_r
+        and C_y, closed by python-control in state space, is exact to 1e-9 up to order 3 and to 3e-8
+        for order 4; that of the closed loop as one fraction to 1e-9, 1e-6 and 3e-3 for orders 2, 3
+        and 4.
         """
         return transfer_function(subsystem(self.plant, self.law, name), self.dt)
 

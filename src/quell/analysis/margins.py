@@ -1,14 +1,16 @@
 """Stability margins of a loop from its frequency response.
 
-With L the loop, broken at the plant's input, and ``S = 1/(1 + L)``, a stable loop stays stable as long as
+With L the loop, broken at the plant's input, and ``S = 1/(1 + L)``, a stable loop stays stable as
+long as
 
 * its gain is multiplied by a factor between the lower and the upper *gain margin*;
 * its phase changes by less than the *phase margin*;
 * its dead time grows by less than the *delay margin*;
-* L changes by less than the *modulus margin* ``1/max |S| = min |1 + L|`` (Landau; Åström & Murray's stability margin s_m);
-* gain and phase vary together in the disk ``(1 + δ/2)/(1 − δ/2)``, ``|δ| <`` the *disk margin* ``α = 1/max |S − ½|`` (Seiler, Packard &
-  Gahinet, *IEEE Control Systems* 40, 2020, with skew 0): gain by any factor in ``(2 − α)/(2 + α) … (2 + α)/(2 − α)`` or phase by
-  ``2 atan(α/2)``.
+* L changes by less than the *modulus margin* ``1/max |S| = min |1 + L|`` (Landau; Åström & Murray's
+  stability margin s_m);
+* gain and phase vary together in the disk ``(1 + δ/2)/(1 − δ/2)``, ``|δ| <`` the *disk margin* ``α
+  = 1/max |S − ½|`` (Seiler, Packard & Gahinet, *IEEE Control Systems* 40, 2020, with skew 0): gain
+  by any factor in ``(2 − α)/(2 + α) … (2 + α)/(2 − α)`` or phase by ``2 atan(α/2)``.
 """
 
 from __future__ import annotations
@@ -25,13 +27,16 @@ from quell.types import Vector
 
 Response = Callable[[Vector], Complex]
 
-# Gains beyond these factors are not searched for the edge of stability: they are far from any physical gain error.
+# Gains beyond these factors are not searched for the edge of stability: they are far from any
+# physical gain error.
 _LEAST_FACTOR, _LARGEST_FACTOR = 1e-9, 1e9
 # How far below the lowest frequency of the grid ω → 0 is evaluated.
 _TOWARDS_ZERO = 1e-3
-# Local minima to refine: a sharp dip may lie beside a grid point that is not the lowest. Chosen by hand.
+# Local minima to refine: a sharp dip may lie beside a grid point that is not the lowest. Chosen by
+# hand.
 _MINIMA = 3
-# Relative errors of the refined frequencies. A minimum is flat, so that its value is exact well before its place.
+# Relative errors of the refined frequencies. A minimum is flat, so that its value is exact well
+# before its place.
 _MINIMUM_TOLERANCE, _CROSSING_TOLERANCE = 1e-9, 1e-13
 
 
@@ -78,7 +83,8 @@ def margins(
     dt
         sample time [s].
     stable_with
-        function that returns whether the closed loop is stable with its gain multiplied by a factor.
+        function that returns whether the closed loop is stable with its gain multiplied by a
+        factor.
     """
     nan = math.nan
     if not stable_with(1.0):
@@ -115,8 +121,9 @@ def _gain_margin(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the range of factors of the gain for which the loop is stable, and the frequencies at its ends.
 
-    A pole is on the unit circle for the factor κ where ``κ L = −1``: at crossings of the negative real axis, at ω → 0 and at half the
-    sampling rate. Between two such factors stability does not change, so one test between them is enough.
+    A pole is on the unit circle for the factor κ where ``κ L = −1``: at crossings of the negative
+    real axis, at ω → 0 and at half the sampling rate. Between two such factors stability does not
+    change, so one test between them is enough.
     """
 
     def imaginary_part(w: Vector) -> Vector:
@@ -177,7 +184,8 @@ def _sign_changes(
     found = []
     for i in np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:])):
         low, high = math.log(omega[i]), math.log(omega[i + 1])
-        # At half the sampling rate a response is real: the sign of its imaginary part is a rounding error, which does not repeat.
+        # At half the sampling rate a response is real: the sign of its imaginary part is a rounding
+        # error, which does not repeat.
         if np.isfinite(values[i]) and np.isfinite(values[i + 1]) and at(low) * at(high) < 0.0:
             root = brentq(at, low, high, xtol=_CROSSING_TOLERANCE, rtol=_CROSSING_TOLERANCE)
             found.append(math.exp(root))

@@ -9,8 +9,8 @@ import numpy as np
 from quell.analysis.frequency_response import System
 from quell.optional import import_extra
 
-# Trailing coefficients below this share of the largest one count as rounding errors of a zero, some hundred times the
-# unit roundoff.
+# Trailing coefficients below this share of the largest one count as rounding errors of a zero, some
+# hundred times the unit roundoff.
 _ROUNDING = 1e-13
 
 
@@ -23,8 +23,9 @@ def state_space(system: System, dt: float) -> Any:
 def transfer_function(system: System, dt: float) -> Any:
     """Return a system as a ``control.TransferFunction`` of sample time ``dt`` [s].
 
-    The denominator is ``det(zI − A)``. The numerator is its product with the impulse response D, CB, CAB, …, which is as small as the
-    numerator itself; in the difference of two characteristic polynomials it would be lost to their rounding errors.
+    The denominator is ``det(zI − A)``. The numerator is its product with the impulse response D,
+    CB, CAB, …, which is as small as the numerator itself; in the difference of two characteristic
+    polynomials it would be lost to their rounding errors.
     """
     N, B, C, D = System.balanced(*system)
     denominator = np.real(np.poly(1.0 + np.linalg.eigvals(N)))
@@ -33,7 +34,8 @@ def transfer_function(system: System, dt: float) -> Any:
         impulse_response.append(float(C @ x))
         x = x + N @ x
     numerator = np.convolve(denominator, impulse_response)[: denominator.size]
-    # Cancel a common pole and zero at z = 0: the u of the sample before, which is a state of both plant and controller.
+    # Cancel a common pole and zero at z = 0: the u of the sample before, which is a state of both
+    # plant and controller.
     while denominator.size > 1 and all(
         abs(part[-1]) < _ROUNDING * np.max(np.abs(part)) for part in (numerator, denominator)
     ):

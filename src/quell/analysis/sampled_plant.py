@@ -1,7 +1,7 @@
 """The plant as the controller sees it: sampled with zero-order hold, with dead time and actuator lag.
 
-Matrices are kept as ``A − I``: a double integrator sampled at 1 ms differs from the unit matrix in the sixth digit, and all slow dynamics
-are in that difference.
+Matrices are kept as ``A − I``: a double integrator sampled at 1 ms differs from the unit matrix in
+the sixth digit, and all slow dynamics are in that difference.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from quell.lti.models import TransferFunction, leading_gain, read_model, to_stat
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
-# Limit on the number of states that a dead time adds; the cost of eigenvalues grows with its cube. Chosen by hand.
+# Limit on the number of states that a dead time adds; the cost of eigenvalues grows with its cube.
+# Chosen by hand.
 _MOST_SAMPLES = 200
 
 
@@ -44,7 +45,8 @@ def sampled_plant(
     Parameters
     ----------
     plant
-        anything that ``LinearPlant.of`` takes; a system of python-control or scipy.signal may be sampled already, with the same dt.
+        anything that ``LinearPlant.of`` takes; a system of python-control or scipy.signal may be
+        sampled already, with the same dt.
     dt
         sample time [s].
     delay
@@ -55,7 +57,8 @@ def sampled_plant(
     Raises
     ------
     ValueError
-        for an object that is not such a plant, direct feedthrough, or a dead time of more than 200 samples.
+        for an object that is not such a plant, direct feedthrough, or a dead time of more than 200
+        samples.
     """
     delay = checks.non_negative("delay", delay, "s")
     actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")

@@ -24,8 +24,8 @@ _OPEN = ("P", "C_r", "C_y", "L")
 def closed_loop_matrix(A: Matrix, B: Matrix, C: Matrix, law: LinearLaw, inner: Matrix) -> Matrix:
     """Return the matrix of a sampled plant in closed loop with a law, without limits; the plant's states come first.
 
-    ``inner`` is ``law.A + B_u C``, the law with its own output applied. Pass A and ``inner`` both as they are, or both less the unit
-    matrix.
+    ``inner`` is ``law.A + B_u C``, the law with its own output applied. Pass A and ``inner`` both
+    as they are, or both less the unit matrix.
     """
     return np.block(
         [
@@ -64,7 +64,8 @@ def _open_loop(plant: SampledPlant, law: LinearLaw, name: str) -> System:
     if name == "C_y":
         return C_y
     n, m = plant.N.shape[0], N.shape[0]
-    # L, with the loop broken at the plant's input: from there through the plant to the output of C_y.
+    # L, with the loop broken at the plant's input: from there through the plant to the output of
+    # C_y.
     A: Matrix = np.block([[plant.N, np.zeros((n, m))], [np.outer(C_y.B, plant.C), N]])
     return System(A, np.append(plant.B, np.zeros(m)), np.concatenate([C_y.D * plant.C, C_y.C]), 0.0)
 

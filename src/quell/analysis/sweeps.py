@@ -19,16 +19,16 @@ def loops_over_time(
 ) -> list[LoopAnalysis]:
     """Analyse the loop with its learner frozen at several instants.
 
-    Each is the loop that would follow if nothing more were learned. That all of them are stable does not prove that the loop with a
-    learner that learns is stable (docs/analysis).
+    Each is the loop that would follow if nothing more were learned. That all of them are stable
+    does not prove that the loop with a learner that learns is stable (docs/analysis).
 
     Parameters
     ----------
     plant, controller
         as for ``analyse``; with a scenario the plant must be one that can be simulated.
     run
-        a ``Trajectory``, whose record holds the learner's coefficients; or the ``Scenario`` of a run, which is simulated up to each
-        instant and works for every learner.
+        a ``Trajectory``, whose record holds the learner's coefficients; or the ``Scenario`` of a
+        run, which is simulated up to each instant and works for every learner.
     times
         instants [s].
     lags
@@ -42,7 +42,8 @@ def loops_over_time(
     Raises
     ------
     ValueError
-        as ``frozen`` and ``analyse``; for a time outside of the run, or a scenario in which the loop diverges before it.
+        as ``frozen`` and ``analyse``; for a time outside of the run, or a scenario in which the
+        loop diverges before it.
     """
     instants = checks.vector("times", times).tolist()
     if isinstance(run, Trajectory):

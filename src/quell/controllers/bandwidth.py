@@ -10,9 +10,9 @@ def omega_c_for(settling_time: float, order: int, band: float = 0.02) -> float:
 
     The unit step response of the ideal loop ``omega_c^n / (s + omega_c)^n`` is the regularised
     incomplete gamma function ``P(n, omega_c t)``. It rises without overshoot, so the loop settles
-    when ``P(n, omega_c t) = 1 − band``. For 2 % and n = 1, 2 that is 3.91/t and 5.83/t, which Herbst
-    (*Electronics* 2, 2013) rounds to 4/t and 6/t. A real loop, with an observer and a plant that
-    differs from its model, settles in another time.
+    when ``P(n, omega_c t) = 1 − band``. For 2 % and n = 1, 2 that is 3.91/t and 5.83/t, which
+    Herbst (*Electronics* 2, 2013) rounds to 4/t and 6/t. A real loop, with an observer and a plant
+    that differs from its model, settles in another time.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """A compiled controller step, called from Python one sample at a time.
 
-Numba unpacks a NamedTuple at each call, array by array: 2.7 µs for ten arrays. A ``structref`` holds
-the same parameters and state unpacked, and a call of the compiled function itself, without the
-look-up of its argument types, costs a tenth of a microsecond.
+Numba unpacks a NamedTuple at each call, array by array: 2.7 µs for ten arrays. A ``structref``
+holds the same parameters and state unpacked, and a call of the compiled function itself, without
+the look-up of its argument types, costs a tenth of a microsecond.
 
 Inside the call the parameters and the state are used without reference counting, which with thirty
 arrays would take longer than the control law. The step therefore runs the same code as the

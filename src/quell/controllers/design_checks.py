@@ -1,14 +1,14 @@
 """Design rules for the sample time and a known delay, judged from the design alone.
 
 An observer places its poles in the z-plane, so it is stable at any sample time, but slow sampling
-reduces the margins. Measured on the loop with the plant that the design assumes, a chain of
-n = 1 … 4 integrators, with omega_o 3 and 10 times omega_c (docs/analysis): compared with fast
-sampling the modulus margin is 8 to 16 % smaller at ``omega_o dt = 1`` for the current form, and 9 to
-14 % at 0.3 for the predictor form, which has one more sample of delay. The law's gains are those of
-continuous time: with omega_o = omega_c, the loops of order 3 and 4 are stable at
-``omega_c dt = 0.5`` and unstable at 0.7. The observer takes account of a known delay of u, but the
-delay stays in the loop: with omega_o 3 to 10 times omega_c, the chains have modulus margins of about
-0.39, 0.33, 0.28 and 0.22 at ``n omega_c delay = 0.5``, and become unstable between 1.2 and 1.6.
+reduces the margins. Measured on the loop with the plant that the design assumes, a chain of n = 1 …
+4 integrators, with omega_o 3 and 10 times omega_c (docs/analysis): compared with fast sampling the
+modulus margin is 8 to 16 % smaller at ``omega_o dt = 1`` for the current form, and 9 to 14 % at 0.3
+for the predictor form, which has one more sample of delay. The law's gains are those of continuous
+time: with omega_o = omega_c, the loops of order 3 and 4 are stable at ``omega_c dt = 0.5`` and
+unstable at 0.7. The observer takes account of a known delay of u, but the delay stays in the loop:
+with omega_o 3 to 10 times omega_c, the chains have modulus margins of about 0.39, 0.33, 0.28 and
+0.22 at ``n omega_c delay = 0.5``, and become unstable between 1.2 and 1.6.
 """
 
 from __future__ import annotations

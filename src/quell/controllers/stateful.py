@@ -15,16 +15,18 @@ from quell.controllers.limits import Limits
 from quell.kernels.dispatch import dispatcher_for
 from quell.kernels.user_types import explain_compile_errors
 
-# Attributes that are made again in a copy: compiled functions and shared arrays belong to one process.
+# Attributes that are made again in a copy: compiled functions and shared arrays belong to one
+# process.
 _NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step")
 
 
 class StatefulController:
     """A controller with its own running state, which ``step`` advances and ``simulate`` does not touch.
 
-    A subclass sets its attributes, then calls ``_initialise``. It defines ``_update_parameters``, which makes ``parameters`` from them,
-    and ``initial_state``. If a field of the state refers to an object outside of its arrays, the subclass also defines
-    ``_external_fields``, ``_external_snapshots`` and ``_restore_external``.
+    A subclass sets its attributes, then calls ``_initialise``. It defines ``_update_parameters``,
+    which makes ``parameters`` from them, and ``initial_state``. If a field of the state refers to
+    an object outside of its arrays, the subclass also defines ``_external_fields``,
+    ``_external_snapshots`` and ``_restore_external``.
     """
 
     parameters: Any
@@ -68,10 +70,12 @@ class StatefulController:
     def step(self, r: float, y: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
 
-        A value that is not finite is replaced by the last finite one, or by the one that an observer expects; ``status`` reports it. The
-        controller assumes that the returned value is applied: set limits by ``u_min``, ``u_max`` and ``rate_limit``.
+        A value that is not finite is replaced by the last finite one, or by the one that an
+        observer expects; ``status`` reports it. The controller assumes that the returned value is
+        applied: set limits by ``u_min``, ``u_max`` and ``rate_limit``.
 
-        The first call compiles, or loads from the disk cache; call ``prepare`` to do that beforehand.
+        The first call compiles, or loads from the disk cache; call ``prepare`` to do that
+        beforehand.
         """
         if self._packed is None:
             self.prepare()
@@ -83,7 +87,8 @@ class StatefulController:
     def applied(self, u: float) -> None:
         """Correct the control signal that was applied since the last ``step`` [u-unit], if it is not the one that was returned.
 
-        Call it before the next ``step``. Limits that are known beforehand belong in ``u_min``, ``u_max`` and ``rate_limit``.
+        Call it before the next ``step``. Limits that are known beforehand belong in ``u_min``,
+        ``u_max`` and ``rate_limit``.
 
         Raises
         ------
@@ -104,7 +109,8 @@ class StatefulController:
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self).update({name: value for name, value in kept.items() if name != "state"})
-        # Parameters may hold addresses of compiled functions, and arrays of a state may share memory: make both again.
+        # Parameters may hold addresses of compiled functions, and arrays of a state may share
+        # memory: make both again.
         self._initialise()
         self.state = kept["state"]
 
@@ -116,8 +122,9 @@ class StatefulController:
     def state(self) -> dict[str, NDArray[Any]]:
         """The whole running state as copies of named arrays: ``numpy.savez(file, **controller.state)`` saves it.
 
-        Assign such a dictionary to restore it; a ``ValueError`` names what does not fit, and then nothing has changed. A learner that is
-        a Python object appears as an array () of objects, which is valid in this process; quell does not pickle or unpickle it.
+        Assign such a dictionary to restore it; a ``ValueError`` names what does not fit, and then
+        nothing has changed. A learner that is a Python object appears as an array () of objects,
+        which is valid in this process; quell does not pickle or unpickle it.
         """
         return self._saved(self._state)
 

@@ -33,8 +33,8 @@ from quell.observers.eso import ESO
 class ADRC(StatefulController):
     """Active disturbance rejection control around an ESO, with or without a learner.
 
-    All but the running state is immutable, except through ``retune``. ``step`` advances the running state; ``simulate`` does not touch
-    it and uses a state of its own.
+    All but the running state is immutable, except through ``retune``. ``step`` advances the running
+    state; ``simulate`` does not touch it and uses a state of its own.
 
     Parameters
     ----------
@@ -45,33 +45,29 @@ class ADRC(StatefulController):
     learner
         predicts f and feeds it forward; none by default.
     guard
-        limits the learner to the authority that it has earned; without one the learner has full authority.
+        limits the learner to the authority that it has earned; without one the learner has full
+        authority.
     feedforward
-        whether to feed the reference's derivatives forward. ``simulate`` takes them from the signal, ``step`` from its arguments. The
-        ideal loop then follows the reference without lag.
+        whether to feed the reference's derivatives forward. ``simulate`` takes them from the
+        signal, ``step`` from its arguments. The ideal loop then follows the reference without lag.
     u_min, u_max
         limits of the control signal [u-unit].
     rate_limit
         largest rate of the control signal, in either direction [u-unit/s].
     half_gain
-        whether to halve the gains k of the law, reference included, but not the cancellation of f. The gain from noise in x̂ is halved,
-        and the loop settles to 2 % in 2.0, 1.4, 1.2 and 1.0 times the time for orders 1 to 4 (Herbst, Hempel, Göhrt & Streif 2020,
-        arXiv 2003.03986).
+        whether to halve the gains k of the law, reference included, but not the cancellation of f.
+        The gain from noise in x̂ is halved, and the loop settles to 2 % in 2.0, 1.4, 1.2 and 1.0
+        times the time for orders 1 to 4 (Herbst, Hempel, Göhrt & Streif 2020, arXiv 2003.03986).
 
     Raises
     ------
     ValueError
-        for a bandwidth or rate limit that is not positive, limits in the wrong order, and an observer of a plant with zeros outside of
-        the left half plane.
+        for a bandwidth or rate limit that is not positive, limits in the wrong order, and an
+        observer of a plant with zeros outside of the left half plane.
 
-    Examples
-    --------
-    >>> from quell.observers import ESO
-    >>> controller = ADRC(ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=2.0, u_min=-1.0, u_max=1.0)
-    >>> controller.step(r=1.0, y=0.0)
-    1.0
-    >>> controller.estimate.status
-    <Status.SATURATED: 4>
+    Examples -------- >>> from quell.observers import ESO >>> controller =
+    ADRC(ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=2.0, u_min=-1.0, u_max=1.0)
+    >>> controller.step(r=1.0, y=0.0) 1.0 >>> controller.estimate.status <Status.SATURATED: 4>
     """
 
     def __init__(
@@ -170,13 +166,16 @@ class ADRC(StatefulController):
     def step(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
 
-        With ``feedforward``, r', r'', … may follow [y-unit/s^i]; missing ones, and those that are not finite, count as zero.
+        With ``feedforward``, r', r'', … may follow [y-unit/s^i]; missing ones, and those that are
+        not finite, count as zero.
 
-        A measurement that is not finite is replaced by the one that the observer expects, a reference by the last finite one;
-        ``estimate.status`` reports it. The observer assumes that the returned value is applied: set limits by ``u_min``, ``u_max`` and
-        ``rate_limit``, or call ``applied`` with what was applied.
+        A measurement that is not finite is replaced by the one that the observer expects, a
+        reference by the last finite one; ``estimate.status`` reports it. The observer assumes that
+        the returned value is applied: set limits by ``u_min``, ``u_max`` and ``rate_limit``, or
+        call ``applied`` with what was applied.
 
-        The first call compiles, or loads from the disk cache; call ``prepare`` to do that beforehand.
+        The first call compiles, or loads from the disk cache; call ``prepare`` to do that
+        beforehand.
 
         Raises
         ------
@@ -211,18 +210,19 @@ class ADRC(StatefulController):
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
         """Start at a plant that rests at ``y`` under the control signal ``u``: the next ``step`` continues from ``u`` without a bump.
 
-        What was learned is kept. A controller that is not started begins at its first sample with f̂ = 0, which is right for a plant at
-        rest without load and makes a bump under load.
+        What was learned is kept. A controller that is not started begins at its first sample with
+        f̂ = 0, which is right for a plant at rest without load and makes a bump under load.
 
         Parameters
         ----------
         y
             measurement [y-unit].
         u
-            control signal that holds the plant there [u-unit]; outside of the limits, the next step jumps to them.
+            control signal that holds the plant there [u-unit]; outside of the limits, the next step
+            jumps to them.
         r
-            reference of the next step [y-unit]; ``y`` by default. With another one u still continues without a jump, and the move begins
-            with the observer's own dynamics.
+            reference of the next step [y-unit]; ``y`` by default. With another one u still
+            continues without a jump, and the move begins with the observer's own dynamics.
 
         Raises
         ------
@@ -246,7 +246,8 @@ class ADRC(StatefulController):
         Returns
         -------
         float
-            the control signal that the controller would have applied; ``hand_over`` bridges the difference.
+            the control signal that the controller would have applied; ``hand_over`` bridges the
+            difference.
 
         Raises
         ------
@@ -274,9 +275,10 @@ class ADRC(StatefulController):
     def increment(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the change of the control signal [u-unit], within the limits of magnitude and rate.
 
-        For actuators that take increments (steppers, valves, a drive that holds its set point). The law is that of ``step`` (Herbst,
-        arXiv 1908.04610, section IV, shows that the two are one). If the actuator's position is not known, ``start(y)`` takes it as
-        zero, f̂ includes the difference, and limits of magnitude refer to that zero.
+        For actuators that take increments (steppers, valves, a drive that holds its set point). The
+        law is that of ``step`` (Herbst, arXiv 1908.04610, section IV, shows that the two are one).
+        If the actuator's position is not known, ``start(y)`` takes it as zero, f̂ includes the
+        difference, and limits of magnitude refer to that zero.
         """
         before = float(self._state.loop[0].u)
         return self.step(r, y, *derivatives) - before
@@ -284,23 +286,26 @@ class ADRC(StatefulController):
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, without a bump; allowed in every sample, so that gains can be scheduled.
 
-        The control signal continues from where the old gains would have it, and the difference decays with the new ``omega_c``. A faster
-        observer still moves it in the middle of a motion, by its own better estimate. What was learned is kept. A call takes some
-        milliseconds, because the designs are sampled again.
+        The control signal continues from where the old gains would have it, and the difference
+        decays with the new ``omega_c``. A faster observer still moves it in the middle of a motion,
+        by its own better estimate. What was learned is kept. A call takes some milliseconds,
+        because the designs are sampled again.
 
         Parameters
         ----------
         omega_c
             new controller bandwidth [rad/s]; unchanged by default.
         observer
-            new observer of the same order, form, structure and sample time, with another ``omega_o``, ``b0`` or model; unchanged by
-            default. For a plant with zeros, or with a separate input for f, only ``omega_o`` may change.
+            new observer of the same order, form, structure and sample time, with another
+            ``omega_o``, ``b0`` or model; unchanged by default. For a plant with zeros, or with a
+            separate input for f, only ``omega_o`` may change.
 
         Raises
         ------
         ValueError
-            for an observer of another kind, for a change of b0 or model that a learner's coefficients or the state do not allow, and for
-            a bandwidth that is not positive. The controller is then unchanged.
+            for an observer of another kind, for a change of b0 or model that a learner's
+            coefficients or the state do not allow, and for a bandwidth that is not positive. The
+            controller is then unchanged.
         """
         new_omega_c = (
             self.omega_c if omega_c is None else checks.positive("omega_c", omega_c, "rad/s")

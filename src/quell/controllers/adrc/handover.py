@@ -1,9 +1,11 @@
 """Start under load, manual operation and retuning of a running ADRC, as functions of its parameters and its state.
 
-A controller starts under load, or follows manual operation, by its observer: the observer receives y and the applied u and estimates f
-(Herbst, "Practical Active Disturbance Rejection Control: Bumpless Transfer, Rate Limitation, and Incremental Algorithm", arXiv
-1908.04610). At rest at the reference the law then returns exactly that u. Otherwise, with another reference or new gains, the difference
-is added to u and decays as ``exp(−omega_c t)``. The observer receives the sum, so the offset does not disturb its estimate.
+A controller starts under load, or follows manual operation, by its observer: the observer receives
+y and the applied u and estimates f (Herbst, "Practical Active Disturbance Rejection Control:
+Bumpless Transfer, Rate Limitation, and Incremental Algorithm", arXiv 1908.04610). At rest at the
+reference the law then returns exactly that u. Otherwise, with another reference or new gains, the
+difference is added to u and decays as ``exp(−omega_c t)``. The observer receives the sum, so the
+offset does not disturb its estimate.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ from quell.observers.nonlinear import NonlinearModel
 from quell.observers.response import scaled_response
 from quell.types import Vector
 
-# Time constants after which nothing is left of an initial error in double precision: exp(−40) = 4e-18.
+# Time constants after which nothing is left of an initial error in double precision: exp(−40) =
+# 4e-18.
 _TIME_CONSTANTS = 40.0
 # Bound on the time that ``start`` takes: some seconds of calculation. Chosen by hand.
 _MOST_SAMPLES = 100_000_000
@@ -107,8 +110,8 @@ def check_replacement(old: ESO, new: Any, learns: bool) -> None:
     Raises
     ------
     ValueError
-        for another order, form, sample time or number of states, or a change of b0 or model that the state or the learner's
-        coefficients do not allow.
+        for another order, form, sample time or number of states, or a change of b0 or model that
+        the state or the learner's coefficients do not allow.
     """
     if not isinstance(new, ESO):
         raise ValueError(f"observer = {new!r}: must be an ESO")

@@ -1,8 +1,9 @@
 """The PID controller that is equivalent to a linear ADRC.
 
-In continuous time, an ESO of order n in closed loop with its own law is a linear system from (r, y) to u. With ``k_i`` the law's gains,
-and the ESO model-free with all poles at ω_o, elimination of its state gives (Herbst, *Control Theory and Technology* 19, 2021, arXiv
-2011.01044; Zhong, Huang & Guo, *Science China Information Sciences* 63, 2020, derive the reverse, from PID to ADRC)::
+In continuous time, an ESO of order n in closed loop with its own law is a linear system from (r, y)
+to u. With ``k_i`` the law's gains, and the ESO model-free with all poles at ω_o, elimination of its
+state gives (Herbst, *Control Theory and Technology* 19, 2021, arXiv 2011.01044; Zhong, Huang & Guo,
+*Science China Information Sciences* 63, 2020, derive the reverse, from PID to ADRC)::
 
     n = 1    b_0 U = ( k_1 (s + ω_o)² R − (β_1 s + β_0) Y ) / ( s (s + α_0) )
              α_0 = 2ω_o + k_1,      β_1 = ω_o² + 2 k_1 ω_o,      β_0 = k_1 ω_o²
@@ -11,9 +12,10 @@ and the ESO model-free with all poles at ω_o, elimination of its state gives (H
              α_1 = 3ω_o + k_2,      α_0 = 3ω_o² + 3ω_o k_2 + k_1
              β_2 = ω_o³ + 3ω_o² k_2 + 3ω_o k_1,      β_1 = ω_o³ k_2 + 3ω_o² k_1,      β_0 = k_1 ω_o³
 
-From y to u this is exactly a PI controller with a filter of first order, or a PID controller with one of second order; from r to u it is
-the same controller with a prefilter of the reference, here the ``setpoint`` polynomial. The sampled ADRC and the PID controller sampled
-by Tustin's rule agree to first order in dt, as long as no limit is reached.
+From y to u this is exactly a PI controller with a filter of first order, or a PID controller with
+one of second order; from r to u it is the same controller with a prefilter of the reference, here
+the ``setpoint`` polynomial. The sampled ADRC and the PID controller sampled by Tustin's rule agree
+to first order in dt, as long as no limit is reached.
 """
 
 from __future__ import annotations
@@ -36,17 +38,20 @@ def equivalent_pid(controller: ADRC, **options: Any) -> PID:
     controller
         an ``ADRC`` without learner around a model-free ESO of order 1 or 2.
     **options
-        limits and name of the PID controller; by default the limits of ``controller``, except its rate limit.
+        limits and name of the PID controller; by default the limits of ``controller``, except its
+        rate limit.
 
     Returns
     -------
     PID
-        with ``kp``, ``ki``, ``kd``, ``filter`` and ``setpoint`` as in the equations above, at the sample time of ``controller``.
+        with ``kp``, ``ki``, ``kd``, ``filter`` and ``setpoint`` as in the equations above, at the
+        sample time of ``controller``.
 
     Raises
     ------
     ValueError
-        for an ADRC of another order, with a learner, feedforward or another observer, and for anything but an ADRC.
+        for an ADRC of another order, with a learner, feedforward or another observer, and for
+        anything but an ADRC.
     """
     _check_linear(controller)
     observer, gains = controller.observer, controller.parameters.law.tolist()

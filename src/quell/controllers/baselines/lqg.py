@@ -4,14 +4,17 @@
 
     minimise ∫ y² + ρ u² dt,      u = −K x̂ − d̂ + N r,      N = 1 / ( C (I − Φ + Γ K)⁻¹ Γ )
 
-(Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, sections 8.5 and 9; observer_law.py has the filter.) The cost
-is sampled exactly (Van Loan, *IEEE Trans. Automatic Control* 23, 1978) and K comes from its Riccati equation.
+(Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, sections 8.5 and 9;
+observer_law.py has the filter.) The cost is sampled exactly (Van Loan, *IEEE Trans. Automatic
+Control* 23, 1978) and K comes from its Riccati equation.
 
-The weights follow from two bandwidths. If u reaches y through ν integrators with the gain b, cheap control places ν poles of the loop in
-a Butterworth pattern of radius ``(b²/ρ)^(1/(2ν))``, and the others at the plant's zeros. With a random walk of density q at the input
-and measurement noise of density v the filter's N − (n − ν) fast poles have the radius ``(q b²/v)^(1/(2(ν + 1)))`` (Kwakernaak & Sivan,
-*Linear Optimal Control Systems*, 1972, sections 3.8 and 4.4). So ``ρ = b²/omega_c^(2ν)`` and ``q b²/v = omega_o^(2(ν+1))``: exact for a
-chain of integrators, else valid for bandwidths above the plant's own frequencies.
+The weights follow from two bandwidths. If u reaches y through ν integrators with the gain b, cheap
+control places ν poles of the loop in a Butterworth pattern of radius ``(b²/ρ)^(1/(2ν))``, and the
+others at the plant's zeros. With a random walk of density q at the input and measurement noise of
+density v the filter's N − (n − ν) fast poles have the radius ``(q b²/v)^(1/(2(ν + 1)))``
+(Kwakernaak & Sivan, *Linear Optimal Control Systems*, 1972, sections 3.8 and 4.4). So ``ρ =
+b²/omega_c^(2ν)`` and ``q b²/v = omega_o^(2(ν+1))``: exact for a chain of integrators, else valid
+for bandwidths above the plant's own frequencies.
 """
 
 from __future__ import annotations
@@ -50,8 +53,9 @@ class LQG(LinearController):
     rho
         weight of u², instead of the one from ``omega_c``.
     process_noise
-        (n, n), symmetric, density of white noise on the state's derivatives, in addition to that of the disturbance, relative to the
-        density of the measurement noise [(state-unit/s)²/y-unit²]; none by default.
+        (n, n), symmetric, density of white noise on the state's derivatives, in addition to that of
+        the disturbance, relative to the density of the measurement noise [(state-unit/s)²/y-unit²];
+        none by default.
     u_min, u_max, rate_limit, name
         as for ``LinearController``.
 
@@ -67,8 +71,8 @@ class LQG(LinearController):
     Raises
     ------
     ValueError
-        for a plant that is not stabilisable from u or not detectable from y, or has a zero at s = 0 (a constant disturbance
-        then has no effect on y), and for numbers out of range.
+        for a plant that is not stabilisable from u or not detectable from y, or has a zero at s = 0
+        (a constant disturbance then has no effect on y), and for numbers out of range.
 
     Examples
     --------
@@ -106,7 +110,8 @@ class LQG(LinearController):
         weight = C.T @ C if Q is None else checks.weight("Q", Q, n)
         self.K = _state_gain(A, B, weight, rho, dt)
         self.model = with_disturbance(A, B, C, B, dt)
-        # From densities to variances per sample: that of y divided by dt, that of the walk times dt.
+        # From densities to variances per sample: that of y divided by dt, that of the walk times
+        # dt.
         W = np.zeros((n + 1, n + 1))
         W[n, n] = dt * omega_o ** (2 * (degree + 1)) / b**2
         if process_noise is not None:

@@ -4,9 +4,11 @@
 
     N(s) = (s² + 2 ζ_z ω s + ω²) / (s² + 2 ζ_p ω s + ω²),      |N(jω)| = ζ_z/ζ_p = depth,      −3 dB over about  2 ζ_p ω = width · ω
 
-(Ellis, *Control System Design Guide*, 4th ed. 2012, chapter 9; Vukosavić & Stojić, *IEEE Trans. Industrial Electronics* 45, 1998, for
-drives with torsional resonance.) The filter removes the resonance from the loop and does not damp it: a plant without friction keeps
-swinging after a disturbance. At low frequencies the filter acts as a delay ``2 (ζ_p − ζ_z)/ω``, which a tuning rule must include.
+(Ellis, *Control System Design Guide*, 4th ed. 2012, chapter 9; Vukosavić & Stojić, *IEEE Trans.
+Industrial Electronics* 45, 1998, for drives with torsional resonance.) The filter removes the
+resonance from the loop and does not damp it: a plant without friction keeps swinging after a
+disturbance. At low frequencies the filter acts as a delay ``2 (ζ_p − ζ_z)/ω``, which a tuning rule
+must include.
 """
 
 from __future__ import annotations

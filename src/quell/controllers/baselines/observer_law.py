@@ -4,13 +4,15 @@ The sampled plant with a disturbance that is a random walk, z = (x, d)::
 
     z⁺ = F z + G u,    F = [[Φ, Γ_d], [0, 1]],    G = [Γ; 0],    y = H z = C x
 
-A Kalman filter in its current form, as the observers of this package, driven by the applied u, and state feedback::
+A Kalman filter in its current form, as the observers of this package, driven by the applied u, and
+state feedback::
 
     z  = z⁻ + L (y − H z⁻),     L = P H' (H P H' + V)⁻¹,     P from the Riccati equation of (F', H', W, V)
     u  = N r − K z,             z⁻⁺ = F z + G u
 
-At rest the innovation is zero, and therefore ``y − r`` is zero for any plant and any constant disturbance: d̂ acts as integral action.
-Because the filter receives the applied u, it does not wind up.
+At rest the innovation is zero, and therefore ``y − r`` is zero for any plant and any constant
+disturbance: d̂ acts as integral action. Because the filter receives the applied u, it does not wind
+up.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from quell.controllers.linear.law import LinearLaw
 from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
-# Relative size below which singular values and distances to the imaginary axis count as zero. Chosen by hand, above rounding errors.
+# Relative size below which singular values and distances to the imaginary axis count as zero.
+# Chosen by hand, above rounding errors.
 _TINY = 1e-9
 _HINT = "check the noise densities, dt and the plant's units"
 
@@ -65,7 +68,8 @@ def check_reachable(A: Matrix, B: Matrix, what: str) -> None:
 def stationary_gain(model: SampledModel, W: Matrix, V: float) -> Vector:
     """Return the gain L (N,) of the stationary Kalman filter.
 
-    The process noise per sample is W (N, N) [state-unit²], the measurement variance V [y-unit²]; only their ratio counts.
+    The process noise per sample is W (N, N) [state-unit²], the measurement variance V [y-unit²];
+    only their ratio counts.
 
     Raises
     ------

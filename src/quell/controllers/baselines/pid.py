@@ -4,10 +4,11 @@
 
     U = 1/F(s) · ( k_p (b R − Y) + k_i/s (R − Y) + k_d s (c R − Y) ),        F(s) = 1 + T_f s + (T_f s)²/2
 
-(Åström & Hägglund, *Advanced PID Control*, ISA 2006, sections 3.2 to 3.4: set-point weights b and c, and a filter of second order on
-the measurement, not one on the derivative alone, so that the controller rolls off. The reference is filtered as well, so that both
-paths have the same denominator, which makes little difference for small T_f.) While u lies at a limit the integrator follows it with the
-tracking time T_t (section 3.5, back-calculation).
+(Åström & Hägglund, *Advanced PID Control*, ISA 2006, sections 3.2 to 3.4: set-point weights b and
+c, and a filter of second order on the measurement, not one on the derivative alone, so that the
+controller rolls off. The reference is filtered as well, so that both paths have the same
+denominator, which makes little difference for small T_f.) While u lies at a limit the integrator
+follows it with the tracking time T_t (section 3.5, back-calculation).
 """
 
 from __future__ import annotations
@@ -29,17 +30,21 @@ class PID(LinearController):
     Parameters
     ----------
     kp, ki, kd
-        gains of the parallel form [u-unit/y-unit, the same per s, times s]; any sign. ``simc`` and ``simc_double_integrator`` tune them.
+        gains of the parallel form [u-unit/y-unit, the same per s, times s]; any sign. ``simc`` and
+        ``simc_double_integrator`` tune them.
     tf
-        filter time [s], of ``F = 1 + tf s + (tf s)²/2``; or a pair (f1, f2), of ``F = 1 + f1 s + f2 s²``. Required with a derivative.
+        filter time [s], of ``F = 1 + tf s + (tf s)²/2``; or a pair (f1, f2), of ``F = 1 + f1 s + f2
+        s²``. Required with a derivative.
     b, c
         set-point weights of the proportional and the derivative part, usually 0 to 1.
     tt
-        tracking time [s]; by default √(T_i T_d), or T_i without derivative (Åström & Hägglund 2006, section 3.5).
+        tracking time [s]; by default √(T_i T_d), or T_i without derivative (Åström & Hägglund 2006,
+        section 3.5).
     dt
         sample time [s].
     setpoint
-        polynomial T(s), highest power first, for the reference's path instead of ``k_d c s² + k_p b s + k_i``; of degree 3 at most.
+        polynomial T(s), highest power first, for the reference's path instead of ``k_d c s² + k_p b
+        s + k_i``; of degree 3 at most.
     u_min, u_max, rate_limit, name
         as for ``LinearController``.
 
@@ -124,8 +129,8 @@ class PID(LinearController):
     ) -> PID:
         """Tune for ``gain e^(−θs) / ((τ1 s + 1)(τ2 s + 1))`` by the SIMC rules.
 
-        In series form ``K_c = τ1 / (gain (τ_c + θ))``, ``τ_I = min(τ1, 4 (τ_c + θ))``, ``τ_D = τ2``; PI without τ2 (Skogestad,
-        *J. Process Control* 13, 2003, eqs. (23)-(25)).
+        In series form ``K_c = τ1 / (gain (τ_c + θ))``, ``τ_I = min(τ1, 4 (τ_c + θ))``, ``τ_D =
+        τ2``; PI without τ2 (Skogestad, *J. Process Control* 13, 2003, eqs. (23)-(25)).
 
         Parameters
         ----------

@@ -1,24 +1,28 @@
 """Resonance ratio control of two masses and a spring.
 
-The torque of the spring ``T = k (x_1 − x_2)``, fed back to the motor, changes the motor's inertia as seen by the load from m_1 to m_1/κ::
+The torque of the spring ``T = k (x_1 − x_2)``, fed back to the motor, changes the motor's inertia
+as seen by the load from m_1 to m_1/κ::
 
     u = m_1 v + (1 − κ) T        so that      x_1'' = v − κ T/m_1,      x_2'' = T/m_2
 
-The resonance is then at H times the anti-resonance ``ω_a = √(k/m_2)``, with ``H² = 1 + κ m_2/m_1``; the resonance ratio H is a design
-parameter. With motor position control ``v = k_p (r_1 − x_1) − k_v x_1'`` the characteristic polynomial of the loop is::
+The resonance is then at H times the anti-resonance ``ω_a = √(k/m_2)``, with ``H² = 1 + κ m_2/m_1``;
+the resonance ratio H is a design parameter. With motor position control ``v = k_p (r_1 − x_1) − k_v
+x_1'`` the characteristic polynomial of the loop is::
 
     s⁴ + k_v s³ + (k_p + H² ω_a²) s² + k_v ω_a² s + k_p ω_a²
 
-which for ``H = √5, k_v = 4 ω_a, k_p = ω_a²`` is ``(s + ω_a)⁴`` (Yuki, Murakami & Ohnishi, *IECON* 1993; Hori, Sawada & Chun, *IEEE
-Trans. Industrial Electronics* 46, 1999, with a disturbance observer slow enough for the whole of both masses).
+which for ``H = √5, k_v = 4 ω_a, k_p = ω_a²`` is ``(s + ω_a)⁴`` (Yuki, Murakami & Ohnishi, *IECON*
+1993; Hori, Sawada & Chun, *IEEE Trans. Industrial Electronics* 46, 1999, with a disturbance
+observer slow enough for the whole of both masses).
 
-They measure the motor and estimate T by a disturbance observer there. Here the only measurement y is the position of either mass, so
-x_1, x_1' and T come from a Kalman filter of both masses with a slow force d on the load (observer_law.py). The reference is corrected for
-d at rest::
+They measure the motor and estimate T by a disturbance observer there. Here the only measurement y
+is the position of either mass, so x_1, x_1' and T come from a Kalman filter of both masses with a
+slow force d on the load (observer_law.py). The reference is corrected for d at rest::
 
     r_1 = r − d̂/k − κ d̂/(m_1 k_p)
 
-that is, for the twist of the spring that carries d, and for the deflection of the motor's position control under it.
+that is, for the twist of the spring that carries d, and for the deflection of the motor's position
+control under it.
 """
 
 from __future__ import annotations
@@ -42,13 +46,15 @@ class ResonanceRatio(LinearController):
     Parameters
     ----------
     m1, m2, k
-        motor and load [kg], spring [N/m] of the design; inertias and torsional stiffness for a torsional system.
+        motor and load [kg], spring [N/m] of the design; inertias and torsional stiffness for a
+        torsional system.
     omega_o
         bandwidth of the filter [rad/s]: the radius of its fastest poles, if above the resonance.
     dt
         sample time [s].
     omega_d
-        bandwidth of the estimate of the force on the load [rad/s]; by default half the anti-resonance.
+        bandwidth of the estimate of the force on the load [rad/s]; by default half the
+        anti-resonance.
     ratio
         H, above 1; √5 by default.
     measured
@@ -105,12 +111,14 @@ class ResonanceRatio(LinearController):
         kp, kv = antiresonance**2, 4.0 * antiresonance
         torque = (1.0 - self.kappa) * k
         self.K = np.array([m1 * kp - torque, torque, m1 * kv, 0.0])
-        # At rest under d the spring carries it: x1 − x2 = −d/k, u = −d, and y = x2 + c1 (x1 − x2) = r.
+        # At rest under d the spring carries it: x1 − x2 = −d/k, u = −d, and y = x2 + c1 (x1 − x2) =
+        # r.
         self.K_d = float(1.0 + (self.K[0] * (1.0 - c1) - self.K[1] * c1) / k)
         model = with_disturbance(plant.A, plant.B, plant.C, plant.E[:, 1:], dt)
-        # White noise in the force on the other mass, and a random walk in d that crosses it at omega_d. Their size gives the filter's
-        # fastest poles the radius omega_o. The force on the measured mass alone would not do: at the anti-resonance it has no effect on y,
-        # and the filter would have undamped poles there.
+        # White noise in the force on the other mass, and a random walk in d that crosses it at
+        # omega_d. Their size gives the filter's fastest poles the radius omega_o. The force on the
+        # measured mass alone would not do: at the anti-resonance it has no effect on y, and the
+        # filter would have undamped poles there.
         far = plant.E[:, :1] if measured == "load" else plant.E[:, 1:]
         gains = [leading_gain(plant.A, column, plant.C) for column in (far, plant.E[:, 1:])]
         # The spring joins both masses, so no gain is None.

@@ -18,7 +18,8 @@ class LinearLaw(NamedTuple):
         u_wished = C x + D_r r + D_y y          u = limited(u_wished)
         x⁺       = A x + B_r r + B_y y + B_u u
 
-    Without limits, u is u_wished and the law is the linear system with A + B_u C and so on. B_u is what keeps it from winding up.
+    Without limits, u is u_wished and the law is the linear system with A + B_u C and so on. B_u is
+    what keeps it from winding up.
     """
 
     A: Matrix
@@ -46,7 +47,8 @@ def checked_law(law: Any) -> LinearLaw:
     Raises
     ------
     ValueError
-        for what is no ``LinearLaw``, shapes that do not fit, or an entry that is not finite; the message names the matrix.
+        for what is no ``LinearLaw``, shapes that do not fit, or an entry that is not finite; the
+        message names the matrix.
     """
     if not isinstance(law, LinearLaw):
         raise ValueError(f"law = {law!r}: must be a quell.controllers.LinearLaw")
@@ -66,8 +68,9 @@ def checked_law(law: Any) -> LinearLaw:
 def rest_state(law: LinearLaw) -> Vector:
     """Return the state (m,) of a law that rests at r = y = 1 with u = 0, or as near to it as it can.
 
-    Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y))`` it is the one whose u is nearest to zero: an integrator holds
-    whatever the rest of the law needs. By least squares, where there is none.
+    Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y))`` it is the one whose u
+    is nearest to zero: an integrator holds whatever the rest of the law needs. By least squares,
+    where there is none.
     """
     D = law.D_r + law.D_y
     pull = np.eye(law.C.size) - law.A - np.outer(law.B_u, law.C)

@@ -1,8 +1,8 @@
 """A sampled linear law from a transfer function in s: realisation, sampling, anti-windup.
 
-A law is not stored as polynomials in z: with fast sampling all their roots crowd at z = 1, and a rounding error of a coefficient moves
-them. It is realised in continuous time, in coordinates where entries are O(1), and sampled as a state-space system, whose matrices are
-of the form I + O(dt).
+A law is not stored as polynomials in z: with fast sampling all their roots crowd at z = 1, and a
+rounding error of a coefficient moves them. It is realised in continuous time, in coordinates where
+entries are O(1), and sampled as a state-space system, whose matrices are of the form I + O(dt).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
 METHODS = ("tustin", "zoh")
-# Poles this close to the unit circle, or outside of it, count as integrators: they do not decay while u is at a limit. Chosen by
-# hand, above the rounding error of a pole at 1.
+# Poles this close to the unit circle, or outside of it, count as integrators: they do not decay
+# while u is at a limit. Chosen by hand, above the rounding error of a pole at 1.
 _MARGINAL = 1e-9
-# Poles and zeros below the one and above the other of these multiples of the fastest pole count as zero and as infinite, which
-# rounding turns into such values. Chosen by hand.
+# Poles and zeros below the one and above the other of these multiples of the fastest pole count as
+# zero and as infinite, which rounding turns into such values. Chosen by hand.
 _ZERO, _INFINITE = 1e-6, 1e6
 
 System = tuple[Matrix, Matrix, Matrix, Matrix]
@@ -34,12 +34,14 @@ def as_state_space(num: Any, den: Any = None) -> System:
     Parameters
     ----------
     num, den
-        polynomials in s, highest power first; or a ``control.TransferFunction`` or ``control.StateSpace`` in continuous time.
+        polynomials in s, highest power first; or a ``control.TransferFunction`` or
+        ``control.StateSpace`` in continuous time.
 
     Raises
     ------
     ValueError
-        for several inputs or outputs, a transfer function that is not proper, or one with a sample time.
+        for several inputs or outputs, a transfer function that is not proper, or one with a sample
+        time.
     """
     if den is not None:
         return realised([num], den)
@@ -68,8 +70,8 @@ def as_state_space(num: Any, den: Any = None) -> System:
 def realised(numerators: list[Any], den: Any) -> System:
     """Return (A, B, C, D) of one output ``Σ N_i(s)/D(s) · input_i``, in balanced coordinates.
 
-    It is the observer canonical form, in time scaled by the geometric mean of the poles other than zero. Several inputs need no more
-    states than D has roots.
+    It is the observer canonical form, in time scaled by the geometric mean of the poles other than
+    zero. Several inputs need no more states than D has roots.
 
     Raises
     ------
@@ -119,9 +121,9 @@ def balanced(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> System:
 def tustin(system: System, dt: float, prewarp: float | None = None) -> System:
     """Sample by the trapezoidal rule ``s = (z − 1) / (h (z + 1))``.
 
-    h = dt/2, or with prewarping at ω h = tan(ω dt/2)/ω, which is exact at ω:
-    ``A_d = (I − hA)⁻¹ (I + hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``, ``D_d = D + h C (I − hA)⁻¹ B`` (Franklin, Powell &
-    Workman, *Digital Control of Dynamic Systems*, 1998, section 6.1).
+    h = dt/2, or with prewarping at ω h = tan(ω dt/2)/ω, which is exact at ω: ``A_d = (I − hA)⁻¹ (I
+    + hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``, ``D_d = D + h C (I − hA)⁻¹ B``
+    (Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, section 6.1).
 
     Raises
     ------
@@ -172,10 +174,11 @@ def sampled_law(
 def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
     """Return the gain B_u (m,) of ``x⁺ = A x + … + B_u (u − u_wished)`` with which a law follows the applied u.
 
-    The law is treated as an observer of its own state with the applied u as measurement (Åström & Wittenmark, *Computer-Controlled
-    Systems*, 1997, section 3.5; Kothare, Campo, Morari & Nett, *Automatica* 30, 1994). Poles on the unit circle or outside of it, which
-    do not decay, are moved to ``pole``; the others stay. For a PID controller this is back-calculation: the integrator alone follows,
-    with the tracking time ``−dt / ln(pole)``.
+    The law is treated as an observer of its own state with the applied u as measurement (Åström &
+    Wittenmark, *Computer-Controlled Systems*, 1997, section 3.5; Kothare, Campo, Morari & Nett,
+    *Automatica* 30, 1994). Poles on the unit circle or outside of it, which do not decay, are moved
+    to ``pole``; the others stay. For a PID controller this is back-calculation: the integrator
+    alone follows, with the tracking time ``−dt / ln(pole)``.
     """
     from scipy.linalg import schur
 

@@ -4,9 +4,10 @@ Han, *IEEE Trans. Industrial Electronics* 56, 2009, eqs. (10) and (11)::
 
     v_1⁺ = v_1 + h v_2,      v_2⁺ = v_2 + h fhan(v_1 − r, v_2, r_0, h_0)
 
-``fhan`` drives the sampled double integrator to the origin in the least time that ``|fhan| ≤ r_0`` allows, and for ``h_0 = h`` without
-overshoot. A larger ``h_0`` gives a smoother transition and filters noise in r. The paper prints ``d = h_0 r_0²``, which has the wrong
-unit: d is compared with a position, so it must be ``r_0 h_0²``.
+``fhan`` drives the sampled double integrator to the origin in the least time that ``|fhan| ≤ r_0``
+allows, and for ``h_0 = h`` without overshoot. A larger ``h_0`` gives a smoother transition and
+filters noise in r. The paper prints ``d = h_0 r_0²``, which has the wrong unit: d is compared with
+a position, so it must be ``r_0 h_0²``.
 """
 
 from __future__ import annotations
@@ -79,7 +80,8 @@ class TrackingDifferentiator:
     acceleration
         largest second derivative, r_0 [y-unit/s²].
     horizon
-        h_0 [s]: the sample time (by default) for the shortest transition, larger for a smoother one.
+        h_0 [s]: the sample time (by default) for the shortest transition, larger for a smoother
+        one.
 
     Raises
     ------

@@ -2,9 +2,10 @@
 
     r_f = ω^m / (s + ω)^m · r,        r_f^(m) = ω^m (r − r_f) − Σ_{i=1}^{m−1} C(m, i) ω^(m−i) r_f^(i)
 
-If as many derivatives are fed forward as the plant has integrators, the ideal loop responds to r as the model does, for any ``omega_c``:
-two degrees of freedom, one for the reference and one for disturbances (Horowitz, *Synthesis of Feedback Systems*, 1963). The model is
-sampled with zero-order hold.
+If as many derivatives are fed forward as the plant has integrators, the ideal loop responds to r as
+the model does, for any ``omega_c``: two degrees of freedom, one for the reference and one for
+disturbances (Horowitz, *Synthesis of Feedback Systems*, 1963). The model is sampled with zero-order
+hold.
 """
 
 from __future__ import annotations
@@ -91,7 +92,8 @@ class ReferenceModel:
     Raises
     ------
     ValueError
-        for a bandwidth that is not positive, and in ``design`` for one too high for the sample time.
+        for a bandwidth that is not positive, and in ``design`` for one too high for the sample
+        time.
     """
 
     omega: float

@@ -1,13 +1,14 @@
 """Input shaping: the reference is split into delayed parts whose vibrations of a mode cancel.
 
-For a mode ``s² + 2ζω s + ω²`` with ``ω_d = ω √(1 − ζ²)`` and ``K = exp(−ζπ/√(1 − ζ²))`` (Singer & Seering, *ASME J. Dynamic Systems,
-Measurement, and Control* 112, 1990, eqs. (11) and (13))::
+For a mode ``s² + 2ζω s + ω²`` with ``ω_d = ω √(1 − ζ²)`` and ``K = exp(−ζπ/√(1 − ζ²))`` (Singer &
+Seering, *ASME J. Dynamic Systems, Measurement, and Control* 112, 1990, eqs. (11) and (13))::
 
     ZV    amplitudes (1, K) / (1 + K)            at the times (0, π/ω_d)
     ZVD   amplitudes (1, 2K, K²) / (1 + K)²      at the times (0, π/ω_d, 2π/ω_d)
 
-ZV leaves no vibration of exactly this mode, ZVD none to first order in an error of ω. After the last of the impulses a_i at t_i, the
-vibration of a mode, relative to that after a single impulse, is::
+ZV leaves no vibration of exactly this mode, ZVD none to first order in an error of ω. After the
+last of the impulses a_i at t_i, the vibration of a mode, relative to that after a single impulse,
+is::
 
     V = e^(−ζω t_N) √( (Σ a_i e^(ζω t_i) cos ω_d t_i)² + (Σ a_i e^(ζω t_i) sin ω_d t_i)² )
 
@@ -84,7 +85,8 @@ class Shaper:
     Raises
     ------
     ValueError
-        for different numbers of both, times that do not begin at 0 or do not increase, and another sum than 1.
+        for different numbers of both, times that do not begin at 0 or do not increase, and another
+        sum than 1.
     """
 
     times: tuple[float, ...]
@@ -118,7 +120,8 @@ class Shaper:
         Raises
         ------
         ValueError
-            for a dt that is not positive, or with which the shaper takes more than ten million samples.
+            for a dt that is not positive, or with which the shaper takes more than ten million
+            samples.
         """
         if self.times[-1] / checks.positive("dt", dt, "s") > _MOST_SAMPLES:
             raise ValueError(
