@@ -79,12 +79,12 @@ def test_a_model_that_fails_is_said_to_and_the_loop_goes_on(
     assert np.max(np.abs(run["y"])) < 2.0
 
 
-def test_a_model_starts_anew_after_a_failure_and_is_left_alone_after_three_in_a_row() -> None:
+def test_a_model_starts_anew_after_a_failure_and_is_disabled_after_three_in_a_row() -> None:
     """One that fails at its sixth call each time goes on for ever; one that always fails is asked three times."""
     again, never = PythonModel(Broken(5, math.nan)), PythonModel(Broken(2, math.nan))
     with pytest.warns(RuntimeWarning):
         run = ql.simulate(CHAIN, law(again), ql.Scenario(ql.signals.Sinusoid(), duration=10.0))
-    assert "left alone" not in again.last_problem
+    assert "disabled" not in again.last_problem
     assert run["status"][-1] in (
         0,
         Status.LEARNER_FAILED,
@@ -95,7 +95,7 @@ def test_a_model_starts_anew_after_a_failure_and_is_left_alone_after_three_in_a_
     never._source.well = 0
     with pytest.warns(RuntimeWarning) as told:
         run = ql.simulate(CHAIN, controller, ql.Scenario(ql.signals.Sinusoid(), duration=20.0))
-    assert ["left alone" in str(warning.message) for warning in told] == [False, True]
+    assert ["disabled" in str(warning.message) for warning in told] == [False, True]
     assert Status(int(run["status"][-1])) == Status.LEARNER_FAILED
     assert np.max(np.abs(run["y"])) < 2.0
     np.testing.assert_array_equal(run["f_learned"][-1000:], 0.0)

@@ -112,7 +112,7 @@ def test_the_model_is_called_once_a_period_with_all_pairs_since() -> None:
         assert batches[0] == 1
         design = learner.design(OBSERVER, 4.0)
         assert len(batches) == math.ceil(
-            (len(run) - 2 - design.online.watch - design.online.delay) / period
+            (len(run) - 2 - design.online.inputs.startup - design.online.delay) / period
         )
         assert len(np.unique(run["f_learned"])) <= len(batches) + 1
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import quell as ql
 from quell.learners.base import adapt, commit, predict, restart
-from quell.learners.gradient.batch_gradient import outputs
+from quell.learners.gradient.buffers import outputs
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.base import begin, observe
 from quell.observers.eso import ESO

@@ -11,9 +11,10 @@ import pytest
 import quell as ql
 from quell.features import RBF, Bias, Friction, Input, Polynomial, State
 from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.least_squares import RlsRule
 from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.nlms import NlmsMemory, NlmsRule
-from quell.learners.regression.rls import RlsMemory, RlsRule
+from quell.learners.regression.rls import RlsMemory
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)
 
@@ -190,7 +191,7 @@ def test_a_scale_that_grows_changes_no_prediction(rng: np.random.Generator) -> N
     before, theta = predict(design, memory, np.array([0.3, -0.4, 0.0]), 0.2), np.zeros(10)
     coefficients(design, memory, theta)
     shown, scale = memory.filtered / memory.units, memory.scale.copy()
-    design = design._replace(rule=NlmsRule(0.0, 1.0), follow=0.0)
+    design = design._replace(rule=NlmsRule(0.0, 1.0), inputs=design.inputs._replace(bias_gain=0.0))
     adapt(design, memory, np.array([50.0, 900.0, 0.0]), 50.0, 70.0, 300.0)
     assert np.all(memory.scale > 8.0 * scale)
     again = np.zeros(10)

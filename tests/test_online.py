@@ -12,10 +12,10 @@ import quell as ql
 from quell.features import Bias, State
 from quell.learners.base import adapt, commit, predict, restart
 from quell.learners.lag import group_delay, lag_memory, lag_of, lag_push
+from quell.learners.least_squares import RlsRule, least_squares_gain
 from quell.learners.online.gaussian_process import GaussianProcessModel
 from quell.learners.online.model import infer, learn
 from quell.learners.online.network import Network
-from quell.learners.regression.rls import RlsRule, least_squares_gain
 from quell.observers.design import FORMS
 from quell.types import Matrix, Vector
 
@@ -154,7 +154,7 @@ def test_a_network_fits_a_nonlinear_function(rng: np.random.Generator) -> None:
         memory.theta[i] = at - step
         below = infer(design, memory, x)
         memory.theta[i] = at
-        assert memory.slope[i] == pytest.approx((above - below) / (2.0 * step), abs=1e-7)
+        assert memory.gradient[i] == pytest.approx((above - below) / (2.0 * step), abs=1e-7)
 
 
 def test_a_network_says_nothing_before_it_has_learned() -> None:
@@ -169,9 +169,9 @@ def test_a_process_fits_a_nonlinear_function_on_its_budget(rng: np.random.Genera
     """Far from its points it says nothing."""
     design, memory, left = fitted(GaussianProcessModel(40, 0.5, 1, math.inf, 0.05, 1e-3), 2000, rng)
     assert left < 0.05
-    assert memory.place[0] <= 40
+    assert memory.counters[0] <= 40
     assert abs(infer(design, memory, np.array([50.0, 50.0]))) < 1e-12
-    count = int(memory.place[0])
+    count = int(memory.counters[0])
     identity = memory.inverse[:count, :count] @ memory.kernel[:count, :count]
     np.testing.assert_allclose(identity, np.eye(count), atol=1e-6)
     assert np.min(np.linalg.eigvalsh(memory.covariance[:count, :count])) > -1e-9
@@ -200,7 +200,7 @@ def test_a_process_is_a_gaussian_process_while_its_budget_lasts(rng: np.random.G
 def test_a_process_with_a_budget_of_one_still_works(rng: np.random.Generator) -> None:
     """The smallest there is."""
     _, memory, _ = fitted(GaussianProcessModel(1, 0.5, 1, 100.0, 0.1, 1.0), 200, rng)
-    assert memory.place[0] == 1
+    assert memory.counters[0] == 1
     assert all(np.all(np.isfinite(array)) for array in memory)
 
 
@@ -234,7 +234,7 @@ def test_what_a_model_learned_is_kept_unless_it_is_no_number(rng: np.random.Gene
     assert predict(design, memory, np.ones(3), 0.0) == (0.0, 0.0)
     memory.model.theta[1] = math.nan
     restart(design, memory)
-    np.testing.assert_array_equal(memory.flat, memory.fresh)
+    np.testing.assert_array_equal(memory.flat, memory.initial)
     assert np.shares_memory(memory.model.theta, memory.flat)
 
 

@@ -36,6 +36,11 @@ def scaling(observer: ESO, frequency: float, fixed: bool) -> Scaling:
     return Scaling(np.append(floors, [0.0, 0.0]), fixed)
 
 
+def initial_scale(scaling: Scaling) -> Vector:
+    """Return the scales before the first sample (n + 2,)."""
+    return np.full(scaling.floors.size, _LEAST)
+
+
 @kernel
 def update_scale(scaling: Scaling, scale: Vector, seen: Vector, u: float, f: float) -> None:
     """Let ``scale`` (n + 2,) grow to hold the state in ``seen`` (n + 1,), ``u`` and ``f``."""

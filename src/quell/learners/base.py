@@ -1,19 +1,21 @@
-"""What the controller asks of a learner.
+"""The contract between a controller and its learner.
 
-A learner is an immutable description (``Kalman(...)``). ``design(observer, omega_c)`` turns it into a NamedTuple of parameters, and
-``memory`` of those into a NamedTuple of arrays, its whole state. For the type of the parameters the functions below are registered;
-each sample the controller calls, in this order:
+A learner is an immutable description (``Kalman(...)``). ``design(observer, omega_c)`` returns its
+parameters (a NamedTuple), and ``memory(parameters)`` its whole state (a NamedTuple of arrays). The
+functions below are registered for the type of the parameters. In each sample the controller calls
 
-1. ``adapt`` with what the observer has just seen;
-2. ``predict``, for the feedforward ``f_L = constant + slope · u``: affine in u, so that a learner with u among its features is cancelled
-   exactly, not a sample late;
-3. ``commit`` with the u that was really applied.
+1. ``adapt`` with the newest estimates of the observer, then ``trouble``; 2. ``predict``, which
+returns the feedforward ``f_L = constant + slope · u``. It is affine in u, so that a
+   learner with u among its features is compensated exactly, not one sample late;
+3. ``commit`` with the u that was applied.
 
-``restart`` is called where the loop starts anew from rest, ``coefficients`` where a run is recorded, ``trouble`` after ``adapt``.
+``restart`` is called when the loop starts from rest, ``coefficients`` when a run is recorded.
 
-A learner whose memory stands for something outside of it, a Python object say, also has ``external_fields``, the names of the fields that do so,
-``snapshot(memory)``, which returns copies of what they stand for by name, and ``recall(memory, snapshots)``, which puts copies of those in
-its place or says that they do not fit. The state that a controller shows has the snapshots instead of those fields.
+A learner whose memory refers to objects outside of its arrays, for example to a Python model, has
+three more members: ``external_fields``, the names of the fields that refer to them;
+``snapshot(memory)``, which returns copies of the objects by name; and ``recall(memory,
+snapshots)``, which replaces the objects by copies of the snapshots, or raises an error if they do
+not fit. A controller's ``state`` contains the snapshots in place of these fields.
 """
 
 from __future__ import annotations
@@ -32,41 +34,45 @@ class Learner(Protocol):
     """A description of a learner."""
 
     def design(self, observer: ESO, omega_c: float) -> Any:
-        """Return the parameters (a NamedTuple) for an observer and a controller's bandwidth [rad/s]."""
+        """Return the parameters for an observer and the controller's bandwidth [rad/s]."""
 
     def memory(self, parameters: Any) -> Any:
-        """Return the state before anything was learned: a NamedTuple of arrays."""
+        """Return the state before anything is learned (a NamedTuple of arrays)."""
 
     def feature_names(self, order: int) -> tuple[str, ...]:
-        """Return what each entry of θ multiplies, for a plant of order ``order``."""
+        """Return the names of the features that θ multiplies, for a plant of order ``order``."""
 
 
 @generic
 def adapt(
     learner: Any, memory: Any, seen: Vector, y: float, u_before: float, f_plain: float
 ) -> None:
-    """Learn from ``seen = (x̂_1 … x̂_n, Δf̂)``, the measurement it follows from and the control signal applied before it.
+    """Learn from the observer's estimates ``seen = (x̂_1 … x̂_n, Δf̂)``.
 
-    ``f_plain = Δf̂ + f_L^F`` is what an ESO without learner would have estimated: f, as the observer shows it (``lag.py``).
+    ``y`` is the measurement they follow from and ``u_before`` the u applied before it. ``f_plain =
+    Δf̂ + f_L^F`` is the f that an ESO without a learner would have estimated (``lag.py``).
     """
     raise TypeError
 
 
 @generic
 def predict(learner: Any, memory: Any, seen: Vector, u_before: float) -> tuple[float, float]:
-    """Return ``(constant, slope)`` of the feedforward ``f_L = constant + slope · u`` [y-unit/s^n]."""
+    """Return ``(constant, slope)`` of ``f_L = constant + slope · u`` [y-unit/s^n]."""
     raise TypeError
 
 
 @generic
 def commit(learner: Any, memory: Any, seen: Vector, u: float, f_learned: float) -> None:
-    """Take note of the ``u`` that was applied and of the ``f_learned`` that the observer is fed, which a guard may have reduced."""
+    """Store the ``u`` that was applied and the ``f_learned`` that the observer is given.
+
+    A guard may have reduced ``f_learned``.
+    """
     raise TypeError
 
 
 @generic
 def restart(learner: Any, memory: Any) -> None:
-    """Forget what belongs to the moment (filters); keep what was learned, unless it is not finite: then learn from the beginning."""
+    """Reset the filters; keep what was learned if it is finite, else start from the beginning."""
     raise TypeError
 
 
@@ -78,7 +84,7 @@ def coefficients(learner: Any, memory: Any, theta: Vector) -> None:
 
 @generic
 def trouble(learner: Any, memory: Any) -> int:
-    """Return the ``Status`` flags that the learner has to add to the step's: none, unless it says otherwise."""
+    """Return the learner's ``Status`` flags for this sample; by default none."""
     raise TypeError
 
 
@@ -87,13 +93,15 @@ def _no_trouble(learner: Any, memory: Any) -> int:
     return 0
 
 
-def validated_design(learner: Any, observer: ESO, omega_c: float) -> Any:
-    """Return ``learner.design(observer, omega_c)``; a learner of the user's own has to take one sample, interpreted.
+def checked_design(learner: Learner, observer: ESO, omega_c: float) -> Any:
+    """Return ``learner.design(observer, omega_c)``; check a user-defined learner first.
+
+    All functions of the contract are called once, interpreted, on a memory that is discarded.
 
     Raises
     ------
     ValueError
-        that names the learner's class and the rule, for whatever is wrong.
+        that names the learner's class and the rule it breaks.
     """
     if not validation.is_user_defined(learner):
         return learner.design(observer, omega_c)
@@ -108,23 +116,24 @@ def validated_design(learner: Any, observer: ESO, omega_c: float) -> Any:
         f"{name}.memory(...)", "memory takes (parameters)", learner.memory, parameters
     )
     validation.check_arrays(f"{name}.memory", memory, nested=True)
+    what = f"{name}.feature_names({order})"
     names = validation.attempt(
-        f"{name}.feature_names({order})",
-        "feature_names takes the plant's order",
-        learner.feature_names,
-        order,
+        what, "feature_names takes the plant's order", learner.feature_names, order
     )
     if not isinstance(names, tuple) or not all(isinstance(label, str) for label in names):
         raise ValueError(
-            f"{name}.feature_names({order}) returns {names!r}: must return a tuple with a name for each coefficient"
+            f"{what} returns {names!r}: must return a tuple with a name for each coefficient"
         )
-    seen, rule = validation.sample_values(order + 1), "docs/extend says what it is given"
-    validation.attempt_kernel(
-        f"{name}: adapt", rule, adapt, parameters, memory, seen, 0.9, 0.5, 0.1
-    )
-    predicted = validation.attempt_kernel(
-        f"{name}: predict", rule, predict, parameters, memory, seen, 0.5
-    )
+
+    def call(
+        function: Any, *arguments: Any, rule: str = "docs/extend describes its arguments"
+    ) -> Any:
+        what = f"{name}: {function.__name__}"
+        return validation.attempt_kernel(what, rule, function, parameters, memory, *arguments)
+
+    seen = validation.sample_values(order + 1)
+    call(adapt, seen, 0.9, 0.5, 0.1)
+    predicted = call(predict, seen, 0.5)
     if predicted is not validation.UNKNOWN:
         if not (isinstance(predicted, tuple) and len(predicted) == 2):
             raise ValueError(
@@ -132,28 +141,21 @@ def validated_design(learner: Any, observer: ESO, omega_c: float) -> Any:
             )
         for label, value in zip(("constant", "slope"), predicted, strict=True):
             validation.check_number(f"{name}: predict, {label},", value)
-    validation.attempt_kernel(f"{name}: commit", rule, commit, parameters, memory, seen, 0.5, 0.1)
-    validation.attempt_kernel(
-        f"{name}: coefficients",
-        f"it has {len(names)} names",
-        coefficients,
-        parameters,
-        memory,
-        np.zeros(len(names)),
-    )
-    validation.attempt_kernel(f"{name}: restart", rule, restart, parameters, memory)
+    call(commit, seen, 0.5, 0.1)
+    call(coefficients, np.zeros(len(names)), rule=f"it has {len(names)} names")
+    call(restart)
     return parameters
 
 
 class NoLearner:
-    """The learner that has nothing to say: it makes an L-ESO a plain ESO."""
+    """The absence of a learner: the L-ESO is a plain ESO."""
 
     def design(self, observer: ESO, omega_c: float) -> NoLearnerDesign:
         """Return no parameters."""
         return NoLearnerDesign()
 
     def memory(self, parameters: NoLearnerDesign) -> NoLearnerMemory:
-        """Return a state without content."""
+        """Return an empty state."""
         return NoLearnerMemory(np.zeros(0))
 
     def feature_names(self, order: int) -> tuple[str, ...]:

@@ -1,16 +1,18 @@
-"""What the observer would answer to a known input: the exact lag between a disturbance and its estimate.
+"""The lag filter: the observer's exact response to an input that enters where f does.
 
-The ESO is linear. To an input φ that enters where f does, and that its measurement does not show, its error answers with the shadow
+The ESO is linear. An input φ that enters where f does and that its measurement does not show causes
+the error
 
     s⁺ = (I − L C)(Φ s + Γ_f φ),        φ^F = −s_N
 
-so that ``Δf̂ = (f − f_L)^F`` exactly, but for noise and for what f does between samples, and ``Δf̂ + f_L^F ≈ θ·φ^F`` is a regression
-without lag bias. All poles of the shadow lie at β = exp(−omega_o dt) in one Jordan chain, so φ^F is a weighted sum of N lags in a row,
+so ``Δf̂ = (f − f_L)^F`` exactly, except for noise and for changes of f between samples, and
+``Δf̂ + f_L^F ≈ θ·φ^F`` is a regression without lag bias. All poles of this filter are at
+β = exp(−omega_o dt) in one Jordan chain, so φ^F is a weighted sum of a chain of N first-order lags,
 
     v_1⁺ = β v_1 + (1−β) φ,      v_j⁺ = β v_j + (1−β) v_{j−1},      φ^F = Σ c_j v_j
 
-which costs O(N) an input instead of O(N²), and moves all inputs side by side. An observer of another tuning or structure has other poles:
-then the shadow itself is kept, in full (``DenseLag``).
+which costs O(N) per input instead of O(N²). An observer of other tuning or structure has other
+poles: then the filter is used in its full form (``DenseLag``).
 """
 
 from __future__ import annotations
@@ -25,69 +27,70 @@ from quell.observers.eso import ESO
 from quell.observers.response import f_lag, f_learned_response, response, scaled_response
 from quell.types import Matrix, Vector
 
-# In units of the observer's lag: after this its initial error has decayed to a part in a thousand.
+# Duration of the start in units of the observer's lag: its initial error decays to 0.1 % in it.
 STARTUP_LAGS = 2.0
 
 
 class Lag(NamedTuple):
-    """The lag filter of an observer whose poles lie in one place, with N = n + 1 states for each input."""
+    """The lag filter of an observer with all poles in one place, N = n + 1 states per input."""
 
     pole: float
     """β."""
     rise: float
-    """1 − β, without the rounding of the difference."""
+    """1 − β, without cancellation."""
     taps: Vector
     """c (N,)."""
     predictor: bool
-    """One sample later, for an observer in predictor form."""
+    """Whether the estimate shows the input one sample later: the observer is in predictor form."""
 
     @property
     def width(self) -> int:
-        """Numbers that an input needs."""
+        """Numbers stored per input."""
         return int(self.taps.size)
 
 
 class DenseLag(NamedTuple):
-    """The lag filter of any linear observer, with m states for each input."""
+    """The lag filter of any linear observer, with m states per input."""
 
     transition: Matrix
     """M (m, m)."""
     input: Vector
     """g (m,)."""
     taps: Vector
-    """c (m,): what the next estimate shows of the state before."""
+    """c (m,): effect of the state on the next estimate."""
     through: float
-    """d: and of the input."""
+    """d: effect of the input."""
 
     @property
     def width(self) -> int:
-        """Numbers that an input needs: the states, and as much room to calculate."""
+        """Numbers stored per input: the states and work space of the same size."""
         return 2 * int(self.taps.size)
 
 
 NO_LAG = Lag(0.0, 0.0, np.zeros(0), False)
-"""For where nothing is fed forward: it shows nothing."""
+"""The filter of a loop without feedforward; its output is zero."""
 
 
 def startup_samples(observer: ESO) -> int:
-    """Return how many samples after a start from rest nothing is learned: the observer's own initial error is in Δf̂ then."""
+    """Return the number of samples after a start from rest in which Δf̂ shows the initial error."""
     return round(STARTUP_LAGS * observer.lag_time / observer.dt)
 
 
-def lag_memory(lag: Any, count: int) -> Matrix:
-    """Return the state of the lag filters of ``count`` inputs, at rest."""
+def lag_memory(lag: Lag | DenseLag, count: int) -> Matrix:
+    """Return the state of the lag filters for ``count`` inputs, at rest."""
     return np.zeros((count, lag.width))
 
 
-def lag_of(observer: ESO) -> Any:
-    """Return the lag filter of an observer: a ``Lag`` where its poles lie in one place, else a ``DenseLag``.
+def lag_of(observer: ESO) -> Lag | DenseLag:
+    """Return the lag filter of an observer.
 
-    A delay of u makes no difference: what is fed forward is not delayed.
+    It is a ``Lag`` if all poles are in one place, else a ``DenseLag``. A delay of u has no effect:
+    the feedforward is not delayed.
 
     Raises
     ------
     ValueError
-        for a nonlinear observer, which has no lag.
+        for a nonlinear observer, which has no lag filter.
     """
     if observer.has_one_pole:
         return _chain(observer)
@@ -96,7 +99,7 @@ def lag_of(observer: ESO) -> Any:
 
 
 def group_delay(observer: ESO) -> float:
-    """Return by how many samples f^F, as the next estimate shows it, lags slow changes of f.
+    """Return the lag in samples of f^F, as the next estimate shows it, behind slow changes of f.
 
     The j-th lag of the chain delays by ``β/(1−β) + (j−1)/(1−β)``, and the taps sum to one.
     """
@@ -104,20 +107,19 @@ def group_delay(observer: ESO) -> float:
         return f_lag(scaled_response(observer.model, observer.units))
     lag = _chain(observer)
     stage = np.arange(lag.taps.size)
-    return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + (
-        1.0 if lag.predictor else 0.0
-    )
+    return float(lag.taps @ (lag.pole / lag.rise + stage / lag.rise)) + float(lag.predictor)
 
 
 def _chain(observer: ESO) -> Lag:
-    """Return the lags in a row.
+    """Return the filter as a chain of first-order lags.
 
-    With ``M = (I − L C) Φ`` and ``g = (I − L C) Γ_f``, the chain is ``s = V v`` with ``V_1 = g/(1−β)`` and
-    ``V_{j+1} = (M − βI) V_j/(1−β)``, which ends by Cayley-Hamilton; ``c_j = −(V_j)_N``.
+    With ``M = (I − L C) Φ`` and ``g = (I − L C) Γ_f``, the chain is ``s = V v`` with ``V_1 =
+    g/(1−β)`` and ``V_{j+1} = (M − βI) V_j/(1−β)``, which ends after N by Cayley-Hamilton; ``c_j =
+    −(V_j)_N``.
     """
     model = without_delay(observer.model)
     size = observer.order + 1
-    # In the coordinates x_i dt^(i−1), as for the design: there all entries are O(1).
+    # In the coordinates x_i dt^(i−1) all entries are O(1).
     scale = observer.dt ** np.arange(size)
     correct = np.eye(size)
     correct[:, 0] -= model.gain * scale
@@ -134,7 +136,10 @@ def _chain(observer: ESO) -> Lag:
 
 @generic
 def lag_push(lag: Any, memory: Matrix, i: int, value: float) -> float:
-    """Move filter ``i`` of ``lag_memory`` on by a sample with the input ``value``; return what the next estimate shows of it."""
+    """Advance filter ``i`` of ``lag_memory`` by a sample with the input ``value``.
+
+    Return its output, the effect of the inputs on the next estimate of f.
+    """
     raise TypeError
 
 

@@ -24,7 +24,7 @@ from quell.controllers.design_checks import warn_if_unwise
 from quell.controllers.limits import checked_limits
 from quell.controllers.stateful import StatefulController
 from quell.guard import GUARD_CHANNELS, Guard, UnguardedDesign, UnguardedMemory
-from quell.learners.base import Learner, NoLearner, validated_design
+from quell.learners.base import Learner, NoLearner, checked_design
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
@@ -121,7 +121,7 @@ class ADRC(StatefulController):
             fade=math.exp(-omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,
-            learner=validated_design(self.learner, observer, self._learner_omega_c),
+            learner=checked_design(self.learner, observer, self._learner_omega_c),
             lag=NO_LAG if isinstance(self.learner, NoLearner) else lag_of(observer),
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer),
         )

@@ -1,4 +1,8 @@
-"""Learners whose model is a Python object, of any library or of none."""
+"""Learners whose model is a Python object, of any library or of none.
+
+May import ``online``, ``features`` and the base files of ``learners``. The libraries themselves are
+imported when a learner is made.
+"""
 
 from quell.learners.adapters.jax import JaxModel
 from quell.learners.adapters.python import PythonModel

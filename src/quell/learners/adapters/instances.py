@@ -1,8 +1,8 @@
-"""Python models at work, and the one function by which compiled loops call them.
+"""Copies of Python models that learn, and the function by which compiled loops call them.
 
-A loop's memory can only hold numbers, so it holds that of its instance. The instance is a copy of the user's model that belongs to this
-loop; it is dropped when the array with its number is. Nothing that goes wrong here may leave this file as an exception: the caller is
-compiled code, which has no way to pass one on.
+A loop's memory contains only numbers, so it contains the number of its instance. The instance is a
+copy of the user's model that belongs to one loop; it is deleted together with the array that holds
+its number. No exception may leave this file: the caller is compiled code and cannot handle one.
 """
 
 from __future__ import annotations
@@ -24,12 +24,15 @@ import numpy as np
 from quell.learners.adapters.worker import Worker
 from quell.types import Matrix, Status, Vector
 
-# After so many failures in a row a model is left alone.
-_PATIENCE = 3
+# Failures in a row after which a model is disabled; chosen by hand.
+_MAX_FAILURES = 3
+# Delay after which an interrupt is passed on to the main thread [s]: the compiled loop has to
+# return from the model first; chosen by hand.
+_INTERRUPT_DELAY = 0.05
 _LATE, _FAILED = int(Status.LEARNER_LATE), int(Status.LEARNER_FAILED)
 
-# Places in what a loop is answered.
-PREDICTION, STATUS, UNTIL, GIVEN_UP = range(4)
+# Indices of the array in which a loop gets its answer.
+PREDICTION, STATUS, COUNTDOWN, DISABLED = range(4)
 
 INSTANCES: dict[int, Instance] = {}
 _NUMBERS = itertools.count(1)
@@ -41,91 +44,97 @@ class Instance:
     Parameters
     ----------
     source
-        what is copied, with ``learn`` and ``predict``; it is never changed.
+        the object that is copied, with ``learn`` and ``predict``; it is never changed.
     name
-        what it is called in messages.
+        its name in messages.
     budget
-        how long the loop waits for an answer [s]; None to call the model in the loop.
-    tell
+        longest time that the loop waits for an answer [s]; None to call the model in the loop's
+        thread.
+    report
         called with the text of each problem.
     """
 
     def __init__(
-        self, source: Any, name: str, budget: float | None, tell: Callable[[str], None]
+        self, source: Any, name: str, budget: float | None, report: Callable[[str], None]
     ) -> None:
-        self.source, self.name, self.budget, self.tell = source, name, budget, tell
+        self.source, self.name, self.budget, self.report = source, name, budget, report
         self.model = copy.deepcopy(source)
         self.failures = 0
-        self.told = False
+        self.warned = False
         self.worker = None if budget is None else Worker()
 
-    def ask(self, features: Matrix, targets: Vector, now: Vector) -> tuple[float | None, int]:
-        """Let the model learn and predict; return its prediction, None where there is no new one, and status flags."""
+    def update(self, features: Matrix, targets: Vector, now: Vector) -> tuple[float | None, int]:
+        """Let the model learn, and predict from the features ``now``.
+
+        Return the prediction, or None if there is no new one, and status flags.
+        """
         if self.worker is None or self.budget is None:
-            return self._judged(self._attempt(features, targets, now))
+            return self._checked(self._call(features, targets, now))
         value: float | None = None
         if self.worker.busy:
-            late = self.worker.answer(0.0)
-            if late is None:
-                return (
-                    None,
-                    _LATE,
-                )  # what was gathered meanwhile is dropped: a model that is late would only get later
-            value, failed = self._judged(late)
+            late = self.worker.result(0.0)
+            if late is None:  # the new pairs are dropped: with them the model would be later still
+                return None, _LATE
+            value, failed = self._checked(late)
             if failed:
                 return value, failed
-        self.worker.start(lambda: self._attempt(features, targets, now))
-        answer = self.worker.answer(self.budget)
-        return (value, _LATE) if answer is None else self._judged(answer)
+        self.worker.start(lambda: self._call(features, targets, now))
+        answer = self.worker.result(self.budget)
+        return (value, _LATE) if answer is None else self._checked(answer)
 
-    def copied(self) -> tuple[Any, int]:
-        """Return a copy of the model, when it has ended what it is at, and its failures in a row."""
+    def copy_model(self) -> tuple[Any, int]:
+        """Return a copy of the model, after its current job, and its failures in a row."""
         if self.worker is not None:
-            self.worker.rest()
+            self.worker.wait()
         return copy.deepcopy(self.model), self.failures
 
-    def replaced(self, model: Any, failures: int) -> None:
-        """Go on with a copy of ``model``."""
+    def replace_model(self, model: Any, failures: int) -> None:
+        """Continue with a copy of ``model``."""
         if self.worker is not None:
-            self.worker.rest()
-            self.worker.answer(0.0)  # it belongs to the model that goes
+            self.worker.wait()
+            self.worker.result(0.0)  # discard the result of the old model
         self.model, self.failures = copy.deepcopy(model), failures
 
     @property
-    def given_up(self) -> bool:
-        """Whether it has failed too often to be asked again."""
-        return self.failures >= _PATIENCE
+    def disabled(self) -> bool:
+        """Whether the model has failed too often to be called again."""
+        return self.failures >= _MAX_FAILURES
 
-    def _attempt(self, features: Matrix, targets: Vector, now: Vector) -> tuple[float, str]:
-        """Return the prediction, or NaN and what went wrong."""
+    def _call(self, features: Matrix, targets: Vector, now: Vector) -> tuple[float, str]:
+        """Return the prediction and an empty text, or NaN and a description of the problem."""
         try:
             self.model.learn(features, targets)
             return finite_number(self.model.predict(now)), ""
         except KeyboardInterrupt:
-            # The loop has to come to the end of its block before it can be interrupted: till then the model keeps out of the way.
-            self.failures = _PATIENCE
-            threading.Timer(0.05, _thread.interrupt_main).start()
+            # The loop can be interrupted only at the end of its block: disable the model until
+            # then.
+            self.failures = _MAX_FAILURES
+            threading.Timer(_INTERRUPT_DELAY, _thread.interrupt_main).start()
             return math.nan, f"learner {self.name} was interrupted"
         except BaseException as error:
             problem = f"learner {self.name} raised {type(error).__name__}: {error}"
         try:
             self.model = copy.deepcopy(self.source)
         except BaseException as error:
-            self.failures = _PATIENCE
-            problem += f"; it can't be copied anew ({type(error).__name__}: {error})"
+            self.failures = _MAX_FAILURES
+            problem += f"; it cannot be copied again ({type(error).__name__}: {error})"
         return math.nan, problem
 
-    def _judged(self, answer: tuple[float, str]) -> tuple[float, int]:
+    def _checked(self, answer: tuple[float, str]) -> tuple[float, int]:
+        """Return prediction and status flags; report the problem, if any."""
         value, problem = answer
         if not problem:
             self.failures = 0
             return value, 0
         self.failures += 1
-        if self.given_up:
-            problem += f"; it is left alone after {_PATIENCE} failures in a row, until the controller is reset"
-        self.tell(problem)
-        if not self.told or self.given_up:
-            self.told = True
+        if self.disabled:
+            problem += (
+                f"; it is disabled after {_MAX_FAILURES} failures in a row, "
+                "until the controller is reset"
+            )
+        self.report(problem)
+        if not self.warned or self.disabled:
+            self.warned = True
             _warn(problem)
         return math.nan, _FAILED
 
@@ -136,47 +145,44 @@ def finite_number(value: Any) -> float:
     Raises
     ------
     ValueError
-        where it is not one finite number.
+        if it is not one finite number.
     """
     if not isinstance(value, float):
         array = np.asarray(value)
         if array.size != 1 or array.dtype.kind not in "iuf":
-            raise ValueError(f"predicted {_brief(value)}: a prediction must be one finite number")
+            text = repr(value)
+            text = text if len(text) <= 60 else f"{text[:57]}..."
+            raise ValueError(f"predicted {text}: a prediction must be one finite number")
         value = float(array.reshape(()))
     if not math.isfinite(value):
         raise ValueError(f"predicted {value!r}: a prediction must be one finite number")
     return float(value)
 
 
-def enter(instance: Instance) -> Vector:
-    """Enter an instance into the table; return the array (1,) with its number, whose end is the instance's end."""
+def register(instance: Instance) -> Vector:
+    """Return an array (1,) with a number for the instance; they are deleted together."""
     number = next(_NUMBERS)
     INSTANCES[number] = instance
     holder = np.full(1, float(number))
-    weakref.finalize(holder, _leave, number)
+    weakref.finalize(holder, _unregister, number)
     return holder
 
 
 def instance_of(holder: Vector) -> Instance:
-    """Return the instance whose number ``holder`` has."""
+    """Return the instance whose number is in ``holder``."""
     return INSTANCES[int(holder[0])]
 
 
-def _leave(number: int) -> None:
+def _unregister(number: int) -> None:
     instance = INSTANCES.pop(number, None)
     if instance is not None and instance.worker is not None:
-        instance.worker.end()
-
-
-def _brief(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+        instance.worker.stop()
 
 
 def _warn(problem: str) -> None:
     try:
         warnings.warn(problem, RuntimeWarning, stacklevel=2)
-    except RuntimeWarning:  # where warnings are errors: it could go nowhere from here
+    except RuntimeWarning:  # warnings are errors, and no exception may leave this file
         print(problem, file=sys.stderr)
 
 
@@ -187,15 +193,15 @@ def _array(address: int, *shape: int) -> Any:
     return np.frombuffer(buffer).reshape(shape)
 
 
-def _serve(
+def _call_instance(
     holder: int, features: int, targets: int, count: int, width: int, now: int, answer: int
 ) -> None:
-    """Answer a loop; all arrays are given by their address, and copied, as a model may keep what it is shown."""
+    """Call the instance of a loop with copies of the arrays at these addresses."""
     reply = None
     try:
         reply = _array(answer, 4)
         instance = INSTANCES[int(_array(holder, 1)[0])]
-        value, status = instance.ask(
+        value, status = instance.update(
             _array(features, count, width).copy(),
             _array(targets, count).copy(),
             _array(now, width).copy(),
@@ -203,19 +209,19 @@ def _serve(
         if value is not None:
             reply[PREDICTION] = value
         reply[STATUS] = status
-        reply[GIVEN_UP] = instance.given_up
+        reply[DISABLED] = instance.disabled
     except BaseException as error:
         if reply is not None:
-            reply[PREDICTION], reply[STATUS], reply[GIVEN_UP] = math.nan, _FAILED, 1.0
-        print(f"quell: a learner can't be asked ({type(error).__name__}: {error})", file=sys.stderr)
+            reply[PREDICTION], reply[STATUS], reply[DISABLED] = math.nan, _FAILED, 1.0
+        print(f"quell: cannot call a learner ({type(error).__name__}: {error})", file=sys.stderr)
 
 
 _POINTER, _COUNT = ctypes.c_void_p, ctypes.c_int64
-_SERVE = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, _POINTER, _COUNT, _COUNT, _POINTER, _POINTER)(
-    _serve
-)
+_CALLBACK = ctypes.CFUNCTYPE(
+    None, _POINTER, _POINTER, _POINTER, _COUNT, _COUNT, _POINTER, _POINTER
+)(_call_instance)
 
 
-def address() -> int:
-    """Return where compiled code finds the function that asks an instance; it is another in each process."""
-    return int(ctypes.cast(_SERVE, ctypes.c_void_p).value or 0)
+def callback_address() -> int:
+    """Return the address at which compiled code calls an instance; it differs between processes."""
+    return int(ctypes.cast(_CALLBACK, ctypes.c_void_p).value or 0)

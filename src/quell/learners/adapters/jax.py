@@ -14,9 +14,10 @@ from quell.types import Matrix, Vector
 
 
 class JaxModel(PythonModel):
-    """A learner whose model is an Equinox module, trained by gradient steps on the mean squared error of each batch.
+    """A learner whose model is an Equinox module.
 
-    The steps are compiled by JAX on the trial, before the loop runs.
+    It is trained by gradient steps on the mean squared error of each batch. JAX compiles the steps
+    in the trial, before the loop runs.
 
     Parameters
     ----------
@@ -24,7 +25,7 @@ class JaxModel(PythonModel):
         takes an array (p,) and returns a number, or an array (1,), for example
         ``equinox.nn.MLP(2, "scalar", 16, 1, key=jax.random.key(0))``.
     optimizer
-        an optax optimiser; ``optax.sgd(0.1)`` by default (``TorchModel`` says why not Adam).
+        an optax optimiser; ``optax.sgd(0.1)`` by default (see ``TorchModel`` on Adam).
     steps
         gradient steps on each batch.
     **options
@@ -33,57 +34,56 @@ class JaxModel(PythonModel):
     Raises
     ------
     ImportError
-        where JAX, Equinox or optax is missing.
+        if JAX, Equinox or optax is missing.
     ValueError
-        for something that is no module or optimiser, and as ``PythonModel``.
+        for an object that is no module or no optimiser, and as ``PythonModel``.
     """
 
     def __init__(
         self, module: Any, optimizer: Any = None, *, steps: int = 1, **options: Unpack[Options]
     ) -> None:
-        import_extra("jax", "jax", "a JAX learner")
-        equinox, optax = (
-            import_extra("equinox", "jax", "a JAX learner"),
-            import_extra("optax", "jax", "a JAX learner"),
-        )
+        _needed("jax")
+        equinox, optax = _needed("equinox"), _needed("optax")
         if not (isinstance(module, equinox.Module) and callable(module)):
             raise ValueError(
-                f"module = {module!r}: must be an equinox.Module that can be called with an array (p,)"
+                f"module = {module!r}: must be an equinox.Module that takes an array (p,)"
             )
         optimizer = optax.sgd(0.1) if optimizer is None else optimizer
         if not all(callable(getattr(optimizer, name, None)) for name in ("init", "update")):
             raise ValueError(
                 f"optimizer = {optimizer!r}: must be an optax optimiser, for example optax.sgd(0.1)"
             )
-        self.name = type(module).__name__
-        self._set_up(_Module(module, optimizer, checks.whole("steps", steps, 1)), **options)
+        model = _Module(module, optimizer, checks.whole("steps", steps, 1))
+        self._set_up(type(module).__name__, model, **options)
 
     def _unwrapped(self, model: Any) -> Any:
         return model.module
 
 
+def _needed(module: str) -> Any:
+    return import_extra(module, "jax", "a JAX learner")
+
+
 class _Module:
     def __init__(self, module: Any, optimizer: Any, steps: int) -> None:
-        equinox = import_extra("equinox", "jax", "a JAX learner")
+        equinox = _needed("equinox")
         self.module, self.optimizer, self.steps = module, optimizer, steps
         self.moments = optimizer.init(equinox.filter(module, equinox.is_inexact_array))
 
     def __deepcopy__(self, memo: Any) -> _Module:
-        # Arrays of JAX never change, so that a shallow copy is as good as a deep one.
+        # Arrays of JAX are immutable, so a shallow copy is enough.
         other = object.__new__(_Module)
         vars(other).update(vars(self))
         return other
 
     def learn(self, features: Matrix, targets: Vector) -> None:
         step, _ = _compiled()
-        # JAX compiles for each shape: batches are filled up to a power of two with rows that do not count.
-        size = 1 << (len(targets) - 1).bit_length()
+        # JAX compiles for each shape: batches are padded to a power of two with rows of weight
+        # zero.
+        count = len(targets)
+        size = 1 << (count - 1).bit_length()
         rows, wanted, weights = np.zeros((size, features.shape[1])), np.zeros(size), np.zeros(size)
-        rows[: len(targets)], wanted[: len(targets)], weights[: len(targets)] = (
-            features,
-            targets,
-            1.0,
-        )
+        rows[:count], wanted[:count], weights[:count] = features, targets, 1.0
         for _ in range(self.steps):
             self.module, self.moments = step(
                 self.module, self.moments, self.optimizer, rows, wanted, weights
@@ -95,11 +95,8 @@ class _Module:
 
 @functools.cache
 def _compiled() -> tuple[Any, Any]:
-    """Return a gradient step and a prediction; made when first used, as JAX takes a while to import."""
-    jax, equinox = (
-        import_extra("jax", "jax", "a JAX learner"),
-        import_extra("equinox", "jax", "a JAX learner"),
-    )
+    """Return a gradient step and a prediction; made at first use, since JAX is slow to import."""
+    jax, equinox = _needed("jax"), _needed("equinox")
 
     def loss(module: Any, rows: Any, wanted: Any, weights: Any) -> Any:
         output = jax.vmap(module)(rows)

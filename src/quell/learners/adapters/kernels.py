@@ -1,4 +1,7 @@
-"""The compiled side of a learner whose model is a Python object: it gathers pairs and asks every ``period`` samples."""
+"""Kernels of a learner whose model is a Python object.
+
+They collect pairs in the compiled loop and call the model every ``period`` samples.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,9 @@ import numpy as np
 
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.function_pointers import call
-from quell.learners.adapters.instances import GIVEN_UP, PREDICTION, STATUS, UNTIL
+from quell.learners.adapters.instances import COUNTDOWN, DISABLED, PREDICTION, STATUS
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
-from quell.learners.online.learner import OnlineDesign, OnlineMemory, ready, show
+from quell.learners.online.learner import OnlineDesign, OnlineMemory, has_pairs, write_current
 from quell.learners.online.model import infer, learn
 from quell.types import Matrix, Status, Vector
 
@@ -18,7 +21,7 @@ _FAILED = int(Status.LEARNER_FAILED)
 
 
 class BatchDesign(NamedTuple):
-    """Parameters of a model that only gathers what it should learn."""
+    """Parameters of a model that only collects its pairs."""
 
     size: int
     """Number of pairs."""
@@ -27,25 +30,25 @@ class BatchDesign(NamedTuple):
 
 
 class BatchMemory(NamedTuple):
-    """State of a model that only gathers."""
+    """State of a model that only collects its pairs."""
 
     features: Matrix
     """(size, p)."""
     targets: Vector
     """(size,)."""
     filled: Vector
-    """(1,): how many there are."""
+    """(1,): number of pairs."""
 
 
 class PythonDesign(NamedTuple):
     """Parameters of a learner whose model is a Python object."""
 
     online: OnlineDesign
-    """What is around the model: features, scaling, lag."""
+    """Features, scaling and lag."""
     period: int
-    """Samples from one call to the next."""
+    """Samples between two calls."""
     address: int
-    """Of the function that asks the model."""
+    """Address of the function that calls the model."""
 
 
 class PythonMemory(NamedTuple):
@@ -53,19 +56,19 @@ class PythonMemory(NamedTuple):
 
     online: OnlineMemory
     answer: Vector
-    """(4,): the last prediction, scaled; status flags; samples until the next call; whether the model is left alone."""
+    """(4,): last prediction, scaled; status flags; samples until the next call; 1 once disabled."""
     model: Vector
-    """(1,): the number of the instance that learns (``instances.py``)."""
+    """(1,): number of the instance that learns (``instances.py``)."""
 
 
 class Batch:
-    """A description of a model that only gathers ``size`` pairs."""
+    """A description of a model that only collects ``size`` pairs."""
 
     def __init__(self, size: int) -> None:
         self.size = size
 
     def design(self, features: int, dt: float) -> BatchDesign:
-        """Return the parameters for so many features."""
+        """Return the parameters for the number of features."""
         return BatchDesign(self.size, features)
 
     def memory(self, parameters: BatchDesign) -> BatchMemory:
@@ -109,20 +112,20 @@ def _adapt(
     f_plain: float,
 ) -> None:
     online, answer = memory.online, memory.answer
-    if answer[GIVEN_UP] != 0.0:
+    if answer[DISABLED] != 0.0:
         answer[PREDICTION] = 0.0
         answer[STATUS] = _FAILED
         return
     adapt(learner.online, online, seen, y, u_before, f_plain)
-    if not ready(learner.online, online):
+    if not has_pairs(learner.online, online):
         answer[STATUS] = 0.0
         return
-    answer[UNTIL] -= 1.0
-    if answer[UNTIL] > 0.0:
+    answer[COUNTDOWN] -= 1.0
+    if answer[COUNTDOWN] > 0.0:
         return
-    show(learner.online, online, seen, u_before, online.now)
-    batch = online.model
-    if batch.filled[0] > 0.0 and _finite(online.now):
+    now, batch = online.features, online.model
+    write_current(learner.online, online, seen, u_before, now)
+    if batch.filled[0] > 0.0 and _finite(now):
         filled = int(batch.filled[0])
         call(
             learner.address,
@@ -130,12 +133,12 @@ def _adapt(
             batch.features,
             batch.targets,
             filled,
-            online.now.size,
-            online.now,
+            now.size,
+            now,
             answer,
         )
         batch.filled[0] = 0.0
-        answer[UNTIL] = learner.period
+        answer[COUNTDOWN] = learner.period
 
 
 @predict.register(PythonDesign)
@@ -157,7 +160,7 @@ def _commit(
 def _restart(learner: PythonDesign, memory: PythonMemory) -> None:
     restart(learner.online, memory.online)
     memory.online.model.filled[0] = 0.0
-    memory.answer[PREDICTION] = memory.answer[UNTIL] = 0.0
+    memory.answer[PREDICTION] = memory.answer[COUNTDOWN] = 0.0
 
 
 @trouble.register(PythonDesign)

@@ -1,4 +1,4 @@
-"""A learner of any Python object."""
+"""A learner whose model is any Python object."""
 
 from __future__ import annotations
 
@@ -12,14 +12,20 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.features.base import checked_design
-from quell.learners.adapters.instances import Instance, address, enter, finite_number, instance_of
+from quell.learners.adapters.instances import (
+    Instance,
+    callback_address,
+    finite_number,
+    instance_of,
+    register,
+)
 from quell.learners.adapters.kernels import Batch, PythonDesign, PythonMemory
 from quell.learners.online.learner import Online
 from quell.observers.eso import ESO
 
 
 class Options(TypedDict, total=False):
-    """What all learners of Python objects may be told; see ``PythonModel``."""
+    """Options of all learners whose model is a Python object; see ``PythonModel``."""
 
     features: Features | None
     period: int
@@ -30,7 +36,7 @@ class Options(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A copy of a model at work, for a controller's ``state``."""
+    """A copy of a model that learns, for a controller's ``state``."""
 
     model: Any
     failures: int
@@ -39,57 +45,65 @@ class Snapshot:
 class PythonModel:
     """A learner whose model is a Python object.
 
-    The loop stays compiled. Every ``period`` samples it calls the model, with the pairs gathered since the last call and with the features
-    of this moment, and holds the prediction until the next call. Pairs are made as for ``Online``: the features are delayed by the
-    observer's lag, features and target are scaled to about [−1, 1].
+    The loop stays compiled. Every ``period`` samples it calls the model with the pairs collected
+    since the last call and with the newest features, and holds the prediction until the next call.
+    Pairs are made as for ``Online``: the features are delayed by the observer's lag, and features
+    and target are scaled to about [−1, 1].
 
-    Each controller state has a deep copy of the model to itself, so that what is given here never changes. A model that draws random
-    numbers should have a generator of its own with a seed, or two runs will differ.
+    Each controller state has its own deep copy of the model, so the object given here never
+    changes. A model that draws random numbers should have its own generator with a seed; else two
+    runs differ.
 
-    A model that raises, or predicts something that is no finite number, is not listened to: the step reports
-    ``Status.LEARNER_FAILED``, a ``RuntimeWarning`` and ``last_problem`` say what happened, and a fresh copy takes over. After three
-    failures in a row the model is left alone, with a prediction of zero, until the controller is reset.
+    If a model raises, or predicts something other than a finite number, its answer is dropped: the
+    step reports ``Status.LEARNER_FAILED``, a ``RuntimeWarning`` and ``last_problem`` describe the
+    problem, and a fresh copy continues. After three failures in a row the model is disabled, with a
+    prediction of zero, until the controller is reset.
 
     Parameters
     ----------
     model
-        an object with ``learn(features, targets)``, of shapes (m, p) and (m,), m from 1 to ``period``, and ``predict(features)``, which
-        returns a number for features of shape (p,).
+        an object with ``learn(features, targets)``, of shapes (m, p) and (m,), m from 1 to
+        ``period``, and ``predict(features)``, which returns a number for features of shape (p,).
     features : Features, optional
-        what it is shown; the estimated state by default.
+        blocks of features; the estimated state by default.
     period : int, optional
-        samples from one call to the next, 10 by default. A prediction is up to so old: ``period · dt`` should be well below the observer's
-        lag, which is about ``(n + 1) / omega_o``.
+        samples between two calls, 10 by default. A prediction is up to one period old: ``period ·
+        dt`` should be well below the observer's lag, which is about ``(n + 1) / omega_o``.
     budget : float, optional
-        how long the loop waits for an answer [s]. By default the model is called in the loop and waited for, which gives the same bits
-        every time: right for simulation. With a budget it runs in a thread of its own. A late answer is taken at the first call after
-        it has come; until then the last prediction holds, new pairs are dropped, and steps report ``Status.LEARNER_LATE``.
+        longest time that the loop waits for an answer [s]. By default the model is called in the
+        loop's thread, which gives the same bits every time: right for simulation. With a budget it
+        runs in its own thread. A late answer is taken at the first call after it has come; until
+        then the last prediction is held, new pairs are dropped, and steps report
+        ``Status.LEARNER_LATE``.
     frequency : float, optional
-        a frequency the plant has [rad/s], for the automatic scaling; ``omega_c`` of the controller by default.
+        a frequency of the plant [rad/s], for the automatic scaling; ``omega_c`` of the controller
+        by default.
     scale : array, optional
-        what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
+        what x_1 … x_n, u and f are divided by, (n + 2,); found automatically by default.
 
     Raises
     ------
     ValueError
-        for arguments that fit nothing; in ``design``, where a copy of the model, tried on a few pairs, does not learn and predict.
+        for an argument out of range; in ``design``, if a copy of the model fails to learn and
+        predict in a trial with a few pairs.
     """
 
     external_fields = ("model",)
-    """The field of the memory that stands for the model."""
+    """The field of the memory that refers to the model."""
 
     def __init__(self, model: Any, **options: Unpack[Options]) -> None:
         if isinstance(model, type) or not all(
             callable(getattr(model, name, None)) for name in ("learn", "predict")
         ):
             raise ValueError(
-                f"model = {model!r}: must be an object with learn(features, targets) and predict(features)"
+                f"model = {model!r}: must be an object with learn(features, targets) and "
+                "predict(features)"
             )
-        self.name = type(model).__name__
-        self._set_up(model, **options)
+        self._set_up(type(model).__name__, model, **options)
 
     def _set_up(
         self,
+        name: str,
         model: Any,
         features: Features | None = None,
         period: int = 10,
@@ -97,6 +111,7 @@ class PythonModel:
         frequency: float | None = None,
         scale: Any = None,
     ) -> None:
+        self.name = name
         self.period = checks.whole("period", period, 1)
         self.budget = None if budget is None else checks.positive("budget", budget, "s")
         self._online = Online(
@@ -110,60 +125,67 @@ class PythonModel:
             self._source = copy.deepcopy(model)
         except Exception as error:
             raise ValueError(
-                f"{self.name}: must be something copy.deepcopy can copy ({type(error).__name__}: {error})"
+                f"{name}: must be something copy.deepcopy can copy "
+                f"({type(error).__name__}: {error})"
             ) from error
         self.last_problem = ""
-        """The text of the last problem that a loop had with the model; empty where there was none."""
-        self._tried: set[int] = set()
+        """The text of the last problem that a loop had with the model; empty if there was none."""
+        self._tried_widths: set[int] = set()
 
     def design(self, observer: ESO, omega_c: float) -> PythonDesign:
-        """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s]; try the model on a copy first."""
+        """Return the parameters for an observer and the controller's bandwidth [rad/s].
+
+        The model is tried on a copy first.
+        """
         checked_design(self._online.features, observer.order)
         self._try(self._online.features.names(observer.order))
-        return PythonDesign(self._online.design(observer, omega_c), self.period, address())
+        online = self._online.design(observer, omega_c)
+        return PythonDesign(online, self.period, callback_address())
 
     def memory(self, parameters: PythonDesign) -> PythonMemory:
-        """Return a state with nothing learned, and with a copy of the model behind it."""
+        """Return the state before anything is learned, with its own copy of the model."""
         instance = Instance(self._source, self.name, self.budget, self._note)
-        return PythonMemory(self._online.memory(parameters.online), np.zeros(4), enter(instance))
+        return PythonMemory(self._online.memory(parameters.online), np.zeros(4), register(instance))
 
     def feature_names(self, order: int) -> tuple[str, ...]:
-        """Return no names: what a black box has learned is not said by coefficients."""
+        """Return no names: the model has no coefficients with a meaning for the user."""
         return ()
 
     def trained(self, memory: PythonMemory) -> Any:
-        """Return a copy of the model as it is in a state: ``learner.trained(run.final_state.learner)``.
+        """Return a copy of the model in a state: ``learner.trained(run.final_state.learner)``.
 
-        What it learned is in scaled units: features and target were divided by ``memory.online.scale``.
+        It learned in scaled units: features and target were divided by ``memory.online.scale``.
         """
-        return self._unwrapped(instance_of(memory.model).copied()[0])
+        return self._unwrapped(instance_of(memory.model).copy_model()[0])
 
     def snapshot(self, memory: PythonMemory) -> dict[str, Any]:
-        """Return a copy of the model that learns, by the name of the field that stands for it.
+        """Return a copy of the model that learns, by the name of its field in the memory.
 
-        It is an object of this process. quell never pickles one, nor unpickles it.
+        It is an object of this process; quell never pickles or unpickles it.
         """
-        return {"model": Snapshot(*instance_of(memory.model).copied())}
+        return {"model": Snapshot(*instance_of(memory.model).copy_model())}
 
     def recall(self, memory: PythonMemory, snapshots: Mapping[str, Any]) -> None:
-        """Go on with copies of what ``snapshot`` returned."""
+        """Continue with copies of what ``snapshot`` returned."""
         snapshot = snapshots["model"]
         if not isinstance(snapshot, Snapshot):
             raise ValueError(
-                f"state of {self.name}: must be what controller.state gave, in this process, got {type(snapshot).__name__}"
+                f"state of {self.name}: must be what controller.state gave, in this process, "
+                f"got {type(snapshot).__name__}"
             )
-        instance_of(memory.model).replaced(snapshot.model, snapshot.failures)
+        instance_of(memory.model).replace_model(snapshot.model, snapshot.failures)
 
     def _unwrapped(self, model: Any) -> Any:
-        """Return what the user knows of a model."""
+        """Return the user's model from the object that learns."""
         return model
 
     def _note(self, problem: str) -> None:
         self.last_problem = problem
 
     def _try(self, names: tuple[str, ...]) -> None:
+        """Let a copy of the model learn one pair, then a period's, and predict after each."""
         width = len(names)
-        if width in self._tried:
+        if width in self._tried_widths:
             return
         wave = np.sin(1.0 + np.arange((self.period + 1) * width)).reshape(self.period + 1, width)
         step = "learn"
@@ -178,7 +200,8 @@ class PythonModel:
             raise
         except Exception as error:
             raise ValueError(
-                f"{self.name}: {step} fails on a trial with {type(error).__name__}: {error}. It is shown {width} features "
-                f"({', '.join(names)}) and must learn and predict one number: fit it to that, or choose other features"
+                f"{self.name}: {step} fails on a trial with {type(error).__name__}: {error}. "
+                f"It is shown {width} features ({', '.join(names)}) and must learn and predict one "
+                "number: fit it to that, or choose other features"
             ) from error
-        self._tried.add(width)
+        self._tried_widths.add(width)

@@ -1,4 +1,4 @@
-"""River's regressors as learners."""
+"""Regressors of river as learners."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from quell.types import Matrix, Vector
 
 
 class RiverModel(PythonModel):
-    """A learner whose model is a river regressor or pipeline, or anything with ``learn_one`` and ``predict_one``.
+    """A learner whose model is a river regressor or pipeline.
 
-    Features are shown as a dictionary, by the numbers 0, 1, … of the features.
+    Any object with ``learn_one`` and ``predict_one`` can be used. It is shown the features as a
+    dictionary with the keys 0, 1, ….
 
     Parameters
     ----------
     regressor
-        for example ``river.preprocessing.StandardScaler() | river.linear_model.LinearRegression()``.
+        for example ``river.preprocessing.StandardScaler() |
+        river.linear_model.LinearRegression()``.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
 
@@ -31,10 +33,10 @@ class RiverModel(PythonModel):
             callable(getattr(regressor, name, None)) for name in ("learn_one", "predict_one")
         ):
             raise ValueError(
-                f"regressor = {regressor!r}: must have learn_one and predict_one, as river's regressors have"
+                f"regressor = {regressor!r}: must have learn_one and predict_one, "
+                "as river's regressors have"
             )
-        self.name = type(regressor).__name__
-        self._set_up(_Regressor(regressor), **options)
+        self._set_up(type(regressor).__name__, _Regressor(regressor), **options)
 
     def _unwrapped(self, model: Any) -> Any:
         return model.regressor

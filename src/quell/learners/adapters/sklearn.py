@@ -1,4 +1,4 @@
-"""Scikit-learn's incremental regressors as learners."""
+"""Incremental regressors of scikit-learn as learners."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ from quell.types import Matrix, Vector
 
 
 class SklearnModel(PythonModel):
-    """A learner whose model is a scikit-learn estimator, or anything with ``partial_fit`` and ``predict``.
+    """A learner whose model is a scikit-learn estimator.
 
-    Features and target come scaled, so that no scaler is needed. A ``random_state`` of None is set to 0 in the copy that learns: the same
-    seed shall give the same run.
+    Any object with ``partial_fit`` and ``predict`` can be used. Features and target are scaled, so
+    no scaler is needed. A ``random_state`` of None is set to 0 in the copy that learns, so that a
+    run can be repeated.
 
     Parameters
     ----------
     estimator
-        for example ``sklearn.linear_model.SGDRegressor()`` or ``sklearn.neural_network.MLPRegressor()``.
+        for example ``sklearn.linear_model.SGDRegressor()`` or
+        ``sklearn.neural_network.MLPRegressor()``.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
 
     Raises
     ------
     ValueError
-        for an estimator that can't learn piece by piece, and as ``PythonModel``.
+        for an estimator that cannot learn incrementally, and as ``PythonModel``.
     """
 
     def __init__(self, estimator: Any, **options: Unpack[Options]) -> None:
@@ -33,11 +35,10 @@ class SklearnModel(PythonModel):
             callable(getattr(estimator, name, None)) for name in ("partial_fit", "predict")
         ):
             raise ValueError(
-                f"estimator = {estimator!r}: must have partial_fit and predict, as SGDRegressor and MLPRegressor have; "
-                "of a pipeline, give its last step: features come scaled"
+                f"estimator = {estimator!r}: must have partial_fit and predict, as SGDRegressor "
+                "and MLPRegressor have; pass the last step of a pipeline: features come scaled"
             )
-        self.name = type(estimator).__name__
-        self._set_up(_Estimator(estimator), **options)
+        self._set_up(type(estimator).__name__, _Estimator(estimator), **options)
 
     def _unwrapped(self, model: Any) -> Any:
         return model.estimator

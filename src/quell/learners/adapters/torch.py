@@ -12,16 +12,19 @@ from quell.types import Matrix, Vector
 
 
 class TorchModel(PythonModel):
-    """A learner whose model is a PyTorch module, trained by gradient steps on the mean squared error of each batch.
+    """A learner whose model is a PyTorch module.
+
+    It is trained by gradient steps on the mean squared error of each batch.
 
     Parameters
     ----------
     module
         takes a tensor (m, p) and returns one of shape (m, 1) or (m,), on the CPU.
     optimizer
-        an optimiser on the module's own parameters, or a function that makes one of parameters, for example
-        ``functools.partial(torch.optim.SGD, lr=0.05)``; that with a learning rate of 0.1 by default. Pairs that follow each other
-        resemble each other, and an optimiser that takes long steps on small gradients (Adam at its usual rates) unlearns the rest.
+        an optimiser of the module's parameters, or a function that makes one from parameters, for
+        example ``functools.partial(torch.optim.SGD, lr=0.05)``; SGD with a learning rate of 0.1 by
+        default. Consecutive pairs are similar, and an optimiser that takes long steps on small
+        gradients (Adam at its usual rates) unlearns the rest.
     steps
         gradient steps on each batch.
     **options
@@ -30,9 +33,9 @@ class TorchModel(PythonModel):
     Raises
     ------
     ImportError
-        where PyTorch is missing.
+        if PyTorch is missing.
     ValueError
-        for something that is no module or optimiser, and as ``PythonModel``.
+        for an object that is no module or no optimiser, and as ``PythonModel``.
     """
 
     def __init__(
@@ -55,40 +58,39 @@ class TorchModel(PythonModel):
             optimizer = optimizer(parameters)
         if not isinstance(optimizer, torch.optim.Optimizer):
             raise ValueError(
-                f"optimizer = {optimizer!r}: must be a torch optimiser, or a function that makes one of parameters"
+                f"optimizer = {optimizer!r}: must be a torch optimiser, or a function that makes "
+                "one from parameters"
             )
         own = {id(parameter) for parameter in parameters}
-        if any(
-            id(parameter) not in own
-            for group in optimizer.param_groups
-            for parameter in group["params"]
-        ):
+        if not own.issuperset(id(p) for group in optimizer.param_groups for p in group["params"]):
             raise ValueError(
-                "optimizer: must be on the parameters of the module; make it of module.parameters()"
+                "optimizer: must be on the parameters of the module; use module.parameters()"
             )
-        self.name = type(module).__name__
-        self._set_up(_Module(module, optimizer, checks.whole("steps", steps, 1)), **options)
+        model = _Module(module, optimizer, checks.whole("steps", steps, 1))
+        self._set_up(type(module).__name__, model, **options)
 
     def _unwrapped(self, model: Any) -> Any:
         return model.module.eval()
 
 
 class _Module:
-    # Module and optimiser are copied together, so that the copy of one has the parameters of the copy of the other.
+    # Module and optimiser are copied together: the copied optimiser has the copied module's
+    # parameters.
     def __init__(self, module: Any, optimizer: Any, steps: int) -> None:
         self.module, self.optimizer, self.steps = module, optimizer, steps
-        self.kind = next(module.parameters()).dtype
+        self.dtype = next(module.parameters()).dtype
 
     def learn(self, features: Matrix, targets: Vector) -> None:
         torch = import_extra("torch", "torch", "a PyTorch learner")
-        rows, wanted = (torch.from_numpy(array).to(self.kind) for array in (features, targets))
+        rows, wanted = (torch.from_numpy(array).to(self.dtype) for array in (features, targets))
         self.module.train()
         for _ in range(self.steps):
             self.optimizer.zero_grad()
             output = self.module(rows)
             if tuple(output.shape) not in ((len(wanted), 1), (len(wanted),)):
                 raise ValueError(
-                    f"returned shape {tuple(output.shape)} for {len(wanted)} rows: must be one number for each"
+                    f"returned shape {tuple(output.shape)} for {len(wanted)} rows: "
+                    "must be one number for each"
                 )
             torch.nn.functional.mse_loss(output.reshape(-1), wanted).backward()
             self.optimizer.step()
@@ -97,4 +99,5 @@ class _Module:
         torch = import_extra("torch", "torch", "a PyTorch learner")
         self.module.eval()
         with torch.no_grad():
-            return self.module(torch.from_numpy(features.reshape(1, -1)).to(self.kind)).numpy()
+            row = torch.from_numpy(features.reshape(1, -1)).to(self.dtype)
+            return self.module(row).numpy()

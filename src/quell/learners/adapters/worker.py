@@ -1,4 +1,4 @@
-"""A thread of its own for a model that may take longer than a loop can wait."""
+"""A separate thread for a model that may take longer than the loop can wait."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import Any
 
 
 class Worker:
-    """Runs one job at a time. The thread starts with the first job."""
+    """A thread that runs one job at a time. It starts with the first job."""
 
     def __init__(self) -> None:
         self.busy = False
-        """Whether there is a job whose answer was not taken."""
+        """Whether there is a job whose result was not taken."""
         self._jobs: queue.SimpleQueue[Callable[[], Any] | None] = queue.SimpleQueue()
         self._done = threading.Event()
-        self._box: list[Any] = []
+        self._results: list[Any] = []
         self._thread: threading.Thread | None = None
 
     def start(self, job: Callable[[], Any]) -> None:
         """Start a job, which must not raise."""
         if self._thread is None:
-            # What the thread holds on to must not be the worker, or neither would ever end.
+            # The thread must not refer to the worker: then neither would ever be deleted.
             self._thread = threading.Thread(
                 target=_run,
-                args=(self._jobs, self._done, self._box),
+                args=(self._jobs, self._done, self._results),
                 name="quell learner",
                 daemon=True,
             )
@@ -34,30 +34,30 @@ class Worker:
         self.busy = True
         self._jobs.put(job)
 
-    def answer(self, patience: float) -> Any:
-        """Return what the job has returned, within ``patience`` [s]; else None."""
-        if not self.busy or not self._done.wait(patience):
+    def result(self, timeout: float) -> Any:
+        """Return the job's result, or None if there is none within ``timeout`` [s]."""
+        if not self.busy or not self._done.wait(timeout):
             return None
         self.busy = False
-        return self._box.pop()
+        return self._results.pop()
 
-    def rest(self) -> None:
+    def wait(self) -> None:
         """Wait until no job is running."""
         if self.busy:
             self._done.wait()
 
-    def end(self) -> None:
-        """Let the thread end, after the job it is at."""
+    def stop(self) -> None:
+        """End the thread after its current job."""
         self._jobs.put(None)
 
 
 def _run(
-    jobs: queue.SimpleQueue[Callable[[], Any] | None], done: threading.Event, box: list[Any]
+    jobs: queue.SimpleQueue[Callable[[], Any] | None], done: threading.Event, results: list[Any]
 ) -> None:
     while True:
         job = jobs.get()
         if job is None:
             return
-        box.append(job())
+        results.append(job())
         del job
         done.set()

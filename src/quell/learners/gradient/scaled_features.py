@@ -1,8 +1,9 @@
-"""Algorithm 1 on features of one's own choice, scaled.
+"""Algorithm 1 with user-defined features, scaled.
 
-The same sliding sum as in ``gradient.py``, with ``I = φ(x̂, u)``; the state, u and Δf̂ are divided by powers of two (``scaling.py``). When
-one of these grows, θ is converted as in ``regression.py`` and the buffers are filled anew. Until the observer has forgotten its start
-nothing is pushed: there is no scale to be had from its transient.
+``buffers.py`` describes the method; here ``I = φ(x̂, u)``. The state, u and Δf̂ are divided by
+powers of two (``features/scaling.py``). When a scale grows, θ is converted and the buffers are
+filled again. Nothing is learned until the observer's initial transient has decayed: it would give
+wrong scales.
 """
 
 from __future__ import annotations
@@ -13,126 +14,96 @@ import numpy as np
 
 from quell.features import Features
 from quell.features.base import checked_design, unit, write
-from quell.features.scaling import Scaling, scaling, update_scale
-from quell.kernels.dispatch import is_finite, kernel
+from quell.features.scaling import Scaling, initial_scale, scaling, update_scale
+from quell.kernels.dispatch import kernel
 from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.gradient.buffers import (
+    BatchGradientMemory,
+    clear_buffers,
+    empty_buffers,
+    restart_buffers,
+    take_step,
+)
 from quell.learners.lag import startup_samples
 from quell.observers.eso import ESO
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
-# Places in FeatureGradientMemory.place.
-_AT, _FULL, _SINCE, _SCALED = range(4)
+# Indices of ScaledGradientMemory.counters.
+_SAMPLES, _SCALED = range(2)
 
 
-class FeatureGradientDesign(NamedTuple):
+class ScaledGradientDesign(NamedTuple):
     """Parameters."""
 
     rate: float
-    """α, a sample."""
+    """α, per sample."""
     batch: int
     """n."""
     features: Any
     scaling: Scaling
-    watch: int
+    startup: int
     """Samples after a start from rest in which nothing is learned."""
 
 
-class FeatureGradientMemory(NamedTuple):
-    """State, with p features."""
+class ScaledGradientMemory(NamedTuple):
+    """State for p features and a plant of order m."""
 
-    theta: Vector
-    """(p,), scaled."""
-    features: Matrix
-    """I (n, p), a ring."""
-    residuals: Vector
-    """ΔF (n,), a ring."""
-    total: Vector
-    """Σ Δf̂ I over the ring (p,)."""
-    fresh: Vector
-    """The same over what was pushed since the ring last came round (p,)."""
-    place: Vector
-    """(4,): where the next datum goes; whether the ring has been full; samples since the start; whether there is a scale."""
+    buffers: BatchGradientMemory
+    """All scaled."""
+    counters: Vector
+    """(2,): samples since the start from rest; 1 once there are scales."""
     scale: Vector
-    """(n + 2,)."""
-    shown: Vector
-    """Room for the scaled state."""
-    now: Vector
-    """Room for the features (p,)."""
+    """(m + 2,): what x_1 … x_m, u and Δf̂ are divided by."""
+    scaled: Vector
+    """Work space for the scaled state (m,)."""
     units: Vector
     """(p,): ``unit`` of the features for ``scale``."""
 
 
-def feature_gradient_design(
+def scaled_gradient_design(
     rate: float, batch: int, features: Features, observer: ESO, frequency: float
-) -> FeatureGradientDesign:
-    """Return the parameters for an observer and a frequency the plant has [rad/s]."""
-    return FeatureGradientDesign(
+) -> ScaledGradientDesign:
+    """Return the parameters for an observer and a frequency of the plant [rad/s]."""
+    return ScaledGradientDesign(
         rate=rate,
         batch=batch,
         features=checked_design(features, observer.order),
         scaling=scaling(observer, frequency, False),
-        watch=startup_samples(observer),
+        startup=startup_samples(observer),
     )
 
 
-def feature_gradient_memory(design: FeatureGradientDesign, p: int) -> FeatureGradientMemory:
-    """Return empty buffers and θ = 0, for p features."""
-    n, size = design.batch, design.scaling.floors.size
-    return FeatureGradientMemory(
-        theta=np.zeros(p),
-        features=np.zeros((n, p)),
-        residuals=np.zeros(n),
-        total=np.zeros(p),
-        fresh=np.zeros(p),
-        place=np.zeros(4),
-        scale=np.full(size, 1e-100),
-        shown=np.zeros(size - 2),
-        now=np.zeros(p),
-        units=np.ones(p),
+def scaled_gradient_memory(design: ScaledGradientDesign, p: int) -> ScaledGradientMemory:
+    """Return empty buffers and θ = 0 for ``p`` features."""
+    scale = initial_scale(design.scaling)
+    return ScaledGradientMemory(
+        empty_buffers(design.batch, p), np.zeros(2), scale, np.zeros(scale.size - 2), np.ones(p)
     )
 
 
-@adapt.register(FeatureGradientDesign)
+@adapt.register(ScaledGradientDesign)
 def _adapt(
-    learner: FeatureGradientDesign,
-    memory: FeatureGradientMemory,
+    learner: ScaledGradientDesign,
+    memory: ScaledGradientMemory,
     seen: Vector,
     y: float,
     u_before: float,
     f_plain: float,
 ) -> None:
-    place, theta, total, fresh = memory.place, memory.theta, memory.total, memory.fresh
-    if place[_SINCE] <= learner.watch:
+    if memory.counters[_SAMPLES] <= learner.startup:
         return
     _rescale(learner, memory, seen, u_before, f_plain)
-    _show(learner, memory, seen, u_before)
-    at = min(max(int(place[_AT]), 0), learner.batch - 1)
+    _write(learner, memory, seen, u_before)
     residual = seen[seen.size - 1] / memory.scale[memory.scale.size - 1]
-    oldest = memory.residuals[at]
-    for i in range(theta.size):
-        gained = residual * memory.now[i]
-        total[i] += gained - oldest * memory.features[at, i]
-        fresh[i] += gained
-        memory.features[at, i] = memory.now[i]
-    memory.residuals[at] = residual
-    at += 1
-    if at == learner.batch:
-        at = 0
-        place[_FULL] = 1.0
-        for i in range(theta.size):
-            total[i] = fresh[i]
-            fresh[i] = 0.0
-    place[_AT] = at
-    if place[_FULL] > 0.0:
-        for i in range(theta.size):
-            theta[i] += learner.rate * total[i]
+    take_step(memory.buffers, residual, learner.rate)
 
 
 @kernel
 def _rescale(
-    learner: FeatureGradientDesign, memory: FeatureGradientMemory, seen: Vector, u: float, f: float
+    learner: ScaledGradientDesign, memory: ScaledGradientMemory, seen: Vector, u: float, f: float
 ) -> None:
-    theta, scale = memory.theta, memory.scale
+    """Let the scales grow; if one does, convert θ and empty the buffers."""
+    theta, current, scale = memory.buffers.theta, memory.buffers.current, memory.scale
     f_before = scale[scale.size - 1]
     before = after = 0.0
     for i in range(scale.size):
@@ -142,80 +113,61 @@ def _rescale(
         after += scale[i]
     if after == before:
         return
-    unit(learner.features, scale, memory.now)
+    unit(learner.features, scale, current)
     for i in range(theta.size):
-        ratio = memory.now[i] / memory.units[i]
-        if memory.place[_SCALED] > 0.0 and 0.0 < ratio <= 1.0:
+        ratio = current[i] / memory.units[i]
+        if memory.counters[_SCALED] > 0.0 and 0.0 < ratio <= 1.0:
             theta[i] *= f_before / scale[scale.size - 1] / ratio
-        memory.units[i] = memory.now[i]
-    memory.place[_SCALED] = 1.0
-    _empty(memory)
+        memory.units[i] = current[i]
+    memory.counters[_SCALED] = 1.0
+    clear_buffers(memory.buffers)
 
 
 @kernel
-def _empty(memory: FeatureGradientMemory) -> None:
-    for i in range(memory.theta.size):
-        memory.total[i] = memory.fresh[i] = 0.0
-        for k in range(memory.residuals.size):
-            memory.features[k, i] = 0.0
-    for k in range(memory.residuals.size):
-        memory.residuals[k] = 0.0
-    memory.place[_AT] = memory.place[_FULL] = 0.0
-
-
-@kernel
-def _show(
-    learner: FeatureGradientDesign, memory: FeatureGradientMemory, seen: Vector, u: float
+def _write(
+    learner: ScaledGradientDesign, memory: ScaledGradientMemory, seen: Vector, u: float
 ) -> None:
-    scale, shown = memory.scale, memory.shown
-    for i in range(shown.size):
-        shown[i] = seen[i] / scale[i]
-    write(learner.features, shown, u / scale[shown.size], memory.now)
+    """Write the scaled features into the buffers' ``current``."""
+    scale, scaled = memory.scale, memory.scaled
+    for i in range(scaled.size):
+        scaled[i] = seen[i] / scale[i]
+    write(learner.features, scaled, u / scale[scaled.size], memory.buffers.current)
 
 
-@predict.register(FeatureGradientDesign)
+@predict.register(ScaledGradientDesign)
 def _predict(
-    learner: FeatureGradientDesign, memory: FeatureGradientMemory, seen: Vector, u_before: float
+    learner: ScaledGradientDesign, memory: ScaledGradientMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
-    if memory.place[_SCALED] == 0.0:
+    if memory.counters[_SCALED] == 0.0:
         return 0.0, 0.0
-    _show(learner, memory, seen, u_before)
+    _write(learner, memory, seen, u_before)
     output = 0.0
-    for i in range(memory.theta.size):
-        output += memory.theta[i] * memory.now[i]
+    for i in range(memory.buffers.theta.size):
+        output += memory.buffers.theta[i] * memory.buffers.current[i]
     return output * memory.scale[memory.scale.size - 1], 0.0
 
 
-@commit.register(FeatureGradientDesign)
+@commit.register(ScaledGradientDesign)
 def _commit(
-    learner: FeatureGradientDesign,
-    memory: FeatureGradientMemory,
+    learner: ScaledGradientDesign,
+    memory: ScaledGradientMemory,
     seen: Vector,
     u: float,
     f_learned: float,
 ) -> None:
-    memory.place[_SINCE] += 1.0
+    memory.counters[_SAMPLES] += 1.0
 
 
-@restart.register(FeatureGradientDesign)
-def _restart(learner: FeatureGradientDesign, memory: FeatureGradientMemory) -> None:
-    memory.place[_SINCE] = 0.0
-    finite = True
-    for i in range(memory.theta.size):
-        finite = finite and is_finite(memory.theta[i]) and is_finite(memory.total[i])
-    if not finite:
-        for i in range(memory.theta.size):
-            memory.theta[i] = 0.0
-        _empty(memory)
+@restart.register(ScaledGradientDesign)
+def _restart(learner: ScaledGradientDesign, memory: ScaledGradientMemory) -> None:
+    memory.counters[_SAMPLES] = 0.0
+    restart_buffers(memory.buffers)
 
 
-@coefficients.register(FeatureGradientDesign)
+@coefficients.register(ScaledGradientDesign)
 def _coefficients(
-    learner: FeatureGradientDesign, memory: FeatureGradientMemory, theta: Vector
+    learner: ScaledGradientDesign, memory: ScaledGradientMemory, theta: Vector
 ) -> None:
+    f_scale, scaled = memory.scale[memory.scale.size - 1], memory.counters[_SCALED] > 0.0
     for i in range(theta.size):
-        theta[i] = (
-            memory.theta[i] * memory.units[i] * memory.scale[memory.scale.size - 1]
-            if memory.place[_SCALED] > 0.0
-            else 0.0
-        )
+        theta[i] = memory.buffers.theta[i] * memory.units[i] * f_scale if scaled else 0.0

@@ -1,4 +1,4 @@
-"""Learners that are Kalman filters: linear in the state, with and without sinusoids of unknown frequency.
+"""Kalman filters as learners: linear in the state, with and without sinusoids of unknown frequency.
 
 May import ``features`` and the base files of ``learners``.
 """

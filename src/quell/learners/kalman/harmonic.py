@@ -1,4 +1,4 @@
-"""The learner of loads that repeat: state, bias and sinusoids of unknown frequency."""
+"""The learner of periodic loads: state, bias and sinusoids of unknown frequency."""
 
 from __future__ import annotations
 
@@ -11,32 +11,37 @@ from quell import checks
 from quell.learners.kalman.kalman import Kalman
 from quell.learners.kalman.oscillators import Oscillators
 from quell.observers.eso import ESO
-from quell.types import Vector
 
-# Where frequencies start by default, in omega_c: the next oscillator at this share of the one before.
+# Initial frequencies by default: omega_c, then each this multiple of the one before. It spreads
+# three oscillators over a decade; not tuned further.
 _SPREAD = 0.3
-# Frequencies stay within these shares of omega_c and omega_o.
+# Default limits of the frequencies as multiples of omega_c and omega_o. A slower load is a drifting
+# bias, and near omega_o the observer does not see the load. Chosen by hand; not tuned further.
 _LOWEST, _HIGHEST = 0.02, 0.5
+# Default bandwidth of the pairs as a multiple of the bias's bandwidth; chosen by hand.
+_PAIR_BANDWIDTH = 2.5
 
 
 @dataclass(frozen=True)
 class Harmonic(Kalman):
-    """``Kalman`` with sinusoids of unknown frequency: ``f_L = θ · (x̂_1 … x̂_n, 1, sin ψ_1, cos ψ_1, …, u)``.
+    """A ``Kalman`` learner with sinusoids of unknown frequency.
 
-    Loads that rotate or repeat are rejected to nothing once their frequency is found (``oscillators.py`` says how), and what is learned of
-    the plant is not worn away by a load that goes on.
+    ``f_L = θ · (x̂_1 … x̂_n, 1, sin ψ_1, cos ψ_1, …, u)``. Once the frequency of a rotating or
+    repeating load is found (``oscillators.py``), the load is rejected completely, and it does not
+    disturb what is learned of the plant.
 
     Parameters
     ----------
     count
-        how many sinusoids, 1 to 8.
+        number of sinusoids, 1 to 8.
     omegas
-        where their frequencies start [rad/s], one for each; by default ``omega_c`` of the controller, 0.3 omega_c, 0.09 omega_c …
+        initial frequencies [rad/s], one for each sinusoid; by default ``omega_c`` of the
+        controller, 0.3 omega_c, 0.09 omega_c …
     limits
-        within which the frequencies stay [rad/s]; by default from ``0.02 omega_c`` to ``0.5 omega_o``.
+        least and largest frequency [rad/s]; ``0.02 omega_c`` and ``0.5 omega_o`` by default.
     pair_bandwidth
-        how fast the sinusoids follow, as λ of the bias [rad/s]; 2.5 times that of the bias by default. An oscillator at ω learns at about
-        the rate ``ω · pair_bandwidth / bias_bandwidth``.
+        bandwidth λ with which the sinusoids follow [rad/s]; 2.5 times that of the bias by default.
+        An oscillator at ω learns at about the rate ``ω · pair_bandwidth / bias_bandwidth``.
 
     All other parameters are those of ``Kalman``.
 
@@ -67,30 +72,31 @@ class Harmonic(Kalman):
             checks.positive("pair_bandwidth", self.pair_bandwidth, "rad/s")
 
     def oscillators(self, observer: ESO, omega_c: float) -> tuple[Oscillators, float]:
-        """Return the oscillators' parameters and how fast their pairs follow [rad/s].
+        """Return the parameters of the oscillators, and the bandwidth of their pairs [rad/s].
 
         Raises
         ------
         ValueError
-            where a frequency starts outside of the limits.
+            for an initial frequency outside of the limits.
         """
-        low, high = (
-            (_LOWEST * omega_c, _HIGHEST * observer.omega_o) if self.limits is None else self.limits
-        )
+        low, high = _LOWEST * omega_c, _HIGHEST * observer.omega_o
+        if self.limits is not None:
+            low, high = self.limits
         if self.omegas is None:
-            start: Vector = np.asarray(
-                np.clip(omega_c * _SPREAD ** np.arange(self.count), low, high), dtype=np.float64
-            )
+            start = np.clip(omega_c * _SPREAD ** np.arange(self.count), low, high)
         else:
             start = checks.vector("omegas", self.omegas)
         if not np.all((low <= start) & (start <= high)):
             raise ValueError(
-                f"omegas = {self.omegas!r} rad/s: must lie within limits = ({low:g}, {high:g}) rad/s"
+                f"omegas = {self.omegas!r} rad/s: must lie within limits = ({low:g}, {high:g}) "
+                "rad/s"
             )
-        follow = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
-        return Oscillators(
-            observer.order * self.state + self.bias, start, float(low), float(high)
-        ), (2.5 * follow if self.pair_bandwidth is None else self.pair_bandwidth)
+        first = observer.order * self.state + self.bias
+        bandwidth = self.pair_bandwidth
+        if bandwidth is None:
+            bias = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
+            bandwidth = _PAIR_BANDWIDTH * bias
+        return Oscillators(first, start, float(low), float(high)), bandwidth
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return ``("x1", …, "bias", "sin1", "cos1", …, "u")``, as far as they are features."""

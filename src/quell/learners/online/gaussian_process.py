@@ -1,20 +1,24 @@
-"""A Gaussian process on a bounded budget: the kernel recursive least squares tracker.
+"""A Gaussian process with a bounded number of points: the kernel recursive least squares tracker.
 
-f is taken for a Gaussian process with the kernel ``k(φ, φ') = exp(−|φ − φ'|²/(2 length²))``. All that is kept of what was seen is a
-dictionary of at most M points c_i, with the mean μ and the covariance Σ of f there. For a pair (φ, y), with ``Q = K⁻¹`` and
-``k_i = k(φ, c_i)``::
+f is modelled as a Gaussian process with the kernel ``k(φ, φ') = exp(−|φ − φ'|²/(2 length²))``. It
+stores at most M points c_i, with the mean μ and the covariance Σ of f at these points. For a pair
+(φ, y), with ``Q = K⁻¹`` and ``k_i = k(φ, c_i)`` (Van Vaerenbergh et al., eqs. (9)-(13))::
 
-    q = Q k,   γ² = 1 − k·q,   h = Σ q,   s = γ² + q·h + σ²,   e = y − q·μ                (Van Vaerenbergh et al., eqs. (9)-(13))
+    q = Q k,   γ² = 1 − k·q,   h = Σ q,   s = γ² + q·h + σ²,   e = y − q·μ
 
-* where γ² is small, the dictionary knows the place: ``μ += h e/s``, ``Σ −= h hᵀ/s``;
-* else φ joins the dictionary, and where that is full, the point goes whose loss changes the mean least: ``min (Qμ)_i²/Q_ii``.
+* if γ² is small, the stored points determine f at φ: ``μ += h e/s``, ``Σ −= h hᵀ/s``;
+* else φ becomes a point. If there are more than M then, the point is removed whose loss changes the
+mean
+  least: ``min (Qμ)_i²/Q_ii``.
 
-Before that, what is known fades back to the prior, ``Σ ← λΣ + (1−λ)K``, ``μ ← √λ μ``. All in O(M²), in place.
+Before that, the state is moved back towards the prior, ``Σ ← λΣ + (1−λ)K``, ``μ ← √λ μ``. All of it
+is O(M²) and in place.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,8 +31,11 @@ from quell.learners.online.model import infer, learn
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
-# Least γ² with which a point joins: it also bounds what rounding does to Q.
-_NEW = 1e-2
+# Least γ² of a new point; it also bounds the effect of rounding on Q. Chosen by hand, not tuned
+# further.
+_LEAST_NOVELTY = 1e-2
+# Default of memory_time in units of 1/omega_c; chosen by hand, not tuned further.
+_MEMORY = 1000.0
 
 
 class GaussianProcessDesign(NamedTuple):
@@ -43,11 +50,11 @@ class GaussianProcessDesign(NamedTuple):
     forget: float
     """1 − λ."""
     every: int
-    """Learn from every so-many-th pair."""
+    """Learn from every ``every``-th pair."""
 
 
 class GaussianProcessMemory(NamedTuple):
-    """State; room for one point more than the budget, m features."""
+    """State for m features; one row more than the budget, for the point that is added last."""
 
     points: Matrix
     """c (M + 1, m)."""
@@ -61,18 +68,18 @@ class GaussianProcessMemory(NamedTuple):
     """μ (M + 1,)."""
     weights: Vector
     """Qμ (M + 1,)."""
-    near: Vector
-    """Room for k (M + 1,)."""
-    share: Vector
-    """Room for q (M + 1,)."""
-    spread: Vector
-    """Room for h (M + 1,)."""
-    place: Vector
-    """(2,): number of points; pairs passed over since the last that was learned from."""
+    k: Vector
+    """Work space (M + 1,)."""
+    q: Vector
+    """Work space (M + 1,)."""
+    h: Vector
+    """Work space (M + 1,)."""
+    counters: Vector
+    """(2,): number of points; pairs since the last one that was learned from."""
 
 
 @kernel
-def _likeness(
+def _similarity(
     model: GaussianProcessDesign, memory: GaussianProcessMemory, i: int, features: Vector
 ) -> float:
     distance = 0.0
@@ -83,15 +90,15 @@ def _likeness(
 
 
 @kernel
-def _count(model: GaussianProcessDesign, memory: GaussianProcessMemory) -> int:
-    return min(max(int(memory.place[0]), 0), model.budget)
+def _point_count(model: GaussianProcessDesign, memory: GaussianProcessMemory) -> int:
+    return min(max(int(memory.counters[0]), 0), model.budget)
 
 
 @infer.register(GaussianProcessDesign)
 def _infer(model: GaussianProcessDesign, memory: GaussianProcessMemory, features: Vector) -> float:
     output = 0.0
-    for i in range(_count(model, memory)):
-        output += memory.weights[i] * _likeness(model, memory, i, features)
+    for i in range(_point_count(model, memory)):
+        output += memory.weights[i] * _similarity(model, memory, i, features)
     return output
 
 
@@ -99,55 +106,55 @@ def _infer(model: GaussianProcessDesign, memory: GaussianProcessMemory, features
 def _learn(
     model: GaussianProcessDesign, memory: GaussianProcessMemory, features: Vector, target: float
 ) -> None:
-    memory.place[1] += 1.0
-    if memory.place[1] < model.every or not is_finite(target):
+    memory.counters[1] += 1.0
+    if memory.counters[1] < model.every or not is_finite(target):
         return
-    memory.place[1] = 0.0
-    count = _count(model, memory)
+    memory.counters[1] = 0.0
+    count = _point_count(model, memory)
     mean, covariance = memory.mean, memory.covariance
-    near, share, spread = memory.near, memory.share, memory.spread
-    _fade(model, memory, count)
+    k, q, h = memory.k, memory.q, memory.h
+    _forget(model, memory, count)
     for i in range(count):
-        near[i] = _likeness(model, memory, i, features)
+        k[i] = _similarity(model, memory, i, features)
     novelty, error = 1.0, target
     for i in range(count):
         total = 0.0
         for j in range(count):
-            total += memory.inverse[i, j] * near[j]
-        share[i] = total
-        novelty -= total * near[i]
+            total += memory.inverse[i, j] * k[j]
+        q[i] = total
+        novelty -= total * k[i]
         error -= total * mean[i]
     novelty = max(novelty, 0.0)
     variance = novelty
     for i in range(count):
         total = 0.0
         for j in range(count):
-            total += covariance[i, j] * share[j]
-        spread[i] = total
-        variance += total * share[i]
+            total += covariance[i, j] * q[j]
+        h[i] = total
+        variance += total * q[i]
     if not (variance > 0.0 and is_finite(error)):
         return
     total = count
-    if novelty > _NEW:
-        _join(memory, count, features, novelty, variance, target - error)
+    if novelty > _LEAST_NOVELTY:
+        _add_point(memory, count, features, novelty, variance, target - error)
         total = count + 1
     gain = 1.0 / (variance + model.noise)
     for i in range(total):
-        mean[i] += spread[i] * error * gain
+        mean[i] += h[i] * error * gain
         for j in range(i + 1):
-            covariance[i, j] -= spread[i] * spread[j] * gain
+            covariance[i, j] -= h[i] * h[j] * gain
             covariance[j, i] = covariance[i, j]
-    _weigh(memory, total)
+    _update_weights(memory, total)
     if total > model.budget:
-        _leave(memory, total)
+        _remove_point(memory, total)
         total -= 1
-        _weigh(memory, total)
-    memory.place[0] = total
+        _update_weights(memory, total)
+    memory.counters[0] = total
 
 
 @kernel
-def _fade(model: GaussianProcessDesign, memory: GaussianProcessMemory, count: int) -> None:
-    """Go back towards the prior."""
+def _forget(model: GaussianProcessDesign, memory: GaussianProcessMemory, count: int) -> None:
+    """Move mean and covariance back towards the prior."""
     if model.forget == 0.0:
         return
     keep = 1.0 - model.forget
@@ -161,7 +168,7 @@ def _fade(model: GaussianProcessDesign, memory: GaussianProcessMemory, count: in
 
 
 @kernel
-def _join(
+def _add_point(
     memory: GaussianProcessMemory,
     count: int,
     features: Vector,
@@ -169,25 +176,25 @@ def _join(
     variance: float,
     expected: float,
 ) -> None:
-    """Add a point, with what was expected there."""
+    """Add a point; ``expected`` is the prediction at it."""
     for j in range(features.size):
         memory.points[count, j] = features[j]
-    memory.share[count] = -1.0
+    memory.q[count] = -1.0
     for i in range(count + 1):
         for j in range(count + 1):
             before = memory.inverse[i, j] if i < count and j < count else 0.0
-            memory.inverse[i, j] = before + memory.share[i] * memory.share[j] / novelty
+            memory.inverse[i, j] = before + memory.q[i] * memory.q[j] / novelty
     for i in range(count):
-        memory.kernel[count, i] = memory.kernel[i, count] = memory.near[i]
-        memory.covariance[count, i] = memory.covariance[i, count] = memory.spread[i]
+        memory.kernel[count, i] = memory.kernel[i, count] = memory.k[i]
+        memory.covariance[count, i] = memory.covariance[i, count] = memory.h[i]
     memory.kernel[count, count] = 1.0
     memory.covariance[count, count] = variance
-    memory.spread[count] = variance
+    memory.h[count] = variance
     memory.mean[count] = expected
 
 
 @kernel
-def _weigh(memory: GaussianProcessMemory, count: int) -> None:
+def _update_weights(memory: GaussianProcessMemory, count: int) -> None:
     for i in range(count):
         total = 0.0
         for j in range(count):
@@ -196,8 +203,8 @@ def _weigh(memory: GaussianProcessMemory, count: int) -> None:
 
 
 @kernel
-def _leave(memory: GaussianProcessMemory, count: int) -> None:
-    """Remove the point whose loss changes the mean least; the last one takes its place."""
+def _remove_point(memory: GaussianProcessMemory, count: int) -> None:
+    """Remove the point whose loss changes the mean least; the last point moves to its row."""
     least, out, last = math.inf, count - 1, count - 1
     for i in range(count):
         loss = memory.weights[i] * memory.weights[i] / memory.inverse[i, i]
@@ -205,10 +212,10 @@ def _leave(memory: GaussianProcessMemory, count: int) -> None:
             least, out = loss, i
     pivot = memory.inverse[out, out]
     for i in range(count):
-        memory.near[i] = memory.inverse[i, out]
+        memory.k[i] = memory.inverse[i, out]
     for i in range(count):
         for j in range(count):
-            memory.inverse[i, j] -= memory.near[i] * memory.near[j] / pivot
+            memory.inverse[i, j] -= memory.k[i] * memory.k[j] / pivot
     memory.mean[out] = memory.mean[last]
     for j in range(memory.points.shape[1]):
         memory.points[out, j] = memory.points[last, j]
@@ -222,37 +229,38 @@ def _leave(memory: GaussianProcessMemory, count: int) -> None:
         memory.covariance[i, out] = memory.covariance[i, last]
 
 
+@dataclass(frozen=True)
 class GaussianProcessModel:
-    """The model behind ``GaussianProcess``: see there.
+    """The model of ``GaussianProcess``.
 
     Parameters
     ----------
     budget, length, every
         as for ``GaussianProcess``.
     memory_time
-        after which what was seen counts 1/e [s].
+        time after which a sample has the weight 1/e [s].
     noise, noise_time
-        of the targets, in units of their scale, and how long it is correlated [s].
+        standard deviation of noise in the targets, in units of their scale, and its correlation
+        time [s].
     """
 
-    def __init__(
-        self,
-        budget: int,
-        length: float,
-        every: int,
-        memory_time: float,
-        noise: float,
-        noise_time: float,
-    ) -> None:
-        self.budget = checks.whole("budget", budget, 1)
-        self.length = checks.positive("length", length)
-        self.every = checks.whole("every", every, 1)
-        self.memory_time = checks.time_constant("memory_time", memory_time)
-        self.noise = checks.positive("noise", noise)
-        self.noise_time = checks.positive("noise_time", noise_time, "s")
+    budget: int
+    length: float
+    every: int
+    memory_time: float
+    noise: float
+    noise_time: float
+
+    def __post_init__(self) -> None:
+        checks.whole("budget", self.budget, 1)
+        checks.positive("length", self.length)
+        checks.whole("every", self.every, 1)
+        checks.time_constant("memory_time", self.memory_time)
+        checks.positive("noise", self.noise)
+        checks.positive("noise_time", self.noise_time, "s")
 
     def design(self, features: int, dt: float) -> GaussianProcessDesign:
-        """Return the parameters for so many features and a sample time [s]."""
+        """Return the parameters for the number of features and a sample time [s]."""
         step = self.every * dt
         return GaussianProcessDesign(
             inputs=features,
@@ -264,7 +272,7 @@ class GaussianProcessModel:
         )
 
     def memory(self, parameters: GaussianProcessDesign) -> GaussianProcessMemory:
-        """Return an empty dictionary."""
+        """Return a process without points."""
         size = parameters.budget + 1
         return GaussianProcessMemory(
             points=np.zeros((size, parameters.inputs)),
@@ -273,44 +281,44 @@ class GaussianProcessModel:
             covariance=np.zeros((size, size)),
             mean=np.zeros(size),
             weights=np.zeros(size),
-            near=np.zeros(size),
-            share=np.zeros(size),
-            spread=np.zeros(size),
-            place=np.zeros(2),
+            k=np.zeros(size),
+            q=np.zeros(size),
+            h=np.zeros(size),
+            counters=np.zeros(2),
         )
 
 
 class GaussianProcess(Online):
-    """A Gaussian process on a bounded budget of points, which it chooses itself: no model of f at all, but that it is smooth.
+    """A Gaussian process on a bounded number of points: a model that assumes only that f is smooth.
 
-    Where nothing was seen it says nothing.
+    It chooses the points itself. Far from all of them it predicts zero.
 
     Parameters
     ----------
     budget
-        number M of points it keeps. A sample costs O(M²).
+        largest number M of points. A sample costs O(M²).
     features
-        what it is shown; the state by default.
+        blocks of features; the state by default.
     length
-        over which f varies, in scaled features: those lie in [−1, 1].
+        distance over which f varies, in scaled features, which lie in [−1, 1].
     memory_time
-        after which what was seen counts 1/e [s]; ``1000/omega_c`` by default.
+        time after which a sample has the weight 1/e [s]; ``1000/omega_c`` by default.
     every
-        learn from every so-many-th sample only; it predicts at each.
+        learn from every ``every``-th sample only; predict in each.
     noise
-        standard deviation of what it can't explain, in units of the largest f.
-    frequency, scale, bias_bandwidth
-        as for ``Online``.
+        standard deviation of what the process cannot explain, in units of the largest f.
+
+    The other parameters are described in the base class ``FeatureLearner``.
 
     Raises
     ------
     ValueError
-        for arguments out of range.
+        for an argument out of range.
 
-    References
-    ----------
-    Van Vaerenbergh, Lázaro-Gredilla & Santamaría, *Kernel recursive least-squares tracker for time-varying regression*, IEEE Trans. Neural
-    Networks and Learning Systems 23 (2012); Csató & Opper, *Sparse on-line Gaussian processes*, Neural Computation 14 (2002).
+    References ---------- Van Vaerenbergh, Lázaro-Gredilla & Santamaría, *Kernel recursive
+    least-squares tracker for time-varying regression*, IEEE Trans. Neural Networks and Learning
+    Systems 23 (2012); Csató & Opper, *Sparse on-line Gaussian processes*, Neural Computation 14
+    (2002).
     """
 
     def __init__(
@@ -329,9 +337,8 @@ class GaussianProcess(Online):
         self.memory_time = (
             None if memory_time is None else checks.time_constant("memory_time", memory_time)
         )
-        model = GaussianProcessModel(budget, length, every, 1.0, noise, 1.0)
         super().__init__(
-            model,
+            GaussianProcessModel(budget, length, every, 1.0, noise, 1.0),
             State() if features is None else features,
             frequency=frequency,
             scale=scale,
@@ -339,13 +346,7 @@ class GaussianProcess(Online):
         )
 
     def fitted_model(self, observer: ESO, omega_c: float) -> GaussianProcessModel:
-        """Return the process with memory and correlation of noise as observer and controller want them."""
+        """Return the process with the memory time and the noise's correlation time."""
         model: GaussianProcessModel = self.model
-        return GaussianProcessModel(
-            model.budget,
-            model.length,
-            model.every,
-            self.memory_time or 1000.0 / omega_c,
-            model.noise,
-            observer.lag_time,
-        )
+        memory_time = self.memory_time or _MEMORY / omega_c
+        return replace(model, memory_time=memory_time, noise_time=observer.lag_time)

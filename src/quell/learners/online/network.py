@@ -2,14 +2,16 @@
 
     h_θ(φ) = v_0 + Σ_j v_j tanh(c_j + W_j · φ)
 
-Each pair is a step of the extended Kalman filter on all weights: recursive least squares (``rls.py``) with the network's gradient ``∂h/∂θ``
-in the place of the features. It costs O(p²) for p weights. A gradient step alone would cost O(p), but the weights of a network act so much
-alike that it needs hours for what the filter, which knows by its covariance what has been settled, learns in seconds.
+Each pair is a step of the extended Kalman filter on all weights: recursive least squares
+(``least_squares.py``) with the network's gradient ``∂h/∂θ`` in place of the features. It costs
+O(p²) for p weights. A gradient step would cost O(p), but the effects of the weights are so similar
+that it needs hours for what the filter learns in seconds, since its covariance separates them.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,18 +19,21 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
+from quell.learners.least_squares import RlsRule, least_squares_gain
 from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
-from quell.learners.regression.rls import RlsRule, least_squares_gain
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
-# No weight of a network with inputs and outputs of O(1) needs to be larger.
+# No weight of a network with inputs and outputs of O(1) has to be larger; not tuned further.
 _LARGEST = 30.0
-# Standard deviation of weights before anything is known: steep enough for units that switch, as friction does, within a third of the range.
+# Standard deviation of the initial weights: a unit switches, as friction does, within a third of
+# the features' range.
 _PRIOR = 3.0
-# Targets are O(1); an error beyond this is an outlier.
+# Targets are O(1); a larger error is an outlier.
 _LARGEST_ERROR = 1.0
+# Default of memory_time in units of 1/omega_c; chosen by hand, not tuned further.
+_MEMORY = 100.0
 
 
 class NetworkDesign(NamedTuple):
@@ -38,7 +43,7 @@ class NetworkDesign(NamedTuple):
     inputs: int
     hidden: int
     every: int
-    """Learn from every so-many-th pair."""
+    """Learn from every ``every``-th pair."""
     seed: int
 
 
@@ -46,15 +51,15 @@ class NetworkMemory(NamedTuple):
     """State of a network."""
 
     theta: Vector
-    """(p,): for each hidden unit v_j, c_j, W_j; last v_0."""
+    """(p,): v_j, c_j, W_j for each hidden unit, then v_0."""
     covariance: Matrix
     """(p, p)."""
-    slope: Vector
-    """Room for ∂h/∂θ (p,)."""
+    gradient: Vector
+    """Work space for ∂h/∂θ (p,)."""
     gain: Vector
-    """Room (p,)."""
+    """Work space (p,)."""
     skipped: Vector
-    """(1,): pairs passed over since the last that was learned from."""
+    """(1,): pairs since the last one that was learned from."""
 
 
 @infer.register(NetworkDesign)
@@ -72,12 +77,12 @@ def _infer(model: NetworkDesign, memory: NetworkMemory, features: Vector) -> flo
 
 
 @kernel
-def _with_slope(model: NetworkDesign, memory: NetworkMemory, features: Vector) -> float:
-    """Return h, and write its gradient."""
-    theta, slope = memory.theta, memory.slope
+def _infer_with_gradient(model: NetworkDesign, memory: NetworkMemory, features: Vector) -> float:
+    """Return h and write its gradient."""
+    theta, gradient = memory.theta, memory.gradient
     width = features.size + 2
     output = theta[theta.size - 1]
-    slope[theta.size - 1] = 1.0
+    gradient[theta.size - 1] = 1.0
     for j in range(model.hidden):
         at = j * width
         inner = theta[at + 1]
@@ -85,11 +90,11 @@ def _with_slope(model: NetworkDesign, memory: NetworkMemory, features: Vector) -
             inner += theta[at + 2 + i] * features[i]
         unit = math.tanh(inner)
         output += theta[at] * unit
-        slope[at] = unit
+        gradient[at] = unit
         steep = theta[at] * (1.0 - unit * unit)
-        slope[at + 1] = steep
+        gradient[at + 1] = steep
         for i in range(features.size):
-            slope[at + 2 + i] = steep * features[i]
+            gradient[at + 2 + i] = steep * features[i]
     return output
 
 
@@ -100,48 +105,49 @@ def _learn(model: NetworkDesign, memory: NetworkMemory, features: Vector, target
         return
     memory.skipped[0] = 0.0
     theta, gain = memory.theta, memory.gain
-    error = target - _with_slope(model, memory, features)
+    error = target - _infer_with_gradient(model, memory, features)
     if not is_finite(error):
         return
     error = min(max(error, -_LARGEST_ERROR), _LARGEST_ERROR)
     step = error * least_squares_gain(
-        model.rule, memory.covariance, gain, memory.slope, model.rule.noise
+        model.rule, memory.covariance, gain, memory.gradient, model.rule.noise
     )
     for i in range(theta.size):
         theta[i] = min(max(theta[i] + step * gain[i], -_LARGEST), _LARGEST)
 
 
+@dataclass(frozen=True)
 class Network:
-    """The model behind ``MLP``: see there.
+    """The model of ``MLP``.
 
     Parameters
     ----------
     hidden, seed, every
         as for ``MLP``.
     memory_time
-        after which what was seen counts 1/e [s].
+        time after which a sample has the weight 1/e [s].
     noise, noise_time
-        of the targets, in units of their scale, and how long it is correlated [s].
+        standard deviation of noise in the targets, in units of their scale, and its correlation
+        time [s].
     """
 
-    def __init__(
-        self,
-        hidden: int,
-        seed: int,
-        every: int,
-        memory_time: float,
-        noise: float,
-        noise_time: float,
-    ) -> None:
-        self.hidden = checks.whole("hidden", hidden, 1)
-        self.seed = checks.whole("seed", seed, 0)
-        self.every = checks.whole("every", every, 1)
-        self.memory_time = checks.time_constant("memory_time", memory_time)
-        self.noise = checks.positive("noise", noise)
-        self.noise_time = checks.positive("noise_time", noise_time, "s")
+    hidden: int
+    seed: int
+    every: int
+    memory_time: float
+    noise: float
+    noise_time: float
+
+    def __post_init__(self) -> None:
+        checks.whole("hidden", self.hidden, 1)
+        checks.whole("seed", self.seed, 0)
+        checks.whole("every", self.every, 1)
+        checks.time_constant("memory_time", self.memory_time)
+        checks.positive("noise", self.noise)
+        checks.positive("noise_time", self.noise_time, "s")
 
     def design(self, features: int, dt: float) -> NetworkDesign:
-        """Return the parameters for so many features and a sample time [s]."""
+        """Return the parameters for the number of features and a sample time [s]."""
         step = self.every * dt
         rule = RlsRule(
             self.noise**2 * max(self.noise_time / step, 1.0),
@@ -151,15 +157,14 @@ class Network:
         return NetworkDesign(rule, features, self.hidden, self.every, self.seed)
 
     def memory(self, parameters: NetworkDesign) -> NetworkMemory:
-        """Return a network that says nothing: its output weights are zero, the others random."""
-        width = parameters.inputs + 2
+        """Return a network that predicts zero: its output weights are zero, the others random."""
+        inputs, hidden = parameters.inputs, parameters.hidden
         rng = np.random.default_rng(parameters.seed)
-        weights = _PRIOR * rng.normal(size=(parameters.hidden, width))
+        weights = _PRIOR * rng.normal(size=(hidden, inputs + 2))
         weights[:, 0] = 0.0
         # Each unit switches somewhere in the range of the features.
-        weights[:, 1] = -np.sum(
-            weights[:, 2:] * rng.uniform(-1.0, 1.0, (parameters.hidden, parameters.inputs)), axis=1
-        )
+        centres = rng.uniform(-1.0, 1.0, (hidden, inputs))
+        weights[:, 1] = -np.sum(weights[:, 2:] * centres, axis=1)
         theta = np.append(weights.ravel(), 0.0)
         p = theta.size
         return NetworkMemory(
@@ -168,36 +173,39 @@ class Network:
 
 
 class MLP(Online):
-    """A neural network with one hidden layer of tanh units, trained from zero in the loop by an extended Kalman filter.
+    """A neural network with one hidden layer of tanh units, trained in the loop from zero output.
 
-    Weights are bounded, and errors clipped, so that no single sample can spoil much.
+    The training algorithm is an extended Kalman filter. Weights are bounded and errors are clipped,
+    so that a single sample has a limited effect.
 
     Parameters
     ----------
     hidden
         number of hidden units h. A sample costs O(h²).
     features
-        what it is shown; the state by default.
+        blocks of features; the state by default.
     memory_time
-        after which what was seen counts 1/e, where something new is seen [s]; ``100/omega_c`` by default.
+        time after which a sample has the weight 1/e, where new samples come [s]; ``100/omega_c`` by
+        default.
     every
-        learn from every so-many-th sample only; it predicts at each.
+        learn from every ``every``-th sample only; predict in each.
     noise
-        standard deviation of what it can't explain, in units of the largest f.
+        standard deviation of what the network cannot explain, in units of the largest f.
     seed
-        of the first weights.
-    frequency, scale, bias_bandwidth
-        as for ``Online``.
+        of the initial weights.
+
+    The other parameters are described in the base class ``FeatureLearner``.
 
     Raises
     ------
     ValueError
-        for arguments out of range.
+        for an argument out of range.
 
     References
     ----------
-    Singhal & Wu, *Training multilayer perceptrons with the extended Kalman algorithm*, NIPS 1988; Puskorius & Feldkamp, *Neurocontrol of
-    nonlinear dynamical systems with Kalman filter trained recurrent networks*, IEEE Trans. Neural Networks 5 (1994).
+    Singhal & Wu, *Training multilayer perceptrons with the extended Kalman algorithm*, NIPS 1988;
+    Puskorius & Feldkamp, *Neurocontrol of nonlinear dynamical systems with Kalman filter trained
+    recurrent networks*, IEEE Trans. Neural Networks 5 (1994).
     """
 
     def __init__(
@@ -216,9 +224,8 @@ class MLP(Online):
         self.memory_time = (
             None if memory_time is None else checks.time_constant("memory_time", memory_time)
         )
-        model = Network(hidden, seed, every, 1.0, noise, 1.0)
         super().__init__(
-            model,
+            Network(hidden, seed, every, memory_time=1.0, noise=noise, noise_time=1.0),
             State() if features is None else features,
             frequency=frequency,
             scale=scale,
@@ -226,13 +233,7 @@ class MLP(Online):
         )
 
     def fitted_model(self, observer: ESO, omega_c: float) -> Network:
-        """Return the network with memory and correlation of noise as observer and controller want them."""
+        """Return the network with the memory time and the noise's correlation time."""
         model: Network = self.model
-        return Network(
-            model.hidden,
-            model.seed,
-            model.every,
-            self.memory_time or 100.0 / omega_c,
-            model.noise,
-            observer.lag_time,
-        )
+        memory_time = self.memory_time or _MEMORY / omega_c
+        return replace(model, memory_time=memory_time, noise_time=observer.lag_time)

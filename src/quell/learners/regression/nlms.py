@@ -2,8 +2,9 @@
 
     θ ← θ + rate dt · φ ε / (ρ + φ·φ)
 
-where ε is the error and φ the filtered features. Along φ the error decays as ``exp(−rate t)``, whatever the features' size and dt; slower
-where noise hides it (``noise_gate.confidence``).
+with the error ε and the filtered features φ. Along φ the error decays as ``exp(−rate t)``, for
+features of any size and for any dt; it decays more slowly where noise hides it
+(``noise_gate.confidence``).
 """
 
 from __future__ import annotations
@@ -30,61 +31,59 @@ class NlmsRule(NamedTuple):
 
 
 class NlmsMemory(NamedTuple):
-    """State: none but θ."""
+    """State: only θ, which the learner holds."""
 
-    nothing: Vector
+    empty: Vector
     """(0,)."""
 
 
 @update_theta.register(NlmsRule)
-def _improve(
-    rule: NlmsRule, memory: NlmsMemory, theta: Vector, features: Vector, error: float, sure: float
+def _update_theta(
+    rule: NlmsRule,
+    memory: NlmsMemory,
+    theta: Vector,
+    features: Vector,
+    error: float,
+    confidence: float,
 ) -> None:
     power = rule.floor
     for i in range(theta.size):
         power += features[i] * features[i]
-    step = rule.gain * sure * error / power
+    step = rule.gain * confidence * error / power
     for i in range(theta.size):
         theta[i] += step * features[i]
 
 
 @reset_uncertainty.register(NlmsRule)
-def _renew(rule: NlmsRule, memory: NlmsMemory) -> None:
+def _reset_uncertainty(rule: NlmsRule, memory: NlmsMemory) -> None:
     pass
 
 
 class NLMS(Linear):
     """Normalised least mean squares on any features.
 
-    It learns in proportion to the error and remembers nothing else, so it follows what drifts and is hard to mislead; where features are
-    alike it takes long to tell them apart, for which ``RLS`` is better.
+    θ moves in proportion to the error and nothing else is remembered, so the learner follows
+    drifting plants and is hard to mislead. Similar features take long to separate; ``RLS`` is
+    better there.
 
     Parameters
     ----------
     rate
-        how fast an error decays where it is seen [1/s]; ``omega_c`` of the controller by default.
-    features
-        what f is taken to be linear in; the state and a constant by default.
+        rate at which an observed error decays [1/s]; ``omega_c`` of the controller by default.
     regularisation
-        ρ: features smaller than its root teach less. Features are O(1).
-    frequency
-        a frequency the plant has [rad/s], for the automatic scaling; ``omega_c`` of the controller by default.
-    scale
-        what x_1 … x_n, u and f are divided by, (n + 2,), where it shall not be found automatically.
-    gain_interval
-        where the effective gain ``(b0 + θ_u)/b0`` is kept when ``Input()`` is a feature.
-    bias_bandwidth
-        how fast a bias follows what the features leave, λ [rad/s]; ``omega_o`` of the observer by default, 0 for none.
+        ρ: features smaller than its square root are learned from less. Features are O(1).
+
+    The other parameters are described in the base classes ``Linear`` and ``FeatureLearner``.
 
     Raises
     ------
     ValueError
-        for arguments out of range.
+        for an argument out of range.
 
     References
     ----------
-    Nagumo & Noda, *A learning method for system identification*, IEEE Trans. Automatic Control 12 (1967); Haykin, *Adaptive Filter Theory*,
-    chapter on normalised least mean squares.
+    Nagumo & Noda, *A learning method for system identification*, IEEE Trans. Automatic Control 12
+    (1967); Haykin, *Adaptive Filter Theory*, chapter on normalised least mean squares.
     """
 
     def __init__(
@@ -107,5 +106,5 @@ class NLMS(Linear):
         return NlmsRule(min((self.rate or omega_c) * observer.dt, 1.0), self.regularisation)
 
     def rule_memory(self, rule: NlmsRule, features: int) -> NlmsMemory:
-        """Return nothing."""
+        """Return an empty state."""
         return NlmsMemory(np.zeros(0))

@@ -1,0 +1,115 @@
+"""The common part of learners on features: choice of features, scaling, noise gate, bias, start."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from quell import checks
+from quell.features import Bias, Features, State
+from quell.features.base import checked_design, write
+from quell.features.scaling import Scaling, initial_scale, scaling
+from quell.kernels.dispatch import kernel
+from quell.learners.lag import startup_samples
+from quell.learners.noise_gate import NoiseGate, NoiseGateMemory, gated, noise_gate
+from quell.observers.eso import ESO
+from quell.types import Vector
+
+
+class Inputs(NamedTuple):
+    """Parameters that all learners on features share, for a plant of order n."""
+
+    features: Any
+    scaling: Scaling
+    gate: NoiseGate
+    bias_gain: float
+    """λ dt, at most 1."""
+    startup: int
+    """Samples after a start from rest in which nothing is learned."""
+
+    @property
+    def order(self) -> int:
+        """N."""
+        return int(self.scaling.floors.size) - 2
+
+
+@kernel
+def write_features(
+    inputs: Inputs,
+    gate: NoiseGateMemory,
+    scale: Vector,
+    scaled: Vector,
+    seen: Vector,
+    u: float,
+    out: Vector,
+) -> None:
+    """Write the features of the estimates ``seen`` (n + 1,) and ``u`` into ``out`` (p,).
+
+    A signal that does not move is replaced by its mean. ``scale`` (n + 2,) divides x_1 … x_n, u and
+    f; ``scaled`` (n,) is work space.
+    """
+    for i in range(scaled.size):
+        scaled[i] = gated(inputs.gate, gate, i, seen[i]) / scale[i]
+    scaled_u = gated(inputs.gate, gate, scaled.size, u) / scale[scaled.size]
+    write(inputs.features, scaled, scaled_u, out)
+
+
+class FeatureLearner:
+    """Base class of the learners that are given scaled features of the state and of u.
+
+    Parameters
+    ----------
+    features
+        blocks of features, for example ``State() + Bias()``, which is the default.
+    frequency
+        a frequency of the plant [rad/s], for the automatic scaling; ``omega_c`` of the controller
+        by default.
+    scale
+        what x_1 … x_n, u and f are divided by, (n + 2,); found automatically by default.
+    bias_bandwidth
+        bandwidth λ of a bias that follows what is not learned otherwise [rad/s]; ``omega_o`` of the
+        observer by default, 0 for no bias.
+
+    Raises
+    ------
+    ValueError
+        for an argument that is out of range or no block of features.
+    """
+
+    def __init__(
+        self,
+        features: Features | None,
+        frequency: float | None,
+        scale: Any,
+        bias_bandwidth: float | None,
+    ) -> None:
+        self.features = State() + Bias() if features is None else features
+        if not isinstance(self.features, Features):
+            raise ValueError(
+                f"features = {features!r}: must be made of blocks from quell.features, "
+                "for example State() + Bias()"
+            )
+        self.frequency = (
+            None if frequency is None else checks.positive("frequency", frequency, "rad/s")
+        )
+        self.scale = None if scale is None else checks.positive_vector("scale", scale)
+        self.bias_bandwidth = (
+            None
+            if bias_bandwidth is None
+            else checks.non_negative("bias_bandwidth", bias_bandwidth, "rad/s")
+        )
+
+    def _inputs(self, observer: ESO, omega_c: float) -> Inputs:
+        order, frequency = observer.order, self.frequency or omega_c
+        if self.scale is not None:
+            checks.vector("scale", self.scale, order + 2)
+        bandwidth = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
+        return Inputs(
+            features=checked_design(self.features, order),
+            scaling=scaling(observer, frequency, self.scale is not None),
+            gate=noise_gate(observer, frequency),
+            bias_gain=min(bandwidth * observer.dt, 1.0),
+            startup=startup_samples(observer),
+        )
+
+    def _initial_scale(self, inputs: Inputs) -> Vector:
+        return initial_scale(inputs.scaling) if self.scale is None else self.scale.copy()

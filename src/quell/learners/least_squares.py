@@ -1,0 +1,61 @@
+"""Recursive least squares with directional forgetting, O(p²) a sample.
+
+With ``ζ = φ·Pφ/R`` and ``λ = exp(−dt/T)`` for the memory time T,
+
+    θ ← θ + Pφ ε / (R (1 + ζ)),      P ← P − c Pφ (Pφ)ᵀ,      c = (λ − (1−λ)/ζ) / (R λ (1 + ζ))
+
+Only what is known along φ is forgotten: after a sample the uncertainty along φ is ``ζ/(λ(1 + ζ))``,
+and orthogonal to φ it is unchanged. With exponential forgetting of everything, P grows without
+bound along directions that are not excited, and a closed loop in normal operation excites few. A
+small φ still increases P slowly, so P stops growing when its trace reaches that of the prior.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from quell.kernels.dispatch import kernel
+from quell.types import Matrix, Vector
+
+
+class RlsRule(NamedTuple):
+    """Parameters."""
+
+    noise: float
+    """R."""
+    forget: float
+    """1 − λ."""
+    prior: float
+    """Variance of θ before anything is known."""
+
+
+@kernel
+def least_squares_gain(
+    rule: RlsRule, covariance: Matrix, gain: Vector, features: Vector, noise: float
+) -> float:
+    """Update P for a sample with the variance R = ``noise``.
+
+    Write Pφ into ``gain`` and return its factor ``1/(R (1 + ζ))`` in the update of θ.
+    """
+    size = gain.size
+    spread = trace = length = 0.0
+    for i in range(size):
+        total = 0.0
+        for j in range(size):
+            total += covariance[i, j] * features[j]
+        gain[i] = total
+        spread += total * features[i]
+        length += total * total
+        trace += covariance[i, i]
+    if not 0.0 < spread < 1e100:  # φ is zero, or P is not a covariance any more: learn nothing
+        return 0.0
+    inverse = 1.0 / (noise + spread)
+    share = (1.0 - rule.forget - rule.forget * noise / spread) * inverse / (1.0 - rule.forget)
+    if share < 0.0 and trace - share * length > rule.prior * size:
+        share = 0.0
+    for i in range(size):
+        part = share * gain[i]
+        for j in range(i + 1):
+            value = covariance[i, j] - part * gain[j]
+            covariance[i, j] = covariance[j, i] = value
+    return inverse
