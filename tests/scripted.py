@@ -11,7 +11,8 @@ import quell as ql
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.realtime.devices.base import read_measurement, write_command
-from quell.realtime.loop.control_loop import ControlLoop, scenario_of, setpoints
+from quell.realtime.loop.control_loop import ControlLoop
+from quell.realtime.loop.reference import as_scenario, reference_samples
 from quell.realtime.loop.safety import Safety
 from quell.realtime.system.clock import pass_time, virtual_clock
 from quell.realtime.telemetry.channels import row_channels
@@ -152,8 +153,8 @@ def run(
     """Run a loop around a scripted device to its end; settle in ten samples, where nothing else is said."""
     controller = adrc() if controller is None else controller
     width = sum(width for _, width in row_channels(controller.channels))
-    points = setpoints(
-        scenario_of(reference, duration), DT, getattr(controller, "derivatives", 0), approach
+    points = reference_samples(
+        as_scenario(reference, duration), DT, getattr(controller, "derivatives", 0), approach
     )
     rules = Safety(**{"settle": 10} | safety).rules(controller)
     loop = ControlLoop.of(
@@ -167,4 +168,4 @@ def run(
     )
     loop.requests[0] = asked
     loop.run()
-    return Outcome(loop, drain(loop.books.ring), device)
+    return Outcome(loop, drain(loop.log.ring), device)

@@ -14,12 +14,12 @@ import quell as ql
 from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compilations
 from quell.realtime.devices.base import PythonHandle, read_measurement, write_command
-from quell.realtime.loop.control_loop import ControlLoop, scenario_of, setpoints, sliding
+from quell.realtime.loop.control_loop import ControlLoop
 from quell.realtime.loop.cycle import run_cycles
 from quell.realtime.loop.modes import Cause
+from quell.realtime.loop.reference import approach_curve, as_scenario, reference_samples
 from quell.realtime.loop.result import mode_changes
 from quell.realtime.loop.safety import Safety
-from quell.realtime.loop.supervisor import OVERRUNS
 from quell.realtime.system.clock import now, pass_time, virtual_clock
 from quell.realtime.system.histogram import BINS, Histogram, count_duration, empty_counts
 from quell.realtime.telemetry.channels import LOOP_WIDTH, Event, row_channels
@@ -117,7 +117,7 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
     loop = ControlLoop.of(
         device,
         FLAT,
-        setpoints(scenario_of(0.0, duration), DT, 0, 0.0),
+        reference_samples(as_scenario(0.0, duration), DT, 0, 0.0),
         rules,
         clock,
         rows,
@@ -136,7 +136,7 @@ def test_the_grid_follows_a_devices_clock(drift: float) -> None:
     y = found[:, LOOP_WIDTH - 2]
     np.testing.assert_array_equal(np.diff(y), 1.0)
     assert len(y) > 10_000
-    assert loop.supervisor.counts[OVERRUNS] == 0
+    assert loop.supervisor.counters[0].overruns == 0
 
 
 # Of two cycles one wakes just before the tick, the next one just after.
@@ -181,7 +181,7 @@ def test_deadlines_that_are_left_out_are_no_blow() -> None:
     k = found["K"]
     assert 3 in np.diff(k) - 1
     assert np.max(np.abs(np.diff(found["U"][:60]))) > 1e-3
-    f_residual = found.rows[:, found.loop.books.f_residual]
+    f_residual = found.rows[:, found.loop.log.f_residual]
     np.testing.assert_allclose(f_residual, 0.0, atol=1e-9)
 
 
@@ -205,14 +205,14 @@ def test_the_reference_slides_from_where_y_is() -> None:
     np.testing.assert_allclose(
         r[:100], np.sin(tau) + 0.5 * (1.0 - (10 * tau**3 - 15 * tau**4 + 6 * tau**5)), atol=1e-12
     )
-    slide = sliding(1e-4, 1.0, 3)
+    slide = approach_curve(1e-4, 1.0, 3)
     for i in range(3):
         np.testing.assert_allclose(
             np.gradient(slide[:, i], 1e-4)[2:-2], slide[2:-2, i + 1], atol=2e-5
         )
     assert slide[0].tolist() == [1.0, 0.0, 0.0, -60.0]
     assert abs(slide[-1, 0]) < 1e-10
-    assert sliding(DT, 0.0, 2).shape == (0, 3)
+    assert approach_curve(DT, 0.0, 2).shape == (0, 3)
 
 
 def test_it_takes_over_without_a_bump() -> None:
@@ -283,7 +283,7 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
     device = ScriptedDevice(PLANT)
     rules, points = (
         Safety(settle=10).rules(controller),
-        setpoints(scenario_of(1.0, 1.0), DT, 0, 0.0),
+        reference_samples(as_scenario(1.0, 1.0), DT, 0, 0.0),
     )
     width = sum(width for _, width in row_channels(controller.channels))
     loop = ControlLoop.of(device, controller, points, rules, virtual_clock(), ring(4096, width))
@@ -303,7 +303,7 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
     [
         (1.0, None, "duration = None: give the duration"),
         ("up", 1.0, "scenario = 'up': must be a number"),
-        (ql.Scenario(1.0, 5.0, rest_at=(1.0,)), None, "a plant of metal can't be put back to rest"),
+        (ql.Scenario(1.0, 5.0, rest_at=(1.0,)), None, "a real plant can't be put back to rest"),
         (ql.Scenario(1.0, 1e6), None, "must be at most 1e\\+07 samples"),
     ],
 )
@@ -312,7 +312,7 @@ def test_a_course_that_can_not_be_run_is_refused(
 ) -> None:
     """Before anything moves."""
     with pytest.raises(ValueError, match=message):
-        setpoints(scenario_of(scenario, duration), DT, 0, 1.0)
+        reference_samples(as_scenario(scenario, duration), DT, 0, 1.0)
 
 
 def test_a_reference_that_is_no_number_is_refused() -> None:
@@ -322,8 +322,8 @@ def test_a_reference_that_is_no_number_is_refused() -> None:
         def evaluate(self, t: Any) -> Any:
             return np.where(t > 0.5, np.nan, t)
 
-    with pytest.raises(ValueError, match="is no number at 0.51 s"):
-        setpoints(scenario_of(Gap(), 1.0), DT, 0, 1.0)
+    with pytest.raises(ValueError, match="is not finite at 0.51 s"):
+        reference_samples(as_scenario(Gap(), 1.0), DT, 0, 1.0)
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=300))

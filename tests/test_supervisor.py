@@ -15,7 +15,7 @@ from quell.controllers.base import control, set_applied_control, write_row
 from quell.realtime import Safety
 from quell.realtime.loop.modes import Cause, Mode, Request
 from quell.realtime.loop.result import mode_changes
-from quell.realtime.loop.supervisor import BEGAN, FLUSH
+from quell.realtime.loop.supervisor import FLUSH
 from quell.realtime.telemetry.channels import Event
 
 from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
@@ -310,7 +310,7 @@ def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(
     # Where u was held, it was held.
     held = np.flatnonzero(mode == Mode.HOLD)
     np.testing.assert_array_equal(u[held], u[held - 1])
-    began = outcome.loop.supervisor.counts[BEGAN]
+    began = outcome.loop.supervisor.memory[0].began
     assert (began >= SETTLE) == bool(np.any(mode == Mode.RUN))
 
 
@@ -319,7 +319,7 @@ def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(
     [
         (
             {"u_min": 1.0, "u_max": 2.0},
-            "u_min = 1.0, u_max = 2.0: zero, which is what u goes to where something fails, must lie within",
+            "u_min = 1.0, u_max = 2.0: must have zero, the safe u, between them",
         ),
         ({"u_min": 2.0, "u_max": 1.0}, "u_min must be less than u_max"),
         ({"most_error": 0.0}, "most_error = 0.0: must be finite and greater than zero"),

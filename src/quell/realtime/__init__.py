@@ -1,11 +1,12 @@
-"""Real time: a controller closed around a device at a fixed rate, with a stated safe action for whatever goes wrong.
+"""Real time: a controller closed around a device at a fixed rate, with safe actions for faults.
 
 The public names, imported when first used::
 
     from quell.realtime import Safety, open_device, run_rig
 
     device = open_device("udp://127.0.0.1:5005", dt=1e-3)
-    run    = run_rig(device, controller, scenario, safety=Safety(most_error=1.0), telemetry=["run.mcap"])
+    safety = Safety(most_error=1.0)
+    run    = run_rig(device, controller, scenario, safety=safety, telemetry=["run.mcap"])
     print(run.text())
 """
 

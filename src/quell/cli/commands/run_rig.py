@@ -176,7 +176,7 @@ def _close_loop(
             return run_rig(
                 device,
                 setup.controller,
-                setup.scenario,
+                setup.needed("scenario"),
                 telemetry=sinks,
                 on_change=print_change,
                 **options,

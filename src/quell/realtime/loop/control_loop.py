@@ -1,107 +1,32 @@
-"""A loop ready to run: all that ``run_cycles`` needs, made and compiled beforehand."""
+"""A control loop: device, controller, supervisor and reference, compiled before the first cycle."""
 
 from __future__ import annotations
 
 import copy
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quell import checks
+from quell.controllers.base import Controller
 from quell.kernels.dispatch import dispatcher_for, interpreted
 from quell.kernels.user_types import explain_compile_errors
-from quell.realtime.devices.base import PythonHandle, handle_of
-from quell.realtime.loop.compiled_controller import bound, warm
-from quell.realtime.loop.cycle import Books, Pace, Setpoints, pace, run_cycles
+from quell.realtime.devices.base import Device, PythonHandle, handle_of
+from quell.realtime.loop.compiled_controller import compile_controller
+from quell.realtime.loop.cycle import CycleLog, CycleTimes, cycle_times, run_cycles
 from quell.realtime.loop.modes import Mode
-from quell.realtime.loop.supervisor import (
-    FLUSH,
-    MODE,
-    SAMPLES,
-    Rules,
-    SupervisorState,
-    initial_state,
-)
+from quell.realtime.loop.reference import ReferenceSamples
+from quell.realtime.loop.supervisor import FLUSH, Rules, SupervisorState, initial_state
 from quell.realtime.system.histogram import Histogram, Timing, empty_counts
-from quell.realtime.telemetry.channels import row_channels
+from quell.realtime.telemetry.channels import LOOP_WIDTH, row_channels
 from quell.realtime.telemetry.ring import Ring
 from quell.records.channels import columns_of
-from quell.records.sample_times import in_steps
-from quell.signals import Signal, as_signal
-from quell.simulation.scenario import Scenario
-from quell.types import Matrix
-
-# With twenty channels a record of them is 1.6 GB.
-_MOST_SAMPLES = 10_000_000
-# s(τ) of the least jerk from 0 to 1, at rest at both ends (Flash & Hogan, J. Neuroscience 5, 1985, eq. (3)).
-_LEAST_JERK = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
-
-
-def scenario_of(value: Any, duration: float | None) -> Scenario:
-    """Return a scenario, or make one of a reference that takes ``duration`` [s].
-
-    Raises
-    ------
-    ValueError
-        for a reference without duration, a scenario with another one, and one that puts the plant back to rest.
-    """
-    if not isinstance(value, Scenario):
-        if duration is None:
-            raise ValueError(
-                "duration = None: give the duration [s] with a reference, or a quell.Scenario, which has one"
-            )
-        return Scenario(as_signal(value, "scenario"), duration)
-    if value.rest_at:
-        raise ValueError(
-            f"rest_at = {value.rest_at!r}: a plant of metal can't be put back to rest; leave it out"
-        )
-    if duration is None:
-        return value
-    return Scenario(value.reference, duration, seed=value.seed)
-
-
-def setpoints(scenario: Scenario, dt: float, derivatives: int, approach: float) -> Setpoints:
-    """Return the reference and its derivatives for every sample, and how the loop gets there within ``approach`` seconds.
-
-    Raises
-    ------
-    ValueError
-        for a run of more than ten million samples, and a reference that is not finite or has no derivatives.
-    """
-    if scenario.duration / dt > _MOST_SAMPLES:
-        raise ValueError(
-            f"duration = {scenario.duration!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES:.0e} samples"
-        )
-    t = np.arange(math.floor(in_steps(scenario.duration, dt)) + 1) * dt
-    reference: Signal = scenario.seeded_signals(len(scenario.disturbances))[0]
-    signals = [reference]
-    for _ in range(derivatives):
-        signals.append(signals[-1].derivative())
-    columns = np.column_stack([signal(t) for signal in signals])
-    if not np.all(np.isfinite(columns)):
-        first = int(np.argmin(np.isfinite(columns).all(axis=1)))
-        raise ValueError(
-            f"reference: it, or a derivative of it, is no number at {t[first]:.6g} s; it must be finite throughout"
-        )
-    slide = sliding(dt, checks.non_negative("approach", approach, "s"), derivatives)
-    return Setpoints(columns[:, 0].copy(), columns[:, 1:].copy(), slide, np.zeros(derivatives))
-
-
-def sliding(dt: float, time: float, derivatives: int) -> Matrix:
-    """Return ``1 − s(t / time)`` and its derivatives at the samples before ``time`` [s], (·, 1 + derivatives)."""
-    tau = np.arange(math.ceil(in_steps(time, dt)) if time else 0) * dt / (time or 1.0)
-    rest = 1.0 - _LEAST_JERK
-    return np.column_stack(
-        [(rest.deriv(i) if i else rest)(tau) / (time or 1.0) ** i for i in range(derivatives + 1)]
-    )
 
 
 @dataclass(frozen=True, eq=False)
 class ControlLoop:
-    """A loop that is compiled and has not begun."""
+    """Arguments of ``run_cycles``, and the way to call it; ``of`` makes and compiles one."""
 
     handle: Any
     clock: Any
@@ -109,67 +34,69 @@ class ControlLoop:
     state: Any
     rules: Rules
     supervisor: SupervisorState
-    setpoints: Setpoints
-    pace: Pace
-    books: Books
+    reference: ReferenceSamples
+    times: CycleTimes
+    log: CycleLog
     interpreted: bool
-    """Whether the loop is Python."""
+    """Whether the loop runs as plain Python."""
 
     @classmethod
     def of(
         cls,
-        device: Any,
-        controller: Any,
-        setpoints: Setpoints,
+        device: Device,
+        controller: Controller,
+        reference: ReferenceSamples,
         rules: Rules,
         clock: Any,
         ring: Ring,
         *,
         interpret: bool = False,
     ) -> ControlLoop:
-        """Put together a device, a controller that begins with nothing learned, and what it has to follow; compile it.
+        """Return the compiled loop of a device and a controller that has learned nothing yet.
 
-        The loop is interpreted where the device needs it, but the controller is compiled all the same; unless ``interpret`` wants both as
-        plain Python, to debug.
+        If the device needs Python, the loop is interpreted and only the controller is compiled;
+        ``interpret`` makes both plain Python, to debug.
         """
         handle = handle_of(device)
+        needs_python = isinstance(handle, PythonHandle)
         design, state = controller.parameters, controller.initial_state()
         channels = row_channels(controller.channels)
         row = np.zeros(sum(width for _, width in channels))
-        if isinstance(handle, PythonHandle) and not interpret:
-            design = bound(design)
-            warm(
-                design,
-                controller.initial_state(),
-                setpoints.now.copy(),
-                row[len(row) - _reported(controller) :].copy(),
-            )
+        if needs_python and not interpret:
+            spare = controller.initial_state(), reference.current.copy(), row[LOOP_WIDTH:].copy()
+            design = compile_controller(design, *spare)
         known = {name for name, width in channels if width}
         f_learned, f_residual = (
             columns_of(channels, name).start if {"f_learned", "f_residual"} <= known else -1
             for name in ("f_learned", "f_residual")
         )
-        books = Books(
-            ring,
-            row,
-            f_learned,
-            f_residual,
-            empty_counts(),
-            empty_counts(),
-            np.zeros(1, dtype=np.int64),
+        loop = cls(
+            handle=handle,
+            clock=clock,
+            design=design,
+            state=state,
+            rules=rules,
+            supervisor=initial_state(),
+            reference=reference,
+            times=cycle_times(controller.dt, getattr(device, "paced", False)),
+            log=CycleLog(ring, row, f_learned, f_residual, empty_counts(), empty_counts()),
+            interpreted=interpret or needs_python,
         )
-        due = pace(controller.dt, getattr(device, "paced", False))
-        as_python = interpret or isinstance(handle, PythonHandle)
-        prepared = cls(
-            handle, clock, design, state, rules, initial_state(), setpoints, due, books, as_python
-        )
-        prepared._compile()
-        return prepared
+        # Compile by a run that is finished before it begins.
+        over = copy.deepcopy(loop.supervisor)
+        over.memory[0].mode, over.memory[0].samples = Mode.STOPPED, FLUSH + 1
+        replace(loop, supervisor=over).run()
+        return loop
 
     @property
     def requests(self) -> NDArray[np.int64]:
-        """What the loop is asked to do (1,), see ``supervisor``."""
-        return self.books.requests
+        """The ``Request`` to the loop (1,), which another thread may write."""
+        return self.supervisor.requests
+
+    @property
+    def timing(self) -> Timing:
+        """Punctuality so far."""
+        return Timing(Histogram.of(self.log.lateness), Histogram.of(self.log.step_time))
 
     def run(self) -> None:
         """Run all cycles."""
@@ -178,35 +105,9 @@ class ControlLoop:
             if self.interpreted
             else dispatcher_for(run_cycles, self.handle, self.clock, self.design)
         )
+        arguments = list(vars(self).values())[:-1]  # all fields but ``interpreted``, in order
         with (
             np.errstate(over="ignore", invalid="ignore"),
             explain_compile_errors(self.handle, self.design),
         ):
-            entry(
-                *(
-                    self.handle,
-                    self.clock,
-                    self.design,
-                    self.state,
-                    self.rules,
-                    self.supervisor,
-                    self.setpoints,
-                    self.pace,
-                    self.books,
-                )
-            )
-
-    def _compile(self) -> None:
-        """Compile by a run that is over before it begins."""
-        over = copy.deepcopy(self.supervisor)
-        over.counts[MODE], over.counts[SAMPLES] = Mode.STOPPED, FLUSH + 1
-        ControlLoop(**{**vars(self), "supervisor": over}).run()
-
-    @property
-    def timing(self) -> Timing:
-        """How punctual it was so far."""
-        return Timing(Histogram.of(self.books.lateness), Histogram.of(self.books.step))
-
-
-def _reported(controller: Any) -> int:
-    return sum(width for _, width in controller.channels)
+            entry(*arguments)

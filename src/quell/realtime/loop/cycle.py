@@ -1,14 +1,17 @@
-"""The loop: one function for the whole run, compiled where the device allows it, on a thread of its own.
+"""The loop: one function for the whole run, compiled if the device allows it.
 
-Cycle k has the deadline ``origin + k dt``. The loop sleeps until then, by the absolute time, takes the measurement, lets supervisor and
-controller have their say, writes u, and pushes a row to whoever records. A cycle that ends after the next deadline has overrun: the
-deadlines that are past are left out (k jumps), they are never caught up with in a burst. The controller is told of them all the same, as of
-samples without a measurement in which u stayed as it was: so its observer goes on with the plant, and a short stall is no blow to it.
+Cycle k has the deadline ``origin + k dt``. The loop sleeps until this time, takes the measurement,
+calls supervisor and controller, writes u, and pushes a row to the telemetry. A cycle that ends
+after the next deadline has overrun: the deadlines that have passed are skipped (k jumps), never
+made up for in a burst. The controller is told of them as of samples without a measurement in which
+u stayed the same. So its observer follows the plant, and a short stall does not disturb it.
 
-A device with a clock of its own (``paced``) sends a measurement at each of its ticks, and the loop wants to wake when one comes. So the
-grid of deadlines follows: where the measurement had to be waited for, it moves later by as much, a five-hundredth of a sample at
-most; where it was there already, it moves earlier by a twenty-thousandth. A clock that is 50 ppm off never slips. Where a measurement was
-there already after a miss, or after the loop itself was late, it may be that of the tick before: then the loop waits a little for another.
+A device with a clock of its own (``paced``) sends a measurement at each of its ticks, and the loop
+should wake when one comes. Therefore the grid of deadlines follows the device: if the loop had to
+wait for the measurement, the grid moves later by that time, by 1/500 of a sample at most; if the
+measurement was there already, the grid moves earlier by 1/20 000 of a sample. After a missed
+sample, or if the loop itself was late, a measurement that was there already may be that of the tick
+before: then the loop waits a short time for another.
 """
 
 from __future__ import annotations
@@ -28,26 +31,10 @@ from quell.controllers.base import (
 from quell.kernels.dispatch import compiled, is_finite, kernel
 from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.loop.modes import Cause, Mode, Request
+from quell.realtime.loop.reference import ReferenceSamples
 from quell.realtime.loop.supervisor import (
-    BEGAN,
-    BLIND,
-    CHANGES,
-    CLIPPED,
-    CYCLES,
-    FAILED,
-    GAP,
-    IN_A_ROW,
-    MODE,
-    OVERRUNS,
-    SKIPPED,
-    SLEPT,
-    TRIPPED,
-    UNSENT,
-    UNSURE,
     Rules,
     SupervisorState,
-    U,
-    Y,
     change_mode,
     finished,
     supervised_output,
@@ -60,20 +47,30 @@ from quell.realtime.telemetry.channels import (
     EVENTS,
     LATENESS,
     LOOP_WIDTH,
+    MODE,
     STEP_TIME,
     Y_MEASURED,
     Event,
     K,
+    R,
+    U,
+    Y,
 )
-from quell.realtime.telemetry.channels import MODE as ROW_MODE
-from quell.realtime.telemetry.channels import R as ROW_R
-from quell.realtime.telemetry.channels import U as ROW_U
-from quell.realtime.telemetry.channels import Y as ROW_Y
 from quell.realtime.telemetry.ring import Ring, push
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
-# A paced device has so long to send its first measurement; in between it is looked whether somebody wants to stop [ns].
+# Time that a paced device has for its first measurement, and time between two looks at the requests
+# meanwhile [ns]; for slow devices at least five ticks and two. Chosen by hand: a rig ticks before
+# it answers the first frame.
 _FIRST, _LOOK = 2_000_000_000, 20_000_000
+_FIRST_TICKS, _LOOK_TICKS = 5.0, 2.0
+# Shares of a sample. Half of it is for the measurement, half for the controller. The wait for a
+# newer measurement and the largest shift towards later (which undoes forty shifts towards earlier)
+# are chosen by hand.
+_TIMEOUT, _RECHECK, _LATER = 0.5, 0.125, 500.0
+# The shift towards earlier, 50 ppm, is the tolerance of an ordinary quartz clock: the grid never
+# falls behind one.
+_EARLIER = 20_000.0
 
 _MISSED, _OVERRAN, _CLIPPED, _UNSENT, _CHANGED = (
     int(event)
@@ -81,56 +78,42 @@ _MISSED, _OVERRAN, _CLIPPED, _UNSENT, _CHANGED = (
 )
 
 
-class Setpoints(NamedTuple):
-    """What y has to follow, for all samples of a run."""
-
-    r: Vector
-    """(samples,)."""
-    derivatives: Matrix
-    """(samples, d): r', r'', …, as many as the controller heeds."""
-    slide: Matrix
-    """(·, 1 + d): how the reference comes from where y is to r, and the derivatives of that, for a distance of 1; see ``sliding``."""
-    now: Vector
-    """Room for the derivatives of one sample (d,)."""
-
-
-class Pace(NamedTuple):
-    """When things are due; nanoseconds."""
+class CycleTimes(NamedTuple):
+    """Times of a cycle [ns]."""
 
     period: float
-    """The sample time."""
-    patience: int
-    """So long after its deadline a measurement of a paced device may come."""
-    probe: int
-    """So long another one is waited for, where the one that was there may be old."""
+    """Sample time."""
+    timeout: int
+    """Wait for the measurement of a paced device, counted from the deadline."""
+    recheck: int
+    """Wait for a newer measurement if the one found may be old, counted from the deadline."""
     later: int
-    """By so much a cycle the grid moves at most towards later; 0 for a device without a clock of its own."""
+    """Largest shift of the grid towards later per cycle; 0 for a device that is not paced."""
     earlier: int
+    """Shift of the grid towards earlier per cycle."""
 
 
-class Books(NamedTuple):
-    """Where the loop writes what happened, and reads what is asked of it."""
+class CycleLog(NamedTuple):
+    """Outputs of the loop for other threads."""
 
     ring: Ring
     row: Vector
+    """Work array: one row."""
     f_learned: int
-    """Where f_L stands in the row; −1 where the controller reports none."""
+    """Index of the learned part of f̂ in a row; −1 if the controller reports none."""
     f_residual: int
+    """Index of the observer's part of f̂."""
     lateness: NDArray[np.int64]
-    """A ``tally``."""
-    step: NDArray[np.int64]
-    """A ``tally``."""
-    requests: NDArray[np.int64]
-    """(1,): GO_ON, END or ZERO; another thread writes it."""
+    """Histogram, see ``count_duration``."""
+    step_time: NDArray[np.int64]
+    """Histogram."""
 
 
-def pace(dt: float, paced: bool) -> Pace:
-    """Return when things are due at a sample time ``dt`` [s]."""
+def cycle_times(dt: float, paced: bool) -> CycleTimes:
+    """Return the times of a cycle for a sample time ``dt`` [s]."""
     period = dt * 1e9
-    later, earlier = (
-        (max(round(period / 500.0), 1), max(round(period / 20_000.0), 1)) if paced else (0, 0)
-    )
-    return Pace(period, round(0.5 * period), round(0.125 * period), later, earlier)
+    shifts = [max(round(period / part), 1) if paced else 0 for part in (_LATER, _EARLIER)]
+    return CycleTimes(period, round(_TIMEOUT * period), round(_RECHECK * period), *shifts)
 
 
 @compiled
@@ -141,180 +124,189 @@ def run_cycles(
     state: Any,
     rules: Rules,
     supervisor: SupervisorState,
-    setpoints: Setpoints,
-    pace: Pace,
-    books: Books,
+    reference: ReferenceSamples,
+    times: CycleTimes,
+    log: CycleLog,
 ) -> None:
     """Run until the supervisor has stopped the device."""
-    counts, row = supervisor.counts, books.row
+    memory, counters = supervisor.memory[0], supervisor.counters[0]
     origin = 0
     if not finished(supervisor):
-        origin = _first_deadline(handle, clock, supervisor, pace, books.requests)
+        origin = _first_deadline(handle, clock, supervisor, times)
     k = left_out = 0
     while not finished(supervisor):
-        deadline = origin + int(k * pace.period)
+        deadline = origin + int(k * times.period)
         woke = wait_until(clock, deadline)
         lateness = woke - deadline
-        slept_over = int(lateness / pace.period)
-        left_out += slept_over
-        k += slept_over
-        _skip(counts, slept_over)
-        y, waited, shift = _measure(handle, clock, pace, counts, origin + int(k * pace.period))
+        overslept = int(lateness / times.period)
+        left_out += overslept
+        k += overslept
+        _count_skipped(supervisor, overslept)
+        deadline = origin + int(k * times.period)
+        y, waited, shift = _measure(handle, clock, times, supervisor, deadline)
         origin += shift
-        changes = counts[CHANGES]
-        clipped = counts[CLIPPED]
-        u = _steer(design, state, rules, supervisor, setpoints, books, k, left_out, y)
+        changed, clipped = supervisor.changed[0], counters.clipped
+        u = _control_step(design, state, rules, supervisor, reference, log, k, left_out, y)
         fault = write_command(handle, u)
-        unsent = fault == 1
-        counts[FAILED] = counts[FAILED] + 1 if unsent else 0
-        counts[TRIPPED] = fault > 1
+        memory.unsent_in_row = memory.unsent_in_row + 1 if fault == 1 else 0
+        memory.tripped = 1 if fault > 1 else 0
         written = now(clock)
-        due = origin + int((k + 1) * pace.period)
-        missed_next = 1 + int((written - due) / pace.period) if written >= due else 0
-        overran = slept_over + missed_next > 0
-        counts[IN_A_ROW] = counts[IN_A_ROW] + 1 if overran else 0
-        counts[OVERRUNS] += overran
-        counts[UNSENT] += unsent
-        counts[CYCLES] += 1
-        step = written - woke - waited
-        row[K] = k
-        row[LATENESS] = 1e-9 * lateness
-        row[STEP_TIME] = 1e-9 * step
-        row[ROW_MODE] = counts[MODE]
-        row[EVENTS] = (
+        due = origin + int((k + 1) * times.period)
+        missed_next = 1 + int((written - due) / times.period) if written >= due else 0
+        overran = overslept + missed_next > 0
+        memory.overruns_in_row = memory.overruns_in_row + 1 if overran else 0
+        counters.overruns += 1 if overran else 0
+        counters.unsent += 1 if fault == 1 else 0
+        counters.cycles += 1
+        events = (
             (0 if is_finite(y) else _MISSED)
             + (_OVERRAN if overran else 0)
-            + (_CLIPPED if counts[CLIPPED] > clipped else 0)
-            + (_UNSENT if unsent else 0)
-            + (_CHANGED if counts[CHANGES] > changes else 0)
+            + (_CLIPPED if counters.clipped > clipped else 0)
+            + (_UNSENT if fault == 1 else 0)
+            + (_CHANGED if supervisor.changed[0] > changed else 0)
         )
-        row[ROW_Y] = supervisor.values[Y]
-        row[Y_MEASURED] = y
-        row[ROW_U] = u
-        push(books.ring, row)
-        count_duration(books.lateness, lateness)
-        count_duration(books.step, step)
-        _skip(counts, missed_next)
+        _log_cycle(log, memory, k, lateness, written - woke - waited, events, y)
+        _count_skipped(supervisor, missed_next)
         left_out = missed_next
         k += 1 + missed_next
 
 
 @kernel
-def _first_deadline(
-    handle: Any, clock: Any, supervisor: SupervisorState, pace: Pace, requests: NDArray[np.int64]
-) -> int:
-    """Return when cycle 0 is due [ns]: a sample from now, or from a paced device's next tick."""
-    begin = now(clock)
-    if pace.later == 0:
-        return begin + int(pace.period)
-    read_measurement(handle, clock, begin)  # what is there already is of no tick that is known
-    while (
-        now(clock) < begin + max(_FIRST, int(5.0 * pace.period))
-        and load_acquire(requests, 0) == Request.NONE
-    ):
-        before = now(clock)
-        y, _ = read_measurement(handle, clock, before + max(_LOOK, int(2.0 * pace.period)))
-        after = now(clock)
-        if is_finite(y):
-            return after + int(pace.period)
-        if after == before:  # it does not wait, and no time passes
-            break
-    change_mode(supervisor, 0, Mode.STOPPED, Cause.NO_MEASUREMENT)
-    return now(clock) + int(pace.period)
+def _log_cycle(
+    log: CycleLog, memory: Any, k: int, lateness: int, step_time: int, events: int, y: float
+) -> None:
+    """Complete the row, in which reference and controller's channels are already, and push it."""
+    row = log.row
+    row[K] = k
+    row[LATENESS] = 1e-9 * lateness
+    row[STEP_TIME] = 1e-9 * step_time
+    row[MODE] = memory.mode
+    row[EVENTS] = events
+    row[Y] = memory.y
+    row[Y_MEASURED] = y
+    row[U] = memory.u
+    push(log.ring, row)
+    count_duration(log.lateness, lateness)
+    count_duration(log.step_time, step_time)
 
 
 @kernel
-def _skip(counts: NDArray[np.int64], deadlines: int) -> None:
-    """Take note of deadlines that are left out: nothing is known of those samples."""
-    counts[SKIPPED] += deadlines
-    counts[BLIND] += deadlines
-    counts[SLEPT] += deadlines
+def _first_deadline(handle: Any, clock: Any, supervisor: SupervisorState, times: CycleTimes) -> int:
+    """Return the deadline of cycle 0 [ns]: a sample from now or from a paced device's next tick."""
+    begin = now(clock)
+    if times.later == 0:
+        return begin + int(times.period)
+    read_measurement(handle, clock, begin)  # discards a measurement of an unknown tick
+    while (
+        now(clock) < begin + max(_FIRST, int(_FIRST_TICKS * times.period))
+        and load_acquire(supervisor.requests, 0) == Request.NONE
+    ):
+        before = now(clock)
+        y, _ = read_measurement(handle, clock, before + max(_LOOK, int(_LOOK_TICKS * times.period)))
+        after = now(clock)
+        if is_finite(y):
+            return after + int(times.period)
+        if after == before:  # the device does not wait, and no time passes
+            break
+    change_mode(supervisor, 0, Mode.STOPPED, Cause.NO_MEASUREMENT)
+    return now(clock) + int(times.period)
+
+
+@kernel
+def _count_skipped(supervisor: SupervisorState, deadlines: int) -> None:
+    """Count deadlines that are skipped: nothing is known of their samples."""
+    memory = supervisor.memory[0]
+    supervisor.counters[0].skipped += deadlines
+    memory.missed_in_row += deadlines
+    memory.skipped_in_row += deadlines
     if deadlines > 0:
-        counts[UNSURE] = 1
+        memory.maybe_stale = 1
 
 
 @kernel
 def _measure(
-    handle: Any, clock: Any, pace: Pace, counts: NDArray[np.int64], deadline: int
+    handle: Any, clock: Any, times: CycleTimes, supervisor: SupervisorState, deadline: int
 ) -> tuple[float, int, int]:
-    """Return the measurement, how long it was waited for, and by how much the grid moves later [ns]."""
-    y, waited = read_measurement(handle, clock, deadline + pace.patience)
-    if pace.later == 0:
+    """Return the measurement, the wait for it and the shift of the grid towards later [ns]."""
+    memory = supervisor.memory[0]
+    y, waited = read_measurement(handle, clock, deadline + times.timeout)
+    if times.later == 0:
         return y, waited, 0
     if not is_finite(y):
-        counts[UNSURE] = 1
+        memory.maybe_stale = 1
         return y, waited, 0
     before = now(clock)
-    if waited == 0 and counts[UNSURE] != 0 and before < deadline + pace.probe:
-        counts[UNSURE] = 0
-        newer, _ = read_measurement(handle, clock, deadline + pace.probe)
+    if waited == 0 and memory.maybe_stale != 0 and before < deadline + times.recheck:
+        memory.maybe_stale = 0
+        newer, _ = read_measurement(handle, clock, deadline + times.recheck)
         waited = now(clock) - before
         if is_finite(newer):
-            return newer, waited, min(waited, pace.later)
+            return newer, waited, min(waited, times.later)
     elif waited > 0:
-        counts[UNSURE] = 0
-        return y, waited, min(waited, pace.later)
-    return y, waited, -pace.earlier
+        memory.maybe_stale = 0
+        return y, waited, min(waited, times.later)
+    return y, waited, -times.earlier
 
 
 @kernel
-def _steer(
+def _control_step(
     design: Any,
     state: Any,
     rules: Rules,
     supervisor: SupervisorState,
-    setpoints: Setpoints,
-    books: Books,
+    reference: ReferenceSamples,
+    log: CycleLog,
     k: int,
     left_out: int,
     y: float,
 ) -> float:
-    """Take a sample of supervisor and controller; return the u to apply, and write reference and report into the row.
+    """Take a sample of supervisor and controller; return the u to apply.
 
-    Of the ``left_out`` deadlines before k the controller is told first, as far as they are not the end of the run.
+    First the controller is told of the ``left_out`` deadlines before k, except those that end the
+    run anyway.
     """
-    counts, values, row = supervisor.counts, supervisor.values, books.row
-    update_mode(rules, supervisor, k, y, load_acquire(books.requests, 0), setpoints.r.size)
+    memory, row = supervisor.memory[0], log.row
+    update_mode(rules, supervisor, k, y, reference.r.size)
     first = k - min(left_out, rules.hold)
-    if counts[MODE] == Mode.RUN and counts[BEGAN] == k:
+    if memory.mode == Mode.RUN and memory.began == k:
         bumpless_transfer(design, state)
-        values[GAP] = y - setpoints.r[0]
+        memory.offset = y - reference.r[0]
         first = k
-    awake = counts[MODE] != Mode.STOPPED and is_finite(values[Y])
+    awake = memory.mode != Mode.STOPPED and is_finite(memory.y)
     r, wished, f_hat = 0.0, 0.0, 0.0
     for i in range(first, k + 1):
-        r = _reference(design, state, setpoints, supervisor, i)
+        r = _set_reference(design, state, reference, memory, i)
         if awake:
             wished = control(design, state, r, y if i == k else np.nan)
             if i < k:
-                set_applied_control(design, state, values[U])
+                set_applied_control(design, state, memory.u)
     write_row(design, state, row[LOOP_WIDTH:])
-    if books.f_learned >= 0:
-        f_hat = row[books.f_learned] + row[books.f_residual]
+    if log.f_learned >= 0:
+        f_hat = row[log.f_learned] + row[log.f_residual]
     u = supervised_output(rules, supervisor, k, wished, r, f_hat)
     if awake and u != wished:
         set_applied_control(design, state, u)
-        counts[CLIPPED] += counts[MODE] == Mode.RUN
-    row[ROW_R] = r
+        supervisor.counters[0].clipped += 1 if memory.mode == Mode.RUN else 0
+    row[R] = r
     return u
 
 
 @kernel
-def _reference(
-    design: Any, state: Any, setpoints: Setpoints, supervisor: SupervisorState, k: int
+def _set_reference(
+    design: Any, state: Any, reference: ReferenceSamples, memory: Any, k: int
 ) -> float:
-    """Return the reference of this sample, and tell the controller its derivatives; where y is, before the scenario begins."""
-    if supervisor.counts[BEGAN] < 0:
-        return supervisor.values[Y]
-    i = min(k - supervisor.counts[BEGAN], setpoints.r.size - 1)
-    gap = supervisor.values[GAP] if i < setpoints.slide.shape[0] else 0.0
-    r = setpoints.r[i]
-    if gap != 0.0:
-        r += gap * setpoints.slide[i, 0]
-    if setpoints.now.size > 0:
-        for j in range(setpoints.now.size):
-            setpoints.now[j] = setpoints.derivatives[i, j]
-            if gap != 0.0:
-                setpoints.now[j] += gap * setpoints.slide[i, 1 + j]
-        set_reference_derivatives(design, state, setpoints.now)
+    """Return the reference of sample k (y before the scenario begins); pass its derivatives on."""
+    if memory.began < 0:
+        return memory.y
+    i = min(k - memory.began, reference.r.size - 1)
+    offset = memory.offset if i < reference.approach.shape[0] else 0.0
+    r = reference.r[i]
+    if offset != 0.0:
+        r += offset * reference.approach[i, 0]
+    if reference.current.size > 0:
+        for j in range(reference.current.size):
+            reference.current[j] = reference.derivatives[i, j]
+            if offset != 0.0:
+                reference.current[j] += offset * reference.approach[i, 1 + j]
+        set_reference_derivatives(design, state, reference.current)
     return r

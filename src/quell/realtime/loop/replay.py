@@ -1,13 +1,15 @@
-"""A recorded run through another observer or learner: what it would have known, and what it would have done.
+"""Replay of a recorded run through another controller: its estimates and the u it wishes.
 
-The controller sees the recorded reference and measurements, sample by sample, and is told that the recorded u was applied, whatever it
-wished. So its observer and its learner run on what really happened; what it would have applied is recorded as ``u_wished``. (Its u never
-acts: whether *the loop* would have been a better one is for ``simulate`` to say.)
+The controller gets the recorded reference and measurements, sample by sample, and the recorded u as
+the applied one. So its observer and its learner run on what really happened. Its own u is recorded
+as ``u_wished`` but never acts: how
+*the loop* would have behaved is a question for ``simulate``.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 from typing import Any
 
 import numpy as np
@@ -29,73 +31,76 @@ from quell.realtime.loop.modes import Mode
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix, Status, Vector
 
-_TOLD = (("r", 1), ("y", 1), ("y_measured", 1), ("u", 1), ("u_wished", 1))
+_RECORDED = ("r", "y", "y_measured", "u")
 _NO_DERIVATIVES = np.zeros(0)
 
 
 def replay(run: Trajectory, controller: Controller, *, u_before: float | None = None) -> Trajectory:
     """Let a controller follow a recorded run.
 
-    It starts with nothing learned, on a state of its own, as in ``simulate``. Through the controller that made the run, its estimates come
-    out again, to rounding. Deadlines that were skipped are samples without measurement, as they were to the controller on the rig, which
-    was told of ``Safety.hold`` of them at once, no more: where it skipped more the run ended, and its last estimates differ. Derivatives
-    of the reference are not recorded: a controller with feedforward is given none, which shows in ``u_wished`` alone.
+    It starts with nothing learned, on a state of its own, as in ``simulate``. The controller that
+    made the run gives the recorded estimates again, to rounding. Skipped deadlines are samples
+    without measurement, as they were on the rig, whose loop passes on ``Safety.hold`` of them at
+    once at most: if it skipped more, the run ended, and its last estimates differ. Derivatives of
+    the reference are not recorded: a controller with feedforward gets none, which changes
+    ``u_wished`` only.
 
     Parameters
     ----------
     run
-        every sample of it: recorded on a rig (``load``, or ``RigRun.record``), or from ``simulate`` with ``record_every=1``.
+        a run with all its samples: recorded on a rig (``load``, or ``RigRun.record``), or from
+        ``simulate`` with ``record_every=1``.
     controller
-        any controller of the run's sample time.
+        any controller with the run's sample time.
     u_before
-        control signal under which the plant rested before the first sample [u-unit], where an ADRC is to know: it then starts as by
-        ``controller.start(y, u_before)``, else as by its first sample.
+        control signal under which the plant rested before the first sample [u-unit]. An ADRC then
+        starts as by ``controller.start(y, u_before)``; by default it starts as by its first sample.
 
     Returns
     -------
     Trajectory
-        ``r``, ``y``, ``y_measured`` and ``u`` of the run, ``u_wished``, and what the controller reports.
+        ``r``, ``y``, ``y_measured`` and ``u`` of the run, ``u_wished``, and the controller's
+        channels.
 
     Raises
     ------
     ValueError
-        for what is no Trajectory, a run that lacks r, y, y_measured or u or does not have all samples, one without a single measurement,
-        another sample time, and ``u_before`` for a controller that is no ADRC.
+        for anything else than a Trajectory; for a run that lacks r, y, y_measured, u or some
+        samples, or has no measurement; for another sample time; and for ``u_before`` with a
+        controller other than an ADRC.
     """
     check_controller(controller)
     if not isinstance(run, Trajectory):
         raise ValueError(
             f"run = {run!r}: must be a Trajectory, for example quell.realtime.load('run.mcap')"
         )
-    r, y, measured, u = (np.ascontiguousarray(run[name]) for name in ("r", "y", "y_measured", "u"))
+    recorded = np.column_stack([run[name] for name in _RECORDED])
+    u = recorded[:, 3]
     if run.every != 1:
         raise ValueError(
-            f"run has every {run.every}th sample: a replay needs all of them; record with record_every=1"
+            f"run has every {run.every}th sample: a replay needs all of them; record with "
+            "record_every=1"
         )
     if run.dt != controller.dt:
         raise ValueError(
             f"controller has dt = {controller.dt!r} s: must have that of the run, {run.dt!r} s"
         )
     if not np.all(np.isfinite(u)):
-        raise ValueError(
-            f"run has no finite u at {run.t[np.argmin(np.isfinite(u))]:.6g} s: what was applied must be known"
-        )
-    good = np.flatnonzero(np.isfinite(measured))
-    if good.size == 0:
+        time = run.t[np.argmin(np.isfinite(u))]
+        raise ValueError(f"run has no finite u at {time:.6g} s: the applied u must be known")
+    measured = np.flatnonzero(np.isfinite(recorded[:, 2]))
+    if measured.size == 0:
         raise ValueError("run has no finite y_measured: there is nothing to observe")
     design, state = controller.parameters, controller.initial_state()
     if u_before is not None:
-        first = good[0]
-        design, state = _started(
-            controller, measured[first], checks.finite("u_before", u_before), r[first]
-        )
-    channels = (*_TOLD, *controller.channels)
+        r, _, y, _ = recorded[measured[0]].tolist()
+        design, state = _started(controller, y, checks.finite("u_before", u_before), r)
+    channels = (*((name, 1) for name in _RECORDED), ("u_wished", 1), *controller.channels)
     log = np.empty((len(run), sum(width for _, width in channels)))
+    log[:, : len(_RECORDED)] = recorded
     began = int(np.argmax(run["mode"] == Mode.RUN)) if "mode" in run.names else 0
     with np.errstate(over="ignore", invalid="ignore"), explain_compile_errors(design):
-        status = dispatcher_for(_follow, design)(
-            design, state, _NO_DERIVATIVES, r, y, measured, u, began, log
-        )
+        status = dispatcher_for(_follow, design)(design, state, _NO_DERIVATIVES, began, log)
     return Trajectory(
         log=log,
         channels=channels,
@@ -109,43 +114,33 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
 
 
 def _started(controller: Any, y: float, u: float, r: float) -> tuple[Any, Any]:
-    """Return parameters and state of a controller, nothing learned, that starts where the plant rests at ``y`` under ``u``."""
+    """Return parameters and initial state for a plant that rests at ``y`` under ``u``."""
     if not hasattr(controller, "start"):
         raise ValueError(
-            f"u_before = {u!r}: only an ADRC starts under load; leave it out for a {type(controller).__name__}"
+            f"u_before = {u!r}: only an ADRC starts under load; leave it out for a "
+            f"{type(controller).__name__}"
         )
     follower = copy.copy(controller)
     follower.reset()
-    follower.start(float(y), u, float(r) if np.isfinite(r) else None)
+    follower.start(y, u, r if math.isfinite(r) else None)
     return follower.parameters, follower._state
 
 
 @compiled
-def _follow(
-    design: Any,
-    state: Any,
-    derivatives: Vector,
-    r: Vector,
-    y: Vector,
-    measured: Vector,
-    u: Vector,
-    began: int,
-    log: Matrix,
-) -> int:
-    """Take all samples as the loop does, log them, and return all status flags seen; from ``began`` on the controller had its say."""
+def _follow(design: Any, state: Any, derivatives: Vector, began: int, log: Matrix) -> int:
+    """Run the controller on the first columns of ``log``, write the others; return status flags.
+
+    From sample ``began`` on the controller was in control.
+    """
     status = 0
-    for k in range(r.size):
+    for k in range(log.shape[0]):
         if k == began and k > 0:
             bumpless_transfer(design, state)
         set_reference_derivatives(design, state, derivatives)
-        wished = control(design, state, r[k], measured[k])
+        wished = control(design, state, log[k, 0], log[k, 2])
         status |= status_flags(design, state)
-        log[k, 0] = r[k]
-        log[k, 1] = y[k]
-        log[k, 2] = measured[k]
-        log[k, 3] = u[k]
         log[k, 4] = wished
         write_row(design, state, log[k, 5:])
-        if u[k] != wished:
-            set_applied_control(design, state, u[k])
+        if log[k, 3] != wished:
+            set_applied_control(design, state, log[k, 3])
     return status

@@ -1,4 +1,4 @@
-"""What the loop does where something goes wrong: hold, then ramp u to zero, then stop.
+"""The supervisor: after a fault it holds u, then ramps it to zero, then stops.
 
 ::
 
@@ -6,13 +6,17 @@
       │                 │                                       │
       └─────────────────┴──────── a cause, see Cause ───────────┴──▶ RAMP ──u is zero──▶ STOPPED
 
-* START: u is zero and the controller watches, with its reference where y is, until ``settle`` samples in a row were good.
-* RUN: u is what the controller says, within limits.
-* HOLD: there was no good sample: u stays as it is. After ``hold`` of them in a row it is RAMP's turn.
-* RAMP: u goes to zero in a straight line, in ``ramp`` samples, whatever happens meanwhile. There is no way back from here.
+* START: u is zero and the controller observes, with y as its reference, until ``settle`` samples
+  in a row were good.
+* RUN: u is the controller's, within limits.
+* HOLD: there was no good sample, and u stays as it is. After ``hold`` such samples in a row the
+  mode is RAMP.
+* RAMP: u goes to zero in a straight line within ``ramp`` samples, whatever happens meanwhile;
+  there is no way back to RUN.
 * STOPPED: u is zero; it is written some more times, in case a frame is lost.
 
-All of it is arithmetic on two arrays, so that it can be tried out sample by sample without a clock or a device.
+All of it is arithmetic on arrays, so that tests can run it sample by sample without a clock or a
+device.
 """
 
 from __future__ import annotations
@@ -23,23 +27,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.scalars import Scalars
 from quell.realtime.loop.modes import Cause, Mode, Request
-from quell.realtime.system.atomics import store_release
-from quell.types import Vector
+from quell.realtime.system.atomics import load_acquire, store_release
 
-# So many more zeros are written once u is zero.
+# Once u is zero it is written FLUSH + 1 more times, in case frames are lost. Chosen by hand.
 FLUSH = 3
-# To settle may take so many times as many samples as it has to.
-_LONGEST_START = 10
+# START may take _LONGEST_START · (settle + _SETTLE_MARGIN) samples: enough for a device that misses
+# some. Chosen by hand; not tuned further.
+_LONGEST_START, _SETTLE_MARGIN = 10, 100
+# Number of changes of mode that are kept (96 KiB). The last ones are reserved for the end of the
+# run, which takes two: RAMP and STOPPED.
+_KEPT, RESERVED = 4096, 4
 
 
 class Rules(NamedTuple):
-    """What the supervisor goes by; ``Safety`` makes it."""
+    """The supervisor's rules; ``Safety.rules`` makes them."""
 
     low: float
-    """Of u [u-unit], ≤ 0."""
+    """Lower limit of u [u-unit], ≤ 0."""
     high: float
-    """≥ 0."""
+    """Upper limit, ≥ 0."""
     most_error: float
     """Largest ``|r − y|`` [y-unit]."""
     most_f: float
@@ -51,129 +59,139 @@ class Rules(NamedTuple):
     most_overruns: int
 
 
-# Places of SupervisorState.counts.
-(
-    MODE,
-    SAMPLES,  # good ones in START; done in RAMP and STOPPED
-    BEGAN,  # k of the scenario's first sample; −1 before
-    BLIND,  # deadlines in a row without a good sample
-    SLEPT,  # those of them that were left out
-    AT_LIMIT,  # samples in a row with u at a limit
-    IN_A_ROW,  # cycles in a row that overran
-    FAILED,  # commands in a row that did not get out
-    CHANGES,  # of mode
-    CYCLES,
-    OVERRUNS,
-    SKIPPED,  # deadlines
-    MISSES,  # cycles without a good measurement
-    CLIPPED,  # cycles in which u was not the controller's
-    UNSENT,  # commands
-    UNSURE,  # whether a measurement may be an old one
-    TRIPPED,  # whether the device has set u to zero for good
-) = range(17)
-COUNTS = 17
-# Places of SupervisorState.values.
-U, FROM, Y, GAP = range(4)
-VALUES = 4
-# So many changes of mode are kept; the last places are not for HOLD and back.
-_KEPT, _RESERVED = 4096, 4
+class Memory(Scalars):
+    """What the supervisor remembers from one cycle to the next."""
+
+    mode: int
+    samples: int
+    """Good samples in a row in START, cycles so far in RAMP and STOPPED."""
+    began: int
+    """Index k of the scenario's first sample; −1 before it."""
+    missed_in_row: int
+    """Deadlines without a good sample, those that were skipped included."""
+    skipped_in_row: int
+    at_limit_in_row: int
+    """Samples with u at a limit."""
+    overruns_in_row: int
+    unsent_in_row: int
+    maybe_stale: int
+    """Not zero if the next measurement may be an old one."""
+    tripped: int
+    """Not zero if the device has set u to zero for good."""
+    u: float
+    """As applied [u-unit]."""
+    ramp_start: float
+    """u at the beginning of the ramp [u-unit]."""
+    y: float
+    """Last good measurement [y-unit]; NaN before the first."""
+    offset: float
+    """Distance from the reference to y at the scenario's first sample [y-unit]."""
+
+
+class Counters(Scalars):
+    """Counters of a run; the first fields of ``quell.realtime.loop.result.Tally``, in its order."""
+
+    cycles: int
+    overruns: int
+    skipped: int
+    missed: int
+    clipped: int
+    unsent: int
 
 
 class SupervisorState(NamedTuple):
-    """What the supervisor remembers."""
+    """State of the supervisor, which the loop writes and another thread may read."""
 
-    counts: NDArray[np.int64]
-    """(COUNTS,)."""
-    values: Vector
-    """(VALUES,): u applied, u at the beginning of the ramp, last good y, distance from where y began to the reference."""
+    memory: NDArray[Memory]
+    counters: NDArray[Counters]
     changes: NDArray[np.int64]
-    """(·, 3): k, mode, cause."""
+    """k, mode and cause of each change of mode (·, 3)."""
+    changed: NDArray[np.int64]
+    """Number of changes of mode that are kept (1,), an atomic word."""
+    requests: NDArray[np.int64]
+    """A ``Request`` (1,), an atomic word that another thread writes."""
 
 
 def initial_state() -> SupervisorState:
-    """Return what the supervisor knows before the first cycle."""
-    state = SupervisorState(
-        np.zeros(COUNTS, dtype=np.int64), np.zeros(VALUES), np.zeros((_KEPT, 3), dtype=np.int64)
-    )
-    state.counts[BEGAN] = -1
-    state.values[Y] = np.nan
-    return state
+    """Return the state before the first cycle."""
+    memory, changed, requests = Memory.zeros(), np.zeros(1, np.int64), np.zeros(1, np.int64)
+    memory[0].began, memory[0].y = -1, np.nan
+    changes = np.zeros((_KEPT, 3), np.int64)
+    return SupervisorState(memory, Counters.zeros(), changes, changed, requests)
 
 
 @kernel
 def change_mode(state: SupervisorState, k: int, mode: int, cause: int) -> None:
-    """Go over to another mode, and note why."""
-    counts = state.counts
-    counts[MODE], counts[SAMPLES] = mode, 0
+    """Change the mode and keep the cause."""
+    memory = state.memory[0]
+    memory.mode = mode
+    memory.samples = 0
     if mode == Mode.RAMP:
-        state.values[FROM] = state.values[U]
-    number = counts[CHANGES]
+        memory.ramp_start = memory.u
+    number = state.changed[0]
     kept = state.changes.shape[0]
-    if number < kept - _RESERVED or (number < kept and mode >= Mode.RAMP):
-        state.changes[number, 0], state.changes[number, 1], state.changes[number, 2] = (
-            k,
-            mode,
-            cause,
-        )
-        store_release(counts, CHANGES, number + 1)
+    if number < kept - RESERVED or (number < kept and mode >= Mode.RAMP):
+        state.changes[number, 0] = k
+        state.changes[number, 1] = mode
+        state.changes[number, 2] = cause
+        store_release(state.changed, 0, number + 1)
 
 
 @kernel
-def update_mode(
-    rules: Rules, state: SupervisorState, k: int, y: float, request: int, samples: int
-) -> None:
-    """Choose the mode for this cycle, before the controller's step.
+def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples: int) -> None:
+    """Choose the mode of cycle ``k`` before the controller's step.
 
-    ``y`` is the measurement, ``request`` what the main thread wants, ``samples`` how many the scenario has.
+    ``y`` is the measurement, ``samples`` the number of samples of the scenario.
     """
-    counts, values = state.counts, state.values
+    memory = state.memory[0]
     good = is_finite(y)
     if good:
-        values[Y] = y
+        memory.y = y
     else:
-        counts[BLIND] += 1
-        counts[MISSES] += 1
-    mode = counts[MODE]
+        memory.missed_in_row += 1
+        state.counters[0].missed += 1
+    mode = memory.mode
+    request = load_acquire(state.requests, 0)
     if request == Request.ZERO and mode != Mode.STOPPED:
         change_mode(state, k, Mode.STOPPED, Cause.ZERO_REQUESTED)
     elif mode <= Mode.HOLD:
-        cause = _cause_to_end(rules, state, k, request, samples)
+        cause = _cause_to_end(rules, memory, k, request, samples)
         if cause != Cause.NONE:
             change_mode(state, k, Mode.RAMP, cause)
         elif mode == Mode.START:
             if not good:
-                counts[SAMPLES] = 0
-            elif counts[SAMPLES] >= rules.settle:
+                memory.samples = 0
+            elif memory.samples >= rules.settle:
                 change_mode(state, k, Mode.RUN, Cause.SETTLED)
-                counts[BEGAN] = k
+                memory.began = k
             else:
-                counts[SAMPLES] += 1
+                memory.samples += 1
         elif good and mode == Mode.HOLD:
             change_mode(state, k, Mode.RUN, Cause.RECOVERED)
         elif not good and mode == Mode.RUN:
             change_mode(state, k, Mode.HOLD, Cause.MISSED)
     if good:
-        counts[BLIND] = counts[SLEPT] = 0
+        memory.missed_in_row = 0
+        memory.skipped_in_row = 0
 
 
 @kernel
-def _cause_to_end(rules: Rules, state: SupervisorState, k: int, request: int, samples: int) -> int:
-    """Return why it has to end, as far as that is known before the controller's step."""
-    counts = state.counts
+def _cause_to_end(rules: Rules, memory: Memory, k: int, request: int, samples: int) -> int:
+    """Return the cause to end the run, as far as it is known before the controller's step."""
     cause = Cause.NONE
     if request == Request.RAMP:
         cause = Cause.STOP_REQUESTED
-    elif counts[BLIND] > rules.hold:
-        cause = Cause.STALLED if counts[SLEPT] > rules.hold else Cause.LOST
-    elif counts[FAILED] > rules.hold:
+    elif memory.missed_in_row > rules.hold:
+        cause = Cause.STALLED if memory.skipped_in_row > rules.hold else Cause.LOST
+    elif memory.unsent_in_row > rules.hold:
         cause = Cause.UNREACHABLE
-    elif counts[IN_A_ROW] > rules.most_overruns:
+    elif memory.overruns_in_row > rules.most_overruns:
         cause = Cause.OVERRUN
-    elif counts[TRIPPED] != 0:
+    elif memory.tripped != 0:
         cause = Cause.WATCHDOG
-    elif counts[MODE] == Mode.START and k > _LONGEST_START * (rules.settle + 100):
+    elif memory.mode == Mode.START and k > _LONGEST_START * (rules.settle + _SETTLE_MARGIN):
         cause = Cause.UNSETTLED
-    elif counts[BEGAN] >= 0 and k - counts[BEGAN] >= samples:
+    elif memory.began >= 0 and k - memory.began >= samples:
         cause = Cause.COMPLETED
     return cause
 
@@ -182,39 +200,41 @@ def _cause_to_end(rules: Rules, state: SupervisorState, k: int, request: int, sa
 def supervised_output(
     rules: Rules, state: SupervisorState, k: int, wished: float, r: float, f_hat: float
 ) -> float:
-    """Return the u to apply, given what the controller wishes; in RUN, trip where a limit is passed.
+    """Return the u to apply in cycle ``k``; in RUN, end the run if a limit is exceeded.
 
-    ``r`` is the reference of this sample, ``f_hat`` the estimate after it, zero where the controller has none.
+    ``wished`` is the controller's u, ``r`` the reference of this sample, ``f_hat`` the estimate
+    after it, zero if the controller has none.
     """
-    counts, values = state.counts, state.values
+    memory = state.memory[0]
     u = 0.0
-    if counts[MODE] == Mode.RUN:
+    if memory.mode == Mode.RUN:
         u = min(max(wished, rules.low), rules.high)
-        counts[AT_LIMIT] = counts[AT_LIMIT] + 1 if u == rules.low or u == rules.high else 0
+        at_limit = u == rules.low or u == rules.high
+        memory.at_limit_in_row = memory.at_limit_in_row + 1 if at_limit else 0
         if not is_finite(wished):
             change_mode(state, k, Mode.RAMP, Cause.NOT_A_NUMBER)
-        elif not abs(r - values[Y]) <= rules.most_error:
+        elif not abs(r - memory.y) <= rules.most_error:
             change_mode(state, k, Mode.RAMP, Cause.TRACKING_ERROR)
         elif not abs(f_hat) <= rules.most_f:
             change_mode(state, k, Mode.RAMP, Cause.F_HAT)
-        elif counts[AT_LIMIT] > rules.most_saturated:
+        elif memory.at_limit_in_row > rules.most_saturated:
             change_mode(state, k, Mode.RAMP, Cause.SATURATED)
-    elif counts[MODE] == Mode.HOLD:
-        u = values[U]
-    if counts[MODE] == Mode.RAMP:
-        counts[SAMPLES] += 1
-        left = rules.ramp - counts[SAMPLES]
-        u = values[FROM] * left / rules.ramp
-        if left <= 0 or values[FROM] == 0.0:
+    elif memory.mode == Mode.HOLD:
+        u = memory.u
+    if memory.mode == Mode.RAMP:
+        memory.samples += 1
+        left = rules.ramp - memory.samples
+        u = memory.ramp_start * left / rules.ramp
+        if left <= 0 or memory.ramp_start == 0.0:
             u = 0.0
             change_mode(state, k, Mode.STOPPED, Cause.RAMPED)
-    elif counts[MODE] == Mode.STOPPED:
-        counts[SAMPLES] += 1
-    values[U] = u
+    elif memory.mode == Mode.STOPPED:
+        memory.samples += 1
+    memory.u = u
     return u
 
 
 @kernel
 def finished(state: SupervisorState) -> bool:
-    """Tell whether u is zero and was written often enough."""
-    return state.counts[MODE] == Mode.STOPPED and state.counts[SAMPLES] > FLUSH
+    """Return whether u is zero and was written often enough."""
+    return state.memory[0].mode == Mode.STOPPED and state.memory[0].samples > FLUSH

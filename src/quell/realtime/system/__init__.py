@@ -1,4 +1,4 @@
-"""Services of the operating system: clocks, scheduling, signals, atomic words, histograms of durations.
+"""Operating system: clocks, scheduling, signals, atomic words, and histograms of durations.
 
 May import ``kernels`` and ``checks`` only.
 """

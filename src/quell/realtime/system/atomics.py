@@ -1,7 +1,7 @@
 """Atomic loads and stores of int64 words that two threads or two processes share.
 
-The writer stores data first and then, as a *release*, a word that announces it. A reader that loads this word as an *acquire* and finds
-the new value also finds the data.
+The writer stores data first and then, as a *release*, a word that announces it. A reader that loads
+this word as an *acquire* and finds the new value also finds the data.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Clocks of the loop: the operating system's monotonic clock, and a virtual one for tests.
 
-All times are integers in nanoseconds [ns]. A clock is a NamedTuple for which ``now`` and ``wait_until`` are
-registered.
+All times are integers in nanoseconds [ns]. A clock is a NamedTuple for which ``now`` and
+``wait_until`` are registered.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Histograms of durations, which the loop fills without allocating memory.
 
-The width of the bins grows with the duration, as in Gil Tene's HdrHistogram: each power of two is divided into 32
-bins, so that a bin is at most 3.1 % wide. Up to 64 ns a bin is 1 ns wide. The longest duration is stored exactly.
+The width of the bins grows with the duration, as in Gil Tene's HdrHistogram: each power of two is
+divided into 32 bins, so that a bin is at most 3.1 % wide. Up to 64 ns a bin is 1 ns wide. The
+longest duration is stored exactly.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.types import Vector
 
-# Bins per power of two; a percentile is rounded by at most 1/32 = 3.1 %. Chosen by hand; not tuned further.
+# Bins per power of two; a percentile is rounded by at most 1/32 = 3.1 %. Chosen by hand; not tuned
+# further.
 _PARTS = 32
 # Below this duration [ns] a bin is 1 ns wide.
 _LINEAR = 2 * _PARTS
@@ -170,7 +172,8 @@ class Timing:
     lateness : Histogram
         time from a deadline until the loop woke.
     step : Histogram
-        time from then until u was written, without waiting for the device: measurement, supervisor, controller, command.
+        time from then until u was written, without waiting for the device: measurement, supervisor,
+        controller, command.
     """
 
     lateness: Histogram

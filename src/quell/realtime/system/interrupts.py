@@ -1,4 +1,4 @@
-"""The operating system's signals that end programs, handled for the duration of a ``with`` block."""
+"""Handling of the signals that end programs."""
 
 from __future__ import annotations
 

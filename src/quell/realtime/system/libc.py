@@ -1,7 +1,8 @@
 """Functions of the C library, called from Python and from compiled code alike.
 
-Compiled code refers to them by name, so that it can be cached on disk; Python calls them through ``ctypes``. Pointers
-are passed as addresses: ``array.ctypes.data`` of an array that lives at least as long as the call.
+Compiled code refers to them by name, so that it can be cached on disk; Python calls them through
+``ctypes``. Pointers are passed as addresses: ``array.ctypes.data`` of an array that lives at least
+as long as the call.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scheduling of the loop's thread and process: priority, processor, locked memory, no deep sleep of processors.
+"""Scheduling of the loop: priority, processor, locked memory, no deep sleep of processors.
 
 What the system refuses is noted in a sentence, and the run goes on without it.
 """
@@ -18,8 +18,8 @@ from quell.realtime.system.libc import external
 # MCL_CURRENT | MCL_FUTURE of <sys/mman.h> on Linux.
 _CURRENT_AND_FUTURE = 3
 _LATENCY = "/dev/cpu_dma_latency"
-# Python's switch interval while the loop is interpreted [s]: as long as a burst of the telemetry writer.
-# CPython's default, 5 ms, is five cycles at 1 kHz.
+# Python's switch interval while the loop is interpreted [s]: as long as a burst of the telemetry
+# writer. CPython's default, 5 ms, is five cycles at 1 kHz.
 _SWITCH = 1e-4
 
 _mlockall = external("mlockall", "int", "int")
@@ -45,9 +45,10 @@ def checked_cpu(cpu: int | None) -> int | None:
 
 @contextmanager
 def real_time_process(priority: int, interpreted: bool) -> Iterator[list[str]]:
-    """Lock the memory, keep processors awake and the garbage collector off for a ``with`` block in the main thread.
+    """Lock the memory, keep processors awake and the garbage collector off; for the main thread.
 
-    Yields a list of notes on what the system permitted. With a priority of 0 only the collector is touched.
+    Yields a list of notes on what the system permitted. With a priority of 0 only the collector is
+    touched.
     """
     notes: list[str] = []
     collecting, interval = gc.isenabled(), sys.getswitchinterval()
@@ -89,7 +90,8 @@ def _lock_memory(notes: list[str]) -> bool:
 def _stay_awake(notes: list[str]) -> int | None:
     """Forbid the processors deep sleep as long as the returned file is open.
 
-    See the Linux kernel's *PM Quality Of Service Interface*: the file takes the largest tolerated latency [µs].
+    See the Linux kernel's *PM Quality Of Service Interface*: the file takes the largest tolerated
+    latency [µs].
     """
     try:
         file = os.open(_LATENCY, os.O_WRONLY)
@@ -130,7 +132,7 @@ def enter_real_time(priority: int, cpu: int | None, notes: list[str]) -> None:
 
 
 def set_low_priority(real_time: bool) -> None:
-    """Give the calling thread the lowest priority of SCHED_FIFO if ``real_time`` and permitted, else an ordinary one."""
+    """Give this thread the lowest priority of SCHED_FIFO if permitted, or an ordinary one."""
     if not hasattr(os, "sched_setscheduler"):
         return
     if real_time:

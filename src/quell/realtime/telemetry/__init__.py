@@ -1,4 +1,4 @@
-"""Telemetry of the real-time loop: ring buffer, writer thread, file formats, live connection, loading of recordings.
+"""Telemetry of the loop: ring buffer, writer thread, file formats, live viewers, loading.
 
 May import ``records`` and ``realtime.system``.
 """

@@ -15,7 +15,7 @@ LOOP_CHANNELS = (
     ("y_measured", 1),  # as received; NaN if nothing was
     ("u", 1),  # applied from this cycle to the next
 )
-"""Names and widths of the first channels of every row; those of the controller (``controller.channels``) follow."""
+"""Names and widths of the first channels of every row; ``controller.channels`` follow."""
 
 K, LATENESS, STEP_TIME, MODE, EVENTS, R, Y, Y_MEASURED, U = range(len(LOOP_CHANNELS))
 LOOP_WIDTH = len(LOOP_CHANNELS)
@@ -35,7 +35,7 @@ class Event(IntFlag):
     CHANGED = 16
     """The mode changed."""
     GAP = 1 << 16
-    """No such cycle is recorded: its deadline was skipped, or its row found the ring full. ``load`` made the row."""
+    """No recorded cycle: its deadline was skipped, or its row lost; ``load`` filled it in."""
 
 
 def row_channels(controller_channels: tuple[tuple[str, int], ...]) -> tuple[tuple[str, int], ...]:

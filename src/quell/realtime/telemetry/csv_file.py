@@ -1,7 +1,8 @@
-"""Recordings as CSV: a line of names, then a line for each row; the header is in ``<name>.json`` beside it.
+"""Recordings as CSV: a line of names, then a line for each row; the header is in ``<name>.json``.
 
-The first column is ``time`` [s]; the others are those of the row, ``x_hat[0]`` the first entry of a vector channel.
-Numbers have as many digits as it takes to read the same bits back, and NaN is ``nan``.
+The first column is ``time`` [s]; the others are those of the row, ``x_hat[0]`` the first entry of a
+vector channel. Numbers have as many digits as it takes to read the same bits back, and NaN is
+``nan``.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ class CsvSink:
         lines = []
         for row in rows.tolist():
             numbers = [row[K] * self._dt, *row]
-            # Some readers (PlotJuggler 3.15) take the type of a column from the first line, and 1e-05 for text.
+            # Some readers (PlotJuggler 3.15) take the type of a column from the first line, and
+            # 1e-05 for text.
             lines.append(",".join(map(_positional if self._first else repr, numbers)))
             self._first = False
         self._file.write(("\n".join(lines) + "\n").encode())
@@ -78,9 +80,10 @@ def header_path(path: Path) -> Path:
 
 
 def read_csv(path: Path) -> tuple[Header, Matrix]:
-    """Return header and rows of a ``CsvSink``'s file, without a last line that the end of the process cut short.
+    """Return header and rows of a ``CsvSink``'s file, without a last line that was cut short.
 
-    Without the header beside it, dt is taken from the column ``time``, and the factors of ``theta`` are unknown.
+    Without the header beside it, dt is taken from the column ``time``, and the factors of ``theta``
+    are unknown.
 
     Raises
     ------
@@ -123,7 +126,7 @@ def _channels(columns: list[str]) -> tuple[tuple[str, int], ...]:
 
 
 def _sample_time(time: Vector, k: Vector) -> float:
-    """Return the dt with the fewest digits for which ``time = k dt`` holds in all rows, to the last bit."""
+    """Return the dt with the fewest digits for which all rows have exactly ``time = k dt``."""
     later = np.flatnonzero(k > 0)
     if later.size == 0:
         raise ValueError(

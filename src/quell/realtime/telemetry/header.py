@@ -31,7 +31,8 @@ class Header:
     device, controller
         names of the device and the controller.
     units
-        of ``y`` and ``u``, for example ``{"y": "rad", "u": "A"}``; ``y-unit`` and ``u-unit`` by default.
+        of ``y`` and ``u``, for example ``{"y": "rad", "u": "A"}``; ``y-unit`` and ``u-unit`` by
+        default.
     notes
         anything else that JSON can represent.
     started

@@ -1,7 +1,8 @@
 """Rows over a Foxglove WebSocket, for Foxglove and for PlotJuggler's Foxglove bridge.
 
-A viewer is no recorder: of a fast loop only a limited number of rows per second is sent, and a slow viewer loses the
-oldest. A row that is sent has the events of all rows since the one before, so that none is lost.
+A viewer is no recorder: of a fast loop only a limited number of rows per second is sent, and a slow
+viewer loses the oldest. A row that is sent has the events of all rows since the one before, so that
+none is lost.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ class LiveSink:
     port
         TCP port; 0 takes any free one.
     host
-        address to listen at; only this machine can connect by default. There is no password: whoever can connect can
-        watch, but not act.
+        address to listen at; only this machine can connect by default. There is no password:
+        whoever can connect can watch, but not act.
     rate
         largest number of rows per second [1/s]; a browser displays a hundred without delay.
 
@@ -69,7 +70,8 @@ class LiveSink:
         except RuntimeError as error:
             reason = str(error).removeprefix("FoxgloveError: ")
             raise ValueError(
-                f"host = {self.host!r}, port = {self.port}: can't listen there ({reason}); choose another port"
+                f"host = {self.host!r}, port = {self.port}: can't listen there ({reason}); choose "
+                "another port"
             ) from None
         self.name = self.url = f"ws://{self.host}:{self._server.port}"
         self._topic = open_topic(foxglove, header, self._context)

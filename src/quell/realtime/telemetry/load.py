@@ -15,16 +15,18 @@ from quell.records.channels import columns_of
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix, Status
 
-# A larger jump of k means a damaged file: 28 hours at 1 kHz, which with 20 channels would fill 16 GB.
+# A larger jump of k means a damaged file: 28 hours at 1 kHz, which with 20 channels would fill 16
+# GB.
 _MOST_ROWS = 100_000_000
 
 
 def load(path: str | os.PathLike[str]) -> Trajectory:
     """Read a recorded run, CSV or MCAP, also if its process was killed.
 
-    A sample of the trajectory is a deadline; time counts from the first one in the file. If deadlines were skipped or
-    rows lost, samples are filled in: r, y, u and the controller's channels stay as they were; ``y_measured``,
-    ``lateness`` and ``step_time`` are NaN, and ``events`` is ``Event.GAP``.
+    A sample of the trajectory is a deadline; time counts from the first one in the file. If
+    deadlines were skipped or rows lost, samples are filled in: r, y, u and the controller's
+    channels stay as they were; ``y_measured``, ``lateness`` and ``step_time`` are NaN, and
+    ``events`` is ``Event.GAP``.
 
     Raises
     ------

@@ -1,8 +1,9 @@
-"""Recordings as MCAP: a message for each row on the topic ``/loop``, and the header as the metadata record ``quell``.
+"""Recordings as MCAP: a message for each row, and the header as metadata.
 
-The file is written by foxglove-sdk, in chunks. A finished chunk is on disk; here chunks are finished twice a second.
-They are not compressed: the values of a loop are mostly noise, of which compression saves a tenth for milliseconds of
-work (``benchmarks/telemetry.py``). The log time of a message is its deadline.
+The topic is ``/loop``, the metadata record ``quell``. The file is written by foxglove-sdk, in
+chunks. A finished chunk is on disk; here chunks are finished twice a second. They are not
+compressed: the values of a loop are mostly noise, of which compression saves about a tenth
+for milliseconds of work. The log time of a message is its deadline.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ MAGIC = b"\x89MCAP0\r\n"
 RECORD = "quell"
 """Name of the metadata record with the header."""
 
-# Time between two chunks [s]: with the writer's period of at most 0.25 s, a killed process loses less than 1 s.
+# Time between two chunks [s]: with the writer's period of at most 0.25 s, a killed process loses
+# less than 1 s.
 _CHUNK_TIME = 0.5
 # Messages that are converted to an array at once when reading; chosen by hand, not tuned further.
 _BLOCK = 4096
@@ -35,8 +37,8 @@ _BLOCK = 4096
 class _File:
     """File for foxglove's writer that keeps the first error instead of raising it.
 
-    The writer would hide the reason of a failure and log each later message. It is told that all went well;
-    ``error`` holds the failure.
+    The writer would hide the reason of a failure and log each later message. It is told that all
+    went well; ``error`` holds the failure.
     """
 
     def __init__(self, path: Path) -> None:

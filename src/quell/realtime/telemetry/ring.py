@@ -1,9 +1,10 @@
-"""A ring buffer between the loop and the telemetry writer, which are two threads; neither of them waits.
+"""A ring buffer between the threads of loop and telemetry writer; neither of them waits.
 
-One producer, one consumer, no lock (Lamport, "Specifying Concurrent Program Modules", ACM TOPLAS 5(2), 1983).
-``HEAD`` counts the rows written, ``TAIL`` those read; each has one writer. The producer writes a row and then, as a
-*release*, the new head; the consumer reads the head as an *acquire* and finds the row complete. The tail keeps the
-producer off rows that are still being read in the same way. If the ring is full, the newest row is dropped and counted.
+One producer, one consumer, no lock (Lamport, "Specifying Concurrent Program Modules", ACM TOPLAS
+5(2), 1983). ``HEAD`` counts the rows written, ``TAIL`` those read; each has one writer. The
+producer writes a row and then, as a *release*, the new head; the consumer reads the head as an
+*acquire* and finds the row complete. The tail keeps the producer off rows that are still being read
+in the same way. If the ring is full, the newest row is dropped and counted.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from quell.kernels.dispatch import compiled, kernel
 from quell.realtime.system.atomics import load_acquire, store_release
 from quell.types import Matrix, Vector
 
-# Indices of ``Ring.ends``, 16 words = 128 bytes apart: processors fetch cache lines of 64 bytes, some of them in pairs.
+# Indices of ``Ring.ends``, 16 words = 128 bytes apart: processors fetch cache lines of 64 bytes,
+# some of them in pairs.
 HEAD, TAIL, DROPPED = 0, 16, 32
 _WORDS = 48
 
@@ -29,7 +31,7 @@ class Ring(NamedTuple):
     rows: Matrix
     """(capacity, width); row number k is stored at k modulo capacity."""
     ends: NDArray[np.int64]
-    """At ``HEAD`` the number of rows written, at ``TAIL`` of those read, at ``DROPPED`` of those dropped."""
+    """Numbers of rows written (at ``HEAD``), read (``TAIL``) and dropped (``DROPPED``)."""
 
 
 def ring(capacity: int, width: int) -> Ring:
@@ -48,7 +50,7 @@ def ring(capacity: int, width: int) -> Ring:
 
 @kernel
 def push(ring: Ring, row: Vector) -> bool:
-    """Write a row, on the producer's thread; return whether there was room. It neither waits nor allocates."""
+    """Write a row, on the producer's thread, without waiting; return whether there was room."""
     rows, ends = ring.rows, ring.ends
     head = ends[HEAD]  # only this thread writes it
     if head - load_acquire(ends, TAIL) >= rows.shape[0]:

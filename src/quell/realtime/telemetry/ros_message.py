@@ -1,8 +1,8 @@
-"""Rows as ROS 2 messages, which PlotJuggler and Foxglove read without configuration, from files and live.
+"""Rows as ROS 2 messages, which PlotJuggler and Foxglove read without configuration.
 
-The definition (``ros2msg``) has a line for each channel. The message in plain CDR, little endian (OMG DDSI-RTPS 2.5,
-10.2), is a mark of four bytes and then the values: all have 64 bits, so nothing is padded, and arrays of fixed length
-have no count.
+The definition (``ros2msg``) has a line for each channel. The message in plain CDR, little endian
+(OMG DDSI-RTPS 2.5, section 10.2), is a mark of four bytes and then the values: all have 64 bits, so
+nothing is padded, and arrays of fixed length have no count.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MARK = b"\x00\x01\x00\x00"
 
 
 def definition(header: Header) -> str:
-    """Return the definition of a row's message: ``float64 y``, ``float64[3] x_hat``, … with meanings and units."""
+    """Return the definition of a row's message: ``float64[3] x_hat  # estimated state […]``, …"""
     lines = []
     for name, width in header.channels:
         if width:

@@ -30,7 +30,7 @@ class Sink(Protocol):
         """Take the next rows (rows, width), in order."""
 
     def flush(self) -> None:
-        """Bring what was taken to where it outlives this process; called after each round of ``write``."""
+        """Store what was taken where it outlives this process; called after each round of rows."""
 
     def close(self) -> None:
         """End the recording."""

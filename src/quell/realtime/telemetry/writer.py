@@ -1,11 +1,13 @@
 """The telemetry writer: a thread that takes the loop's rows out of a ring and passes them to sinks.
 
-The loop puts a row into the ring each cycle and never waits. The writer empties the ring some twenty times a second. A
-sink that fails (disk full, no permission) is closed and reported; the loop and the other sinks go on.
+The loop puts a row into the ring each cycle and never waits. The writer empties the ring some
+twenty times a second. A sink that fails (disk full, no permission) is closed and reported; the loop
+and the other sinks go on.
 
-An interpreted loop shares Python's interpreter with the writer. Therefore the writer works in bursts of 0.1 ms and
-sleeps in between. On a busy machine a thread of ordinary priority may be suspended for milliseconds in the middle of a
-burst, while it holds the interpreter: for such a loop the writer takes the lowest real-time priority (``urgent``).
+An interpreted loop shares Python's interpreter with the writer. Therefore the writer works in
+bursts of 0.1 ms and sleeps in between. On a busy machine a thread of ordinary priority may be
+suspended for milliseconds in the middle of a burst, while it holds the interpreter: for such a loop
+the writer takes the lowest real-time priority (``urgent``).
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from quell.types import Matrix
 
 _LOG = logging.getLogger(__name__)
 
-# Values per burst: they take CSV about 0.1 ms (benchmarks/telemetry.py), after which the writer sleeps as long [s].
+# Values per burst: they take CSV about 0.1 ms (benchmarks/telemetry.py), after which the writer
+# sleeps as long [s].
 _BURST = 100
 _PAUSE = 1e-4
 # The ring holds the rows of so many seconds, so that a disk may stall as long; chosen by hand.
@@ -47,8 +50,9 @@ class TelemetryWriter:
     period
         time between two rounds of emptying the ring [s].
     urgent
-        True if the loop is interpreted and has a real-time priority above 1: the writer then takes priority 1 if
-        permitted. Otherwise it takes an ordinary one, even if it would inherit another.
+        True if the loop is interpreted and has a real-time priority above 1: the writer then takes
+        priority 1 if permitted. Otherwise it takes an ordinary one, even if it would inherit
+        another.
 
     Attributes
     ----------
@@ -62,7 +66,8 @@ class TelemetryWriter:
     Raises
     ------
     ValueError
-        for a period that is not positive, or above 0.25 s: a killed process must lose less than one second.
+        for a period that is not positive, or above 0.25 s: a killed process must lose less than one
+        second.
     """
 
     def __init__(
@@ -78,7 +83,8 @@ class TelemetryWriter:
             period > 0.25
         ):  # half a second of an MCAP chunk and a quarter here leave a margin of a quarter
             raise ValueError(
-                f"period = {period!r} s: must be at most 0.25 s, or a killed process may lose more than a second"
+                f"period = {period!r} s: must be at most 0.25 s, or a killed process may lose more "
+                "than a second"
             )
         self.ring: Ring = ring(max(_LEAST_ROWS, math.ceil(_CAPACITY / header.dt)), header.width)
         self.urgent = urgent
@@ -97,7 +103,8 @@ class TelemetryWriter:
     def start(self) -> None:
         """Open all sinks and start writing.
 
-        Call it before the loop's thread takes a real-time priority or a processor of its own: threads inherit both.
+        Call it before the loop's thread takes a real-time priority or a processor of its own:
+        threads inherit both.
 
         Raises
         ------
@@ -119,7 +126,7 @@ class TelemetryWriter:
         self._thread.start()
 
     def stop(self, timeout: float = 10.0) -> None:
-        """Write what is left in the ring and close all sinks; wait at most ``timeout`` [s] for a disk that hangs."""
+        """Write the rest of the ring and close all sinks; give up after ``timeout`` [s]."""
         self._stopped.set()
         self._thread.join(timeout)
         if self._thread.is_alive():
