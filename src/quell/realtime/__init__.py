@@ -35,7 +35,7 @@ _HOME = {
     "LiveSink": "telemetry.live",
     "McapSink": "telemetry.mcap_file",
     "Rig": "rig.server",
-    "RigRun": "loop.outcome",
+    "RigRun": "loop.result",
     "Safety": "loop.safety",
     "TwinDevice": "devices.twin",
     "load": "telemetry.load",

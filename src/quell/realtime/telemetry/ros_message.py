@@ -21,7 +21,7 @@ MARK = b"\x00\x01\x00\x00"
 
 
 def definition(header: Header) -> str:
-    """Return the definition of a row's message: ``float64[3] x_hat  # estimated state […]``, …"""
+    """Return the definition of a row's message, with meanings and units as comments."""
     lines = []
     for name, width in header.channels:
         if width:
