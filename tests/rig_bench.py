@@ -1,0 +1,138 @@
+"""A rig that ticks only when a test says so, with devices at the other end of its wire."""
+
+from __future__ import annotations
+
+import fcntl
+import struct
+import termios
+import threading
+import uuid
+import zlib
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+
+import quell as ql
+from quell.realtime.devices.base import read_measurement
+from quell.realtime.devices.registry import listen
+from quell.realtime.rig.kernel import APPLIED
+from quell.realtime.rig.server import Rig
+from quell.realtime.system.clock import system_clock
+from quell.realtime.wire.frames import LENGTH
+from quell.realtime.wire.serial_line import SerialDevice
+from quell.realtime.wire.shared_memory import SharedMemoryDevice
+from quell.realtime.wire.transport import wait_for_frame
+from quell.realtime.wire.udp import UdpDevice
+
+DT = 0.01
+PLANT = ql.plants.two_mass_spring()
+DEVICES = {"udp": UdpDevice, "shm": SharedMemoryDevice, "serial": SerialDevice}
+WIRES = tuple(DEVICES)
+
+
+def url_of(wire: str) -> str:
+    """Return a URL at which a rig can listen."""
+    urls = {"udp": "udp://127.0.0.1:0", "serial": "serial://pty"}
+    return urls.get(wire, f"shm://test-{uuid.uuid4().hex}")
+
+
+def connect(url: str, dt: float = DT, timeout: float = 30.0) -> Any:
+    """Return the device at a URL."""
+    return DEVICES[url.partition(":")[0]](url, dt, timeout)
+
+
+def law(y: float) -> float:
+    """Return some u."""
+    return 1.0 - 0.7 * y
+
+
+def packed(
+    kind: int,
+    number: int,
+    answers: int,
+    value: float,
+    *,
+    session: int = 0x5EED0001,
+    version: int = 1,
+    time: int = 0,
+    state: int = 0,
+) -> bytes:
+    """Return a frame, made without the package."""
+    numbers = number % 2**32, answers % 2**32
+    head = struct.pack("<2sBBIIIqdI", b"QL", version, kind, session, *numbers, time, value, state)
+    return head + struct.pack("<I", zlib.crc32(head))
+
+
+class Bench:
+    """A rig, and the devices that are opened on it."""
+
+    def __init__(self, stack: ExitStack, wire: str = "udp", url: str = "", **settings: Any) -> None:
+        self._stack = stack
+        self.rig = stack.enter_context(Rig(PLANT, DT, listen(url or url_of(wire)), **settings))
+        self.rig.prepare()
+        self.url = self.rig.listener.url
+
+    @property
+    def applied(self) -> float:
+        """The u that acts on the plant."""
+        return float(self.rig.model.signals[APPLIED])
+
+    def open(
+        self,
+        url: str = "",
+        dt: float = DT,
+        timeout: float = 30.0,
+        meanwhile: Callable[[], Any] = lambda: None,
+    ) -> Any:
+        """Return a device; the rig ticks until it is open, or raise what it raised."""
+        made: list[Any] = []
+
+        def work() -> None:
+            try:
+                made.append(connect(url or self.url, dt, timeout))
+            except Exception as error:
+                made.append(error)
+
+        self.tick_during(work, meanwhile)
+        if isinstance(made[0], Exception):
+            raise made[0]
+        self._stack.callback(made[0].close)
+        read_all(made[0])
+        return made[0]
+
+    def tick_during(
+        self, work: Callable[[], Any], meanwhile: Callable[[], Any] = lambda: None
+    ) -> None:
+        """Tick while ``work`` runs on a thread."""
+        thread = threading.Thread(target=work)
+        thread.start()
+        while thread.is_alive():
+            self.rig.tick()
+            meanwhile()
+            thread.join(0.002)
+
+    def await_frame(self) -> None:
+        """Wait until a frame has arrived: a pseudoterminal takes its time."""
+        if not self.url.startswith("serial"):
+            return
+        waiting, port = np.zeros(1, dtype=np.int32), self.rig.model.transport.port.fd
+        while waiting[0] < LENGTH + 2:
+            wait_for_frame(self.rig.model.transport, 100_000_000)
+            fcntl.ioctl(port, termios.FIONREAD, waiting)
+
+    def cycle(self, device: Any, law: Callable[[float], float], count: int = 1) -> list[float]:
+        """Let ``count`` ticks pass, each answered; return what was measured."""
+        measured = []
+        for _ in range(count):
+            self.rig.tick()
+            measured.append(device.read())
+            device.write(law(measured[-1]))
+            self.await_frame()
+        return measured
+
+
+def read_all(device: Any) -> None:
+    """Take all that has come so far."""
+    read_measurement(device.handle, system_clock(), 0)
