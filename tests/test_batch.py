@@ -11,7 +11,7 @@ import pytest
 
 import quell as ql
 from quell.plants import PlantBatch, batch, two_mass_spring
-from quell.simulation import driver
+from quell.simulation import sampled_scenario
 
 MASSES = np.array([0.9, 1.0, 1.1])
 PLANTS = batch(two_mass_spring, m1=MASSES, k=1.0)
@@ -44,9 +44,9 @@ def as_it_is() -> ql.ADRC:
 def test_each_run_of_a_batch_is_the_run_alone(
     learner: object, two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bit for bit, in all channels, with rests, noise, a thinned record, and stretches of any length."""
+    """Bit for bit, in all channels, with rests, noise, a thinned record, and segments of any length."""
     law = controller(learner=learner, guard=ql.Guard())
-    monkeypatch.setattr(driver, "_BLOCK", 1001)
+    monkeypatch.setattr(sampled_scenario, "_SEGMENT", 1001)
     runs = ql.simulate(PLANTS, law, two_mass_scenario, record="all", record_every=7, workers=2)
     monkeypatch.undo()
     assert runs["y"].shape == (3, len(runs.t))

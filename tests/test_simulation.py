@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.simulation import driver
+from quell.simulation import sampled_scenario
 
 PLANT = ql.plants.two_mass_spring()
 
@@ -24,12 +24,12 @@ def test_the_same_seed_gives_the_same_bits(two_mass_scenario: ql.Scenario) -> No
     assert np.any(ql.simulate(PLANT, controller(), other)["y_measured"] != runs[0]["y_measured"])
 
 
-def test_the_block_size_leaves_no_trace(
+def test_the_segment_length_changes_nothing(
     two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Signals are made in pieces, the record is one."""
     whole = ql.simulate(PLANT, controller(), two_mass_scenario)
-    monkeypatch.setattr(driver, "_BLOCK", 77)
+    monkeypatch.setattr(sampled_scenario, "_SEGMENT", 77)
     np.testing.assert_array_equal(
         ql.simulate(PLANT, controller(), two_mass_scenario).log, whole.log
     )

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quell import checks
+from quell.controllers.base import Controller, check_controller
 from quell.parallel import in_parallel, one_blas_thread
+from quell.plants.base import Plant, check_plant
 from quell.plants.batch import PlantBatch
 from quell.records.batch_trajectory import BatchTrajectory
-from quell.records.channels import columns_of, readable_names
-from quell.simulation.driver import Course, Loop, Stretch, channels_of, check_part, pieces
+from quell.records.channels import Channels, columns_of, readable_names
+from quell.simulation.driver import Loop, logged_channels
+from quell.simulation.sampled_scenario import SampledScenario, Segment, segment_bounds
+from quell.simulation.scenario import Scenario, check_scenario
 
 _RECORDED = ("r", "y", "u")
-# Runs in a job: enough that a thread seldom comes back for more, few enough that progress is told
-# and no thread is left waiting.
-_RUNS_AT_ONCE = 16
+# Runs in a job: enough that threads seldom wait for the next one, few enough that progress is
+# reported often and that all threads end at about the same time. Chosen by hand.
+_RUNS_PER_JOB = 16
 
 
 def simulate_batch(
-    plant: Any,
-    controller: Any,
-    scenario: Any,
+    plant: Plant | Sequence[Plant],
+    controller: Controller | Sequence[Controller],
+    scenario: Scenario | Sequence[Scenario],
     record_every: int = 1,
     limit: float | None = None,
     interpret: bool = False,
@@ -33,61 +37,59 @@ def simulate_batch(
     record: Sequence[str] | None = None,
     workers: int | None = None,
 ) -> BatchTrajectory:
-    """Run every plant of a batch; see ``quell.simulate``."""
-    plants, controllers, scenarios = _parts(plant, controller, scenario)
+    """Run every plant, controller and scenario of a batch; see ``quell.simulate``."""
+    plants, controllers, scenarios = _members(plant, controller, scenario)
     every = checks.whole("record_every", record_every, 1)
     workers = None if workers is None else checks.whole("workers", workers, 1)
-    courses = _courses(scenarios, plants[0], controllers, limit)
-    course, runs = courses[0], len(courses)
-    every_channel = channels_of(plants[0], controllers[0])
-    channels = _wanted(_RECORDED if record is None else record, every_channel)
-    columns = [
-        column
-        for name, _ in channels
-        for column in range(*columns_of(every_channel, name).indices(10**9))
-    ]
-    loops = _loops(plants, controllers, courses, interpret)
-    # Column by column, so that a channel of all runs lies in one piece.
-    log = np.moveaxis(np.empty((len(columns), runs, (course.samples - 1) // every + 1)), 0, -1)
+    sampled = _sampled(scenarios, plants[0], controllers, limit)
+    dt, samples, runs = sampled[0].dt, sampled[0].samples, len(sampled)
+    logged = logged_channels(plants[0], controllers[0])
+    width = sum(width for _, width in logged)
+    channels = _selected(_RECORDED if record is None else record, logged)
+    columns = [k for name, _ in channels for k in range(width)[columns_of(logged, name)]]
+    loops = _loops(plants, controllers, sampled, interpret)
+    # Column by column, so that a channel of all runs is contiguous in memory.
+    log = np.moveaxis(np.empty((len(columns), runs, (samples - 1) // every + 1)), 0, -1)
     lengths = np.zeros(runs, dtype=np.int64)
 
-    def proceed(
-        which: NDArray[np.int64], first: int, last: int, shared: Mapping[int, Stretch]
+    def run_some(
+        which: Sequence[int], first: int, last: int, shared: Mapping[SampledScenario, Segment]
     ) -> None:
-        """Take some runs through a stretch, in a thread of its own."""
-        own = np.empty(((last - first) // every + 1, sum(width for _, width in every_channel)))
-        for i in which.tolist():
-            stretch = shared.get(id(courses[i])) or courses[i].stretch(first, last)
+        """Take some runs through a segment, in a thread."""
+        buffer = np.empty(((last - first) // every + 1, width))
+        for i in which:
+            segment = shared.get(sampled[i]) or sampled[i].segment(first, last)
             try:
-                rows = loops[i].run(stretch, own, 0, every)
+                rows = loops[i].run(segment, buffer, 0, every)
             except ValueError as error:
                 raise ValueError(f"run {i}: {error}") from error
             at = int(lengths[i])
             for k, column in enumerate(columns):
-                log[i, at : at + rows, k] = own[:rows, column]
+                log[i, at : at + rows, k] = buffer[:rows, column]
             lengths[i] += rows
 
-    for first, last in pieces(course.samples, set().union(*(c.rests for c in set(courses)))):
-        live = np.array([i for i in range(runs) if not loops[i].diverged], dtype=np.int64)
-        if live.size == 0:
+    counts = Counter(sampled)
+    for first, last in segment_bounds(samples, set().union(*(s.rest_samples for s in counts))):
+        live = [i for i in range(runs) if not loops[i].diverged]
+        if not live:
             break
-        shared = {id(c): c.stretch(first, last) for c in _several(courses)}
+        shared = {s: s.segment(first, last) for s, count in counts.items() if count > 1}
         jobs = [
-            partial(proceed, live[i : i + _RUNS_AT_ONCE], first, last, shared)
-            for i in range(0, live.size, _RUNS_AT_ONCE)
+            partial(run_some, live[i : i + _RUNS_PER_JOB], first, last, shared)
+            for i in range(0, len(live), _RUNS_PER_JOB)
         ]
-        in_parallel(jobs, _told(progress, first, last, course.samples), workers)
+        in_parallel(jobs, _progress_within(progress, first, last, samples), workers)
     for i in range(runs):
         log[i, lengths[i] :] = np.nan
     return BatchTrajectory(
         log=log,
         channels=channels,
-        dt=course.dt,
+        dt=dt,
         every=every,
         lengths=lengths,
         status=np.array([int(loop.status) for loop in loops]),
-        ended=np.array([loop.ended for loop in loops]) * course.dt,
-        limit=np.array([c.limit for c in courses]),
+        ended=np.array([loop.ended for loop in loops]) * dt,
+        limit=np.array([s.limit for s in sampled]),
         plant=plants.name if isinstance(plants, PlantBatch) else plants[0].name,
         parameters=plants.parameters if isinstance(plants, PlantBatch) else {},
         features=controllers[0].features,
@@ -95,107 +97,104 @@ def simulate_batch(
     )
 
 
-def _parts(
+def _members(
     plant: Any, controller: Any, scenario: Any
-) -> tuple[Sequence[Any], Sequence[Any], Sequence[Any]]:
+) -> tuple[Sequence[Plant], Sequence[Controller], Sequence[Scenario]]:
     """Return plants, controllers and scenarios, one for each run."""
     given = {"plant": plant, "controller": controller, "scenario": scenario}
+    check = {"plant": check_plant, "controller": check_controller, "scenario": check_scenario}
     lengths = {name: len(value) for name, value in given.items() if isinstance(value, Sequence)}
     (leader, runs), *others = lengths.items()
     for name, length in others:
         if length != runs:
             raise ValueError(
-                f"{name} has {length} entries, {leader} {runs}: must be one for all runs, or one for each"
+                f"{name} has {length} entries, {leader} {runs}: "
+                "must be one for all runs, or one for each"
             )
     if runs == 0:
         raise ValueError(f"{leader} has no entries: a batch must have at least one run")
-    for kind, value in given.items():
-        if kind not in lengths:
-            check_part(kind, value)
-        for i in range(lengths.get(kind, 0)):
-            check_part(kind, value[i], f"{kind}[{i}]")
-    plants = (
-        plant
-        if isinstance(plant, PlantBatch)
-        else PlantBatch(plant)
-        if "plant" in lengths
-        else [plant] * runs
+    for name, value in given.items():
+        if name not in lengths:
+            check[name](value, name)
+            given[name] = [value] * runs
+        else:
+            for i in range(runs):
+                check[name](value[i], f"{name}[{i}]")
+    plants, controllers, scenarios = (
+        given["plant"],
+        list(given["controller"]),
+        list(given["scenario"]),
     )
-    controllers, scenarios = (
-        list(given[kind]) if kind in lengths else [given[kind]] * runs
-        for kind in ("controller", "scenario")
-    )
+    if "plant" in lengths and not isinstance(plants, PlantBatch):
+        plants = PlantBatch(plants)
     for i, other in enumerate(controllers):
         for what in ("dt", "channels", "features"):
-            mine, first = getattr(other, what), getattr(controllers[0], what)
-            if mine != first:
+            value, first = getattr(other, what), getattr(controllers[0], what)
+            if value != first:
                 raise ValueError(
-                    f"controller[{i}] has {what} = {mine!r}, controller[0] {first!r}: must be the same; run them as two batches"
+                    f"controller[{i}] has {what} = {value!r}, controller[0] {first!r}: "
+                    "must be the same; run them as two batches"
                 )
     return plants, controllers, scenarios
 
 
-def _courses(
-    scenarios: Sequence[Any], plant: Any, controllers: Sequence[Any], limit: float | None
-) -> list[Course]:
-    """Return the course of each run; runs of one scenario share theirs."""
-    found: dict[tuple[int, int], Course] = {}
-    courses: list[Course] = []
+def _sampled(
+    scenarios: Sequence[Scenario],
+    plant: Plant,
+    controllers: Sequence[Controller],
+    limit: float | None,
+) -> list[SampledScenario]:
+    """Return the sampled scenario of each run; runs of one scenario share theirs."""
+    found: dict[tuple[int, int], SampledScenario] = {}
+    sampled: list[SampledScenario] = []
     for i, (scenario, controller) in enumerate(zip(scenarios, controllers, strict=True)):
         key = id(scenario), getattr(controller, "derivatives", 0)
         if key not in found:
-            found[key] = Course.of(scenario, plant, controller, limit)
-        courses.append(found[key])
-        if courses[i].samples != courses[0].samples:
+            found[key] = SampledScenario.of(scenario, plant, controller, limit)
+        sampled.append(found[key])
+        if sampled[i].samples != sampled[0].samples:
             raise ValueError(
-                f"scenario[{i}] has duration = {scenario.duration!r} s, scenario[0] {scenarios[0].duration!r} s: "
-                "must be the same in all runs of a batch; run them as two batches"
+                f"scenario[{i}] has duration = {scenario.duration!r} s, scenario[0] "
+                f"{scenarios[0].duration!r} s: must be the same in all runs of a batch; "
+                "run them as two batches"
             )
-    return courses
-
-
-def _several(courses: Sequence[Course]) -> list[Course]:
-    """Return the courses that more than one run takes."""
-    count: dict[int, int] = {}
-    for course in courses:
-        count[id(course)] = count.get(id(course), 0) + 1
-    return list({id(course): course for course in courses if count[id(course)] > 1}.values())
+    return sampled
 
 
 def _loops(
-    plants: Sequence[Any], controllers: Sequence[Any], courses: Sequence[Course], interpret: bool
+    plants: Sequence[Plant],
+    controllers: Sequence[Controller],
+    sampled: Sequence[SampledScenario],
+    interpret: bool,
 ) -> list[Loop]:
     models: dict[int, Any] = {}
     with one_blas_thread():
         for plant in plants:
             if id(plant) not in models:
-                models[id(plant)] = plant.sampled(courses[0].dt, interpret)
+                models[id(plant)] = plant.sampled(sampled[0].dt, interpret)
     return [
-        Loop(plant, models[id(plant)], controllers[i], courses[i], interpret)
+        Loop(plant, models[id(plant)], controllers[i], sampled[i], interpret)
         for i, plant in enumerate(plants)
     ]
 
 
-def _wanted(
-    record: Sequence[str], channels: tuple[tuple[str, int], ...]
-) -> tuple[tuple[str, int], ...]:
-    """Return the channels of a log that are to be kept, in the log's order."""
-    names = readable_names(channels)
-    asked = set(names if record == "all" else [record] if isinstance(record, str) else record)
-    for name in asked:
+def _selected(record: Sequence[str], logged: Channels) -> Channels:
+    """Return the channels of a log that are to be recorded, in the log's order."""
+    names = readable_names(logged)
+    wanted = set(names if record == "all" else [record] if isinstance(record, str) else record)
+    for name in wanted:
         checks.one_of("record", name, (*names, "all"))
-    if not asked:
+    if not wanted:
         raise ValueError(f"record = {record!r}: must name at least one channel")
-    if "f_hat" in asked:
-        asked |= {"f_learned", "f_residual"}
-    return tuple((name, width) for name, width in channels if name in asked)
+    if "f_hat" in wanted:
+        wanted |= {"f_learned", "f_residual"}
+    return tuple((name, width) for name, width in logged if name in wanted)
 
 
-def _told(
+def _progress_within(
     progress: Callable[[float], None] | None, first: int, last: int, samples: int
 ) -> Callable[[float], None] | None:
-    return (
-        None
-        if progress is None
-        else lambda share: progress((first + share * (last - first)) / samples)
-    )
+    """Return a callback for the share done of the samples from ``first`` to ``last``."""
+    if progress is None:
+        return None
+    return lambda share: progress((first + share * (last - first)) / samples)

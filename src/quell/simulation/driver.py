@@ -1,16 +1,11 @@
-"""The inner loop: a plant and a controller, sample by sample, through stretches of a scenario."""
+"""The inner loop: a plant and a controller, sample by sample, in segments of a scenario."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from quell import checks
 from quell.controllers.base import (
     Controller,
     control,
@@ -22,24 +17,9 @@ from quell.controllers.base import (
 from quell.kernels.dispatch import compiled, dispatcher_for, interpreted
 from quell.kernels.user_types import explain_compile_errors
 from quell.plants.base import Plant, advance, measure
-from quell.records.sample_times import first_sample_at, in_steps
-from quell.signals import Signal
+from quell.records.channels import Channels
+from quell.simulation.sampled_scenario import SampledScenario, Segment
 from quell.types import Matrix, Status, Vector
-
-# Signals are evaluated so many samples at a time: enough to make Python's share small, few enough
-# to stay in cache.
-_BLOCK = 8192
-# Time in steps of dt is exact to a part in a thousand of a step up to here.
-_MOST_SAMPLES = 10**12
-# What each part of a loop is known by, and what to give.
-_PARTS = {
-    "plant": (
-        "sampled",
-        "a plant, for example quell.plants.two_mass_spring() or quell.plants.LinearPlant.of(model)",
-    ),
-    "controller": ("initial_state", "a controller, for example quell.ADRC(...)"),
-    "scenario": ("seeded_signals", "a quell.Scenario"),
-}
 
 
 @compiled
@@ -61,11 +41,11 @@ def run_block(
     until_next: int,
     limit: float,
 ) -> tuple[int, int, int, int]:
-    """Run ``r.size`` samples from the time ``t0``; write every ``every``-th into ``log`` from ``row`` on.
+    """Run ``r.size`` samples from the time ``t0``; log every ``every``-th from ``row`` on.
 
-    Returns how many samples were run (fewer than asked where the loop diverged: ``|y|`` beyond
-    ``limit``, or not finite), the next row, how many samples are left until it is written, and all
-    status flags that were seen.
+    Returns the number of samples that were run (fewer if the loop diverged: ``|y|`` beyond
+    ``limit``, or not finite), the next row, the number of samples until it is written, and all
+    status flags.
     """
     inputs = w.shape[1]
     status = 0
@@ -97,97 +77,28 @@ def run_block(
 
 @compiled
 def start_from_rest(design: Any, state: Any) -> None:
-    """Start the controller from rest, with what it has learned."""
+    """Start the controller from rest; it keeps what it has learned."""
     reset_loop(design, state)
 
 
-class Stretch(NamedTuple):
-    """Some samples of a course, evaluated."""
-
-    first: int
-    dt: float
-    from_rest: bool
-    """Whether the loop starts from rest at its first sample."""
-    r: Vector
-    derivatives: Matrix
-    w: Matrix
-    noise: Vector
-
-
-@dataclass(frozen=True, eq=False)
-class Course:
-    """A scenario as the samples of a loop."""
-
-    signals: tuple[Signal, tuple[Signal, ...], Signal]
-    derivatives: tuple[Signal, ...]
-    """Of the reference, those that the controller heeds."""
-    samples: int
-    dt: float
-    x0: Vector
-    limit: float
-    rests: frozenset[int]
-
-    @classmethod
-    def of(cls, scenario: Any, plant: Any, controller: Controller, limit: float | None) -> Course:
-        """Return the course of a scenario for a plant of this order and a controller; ``limit`` as ``simulate`` takes it."""
-        dt = controller.dt
-        if scenario.duration / dt > _MOST_SAMPLES:
-            raise ValueError(
-                f"duration = {scenario.duration!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES:.0e} samples"
-            )
-        samples = math.floor(in_steps(scenario.duration, dt)) + 1
-        x0 = (
-            np.zeros(plant.order)
-            if scenario.x0 is None
-            else checks.vector("x0", scenario.x0, plant.order)
-        )
-        signals = scenario.seeded_signals(plant.disturbances)
-        limit = (
-            _default_limit(signals[0], x0, samples, dt)
-            if limit is None
-            else checks.positive("limit", limit)
-        )
-        rests = frozenset(first_sample_at(time, dt, samples) for time in scenario.rest_at)
-        derivatives = _derivatives(signals[0], getattr(controller, "derivatives", 0))
-        return cls(signals, derivatives, samples, dt, x0, limit, rests)
-
-    def stretch(self, first: int, last: int) -> Stretch:
-        """Return the samples from ``first`` to before ``last``."""
-        reference, disturbances, noise = self.signals
-        t = np.arange(first, last) * self.dt
-        w = np.empty((t.size, len(disturbances)))
-        for j, disturbance in enumerate(disturbances):
-            w[:, j] = disturbance(t)
-        rates = (
-            np.array([rate(t) for rate in self.derivatives])
-            .reshape(len(self.derivatives), t.size)
-            .T.copy()
-        )
-        r, added = np.ascontiguousarray(reference(t)), np.ascontiguousarray(noise(t))
-        return Stretch(first, self.dt, first in self.rests, r, rates, w, added)
-
-
-def pieces(samples: int, rests: Iterable[int]) -> list[tuple[int, int]]:
-    """Return where stretches begin and end: none is long, none has a start from rest but at its beginning."""
-    return list(pairwise(sorted({*range(0, samples, _BLOCK), *rests, samples})))
-
-
 class Loop:
-    """A plant and a controller under way; ``run`` takes them through stretches one after the other."""
+    """A plant and a controller during a run; ``run`` takes them through a segment."""
 
     def __init__(
-        self, plant: Plant, model: Any, controller: Controller, course: Course, interpret: bool
+        self,
+        plant: Plant,
+        model: Any,
+        controller: Controller,
+        scenario: SampledScenario,
+        interpret: bool,
     ) -> None:
-        self.model, self.design, self.state = (
-            model,
-            controller.parameters,
-            controller.initial_state(),
-        )
-        self.x0, self.limit = course.x0, course.limit
-        self.x, self.scratch = course.x0.copy(), np.zeros(6 * plant.order)
+        self.model, self.design = model, controller.parameters
+        self.state = controller.initial_state()
+        self.x0, self.limit = scenario.x0, scenario.limit
+        self.x, self.scratch = scenario.x0.copy(), np.zeros(6 * plant.order)
         self.done = self.status = self.until_next = 0
         as_python = interpret or not plant.compiled
-        self._block, self._to_rest = (
+        self._run_block, self._start_from_rest = (
             interpreted(f) if as_python else dispatcher_for(f, model, self.design)
             for f in (run_block, start_from_rest)
         )
@@ -197,75 +108,33 @@ class Loop:
         """Whether it has ended early."""
         return bool(self.status & Status.DIVERGED)
 
-    def run(self, stretch: Stretch, log: Matrix, row: int, every: int) -> int:
-        """Run a stretch, write every ``every``-th sample into ``log`` from ``row`` on, and return the next row."""
-        first, dt, from_rest, r, derivatives, w, noise = stretch
-        # An interpreted loop that diverges would warn of every overflow; the status says it once.
+    @property
+    def ended(self) -> int:
+        """The sample at which it ended."""
+        return self.done if self.diverged else self.done - 1
+
+    def run(self, segment: Segment, log: Matrix, row: int, every: int) -> int:
+        """Run a segment, log every ``every``-th sample from ``row`` on, and return the next row."""
+        first, dt, from_rest, *signals = segment
+        loop = (self.model, self.x, self.scratch, self.design, self.state, first * dt, dt)
+        # An interpreted loop that diverges would warn of every overflow; the status reports it
+        # once.
         with (
             np.errstate(over="ignore", invalid="ignore"),
             explain_compile_errors(self.model, self.design),
         ):
             if from_rest:
                 self.x[:] = self.x0
-                self._to_rest(self.design, self.state)
-            ran, row, self.until_next, seen = self._block(
-                *(
-                    self.model,
-                    self.x,
-                    self.scratch,
-                    self.design,
-                    self.state,
-                    first * dt,
-                    dt,
-                    r,
-                    derivatives,
-                    w,
-                    noise,
-                ),
-                *(log, row, every, self.until_next, self.limit),
+                self._start_from_rest(self.design, self.state)
+            samples, row, self.until_next, flags = self._run_block(
+                *loop, *signals, log, row, every, self.until_next, self.limit
             )
-        self.done = first + ran
-        self.status |= seen if ran == r.size else seen | Status.DIVERGED
+        self.done = first + samples
+        self.status |= flags if samples == segment.r.size else flags | Status.DIVERGED
         return int(row)
 
-    @property
-    def ended(self) -> int:
-        """The sample at which it ended."""
-        return self.done if self.diverged else self.done - 1
 
-
-def check_part(kind: str, value: Any, name: str = "") -> None:
-    """Check that ``value``, the argument ``name``, is of a ``kind``: plant, controller or scenario."""
-    has, wanted = _PARTS[kind]
-    if isinstance(value, type) or not hasattr(value, has):
-        raise ValueError(f"{name or kind} = {value!r}: must be {wanted}")
-
-
-def channels_of(plant: Any, controller: Controller) -> tuple[tuple[str, int], ...]:
-    """Return name and width of what ``run_block`` logs, in order."""
-    return (
-        *(
-            ("r", 1),
-            ("y", 1),
-            ("y_measured", 1),
-            ("u", 1),
-            ("w", plant.disturbances),
-            ("x", plant.order),
-        ),
-        *controller.channels,
-    )
-
-
-def _default_limit(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
-    """Return a million times what is asked of the loop: a loop in encoder counts is not one that diverges."""
-    early = reference(np.arange(min(samples, _BLOCK)) * dt)
-    sizes = np.abs([1.0, *x0, *early[np.isfinite(early)]])
-    return 1e6 * float(np.max(sizes))
-
-
-def _derivatives(reference: Signal, count: int) -> tuple[Signal, ...]:
-    """Return the first ``count`` derivatives of the reference."""
-    found: list[Signal] = []
-    for _ in range(count):
-        found.append((found[-1] if found else reference).derivative())
-    return tuple(found)
+def logged_channels(plant: Plant, controller: Controller) -> Channels:
+    """Return name and width of the columns that ``run_block`` logs, in order."""
+    scalars = tuple((name, 1) for name in ("r", "y", "y_measured", "u"))
+    return (*scalars, ("w", plant.disturbances), ("x", plant.order), *controller.channels)

@@ -1,4 +1,4 @@
-"""A scenario: what happens to a loop during a run."""
+"""A scenario: signals, duration and initial state of a run."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from quell.signals import Constant, Signal, as_signal, seeded_apart
 
 @dataclass(frozen=True)
 class Scenario:
-    """What happens to the loop.
+    """Signals, duration and initial state of a run.
 
     Parameters
     ----------
     reference
-        what y has to follow [y-unit]; a signal or a number.
+        signal or number that y has to follow [y-unit].
     disturbances
         one signal or number for each disturbance input of the plant, in its order; missing ones are
         zero.
     noise
-        what is added to y before the controller sees it; none by default.
+        signal added to y before the controller sees it; none by default.
     duration
-        how long it takes [s]; the record has the samples from 0 to ``duration``, both included.
+        length of the run [s]; the record has the samples from 0 to ``duration``, both included.
     x0
         the plant's state at the start; zero by default.
     rest_at
-        times [s] at which the plant is put back to ``x0`` and the controller starts from rest, with
-        what it has learned.
+        times [s] at which the plant is put back to ``x0`` and the controller starts from rest; it
+        keeps what it has learned.
     seed
-        which noise; the same seed gives the same bits.
+        seed of all random signals; the same seed gives the same bits.
 
     Raises
     ------
     ValueError
-        for a duration that is not positive, a seed below zero, something that is no signal, or
-        ``rest_at`` times that do not increase within the duration.
+        if the duration is not positive, the seed is negative, a signal is none, or the times in
+        ``rest_at`` do not increase within the duration.
     """
 
     reference: Signal | float = 0.0
@@ -57,7 +57,8 @@ class Scenario:
         as_signal(self.noise, "noise")
         if not isinstance(self.disturbances, Sequence):
             raise ValueError(
-                f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers, one for each input"
+                f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers, "
+                "one for each input"
             )
         for i, disturbance in enumerate(self.disturbances):
             as_signal(disturbance, f"disturbances[{i}]")
@@ -66,18 +67,25 @@ class Scenario:
             np.any(np.diff(times) <= 0.0) or times[0] <= 0.0 or times[-1] >= self.duration
         ):
             raise ValueError(
-                f"rest_at = {self.rest_at!r}: must increase and lie within (0, duration = {self.duration!r})"
+                f"rest_at = {self.rest_at!r}: must increase and lie within "
+                f"(0, duration = {self.duration!r})"
             )
 
     def seeded_signals(self, inputs: int) -> tuple[Signal, tuple[Signal, ...], Signal]:
-        """Return the reference, ``inputs`` disturbances and the noise, with all that is random drawn from ``seed``."""
+        """Return the reference, ``inputs`` disturbances and the noise, seeded."""
         if len(self.disturbances) > inputs:
             raise ValueError(
-                f"disturbances has {len(self.disturbances)} signals: the plant has {inputs} disturbance inputs"
+                f"disturbances has {len(self.disturbances)} signals: the plant has {inputs} "
+                "disturbance inputs"
             )
         given = (as_signal(self.reference), *map(as_signal, self.disturbances))
         noise = as_signal(self.noise).seeded(self.seed)
-        # The noise takes the seed itself, so that its bits do not depend on how many disturbances
-        # there are.
+        # The noise has the seed itself: its bits must not depend on the number of disturbances.
         reference, *disturbances = seeded_apart(given, self.seed)
         return reference, (*disturbances, *[Constant(0.0)] * (inputs - len(disturbances))), noise
+
+
+def check_scenario(value: Any, name: str = "scenario") -> None:
+    """Raise a ``ValueError`` if ``value``, the argument ``name``, is not a scenario."""
+    if isinstance(value, type) or not hasattr(value, "seeded_signals"):
+        raise ValueError(f"{name} = {value!r}: must be a quell.Scenario")

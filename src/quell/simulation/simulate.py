@@ -1,4 +1,4 @@
-"""Simulation of plants and controllers through scenarios: one run, or many."""
+"""``simulate``: one run of a plant and a controller through a scenario, or a batch of runs."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
-from quell.controllers.base import Controller
+from quell.controllers.base import Controller, check_controller
 from quell.lti.models import is_linear_model
-from quell.plants.base import Plant
+from quell.plants.base import Plant, check_plant
 from quell.plants.linear import LinearPlant
 from quell.records.batch_trajectory import BatchTrajectory
 from quell.records.trajectory import Trajectory
 from quell.simulation.batch import simulate_batch
-from quell.simulation.driver import Course, Loop, channels_of, check_part, pieces
-from quell.simulation.scenario import Scenario
+from quell.simulation.driver import Loop, logged_channels
+from quell.simulation.sampled_scenario import SampledScenario, segment_bounds
+from quell.simulation.scenario import Scenario, check_scenario
 from quell.types import Status
 
 
@@ -57,27 +58,27 @@ def simulate(
     record: Sequence[str] | None = None,
     workers: int | None = None,
 ) -> Trajectory | BatchTrajectory:
-    """Run a controller on a plant through a scenario; or many of them, each on its own, on all cores.
+    """Run a controller on a plant through a scenario, or a batch of them on all cores.
 
-    The controller starts with nothing learned, on a state of its own: neither it nor the plant is
+    The controller starts with nothing learned, from a new state: neither it nor the plant is
     changed.
 
     Parameters
     ----------
     plant, controller, scenario
-        what to run; the sample time is the controller's. A linear plant may also be given as
-        ``LinearPlant.of`` takes it, for example as ``(numerator, denominator)``: numbers in a tuple
-        or a list are one plant. Where one of the three is a sequence of plants
-        (``quell.plants.batch``, or a list of them), controllers or scenarios, it is a batch: a run
-        for each of its entries, the others the same in all runs or a sequence of the same length.
-        Run i is, bit for bit, what ``simulate`` gives for the i-th plant, controller and scenario
-        alone. So all runs of one scenario have the same noise; for other noise give a sequence of
-        scenarios with other seeds. All runs of a batch have the same sample time and duration.
+        parts of the loop; the sample time is the controller's. A linear plant may also be any
+        argument of ``LinearPlant.of``, for example ``(numerator, denominator)``: a tuple or a list
+        of numbers is one plant. If one of the three is a sequence of plants (``quell.plants.batch``
+        or a list), controllers or scenarios, it is a batch: one run for each of its entries; the
+        others are the same in all runs or a sequence of the same length. Run i is, bit for bit, the
+        result of ``simulate`` for the i-th plant, controller and scenario alone. So all runs of one
+        scenario have the same noise; for different noise pass scenarios with different seeds. All
+        runs of a batch have the same sample time and duration.
     record_every
-        keep every so-many-th sample; the memory used is that of the record.
+        record every ``record_every``-th sample; memory is used only for these.
     limit
-        the run ends early, with ``Status.DIVERGED``, where ``|y|`` goes beyond it or is not finite
-        [y-unit]; by default at a million times the largest of 1, ``|x0|`` and the reference in the
+        the run ends early, with ``Status.DIVERGED``, if ``|y|`` exceeds it or is not finite
+        [y-unit]; by default a million times the largest of 1, ``|x0|`` and the reference in the
         first samples.
     interpret
         run the same functions as plain Python, the plant's too, to debug; about a thousand times
@@ -85,14 +86,14 @@ def simulate(
     progress
         called with the share done, 0 to 1, every few thousand samples, or every few runs.
     record
-        for a batch: the channels to keep; ``("r", "y", "u")`` by default. A single run keeps all.
+        for a batch: channels to record, ``("r", "y", "u")`` by default. A single run records all.
     workers
-        for a batch: how many threads share it; as many as there are cores by default.
+        for a batch: number of threads; the number of cores by default.
 
     Returns
     -------
     Trajectory or BatchTrajectory
-        what was recorded, as far as the run went.
+        the recorded samples, up to the end of the run.
 
     Raises
     ------
@@ -109,31 +110,33 @@ def simulate(
     for name, value in (("record", record), ("workers", workers)):
         if value is not None:
             raise ValueError(
-                f"{name} = {value!r}: is for a batch; a single run records all channels, in this thread"
+                f"{name} = {value!r}: is for a batch; a single run records all channels, "
+                "in this thread"
             )
-    check_part("plant", plant)
-    check_part("controller", controller)
-    check_part("scenario", scenario)
+    check_plant(plant)
+    check_controller(controller)
+    check_scenario(scenario)
     every = checks.whole("record_every", record_every, 1)
-    course = Course.of(scenario, plant, controller, limit)
-    loop = Loop(plant, plant.sampled(course.dt, interpret), controller, course, interpret)
-    channels = channels_of(plant, controller)
-    log = np.empty(((course.samples - 1) // every + 1, sum(width for _, width in channels)))
+    sampled = SampledScenario.of(scenario, plant, controller, limit)
+    dt, samples = sampled.dt, sampled.samples
+    loop = Loop(plant, plant.sampled(dt, interpret), controller, sampled, interpret)
+    channels = logged_channels(plant, controller)
+    log = np.empty(((samples - 1) // every + 1, sum(width for _, width in channels)))
     row = 0
-    for first, last in pieces(course.samples, course.rests):
-        row = loop.run(course.stretch(first, last), log, row, every)
+    for first, last in segment_bounds(samples, sampled.rest_samples):
+        row = loop.run(sampled.segment(first, last), log, row, every)
         if loop.diverged:
             break
         if progress is not None:
-            progress(last / course.samples)
+            progress(last / samples)
     return Trajectory(
         log=log[:row],
         channels=channels,
-        dt=course.dt,
+        dt=dt,
         every=every,
         status=Status(loop.status),
-        ended=loop.ended * course.dt,
-        limit=course.limit,
+        ended=loop.ended * dt,
+        limit=sampled.limit,
         plant=plant.name,
         features=controller.features,
         final_state=loop.state,
