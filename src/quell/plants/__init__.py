@@ -1,4 +1,8 @@
-"""Plants: what is to be controlled."""
+"""Plants: the systems to be controlled, each with an exact or numerical solution for a sample.
+
+May import ``lti``, ``kernels`` and what stands before them. A new plant needs its own file, a line
+in ``registry.py`` and, if it is public, its name here.
+"""
 
 from quell.plants.base import Plant
 from quell.plants.batch import PlantBatch, batch

@@ -1,8 +1,7 @@
-"""What the driver asks of a plant.
+"""The interface of a plant: a protocol for its description and two functions for its kernels.
 
-A plant is an object with ``order`` (number of states), ``disturbances`` (number of disturbance inputs), ``name``, and
-``compiled`` and ``sampled(dt)``, which returns a NamedTuple of parameters. For the type of that NamedTuple two functions are registered:
-``measure`` and ``advance``. See ``linear.py`` for a complete example.
+``Plant.sampled`` returns a NamedTuple of parameters. ``measure`` and ``advance`` are registered for
+the type of that NamedTuple; ``linear.py`` is a complete example.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ class Plant(Protocol):
 
     @property
     def name(self) -> str:
-        """What tables and plots call it."""
+        """Name for tables and plots."""
 
     @property
     def order(self) -> int:
@@ -33,28 +32,31 @@ class Plant(Protocol):
         """Whether the driver can run it compiled."""
 
     def sampled(self, dt: float, interpret: bool = False) -> Any:
-        """Return the parameters for a sample time ``dt`` [s]; with ``interpret``, such that Python can run and debug them."""
+        """Return the parameters for a sample time ``dt`` [s].
+
+        With ``interpret`` Python can run and debug them.
+        """
 
 
 class PlantWrapper:
-    """What a plant that is put around another one has of that one."""
+    """The properties that a wrapper takes over from the plant inside."""
 
-    plant: Any
+    plant: Plant
 
     @property
     def order(self) -> int:
         """Number of states."""
-        return int(self.plant.order)
+        return self.plant.order
 
     @property
     def disturbances(self) -> int:
-        """Number of disturbance inputs; they act as ever."""
-        return int(self.plant.disturbances)
+        """Number of disturbance inputs."""
+        return self.plant.disturbances
 
     @property
     def compiled(self) -> bool:
         """Whether the driver can run it compiled."""
-        return bool(self.plant.compiled)
+        return self.plant.compiled
 
 
 def check_plant(value: Any, name: str = "plant") -> None:
@@ -74,5 +76,8 @@ def measure(plant: Any, x: Vector) -> float:
 
 @generic
 def advance(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
-    """Move the state ``x`` (n,) on by a sample from the time ``t`` [s]; ``u`` and ``w`` (m,) hold. ``scratch`` has room for 6 n."""
+    """Advance the state ``x`` (n,) by a sample from the time ``t`` [s], with held u and w (m,).
+
+    ``scratch`` has room for 6 n numbers.
+    """
     raise TypeError

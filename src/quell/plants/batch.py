@@ -1,4 +1,4 @@
-"""Many plants of one kind."""
+"""Batches of plants of one kind."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ from quell.plants.base import Plant, check_plant
 
 
 class PlantBatch(Sequence[Plant]):
-    """Plants of one kind, order and number of disturbances: ``len(batch)`` of them, ``batch[i]`` is one, ``batch[i:j]`` a batch again.
+    """Plants of one kind, order and number of disturbances.
+
+    ``batch[i]`` is a plant, ``batch[i:j]`` a batch again.
 
     Parameters
     ----------
     plants
         at least one.
     parameters
-        by name, in which they differ: arrays (runs,).
+        arrays (runs,) of the parameters in which the plants differ, by name.
 
     Raises
     ------
     ValueError
-        where one is no plant, or is of another kind, order or number of disturbances than the first; the message says which.
+        if an entry is no plant, or is of another kind, order or number of disturbances than the
+        first.
     """
 
     def __init__(
@@ -37,32 +40,31 @@ class PlantBatch(Sequence[Plant]):
             raise ValueError("plants has no entries: a batch must hold at least one plant")
         for i, plant in enumerate(self._plants):
             check_plant(plant, f"plant[{i}]")
-            for what, (mine, first) in {
-                "kind": (type(plant).__name__, type(self._plants[0]).__name__),
-                "order": (plant.order, self._plants[0].order),
-                "disturbances": (plant.disturbances, self._plants[0].disturbances),
-            }.items():
-                if mine != first:
+            for what, own, common in (
+                ("kind", type(plant).__name__, type(self[0]).__name__),
+                ("order", plant.order, self.order),
+                ("disturbances", plant.disturbances, self.disturbances),
+            ):
+                if own != common:
                     raise ValueError(
-                        f"plant[{i}] has {what} {mine}, plant[0] {first}: must be the same; run them as two batches"
+                        f"plant[{i}] has {what} {own}, plant[0] {common}: must be the same; run "
+                        "them as two batches"
                     )
         arrays = {name: np.array(values) for name, values in (parameters or {}).items()}
         for name, array in arrays.items():
             if array.shape != (len(self._plants),):
                 raise ValueError(
-                    f"parameters[{name!r}] has shape {array.shape}: must be ({len(self._plants)},), one value for each plant"
+                    f"parameters[{name!r}] has shape {array.shape}: must be "
+                    f"({len(self._plants)},), one value for each plant"
                 )
             array.flags.writeable = False
         self.parameters: Mapping[str, NDArray[Any]] = MappingProxyType(arrays)
 
     @property
     def name(self) -> str:
-        """Their name, where it is the same."""
-        return (
-            self._plants[0].name
-            if len({plant.name for plant in self._plants}) == 1
-            else f"{len(self)} plants"
-        )
+        """Common name of the plants, or their number if the names differ."""
+        names = {plant.name for plant in self._plants}
+        return names.pop() if len(names) == 1 else f"{len(self)} plants"
 
     @property
     def order(self) -> int:
@@ -83,29 +85,28 @@ class PlantBatch(Sequence[Plant]):
     def __getitem__(self, which: slice) -> PlantBatch: ...
     def __getitem__(self, which: int | slice) -> Plant | PlantBatch:
         if isinstance(which, slice):
-            return PlantBatch(
-                self._plants[which],
-                {name: values[which] for name, values in self.parameters.items()},
-            )
+            parameters = {name: values[which] for name, values in self.parameters.items()}
+            return PlantBatch(self._plants[which], parameters)
         return self._plants[which]
 
 
 def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
-    """Return a plant for each entry of the parameters' arrays.
+    """Return a batch with a plant for each entry of the parameters' arrays.
 
     Parameters
     ----------
     factory
-        makes one plant of numbers, for example ``quell.plants.two_mass_spring``; what is not a number belongs into a ``functools.partial``.
-        A factory that makes a new function for each ``NonlinearPlant`` has each compiled.
+        function that makes a plant from numbers, for example ``quell.plants.two_mass_spring``; use
+        ``functools.partial`` for arguments that are not numbers. If it makes a new function for
+        each ``NonlinearPlant``, each function is compiled.
     parameters
         numbers or vectors (runs,), broadcast against each other.
 
     Raises
     ------
     ValueError
-        for vectors that do not have the same length, a parameter that the factory does not know, and a plant that it refuses: the message
-        says which run.
+        for vectors of different lengths, a parameter that the factory does not have, and a plant
+        that it refuses; the message names the run.
 
     Examples
     --------
@@ -122,7 +123,8 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
         if length not in (1, runs) or length == 0:
             longest = max(lengths, key=lambda name: lengths[name])
             raise ValueError(
-                f"{name} has {length} entries, {longest} {runs}: must be numbers or vectors of one length, at least 1"
+                f"{name} has {length} entries, {longest} {runs}: must be numbers or vectors of one "
+                "length, at least 1"
             )
     whole = {name: np.broadcast_to(array, (runs,)) for name, array in arrays.items()}
     columns = {name: values.tolist() for name, values in whole.items()}
@@ -130,7 +132,8 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
         inspect.signature(factory).bind(**columns)
     except TypeError as error:
         raise ValueError(
-            f"parameters = {', '.join(parameters) or 'none'}: the factory can't be called with them: {error}"
+            f"parameters = {', '.join(parameters) or 'none'}: the factory can't be called with "
+            f"them: {error}"
         ) from None
     plants = []
     for i in range(runs):
@@ -142,16 +145,13 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
 
 
 def _numbers(name: str, value: Any) -> NDArray[Any]:
+    rule = "must be a number or a vector of numbers, one for each run"
     try:
         array = np.asarray(value)
     except ValueError:  # ragged
         array = np.empty((), dtype=object)
     if array.dtype.kind not in "iuf":
-        raise ValueError(
-            f"{name}: must be a number or a vector of numbers, one for each run, got {value!r:.60}"
-        )
+        raise ValueError(f"{name}: {rule}, got {value!r:.60}")
     if array.ndim > 1:
-        raise ValueError(
-            f"{name} has shape {array.shape}: must be a number or a vector of numbers, one for each run"
-        )
+        raise ValueError(f"{name} has shape {array.shape}: {rule}")
     return array

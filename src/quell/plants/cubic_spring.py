@@ -1,7 +1,8 @@
 """Two masses, a spring that may harden or soften, and an actuator with lag.
 
-The benchmark of Wie & Bernstein (1992) in the extended form of Rocchetta, Crespo & Kenny (*Solution of the Benchmark Control Problem by
-Scenario Optimization*, DSCC 2019, doi 10.1115/DSCC2019-8949)::
+The benchmark of Wie & Bernstein (1992) in the extended form of Rocchetta, Crespo & Kenny (*Solution
+of the Benchmark Control Problem by Scenario Optimization*, DSCC 2019, doi
+10.1115/DSCC2019-8949)::
 
     m1 x1'' = −p + λ F + w1          p = k (x1 − x2) + k_cubic (x1 − x2)³
     m2 x2'' =  p + w2                y = x2
@@ -19,11 +20,12 @@ from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.linear import LinearModel, LinearPlant
+from quell.plants.two_mass_spring import two_mass_matrices
 from quell.types import Matrix, Vector
 
 
 class CubicSpringModel(NamedTuple):
-    """The plant sampled: its linear part exactly, as a ``LinearModel``, and half a sample's push of the cubic spring."""
+    """The sampled plant: the fields of a ``LinearModel``, and the impulses of the cubic spring."""
 
     transition: Matrix
     """Φ (5, 5)."""
@@ -33,9 +35,9 @@ class CubicSpringModel(NamedTuple):
     """Γ_w (5, 2)."""
     output: Vector
     """C (5,)."""
-    push1: float
-    """What a stretch of 1 m adds to the velocity of m1 in half a sample, ``−k_cubic dt / 2 m1``."""
-    push2: float
+    impulse1: float
+    """Velocity that m1 gains in half a sample at a spring length of 1 m, ``−k_cubic dt / 2 m1``."""
+    impulse2: float
     """The same for m2, ``k_cubic dt / 2 m2``."""
 
 
@@ -48,31 +50,26 @@ def _measure(plant: CubicSpringModel, x: Vector) -> float:
 def _advance(
     plant: CubicSpringModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
 ) -> None:
-    _push(plant, x)
-    advance(
-        LinearModel(plant.transition, plant.input, plant.disturbance, plant.output),
-        x,
-        scratch,
-        t,
-        u,
-        w,
-    )
-    _push(plant, x)
+    _apply_cubic_force(plant, x)
+    linear = LinearModel(plant.transition, plant.input, plant.disturbance, plant.output)
+    advance(linear, x, scratch, t, u, w)
+    _apply_cubic_force(plant, x)
 
 
 @kernel
-def _push(plant: CubicSpringModel, x: Vector) -> None:
+def _apply_cubic_force(plant: CubicSpringModel, x: Vector) -> None:
     cube = (x[0] - x[1]) ** 3
-    x[2] += plant.push1 * cube
-    x[3] += plant.push2 * cube
+    x[2] += plant.impulse1 * cube
+    x[3] += plant.impulse2 * cube
 
 
 @dataclass(frozen=True, eq=False)
 class CubicSpringPlant:
     """Two masses with a cubic spring; ``lagged_two_mass_spring`` makes it.
 
-    It is advanced by Strang's splitting (Hairer, Lubich & Wanner, *Geometric Numerical Integration*, II.5): half the cubic force's push,
-    the linear plant exactly for a whole sample, the other half. The error is of order dt²; the linear part, however stiff, has none.
+    It is solved by Strang splitting (Hairer, Lubich & Wanner, *Geometric Numerical Integration*,
+    II.5): half the impulse of the cubic force, the linear plant exactly for a whole sample, the
+    other half. The error is of order dt²; the linear part, however stiff, has none.
     """
 
     linear: LinearPlant
@@ -97,7 +94,7 @@ class CubicSpringPlant:
         return True
 
     def sampled(self, dt: float, interpret: bool = False) -> CubicSpringModel:
-        """Return the plant sampled at ``dt`` [s], for the driver (interpreted or not, the same)."""
+        """Return the parameters for a sample time ``dt`` [s]."""
         half = 0.5 * self.k_cubic * checks.positive("dt", dt, "s")
         return CubicSpringModel(*self.linear.sampled(dt), -half / self.m1, half / self.m2)
 
@@ -110,11 +107,12 @@ def lagged_two_mass_spring(
     effectiveness: float = 1.0,
     lag: float = 0.01,
 ) -> LinearPlant | CubicSpringPlant:
-    """Return two masses on a spring, pushed through an actuator with lag.
+    """Return two masses on a spring, driven by an actuator with lag.
 
-    States: positions of m1 and m2 [m], their velocities [m/s], the actuator's force before its effectiveness [N]. The control signal u [N]
-    drives the actuator; the disturbance forces w1 and w2 act on m1 and m2 [N]. Output ``y = x2`` [m]. A unit impulse on m2 at t = 0 is the
-    start from ``x0 = (0, 0, 0, 1/m2, 0)``.
+    States: positions of m1 and m2 [m], their velocities [m/s], the actuator's force before its
+    effectiveness [N]. The control signal u [N] drives the actuator; the disturbance forces w1 and
+    w2 act on m1 and m2 [N]. Output ``y = x2`` [m]. A unit impulse on m2 at t = 0 is the start from
+    ``x0 = (0, 0, 0, 1/m2, 0)``.
 
     Parameters
     ----------
@@ -123,7 +121,8 @@ def lagged_two_mass_spring(
     k
         stiffness of the spring [N/m].
     k_cubic
-        its cubic part [N/m³]: hardening above zero, softening below; by default there is none, and the plant is a ``LinearPlant``.
+        its cubic part [N/m³]: hardening above zero, softening below; by default there is none, and
+        the plant is a ``LinearPlant``.
     effectiveness
         share λ of the actuator's force that reaches m1.
     lag
@@ -132,30 +131,17 @@ def lagged_two_mass_spring(
     Raises
     ------
     ValueError
-        for a mass, stiffness, effectiveness or lag that is not positive, or a ``k_cubic`` that is not finite.
+        for a mass, stiffness, effectiveness or lag that is not positive, or a ``k_cubic`` that is
+        not finite.
     """
-    m1, m2, k = (
-        checks.positive("m1", m1, "kg"),
-        checks.positive("m2", m2, "kg"),
-        checks.positive("k", k, "N/m"),
-    )
-    effectiveness, lag = (
-        checks.positive("effectiveness", effectiveness),
-        checks.positive("lag", lag, "s"),
-    )
-    cubic = None if k_cubic is None else checks.finite("k_cubic", k_cubic)
-    A = np.zeros((5, 5))
-    A[0, 2] = A[1, 3] = 1.0
-    A[2, :2] = -k / m1, k / m1
-    A[3, :2] = k / m2, -k / m2
-    A[2, 4], A[4, 4] = effectiveness / m1, -1.0 / lag
-    E = np.zeros((5, 2))
-    E[2, 0], E[3, 1] = 1.0 / m1, 1.0 / m2
-    linear = LinearPlant(
-        A,
-        B=[0.0, 0.0, 0.0, 0.0, 1.0 / lag],
-        C=[0.0, 1.0, 0.0, 0.0, 0.0],
-        E=E,
-        name="two-mass-spring with lag",
-    )
-    return linear if cubic is None else CubicSpringPlant(linear, m1, m2, cubic)
+    masses, forces = two_mass_matrices(m1, m2, k)
+    effectiveness = checks.positive("effectiveness", effectiveness)
+    lag = checks.positive("lag", lag, "s")
+    A, E = np.zeros((5, 5)), np.zeros((5, 2))
+    A[:4, :4], E[:4] = masses, forces
+    A[2, 4], A[4, 4] = effectiveness / float(m1), -1.0 / lag
+    B, C = [0.0, 0.0, 0.0, 0.0, 1.0 / lag], [0.0, 1.0, 0.0, 0.0, 0.0]
+    linear = LinearPlant(A, B, C, E, name="two-mass-spring with lag")
+    if k_cubic is None:
+        return linear
+    return CubicSpringPlant(linear, float(m1), float(m2), checks.finite("k_cubic", k_cubic))

@@ -1,7 +1,7 @@
-"""A plant behind a delay: what is sent to it arrives a while later.
+"""A plant with an input delay.
 
-``x' = f(x, u(t − τ), w)`` with ``τ = d dt``. Its state is the plant's, followed by the last d values of u, the newest first: the state that
-the record shows, and that a start from rest sets to zero.
+``x' = f(x, u(t − τ), w)`` with ``τ = d dt``. The state is that of the plant, followed by the last d
+values of u, newest first. The record shows this state, and a start from rest sets it to zero.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from quell.types import Vector
 
 
 class DelayedPlantModel(NamedTuple):
-    """A sampled plant behind a delay of at least one sample."""
+    """A sampled plant with a delay of at least one sample."""
 
     inner: Any
-    """The plant's own parameters."""
+    """Parameters of the plant without delay."""
     size: int
     """Number of its states."""
 
@@ -42,29 +42,33 @@ def _advance(
 
 @dataclass(frozen=True, eq=False)
 class DelayedPlant(PlantWrapper):
-    """A plant whose control signal arrives ``samples`` samples of ``dt`` [s] late; make it with ``delayed``."""
+    """A plant whose control signal arrives ``samples`` samples of ``dt`` [s] late.
 
-    plant: Any
+    Make it with ``delayed``.
+    """
+
+    plant: Plant
     samples: int
     dt: float
 
     @property
     def name(self) -> str:
-        """What tables and plots call it."""
+        """Name for tables and plots."""
         return f"{self.plant.name}, {self.samples * self.dt:g} s late"
 
     @property
     def order(self) -> int:
-        """Number of states, the u under way included."""
-        return int(self.plant.order) + self.samples
+        """Number of states, including the delayed values of u."""
+        return self.plant.order + self.samples
 
     def sampled(self, dt: float, interpret: bool = False) -> DelayedPlantModel:
-        """Return the parameters for the sample time ``dt`` [s] that it was made for."""
+        """Return the parameters for the sample time ``dt`` [s] of the delay."""
         if abs(dt - self.dt) > 1e-9 * self.dt:
             raise ValueError(
-                f"dt = {dt!r} s: this delayed plant has the states of {self.dt!r} s; make it with dt={dt!r}"
+                f"dt = {dt!r} s: this delayed plant has the states of {self.dt!r} s; make it with "
+                f"dt={dt!r}"
             )
-        return DelayedPlantModel(self.plant.sampled(dt, interpret), int(self.plant.order))
+        return DelayedPlantModel(self.plant.sampled(dt, interpret), self.plant.order)
 
 
 def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
@@ -75,14 +79,15 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
     plant
         any plant.
     delay
-        [s], at least one sample and a whole number of them.
+        [s], at least one sample and a whole number of samples.
     dt
-        the sample time that it will be run with [s]; it decides how many values of u are under way.
+        sample time of the later runs [s]; it decides how many values of u are stored.
 
     Raises
     ------
     ValueError
-        for a delay of less than a sample or of no whole number of samples, and for something that is no plant.
+        if the delay is shorter than a sample or no whole number of samples, or ``plant`` is not a
+        plant.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""A plant whose output is counted: an encoder has a finite number of counts a turn.
+"""A plant whose output is quantized by an encoder with a finite number of counts a turn.
 
-``y = q floor(y_plant/q + 1/2)`` with ``q = 2π/counts``. The counter is set to zero half-way between two edges, so that it errs by at most
-q/2 to either side. Between two edges the plant moves unseen; its state is as fine as ever.
+``y = q floor(y_plant/q + 1/2)`` with ``q = 2π/counts``. The counter is zeroed half-way between two
+edges, so its error is at most q/2 in both directions. Only the output is quantized, not the state.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from quell.types import Vector
 
 
 class EncodedPlantModel(NamedTuple):
-    """A sampled plant behind an encoder."""
+    """A sampled plant with an encoder."""
 
     inner: Any
-    """The plant's own parameters."""
+    """Parameters of the plant without encoder."""
     resolution: float
     """q [y-unit]."""
 
 
 @kernel
 def quantized(value: float, resolution: float) -> float:
-    """Return the multiple of ``resolution`` next to ``value``: what a counter, or a converter, makes of it."""
+    """Return the multiple of ``resolution`` nearest to ``value``."""
     return resolution * np.floor(value / resolution + 0.5)
 
 
@@ -47,19 +47,22 @@ def _advance(
 
 @dataclass(frozen=True, eq=False)
 class EncodedPlant(PlantWrapper):
-    """A plant whose output [rad] an encoder of ``counts`` a turn measures; make it with ``encoded``."""
+    """A plant whose output [rad] is read by an encoder of ``counts`` a turn.
 
-    plant: Any
+    Make it with ``encoded``.
+    """
+
+    plant: Plant
     counts: int
 
     @property
     def resolution(self) -> float:
-        """What one count is [rad]."""
+        """Angle of one count [rad]."""
         return math.tau / self.counts
 
     @property
     def name(self) -> str:
-        """What tables and plots call it."""
+        """Name for tables and plots."""
         return f"{self.plant.name}, {self.counts} counts a turn"
 
     def sampled(self, dt: float, interpret: bool = False) -> EncodedPlantModel:
@@ -68,19 +71,19 @@ class EncodedPlant(PlantWrapper):
 
 
 def encoded(plant: Plant, counts: int) -> EncodedPlant:
-    """Return a plant whose y, an angle [rad], is read off an encoder.
+    """Return a plant whose output y, an angle [rad], is read by an encoder.
 
     Parameters
     ----------
     plant
         any plant.
     counts
-        how many the encoder gives a turn, all four edges of its two channels counted.
+        counts of the encoder a turn, with all four edges of its two channels.
 
     Raises
     ------
     ValueError
-        for counts that are no whole number above zero, and for something that is no plant.
+        if ``counts`` is no whole number above zero, or ``plant`` is not a plant.
 
     Examples
     --------

@@ -49,7 +49,7 @@ def _advance(plant: LinearModel, x: Vector, scratch: Vector, t: float, u: float,
 
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
-    """``x' = A x + B u + E w``, ``y = C x``, of any size, with one input, one output and any number of disturbances.
+    """A linear plant ``x' = A x + B u + E w``, ``y = C x`` of any size with one input and output.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class LinearPlant:
     Raises
     ------
     ValueError
-        where shapes do not fit or an entry is not finite.
+        if shapes do not fit or an entry is not finite.
     """
 
     A: Any
@@ -85,35 +85,41 @@ class LinearPlant:
 
     @classmethod
     def of(cls, model: Any, E: Any = None, *, name: str = "linear plant") -> LinearPlant:
-        """Return what ``model`` describes as a plant; all that takes a linear plant takes these too.
+        """Return the plant that ``model`` describes, of any kind that functions of quell accept.
 
         Parameters
         ----------
         model
             one of
 
-            * matrices ``(A, B, C)``, or ``(A, B, E, C)`` as in the paper's eq. (1), in a tuple or a list; B, E and C may be vectors,
+            * matrices ``(A, B, C)``, or ``(A, B, E, C)`` as in the paper's eq. (1), in a tuple or a
+              list; B, E and C may be vectors,
             * a transfer function ``(numerator, denominator)``, sequences in descending powers of s,
             * ``(a, b)`` with a number b: ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u``,
-            * a continuous-time ``control.StateSpace`` or ``control.TransferFunction``, of one input and output, with D = 0,
+            * a continuous-time ``control.StateSpace`` or ``control.TransferFunction``, of one input
+              and output, with D = 0,
             * the same of scipy.signal: ``StateSpace``, ``TransferFunction``, ``ZerosPolesGain``,
             * a ``LinearPlant``, which is returned as it is, or anything else with A, B and C.
         E
-            where the disturbance enters: a column (n,) or (n, 1), or the index of one of the plant's own disturbance inputs. By default a
-            plant keeps its own, and for the others it enters where u does.
+            input of the disturbance: a column (n,) or (n, 1), or the index of one of the plant's
+            own disturbance inputs. By default a plant keeps its own, and in other models the
+            disturbance enters where u does.
         name
             for tables and plots.
 
         Returns
         -------
         LinearPlant
-            with the model's own states. A transfer function ``(c_{n−1} s^(n−1) + … + c_0)/(s^n + a_{n−1} s^(n−1) + … + a_0)`` gets states
-            [y-unit/s^(i−1)]: without zeros y and its derivatives, with zeros ``x_1 = y``, ``x_{i+1} = x_i' + a_{n−i} y − c_{n−i} u``.
+            with the model's own states. For a transfer function
+            ``(c_{n−1} s^(n−1) + … + c_0)/(s^n + a_{n−1} s^(n−1) + … + a_0)`` the states
+            [y-unit/s^(i−1)] are y and its derivatives without zeros, and ``x_1 = y``,
+            ``x_{i+1} = x_i' + a_{n−i} y − c_{n−i} u`` with zeros.
 
         Raises
         ------
         ValueError
-            where shapes do not fit, an entry is not finite, y follows u at once, the model is of discrete time, or it is no linear model.
+            if shapes do not fit, an entry is not finite, y follows u at once, the model is of
+            discrete time, or it is no linear model.
 
         Examples
         --------
@@ -145,8 +151,7 @@ class LinearPlant:
         return True
 
     def sampled(self, dt: float, interpret: bool = False) -> LinearModel:
-        """Return the plant sampled with zero-order hold on u and w at ``dt`` [s], for the driver (interpreted or not, the same)."""
-        phi, (gamma, gamma_w) = zero_order_hold(
-            self.A, [self.B, self.E], checks.positive("dt", dt, "s")
-        )
+        """Return the plant sampled at ``dt`` [s] with zero-order hold on u and w."""
+        inputs = [self.B, self.E]
+        phi, (gamma, gamma_w) = zero_order_hold(self.A, inputs, checks.positive("dt", dt, "s"))
         return LinearModel(phi, gamma[:, 0].copy(), gamma_w, self.C[0].copy())

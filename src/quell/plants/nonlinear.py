@@ -1,4 +1,4 @@
-"""Nonlinear plants given by the user's own differential equation."""
+"""Nonlinear plants, given by the differential equation of the user."""
 
 from __future__ import annotations
 
@@ -13,15 +13,9 @@ import numpy as np
 from numba.core import types as nb_types
 
 from quell import checks
-from quell.kernels.dispatch import generic, kernel
-from quell.kernels.function_pointers import (
-    POINTER,
-    NotCompilableError,
-    call,
-    compile_cfunc,
-    evaluate,
-    jit_user_function,
-)
+from quell.kernels import function_pointers, validation
+from quell.kernels.dispatch import generic
+from quell.kernels.function_pointers import POINTER, call, evaluate
 from quell.plants.base import advance, measure
 from quell.types import Vector
 
@@ -30,7 +24,10 @@ _OUTPUT_SIGNATURE = nb_types.float64(POINTER)
 
 
 class CompiledNonlinear(NamedTuple):
-    """A nonlinear plant whose functions are compiled; they are given by address, so that the driver is compiled once for all."""
+    """A nonlinear plant with compiled functions.
+
+    They are given by address, so one compiled driver serves all of them.
+    """
 
     rate: int
     output: int
@@ -40,7 +37,7 @@ class CompiledNonlinear(NamedTuple):
 
 
 class PythonNonlinear(NamedTuple):
-    """A nonlinear plant whose functions only Python can run."""
+    """A nonlinear plant whose functions only Python can run; fields as ``CompiledNonlinear``."""
 
     rate: Callable[..., Any]
     output: Callable[..., Any]
@@ -54,25 +51,29 @@ def derivatives(plant: Any, t: float, x: Vector, u: float, w: Vector, dx: Vector
     raise TypeError
 
 
-@kernel
+@advance.register(CompiledNonlinear)
+@advance.register(PythonNonlinear)
 def _runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
-    """Classical Runge-Kutta, ``substeps`` times (Hairer, Nørsett & Wanner, *Solving ODEs I*, table II.1.2)."""
+    """Take ``substeps`` classical Runge-Kutta steps.
+
+    Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, table II.1.2.
+    """
     n = x.size
     k1, k2, k3 = scratch[:n], scratch[n : 2 * n], scratch[2 * n : 3 * n]
-    k4, at = scratch[3 * n : 4 * n], scratch[4 * n : 5 * n]
+    k4, inner = scratch[3 * n : 4 * n], scratch[4 * n : 5 * n]
     h = plant.step
     for i in range(plant.substeps):
         now = t + i * h
         derivatives(plant, now, x, u, w, k1)
         for j in range(n):
-            at[j] = x[j] + 0.5 * h * k1[j]
-        derivatives(plant, now + 0.5 * h, at, u, w, k2)
+            inner[j] = x[j] + 0.5 * h * k1[j]
+        derivatives(plant, now + 0.5 * h, inner, u, w, k2)
         for j in range(n):
-            at[j] = x[j] + 0.5 * h * k2[j]
-        derivatives(plant, now + 0.5 * h, at, u, w, k3)
+            inner[j] = x[j] + 0.5 * h * k2[j]
+        derivatives(plant, now + 0.5 * h, inner, u, w, k3)
         for j in range(n):
-            at[j] = x[j] + h * k3[j]
-        derivatives(plant, now + h, at, u, w, k4)
+            inner[j] = x[j] + h * k3[j]
+        derivatives(plant, now + h, inner, u, w, k4)
         for j in range(n):
             x[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
 
@@ -80,13 +81,6 @@ def _runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: 
 @measure.register(CompiledNonlinear)
 def _measure(plant: CompiledNonlinear, x: Vector) -> float:
     return evaluate(plant.output, x)
-
-
-@advance.register(CompiledNonlinear)
-def _advance(
-    plant: CompiledNonlinear, x: Vector, scratch: Vector, t: float, u: float, w: Vector
-) -> None:
-    _runge_kutta(plant, x, scratch, t, u, w)
 
 
 @derivatives.register(CompiledNonlinear)
@@ -106,13 +100,6 @@ def _measure_python(plant: PythonNonlinear, x: Vector) -> float:
         return float("nan")
 
 
-@advance.register(PythonNonlinear)
-def _advance_python(
-    plant: PythonNonlinear, x: Vector, scratch: Vector, t: float, u: float, w: Vector
-) -> None:
-    _runge_kutta(plant, x, scratch, t, u, w)
-
-
 @derivatives.register(PythonNonlinear)
 def _derivatives_python(
     plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
@@ -122,33 +109,40 @@ def _derivatives_python(
     except Exception as error:
         if not _out_of_range(error):
             raise
-        dx[:] = np.nan  # as the compiled function has it; the run ends as diverged
+        dx[:] = np.nan  # as in the compiled function; the run ends as diverged
+
+
+def _out_of_range(error: Exception) -> bool:
+    """Return whether a function failed because its value is not a number, such as exp(1000.0)."""
+    return isinstance(error, ArithmeticError) or "math domain" in str(error)
 
 
 @dataclass(frozen=True, eq=False)
 class NonlinearPlant:
-    """``x' = f(t, x, u, w)`` with a function of the user's own, solved by Runge-Kutta of order 4 with a fixed sub-step.
+    """A plant ``x' = f(t, x, u, w)``, solved by Runge-Kutta of order 4 with a fixed sub-step.
 
     Parameters
     ----------
     f
-        ``f(t, x, u, w)`` returns the n derivatives as a tuple, list or array; t [s], x (n,), u a number, w (m,). It is compiled by
-        Numba where that is possible; where not, it runs as Python, about a hundred times slower, and a warning says why.
+        ``f(t, x, u, w)`` returns the n derivatives as a tuple, list or array; t [s], x (n,), u a
+        number, w (m,). Numba compiles it if it can; else it runs as Python, about a hundred times
+        slower, and a warning says why.
     order
         number of states n.
     output
-        what y is: a function ``h(x)``, or the row C of ``y = C x``; the first state by default.
+        the output y: a function ``h(x)``, or the row C of ``y = C x``; the first state by default.
     disturbances
         number m of disturbance inputs.
     substeps
-        Runge-Kutta steps in a sample; u and w hold over the sample.
+        Runge-Kutta steps in a sample; u and w are held over the sample.
     name
         for tables and plots.
 
     Raises
     ------
     ValueError
-        where ``f`` does not return n numbers, or ``output`` fits neither form.
+        if ``f`` does not return n numbers, or ``output`` is neither a row nor a function that
+        returns a number.
 
     Examples
     --------
@@ -169,14 +163,18 @@ class NonlinearPlant:
         checks.whole("substeps", self.substeps, 1)
         if not callable(self.f):
             raise ValueError(f"f = {self.f!r}: must be a function f(t, x, u, w)")
-        returned = _tried("f(0.0, zeros, 0.0, zeros)", self.f, 0.0, np.zeros(n), 0.0, np.zeros(m))
-        if returned is not None and np.shape(returned) != (n,):
+        rule = "f takes (t, x, u, w), output takes (x), with arrays x and w of the plant's sizes"
+        returned = validation.attempt_kernel(
+            "f(0.0, zeros, 0.0, zeros)", rule, self.f, 0.0, np.zeros(n), 0.0, np.zeros(m)
+        )
+        if returned is not validation.UNKNOWN and np.shape(returned) != (n,):
             raise ValueError(
-                f"f returns shape {np.shape(returned)}: must return the {n} derivatives of the state"
+                f"f returns shape {np.shape(returned)}: must return the {n} derivatives of the "
+                "state"
             )
         if not callable(self.output):
             checks.vector("output", self._row, n)
-        elif np.shape(_tried("output(zeros)", self.output, np.zeros(n))) != ():
+        elif np.shape(validation.attempt_kernel("output(zeros)", rule, self.output, np.zeros(n))):
             raise ValueError("output(x) must return one number")
 
     @property
@@ -184,7 +182,7 @@ class NonlinearPlant:
         return np.eye(self.order)[0] if self.output is None else self.output
 
     @cached_property
-    def _measured(self) -> Callable[..., Any]:
+    def _output_function(self) -> Callable[..., Any]:
         if callable(self.output):
             return self.output
         row = tuple(np.asarray(self._row, dtype=float).tolist())
@@ -199,7 +197,7 @@ class NonlinearPlant:
 
     @cached_property
     def _machine_code(self) -> tuple[Any, Any] | None:
-        """The two functions compiled, or None where they can't be; they are kept as long as their addresses are."""
+        """The two compiled functions, kept as long as their addresses; None if Numba can't."""
         n, m = self.order, self.disturbances
 
         def rate(t, px, u, pw, pdx):  # type: ignore[no-untyped-def]
@@ -212,17 +210,19 @@ class NonlinearPlant:
             return h(numba.carray(px, (n,)))
 
         try:
-            f, h = jit_user_function(self.f), jit_user_function(self._measured)
-            return compile_cfunc(_RATE_SIGNATURE, rate), compile_cfunc(_OUTPUT_SIGNATURE, output)
-        except NotCompilableError as error:
-            self._warn(str(error))
+            f = function_pointers.jit_user_function(self.f)
+            h = function_pointers.jit_user_function(self._output_function)
+            return (
+                function_pointers.compile_cfunc(_RATE_SIGNATURE, rate),
+                function_pointers.compile_cfunc(_OUTPUT_SIGNATURE, output),
+            )
+        except function_pointers.NotCompilableError as error:
+            warnings.warn(
+                f"{self.name}: f or output can't be compiled and runs as Python, which is slow "
+                f"({error})",
+                stacklevel=3,
+            )
             return None
-
-    def _warn(self, reason: str) -> None:
-        warnings.warn(
-            f"{self.name}: f or output can't be compiled and runs as Python, which is slow ({reason})",
-            stacklevel=4,
-        )
 
     @property
     def compiled(self) -> bool:
@@ -230,27 +230,9 @@ class NonlinearPlant:
         return self._machine_code is not None
 
     def sampled(self, dt: float, interpret: bool = False) -> CompiledNonlinear | PythonNonlinear:
-        """Return the plant for the driver, at the sample time ``dt`` [s]; with ``interpret``, so that Python runs the functions."""
+        """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
         step = checks.positive("dt", dt, "s") / self.substeps
         if interpret or self._machine_code is None:
-            return PythonNonlinear(self.f, self._measured, step, self.substeps)
+            return PythonNonlinear(self.f, self._output_function, step, self.substeps)
         rate, output = self._machine_code
         return CompiledNonlinear(rate.address, output.address, step, self.substeps)
-
-
-def _tried(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return what a user's function returns; None where the origin is no place for it."""
-    try:
-        return function(*arguments)
-    except Exception as error:
-        if _out_of_range(error):
-            return None
-        raise ValueError(
-            f"{what} fails with {type(error).__name__}: {error}; "
-            "f takes (t, x, u, w), output takes (x), with arrays x and w of the plant's sizes"
-        ) from error
-
-
-def _out_of_range(error: Exception) -> bool:
-    """Tell whether a function was asked for something that is no number there, such as exp(1000.0)."""
-    return isinstance(error, ArithmeticError) or "math domain" in str(error)

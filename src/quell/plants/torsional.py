@@ -1,23 +1,25 @@
-"""The ECP 205 torsional plant: two disks on a shaft, a motor on a belt; the paper's testbed (section V).
+"""The ECP 205 torsional plant, the paper's testbed (section V): two disks on a shaft with a motor.
 
-With the angles θ of the lower disk (1), which the motor drives, and the upper one (2), which is measured::
+The motor drives the lower disk (1) by a belt; the angle of the upper disk (2) is measured. With the
+angles θ and speeds ω::
 
     J1 θ1'' = τ − k (θ1 − θ2) − d (ω1 − ω2) − c1 ω1 − F1 + w1          J1 = J_lower + N² J_motor
     J2 θ2'' =     k (θ1 − θ2) + d (ω1 − ω2) − c2 ω2 − F2 + w2          τ = N k_t i,  |i| ≤ i_max
-    i = k_a q(u),  |u| ≤ 10 V                                           y = what the encoder counts of θ2
+    i = k_a q(u),  |u| ≤ 10 V                                y = θ2 as counted by the encoder
 
-q rounds to the converter's steps. F is Coulomb friction with sticking: ``F = C sign(ω)`` where a disk turns; where it stands F is what
-keeps it standing, up to C.
+q rounds to the converter's steps. F is Coulomb friction with sticking: ``F = C sign(ω)`` while a
+disk turns; while it stands, F is the torque that keeps it standing, up to C.
 
-*How it is solved.* Over a sub-step h the friction torques are constant, and such that at its end each disk either turns against its
-``C`` or stands with less than that (Moreau's time-stepping: Acary & Brogliato, *Numerical Methods for Nonsmooth Dynamical Systems*,
-2008, section 10.1)::
+*Solution.* Over a sub-step h the friction torques are constant. They are such that at its end each
+disk either turns against its ``C`` or stands with less than that (Moreau's time-stepping: Acary &
+Brogliato, *Numerical Methods for Nonsmooth Dynamical Systems*, 2008, section 10.1)::
 
     x⁺ = Φ x + Γ u + Γ_w (w − F),      F_i = C_i sign(ω_i⁺)  or  ω_i⁺ = 0, |F_i| ≤ C_i
 
-Φ and Γ are exact, so without friction the plant has no error, and one sub-step suffices. The two conditions are solved one after the
-other, thrice: within a sub-step a disk hardly feels the other's friction. A disk that sticks stays where it is, and does not creep. Where
-one starts or stops, the error is of order h.
+Φ and Γ are exact, so without friction the solution has no error, and one sub-step suffices. The two
+conditions are solved alternately, three times, because within a sub-step the disks are only weakly
+coupled. A disk that sticks stays where it is and does not creep. If a disk starts or stops, the
+error is of order h.
 """
 
 from __future__ import annotations
@@ -36,26 +38,27 @@ from quell.plants.encoder import EncodedPlantModel, quantized
 from quell.plants.linear import LinearModel, LinearPlant
 from quell.types import Vector
 
-# Longest sub-step [s]: the disks' mode, about 6.5 Hz, moves little in it.
+# Longest sub-step [s]: short against the period of the disks' mode at about 6.5 Hz. Chosen by hand.
 _SUBSTEP = 1e-4
-# A visit makes the two friction torques better by six digits: that is the disks' coupling within a sub-step, squared.
-_VISITS = 3
-# The converter's range, either way [V].
+# Each iteration reduces the error of the two friction torques by six digits, the square of the
+# disks' coupling within a sub-step.
+_ITERATIONS = 3
+# The converter's range in both directions [V] (module docstring).
 _RANGE = 10.0
 
 
 class TorsionalModel(NamedTuple):
     """The disks and their drive, sampled at a sub-step."""
 
-    disks: Any
-    """The disks without Coulomb friction, as a ``LinearModel``; the disturbance inputs are torques on them [N m]."""
+    disks: LinearModel
+    """The disks without Coulomb friction; the disturbances are torques on them [N m]."""
     substeps: int
     coulomb: Vector
     """C of the lower and the upper disk [N m] (2,)."""
     u_max: float
-    """Where the converter or the current limit is reached [V]."""
+    """Limit of u by the converter or the current limit [V]."""
     step: float
-    """The converter's [V]; 0.0 for none."""
+    """Step of the converter [V]; 0.0 for no rounding."""
 
 
 @measure.register(TorsionalModel)
@@ -71,24 +74,24 @@ def _advance(
     applied = min(max(applied, -plant.u_max), plant.u_max)
     for _ in range(plant.substeps):
         advance(plant.disks, x, scratch, t, applied, w)
-        _rub(plant, x)
+        _apply_coulomb_friction(plant, x)
 
 
 @kernel
-def _rub(plant: TorsionalModel, x: Vector) -> None:
-    """Add to the state at the end of a sub-step, found without Coulomb friction, what Coulomb friction makes of it."""
+def _apply_coulomb_friction(plant: TorsionalModel, x: Vector) -> None:
+    """Add the effect of Coulomb friction to the state at the end of a sub-step without it."""
     gamma = plant.disks.disturbance
     lower = upper = 0.0
-    for _ in range(_VISITS):
-        lower = _held(x[2] + gamma[2, 1] * upper, gamma[2, 0], plant.coulomb[0])
-        upper = _held(x[3] + gamma[3, 0] * lower, gamma[3, 1], plant.coulomb[1])
+    for _ in range(_ITERATIONS):
+        lower = _stopping_torque(x[2] + gamma[2, 1] * upper, gamma[2, 0], plant.coulomb[0])
+        upper = _stopping_torque(x[3] + gamma[3, 0] * lower, gamma[3, 1], plant.coulomb[1])
     for i in range(x.size):
         x[i] += gamma[i, 0] * lower + gamma[i, 1] * upper
 
 
 @kernel
-def _held(speed: float, gain: float, largest: float) -> float:
-    """Return the torque that stops a disk which would have ``speed``, as far as friction has it."""
+def _stopping_torque(speed: float, gain: float, largest: float) -> float:
+    """Return the torque that stops a disk of this ``speed``, limited to ±``largest``."""
     return min(max(-speed / gain, -largest), largest)
 
 
@@ -96,25 +99,25 @@ def _held(speed: float, gain: float, largest: float) -> float:
 class TorsionalPlant:
     """Two disks with friction, drive and encoder; ``torsional`` makes it.
 
-    Its states are those of ``linear``, and behind them the values of u under way.
+    Its states are those of ``linear``, followed by the delayed values of u.
     """
 
     linear: LinearPlant
-    """The disks with viscous friction alone, from u [V] to the angle itself: for analysis and observers' design."""
+    """The disks with viscous friction alone, from u [V] to the angle: for analysis and design."""
     coulomb: tuple[float, float]
-    """Of the lower and the upper disk [N m]."""
+    """Coulomb friction of the lower and the upper disk [N m]."""
     u_max: float
-    """Beyond it u has no more effect [V]."""
+    """Limit of u [V]."""
     step: float
-    """What u is rounded to [V]; 0.0 for none."""
+    """Rounding of u [V]; 0.0 for none."""
     counts: int | None
     late: int
-    """How many samples u is late."""
+    """Delay of u in samples."""
     name: str = "torsional plant"
 
     @property
     def order(self) -> int:
-        """Number of states, the u under way included."""
+        """Number of states, including the delayed values of u."""
         return self.linear.order + self.late
 
     @property
@@ -129,14 +132,14 @@ class TorsionalPlant:
 
     @property
     def resolution(self) -> float:
-        """What one count of the encoder is [rad]; 0.0 without one."""
+        """Angle of one count of the encoder [rad]; 0.0 without an encoder."""
         return 0.0 if self.counts is None else math.tau / self.counts
 
     def sampled(self, dt: float, interpret: bool = False) -> Any:
-        """Return the parameters for a sample time ``dt`` [s]: those of the disks, in those of the delay, in those of the encoder."""
+        """Return the parameters for a sample time ``dt`` [s]: disks, in a delay, in an encoder."""
         dry = any(c > 0.0 for c in self.coulomb)
         substeps = math.ceil(checks.positive("dt", dt, "s") / _SUBSTEP - 1e-9) if dry else 1
-        disks: LinearModel = self.linear.sampled(dt / substeps)
+        disks = self.linear.sampled(dt / substeps)
         model: Any = TorsionalModel(disks, substeps, np.array(self.coulomb), self.u_max, self.step)
         if self.late:
             model = DelayedPlantModel(model, self.linear.order)
@@ -163,61 +166,69 @@ def torsional(
 ) -> TorsionalPlant:
     """Return the ECP 205 torsional plant with two disks, from physical parameters.
 
-    States: angles of the lower and the upper disk [rad], their speeds [rad/s], then the u under way [V]. The control signal u [V] is the
-    amplifier's input; the disturbances are torques on the lower and the upper disk [N m]. Output: the upper disk's angle [rad] as the
-    encoder counts it.
+    States: angles of the lower and the upper disk [rad], their speeds [rad/s], then the delayed
+    values of u [V]. The control signal u [V] is the amplifier's input; the disturbances are torques
+    on the lower and the upper disk [N m]. Output: the upper disk's angle [rad] as counted by the
+    encoder.
 
-    The defaults are published ones where there are some; what is left free is such that the plant without Coulomb friction has the
-    transfer function that the paper identified, but for its ``0.1032``: an integrator stands in place of a pole at −5.7e-5 rad/s. The
-    other coefficients agree to 0.01 %.
+    Defaults are published values if there are any. The free ones are chosen so that the plant
+    without Coulomb friction has the transfer function that the paper identified, except for its
+    ``0.1032``: an integrator replaces a pole at −5.7e-5 rad/s. The other coefficients agree to
+    0.01 %.
 
     Parameters
     ----------
     lower_inertia
-        of the lower disk [kg m²]: the bare disk, as the upper one, and four weights of 0.5 kg and 5 cm across at 9 cm from the axis [1]_.
+        of the lower disk [kg m²]: the bare disk, as the upper one, and four weights of 0.5 kg and
+        5 cm diameter at 9 cm from the axis [1]_.
     upper_inertia
         of the upper disk [kg m²]: 0.0103 with two such weights [2]_, less the weights.
     motor_inertia
-        of the motor and what turns with it [kg m²]: 0.0005 at the disk [1]_, so less by ``belt²``.
+        of the motor and the parts that turn with it [kg m²]: 0.0005 at the disk [1]_, so less by
+        ``belt²``.
     belt
         speed reduction N from the motor to the lower disk: 3 (paper, section V; [1]_).
     stiffness
-        of the shaft between the disks [N m/rad]: 1.37 for its whole length [2]_, twice that for half of it, where a disk may be put too
-        [1]_. Here 6 % more than twice, which puts the resonance where the paper has it.
+        of the shaft between the disks [N m/rad]: 1.37 for its whole length [2]_, twice that for
+        half of it, another place for a disk [1]_. Here 6 % more than twice, which gives the
+        resonance of the paper.
     shaft_damping
         d [N m s/rad]: none in the published models; assumed zero.
     lower_viscous, upper_viscous
-        viscous friction of the disks [N m s/rad]: published 0.007 and 0.001 [2]_. These are what the paper's transfer function has in
-        it: the upper one half as much again as the published, the lower one three times as large (identification takes some Coulomb
-        friction for viscous).
+        viscous friction of the disks [N m s/rad]: published 0.007 and 0.001 [2]_. The defaults
+        follow from the paper's transfer function: 1.5 times the published value for the upper disk,
+        three times for the lower one (identification takes some Coulomb friction for viscous).
     lower_coulomb, upper_coulomb
-        their Coulomb friction [N m]: assumed. Friction is said to rule free swings of less than 0.04 rad [1]_; 0.01 is a tenth of the
-        spring's torque there, and the upper disk, on its bearings alone, is given a tenth of that.
+        Coulomb friction of the disks [N m]: assumed. Friction is said to dominate free swings of
+        less than 0.04 rad [1]_; 0.01 is a tenth of the spring's torque there. The upper disk has
+        only its bearings and gets a tenth of that.
     torque_constant
-        of the motor k_t [N m/A]: about 0.1 [1]_; here such as to give the paper's gain. ``k_a k_t N`` is then 0.58 N m/V, of which 0.70 is
-        published [2]_.
+        of the motor k_t [N m/A]: about 0.1 [1]_; here such as to give the paper's gain.
+        ``k_a k_t N`` is then 0.58 N m/V; 0.70 is published [2]_.
     amplifier
         its gain k_a [A/V]: about 2 [1]_.
     current_limit
         of the amplifier [A]: assumed.
     dac_bits
-        of the converter, over ±10 V: 16 (NI PCI-6221 data sheet); None for no rounding, as of a sampled u that is a number.
+        of the converter, over ±10 V: 16 (NI PCI-6221 data sheet); None for no rounding.
     counts
         of the encoder a turn: 16000 [1]_; None for the angle itself.
     late
-        how many samples after it is sent u arrives: assumed 0, as where the computer answers within the sample.
+        delay of u in samples: assumed 0, as if the computer answers within the sample.
 
     Raises
     ------
     ValueError
-        for an inertia, stiffness, belt, torque constant, amplifier or current limit that is not positive, a friction or damping below zero,
-        or bits, counts or samples out of range.
+        for an inertia, stiffness, belt, torque constant, amplifier or current limit that is not
+        positive, a friction or damping below zero, or bits, counts or samples out of range.
 
     References
     ----------
-    .. [1] *Torsional Pendulum*, laboratory manual for the ECP Model 205a in a public repository: weights, inertia of the drive, "hardware
-       gains" as in the maker's manual, range of amplitudes.
-    .. [2] Course work on the Model 205a (ELEC 481, tasks 1 to 3) in a public repository: J, c and k of two disks with two weights each.
+    .. [1] *Torsional Pendulum*, laboratory manual for the ECP Model 205a in a public repository:
+       weights, inertia of the drive, "hardware gains" as in the maker's manual, range of
+       amplitudes.
+    .. [2] Course work on the Model 205a (ELEC 481, tasks 1 to 3) in a public repository: J, c and k
+       of two disks with two weights each.
 
     Examples
     --------
@@ -225,54 +236,41 @@ def torsional(
     >>> twin.order, twin.u_max
     (4, 5.0)
     """
-    positive = {
-        "lower_inertia": (lower_inertia, "kg m²"),
-        "upper_inertia": (upper_inertia, "kg m²"),
-        "belt": (belt, ""),
-        "stiffness": (stiffness, "N m/rad"),
-        "torque_constant": (torque_constant, "N m/A"),
-        "amplifier": (amplifier, "A/V"),
-        "current_limit": (current_limit, "A"),
-    }
-    j_lower, j2, ratio, k, k_t, k_a, i_max = (
-        checks.positive(name, value, unit) for name, (value, unit) in positive.items()
-    )
-    j_motor = checks.non_negative("motor_inertia", motor_inertia, "kg m²")
+    j1 = checks.positive("lower_inertia", lower_inertia, "kg m²")
+    j2 = checks.positive("upper_inertia", upper_inertia, "kg m²")
+    ratio = checks.positive("belt", belt)
+    k = checks.positive("stiffness", stiffness, "N m/rad")
+    k_t = checks.positive("torque_constant", torque_constant, "N m/A")
+    k_a = checks.positive("amplifier", amplifier, "A/V")
+    i_max = checks.positive("current_limit", current_limit, "A")
+    j1 += ratio**2 * checks.non_negative("motor_inertia", motor_inertia, "kg m²")
     d = checks.non_negative("shaft_damping", shaft_damping, "N m s/rad")
     c1 = checks.non_negative("lower_viscous", lower_viscous, "N m s/rad")
     c2 = checks.non_negative("upper_viscous", upper_viscous, "N m s/rad")
-    dry = (
-        checks.non_negative("lower_coulomb", lower_coulomb, "N m"),
-        checks.non_negative("upper_coulomb", upper_coulomb, "N m"),
-    )
-    step = (
-        0.0 if dac_bits is None else 2.0 * _RANGE / 2 ** checks.whole("dac_bits", dac_bits, 2, 32)
-    )
+    dry_lower = checks.non_negative("lower_coulomb", lower_coulomb, "N m")
+    dry_upper = checks.non_negative("upper_coulomb", upper_coulomb, "N m")
+    step = 0.0
+    if dac_bits is not None:
+        step = 2.0 * _RANGE / 2 ** checks.whole("dac_bits", dac_bits, 2, 32)
     if counts is not None:
         counts = checks.whole("counts", counts, 1)
-    j1 = j_lower + ratio**2 * j_motor
-    A = np.zeros((4, 4))
+    late = checks.whole("late", late, 0, 1000)
+    A, E = np.zeros((4, 4)), np.zeros((4, 2))
     A[0, 2] = A[1, 3] = 1.0
     A[2] = -k / j1, k / j1, -(c1 + d) / j1, d / j1
     A[3] = k / j2, -k / j2, d / j2, -(c2 + d) / j2
-    E = np.zeros((4, 2))
     E[2, 0], E[3, 1] = 1.0 / j1, 1.0 / j2
-    linear = LinearPlant(
-        A,
-        B=ratio * k_t * k_a * E[:, 0],
-        C=[0.0, 1.0, 0.0, 0.0],
-        E=E,
-        name="torsional plant without friction",
-    )
-    return TorsionalPlant(
-        linear, dry, min(_RANGE, i_max / k_a), step, counts, checks.whole("late", late, 0, 1000)
-    )
+    B, C = ratio * k_t * k_a * E[:, 0], [0.0, 1.0, 0.0, 0.0]
+    linear = LinearPlant(A, B, C, E, name="torsional plant without friction")
+    u_max = min(_RANGE, i_max / k_a)
+    return TorsionalPlant(linear, (dry_lower, dry_upper), u_max, step, counts, late)
 
 
 def torsional_identified() -> LinearPlant:
-    """Return the testbed as the paper identified it: ``4.6e4 / (s⁴ + 1.901 s³ + 1683 s² + 1812 s + 0.1032)`` (section V, System Model).
+    """Return the testbed as identified in the paper (section V, System Model).
 
-    States: the upper disk's angle [rad] and its derivatives [rad/s, …]; u [V] and one disturbance, which enters as u does.
+    ``4.6e4 / (s⁴ + 1.901 s³ + 1683 s² + 1812 s + 0.1032)``. States: the upper disk's angle [rad]
+    and its derivatives [rad/s, …]. There is one disturbance, which enters as u [V] does.
     """
     return LinearPlant.of(
         ([4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032]), name="torsional plant as identified"

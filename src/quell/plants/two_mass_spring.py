@@ -6,6 +6,20 @@ import numpy as np
 
 from quell import checks
 from quell.plants.linear import LinearPlant
+from quell.types import Matrix
+
+
+def two_mass_matrices(m1: float, m2: float, k: float) -> tuple[Matrix, Matrix]:
+    """Return A (4, 4) and the inputs (4, 2) of forces on both masses; the arguments are checked."""
+    m1, m2 = checks.positive("m1", m1, "kg"), checks.positive("m2", m2, "kg")
+    k = checks.positive("k", k, "N/m")
+    A = np.zeros((4, 4))
+    A[0, 2] = A[1, 3] = 1.0
+    A[2, :2] = -k / m1, k / m1
+    A[3, :2] = k / m2, -k / m2
+    E = np.zeros((4, 2))
+    E[2, 0], E[3, 1] = 1.0 / m1, 1.0 / m2
+    return A, E
 
 
 def two_mass_spring(
@@ -13,8 +27,9 @@ def two_mass_spring(
 ) -> LinearPlant:
     """Return the two-mass-spring system (paper eq. (two-mass)), without friction.
 
-    States: positions of m1 and m2 [m], their velocities [m/s]. The control force u [N] acts on m1, the disturbance forces w1 on m1
-    and w2 on m2 [N]. Output ``y = c1 x1 + c2 x2`` [m]. For the default ``y = x2``, eq. (4order)::
+    States: positions of m1 and m2 [m], their velocities [m/s]. The control force u [N] acts on m1,
+    the disturbance forces w1 on m1 and w2 on m2 [N]. Output ``y = c1 x1 + c2 x2`` [m]. For the
+    default ``y = x2``, eq. (4order)::
 
         y⁗ = −k (m1 + m2)/(m1 m2) y'' + k/(m1 m2) (u + w1 + w2) + w2''/m2
 
@@ -25,27 +40,17 @@ def two_mass_spring(
     k
         stiffness of the spring [N/m].
     c1, c2
-        what is measured.
+        weights of the positions in y.
 
     Raises
     ------
     ValueError
-        for a mass or stiffness that is not positive, or where nothing is measured.
+        for a mass or stiffness that is not positive, or if c1 and c2 are both zero.
     """
-    m1, m2, k = (
-        checks.positive("m1", m1, "kg"),
-        checks.positive("m2", m2, "kg"),
-        checks.positive("k", k, "N/m"),
-    )
+    A, E = two_mass_matrices(m1, m2, k)
     c1, c2 = checks.finite("c1", c1), checks.finite("c2", c2)
     if c1 == 0.0 and c2 == 0.0:
         raise ValueError(
             "c1 = 0.0, c2 = 0.0: at least one must differ from zero, or nothing is measured"
         )
-    A = np.zeros((4, 4))
-    A[0, 2] = A[1, 3] = 1.0
-    A[2, :2] = -k / m1, k / m1
-    A[3, :2] = k / m2, -k / m2
-    E = np.zeros((4, 2))
-    E[2, 0], E[3, 1] = 1.0 / m1, 1.0 / m2
     return LinearPlant(A, B=E[:, 0], C=[c1, c2, 0.0, 0.0], E=E, name="two-mass-spring")
