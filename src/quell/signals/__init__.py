@@ -1,10 +1,13 @@
 """References, disturbances and noise as functions of time.
 
-A signal is an immutable object called with an array of times [s]; it returns an array of values. It has no state, so it can be
-evaluated anywhere, in any order, in pieces of any size, always with the same bits. Signals add, subtract and scale::
+A signal is an immutable object called with an array of times [s]; it returns an array of values. It
+has no state: the same times give the same bits, in any order and in blocks of any size. Signals
+add, subtract and scale::
 
     reference   = Sinusoid(amplitude=1.0, omega=1.0).until(110.0, then=Step(at=110.0))
     disturbance = 0.5 * Step(at=2.0) + BandLimitedNoise(power=1e-6, sample_time=0.01)
+
+May import ``types`` and ``checks``.
 """
 
 from __future__ import annotations
@@ -54,11 +57,11 @@ KINDS: Mapping[str, type[Signal]] = {
     "samples": Samples,
     "noise": BandLimitedNoise,
 }
-"""The signals that a name and numbers describe, as scenario files use them."""
+"""The signals that setup files can have, by their ``kind``."""
 
 
 def make(kind: str, **parameters: Any) -> Signal:
-    """Make a signal from the name of its kind and its parameters.
+    """Return a signal from the name of its kind and its parameters.
 
     Raises
     ------

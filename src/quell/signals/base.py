@@ -1,4 +1,4 @@
-"""What every signal can do, and how signals are put together."""
+"""The base class of signals, and how signals are combined."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import numpy as np
 from quell import checks
 from quell.types import Vector
 
-# Edges that fall on a sample belong to it even when k * dt is short of it by rounding.
+# Tolerance [s] by which an edge on a sample belongs to it if rounding makes k dt fall short of it.
+# Below any sample time; results do not depend on it otherwise.
 EDGE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class Signal:
-    """What every signal can do; ``evaluate`` is what a new kind has to give."""
+    """Base class of signals; a new kind must define ``evaluate``."""
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the values at the times ``t`` [s], an array of the same shape."""
@@ -29,16 +30,17 @@ class Signal:
         values = np.asarray(self.evaluate(times), dtype=np.float64)
         if values.shape != times.shape:
             raise ValueError(
-                f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape {times.shape}"
+                f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape "
+                f"{times.shape}"
             )
         return values
 
     def seeded(self, seed: int) -> Signal:
-        """Return this signal with its noise, if it has any, drawn from ``seed``."""
+        """Return this signal with its noise, if any, drawn from ``seed``."""
         return self
 
     def derivative(self) -> Signal:
-        """Return the signal's derivative in time, of which jumps are no part; a kind that has none says so.
+        """Return the derivative in time, without the impulses of jumps.
 
         Raises
         ------
@@ -47,7 +49,7 @@ class Signal:
         """
         raise ValueError(
             f"reference has no derivative known in closed form, {type(self).__name__} has none: "
-            "take another signal, define derivative(), or put a prefilter before the controller"
+            "take another signal, define derivative(), or use a prefilter"
         )
 
     def until(self, time: float, then: Signal | float) -> Signal:
@@ -70,9 +72,8 @@ class Signal:
         return as_signal(other) - self
 
     def __truediv__(self, factor: float) -> Signal:
-        return Scaled(
-            1.0 / checks.nonzero("factor", factor, "a signal can't be divided by it"), self
-        )
+        factor = checks.nonzero("factor", factor, "a signal can't be divided by it")
+        return Scaled(1.0 / factor, self)
 
     __radd__ = __add__
     __rmul__ = __mul__
@@ -80,7 +81,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Constant(Signal):
-    """The same ``value`` at all times."""
+    """A constant ``value``."""
 
     value: float = 0.0
 
@@ -88,7 +89,7 @@ class Constant(Signal):
         checks.finite("value", self.value)
 
     def evaluate(self, t: Vector) -> Vector:
-        """Return ``value`` everywhere."""
+        """Return the constant."""
         return np.full(t.shape, float(self.value))
 
     def derivative(self) -> Signal:
@@ -108,11 +109,11 @@ class Scaled(Signal):
         return self.factor * self.signal(t)
 
     def derivative(self) -> Signal:
-        """Scale the derivative."""
+        """Return the scaled derivative."""
         return replace(self, signal=self.signal.derivative())
 
     def seeded(self, seed: int) -> Signal:
-        """Seed the signal inside."""
+        """Return the signal with seeded noise."""
         return replace(self, signal=self.signal.seeded(seed))
 
 
@@ -130,17 +131,20 @@ class Sum(Signal):
         return total
 
     def derivative(self) -> Signal:
-        """Sum the derivatives."""
+        """Return the sum of the derivatives."""
         return replace(self, terms=tuple(term.derivative() for term in self.terms))
 
     def seeded(self, seed: int) -> Signal:
-        """Seed every term, each with a stream of its own."""
+        """Return the sum with independently seeded terms."""
         return replace(self, terms=seeded_apart(self.terms, seed))
 
 
 @dataclass(frozen=True)
 class Switched(Signal):
-    """Pieces in time: ``pieces[i]`` holds from ``times[i − 1]`` to ``times[i]`` [s]; each is a function of absolute time."""
+    """Signals one after the other: ``pieces[i]`` from ``times[i − 1]`` to ``times[i]`` [s].
+
+    Each piece is evaluated at absolute time.
+    """
 
     times: tuple[float, ...]
     pieces: tuple[Signal, ...]
@@ -149,13 +153,14 @@ class Switched(Signal):
         times = checks.vector("times", self.times)
         if len(self.pieces) != times.size + 1:
             raise ValueError(
-                f"pieces has {len(self.pieces)} entries, times {times.size}: there must be one piece more than times"
+                f"pieces has {len(self.pieces)} entries, times {times.size}: there must be one "
+                "piece more than times"
             )
         if np.any(np.diff(times) <= 0.0):
             raise ValueError(f"times = {self.times!r}: must increase")
 
     def evaluate(self, t: Vector) -> Vector:
-        """Return the values of whichever piece holds."""
+        """Return the values of the piece at each time."""
         edges = np.asarray(self.times) - EDGE_TOLERANCE
         if t.size:
             first, last = np.searchsorted(edges, (t.min(), t.max()), side="right")
@@ -164,26 +169,26 @@ class Switched(Signal):
         which = np.searchsorted(edges, t, side="right")
         values = np.empty(t.shape)
         for i, piece in enumerate(self.pieces):
-            mine = which == i
-            values[mine] = piece(t[mine])
+            inside = which == i
+            values[inside] = piece(t[inside])
         return values
 
     def derivative(self) -> Signal:
-        """Take the derivative of each piece."""
+        """Return the derivatives of the pieces."""
         return replace(self, pieces=tuple(piece.derivative() for piece in self.pieces))
 
     def seeded(self, seed: int) -> Signal:
-        """Seed every piece, each with a stream of its own."""
+        """Return the signal with independently seeded pieces."""
         return replace(self, pieces=seeded_apart(self.pieces, seed))
 
 
 def as_signal(value: Signal | float, name: str = "signal") -> Signal:
-    """Return a signal as it is and a number as a constant; ``name`` is what an error calls it."""
+    """Return a signal as it is and a number as a constant; errors call the value ``name``."""
     return value if isinstance(value, Signal) else Constant(checks.finite(name, value))
 
 
 def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:
-    """Seed several signals from one seed, so that no two of them share a stream."""
+    """Return the signals seeded from one seed, with independent streams."""
     if not signals:
         return ()
     children = np.random.SeedSequence(seed).generate_state(len(signals), np.uint32).tolist()
@@ -191,6 +196,6 @@ def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:
 
 
 def check_finite_fields(signal: Signal) -> None:
-    """Check that every parameter of a signal is a finite number."""
+    """Raise a ``ValueError`` if a parameter of ``signal`` is not a finite number."""
     for f in fields(signal):
         checks.finite(f.name, getattr(signal, f.name))

@@ -13,34 +13,37 @@ from quell import checks
 from quell.signals.base import EDGE_TOLERANCE, Constant, Signal
 from quell.types import Vector
 
-# Registers whose feedback, the sum of these stages, has the longest period (Golomb, *Shift Register Sequences*, 1967).
+# By the number of bits, the stages whose sum is fed back for the longest period (Golomb, *Shift
+# Register Sequences*, 1967).
 _TAPS = {
-    2: (2, 1), 3: (3, 2), 4: (4, 3), 5: (5, 3), 6: (6, 5), 7: (7, 6), 8: (8, 6, 5, 4), 9: (9, 5), 10: (10, 7), 11: (11, 9),
-    12: (12, 11, 10, 4), 13: (13, 12, 11, 8), 14: (14, 13, 12, 2), 15: (15, 14), 16: (16, 15, 13, 4), 17: (17, 14), 18: (18, 11),
-    19: (19, 18, 17, 14), 20: (20, 17),
+    2: (2, 1), 3: (3, 2), 4: (4, 3), 5: (5, 3), 6: (6, 5), 7: (7, 6), 8: (8, 6, 5, 4), 9: (9, 5),
+    10: (10, 7), 11: (11, 9), 12: (12, 11, 10, 4), 13: (13, 12, 11, 8), 14: (14, 13, 12, 2),
+    15: (15, 14), 16: (16, 15, 13, 4), 17: (17, 14), 18: (18, 11), 19: (19, 18, 17, 14),
+    20: (20, 17),
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class PRBS(Signal):
-    """A pseudo-random binary sequence: ``±amplitude``, from a shift register of so many bits, each value held for ``step`` [s].
+    """A pseudo-random binary sequence of ``±amplitude`` from a shift register.
 
-    It repeats after ``(2^bits − 1) step`` seconds. Over a period its values correlate with 1 at lag 0, at all others with
-    ``−1/(2^bits − 1)`` (Golomb 1967): all its lines up to about ``2.8/step`` rad/s have within 3 dB the same power, and no signal has more
-    power for its peak.
+    It repeats after ``(2^bits − 1) step`` seconds. Over a period its autocorrelation is 1 at lag 0
+    and ``−1/(2^bits − 1)`` at all others (Golomb 1967): all its lines up to about ``2.8/step``
+    rad/s have the same power within 3 dB, and no signal has more power for its peak.
 
     Parameters
     ----------
     amplitude
-        half of the distance of its two values.
+        half of the difference of its two values.
     bits
         length of the register, 2 to 20.
     step
-        how long each value is held [s].
+        time for which each value is held [s].
     start
-        when it begins [s]; before, it is zero.
+        time of its start [s]; it is zero before.
     seed
-        where in the sequence it begins: at the value number ``seed``. It is no noise: a scenario's own seed leaves it as it is.
+        index of its first value in the sequence. It is no noise: the seed of a scenario does not
+        change it.
     """
 
     amplitude: float = 1.0
@@ -58,16 +61,15 @@ class PRBS(Signal):
 
     @property
     def period(self) -> float:
-        """After how long it repeats [s]."""
+        """Time after which it repeats [s]."""
         return (2**self.bits - 1) * self.step
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the sequence."""
         since = (t - self.start + EDGE_TOLERANCE) / self.step
         which = np.floor(since).astype(np.int64) + self.seed
-        return np.where(
-            since >= 0.0, self.amplitude * _sequence(self.bits)[which % (2**self.bits - 1)], 0.0
-        )
+        values = _sequence(self.bits)[which % (2**self.bits - 1)]
+        return np.where(since >= 0.0, self.amplitude * values, 0.0)
 
     def derivative(self) -> Signal:
         """Return zero."""
@@ -88,7 +90,7 @@ def _sequence(bits: int) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class Multisine(Signal):
-    """A sum of sinusoids ``Σ amplitudes_k sin(omegas_k (t − start) + phases_k)``, zero before ``start`` [s].
+    """A sum of sinusoids ``Σ amplitudes_k sin(omegas_k (t − start) + phases_k)``.
 
     Parameters
     ----------
@@ -97,9 +99,10 @@ class Multisine(Signal):
     amplitudes
         of each (lines,); 1 by default.
     phases
-        of each [rad] (lines,); by default Schroeder's, which keep the peak low (``schroeder_phases``).
+        of each [rad] (lines,); by default Schroeder's, which keep the peak low
+        (``schroeder_phases``).
     start
-        when it begins [s].
+        time of its start [s]; it is zero before.
     """
 
     omegas: Any = (1.0, 2.0, 3.0)
@@ -109,16 +112,12 @@ class Multisine(Signal):
 
     def __post_init__(self) -> None:
         omegas = checks.positive_vector("omegas", self.omegas)
-        amplitudes = (
-            np.ones(omegas.size)
-            if self.amplitudes is None
-            else checks.vector("amplitudes", self.amplitudes, omegas.size)
-        )
-        phases = (
-            schroeder_phases(amplitudes)
-            if self.phases is None
-            else checks.vector("phases", self.phases, omegas.size)
-        )
+        amplitudes, phases = np.ones(omegas.size), self.phases
+        if self.amplitudes is not None:
+            amplitudes = checks.vector("amplitudes", self.amplitudes, omegas.size)
+        if phases is None:
+            phases = schroeder_phases(amplitudes)
+        phases = checks.vector("phases", phases, omegas.size)
         for name, value in (("omegas", omegas), ("amplitudes", amplitudes), ("phases", phases)):
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -127,25 +126,23 @@ class Multisine(Signal):
     def evaluate(self, t: Vector) -> Vector:
         """Return the sum."""
         since, total = t - self.start, np.zeros(t.shape)
-        for omega, amplitude, phase in zip(
-            self.omegas.tolist(), self.amplitudes.tolist(), self.phases.tolist(), strict=True
-        ):
+        lines = np.transpose([self.omegas, self.amplitudes, self.phases]).tolist()
+        for omega, amplitude, phase in lines:
             total += amplitude * np.sin(omega * since + phase)
         return np.where(since >= -EDGE_TOLERANCE, total, 0.0)
 
     def derivative(self) -> Signal:
         """Return the sum of the derivatives."""
-        return Multisine(
-            self.omegas, self.amplitudes * self.omegas, self.phases + 0.5 * math.pi, self.start
-        )
+        amplitudes, phases = self.amplitudes * self.omegas, self.phases + 0.5 * math.pi
+        return Multisine(self.omegas, amplitudes, phases, self.start)
 
 
 def schroeder_phases(amplitudes: Vector) -> Vector:
     """Return phases (lines,) [rad] that keep the peak of a sum of sines low.
 
-    ``φ_k = π/2 − 2π Σ_{j<k} (k − j) p_j`` with the lines' shares p of the power (Schroeder, *IEEE Trans. Information Theory* 16, 1970,
-    eq. (11)): each line is given its share of the period as group delay, as a sweep would. Cosines, hence the
-    π/2, have a crest factor of 1.7, sines of 1.9.
+    ``φ_k = π/2 − 2π Σ_{j<k} (k − j) p_j`` with the lines' shares p of the power (Schroeder, *IEEE
+    Trans. Information Theory* 16, 1970, eq. (11)): the group delay of each line is its share of the
+    period, as in a sweep. Cosines, hence the π/2, have a crest factor of 1.7, sines of 1.9.
     """
     share = amplitudes**2 / max(float(np.sum(amplitudes**2)), np.finfo(float).tiny)
     delay = np.concatenate([[0.0], np.cumsum(share)[:-1]])

@@ -1,4 +1,4 @@
-"""Noise."""
+"""Band-limited noise."""
 
 from __future__ import annotations
 
@@ -12,23 +12,27 @@ from quell import checks
 from quell.signals.base import Signal
 from quell.types import Vector
 
-# Draws come in blocks, each with a generator of its own, so that any stretch of time can be asked for.
+# Each block of draws has its own generator, so any interval of time can be evaluated alone. The
+# size decides which draws a seed gives, so it must not change.
 _BLOCK = 4096
+# In a range of more blocks than this, those that are used are found first. Chosen by hand; results
+# do not depend on it.
 _BLOCKS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
 class BandLimitedNoise(Signal):
-    """White noise limited in band by holding each draw, as Simulink's block "Band-Limited White Noise".
+    """White noise whose draws are held, as in Simulink's block "Band-Limited White Noise".
 
     Parameters
     ----------
     power
-        the height of the power spectral density [unit²/Hz]; the variance of a draw is ``power / sample_time``.
+        the height of the power spectral density [unit²/Hz]; the variance of a draw is
+        ``power / sample_time``.
     sample_time
-        how long each draw is held [s]; the spectrum is flat well below π / sample_time rad/s.
+        time for which each draw is held [s]; the spectrum is flat well below π / sample_time rad/s.
     seed
-        which noise; the same seed gives the same bits whatever times are asked for.
+        of the draws; the same seed gives the same bits for the same time.
     """
 
     power: float = 1e-12
@@ -41,29 +45,26 @@ class BandLimitedNoise(Signal):
         checks.whole("seed", self.seed, 0)
 
     def evaluate(self, t: Vector) -> Vector:
-        """Return the draws that hold at ``t``; none are drawn for negative times, which give zero."""
+        """Return the draws that are held at ``t``; zero for negative times."""
         count = t * (1.0 / self.sample_time) + (1.0 + 1e-6)
         if t.size and not float(np.max(np.abs(count))) < 2.0**52:
             raise ValueError(
-                f"sample_time = {self.sample_time!r}: too short to be counted in times of {float(np.max(np.abs(t))):g} s"
+                f"sample_time = {self.sample_time!r}: too short to be counted in times of "
+                f"{float(np.max(np.abs(t))):g} s"
             )
         index = count.astype(np.int64) - 1  # floor, for times from 0 on
-        first, last = (
-            (int(index.min()) // _BLOCK, int(index.max()) // _BLOCK) if t.size else (0, -1)
-        )
-        blocks = (
-            np.arange(first, last + 1)
-            if last - first < _BLOCKS_AT_ONCE
-            else np.unique(index // _BLOCK)
-        )
+        if t.size and np.ptp(index) < _BLOCKS_AT_ONCE * _BLOCK:
+            blocks = np.arange(index.min() // _BLOCK, index.max() // _BLOCK + 1)
+        else:
+            blocks = np.unique(index // _BLOCK)
         values = np.zeros(t.shape)
         sigma = math.sqrt(self.power / self.sample_time)
         for block in blocks[blocks >= 0].tolist():
-            place = index - block * _BLOCK
+            at = index - block * _BLOCK
             if blocks.size == 1:
-                return sigma * _draws(self.seed, block)[place]
-            mine = (place >= 0) & (place < _BLOCK)
-            values[mine] = sigma * _draws(self.seed, block)[place[mine]]
+                return sigma * _draws(self.seed, block)[at]
+            inside = (at >= 0) & (at < _BLOCK)
+            values[inside] = sigma * _draws(self.seed, block)[at[inside]]
         return values
 
     def seeded(self, seed: int) -> Signal:

@@ -34,7 +34,7 @@ class Step(Signal):
 
 @dataclass(frozen=True)
 class Ramp(Signal):
-    """Zero before ``start`` [s], then rising by ``slope`` a second until ``stop`` [s], then held."""
+    """Zero before ``start`` [s], then ``slope`` times the time until ``stop`` [s], then held."""
 
     slope: float = 1.0
     start: float = 0.0
@@ -49,14 +49,17 @@ class Ramp(Signal):
         return self.slope * (np.clip(t, self.start, self.stop) - self.start)
 
     def derivative(self) -> Signal:
-        """Return the slope while it rises."""
+        """Return the slope between ``start`` and ``stop``."""
         rising = Step(self.slope, self.start)
         return rising if math.isinf(self.stop) else rising - Step(self.slope, self.stop)
 
 
 @dataclass(frozen=True)
 class Sinusoid(Signal):
-    """``amplitude · sin(omega (t − start) + phase)`` from ``start`` [s] on, zero before; ``omega`` in rad/s, ``phase`` in rad."""
+    """``amplitude · sin(omega (t − start) + phase)``, zero before ``start`` [s].
+
+    ``omega`` is in rad/s, ``phase`` in rad.
+    """
 
     amplitude: float = 1.0
     omega: float = 1.0
@@ -77,17 +80,16 @@ class Sinusoid(Signal):
 
     def derivative(self) -> Signal:
         """Return the sinusoid a quarter of a period ahead."""
-        return replace(
-            self, amplitude=self.amplitude * self.omega, phase=self.phase + 0.5 * math.pi
-        )
+        amplitude, phase = self.amplitude * self.omega, self.phase + 0.5 * math.pi
+        return replace(self, amplitude=amplitude, phase=phase)
 
 
 @dataclass(frozen=True)
 class Chirp(Signal):
-    """A sinusoid whose frequency moves from ``omega_start`` to ``omega_end`` [rad/s] in ``duration`` [s], then stays.
+    """A sinusoid whose frequency moves from ``omega_start`` to ``omega_end`` [rad/s], then stays.
 
-    It moves linearly, or with ``logarithmic`` by the same factor in every second: then each octave gets the same time. The phase is the
-    integral of the frequency, so it has no jump.
+    It moves in ``duration`` [s] linearly, or with ``logarithmic`` exponentially, so that each
+    octave takes the same time. The phase is the integral of the frequency and has no jump.
     """
 
     amplitude: float = 1.0
@@ -116,16 +118,13 @@ class Chirp(Signal):
         """Return the chirp."""
         since = np.maximum(t - self.start, 0.0)
         sweep = np.minimum(since, self.duration)
-        growth = (
-            math.log(self.omega_end / self.omega_start) / self.duration if self.logarithmic else 0.0
-        )
+        ratio = self.omega_end / self.omega_start if self.logarithmic else 1.0
+        growth = math.log(ratio) / self.duration
         if growth:
             phase = self.omega_start * np.expm1(growth * sweep) / growth
         else:
-            phase = (
-                self.omega_start * sweep
-                + 0.5 * (self.omega_end - self.omega_start) * sweep**2 / self.duration
-            )
+            change = self.omega_end - self.omega_start
+            phase = self.omega_start * sweep + 0.5 * change * sweep**2 / self.duration
         return self.amplitude * np.sin(phase + self.omega_end * (since - sweep))
 
 
@@ -136,14 +135,14 @@ class Trapezoid(Signal):
     Parameters
     ----------
     distance
-        where the move ends [y-unit], of either sign.
+        final position [y-unit], of either sign.
     duration
-        how long it takes [s].
+        duration of the move [s].
     ramp_time
-        how long it accelerates, and decelerates [s]; at most half of ``duration`` (then the profile is a triangle). A third of
-        ``duration`` by default, the profile of least energy.
+        duration of the acceleration, and of the deceleration [s]; at most half of ``duration``
+        (then the profile is a triangle). A third by default, the profile of least energy.
     start
-        when it begins [s].
+        time of its start [s].
     """
 
     distance: float = 1.0
@@ -157,57 +156,52 @@ class Trapezoid(Signal):
         checks.positive("duration", self.duration, "s")
         ramp = self._ramp
         if not 0.0 < ramp <= self.duration / 2:
-            raise ValueError(
-                f"ramp_time = {self.ramp_time!r}: must be in (0, duration / 2 = {self.duration / 2}]"
-            )
+            bound = self.duration / 2
+            raise ValueError(f"ramp_time = {ramp!r}: must be in (0, duration / 2 = {bound}]")
 
     @property
     def _ramp(self) -> float:
-        return (
-            self.duration / 3
-            if self.ramp_time is None
-            else checks.finite("ramp_time", self.ramp_time)
-        )
+        if self.ramp_time is None:
+            return self.duration / 3
+        return checks.finite("ramp_time", self.ramp_time)
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the position along the move."""
         ramp, since = self._ramp, np.clip(t - self.start, 0.0, self.duration)
         cruise = self.distance / (self.duration - ramp)
         left = self.duration - since
-        speeding = 0.5 * cruise / ramp * since**2
+        accelerating = 0.5 * cruise / ramp * since**2
         braking = self.distance - 0.5 * cruise / ramp * left**2
-        return np.where(
-            since < ramp, speeding, np.where(left < ramp, braking, cruise * (since - 0.5 * ramp))
-        )
+        cruising = cruise * (since - 0.5 * ramp)
+        return np.where(since < ramp, accelerating, np.where(left < ramp, braking, cruising))
 
     def derivative(self) -> Signal:
-        """Return the speed: a trapezoid of two ramps."""
+        """Return the speed: the difference of two ramps."""
         ramp, end = self._ramp, self.start + self.duration
-        acceleration = self.distance / (self.duration - ramp) / ramp
-        return Ramp(acceleration, self.start, self.start + ramp) - Ramp(
-            acceleration, end - ramp, end
-        )
+        slope = self.distance / (self.duration - ramp) / ramp
+        return Ramp(slope, self.start, self.start + ramp) - Ramp(slope, end - ramp, end)
 
 
 @dataclass(frozen=True)
 class SmoothMove(Signal):
-    """A move from 0 to ``distance`` along the polynomial whose first derivatives vanish at both ends, then held.
+    """A move from 0 to ``distance`` along a polynomial with smooth ends, then held.
 
-    With σ = (t − start)/duration the position is ``distance · I_σ(m + 1, m + 1)``, the regularised incomplete beta function: its speed is
-    proportional to ``σ^m (1 − σ)^m``. For m = 2 that is the move of least jerk (Flash & Hogan, *J. Neuroscience* 5, 1985).
+    With σ = (t − start)/duration the position is ``distance · I_σ(m + 1, m + 1)``, the regularised
+    incomplete beta function: the speed is proportional to ``σ^m (1 − σ)^m``. For m = 2 it is the
+    move of least jerk (Flash & Hogan, *J. Neuroscience* 5, 1985).
 
     Parameters
     ----------
     distance
-        where the move ends [y-unit], of either sign.
+        final position [y-unit], of either sign.
     duration
-        how long it takes [s].
+        duration of the move [s].
     smoothness
-        how many derivatives m are continuous, 1 to 12: feedforward for a plant of order n wants n.
+        number m of continuous derivatives, 1 to 12; feedforward for a plant of order n needs n.
     start
-        when it begins [s].
+        time of its start [s].
     order
-        which derivative of it this is; 0 is the move itself.
+        order of the derivative; 0 is the move itself.
     """
 
     distance: float = 1.0
@@ -226,27 +220,18 @@ class SmoothMove(Signal):
     def evaluate(self, t: Vector) -> Vector:
         """Return the position along the move, or its derivative."""
         m, sigma = self.smoothness, np.clip((t - self.start) / self.duration, 0.0, 1.0)
-        # The second half is the first one mirrored: the polynomial itself cancels badly near σ = 1.
-        back = sigma > 0.5
-        near = np.where(back, 1.0 - sigma, sigma)
-        speed = np.polynomial.Polynomial(
-            [math.comb(m, i) * (-1.0) ** i for i in range(m + 1)]
-        ) * np.polynomial.Polynomial.basis(m)
-        position = speed.integ()
+        # Mirror the first half, because near σ = 1 rounding errors of the polynomial are large.
+        second_half = sigma > 0.5
+        near = np.where(second_half, 1.0 - sigma, sigma)
+        power = np.polynomial.Polynomial([math.comb(m, i) * (-1.0) ** i for i in range(m + 1)])
+        position = (power * np.polynomial.Polynomial.basis(m)).integ()
         value = position.deriv(self.order)(near) if self.order else position(near)
         value = value / (position(0.5) * 2.0) * self.distance / self.duration**self.order
-        mirrored = self.distance - value if self.order == 0 else (-1.0) ** (self.order + 1) * value
-        inside = np.where(back, mirrored, value)
-        return (
-            inside
-            if self.order == 0
-            else np.where(
-                (t >= self.start - EDGE_TOLERANCE)
-                & (t < self.start + self.duration - EDGE_TOLERANCE),
-                inside,
-                0.0,
-            )
-        )
+        if self.order == 0:
+            return np.where(second_half, self.distance - value, value)
+        value = np.where(second_half, (-1.0) ** (self.order + 1) * value, value)
+        after = self.start + self.duration - EDGE_TOLERANCE
+        return np.where((t >= self.start - EDGE_TOLERANCE) & (t < after), value, 0.0)
 
     def derivative(self) -> Signal:
         """Return the next derivative."""
@@ -255,16 +240,16 @@ class SmoothMove(Signal):
 
 @dataclass(frozen=True, eq=False)
 class Samples(Signal):
-    """Recorded samples.
+    """Recorded samples, interpolated or held; beyond the ends the first and last value hold.
 
     Parameters
     ----------
     times
-        when they were taken [s], increasing.
+        times of the samples [s], increasing.
     values
-        what they were.
+        of the same size.
     hold
-        ``"linear"`` interpolates, ``"previous"`` holds each value until the next. Outside of the record the end values hold.
+        ``"linear"`` interpolates, ``"previous"`` holds each value until the next.
     """
 
     times: Any
