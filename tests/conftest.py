@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,3 +34,12 @@ def two_mass_scenario() -> ql.Scenario:
         duration=45.0,
         rest_at=(20.0,),
     )
+
+
+@pytest.fixture
+def bench() -> Iterator[Callable[..., Any]]:
+    """Make benches (``tests.rig_bench.Bench``); at the end all that is open is closed."""
+    from .rig_bench import Bench
+
+    with ExitStack() as stack:
+        yield lambda *where, **settings: Bench(stack, *where, **settings)

@@ -13,6 +13,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
+import pytest
 
 import quell as ql
 from quell.realtime.devices.base import read_measurement
@@ -30,6 +31,8 @@ DT = 0.01
 PLANT = ql.plants.two_mass_spring()
 DEVICES = {"udp": UdpDevice, "shm": SharedMemoryDevice, "serial": SerialDevice}
 WIRES = tuple(DEVICES)
+TIME = 123_456_789
+"""In every frame that ``packed`` makes [ns]."""
 
 
 def url_of(wire: str) -> str:
@@ -56,12 +59,11 @@ def packed(
     *,
     session: int = 0x5EED0001,
     version: int = 1,
-    time: int = 0,
     state: int = 0,
 ) -> bytes:
     """Return a frame, made without the package."""
     numbers = number % 2**32, answers % 2**32
-    head = struct.pack("<2sBBIIIqdI", b"QL", version, kind, session, *numbers, time, value, state)
+    head = struct.pack("<2sBBIIIqdI", b"QL", version, kind, session, *numbers, TIME, value, state)
     return head + struct.pack("<I", zlib.crc32(head))
 
 
@@ -69,6 +71,8 @@ class Bench:
     """A rig, and the devices that are opened on it."""
 
     def __init__(self, stack: ExitStack, wire: str = "udp", url: str = "", **settings: Any) -> None:
+        if wire == "serial":
+            pytest.importorskip("serial")
         self._stack = stack
         self.rig = stack.enter_context(Rig(PLANT, DT, listen(url or url_of(wire)), **settings))
         self.rig.prepare()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import struct
 import zlib
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,8 @@ from quell.realtime.wire.frames import (
     write_next_frame,
 )
 
+from .rig_bench import TIME, packed
+
 SESSION = 0x5EED0001
 PAGE = Path(__file__).parents[1] / "docs" / "wire.md"
 
@@ -44,32 +45,6 @@ def _write_next_frame(out: Any, own: Any, kind: int, time: int, value: float, st
 @compiled
 def _crc32(data: Any, size: int) -> int:
     return crc32(data, size)
-
-
-def packed(
-    kind: int,
-    number: int,
-    answers: int,
-    value: float,
-    *,
-    session: int = SESSION,
-    version: int = 1,
-    state: int = 0,
-) -> bytes:
-    """Return a frame, made without the package."""
-    head = struct.pack(
-        "<2sBBIIIqdI",
-        b"QL",
-        version,
-        kind,
-        session,
-        number % 2**32,
-        answers % 2**32,
-        123_456_789,
-        value,
-        state,
-    )
-    return head + struct.pack("<I", zlib.crc32(head))
 
 
 def offered(own: Any, data: bytes, entry: Any = None) -> bool:
@@ -97,7 +72,7 @@ def test_a_frame_is_what_the_table_says(entry: Any) -> None:
     """Byte by byte the one that ``struct`` and ``zlib`` make."""
     own, out = endpoint(COMMAND, SESSION, 20), buffer()
     own.numbers[frames.SENT], own.numbers[frames.RECEIVED] = 2**32 + 6, 41
-    entry(out, own, MEASUREMENT, 123_456_789, -1.5, 1)
+    entry(out, own, MEASUREMENT, TIME, -1.5, 1)
     assert out.bytes[:40].tobytes() == packed(MEASUREMENT, 7, 41, -1.5, state=1)
 
 

@@ -1,178 +1,179 @@
-"""The rig as a process of its own, as ``quell rig`` starts it."""
+"""The rig, step by step."""
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
-import uuid
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+import threading
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from quell.cli.commands.rig import rig as run_rig
-from quell.realtime.devices.registry import listen, open_device
+from quell.kernels.dispatch import interpreted
+from quell.realtime.devices.registry import listen
+from quell.realtime.rig.kernel import serve
+from quell.realtime.rig.server import Rig
+from quell.realtime.system.clock import virtual_clock
 
-# A tick so long that a machine with much else to do still keeps the session alive.
-DT = 0.01
-SETTINGS = {"dt": DT, "watchdog": 20, "u_max": 1.0, "rest": True}
-
-
-@contextmanager
-def rig(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start a rig; yield it and what it says when it is ready."""
-    command = [
-        sys.executable,
-        "-m",
-        "quell",
-        "rig",
-        "--plant",
-        "two-mass",
-        "--dt",
-        str(DT),
-        "--priority",
-        "0",
-        *arguments,
-    ]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            yield process, str(process.stdout and process.stdout.readline())
-        finally:
-            process.kill()
+from .rig_bench import DT, PLANT, Bench, law, read_all, url_of
 
 
-def exchanged(device: Any, count: int) -> list[float]:
-    """Return what was measured in some samples, each answered."""
-    measured = []
-    for _ in range(count):
-        measured.append(device.read())
-        device.write(1.0)
-    return measured
+def test_ticks_that_were_slept_over_are_caught_up(bench: Callable[..., Bench]) -> None:
+    """Where the plant goes depends on the commands at the ticks, not on how late those were; and none is skipped."""
+    positions = []
+    for late in ([0], [0, 0, 0, 70_500_000, 0]):
+        here = bench("udp")
+        device = here.open()
+        here.cycle(device, law, 3)
+        ticks = here.rig.counters["ticks"]
+        interpreted(serve)(here.rig.model, virtual_clock(late), 12, True)
+        assert here.rig.counters["ticks"] == ticks + 12
+        positions.append(here.rig.x)
+    assert here.rig.counters["caught_up"] == 7
+    assert here.rig.lateness.max == pytest.approx(0.0705)
+    assert np.array_equal(*positions)
 
 
-def test_a_rig_runs_until_it_is_told_to_end_and_says_how_it_went(tmp_path: Path) -> None:
-    """One line when it is ready, its counts at the end, exit code 0; and each tick in the log."""
-    log = tmp_path / "wire.csv"
-    with rig(
-        "--device", "udp://127.0.0.1:0", "--log", str(log), "--u-max", "0.5", "--watchdog", "200"
-    ) as (process, ready):
-        assert ready.startswith("two-mass at udp://127.0.0.1:")
-        url = ready.split()[2].rstrip(":")
-        with open_device(url, DT) as device:
-            assert np.isfinite(exchanged(device, 20)).all()
-        process.send_signal(signal.SIGTERM)
-        said, errors = process.communicate(timeout=60)
-        assert process.returncode == 0
-    assert errors == ""
-    assert "sessions: 1" in said
-    assert "largest |u| 1, cut to the limit: 1" in said
-    assert "frames that were not accepted:" in said
-    rows = np.genfromtxt(log, delimiter=",", names=True)
-    assert np.array_equal(rows["tick"], np.arange(rows.size))
-    assert f"ticks: {rows.size}" in said
-    assert np.nanmax(rows["u"]) == 0.5
-    assert np.nanmax(rows["command"]) == 1.0
+def test_the_watchdog_waits_for_the_first_command(bench: Callable[..., Bench]) -> None:
+    """Until then u is zero anyway, and the loop may have to be compiled."""
+    here = bench("udp", watchdog=5)
+    device = here.open()
+    here.rig.tick(200)
+    assert here.rig.state == "waiting"
+    read_all(device)
+    here.cycle(device, law, 2)
+    assert here.rig.state == "live"
 
 
-def test_a_rig_that_is_killed_is_noticed_and_replaced() -> None:
-    """In shared memory nothing stays in the way of the next one; the loop gets no more numbers."""
-    url = f"shm://test-{uuid.uuid4().hex}"
-    with rig("--device", url, "--watchdog", "200") as (process, _), open_device(url, DT) as device:
-        exchanged(device, 3)
-        process.kill()
-        process.wait()
-        device.read()
-        assert np.isnan(device.read())
-    with pytest.raises(ConnectionError, match="start one with: quell rig"):
-        open_device(url, DT)
-    with rig("--device", url) as (process, ready):
-        assert ready
-        with open_device(url, DT) as device:
-            exchanged(device, 3)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
-    assert not list(Path("/dev/shm").glob(f"quell-{url.removeprefix('shm://')}*"))
+def test_a_session_that_never_begins_gives_way(bench: Callable[..., Bench]) -> None:
+    """After a minute of ticks; before that a second hello is refused, however long the first takes."""
+    here = bench("udp")
+    here.open()
+    here.rig.tick(int(30.0 / DT))
+    with pytest.raises(ConnectionError, match="another session"):
+        here.open(timeout=0.2)
+    here.rig.tick(int(30.0 / DT))
+    here.cycle(here.open(), law, 2)
+    assert here.rig.state == "live"
 
 
-def test_a_loop_that_is_killed_leaves_u_at_zero(tmp_path: Path) -> None:
-    """The watchdog sees to it, within the ticks it was given; the next loop is served."""
-    log = tmp_path / "wire.csv"
-    with rig("--device", "udp://127.0.0.1:0", "--log", str(log), "--watchdog", "30") as (
-        process,
-        ready,
-    ):
-        url = ready.split()[2].rstrip(":")
-        loop = f"""
-import os, signal
-from quell.realtime import open_device
-device = open_device({url!r}, {DT})
-for _ in range(5):
+def test_a_rig_that_ends_says_so_at_once(bench: Callable[..., Bench]) -> None:
+    """Not only when it is closed, which may take its time."""
+    here = bench("shm")
+    device = here.open()
+    here.rig.run(5 * DT)
     device.read()
-    device.write(1.0)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-        assert (
-            subprocess.run([sys.executable, "-c", loop], check=False).returncode == -signal.SIGKILL
-        )
-        with open_device(url, DT) as device:
-            exchanged(device, 3)
-        process.send_signal(signal.SIGINT)
-        assert "ended by the watchdog: 1" in process.communicate(timeout=60)[0]
+    assert device.lost
+
+
+def test_a_rig_with_long_ticks_need_not_be_waited_for(bench: Callable[..., Bench]) -> None:
+    """To be told to stop it does not wait for the next tick."""
+    with closing(listen(url_of("shm"))) as listener, Rig(PLANT, 100.0, listener) as rig:
+        rig.prepare()
+        thread = threading.Thread(target=rig.run)
+        thread.start()
+        while rig.counters["ticks"] == 0:
+            thread.join(0.01)
+        rig.stop()
+        thread.join(50.0)
+        assert not thread.is_alive()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is full")
+def test_a_rig_goes_on_without_its_log_where_the_disk_is_full() -> None:
+    """And says so."""
+    with (
+        closing(listen(url_of("shm"))) as listener,
+        Rig(PLANT, DT, listener, log="/dev/full") as rig,
+    ):
+        notes = rig.run(10 * DT)
+        assert rig.counters["ticks"] == 10
+    assert "the log was given up: No space left on device" in notes
+
+
+def test_a_rig_does_not_hide_what_went_wrong_on_its_thread(
+    bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It comes out of run."""
+    here = bench("shm")
+
+    def serve(most: int, paced: bool) -> None:
+        if paced:
+            raise RuntimeError("broken")
+
+    monkeypatch.setattr(here.rig, "_serve", serve)
+    with pytest.raises(RuntimeError, match="broken"):
+        here.rig.run(1.0)
+    with pytest.raises(ValueError, match="seconds = 1e\\+300: must be at most 1e\\+09 s"):
+        here.rig.run(1e300)
+
+
+def test_what_is_no_number_is_not_applied_nor_a_sign_of_life(bench: Callable[..., Bench]) -> None:
+    """The last u holds until the watchdog trips."""
+    here = bench("udp", watchdog=4)
+    device = here.open()
+    here.cycle(device, lambda y: 1.5, 2)
+    here.cycle(device, lambda y: np.nan, 3)
+    assert here.applied == 1.5
+    here.cycle(device, lambda y: np.inf)
+    assert (here.rig.state, here.applied) == ("live", 1.5)
+    here.rig.tick()
+    assert (here.rig.state, here.applied) == ("tripped", 0.0)
+    assert here.rig.counters["not_finite"] == 4
+
+
+def test_the_rig_has_a_limit_of_its_own(bench: Callable[..., Bench], tmp_path: Path) -> None:
+    """What was on the wire is in the log, beside what was applied."""
+    log = tmp_path / "wire.csv"
+    here = bench("udp", u_max=2.0, log=log)
+    device = here.open()
+    here.cycle(device, lambda y: -7.0, 3)
+    here.rig.tick(2)
+    assert here.rig.counters["clipped"] == 3
+    assert here.rig.largest == 7.0
+    here.rig.close()
     rows = np.genfromtxt(log, delimiter=",", names=True)
-    last = np.flatnonzero(
-        np.isfinite(rows["command"]) & (rows["session"] == rows["session"][rows["session"] > 0][0])
-    )[-1]
-    assert np.all(rows["u"][last : last + 30] == 1.0)
-    assert rows["u"][last + 30] == 0.0
-    assert rows["state"][last + 30] == 3
+    assert rows["u"][-4:].tolist() == [-2.0] * 4
+    assert rows["command"][-4:-2].tolist() == [-7.0, -7.0]
+    assert np.isnan(rows["command"][-1])
+    assert np.array_equal(rows["tick"], np.arange(rows.size))
 
 
-def test_bad_input_is_a_line_and_exit_code_2() -> None:
-    """Before anything is opened."""
-    with rig("--device", "udp://127.0.0.1") as (process, ready):
-        said = process.communicate(timeout=60)[1]
-        assert (ready, process.returncode, said.count("\n")) == ("", 2, 1)
-    assert "must be udp://HOST:PORT" in said
+@pytest.mark.parametrize("rest", [True, False])
+def test_a_session_starts_from_rest_or_where_the_last_one_ended(
+    rest: bool, bench: Callable[..., Bench]
+) -> None:
+    """As was asked for."""
+    here = bench("shm", rest=rest)
+    device = here.open()
+    here.cycle(device, law, 100)
+    device.close()
+    here.rig.tick()
+    assert here.rig.state == "idle"
+    assert here.applied == 0.0
+    again = here.open()
+    (y,) = here.cycle(again, law)
+    assert (y == 0.0) == rest
 
 
 @pytest.mark.parametrize(
-    ("changed", "message"),
+    ("settings", "message"),
     [
-        ({"device": "tcp://x"}, "must be like udp://"),
-        ({"plant": "moon"}, "--plant = 'moon'"),
-        ({"log": Path("/nowhere/x.csv")}, "log = '/nowhere/x.csv': can't be written"),
-        ({"seconds": -1.0}, "--seconds = -1.0"),
-        ({"priority": 100}, "priority = 100"),
-        ({"dt": 0.0}, "dt = 0.0"),
         ({"watchdog": 0}, "watchdog = 0"),
+        ({"u_max": -1.0}, "u_max"),
+        ({"u_max": float("nan")}, "u_max"),
+        ({"x0": [1.0]}, "x0"),
+        ({"log": "/nowhere/x.csv"}, "log = '/nowhere/x.csv'"),
+        ({"rest": 1}, "rest"),
+        ({"dt": 1e-9}, "dt = 1e-09 s: must be from 1e-06 to 100 s"),
+        ({"dt": 1e300}, "must be from 1e-06 to 100 s"),
+        ({"watchdog": 10**20}, "watchdog = 1.*: must be a whole number from 1 to 1000000"),
     ],
 )
-def test_what_is_wrong_is_named(
-    changed: dict[str, Any], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Nothing is printed that would look like a rig."""
-    given = {
-        "device": "udp://127.0.0.1:0",
-        "plant": "two-mass",
-        "seconds": 1.0,
-        "priority": 0,
-    }
-    with pytest.raises(ValueError) as raised:
-        run_rig(**{**given, **SETTINGS, **changed})
-    assert message in str(raised.value)
-    assert capsys.readouterr().out == ""
-
-
-def test_a_port_that_is_taken_is_named() -> None:
-    """The second rig does not start."""
-    with (
-        closing(listen("udp://127.0.0.1:0")) as first,
-        pytest.raises(ValueError, match="can't listen there"),
-    ):
-        run_rig(device=first.url, plant="two-mass", seconds=1.0, priority=0, **SETTINGS)
+def test_a_rig_says_what_is_wrong_with_its_settings(settings: dict[str, Any], message: str) -> None:
+    """By name."""
+    listener = listen(url_of("shm"))
+    with closing(listener), pytest.raises(ValueError, match=message):
+        Rig(PLANT, **{"dt": DT, "listener": listener} | settings)

@@ -153,11 +153,8 @@ REAL = [scheme for scheme in SCHEMES if scheme != "twin"]
 @pytest.fixture
 def example(request: pytest.FixtureRequest) -> Iterator[Any]:
     """A device of the scheme that the test is for, and what lies behind it."""
-    scheme = request.param
-    if scheme == "serial":
-        pytest.importorskip("serial")
     with ExitStack() as stack:
-        yield EXAMPLES[scheme](stack)
+        yield EXAMPLES[request.param](stack)
 
 
 every = pytest.mark.parametrize("example", SCHEMES, indirect=True)

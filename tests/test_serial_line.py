@@ -1,115 +1,23 @@
-"""The serial line: packets on a stream of bytes, and the loop's and the device's end of it over a pseudoterminal."""
+"""The serial line: frames on a stream of bytes, and the ports."""
 
 import errno
-import fcntl
 import itertools
-import math
 import os
 import socket
-import termios
-import threading
-import time
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import quell as ql
-from quell.plants.base import advance, measure
-from quell.realtime.devices.base import read_measurement
-from quell.realtime.rig.server import Rig
-from quell.realtime.system.clock import system_clock
-from quell.realtime.wire import cobs, frames
-from quell.realtime.wire.serial_line import (
-    FRAME_BITS,
-    SerialDevice,
-    SerialListener,
-    serial_transport,
-)
-from quell.realtime.wire.transport import receive, send, wait_for_frame
+from quell.realtime.wire import frames
+from quell.realtime.wire.serial_line import SerialDevice, SerialListener, serial_transport
+from quell.realtime.wire.transport import receive, send
+
+from .test_cobs import encoded
 
 pytest.importorskip("serial")
 DT = 1e-3
-
-
-def encoded(data):
-    """What ``cobs`` makes of bytes."""
-    out = np.zeros(len(data) + len(data) // 254 + 2, dtype=np.uint8)
-    return out[: cobs.encode(np.frombuffer(data, dtype=np.uint8), len(data), out)].tobytes()
-
-
-def decoded(packet):
-    """What it makes of a packet without its zero; None where that is none."""
-    out = np.zeros(len(packet) + 1, dtype=np.uint8)
-    size = cobs.decode(np.frombuffer(packet, dtype=np.uint8), len(packet), out)
-    return None if size == cobs.INVALID else out[:size].tobytes()
-
-
-def plainly_decoded(packet):
-    """The same, written as the paper explains it."""
-    data = b""
-    while packet:
-        code, packet = packet[0], packet[1:]
-        block, packet = packet[: code - 1], packet[code - 1 :]
-        data += block + (b"\0" if code < 255 and packet else b"")
-    return data
-
-
-@pytest.mark.parametrize(
-    ("data", "packet"),
-    [
-        # The head of an IP packet, as in figure 3 of Cheshire and Baker.
-        ("45 00 00 2c 4c 79 00 00 40 06 4f 37", "02 45 01 04 2c 4c 79 01 05 40 06 4f 37"),
-        ("", "01"),
-        ("00", "01 01"),
-        ("00 00", "01 01 01"),
-        ("11 22 00 33", "03 11 22 02 33"),
-        ("11 22 33 44", "05 11 22 33 44"),
-        ("11 00 00 00", "02 11 01 01 01"),
-    ],
-)
-def test_packets_are_those_of_cheshire_and_baker(data, packet):
-    """Code by code, with the zero that ends them."""
-    assert encoded(bytes.fromhex(data)) == bytes.fromhex(packet) + b"\0"
-
-
-def test_a_run_of_254_bytes_has_a_code_of_its_own():
-    """255 stands for 254 bytes without a zero behind them, whatever follows."""
-    run = bytes(range(1, 255))
-    assert encoded(run) == b"\xff" + run + b"\0"
-    assert encoded(run + b"\0") == b"\xff" + run + b"\1\1\0"
-    assert encoded(b"\0" + run) == b"\1\xff" + run + b"\0"
-    assert encoded(run + b"\xff") == b"\xff" + run + b"\2\xff\0"
-
-
-@given(
-    st.one_of(
-        st.binary(max_size=600), st.lists(st.sampled_from([0, 1, 255]), max_size=600).map(bytes)
-    )
-)
-def test_what_is_encoded_is_decoded(data):
-    """For any bytes: none inside is zero, no more than one in 254 is added, and a plain decoder finds the same."""
-    packet = encoded(data)
-    assert packet[-1] == 0
-    assert 0 not in packet[:-1]
-    assert len(packet) <= len(data) + 1 + max(math.ceil(len(data) / 254), 1)
-    assert decoded(packet[:-1]) == data == plainly_decoded(packet[:-1])
-
-
-@given(st.binary(max_size=60))
-def test_any_bytes_decode_to_no_more_than_there_are_or_are_refused(packet):
-    """Nothing is read or written outside: a block that reaches beyond the end is no packet."""
-    found = decoded(packet)
-    assert found is None or len(found) <= max(len(packet) - 1, 0)
-    if found is not None:
-        assert 0 not in packet
-
-
-def test_a_frame_takes_42_bytes_whatever_is_in_it():
-    """The figure by which rates are checked."""
-    for fill in (0, 1, 255):
-        assert len(encoded(bytes([fill]) * frames.LENGTH)) * 10 == FRAME_BITS
 
 
 class Stream:
@@ -251,104 +159,6 @@ def test_a_frame_that_did_not_fit_does_not_spoil_the_next(wire):
     assert values + wire.accepted(endpoint) == [float(k + 1) for k in range(sent)] + [-1.0]
 
 
-@pytest.fixture
-def rig():
-    """The two-mass-spring benchmark at the other end of a line without a cable."""
-    with Rig(ql.plants.two_mass_spring(), DT, SerialListener("serial://pty"), watchdog=5) as rig:
-        yield rig
-
-
-def opened(rig, dt=DT):
-    """A device for the loop, while the rig ticks."""
-    done = threading.Event()
-
-    def turn():
-        while not done.is_set():
-            rig.tick()
-            time.sleep(1e-3)
-
-    thread = threading.Thread(target=turn)
-    rig.prepare()
-    thread.start()
-    try:
-        return SerialDevice(rig.listener.url, dt, timeout=30.0)
-    finally:
-        done.set()
-        thread.join()
-
-
-def await_command(rig):
-    """Wait until a command is there: a pseudoterminal hands on bytes when the system finds the time."""
-    waiting = np.zeros(1, dtype=np.int32)
-    while waiting[0] < FRAME_BITS // 10:
-        wait_for_frame(rig.listener.transport, 100_000_000)
-        fcntl.ioctl(rig.listener.transport.port.fd, termios.FIONREAD, waiting)
-
-
-def test_a_loop_over_the_line_is_the_loop_on_the_delayed_plant(rig):
-    """What the wires cost is one sample: u acts from the tick after the one whose y it answers."""
-    plant = ql.plants.delayed(ql.plants.two_mass_spring(), DT, DT)
-    model, x, scratch, still = (
-        plant.sampled(DT, True),
-        np.zeros(plant.order),
-        np.zeros(plant.order),
-        np.zeros(plant.disturbances),
-    )
-    with opened(rig) as device:
-        while (
-            device.handle.endpoint.numbers[frames.RECEIVED]
-            < rig.model.endpoint.numbers[frames.SENT]
-        ):
-            device.read()
-        for k in range(500):
-            rig.tick()
-            y = device.read()
-            assert y == pytest.approx(measure(model, x), rel=1e-9, abs=1e-15)
-            u = 5.0 * math.sin(0.1 * k) - y
-            device.write(u)
-            advance(model, x, scratch, k * DT, u, still)
-            await_command(rig)
-        assert abs(y) > 1e-9
-        assert device.counters["malformed"] == 0
-    await_command(rig)
-    rig.tick()
-    assert rig.state == "idle", "the goodbye must have come"
-
-
-def test_the_rig_s_watchdog_trips_when_commands_stop(rig):
-    """And the loop is told with the next measurement."""
-    with opened(rig) as device:
-        rig.tick()
-        device.read()
-        device.write(3.0)
-        await_command(rig)
-        rig.tick(6)
-        assert rig.state == "tripped"
-        device.read()
-        with pytest.raises(ConnectionError, match="watchdog has set u to zero"):
-            device.write(1.0)
-        assert device.lost
-
-
-def test_a_line_that_is_cut_is_told_at_once(rig):
-    """Nothing can be sent; nothing comes, and waiting for it takes no longer than it may."""
-    device = opened(rig)
-    rig.listener.close()
-    with pytest.raises(ConnectionError, match="could not be sent"):
-        device.write(1.0)
-    handle, clock = device.handle, system_clock()
-    for _ in range(3):
-        y, _ = read_measurement(handle, clock, time.monotonic_ns() + 1_000_000)
-    assert math.isnan(y)
-    device.close()
-
-
-def test_a_board_with_another_sample_time_is_refused(rig):
-    """In words that name both."""
-    with pytest.raises(ValueError, match="dt = 0.002 s: the device at .* ticks every 0.001 s"):
-        opened(rig, dt=2e-3)
-
-
 def test_nobody_at_the_other_end_is_said_so():
     """With what to look at."""
     listener = SerialListener("serial://pty")
@@ -392,12 +202,6 @@ def test_ports_that_are_none_are_refused(url, says):
         with pytest.raises(ValueError, match=says) as caught:
             end()
         assert "\n" not in str(caught.value)
-
-
-def test_a_port_has_one_user(rig):
-    """The second is told that there is a first."""
-    with opened(rig) as device, pytest.raises(ValueError, match="another program uses it"):
-        SerialDevice(device.url, DT)
 
 
 def test_a_port_that_is_not_ours_is_said_so(monkeypatch):

@@ -1,0 +1,178 @@
+"""The rig as a process of its own, as ``quell rig`` starts it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import uuid
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quell.cli.commands.rig import rig as run_rig
+from quell.realtime.devices.registry import listen, open_device
+
+# A tick so long that a machine with much else to do still keeps the session alive.
+DT = 0.01
+SETTINGS = {"dt": DT, "watchdog": 20, "u_max": 1.0, "rest": True}
+
+
+@contextmanager
+def rig(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start a rig; yield it and what it says when it is ready."""
+    command = [
+        sys.executable,
+        "-m",
+        "quell",
+        "rig",
+        "--plant",
+        "two-mass",
+        "--dt",
+        str(DT),
+        "--priority",
+        "0",
+        *arguments,
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            yield process, str(process.stdout and process.stdout.readline())
+        finally:
+            process.kill()
+
+
+def exchanged(device: Any, count: int) -> list[float]:
+    """Return what was measured in some samples, each answered."""
+    measured = []
+    for _ in range(count):
+        measured.append(device.read())
+        device.write(1.0)
+    return measured
+
+
+def test_a_rig_runs_until_it_is_told_to_end_and_says_how_it_went(tmp_path: Path) -> None:
+    """One line when it is ready, its counts at the end, exit code 0; and each tick in the log."""
+    log = tmp_path / "wire.csv"
+    with rig(
+        "--device", "udp://127.0.0.1:0", "--log", str(log), "--u-max", "0.5", "--watchdog", "200"
+    ) as (process, ready):
+        assert ready.startswith("two-mass at udp://127.0.0.1:")
+        url = ready.split()[2].rstrip(":")
+        with open_device(url, DT) as device:
+            assert np.isfinite(exchanged(device, 20)).all()
+        process.send_signal(signal.SIGTERM)
+        said, errors = process.communicate(timeout=60)
+        assert process.returncode == 0
+    assert errors == ""
+    assert "sessions: 1" in said
+    assert "largest |u| 1, cut to the limit: 1" in said
+    assert "frames that were not accepted:" in said
+    rows = np.genfromtxt(log, delimiter=",", names=True)
+    assert np.array_equal(rows["tick"], np.arange(rows.size))
+    assert f"ticks: {rows.size}" in said
+    assert np.nanmax(rows["u"]) == 0.5
+    assert np.nanmax(rows["command"]) == 1.0
+
+
+def test_a_rig_that_is_killed_is_noticed_and_replaced() -> None:
+    """In shared memory nothing stays in the way of the next one; the loop gets no more numbers."""
+    url = f"shm://test-{uuid.uuid4().hex}"
+    with rig("--device", url, "--watchdog", "200") as (process, _), open_device(url, DT) as device:
+        exchanged(device, 3)
+        process.kill()
+        process.wait()
+        device.read()
+        assert np.isnan(device.read())
+    with pytest.raises(ConnectionError, match="start one with: quell rig"):
+        open_device(url, DT)
+    with rig("--device", url) as (process, ready):
+        assert ready
+        with open_device(url, DT) as device:
+            exchanged(device, 3)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+    assert not list(Path("/dev/shm").glob(f"quell-{url.removeprefix('shm://')}*"))
+
+
+def test_a_loop_that_is_killed_leaves_u_at_zero(tmp_path: Path) -> None:
+    """The watchdog sees to it, within the ticks it was given; the next loop is served."""
+    log = tmp_path / "wire.csv"
+    with rig("--device", "udp://127.0.0.1:0", "--log", str(log), "--watchdog", "30") as (
+        process,
+        ready,
+    ):
+        url = ready.split()[2].rstrip(":")
+        loop = f"""
+import os, signal
+from quell.realtime import open_device
+device = open_device({url!r}, {DT})
+for _ in range(5):
+    device.read()
+    device.write(1.0)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+        assert (
+            subprocess.run([sys.executable, "-c", loop], check=False).returncode == -signal.SIGKILL
+        )
+        with open_device(url, DT) as device:
+            exchanged(device, 3)
+        process.send_signal(signal.SIGINT)
+        assert "ended by the watchdog: 1" in process.communicate(timeout=60)[0]
+    rows = np.genfromtxt(log, delimiter=",", names=True)
+    last = np.flatnonzero(
+        np.isfinite(rows["command"]) & (rows["session"] == rows["session"][rows["session"] > 0][0])
+    )[-1]
+    assert np.all(rows["u"][last : last + 30] == 1.0)
+    assert rows["u"][last + 30] == 0.0
+    assert rows["state"][last + 30] == 3
+
+
+def test_bad_input_is_a_line_and_exit_code_2() -> None:
+    """Before anything is opened."""
+    with rig("--device", "udp://127.0.0.1") as (process, ready):
+        said = process.communicate(timeout=60)[1]
+        assert (ready, process.returncode, said.count("\n")) == ("", 2, 1)
+    assert "must be udp://HOST:PORT" in said
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"device": "tcp://x"}, "must be like udp://"),
+        ({"plant": "moon"}, "--plant = 'moon'"),
+        ({"log": Path("/nowhere/x.csv")}, "log = '/nowhere/x.csv': can't be written"),
+        ({"seconds": -1.0}, "--seconds = -1.0"),
+        ({"priority": 100}, "priority = 100"),
+        ({"dt": 0.0}, "dt = 0.0"),
+        ({"watchdog": 0}, "watchdog = 0"),
+    ],
+)
+def test_what_is_wrong_is_named(
+    changed: dict[str, Any], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing is printed that would look like a rig."""
+    given = {
+        "device": "udp://127.0.0.1:0",
+        "plant": "two-mass",
+        "seconds": 1.0,
+        "priority": 0,
+    }
+    with pytest.raises(ValueError) as raised:
+        run_rig(**{**given, **SETTINGS, **changed})
+    assert message in str(raised.value)
+    assert capsys.readouterr().out == ""
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    """The second rig does not start."""
+    with (
+        closing(listen("udp://127.0.0.1:0")) as first,
+        pytest.raises(ValueError, match="can't listen there"),
+    ):
+        run_rig(device=first.url, plant="two-mass", seconds=1.0, priority=0, **SETTINGS)

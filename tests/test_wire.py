@@ -1,0 +1,251 @@
+"""Both ends of a wire, step by step: no test here knows what time it is."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.realtime.devices.base import (
+    read_measurement,
+)
+from quell.realtime.devices.registry import listen
+from quell.realtime.devices.twin import TwinDevice
+from quell.realtime.system.clock import system_clock
+from quell.realtime.wire import frames
+from quell.realtime.wire.udp import UdpDevice
+
+from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed, url_of
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_wire_is_a_delay_of_one_sample(wire: str, bench: Callable[..., Bench]) -> None:
+    """Bit for bit, where no frame is late: a twin behind ``delayed(plant, dt, dt)``, and so the simulation."""
+    here = bench(wire)
+    device = here.open()
+    assert device.paced
+    twin = TwinDevice(ql.plants.delayed(PLANT, DT, DT), DT)
+    for _ in range(500):
+        (y,) = here.cycle(device, law)
+        assert y == twin.read()
+        twin.write(law(y))
+    assert abs(y) > 0.1
+    counted = here.rig.counters
+    assert counted["accepted"] == 499
+    assert counted["skipped"] == counted["stale"] == device.counters["stale"] == 0
+
+
+def test_a_controller_over_the_wire_does_as_in_the_simulation(bench: Callable[..., Bench]) -> None:
+    """To the last digits: they hang on how the controller was compiled."""
+    here = bench("udp")
+    device = here.open()
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT), omega_c=1.0, u_min=-3.0, u_max=3.0
+    )
+    run = ql.simulate(
+        ql.plants.delayed(PLANT, DT, DT), controller, ql.Scenario(reference=1.0, duration=5.0)
+    )
+    measured = here.cycle(device, lambda y: controller.step(1.0, y), run["y"].size)
+    assert np.max(np.abs(run["y"])) > 0.3
+    np.testing.assert_allclose(measured, run["y"], atol=1e-10)
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_the_watchdog_sets_u_to_zero_for_good(wire: str, bench: Callable[..., Bench]) -> None:
+    """After so many ticks without a command, on that very tick; commands that come later change nothing, a new session does."""
+    here = bench(wire, watchdog=5)
+    device = here.open()
+    here.cycle(device, lambda y: 2.0, 3)
+    applied = []
+    for _ in range(8):
+        here.rig.tick()
+        applied.append(here.applied)
+    assert applied == [2.0, 2.0, 2.0, 2.0, 2.0, 0.0, 0.0, 0.0]
+    assert here.rig.state == "tripped"
+    assert not device.lost
+    assert np.isfinite(device.read())
+    assert device.lost
+    with pytest.raises(ConnectionError, match="watchdog"):
+        device.write(2.0)
+    here.rig.tick(3)
+    assert here.rig.state == "tripped"
+    assert here.applied == 0.0
+    device.close()
+    again = here.open()
+    here.cycle(again, lambda y: 2.0, 2)
+    assert here.rig.state == "live"
+    assert here.applied == 2.0
+    assert here.rig.counters["watchdog"] == 1
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(
+    wire: str, bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over UDP a frame may not arrive, in shared memory the hello may take its place: the goodbye is said again, and the rig serves."""
+    here = bench(wire)
+    device, said = here.open(), []
+    say = device._send
+
+    def lossy(kind: int, value: float, session: int) -> None:
+        said.append(kind)
+        if said.count(frames.GOODBYE) != 1 or kind != frames.GOODBYE:
+            say(kind, value, session)
+
+    monkeypatch.setattr(device, "_send", lossy)
+    thread = threading.Thread(target=device.restart_session)
+    thread.start()
+    while thread.is_alive():
+        here.rig.tick()
+        thread.join(0.002)
+    assert here.rig.state == "waiting"
+    assert here.rig.counters["sessions"] == 2
+    assert said.count(frames.GOODBYE) >= 2
+    here.rig.tick()
+    assert (
+        here.rig.model.endpoint.numbers[frames.SESSION]
+        == device.handle.endpoint.numbers[frames.SESSION]
+    )
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_hello_that_is_heard_when_its_loop_has_gone_begins_nothing(
+    wire: str, bench: Callable[..., Bench]
+) -> None:
+    """The rig was not ready yet, the loop gave up: the next one finds the rig free."""
+    here = bench(wire)
+    with pytest.raises(ConnectionError, match="no device answers"):
+        connect(here.url, DT, 0.1)
+    here.rig.tick(3)
+    assert here.rig.state == "idle"
+
+
+@pytest.mark.parametrize("wire", ["udp", "shm"])  # a serial line hangs up with it
+def test_the_rigs_end_is_told(wire: str, bench: Callable[..., Bench]) -> None:
+    """Its goodbye, where it can say one."""
+    here = bench(wire)
+    device = here.open()
+    here.cycle(device, law, 2)
+    here.rig.close()
+    assert np.isnan(device.read())
+    assert device.lost
+    with pytest.raises(ConnectionError):
+        device.write(0.0)
+    device.close()
+    with pytest.raises(ValueError, match="closed"):
+        device.read()
+
+
+@pytest.mark.parametrize("url", ["udp://127.0.0.1:9", "shm://nobody"])
+def test_where_nobody_answers_it_says_what_to_start(url: str) -> None:
+    """In a line."""
+    with pytest.raises(ConnectionError, match=f"start one with: quell rig --device {url}"):
+        connect(url, DT, 0.1)
+
+
+def test_a_port_that_is_taken_is_refused(bench: Callable[..., Bench]) -> None:
+    """And a name in shared memory that another rig has."""
+    for wire in ("udp", "shm"):
+        with pytest.raises(ValueError, match=r"can't listen there|another rig has this name"):
+            listen(bench(wire).url)
+
+
+def test_an_address_that_cannot_be_reached_is_named() -> None:
+    """Not only its error."""
+    with pytest.raises(ConnectionError, match="udp://255.255.255.255:5005: can't be reached"):
+        UdpDevice("udp://255.255.255.255:5005", DT)
+    with pytest.raises(ValueError, match="the host 'a{70}.com' is unknown"):
+        listen(f"udp://{70 * 'a'}.com:5005")
+
+
+def test_garbage_is_counted_and_changes_nothing(
+    bench: Callable[..., Bench], rng: np.random.Generator
+) -> None:
+    """At the rig, from real sockets: the loop does not notice."""
+    here = bench("udp")
+    device = here.open()
+    twin = TwinDevice(ql.plants.delayed(PLANT, DT, DT), DT)
+    host, _, port = here.url.removeprefix("udp://").partition(":")
+    good = packed(frames.COMMAND, 1, 1, 9.9)
+    other = packed(frames.COMMAND, 1, 1, 9.9, session=77)
+    foreign = [rng.bytes(int(rng.integers(0, 200))) for _ in range(20)] + [
+        b"",
+        good[:39],
+        good + b"x",
+        other,
+        packed(9, 1, 1, 0.0, session=77),
+    ]
+    foreign += [
+        packed(frames.GOODBYE, 0, 0, 0.0, session=77),
+        packed(frames.HELLO, 0, 0, DT, session=0),
+        packed(1, 1, 1, 0.0, version=3),
+    ]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for _ in range(5):
+            for data in foreign:
+                stranger.sendto(data, (host, int(port)))
+            (y,) = here.cycle(device, law)
+            assert y == twin.read()
+            twin.write(law(y))
+    counted = here.rig.counters
+    assert here.rig.state == "live"
+    assert counted["malformed"] == 5 * 23
+    assert counted["session"] == 5 * 3
+    assert counted["kind"] == 5 * 1
+    assert counted["version"] == 5
+    assert counted["accepted"] == 4
+
+
+def test_a_session_that_is_over_does_not_come_back(bench: Callable[..., Bench]) -> None:
+    """A hello or a command of it that was late on its way is counted, and u stays zero."""
+    here = bench("udp")
+    device = here.open()
+    session = int(device.handle.endpoint.numbers[frames.SESSION])
+    here.cycle(device, law, 3)
+    device.close()
+    here.rig.tick()
+    host, _, port = here.url.removeprefix("udp://").partition(":")
+    before = here.rig.counters["session"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as late:
+        for data in (
+            packed(frames.HELLO, 0, 0, DT, session=session),
+            packed(frames.COMMAND, 9, 3, 5.0, session=session),
+        ):
+            late.sendto(data, (host, int(port)))
+    here.rig.tick()
+    assert here.rig.state == "idle"
+    assert here.applied == 0.0
+    assert here.rig.counters["session"] == before + 2
+
+
+def test_what_waited_behind_many_others_is_not_taken_for_new(bench: Callable[..., Bench]) -> None:
+    """A queue that was full has lost its end; the next measurement is one again."""
+    here = bench("udp")
+    device = here.open()
+    here.cycle(device, law, 2)
+    here.rig.tick(60)
+    assert np.isnan(read_measurement(device.handle, system_clock(), 0)[0])
+    assert device.counters["stale"] == 1
+    here.rig.tick()
+    assert np.isfinite(device.read())
+
+
+def test_a_rig_that_was_killed_leaves_nothing_in_the_way(bench: Callable[..., Bench]) -> None:
+    """Its mailboxes are taken over, and a loop that was killed at writing does not stop the next."""
+    url = url_of("shm")
+    dead = listen(url)
+    dead.transport.own[:] = 7
+    dead.transport.others[:] = 7
+    for box in dead._boxes:
+        box.close()  # as the system does
+    here = bench(url=url)
+    device = here.open()
+    here.cycle(device, law, 3)
+    assert here.rig.state == "live"
+    here.rig.close()
+    assert not list(Path("/dev/shm").glob(f"quell-{url.removeprefix('shm://')}*"))
