@@ -161,7 +161,7 @@ def kalman_memory(learner: ql.learners.Kalman, observer: ESO) -> tuple[object, o
     design = learner.design(observer, 1.0)
     design = design._replace(threshold=1e-9 * design.threshold)
     memory = learner.memory(design)
-    memory.moment[:] = 1.0, 1.0, 1.0, 1e9
+    memory.averages.view(float)[:] = 1.0, 1.0, 1.0, 1e9
     memory.variance[:] = 1.0
     return design._replace(forget=0.0, fastest=1e9, f_noise=0.0), memory
 
@@ -417,7 +417,7 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew(learner: object) -
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ql.learners.Kalman(state=False, bias=False), "at least one feature must be left"),
+        (lambda: ql.learners.Kalman(state=False, bias=False), "keep at least one feature"),
         (
             lambda: ql.learners.Kalman(bias_bandwidth=-1.0),
             "bias_bandwidth = -1.0: must be finite and not negative",

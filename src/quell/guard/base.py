@@ -34,7 +34,7 @@ def limit(
 
 @generic
 def record_output(guard: Any, memory: Any, f_learned: float) -> None:
-    """Store the learner's output of this sample and the ``f_learned`` that the observer receives."""
+    """Store the output of this sample and the ``f_learned`` that the observer receives."""
     raise TypeError
 
 

@@ -3,10 +3,10 @@
     u_0 = k_1 (r − x̂_1) + k_2 (r' − x̂_2) + … + k_m (r^(m−1) − x̂_m) + r^(m),
     u   = sat( (u_0 − f_L − Δf̂ + a·x̂) / b0 ),        k_i = C(m, i−1) omega_c^(m−i+1)
 
-(Gao, ACC 2003; paper eq. (control), which lacks the term ``a·x̂``.) Derivatives of r are zero unless
-they are given; m is the relative degree from u to y, which is the plant's order unless it has zeros.
-The feedforward ``f_L = h + s u`` is affine in u, so the loop through u is solved exactly, without a
-delay of one sample: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``.
+(Gao, ACC 2003; paper eq. (control), which lacks the term ``a·x̂``.) Derivatives of r are zero
+unless they are given; m is the relative degree from u to y, which is the plant's order unless it
+has zeros. The feedforward ``f_L = h + s u`` is affine in u, so the loop through u is solved
+exactly, without a delay of one sample: ``u = sat( (u_0 − h − Δf̂ + a·x̂) / (b0 + s) )``.
 
 If u reaches the plant with a delay, learner, guard and observer receive the u that *acts*
 (``observers.base.acting_control``): ``f_L = h + s u_acting``. The law does not change, because f

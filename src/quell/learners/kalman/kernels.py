@@ -1,0 +1,317 @@
+"""The lag-compensated learner: a Kalman filter that accounts for the observer's own lag.
+
+With the features φ (state, bias, sinusoids, u) and their lag-filtered values φ^F
+(``learners/lag.py``), each sample::
+
+    ε = Δf̂ + f_L^F − θ·φ^F
+    g = P φ̃ / max(φ̃·P φ̃ + 1/dt, φ̃·P φ̃ / (λ_m dt))
+    θ ← θ + g ε,    P ← P − g (P φ̃)ᵀ + Q dt
+
+All quantities are continuous-time densities, so the tuning does not change with dt. Coefficients of
+the state and of u are measured in noise of density ``R = τ E[ε² + (0.1 f̂)² + σ²]``: for them φ̃ =
+φ^F/√R and ε/√R replace φ^F and ε. The coefficient of the bias is measured in units of R itself.
+
+**R follows the innovation.** What the learner cannot explain counts as noise, so it learns less
+from it. Two lower bounds keep R positive: a linear model never explains more than nine tenths of f,
+and f̂ contains σ, the effect of measurement noise and rounding. The mean is exponential; τ =
+N/omega_o, the observer's lag, is the correlation time of the noise in Δf̂. The gain of the bias
+does not follow R: a gain that follows the noise shifts its high frequencies to low ones, where the
+loop is sensitive.
+
+**Random walk.** A walk is given as a tracking bandwidth λ. For the bias ``Q = λ²``: the steady
+Kalman gain of a random walk in white noise is ``sqrt(Q/R)``, so a constant disturbance is learned
+with the time constant 1/λ in any unit. For a feature of variance φ² it is ``λ² R/φ²``. All features
+together learn at most at the rate λ_m, the larger of omega_o and the bandwidth of the bias, because
+the observer cannot verify anything faster.
+
+**Excitation.** At rest the estimated derivatives are only noise, and a regression on noise slowly
+finds coefficients that mean nothing. So a feature is used only while its variance exceeds
+``SIGNAL_TO_NOISE²`` times the variance that measurement noise, estimated from y − x̂_1, causes in
+it; otherwise its entry of φ̃ is zero. Rounding counts as noise. With a bias, φ̃ contains the
+feature less its running mean, and a change of a coefficient is compensated in the bias at that
+mean.
+
+**Start.** After a start from rest Δf̂ contains the observer's initial error, which is no
+disturbance: the learner does not learn for 2 τ.
+
+docs/theory, "The lag-compensated learner", has the derivation and measurements.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.scalars import Scalars, clear
+from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
+from quell.learners.lag import STARTUP_LAGS, lag_push
+from quell.learners.noise_gate import RESOLUTION
+from quell.types import Matrix, Vector
+
+# Least share of f that counts as unexplained by a linear model; chosen by hand, not tuned further.
+_UNEXPLAINED_SHARE = 0.1
+
+
+class KalmanDesign(NamedTuple):
+    """Parameters for an observer of order n and p features: state, bias, pairs of sinusoids, u."""
+
+    lag: Any
+    scale: Vector
+    """Factor of each feature's signal (p,)."""
+    walk: Vector
+    """λ² of each feature [1/s²] (p,)."""
+    threshold: Vector
+    """Least variance of a feature that is used, in units of that of y − x̂_1 (p,).
+
+    0 for bias and sinusoids, which are always used.
+    """
+    prior: Vector
+    """Initial standard deviation of θ in scaled units (p,).
+
+    0 for bias and sinusoids, because their walk makes P grow by itself.
+    """
+    fastest: float
+    """λ_m [rad/s]."""
+    f_noise: float
+    """Variance that white noise of unit variance in y causes in f̂."""
+    states: int
+    """n, or 0 without state features."""
+    bias: bool
+    oscillators: Oscillators
+    with_u: bool
+    slope_low: float
+    """Least θ_u in scaled units."""
+    slope_high: float
+    """Largest θ_u in scaled units."""
+    dt: float
+    forget: float
+    """dt over the averaging time of mean squares."""
+    lag_time: float
+    """τ [s]."""
+
+
+class KalmanAverages(Scalars):
+    """Exponential sums, whose quotient with ``weight`` is a mean, and the time."""
+
+    noise: float  # squares of y − x̂_1
+    unexplained: float  # squares of what the model does not explain
+    weight: float  # ones: it grows from 0 to 1
+    time: float  # since the start from rest [s]
+
+
+class KalmanMemory(NamedTuple):
+    """State of the learner, with p features and m oscillators."""
+
+    theta: Vector
+    """θ in scaled units (p,)."""
+    covariance: Matrix
+    """P (p, p); for the bias in units of R."""
+    chain: Matrix
+    """Lag filters of the features (p, …)."""
+    filtered: Vector
+    """φ^F (p,)."""
+    mean: Vector
+    """Running means of φ^F (p,)."""
+    variance: Vector
+    """Running variances of φ^F (p,)."""
+    regressor: Vector
+    """φ̃ of the newest sample (p,)."""
+    gain: Vector
+    """P φ̃ (p,)."""
+    phase: Vector
+    """ψ of each oscillator [rad] (m,)."""
+    omega: Vector
+    """ω̂ of each oscillator [rad/s] (m,)."""
+    averages: NDArray[KalmanAverages]
+    """(1,)."""
+
+
+@adapt.register(KalmanDesign)
+def _adapt(
+    learner: KalmanDesign,
+    memory: KalmanMemory,
+    seen: Vector,
+    y: float,
+    u_before: float,
+    f_plain: float,
+) -> None:
+    theta, covariance, gain = memory.theta, memory.covariance, memory.gain
+    regressor, averages = memory.regressor, memory.averages[0]
+    size = theta.size
+    # Loops, because at this size a call of BLAS takes longer than the arithmetic.
+    innovation = f_plain
+    for i in range(size):
+        innovation -= theta[i] * memory.filtered[i]
+    noise, deviation = _update_averages(learner, averages, y, y - seen[0], innovation, f_plain)
+    if not is_finite(deviation):  # for example after a measurement near the largest float
+        restart(learner, memory)
+        return
+    if deviation == 0.0:
+        return
+    weight = 1.0 / deviation
+    _update_regressor(learner, memory, noise, weight)
+    if averages.time <= STARTUP_LAGS * learner.lag_time:
+        return
+    spread = 0.0
+    for i in range(size):
+        total = 0.0
+        for j in range(size):
+            total += covariance[i, j] * regressor[j]
+        gain[i] = total
+        spread += total * regressor[i]
+    if spread < 0.0:  # by rounding P is no longer a covariance: do not learn
+        return
+    inverse = 1.0 / max(spread + 1.0 / learner.dt, spread / (learner.fastest * learner.dt))
+    for i in range(size):
+        share = gain[i] * inverse
+        for j in range(size):
+            covariance[i, j] -= share * gain[j]
+        if learner.threshold[i] == 0.0:
+            theta[i] += share * innovation
+            covariance[i, i] += learner.walk[i] * learner.dt
+        else:
+            updated = theta[i] + share * innovation * weight
+            if learner.with_u and i == size - 1:
+                updated = min(max(updated, learner.slope_low), learner.slope_high)
+            change = updated - theta[i]
+            theta[i] = updated
+            if learner.bias:
+                theta[learner.states] -= change * memory.mean[i]
+            if memory.regressor[i] != 0.0:
+                covariance[i, i] += (
+                    learner.walk[i] * learner.dt * deviation * deviation / memory.variance[i]
+                )
+    step = inverse * innovation
+    for j in range(memory.omega.size):
+        at = learner.oscillators.first + 2 * j
+        change_s, change_c = step * gain[at], step * gain[at + 1]
+        retune(
+            learner.oscillators, memory.omega, j, theta, change_s, change_c, averages.unexplained
+        )
+
+
+@kernel
+def _update_averages(
+    learner: KalmanDesign,
+    averages: KalmanAverages,
+    y: float,
+    error: float,
+    innovation: float,
+    target: float,
+) -> tuple[float, float]:
+    """Update the averages; return the mean square of y − x̂_1, and √R."""
+    rounding, doubt = RESOLUTION * y, _UNEXPLAINED_SHARE * target
+    averages.noise += learner.forget * (error * error + rounding * rounding - averages.noise)
+    averages.unexplained += learner.forget * (
+        innovation * innovation + doubt * doubt - averages.unexplained
+    )
+    averages.weight += learner.forget * (1.0 - averages.weight)
+    averages.time += learner.dt
+    unexplained = averages.unexplained + learner.f_noise * averages.noise
+    deviation = math.sqrt(learner.lag_time * unexplained / averages.weight)
+    return averages.noise / averages.weight, deviation
+
+
+@kernel
+def _update_regressor(
+    learner: KalmanDesign, memory: KalmanMemory, noise: float, weight: float
+) -> None:
+    """Calculate φ̃; ``noise`` is the mean square of y − x̂_1, ``weight`` 1/√R."""
+    filtered, mean, variance = memory.filtered, memory.mean, memory.variance
+    for i in range(filtered.size):
+        if learner.threshold[i] == 0.0:
+            memory.regressor[i] = filtered[i]
+        else:
+            away = filtered[i] - mean[i]
+            mean[i] += learner.forget * away
+            variance[i] += learner.forget * (away * away - variance[i])
+            centre = mean[i] if learner.bias else 0.0
+            moves = variance[i] > learner.threshold[i] * noise
+            memory.regressor[i] = weight * (filtered[i] - centre) if moves else 0.0
+
+
+@predict.register(KalmanDesign)
+def _predict(
+    learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before: float
+) -> tuple[float, float]:
+    theta, phase = memory.theta, memory.phase
+    constant = 0.0
+    for i in range(learner.states):
+        constant += theta[i] * learner.scale[i] * seen[i]
+    if learner.bias:
+        constant += theta[learner.states]
+    for j in range(phase.size):
+        at = learner.oscillators.first + 2 * j
+        constant += theta[at] * math.sin(phase[j]) + theta[at + 1] * math.cos(phase[j])
+    last = theta.size - 1
+    slope = theta[last] * learner.scale[last] if learner.with_u else 0.0
+    return constant, slope
+
+
+@commit.register(KalmanDesign)
+def _commit(
+    learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u: float, f_learned: float
+) -> None:
+    chain, filtered = memory.chain, memory.filtered
+    for i in range(learner.states):
+        filtered[i] = lag_push(learner.lag, chain, i, learner.scale[i] * seen[i])
+    if learner.bias:
+        filtered[learner.states] = lag_push(learner.lag, chain, learner.states, 1.0)
+    for j in range(memory.phase.size):
+        at = learner.oscillators.first + 2 * j
+        filtered[at] = lag_push(learner.lag, chain, at, math.sin(memory.phase[j]))
+        filtered[at + 1] = lag_push(learner.lag, chain, at + 1, math.cos(memory.phase[j]))
+    turn_phases(memory.phase, memory.omega, learner.dt)
+    if learner.with_u:
+        last = filtered.size - 1
+        filtered[last] = lag_push(learner.lag, chain, last, learner.scale[last] * u)
+
+
+@restart.register(KalmanDesign)
+def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
+    for i in range(memory.filtered.size):
+        memory.filtered[i] = 0.0
+        for j in range(memory.chain.shape[1]):
+            memory.chain[i, j] = 0.0
+    memory.averages[0].time = 0.0
+    if not _all_finite(memory):
+        _forget(learner, memory)
+
+
+@kernel
+def _all_finite(memory: KalmanMemory) -> bool:
+    """Return whether everything that was learned is finite."""
+    averages = memory.averages[0]
+    finite = is_finite(averages.noise) and is_finite(averages.unexplained)
+    for j in range(memory.omega.size):
+        finite = finite and is_finite(memory.omega[j]) and is_finite(memory.phase[j])
+    for i in range(memory.theta.size):
+        finite = finite and is_finite(memory.theta[i])
+        finite = finite and is_finite(memory.mean[i]) and is_finite(memory.variance[i])
+        for j in range(memory.theta.size):
+            finite = finite and is_finite(memory.covariance[i, j])
+    return finite
+
+
+@kernel
+def _forget(learner: KalmanDesign, memory: KalmanMemory) -> None:
+    """Return to a state with nothing learned."""
+    clear(memory.averages)
+    for j in range(memory.omega.size):
+        memory.phase[j] = 0.0
+        memory.omega[j] = learner.oscillators.omega[j]
+    for i in range(memory.theta.size):
+        memory.theta[i] = memory.mean[i] = memory.variance[i] = 0.0
+        memory.regressor[i] = memory.gain[i] = 0.0
+        for j in range(memory.theta.size):
+            memory.covariance[i, j] = learner.prior[i] ** 2 if i == j else 0.0
+
+
+@coefficients.register(KalmanDesign)
+def _coefficients(learner: KalmanDesign, memory: KalmanMemory, theta: Vector) -> None:
+    for i in range(theta.size):
+        theta[i] = memory.theta[i] * learner.scale[i]
