@@ -14,7 +14,7 @@ import pytest
 import quell as ql
 from quell.cli.app import app
 from quell.identification import Identified, excitation, excited, frequency_response, read_record
-from quell.identification.search import root_covariance
+from quell.identification.roots import root_covariance
 from quell.identification.structure import Structure, gradient, output
 
 from .test_cli import quell

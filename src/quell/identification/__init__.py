@@ -1,11 +1,14 @@
-"""Models from records: a transfer function from measured input and output, and what to excite a plant with."""
+"""System identification: a transfer function from measured input and output, and the design of excitations.
+
+``identify`` is the search; ``structure`` has the model and its gradient, ``sampling`` the filters below it.
+"""
 
 from quell.identification.excitation import Excitation, excitation
-from quell.identification.experiment import excited
 from quell.identification.frequency_response import FrequencyResponse, frequency_response
 from quell.identification.identify import identify
-from quell.identification.measured import Measured, read_record
-from quell.identification.result import Identified, Root
+from quell.identification.measured import Measured, excited, read_record
+from quell.identification.result import Identified
+from quell.identification.roots import Root
 from quell.identification.validation import Residuals
 
 __all__ = [

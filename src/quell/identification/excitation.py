@@ -1,13 +1,13 @@
-"""What to send to a plant, so that a model can be found in the answer: designed for a band, a duration and limits of u."""
+"""Design of excitations for identification, for a frequency band, a duration and limits of u."""
 
 from __future__ import annotations
 
 import math
 import os
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell import checks
 from quell.files import written_atomically
@@ -17,11 +17,13 @@ from quell.signals.shapes import Chirp
 from quell.types import Vector
 
 KINDS = ("multisine", "prbs", "chirp")
+# Least and most bits of a PRBS, those of ``signals.PRBS``.
 _BITS = (2, 20)
-# The spectrum of a PRBS is 3 dB down at 0.443 of a value's rate.
+# The spectrum of a PRBS, sinc², is 3 dB down at 0.443 of the rate of its values.
 _HALF_POWER = 2.0 * math.pi * 0.443
-# Lines of a multisine at most: more are not told apart in a plot, and each has less power.
+# Most lines of a multisine: chosen by hand, as more lines look like one in a plot and have less power each.
 _LINES = 120
+# Rounds of clipping: chosen by hand; not tuned further.
 _ROUNDS = 400
 
 
@@ -31,23 +33,23 @@ class Excitation:
 
     kind: str
     signal: Signal
-    """For a scenario or a rig; as ``u``, if it is sampled at ``dt`` and held."""
+    """The same for a scenario or a rig; equals ``u`` if it is sampled at ``dt`` and held."""
     dt: float
     """[s]."""
     u: Vector
-    """Its samples (N,) [u-unit]."""
+    """Samples (N,) [u-unit]."""
     period: float
-    """After how long it repeats [s]; infinite for a chirp."""
+    """Period [s]; infinite for a chirp."""
     band: tuple[float, float]
-    """From the lowest to the highest frequency that it really excites [rad/s]."""
+    """Lowest and highest frequency that is really excited [rad/s]."""
     crest: float
-    """Peak of ``u − mean`` over its RMS: 1 is the least there is, a sinusoid has 1.41."""
+    """Peak of ``u − mean`` over its RMS: 1 at least, 1.41 for a sinusoid."""
     rms: float
-    """of ``u − mean`` [u-unit]."""
+    """RMS of ``u − mean`` [u-unit]."""
     details: str
     """The design in a sentence."""
     shortcomings: tuple[str, ...]
-    """What was asked for and could not be had within limits and duration; each says what to do."""
+    """Requirements that limits and duration do not allow; each with a remedy."""
 
     @property
     def t(self) -> Vector:
@@ -58,24 +60,23 @@ class Excitation:
         """Return the design as text."""
         lines = [
             self.details,
-            f"excites {self.band[0]:.4g} to {self.band[1]:.4g} rad/s; crest factor {self.crest:.3f}, RMS {self.rms:.4g}, "
-            f"from {np.min(self.u):.4g} to {np.max(self.u):.4g}",
+            f"excites {self.band[0]:.4g} to {self.band[1]:.4g} rad/s; crest factor {self.crest:.3f}, "
+            f"RMS {self.rms:.4g}, from {np.min(self.u):.4g} to {np.max(self.u):.4g}",
         ]
         return "\n".join([*lines, *(f"NOT: {text}" for text in self.shortcomings)])
 
     __str__ = describe
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``t,u`` as CSV, whole or not at all.
+        """Write ``t,u`` as CSV, completely or not at all.
 
         Raises
         ------
         ValueError
-            where the file can't be written.
+            if the file can't be written.
         """
-        rows = "".join(
-            f"{t:.9g},{u:.9g}\n" for t, u in zip(self.t.tolist(), self.u.tolist(), strict=True)
-        )
+        samples = zip(self.t.tolist(), self.u.tolist(), strict=True)
+        rows = "".join(f"{t:.9g},{u:.9g}\n" for t, u in samples)
         with written_atomically(path) as part:
             part.write_text("t,u\n" + rows, encoding="utf-8")
 
@@ -95,33 +96,34 @@ def excitation(
     Parameters
     ----------
     kind
-        * ``"multisine"``: up to 120 lines of one size, logarithmically spread over the band, all with whole numbers of periods: an answer
-          at rest has no leakage. Phases are Schroeder's, then made better by clipping the peaks again and again and keeping the phases
-          that this gives (van der Ouderaa, Schoukens & Renneboog, *IEEE Trans. Instrumentation and Measurement* 37, 1988).
-        * ``"prbs"``: two values, the least crest factor. Values are held as long as the upper end of the band lets them (there the
-          spectrum is 3 dB down), the register is as long as its lower end asks for.
-        * ``"chirp"``: a sinusoid that sweeps through the band once, the same time for each octave.
+        * ``"multisine"``: up to 120 lines of equal size, logarithmically spread over the band, all with whole numbers of
+          periods, so that a steady response has no leakage. The phases are Schroeder's, improved by repeatedly clipping the
+          peaks and keeping the resulting phases (van der Ouderaa, Schoukens & Renneboog, *IEEE Trans. Instrumentation and
+          Measurement* 37, 1988).
+        * ``"prbs"``: two values, the least crest factor. The upper end of the band determines how long values are held (the
+          spectrum is 3 dB down there), the lower end the length of the register.
+        * ``"chirp"``: a sinusoid that sweeps through the band once, with the same time for each octave.
     band
         lowest and highest frequency [rad/s], the highest below π/dt.
     duration
-        how long it takes [s].
+        [s].
     dt
         sample time [s].
     u_min, u_max
-        limits of u, which are reached. With both of one sign a motor that turns does not turn back: then Coulomb friction is a constant
-        force, and does not disturb the identification (docs/identification).
+        limits of u, which are reached. With both of the same sign a motor does not turn back: then Coulomb friction is a
+        constant force, and does not disturb the identification (docs/identification).
     seed
-        where a PRBS begins, and the phase of the first line of a multisine.
+        start of a PRBS, and phase of the first line of a multisine.
 
     Returns
     -------
     Excitation
-        with ``shortcomings`` where not all that was asked for can be had.
+        with ``shortcomings`` if not all requirements can be met.
 
     Raises
     ------
     ValueError
-        for a kind, a band, a duration or limits that are out of range.
+        for a kind, a band, a duration or limits out of range.
 
     Examples
     --------
@@ -141,7 +143,8 @@ def excitation(
     count = math.floor(duration / dt + 1e-9)
     if count < 16 or count * dt * low < 2.0 * math.pi * 0.1:
         raise ValueError(
-            f"duration = {duration!r} s: must be at least 16 samples and a tenth of the slowest period, {2.0 * math.pi / low:.4g} s"
+            f"duration = {duration!r} s: must be at least 16 samples and a tenth of the slowest "
+            f"period, {2.0 * math.pi / low:.4g} s"
         )
     design = {"multisine": _multisine, "prbs": _prbs, "chirp": _chirp}[kind]
     signal, period, reached, details, shortcomings = design(low, high, count, dt, seed)
@@ -154,7 +157,8 @@ def excitation(
     if count * dt * low < 2.0 * math.pi:
         shortcomings = (
             *shortcomings,
-            f"{duration:g} s is less than one period of {low:.4g} rad/s; take longer, or begin the band higher",
+            f"{duration:g} s is less than one period of {low:.4g} rad/s; "
+            "take longer, or begin the band higher",
         )
     return Excitation(
         kind=kind,
@@ -176,17 +180,17 @@ _Design = tuple[Signal, float, tuple[float, float], str, tuple[str, ...]]
 def _chirp(low: float, high: float, count: int, dt: float, seed: int) -> _Design:
     sweep = Chirp(1.0, low, high, count * dt, logarithmic=True)
     octaves = math.log2(high / low)
-    details = f"chirp from {low:.4g} to {high:.4g} rad/s in {count * dt:.6g} s, {count * dt / octaves:.3g} s an octave"
-    # A resonance is only seen by as many periods as the sweep stays near it.
+    details = (
+        f"chirp from {low:.4g} to {high:.4g} rad/s in {count * dt:.6g} s, "
+        f"{count * dt / octaves:.3g} s an octave"
+    )
+    # A resonance is excited for only as many periods as the sweep stays near it.
     periods = low * count * dt / octaves / (2.0 * math.pi)
     short = (
-        ()
-        if periods >= 1.0
-        else (
-            f"the lowest octave gets {periods:.2g} periods of its lowest frequency; take longer, or a multisine",
-        )
+        f"the lowest octave gets {periods:.2g} periods of its lowest frequency; "
+        "take longer, or a multisine"
     )
-    return sweep, math.inf, (low, high), details, short
+    return sweep, math.inf, (low, high), details, () if periods >= 1.0 else (short,)
 
 
 def _prbs(low: float, high: float, count: int, dt: float, seed: int) -> _Design:
@@ -199,23 +203,30 @@ def _prbs(low: float, high: float, count: int, dt: float, seed: int) -> _Design:
     reached = (2.0 * math.pi / signal.period, min(_HALF_POWER / step, math.pi / dt))
     if bits < wanted:
         short.append(
-            f"the lowest line is {reached[0]:.4g} rad/s, not {low:.4g}: {wanted} bits take {(2**wanted - 1) * step:.4g} s, "
-            f"{'more than there are' if bits == fits else 'and 20 bits are the most'}; take longer, or begin the band higher"
+            f"the lowest line is {reached[0]:.4g} rad/s, not {low:.4g}: {wanted} bits take "
+            f"{(2**wanted - 1) * step:.4g} s, "
+            f"{'more than there are' if bits == fits else 'and 20 bits are the most'}; "
+            "take longer, or begin the band higher"
         )
     if reached[1] < high:
         short.append(
-            f"at {high:.4g} rad/s it is more than 3 dB down, from {reached[1]:.4g} on; sample faster, or end the band lower"
+            f"at {high:.4g} rad/s it is more than 3 dB down, from {reached[1]:.4g} on; "
+            "sample faster, or end the band lower"
         )
     if signal.period > count * dt + 1e-9:
         short.append(
-            f"not one whole period of {signal.period:.4g} s fits into {count * dt:.4g} s; take longer"
+            f"not one whole period of {signal.period:.4g} s fits into {count * dt:.4g} s; "
+            "take longer"
         )
-    details = f"PRBS of {bits} bits, each held for {samples} samples ({step:.4g} s), period {signal.period:.4g} s"
+    details = (
+        f"PRBS of {bits} bits, each held for {samples} samples ({step:.4g} s), "
+        f"period {signal.period:.4g} s"
+    )
     return signal, signal.period, reached, details, tuple(short)
 
 
 def _multisine(low: float, high: float, count: int, dt: float, seed: int) -> _Design:
-    # As many periods as the lowest frequency, of at least one period itself, leaves.
+    # As many periods as the lowest frequency, which needs at least one period itself, allows.
     periods = max(1, math.floor(low * count * dt / (2.0 * math.pi) + 1e-9))
     length = count // periods
     base = 2.0 * math.pi / (length * dt)
@@ -223,42 +234,37 @@ def _multisine(low: float, high: float, count: int, dt: float, seed: int) -> _De
     last = min(last, (length - 1) // 2)
     if last < first:
         raise ValueError(
-            f"band = {(low, high)!r}: has no multiple of {base:.4g} rad/s, the lowest frequency of the duration; take longer"
+            f"band = {(low, high)!r}: has no multiple of {base:.4g} rad/s, "
+            "the lowest frequency of the duration; take longer"
         )
-    lines = np.unique(
-        np.round(np.geomspace(first, last, min(_LINES, last - first + 1))).astype(int)
-    )
-    phases = _flattened(lines, schroeder_phases(np.ones(lines.size)), length) + float(
-        seed % 360
-    ) * math.pi / 180.0 * (seed > 0)
+    spread = np.geomspace(first, last, min(_LINES, last - first + 1))
+    lines = np.unique(np.round(spread).astype(int))
+    phases = _flattened(lines, schroeder_phases(np.ones(lines.size)))
+    phases = phases + float(seed % 360) * math.pi / 180.0 * (seed > 0)
     signal = Multisine(lines * base, np.ones(lines.size), np.mod(phases, 2.0 * math.pi))
-    details = f"multisine of {lines.size} lines, period {length * dt:.6g} s, {periods} time{'s' if periods > 1 else ''}"
-    short = (
-        []
-        if periods > 1
-        else [
-            "there is only one period, so what is left of the start is not told from the answer; take longer for two"
-        ]
-    )
+    times = f"{periods} time{'s' if periods > 1 else ''}"
+    details = f"multisine of {lines.size} lines, period {length * dt:.6g} s, {times}"
+    short = []
+    if periods == 1:
+        short.append(
+            "there is only one period, so the transient of the start is not separated from the "
+            "response; take longer for two"
+        )
     if lines.size < last - first + 1:
         gap = float(np.max(np.diff(lines))) * base
         short.append(
-            f"lines are up to {gap:.3g} rad/s apart: a resonance narrower than that may lie between; take a PRBS or a narrower band"
+            f"lines are up to {gap:.3g} rad/s apart: a resonance narrower than that may lie between; "
+            "take a PRBS or a narrower band"
         )
-    return (
-        signal,
-        length * dt,
-        (float(lines[0] * base), float(lines[-1] * base)),
-        details,
-        tuple(short),
-    )
+    reached = (float(lines[0] * base), float(lines[-1] * base))
+    return signal, length * dt, reached, details, tuple(short)
 
 
-def _flattened(lines: Any, phases: Vector, length: int) -> Vector:
-    """Return phases of a lower peak: clip, keep the phases of what results, and again; the best of all rounds."""
+def _flattened(lines: NDArray[np.int64], phases: Vector) -> Vector:
+    """Return phases with a lower peak: the best of repeated rounds of clipping and keeping the resulting phases."""
     from scipy.fft import irfft, next_fast_len, rfft
 
-    # A few samples a period of the highest line show its peaks.
+    # Eight samples per period of the highest line show its peaks.
     size = next_fast_len(max(8 * int(lines[-1]), 64), real=True)
     best, lowest = phases, math.inf
     spectrum = np.zeros(size // 2 + 1, dtype=complex)

@@ -1,26 +1,27 @@
-"""The frequency response as the record itself has it, without a model."""
+"""The empirical frequency response: averaged spectra of a record, without a model."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell import checks
 from quell.types import Vector
 
 
 class FrequencyResponse(NamedTuple):
-    """Ratios of spectra."""
+    """An empirical frequency response."""
 
     omega: Vector
     """[rad/s] (points,)."""
-    response: Any
-    """complex [y-unit/u-unit] (points,)."""
+    response: NDArray[np.complex128]
+    """Complex [y-unit/u-unit] (points,)."""
     coherence: Vector
-    """the share of y that is explained by u (by ``reference`` where that was given), 0 to 1 (points,)."""
+    """Share of the power of y that u (or ``reference``, if given) explains, 0 to 1 (points,)."""
     deviation: Vector
-    """relative standard deviation of ``response`` (points,)."""
+    """Relative standard deviation of ``response`` (points,)."""
 
 
 def frequency_response(
@@ -28,11 +29,12 @@ def frequency_response(
 ) -> FrequencyResponse:
     """Estimate the frequency response from u to y by averaged spectra, without a model.
 
-    ``Ĝ = S_yu/S_uu`` over half-overlapping segments with a Hann window (Welch, *IEEE Trans. Audio Electroacoustics* 15, 1967), of the
-    differences of u and y: that leaves the ratio as it is, and an integrator's drift does not leak over all frequencies. In a closed loop
-    it is biased, as u answers to the noise in y too; with what was sent into the loop from outside it is not: ``Ĝ = S_yr/S_ur``
-    (Söderström & Stoica, *System Identification*, 1989, sec. 10.3). Its relative variance is about ``(1 − γ²)/(2 γ² n)`` for the
-    coherence γ² and n independent averages (Bendat & Piersol, *Random Data*, 4th ed. 2010, sec. 9.2).
+    ``Ĝ = S_yu/S_uu`` over half-overlapping segments with a Hann window (Welch, *IEEE Trans. Audio Electroacoustics* 15, 1967).
+    The spectra are those of the differences of u and y, which have the same ratio, and in which the drift of an integrator does
+    not leak over all frequencies. In a closed loop the ratio is biased, as u reacts to the noise in y; with the external signal
+    ``Ĝ = S_yr/S_ur`` is not (Söderström & Stoica, *System Identification*, 1989, sec. 10.3). The relative variance is about
+    ``(1 − γ²)/(2 γ² n)`` for the coherence γ² and n independent averages (Bendat & Piersol, *Random Data*, 4th ed. 2010,
+    sec. 9.2).
 
     Parameters
     ----------
@@ -41,19 +43,19 @@ def frequency_response(
     dt
         sample time [s].
     reference
-        what was sent into the loop from outside (N,), of data from a closed loop.
+        external signal of a closed loop (N,).
     segments
-        how many segments the record is cut into, 2 or more: more are smoother and blur resonances.
+        number of segments, 2 or more: with more the response is smoother, and resonances are blurred.
 
     Returns
     -------
     FrequencyResponse
-        at frequencies up to half the sampling rate, zero not among them.
+        at frequencies up to half the sampling rate, without zero.
 
     Raises
     ------
     ValueError
-        for records that are not of one length, or too short for so many segments.
+        for records that differ in length, or are too short for the number of segments.
     """
     from scipy.signal import csd, welch
 
@@ -63,7 +65,8 @@ def frequency_response(
     length = (u.size - 1) // checks.whole("segments", segments, 2)
     if length < 16:
         raise ValueError(
-            f"u has {u.size} samples: must have at least {17 * segments} for {segments} segments; take fewer"
+            f"u has {u.size} samples: must have at least {17 * segments} for {segments} segments; "
+            "take fewer"
         )
     settings = {"fs": 1.0 / checks.positive("dt", dt, "s"), "nperseg": length, "detrend": False}
     du, dy, dr = np.diff(u), np.diff(y), np.diff(r)
@@ -74,9 +77,5 @@ def frequency_response(
         response = ry / ru
         deviation = np.sqrt(np.maximum(1.0 - coherence, 0.0) / (2.0 * coherence * segments))
     good = np.isfinite(response) & np.isfinite(deviation) & (frequency > 0.0)
-    return FrequencyResponse(
-        2.0 * np.pi * frequency[good],
-        response[good],
-        np.minimum(coherence[good], 1.0),
-        deviation[good],
-    )
+    omega, coherence = 2.0 * np.pi * frequency[good], np.minimum(coherence[good], 1.0)
+    return FrequencyResponse(omega, response[good], coherence, deviation[good])

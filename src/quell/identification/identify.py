@@ -1,4 +1,4 @@
-"""The public function."""
+"""The public function ``identify``: checks of its arguments, the search, and the judged result."""
 
 from __future__ import annotations
 
@@ -7,21 +7,23 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.identification.closed_loop import instrumental
-from quell.identification.friction import free_run
-from quell.identification.result import Identified, Root
-from quell.identification.search import Fit, fit, root_covariance
-from quell.identification.structure import Structure
-from quell.identification.validation import Predictor, nrmse, residuals, simulated
+from quell.identification.closed_loop import instrumental_variables
+from quell.identification.result import Identified
+from quell.identification.roots import poles_of, zeros_of
+from quell.identification.search import Fit, fit
+from quell.identification.structure import free_run
+from quell.identification.validation import Predictor, nrmse, residuals, simulate_fit
 from quell.parallel import one_blas_thread
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
 _METHODS = (
     "output error, started by refined instrumental variables",
     "instrumental variables from the reference, started by output error",
 )
+# Number of lags in the tests of the error, fewer for short records: chosen by hand.
 _LAGS = 50
-_SAMPLES_A_PARAMETER = 10
+# Least number of samples for each parameter: chosen by hand; real records have many more.
+_SAMPLES_PER_PARAMETER = 10
 
 
 def identify(
@@ -41,17 +43,18 @@ def identify(
 ) -> Identified:
     """Fit a continuous transfer function to recorded input and output.
 
-    It is the model of least output error, ``min Σ (y − ŷ)²`` with ŷ simulated from u alone, exact at the samples for a u that is held
-    between them. The search starts at an ARX model in continuous time, least squares on filtered signals, made free of bias by refined
-    instrumental variables, and goes on with Levenberg and Marquardt's method (``quell.identification``: ``start``, ``output_error`` and
-    ``structure`` have equations and sources).
+    The result is the model of least output error, ``min Σ (y − ŷ)²``, with ŷ simulated from u alone and exact at the samples for
+    a u that is held between them. The search starts at an ARX model in continuous time, found by least squares on filtered
+    signals and freed of bias by refined instrumental variables, and continues with Levenberg and Marquardt's method
+    (``quell.identification``: ``initial_estimate``, ``output_error`` and ``structure`` have equations and sources).
 
     Parameters
     ----------
     u
-        what the plant was told (N,) [u-unit]; held between samples.
+        input of the plant (N,) [u-unit]; held between samples.
     y
-        what was measured (N,) [y-unit], as it was when each u began to act; noise and an encoder's steps are taken for white.
+        measured output (N,) [y-unit], each at the time when its u began to act; noise and an encoder's steps are taken as
+        white.
     dt
         sample time [s].
     order
@@ -59,22 +62,22 @@ def identify(
     zeros
         number of zeros, less than n.
     integrators
-        how many poles lie at s = 0; by default one is put there where the slowest can't be told from it: it is within three of its
-        standard deviations, or slower than ten times the record; two, where that holds of two at once.
+        number of poles at s = 0. By default a pole is set there if it can't be distinguished from s = 0: if it is within three
+        of its standard deviations, or slower than ten times the record; and two poles, if this holds for both at once.
     delay
-        how late u is [s], a whole number of samples; or the smallest and largest to look through, for the best.
+        delay of u [s], a whole number of samples; or the least and the largest, to find the best between them.
     bias
         whether a constant force acts besides u, as an offset of u does.
     friction
-        whether Coulomb friction acts. The sign of the model's own speed is then a second input, with a numerator of its own of degree n −
-        2.
+        whether Coulomb friction acts. The sign of the model's own speed is then a second input, with a numerator of its own
+        of degree n − 2.
     held_out
-        the share of the record, its end, that is not used for the fit but to judge it; 0 to 0.9.
+        share of the record, its end, that is not used for the fit but for its validation; 0 to 0.9.
     horizon
-        how many samples ahead is predicted for the fits of prediction.
+        number of samples that predictions look ahead.
     reference
-        what was sent into the loop from outside (N,), of data from a closed loop, where it is known: the part of u that answers to it is
-        found first, and the model is fitted to that (see Notes).
+        external signal of a closed loop (N,), if it is known: the model is then fitted to the part of u and y that follows
+        it (see Notes).
 
     Returns
     -------
@@ -83,14 +86,14 @@ def identify(
     Raises
     ------
     ValueError
-        for records that differ in length, hold a number that is not finite, are too short for so many parameters or do not move; and for
-        an order, a number of zeros, a delay or a share that is out of range.
+        for records that differ in length, are not finite, are too short for the number of parameters or constant; and for an
+        order, a number of zeros, a delay or a share that is out of range.
 
     Notes
     -----
-    *Closed loop.* u then answers to the noise in y. The output-error fit stays free of bias as long as what is measured wrongly is white,
-    as an encoder's rounding nearly is (Ljung 1999, th. 8.3 and sec. 13.4); forces on the plant, and friction that is not modelled, are
-    not. With ``reference`` the estimate uses only what was sent in from outside.
+    *Closed loop.* There u reacts to the noise in y. The output-error fit stays free of bias if the measurement error is white,
+    as an encoder's rounding nearly is (Ljung 1999, th. 8.3 and sec. 13.4), but not with forces on the plant or friction
+    that is not in the model. With ``reference`` the estimate uses only the external signal.
 
     Examples
     --------
@@ -119,24 +122,28 @@ def identify(
     if integrators is not None:
         integrators = checks.whole("integrators", integrators, 0, order)
     bias, friction = checks.flag("bias", bias), checks.flag("friction", friction)
-    late = _range_of_delays(delay, dt)
+    delays = _delays(delay, dt)
     horizon = checks.whole("horizon", horizon, 1)
-    held_from = _split(u, y, order, zeros, friction, held_out, horizon, late[1])
+    least = max(
+        _SAMPLES_PER_PARAMETER * (3 * order + zeros + 2), 3 * horizon * (order + 1), 4 * delays[1]
+    )
+    held_from = _split(u, y, order, held_out, least, 3 * horizon * (order + 1))
     with one_blas_thread():
-        found = fit(u[:held_from], y[:held_from], order, zeros, integrators, late, bias, friction)
+        fitted = fit(
+            u[:held_from], y[:held_from], order, zeros, integrators, delays, bias, friction
+        )
         if reference is not None:
-            v = found.inputs(u[:held_from])
-            v = free_run(found.structure, found.found.theta, v, own_friction=True)[1]
-            found = found._replace(
-                found=instrumental(
-                    found.structure, found.found.theta, v, y[:held_from], reference[:held_from]
-                )
+            structure, theta = fitted.structure, fitted.estimate.theta
+            v = free_run(structure, theta, fitted.inputs(u[:held_from]), own_friction=True)[1]
+            estimate = instrumental_variables(
+                structure, theta, v, y[:held_from], reference[:held_from]
             )
-        return _judged(found, u, y, reference, dt, held_from, horizon)
+            fitted = fitted._replace(estimate=estimate)
+        return _validated(fitted, u, y, reference, dt, held_from, horizon)
 
 
-def _judged(
-    found: Fit,
+def _validated(
+    fitted: Fit,
     u: Vector,
     y: Vector,
     reference: Vector | None,
@@ -144,117 +151,72 @@ def _judged(
     held_from: int,
     horizon: int,
 ) -> Identified:
-    structure = found.structure
-    a, numerators, covariance = _in_seconds(
-        structure, found.found.theta, found.found.covariance, dt
-    )
-    v, fitted, held = found.inputs(u), slice(0, held_from), slice(held_from, y.size)
-    model = simulated(found, v[fitted])
-    error, judged_on = y[fitted] - model, u[fitted]
+    """Return the result in seconds, with fits and tests."""
+    structure, v = fitted.structure, fitted.inputs(u)
+    first, last = slice(0, held_from), slice(held_from, y.size)
+    model = simulate_fit(fitted, v[first])
+    error, tested_u = y[first] - model, u[first]
     predictor = Predictor.fitted(error, horizon, structure.order + 1)
     fits = {
-        "estimation": nrmse(y[fitted], model),
-        "estimation, predicted": predictor.fit_percent(y[fitted], error),
+        "estimation": nrmse(y[first], model),
+        "estimation, predicted": predictor.fit_percent(y[first], error),
     }
     if held_from < y.size:
-        fresh = simulated(found, v[held], y[held])
-        model, error, judged_on = np.append(model, fresh), y[held] - fresh, u[held]
+        fresh = simulate_fit(fitted, v[last], y[last])
+        model, error, tested_u = np.append(model, fresh), y[last] - fresh, u[last]
         fits |= {
-            "held out": nrmse(y[held], fresh),
-            "held out, predicted": predictor.fit_percent(y[held], error),
+            "held out": nrmse(y[last], fresh),
+            "held out, predicted": predictor.fit_percent(y[last], error),
         }
-    b = numerators[0, : structure.degrees[0] + 1]
+    seconds = 1.0 / structure.powers(dt)
+    theta = fitted.estimate.theta * seconds
+    covariance = fitted.estimate.covariance * np.outer(seconds, seconds)
+    a, numerators = structure.denominator(theta), structure.numerators(theta)
+    b, free = numerators[0, : structure.degrees[0] + 1], structure.free
+    of_b = slice(free, free + b.size)
     gain = b[0] if b[0] != 0.0 else np.nan
-    rubs = len(structure.rubbing)
-    rubbed = numerators[-rubs:] if rubs else np.zeros((0, structure.order))
-    free = structure.free
+    rubbing = numerators[numerators.shape[0] - len(structure.friction) :, 0]
     return Identified(
         num=b[::-1].copy(),
         den=np.append(1.0, a[::-1]),
         covariance=covariance[: free + b.size, : free + b.size],
-        poles=_poles(a, covariance, structure),
-        zeros=_zeros(b, covariance[free : free + b.size, free : free + b.size]),
+        poles=poles_of(a, covariance, structure.integrators),
+        zeros=zeros_of(b, covariance[of_b, of_b]),
         integrators=structure.integrators,
-        delay=found.late * dt,
-        bias=float(numerators[1, 0] / gain) if found.bias else 0.0,
-        friction=float(np.sum(rubbed[:, 0]) / gain) if rubs else None,
+        delay=fitted.delay * dt,
+        bias=float(numerators[1, 0] / gain) if fitted.bias else 0.0,
+        friction=float(np.sum(rubbing) / gain) if structure.friction else None,
         dt=dt,
         horizon=horizon,
         fits=fits,
-        residuals=residuals(error, judged_on, min(_LAGS, error.size // 4)),
+        residuals=residuals(error, tested_u, min(_LAGS, error.size // 4)),
         resolution=_resolution(y),
         held_from=held_from,
         u=u,
         y=y,
         simulated=model,
         reference=reference,
-        converged=found.found.converged,
+        converged=fitted.estimate.converged,
         method=_METHODS[reference is not None],
     )
 
 
-def _in_seconds(
-    structure: Structure, theta: Vector, covariance: Matrix, dt: float
-) -> tuple[Vector, Matrix, Matrix]:
-    """Return a, the numerators and the covariance with time in seconds in place of samples."""
-    powers = 1.0 / structure.powers(dt)
-    scaled = theta * powers
-    return (
-        structure.denominator(scaled),
-        structure.numerators(scaled),
-        covariance * np.outer(powers, powers),
-    )
-
-
-def _poles(a: Vector, covariance: Matrix, structure: Structure) -> tuple[Root, ...]:
-    free = a[structure.integrators :]
-    part = covariance[: free.size, : free.size]
-    found = [_root(free, part, value) for value in np.roots(np.append(1.0, free[::-1])).tolist()]
-    return tuple(
-        sorted(
-            [*[Root(0j, 0.0, 0.0)] * structure.integrators, *found],
-            key=lambda root: (root.omega, -root.value.imag),
-        )
-    )
-
-
-def _zeros(b: Vector, covariance: Matrix) -> tuple[Root, ...]:
-    """Return the roots of the numerator, whose covariance is taken relative to its leading coefficient."""
-    if b.size < 2:
-        return ()
-    monic = b[:-1] / b[-1]
-    slope = np.column_stack([np.eye(monic.size), -monic]) / b[-1]
-    part = slope @ covariance @ slope.T
-    return tuple(_root(monic, part, value) for value in np.roots(b[::-1]).tolist())
-
-
-def _root(a: Vector, covariance: Matrix, value: complex) -> Root:
-    real, imag = root_covariance(a, covariance, value)
-    return Root(
-        complex(value),
-        float(np.sqrt(max(real, 0.0))),
-        float(np.sqrt(max(imag, 0.0))) if complex(value).imag else 0.0,
-    )
-
-
 def _resolution(y: Vector) -> float:
-    """Return the step that y is rounded to, 0.0 where there is none."""
+    """Return the step that y is rounded to, 0.0 if it is not rounded."""
     steps = np.abs(np.diff(y))
     steps = steps[steps > 1e-9 * np.max(np.abs(y))]
     if steps.size == 0:
         return 0.0
-    # The mean of the smallest: a file has their last digits rounded.
+    # The mean of the smallest steps, as the last digits in a file are rounded.
     step = float(np.mean(steps[steps < 1.5 * np.min(steps)]))
     counts = steps[steps < 50.0 * step] / step
-    # Of numbers that are not rounded the smallest difference is no measure of the others.
-    return (
-        step
-        if counts.size > 0.01 * y.size and np.all(np.abs(counts - np.round(counts)) < 0.1)
-        else 0.0
-    )
+    # Without rounding the smallest difference is unrelated to the others. Thresholds are chosen by hand.
+    rounded = counts.size > 0.01 * y.size and np.all(np.abs(counts - np.round(counts)) < 0.1)
+    return step if rounded else 0.0
 
 
-def _range_of_delays(delay: Any, dt: float) -> tuple[int, int]:
+def _delays(delay: Any, dt: float) -> tuple[int, int]:
+    """Return the least and the largest delay [samples]."""
     if np.ndim(delay) == 0:
         samples = checks.samples("delay", delay, dt)
         return samples, samples
@@ -266,40 +228,35 @@ def _range_of_delays(delay: Any, dt: float) -> tuple[int, int]:
     return low, high
 
 
-def _split(
-    u: Vector,
-    y: Vector,
-    order: int,
-    zeros: int,
-    friction: bool,
-    held_out: float,
-    horizon: int,
-    late: int,
-) -> int:
+def _split(u: Vector, y: Vector, order: int, held_out: float, least: int, least_held: int) -> int:
+    """Return the index of the first held-out sample; ``least`` samples are needed before, ``least_held`` after it."""
     share = checks.non_negative("held_out", held_out)
     if share > 0.9:
         raise ValueError(
-            f"held_out = {held_out!r}: must be from 0 to 0.9, the share of the record that is not used for the fit"
+            f"held_out = {held_out!r}: must be from 0 to 0.9, "
+            "the share of the record that is not used for the fit"
         )
     held_from = u.size - int(share * u.size)
-    least = max(_SAMPLES_A_PARAMETER * (3 * order + zeros + 2), 3 * horizon * (order + 1), 4 * late)
+    held = u.size - held_from
     if held_from < least:
         raise ValueError(
-            f"u has {u.size} samples, {held_from} of them for the fit: must have at least {least} for order {order}; record longer"
+            f"u has {u.size} samples, {held_from} of them for the fit: "
+            f"must have at least {least} for order {order}; record longer"
         )
-    if 0 < u.size - held_from < 3 * horizon * (order + 1):
+    if 0 < held < least_held:
         raise ValueError(
-            f"held_out = {held_out!r}: of {u.size} samples these are {u.size - held_from}, must be at least "
-            f"{3 * horizon * (order + 1)} to be judged on; record longer, lower horizon, or hold none out"
+            f"held_out = {held_out!r}: of {u.size} samples these are {held}, must be at least "
+            f"{least_held} to be judged on; record longer, lower horizon, or hold none out"
         )
     for name, value in (("u", u), ("y", y)):
         if np.ptp(value[:held_from]) == 0.0:
             raise ValueError(
-                f"{name} is {value[0]:g} all through the samples for the fit: must move, or nothing can be learned from it"
+                f"{name} is {value[0]:g} all through the samples for the fit: "
+                "must move, or nothing can be learned from it"
             )
-        if held_from < u.size and np.ptp(value[held_from:]) == 0.0:
+        if held and np.ptp(value[held_from:]) == 0.0:
             raise ValueError(
-                f"held_out = {held_out!r}: {name} is {value[-1]:g} all through these samples, must move to be judged on; "
-                "hold fewer out, or none, or cut the record where it rests"
+                f"held_out = {held_out!r}: {name} is {value[-1]:g} all through these samples, "
+                "must move to be judged on; hold fewer out, or none, or cut the record where it rests"
             )
     return held_from

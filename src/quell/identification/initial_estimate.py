@@ -1,17 +1,18 @@
-"""Where the search starts: least squares on filtered signals, then refined instrumental variables.
+"""Start of the search: least squares on filtered signals, then refined instrumental variables.
 
-Dividing ``A y = B u + …`` by any stable polynomial Λ of degree n gives what can be calculated from samples and is linear in θ::
+Dividing ``A y = B u + …`` by any stable polynomial Λ of degree n gives an equation that is linear in θ, with signals that can
+be computed from samples::
 
     p^n/Λ y = −Σ a_i p^i/Λ y + Σ b_i p^i/Λ u + … + Σ d_i p^i/Λ δ
 
-an ARX model in continuous time (Young, *Automatica* 17, 1981; Garnier & Wang, *Identification of Continuous-time Models from Sampled
-Data*, 2008, ch. 1). With ``Λ = (p + λ)^n`` it is least squares, whose poles noise drags along. *Refined* it takes the last model's
-own A for Λ, and its noise-free output ŷ in place of y among the instruments (SRIVC; Young & Jakeman, *Int. J. Control* 31, 1980): then
-the instruments are the gradient of ŷ, and where it comes to rest θ is free of bias by noise. Starting it at several λ makes it find the
-plant whatever its speed.
+This is an ARX model in continuous time (Young, *Automatica* 17, 1981; Garnier & Wang, *Identification of Continuous-time Models
+from Sampled Data*, 2008, ch. 1). With ``Λ = (p + λ)^n`` it is solved by least squares; noise biases the poles. The *refined*
+method (SRIVC; Young & Jakeman, *Int. J. Control* 31, 1980) takes the A of the last model for Λ, and its noise-free output ŷ
+in place of y in the instruments. The instruments are then the gradient of ŷ, and after convergence noise does not bias θ.
+Several λ are tried, so that nothing has to be known of the plant's speed.
 
-A model of more poles than the plant has is not found that way: 1/Λ^n leaves little of u, and any poles fit what is left. So the model of
-one pole less, and a fast pole beside it, is tried too.
+This does not find a model with more poles than the plant: 1/Λ^n leaves little of u, and any poles fit the rest. So the model
+with one pole less, and a fast pole added, is tried too.
 """
 
 from __future__ import annotations
@@ -21,24 +22,33 @@ import math
 import numpy as np
 
 from quell.identification.sampling import chain
-from quell.identification.structure import Structure, gradient, lengths, linear_columns, output
+from quell.identification.structure import (
+    Structure,
+    cost,
+    gradient,
+    lengths,
+    linear_columns,
+    nonzero_lengths,
+)
 from quell.types import Matrix, Vector
 
+# Number of λ, log-spaced from 10 per length of the record (at most 0.01 per sample) to 0.5 per sample: chosen by hand.
 _RATES = 7
-# Where more of the output's power than this is not explained, a lower order may lead to something better.
+# Share of the output's power that may stay unexplained before lower orders are tried: chosen by hand.
 _POOR = 1e-3
-# The further pole that a model of lower order is given [1/sample].
-_FURTHER = 10.0
-_ROUNDS = 8
-# Averages are over so much of the filter's time constant at most, and so many to a parameter at least.
-_FINE = 0.1
-_FEWEST = 100
+# Fast pole that is added to a model of lower order [1/sample]: beyond the π per sample that samples show.
+_FAST_POLE = 10.0
+# Rounds of refined instrumental variables, and the least relative gain of one: chosen by hand; not tuned further.
+_ROUNDS, _GAIN = 8, 1e-3
+# For slow λ, samples are averaged: over this share of the filter's time constant at most, with this number of averages
+# for each parameter at least. Chosen by hand; the result is only a start.
+_SHARE, _AVERAGES = 0.1, 100
 
 
-def started(structure: Structure, v: Matrix, y: Vector) -> tuple[Vector, ...]:
-    """Return parameters near those of least output error, for the inputs ``v`` (N, inputs) and the output ``y`` (N,).
+def initial_estimates(structure: Structure, v: Matrix, y: Vector) -> tuple[Vector, ...]:
+    """Return one or more θ near the least output error, for the inputs ``v`` (N, inputs) and the output ``y`` (N,).
 
-    Those that leave much unexplained are followed by those of a lower order, with fast poles.
+    If the first leaves much unexplained, those of lower orders with added fast poles follow.
     """
     tried = [
         _filtered(structure, v, y, rate)
@@ -50,50 +60,34 @@ def started(structure: Structure, v: Matrix, y: Vector) -> tuple[Vector, ...]:
     for _ in range(_ROUNDS):
         refined = stable(structure, _refined(structure, theta, v, y))
         value = cost(structure, refined, v, y)
-        if not value < best * (1.0 - 1e-3):
+        if not value < best * (1.0 - _GAIN):
             break
         best, theta = value, refined
-    if best > _POOR * float(np.var(y)) and structure.order > max(
-        structure.degrees[0] + 1, structure.integrators
-    ):
-        lower = structure._replace(
-            order=structure.order - 1,
-            degrees=(
-                structure.degrees[0],
-                *(max(min(d, structure.order - 3), 0) for d in structure.degrees[1:]),
-            ),
-        )
-        return theta, *(_faster(structure, lower, simpler) for simpler in started(lower, v, y))
-    return (theta,)
+    least_order = max(structure.degrees[0] + 1, structure.integrators)
+    if best <= _POOR * float(np.var(y)) or structure.order <= least_order:
+        return (theta,)
+    others = (max(min(degree, structure.order - 3), 0) for degree in structure.degrees[1:])
+    lower = structure._replace(order=structure.order - 1, degrees=(structure.degrees[0], *others))
+    simpler = initial_estimates(lower, v, y)
+    return theta, *(_with_fast_pole(structure, lower, one) for one in simpler)
 
 
-def _faster(structure: Structure, lower: Structure, theta: Vector) -> Vector:
-    """Return the parameters of the model of one pole less with a fast pole beside it; zeros that it would need and has not are left out."""
+def _with_fast_pole(structure: Structure, lower: Structure, theta: Vector) -> Vector:
+    """Return θ of the model ``lower`` with a fast pole added; coefficients that ``structure`` lacks are left out."""
 
     def times(polynomial: Vector) -> Vector:
-        return np.append(0.0, polynomial) + _FURTHER * np.append(polynomial, 0.0)
+        return np.append(0.0, polynomial) + _FAST_POLE * np.append(polynomial, 0.0)
 
     a = times(np.append(lower.denominator(theta), 1.0))
     numerators = [
         times(row)[: degree + 1]
         for row, degree in zip(lower.numerators(theta), structure.degrees, strict=True)
     ]
-    return np.concatenate([a[structure.integrators : -1], *numerators, times(lower.start(theta))])
-
-
-def cost(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> float:
-    """Return the mean square of the output error, infinite where it is no number."""
-    with np.errstate(all="ignore"):
-        value = (
-            float(np.mean((y - output(structure, theta, v)) ** 2))
-            if np.all(np.isfinite(theta))
-            else math.inf
-        )
-    return value if math.isfinite(value) else math.inf
+    return np.concatenate([a[structure.integrators : -1], *numerators, times(lower.initial(theta))])
 
 
 def stable(structure: Structure, theta: Vector) -> Vector:
-    """Return θ with the unstable poles of A mirrored into the left half plane: a model that runs away can't be judged by its output."""
+    """Return θ with the unstable poles of A mirrored into the left half plane, so that its output stays finite."""
     free = theta[: structure.free]
     if structure.free == 0 or not np.all(np.isfinite(free)):
         return theta
@@ -106,22 +100,21 @@ def stable(structure: Structure, theta: Vector) -> Vector:
 
 
 def _filtered(structure: Structure, v: Matrix, y: Vector, rate: float) -> Vector:
-    """Return θ by least squares with ``Λ = (p + rate)^n``; what is slow is found in averages over several samples, which are fewer."""
+    """Return θ by least squares with ``Λ = (p + rate)^n``; for a slow rate, from averages over several samples."""
     n = structure.order
-    every = max(1, min(int(_FINE / rate), y.size // (_FEWEST * structure.size)))
+    every = max(1, min(int(_SHARE / rate), y.size // (_AVERAGES * structure.size)))
     whole = y.size // every * every
     coarse, mean = y[:whole:every], v[:whole].reshape(-1, every, v.shape[1]).mean(axis=1)
     prefilter = np.array([math.comb(n, i) * (every * rate) ** (n - i) for i in range(n)])
-    target, regressors = equation(
-        structure, prefilter, linear_columns(structure, prefilter, mean), coarse
-    )
+    known = linear_columns(structure, prefilter, mean)
+    target, regressors = equation(structure, prefilter, known, coarse)
     return stable(structure, _solve(regressors, target) / structure.powers(float(every)))
 
 
 def equation(
     structure: Structure, prefilter: Vector, known: Matrix, y: Vector
 ) -> tuple[Vector, Matrix]:
-    """Return left and right side of the equation divided by Λ; y is taken as straight between samples."""
+    """Return both sides of the equation divided by Λ; y is taken as linear between samples."""
     filtered = chain(prefilter, y)
     return y - filtered @ prefilter, np.hstack([-filtered[:, structure.integrators :], known])
 
@@ -130,24 +123,18 @@ def _refined(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Vecto
     """Return θ after a round of refined instrumental variables."""
     with np.errstate(all="ignore"):
         _, instruments = gradient(structure, theta, v)
-        target, regressors = equation(
-            structure, structure.denominator(theta), instruments[:, structure.free :], y
-        )
+        known = instruments[:, structure.free :]
+        target, regressors = equation(structure, structure.denominator(theta), known, y)
         return _solve(regressors, target, instruments)
 
 
 def _solve(regressors: Matrix, target: Vector, instruments: Matrix | None = None) -> Vector:
-    """Solve ``Zᵀ R θ = Zᵀ target``, Z being R itself without instruments; what is not excited is left at zero."""
+    """Solve ``Zᵀ R θ = Zᵀ target``, with Z = R without instruments; parameters that are not excited become zero."""
     Z = regressors if instruments is None else instruments
     with np.errstate(all="ignore"):
         left, right = Z.T @ regressors, Z.T @ target
-        rows, columns = lengths(Z), lengths(regressors)
-    if not (
-        np.all(np.isfinite(left))
-        and np.all(np.isfinite(right))
-        and np.all(np.isfinite(rows))
-        and np.all(np.isfinite(columns))
-    ):
-        return np.full(columns.size, np.nan)
-    rows, columns = np.where(rows > 0.0, rows, 1.0), np.where(columns > 0.0, columns, 1.0)
+        known = (left, right, lengths(Z), lengths(regressors))
+    if not all(np.all(np.isfinite(part)) for part in known):
+        return np.full(regressors.shape[1], np.nan)
+    rows, columns = nonzero_lengths(Z), nonzero_lengths(regressors)
     return np.linalg.lstsq(left / np.outer(rows, columns), right / rows, rcond=1e-14)[0] / columns

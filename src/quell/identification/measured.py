@@ -1,4 +1,4 @@
-"""Records from CSV files: time, input, output, and what was sent in from outside."""
+"""Records of input and output: read from CSV files, or simulated."""
 
 from __future__ import annotations
 
@@ -11,22 +11,46 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.controllers.linear.law import LinearLaw
+from quell.controllers.linear.linear import LinearController
 from quell.files import csv_rows, read_text
+from quell.identification.excitation import Excitation
+from quell.plants import Plant
+from quell.simulation import Scenario, simulate
 from quell.types import Vector
 
-# Times may be this much of a sample off the grid, as rounded ones are.
+# Times may be off the grid by this share of a sample: chosen by hand, so that rounded times pass and a gap does not.
 _JITTER = 0.2
+# Least number of samples: chosen by hand, ``identify`` asks for more.
 _FEWEST = 8
+
+_Row = tuple[int, list[str]]
+"""Line number and cells."""
 
 
 class Measured(NamedTuple):
-    """A record, evenly sampled."""
+    """An evenly sampled record."""
 
     u: Vector
     y: Vector
     dt: float
     """[s]."""
     reference: Vector | None
+
+
+def excited(plant: Plant, design: Excitation) -> Measured:
+    """Simulate a plant in open loop, from rest, with a designed excitation as u; return the record for ``identify``.
+
+    Raises
+    ------
+    ValueError
+        as ``simulate``.
+    """
+    none = np.zeros(0)
+    law = LinearLaw(np.zeros((0, 0)), none, none, none, none, 1.0, 0.0)  # u = r
+    scenario = Scenario(reference=design.signal, duration=(design.u.size - 1) * design.dt)
+    run = simulate(plant, LinearController(law, design.dt), scenario)
+    return Measured(run["u"], run["y_measured"], design.dt, None)
 
 
 def read_record(
@@ -37,83 +61,57 @@ def read_record(
     Parameters
     ----------
     path
-        the file, with commas, semicolons or tabs between, as its first line has them; between semicolons or tabs a comma is a decimal
-        point. A first line that is not numbers names the columns.
+        the file, separated by commas, semicolons or tabs, as its first line is; with semicolons or tabs a comma is a
+        decimal point. A first line that is not numbers has the names of the columns.
     columns
-        which are time [s], input and output, and if there are four, what was sent into the loop from outside: names where the file has
-        them, or numbers from 1 on. With ``dt`` the time is left out.
+        columns of time [s], input and output, and optionally of the external signal of a closed loop: names if the file
+        has them, or numbers from 1 on. With ``dt`` there is no time.
     dt
         sample time [s] of a file without times.
 
     Raises
     ------
     ValueError
-        where the file can't be read, a column is missing, a value is no number, or the times are not even; it names line and column.
+        if the file can't be read, a column is missing, a value is not a number, or the times are not even; it names line and
+        column.
     """
     if dt is not None:
         checks.positive("dt", dt, "s")
     where = f"data = {os.fspath(path)!r}"
-    wanted = (2, 3) if dt is not None else (3, 4)
-    if len(columns) not in wanted or len(set(columns)) != len(columns):
-        what = "u,y or u,y,r, as dt is given" if dt is not None else "t,u,y or t,u,y,r"
+    if len(set(columns)) != len(columns) or len(columns) not in ((3, 4) if dt is None else (2, 3)):
+        rule = "t,u,y or t,u,y,r" if dt is None else "u,y or u,y,r, as dt is given"
         raise ValueError(
-            f"columns = {','.join(columns)!r}: must be {what}, by their names or numbers"
+            f"columns = {','.join(columns)!r}: must be {rule}, by their names or numbers"
         )
     rows = _rows(Path(path), where)
-    header = rows[0][1] if any(not _is_number(cell) for cell in rows[0][1]) else None
+    header = None if all(_is_number(cell) for cell in rows[0][1]) else rows[0][1]
     if header is not None:
         rows = rows[1:]
     if len(rows) < _FEWEST:
         raise ValueError(f"{where}: has {len(rows)} samples; must have at least {_FEWEST}")
-    width = len(header if header is not None else rows[0][1])
+    width = len(rows[0][1] if header is None else header)
     places = [
         _place(where, header, width, name, i + (dt is not None)) for i, name in enumerate(columns)
     ]
-    values, plain = np.zeros((0, 0)), False
-    try:
-        values = np.array([[row[place] for place in places] for _, row in rows], dtype=np.float64)
-        plain = bool(np.all(np.isfinite(values))) and not any(
-            "_" in row[place] for _, row in rows for place in places
-        )
-    except (ValueError, IndexError):
-        pass
-    if not plain:
-        # One at a time, to say which one it is.
-        values = np.array(
-            [
-                [
-                    _value(where, number, row, place, name)
-                    for place, name in zip(places, columns, strict=True)
-                ]
-                for number, row in rows
-            ]
-        )
+    values = _values(where, rows, places, columns)
     if dt is None:
         dt = _sample_time(where, values[:, 0], [number for number, _ in rows])
         values = values[:, 1:]
-    reference = values[:, 2].copy() if values.shape[1] > 2 else None
-    return Measured(values[:, 0].copy(), values[:, 1].copy(), dt, reference)
+    u, y, *reference = (column.copy() for column in values.T)
+    return Measured(u, y, dt, reference[0] if reference else None)
 
 
-def _rows(path: Path, where: str) -> list[tuple[int, list[str]]]:
+def _rows(path: Path, where: str) -> list[_Row]:
     text = read_text(path, where)
-    between = _separator(
-        next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
-    )
-    rows = [
-        (number, row)
-        for number, row in csv_rows(text, where, between)
-        if not row[0].startswith("#")
-    ]
+    lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
+    first = next(lines, "")
+    separator = next((mark for mark in ("\t", ";") if mark in first), ",")
+    rows = [row for row in csv_rows(text, where, separator) if not row[1][0].startswith("#")]
     if not rows:
         raise ValueError(f"{where}: is empty")
-    if between != ",":
+    if separator != ",":
         rows = [(number, [_with_point(cell) for cell in row]) for number, row in rows]
     return rows
-
-
-def _separator(line: str) -> str:
-    return next((mark for mark in ("\t", ";") if mark in line), ",")
 
 
 def _with_point(cell: str) -> str:
@@ -122,7 +120,7 @@ def _with_point(cell: str) -> str:
 
 
 def _place(where: str, header: list[str] | None, width: int, name: str, role: int) -> int:
-    """Return where a column is; without names in the file the first are time, input, output."""
+    """Return the index of a column; without names in the file the first columns are time, input, output."""
     if header is not None and name in header:
         if header.count(name) > 1:
             raise ValueError(f"{where}: column {name} is there {header.count(name)} times")
@@ -138,9 +136,9 @@ def _place(where: str, header: list[str] | None, width: int, name: str, role: in
         if place < width:
             return place
     has = (
-        f"the first line names {', '.join(header)}"
-        if header is not None
-        else f"no line names columns, there are {width}"
+        f"no line names columns, there are {width}"
+        if header is None
+        else f"the first line names {', '.join(header)}"
     )
     raise ValueError(f"{where}: column {name} is missing; {has}; say which with --columns")
 
@@ -153,6 +151,25 @@ def _is_number(text: str) -> bool:
     return True
 
 
+def _values(
+    where: str, rows: Sequence[_Row], places: Sequence[int], names: Sequence[str]
+) -> Vector:
+    """Return the values (samples, columns)."""
+    try:
+        cells = [[row[place] for place in places] for _, row in rows]
+        values = np.array(cells, dtype=np.float64)
+        # Python accepts 1_000.
+        if np.all(np.isfinite(values)) and not any("_" in cell for row in cells for cell in row):
+            return values
+    except (ValueError, IndexError):
+        pass
+    # One at a time, to name the faulty one.
+    columns = list(zip(places, names, strict=True))
+    return np.array(
+        [[_value(where, number, row, *column) for column in columns] for number, row in rows]
+    )
+
+
 def _value(where: str, number: int, row: list[str], place: int, name: str) -> float:
     text = row[place] if place < len(row) else ""
     if not _is_number(text) or "_" in text:
@@ -160,7 +177,8 @@ def _value(where: str, number: int, row: list[str], place: int, name: str) -> fl
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(
-            f"{where}, line {number}: {name} = {text}: must be finite; mend the record or cut it there"
+            f"{where}, line {number}: {name} = {text}: must be finite; "
+            "mend the record or cut it there"
         )
     return value
 
@@ -174,9 +192,10 @@ def _sample_time(where: str, t: Vector, lines: list[int]) -> float:
     worst = int(np.argmax(off))
     if off[worst] > _JITTER * dt or round((t[-1] - t[0]) / dt) != t.size - 1:
         raise ValueError(
-            f"{where}, line {lines[worst + 1]}: t rises by {t[worst + 1] - t[worst]:.6g} s where samples are {dt:.6g} s apart: "
-            "must be evenly sampled; interpolate, or cut the record at the gap"
+            f"{where}, line {lines[worst + 1]}: t rises by {t[worst + 1] - t[worst]:.6g} s where "
+            f"samples are {dt:.6g} s apart: must be evenly sampled; interpolate, or cut the record "
+            "at the gap"
         )
-    # Of times with few digits the sample time is known better than they are.
+    # With few digits in the times, the sample time is more exact than they are.
     rounded = float(f"{dt:.6g}")
     return rounded if abs(rounded - dt) * t.size < _JITTER * dt else dt

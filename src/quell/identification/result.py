@@ -1,54 +1,31 @@
-"""What an identification returns."""
+"""The result of an identification."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from quell.identification import plots
 from quell.identification.frequency_response import FrequencyResponse, frequency_response
+from quell.identification.roots import Root
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
+# A pole and a zero within three standard deviations may be equal (99.7 %).
 _DEVIATIONS = 3.0
-
-
-class Root(NamedTuple):
-    """A pole or a zero; of a conjugate pair both are listed."""
-
-    value: complex
-    """[rad/s]."""
-    real_std: float
-    """standard deviation of the real part [rad/s]; 0 for one that was set."""
-    imag_std: float
-    """of the imaginary part [rad/s]."""
-
-    @property
-    def omega(self) -> float:
-        """Its size [rad/s]."""
-        return abs(self.value)
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation of the distance to where it really is [rad/s]."""
-        return math.hypot(self.real_std, self.imag_std)
-
-    @property
-    def damping(self) -> float:
-        """Damping ratio; 1 for real ones in the left half plane, NaN at s = 0."""
-        return -self.value.real / abs(self.value) if self.value else math.nan
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """A transfer function found in a record, with what it is worth.
+    """A transfer function found in a record, with measures of its quality.
 
-    ``str()`` of it is the whole report; ``plant`` goes into ``ESO.model_based`` and everywhere else.
+    ``str()`` gives the whole report; ``plant`` is the model for ``ESO.model_based`` and other functions.
     """
 
     num: Vector
@@ -56,33 +33,34 @@ class Identified:
     den: Vector
     """Denominator, descending powers of s; the first is 1."""
     covariance: Matrix
-    """of all coefficients that were fitted, those of ``den`` in ascending powers first, then those of ``num`` (parameters, parameters)."""
+    """Covariance of the fitted coefficients, those of ``den`` first, then those of ``num``, in ascending powers."""
     poles: tuple[Root, ...]
     zeros: tuple[Root, ...]
     integrators: int
-    """How many poles were set to s = 0."""
+    """Number of poles that were set to s = 0."""
     delay: float
-    """How late u is [s]."""
+    """Delay of u [s]."""
     bias: float
-    """A constant force on the plant, in units of u; NaN where the plant does not let a constant u through."""
+    """Constant force on the plant [u-unit]; NaN if a constant u has no effect on the plant."""
     friction: float | None
-    """Coulomb friction, in units of u: what |u| has to overcome in slow motion; None where it was not asked for."""
+    """Coulomb friction, which |u| has to overcome in slow motion [u-unit]; None if it was not fitted."""
     dt: float
     """Sample time of the record [s]."""
     horizon: int
-    """How many samples ahead ``predicted`` is."""
+    """Number of samples that the predictions in ``fits`` look ahead."""
     fits: dict[str, float]
-    """NRMSE in %: ``"estimation"`` and ``"held out"`` for the simulation, ``"estimation, predicted"`` and ``"held out, predicted"``."""
+    """NRMSE in %: ``"estimation"`` and ``"held out"`` of the simulation, ``"estimation, predicted"`` and
+    ``"held out, predicted"`` of the prediction."""
     residuals: Residuals
-    """The tests, on held-out samples where there are some."""
+    """Tests of the error, on the held-out samples if there are any."""
     resolution: float
-    """The step of y, 0.0 where it has none [y-unit]."""
+    """Step that y is rounded to, 0.0 if it is not rounded [y-unit]."""
     held_from: int
-    """The first of the samples that were held out; their number where none were."""
+    """Index of the first held-out sample; N if none was held out."""
     u: Vector
     y: Vector
     simulated: Vector
-    """The model's output (N,): from the start of the record, and begun anew with the samples held out [y-unit]."""
+    """The model's output (N,) [y-unit]; it starts again at the held-out samples."""
     reference: Vector | None
     converged: bool
     method: str
@@ -94,32 +72,31 @@ class Identified:
 
     @property
     def shortcomings(self) -> tuple[str, ...]:
-        """What speaks against the model, whatever its fit: poles that run away, that no sample shows, or that a zero cancels."""
-        seen = math.pi / self.dt
+        """Faults of the model that the fit does not show: poles that are unstable, too fast for the samples, or cancelled."""
+        fastest = math.pi / self.dt
         poles, zeros = (
             [root for root in roots if root.value.imag >= 0.0] for roots in (self.poles, self.zeros)
         )
         found = [
-            f"the pole at {_named(pole)} runs away; if the plant does not, take a lower order or set integrators"
+            f"the pole at {_format(pole)} runs away; if the plant does not, take a lower order "
+            "or set integrators"
             for pole in poles
             if pole.value.real > 0.0
         ]
-        for what, roots in (("pole", poles), ("zero", zeros)):
-            fast = [root for root in roots if root.omega > seen]
+        for kind, roots in (("pole", poles), ("zero", zeros)):
             found += [
-                f"the {what} at {_named(root)} is faster than samples show, {seen:.4g} rad/s; take fewer {what}s"
-                for root in fast
+                f"the {kind} at {_format(root)} is faster than samples show, {fastest:.4g} rad/s; "
+                f"take fewer {kind}s"
+                for root in roots
+                if root.omega > fastest
             ]
         for zero in zeros:
             cancelled = [
-                pole
+                f"the pole at {_format(pole)} can't be told from a zero; take one of each less"
                 for pole in poles
                 if abs(pole.value - zero.value) <= _DEVIATIONS * (pole.deviation + zero.deviation)
             ]
-            found += [
-                f"the pole at {_named(pole)} can't be told from a zero; take one of each less"
-                for pole in cancelled[:1]
-            ]
+            found += cancelled[:1]
         return tuple(found)
 
     @property
@@ -128,10 +105,10 @@ class Identified:
         return np.arange(float(self.y.size)) * self.dt
 
     def response(self, omega: Any) -> Any:
-        """Return the model's frequency response at ``omega`` [rad/s], delay and the hold of u included.
+        """Return the model's frequency response at ``omega`` [rad/s], including the delay and the hold of u.
 
-        It is that of the samples: what is measured at ``omega`` in a record whose u is held. Towards half the sampling rate images of the
-        hold matter, which are left out here.
+        This is the response of the samples in a record with held u. Images of the hold, which matter near half the sampling
+        rate, are left out.
         """
         s = 1j * np.asarray(omega, dtype=np.float64)
         hold = np.exp(-0.5 * s * self.dt) * np.sinc(s.imag * self.dt / (2.0 * np.pi))
@@ -139,28 +116,31 @@ class Identified:
 
     def empirical(self, segments: int = 8) -> FrequencyResponse:
         """Return the frequency response of the record itself; see ``frequency_response``."""
-        return frequency_response(
-            self.u, self.y, self.dt, reference=self.reference, segments=segments
-        )
+        r = self.reference
+        return frequency_response(self.u, self.y, self.dt, reference=r, segments=segments)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the Bode plot against the empirical response, coherence, output and error, and the tests of residuals; return the axes.
+        """Draw Bode plot and empirical response, coherence, output, error, and the tests of the error; return the axes.
 
         Parameters
         ----------
         axes
-            seven matplotlib axes to draw into: gain, phase, coherence, output, error, autocorrelation, cross-correlation; a new figure by
-            default.
+            seven matplotlib axes: gain, phase, coherence, output, error, autocorrelation, cross-correlation; those of a new
+            figure by default.
         """
-        from quell.identification.plots import plot_identified
-
-        return plot_identified(self, axes)
+        axes, split = plots.seven_axes(axes), self.held_from
+        plots.draw_bode(axes[:3], self.empirical(), self.response)
+        plots.draw_output(axes[3:5], self.t, self.y, self.simulated, split, self.fits)
+        plots.draw_tests(axes[5:], self.residuals, (self.y.size - split) or self.y.size)
+        for ax in axes:
+            ax.grid(alpha=0.3)
+        return axes
 
     def describe(self) -> str:
         """Return the report as text."""
+        delay = f" · exp(−{self.delay:g} s)" if self.delay else ""
         lines = [
-            f"G(s) = ({_spelled(self.num)}) / ({_spelled(self.den)})"
-            + (f" · exp(−{self.delay:g} s)" if self.delay else ""),
+            f"G(s) = ({_polynomial(self.num)}) / ({_polynomial(self.den)}){delay}",
             f"{self.method}{'' if self.converged else '; the search did NOT come to rest'}",
             "",
             "pole [rad/s]                  ± real      ± imag     |p|       damping",
@@ -172,17 +152,16 @@ class Identified:
         if self.friction is not None:
             lines += [f"Coulomb friction {self.friction:.4g} (in units of u)"]
         lines += [f"fit, {name}: {percent(value)} %" for name, value in self.fits.items()]
-        left = self.residuals
-        quantum = (
-            f" ({left.rms / self.resolution * math.sqrt(12.0):.3g} times that of rounding to {self.resolution:.3g})"
-            if self.resolution
-            else ""
-        )
+        tests, rounding = self.residuals, ""
+        if self.resolution:
+            factor = tests.rms / self.resolution * math.sqrt(12.0)
+            rounding = f" ({factor:.3g} times that of rounding to {self.resolution:.3g})"
         lines += [
-            f"error of the simulation: RMS {left.rms:.3g}{quantum}",
-            f"white: {'yes' if left.white else 'no'} (zeta = {left.whiteness:.3g}, limit {left.whiteness_limit:.3g}, {left.lags} lags)",
-            f"independent of past u: {'yes' if left.independent else 'no'} "
-            f"(largest correlation {np.max(np.abs(left.cross_correlation[left.lags :])):.3g}, limit {left.cross_limit:.3g})",
+            f"error of the simulation: RMS {tests.rms:.3g}{rounding}",
+            f"white: {'yes' if tests.white else 'no'} (zeta = {tests.whiteness:.3g}, "
+            f"limit {tests.whiteness_limit:.3g}, {tests.lags} lags)",
+            f"independent of past u: {'yes' if tests.independent else 'no'} "
+            f"(largest correlation {_largest_correlation(tests):.3g}, limit {tests.cross_limit:.3g})",
             *(f"NOT: {text}" for text in self.shortcomings),
         ]
         return "\n".join(lines)
@@ -191,20 +170,20 @@ class Identified:
 
     def __repr__(self) -> str:
         fit = self.fits.get("held out", self.fits["estimation"])
-        return f"Identified(order={self.den.size - 1}, poles {format_roots(np.array([p.value for p in self.poles]))} rad/s, fit {percent(fit, 2)} %)"
+        poles = format_roots(np.array([pole.value for pole in self.poles]))
+        order = self.den.size - 1
+        return f"Identified(order={order}, poles {poles} rad/s, fit {percent(fit, 2)} %)"
 
     def to_json(self) -> dict[str, Any]:
-        """Return the results for ``quell.files.write_json``: no records, and None for what is not finite."""
+        """Return the results for ``quell.files.write_json``, without the record; None for numbers that are not finite."""
         from quell.files import nonfinite_to_none
 
-        left = self.residuals
+        tests = self.residuals
         value = {
             "num": self.num.tolist(),
             "den": self.den.tolist(),
-            **{
-                name: [_root_json(root) for root in getattr(self, name)]
-                for name in ("poles", "zeros")
-            },
+            "poles": [_root_json(root) for root in self.poles],
+            "zeros": [_root_json(root) for root in self.zeros],
             "integrators": self.integrators,
             "delay": self.delay,
             "bias": self.bias,
@@ -215,24 +194,26 @@ class Identified:
             "horizon": self.horizon,
             "fits": self.fits,
             "residuals": {
-                "rms": left.rms,
-                "lags": left.lags,
-                "whiteness": left.whiteness,
-                "whiteness_limit": left.whiteness_limit,
-                "white": left.white,
-                "independent_of_u": left.independent,
-                "largest_cross_correlation": float(
-                    np.max(np.abs(left.cross_correlation[left.lags :]))
-                ),
-                "cross_limit": left.cross_limit,
+                "rms": tests.rms,
+                "lags": tests.lags,
+                "whiteness": tests.whiteness,
+                "whiteness_limit": tests.whiteness_limit,
+                "white": tests.white,
+                "independent_of_u": tests.independent,
+                "largest_cross_correlation": _largest_correlation(tests),
+                "cross_limit": tests.cross_limit,
             },
             "resolution": self.resolution,
             "shortcomings": self.shortcomings,
             "converged": self.converged,
             "method": self.method,
         }
-        found: dict[str, Any] = nonfinite_to_none(value)
-        return found
+        return dict(nonfinite_to_none(value))
+
+
+def _largest_correlation(tests: Residuals) -> float:
+    """Return the largest correlation of the error with past u."""
+    return float(np.max(np.abs(tests.cross_correlation[tests.lags :])))
 
 
 def _root_json(root: Root) -> dict[str, float]:
@@ -247,11 +228,11 @@ def _root_json(root: Root) -> dict[str, float]:
 
 
 def percent(fit: float, digits: int = 3) -> str:
-    """Return a fit as text; that of a model which runs away is a large negative number."""
+    """Return a fit as text; the fit of an unstable model is a large negative number."""
     return f"{fit:.{digits}f}" if fit > -1e4 else f"{fit:.3g}"
 
 
-def _named(root: Root) -> str:
+def _format(root: Root) -> str:
     return f"{format_roots(np.array([root.value]))} rad/s"
 
 
@@ -261,12 +242,11 @@ def _row(root: Root) -> str:
     return f"{value:<28}  {root.real_std:<10.2g}{root.imag_std:<10.2g} {root.omega:<9.5g} {damping}"
 
 
-def _spelled(coefficients: Vector) -> str:
-    """Return a polynomial in s as text."""
+def _polynomial(coefficients: Vector) -> str:
+    """Return a polynomial in s as text, from its coefficients in descending powers."""
     terms = []
-    for power, value in zip(
-        range(coefficients.size - 1, -1, -1), coefficients.tolist(), strict=True
-    ):
+    for i, value in enumerate(coefficients.tolist()):
+        power = coefficients.size - 1 - i
         if value:
             symbol = "" if power == 0 else ("s" if power == 1 else f"s^{power}")
             number = f"{value:.6g}" if value != 1.0 or not symbol else ""

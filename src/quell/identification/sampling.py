@@ -1,38 +1,43 @@
-"""Filters 1/A(s) and their derivatives, sampled exactly: what all of identification is calculated with.
+"""Filters 1/A(s) and their derivatives, sampled exactly: the computations below all of identification.
 
-Polynomials are in ``p = s dt``, so that a sample is a unit of time and nothing depends on the user's seconds: of
-``A = p^n + a_{n−1} p^(n−1) + … + a_0`` the vector ``a`` (n,) has the coefficients in ascending powers. A *chain* is the filter bank
-``p^i/A(p)``, i = 0 … n − 1, on one signal: the states of the controllable companion form.
+Polynomials are in ``p = s dt``: a sample is a unit of time, and nothing depends on the user's seconds. The vector ``a`` (n,) holds
+the coefficients of ``A = p^n + a_{n−1} p^(n−1) + … + a_0`` in ascending powers. A *chain* is the filter bank ``p^i/A(p)``,
+i = 0 … n − 1, of one signal: the states of the controllable companion form.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.kernels.dispatch import compiled
 from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
-# Far below what matters in any unit, far above where processors become slow.
-_DIED_AWAY = 1e-140
+# States below this become zero: far below all values that matter, far above the denormal numbers (1e-308) that processors are
+# slow with.
+_TINY = 1e-140
+
+Bank = NDArray[np.float64]
+"""States of a chain for several inputs (N, n, m)."""
 
 
 class Sampled(NamedTuple):
-    """``x⁺ = Φ x + Γ v + Γ₁ (v⁺ − v)``: inputs that are held, or straight between samples."""
+    """A sampled system ``x⁺ = Φ x + Γ v + Γ₁ (v⁺ − v)``, with inputs held or linear between samples."""
 
     phi: Matrix
     """Φ (n, n)."""
     gamma: Matrix
     """Γ (n, m)."""
     slope: Matrix
-    """Γ₁ (n, m); zero where the inputs are held."""
+    """Γ₁ (n, m); zero for held inputs."""
 
 
 @compiled
 def _states(phi: Matrix, gamma: Matrix, slope: Matrix, v: Matrix, x: Vector, out: Matrix) -> None:
-    """Write the states at all samples of ``v`` (N, m) into ``out`` (N, n); ``x`` (n,) is the first and is used up."""
+    """Write the states at all samples of ``v`` (N, m) into ``out`` (N, n); ``x`` (n,) is the first, and is changed."""
     n, m = gamma.shape
     last = v.shape[0] - 1
     for k in range(v.shape[0]):
@@ -45,13 +50,12 @@ def _states(phi: Matrix, gamma: Matrix, slope: Matrix, v: Matrix, x: Vector, out
                 total += phi[i, j] * out[k, j]
             for j in range(m):
                 total += gamma[i, j] * v[k, j] + slope[i, j] * (v[after, j] - v[k, j])
-            # What has died away stays zero: processors are slow with numbers that are nearly too small.
-            x[i] = total if abs(total) > _DIED_AWAY else 0.0
+            x[i] = total if abs(total) > _TINY else 0.0
 
 
 @compiled
-def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Any) -> None:
-    """Write the states of one filter on several held inputs ``v`` (N, m) into ``out`` (N, n, m); ``x`` (n, m) is used up."""
+def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Bank) -> None:
+    """Write the states of a filter for held inputs ``v`` (N, m) into ``out`` (N, n, m); ``x`` (n, m) is changed."""
     n, m = x.shape
     for k in range(v.shape[0]):
         for i in range(n):
@@ -63,14 +67,14 @@ def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Any) -> None:
                 for c in range(m):
                     x[i, c] += phi[i, j] * out[k, j, c]
             for c in range(m):
-                x[i, c] = x[i, c] if abs(x[i, c]) > _DIED_AWAY else 0.0
+                x[i, c] = x[i, c] if abs(x[i, c]) > _TINY else 0.0
 
 
 @compiled
 def _gradient(
     one: Sampled,
     bank: Matrix,
-    columns: Any,
+    columns: NDArray[np.int64],
     both: Sampled,
     x: Vector,
     skipped: int,
@@ -80,8 +84,8 @@ def _gradient(
 ) -> None:
     """Write y (N,) and its derivatives ``out`` (N, size); see ``structure.gradient``.
 
-    ``one`` is the filter on each input, ``bank`` (2, n, inputs) has room for its states now and then, ``columns`` (n, inputs) says where
-    they go, below zero for nowhere; ``both`` is the model with its filter behind it, ``x`` (2, 2 n) has their states.
+    ``one`` is the filter on each input, ``bank`` (2, n, inputs) its states now and at the next sample; ``columns`` (n, inputs)
+    are their columns in ``out``, negative for none. ``both`` is the model followed by the filter, ``x`` (2, 2 n) their states.
     """
     _, n, m = bank.shape
     now, then = 0, 1
@@ -100,14 +104,14 @@ def _gradient(
                 for c in range(m):
                     bank[then, i, c] += one.phi[i, j] * bank[now, j, c]
             for c in range(m):
-                bank[then, i, c] = bank[then, i, c] if abs(bank[then, i, c]) > _DIED_AWAY else 0.0
+                bank[then, i, c] = bank[then, i, c] if abs(bank[then, i, c]) > _TINY else 0.0
         for i in range(2 * n):
             total = 0.0
             for j in range(n if i < n else 2 * n):
                 total += both.phi[i, j] * x[now, j]
             for c in range(m - 1):
                 total += both.gamma[i, c] * v[k, c]
-            x[then, i] = total if abs(total) > _DIED_AWAY else 0.0
+            x[then, i] = total if abs(total) > _TINY else 0.0
         now, then = then, now
 
 
@@ -115,7 +119,7 @@ def _gradient(
 def _states_with_friction(
     phi: Matrix, gamma: Matrix, v: Matrix, speeds: Matrix, x: Vector, out: Matrix
 ) -> None:
-    """As ``_states`` for held inputs, the last of which are written: minus the signs of ``speeds`` (frictions, n) times the state."""
+    """As ``_states`` for held inputs; writes the last inputs: minus the signs of ``speeds`` (frictions, n) times the state."""
     n, m = gamma.shape
     first = m - speeds.shape[0]
     for k in range(v.shape[0]):
@@ -144,33 +148,29 @@ def companion(a: Vector) -> tuple[Matrix, Matrix]:
 
 
 def observable(a: Vector) -> Matrix:
-    """Return A of the observable companion form, ``y = x_1``: a numerator in descending powers is its column of B."""
+    """Return A of the observable companion form, ``y = x_1``; a numerator in descending powers is a column of B."""
     A = np.diag(np.ones(a.size - 1), 1)
     A[:, 0] -= a[::-1]
     return A
 
 
 def sampled(A: Matrix, B: Matrix, straight: bool = False) -> Sampled:
-    """Sample ``x' = A x + B v`` exactly over a unit of time, ``v`` held, or straight between its samples."""
+    """Sample ``x' = A x + B v`` exactly over a unit of time, with ``v`` held, or linear between samples (``straight``)."""
     n, m = B.shape
     if not straight:
-        # Of a model that runs away nothing finite is left; whoever asked sees that in its output.
+        # An unstable model may give no finite numbers; the caller sees this in the output.
         with np.errstate(all="ignore"):
             phi, (gamma,) = zero_order_hold(A, [B], 1.0)
         return Sampled(phi, gamma, np.zeros((n, m)))
-    # A straight input is the state of an integrator whose own input, the slope, is held.
+    # A linear input is the state of an integrator whose own input, the slope, is held.
     block = np.zeros((n + m, n + m))
     block[:n, :n], block[:n, n:] = A, B
     phi, (slope,) = zero_order_hold(block, [np.eye(n + m)[:, n:]], 1.0)
-    return Sampled(
-        np.ascontiguousarray(phi[:n, :n]),
-        np.ascontiguousarray(phi[:n, n:]),
-        np.ascontiguousarray(slope[:n]),
-    )
+    return Sampled(*map(np.ascontiguousarray, (phi[:n, :n], phi[:n, n:], slope[:n])))
 
 
 def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
-    """Return the states (N, n) for the inputs ``v`` (N, m), from ``x0``, zero by default."""
+    """Return the states (N, n) for the inputs ``v`` (N, m), starting at ``x0``, zero by default."""
     n = system.phi.shape[0]
     out = np.empty((v.shape[0], n))
     start = np.zeros(n) if x0 is None else np.array(x0, dtype=np.float64)
@@ -181,26 +181,20 @@ def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
 def states_with_friction(
     system: Sampled, v: Matrix, speeds: Matrix, x0: Vector
 ) -> tuple[Matrix, Matrix]:
-    """Return the states and the inputs, of which the last are minus the signs of ``speeds`` (frictions, n) times the state."""
+    """Return the states and the inputs; the last inputs are minus the signs of ``speeds`` (frictions, n) times the state."""
     out, inputs = np.empty((v.shape[0], x0.size)), np.array(v, order="C")
-    _states_with_friction(
-        system.phi,
-        system.gamma,
-        inputs,
-        np.ascontiguousarray(speeds),
-        np.array(x0, dtype=np.float64),
-        out,
-    )
+    speeds, x = np.ascontiguousarray(speeds), np.array(x0, dtype=np.float64)
+    _states_with_friction(system.phi, system.gamma, inputs, speeds, x, out)
     return out, inputs
 
 
 def chain(a: Vector, v: Vector) -> Matrix:
-    """Return ``p^i/A(p) v`` (N, n) at the samples, from rest, for a ``v`` that is straight between them."""
+    """Return ``p^i/A(p) v`` (N, n) at the samples, from rest, for ``v`` linear between them."""
     return states(sampled(*companion(a), straight=True), v[:, None])
 
 
-def chains(a: Vector, v: Matrix) -> Any:
-    """Return ``p^i/A(p)`` (N, n, inputs + 1) of the held inputs ``v`` (N, inputs), and of an impulse at the start, at the samples."""
+def chains(a: Vector, v: Matrix) -> Bank:
+    """Return ``p^i/A(p)`` (N, n, inputs + 1) of held inputs ``v`` (N, inputs) and, last, of an impulse at the start."""
     one, count = sampled(*companion(a)), v.shape[1] + 1
     out = np.empty((v.shape[0], a.size, count))
     _chains(one.phi, one.gamma[:, 0].copy(), _with_impulse(v), _first(a.size, count), out)
@@ -208,12 +202,18 @@ def chains(a: Vector, v: Matrix) -> Any:
 
 
 def gradient(
-    a: Vector, B: Matrix, start: Vector, columns: Any, skipped: int, v: Matrix, size: int
+    a: Vector,
+    B: Matrix,
+    start: Vector,
+    columns: NDArray[np.int64],
+    skipped: int,
+    v: Matrix,
+    size: int,
 ) -> tuple[Vector, Matrix]:
     """Return y (N,) of a model in observable companion form, from the state ``start``, and its derivatives (N, size).
 
-    The first are ``−p^i/A y`` for i from ``skipped`` on, the others the states of ``chains`` that ``columns`` (n, inputs + 1) gives a
-    place.
+    The first are ``−p^i/A y`` for i from ``skipped`` on; the others are the states of ``chains``, in the columns given by
+    ``columns`` (n, inputs + 1).
     """
     n = a.size
     A, both = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, B.shape[1]))
@@ -223,26 +223,18 @@ def gradient(
     x, bank = np.zeros((2, 2 * n)), np.zeros((2, n, v.shape[1] + 1))
     x[0, :n], bank[0] = start, _first(n, v.shape[1] + 1)
     y, out = np.empty(v.shape[0]), np.empty((v.shape[0], size))
-    _gradient(
-        sampled(*companion(a)),
-        bank,
-        columns,
-        sampled(A, both),
-        x,
-        skipped,
-        _with_impulse(v),
-        y,
-        out,
-    )
+    one, model, v = sampled(*companion(a)), sampled(A, both), _with_impulse(v)
+    _gradient(one, bank, columns, model, x, skipped, v, y, out)
     return y, out
 
 
 def _with_impulse(v: Matrix) -> Matrix:
-    """Return the inputs and a zero: after the start nothing is left of an impulse but the state."""
+    """Return the inputs and zeros for the impulse, which only sets the initial state."""
     return np.column_stack([v, np.zeros(v.shape[0])])
 
 
 def _first(n: int, count: int) -> Matrix:
+    """Return the initial states of ``count`` chains, the last of which starts with an impulse."""
     x = np.zeros((n, count))
     x[-1, -1] = 1.0
     return x

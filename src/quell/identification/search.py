@@ -1,59 +1,60 @@
-"""The search as a whole: start, refinement, what rubs, how late u is, whether a pole lies at s = 0."""
+"""The search for a model: start, refinement, signs of friction, delay of u, and poles at s = 0."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.friction import free_run, measured_sign, resonance
-from quell.identification.initial_estimate import started
-from quell.identification.output_error import Refined, promised, refined
-from quell.identification.structure import Structure
+from quell.identification.initial_estimate import initial_estimates
+from quell.identification.output_error import ParameterEstimate, gauss_newton, refine
+from quell.identification.roots import squared_distance_from_zero
+from quell.identification.structure import Structure, free_run
 from quell.types import Matrix, Vector
 
-# The slope of the measured output is taken over so many samples either way until there is a model.
+# Half width of the mean slope that stands for the measured speed until there is a model [samples]: chosen by hand, the sign
+# of the model's own speed replaces it.
 _HALF_WIDTH = 10
-_PASSES = 12
-# So few signs, as a share, may still change.
-_AT_REST = 5e-4
-# Of the resonance's square, where the driven side's own frequency is looked for: it is its inertia's share of both.
+# Most passes until the signs of friction settle, and the share of them that may still change: chosen by hand; not tuned further.
+_PASSES, _SETTLED = 12, 5e-4
+# Range of ω_a²/ω_r² and most trials for the driven side. The ratio is J₁'s share of both inertias; a driven side of less than
+# a tenth of them is rare. The number of trials is chosen by hand.
 _SHARES, _TRIALS = (0.1, 1.0), 10
-# Steps of the search on the way, and at the end.
-_BRIEFLY, _THOROUGHLY = 2, 30
-# A pole within so many of its standard deviations of s = 0, or this much slower than the record is long, is taken for an integrator.
+# Steps of the refinement on the way, and most of them at the end: chosen by hand; not tuned further.
+_FEW_STEPS, _STEPS = 2, 30
+# A pole is set to s = 0 within three standard deviations of it (99.7 %), or if its time constant is more than ten times the
+# record (chosen by hand). For two poles, χ² with two degrees of freedom exceeds 11.8 as rarely.
 _DEVIATIONS = 3.0
-_SLOWER = 10.0
-# The same for two poles at a time: as rare of χ² with two degrees of freedom as three deviations are of one.
 _PAIR = 11.8
-# That is to first order. So the mean square of the error may become so much larger by one integrator, by two, and without noise be so
-# much of the output's: signs of friction that are not settled yet make it larger too.
-_AS_GOOD = (30.0, 1.05)
+_SLOWER = 10.0
+# These tests are of first order. So one and two integrators may increase the mean square error by these factors at most, or
+# to this share of the output's mean square. Chosen by hand; signs of friction that are not settled increase it too.
+_MOST_COST = {1: 30.0, 2: 1.05}
 _ROUNDING = 1e-18
 
 
 class Fit(NamedTuple):
-    """What was fitted to the samples used for it."""
+    """A model fitted to the samples for the fit."""
 
     structure: Structure
-    found: Refined
-    late: int
-    """By how many samples u is late."""
+    estimate: ParameterEstimate
+    delay: int
+    """Delay of u [samples]."""
     bias: bool
 
     def inputs(self, u: Vector) -> Matrix:
-        """Return the inputs (N, inputs) for ``u``; those of friction are zero, ``free_run`` fills them in."""
-        columns = [
-            delayed(u, self.late),
-            *([np.ones(u.size)] if self.bias else []),
-            *[np.zeros(u.size)] * len(self.structure.rubbing),
-        ]
-        return np.column_stack(columns)
+        """Return the inputs (N, inputs) for ``u``; friction inputs are zero, ``free_run`` fills them in."""
+        zero = np.zeros(u.size)
+        return _columns(u, self.delay, self.bias, [zero] * len(self.structure.friction))
 
 
-def delayed(u: Vector, late: int) -> Vector:
-    """Return ``u`` so many samples later; before the record it was what it is at its start."""
-    return u if late == 0 else np.concatenate([np.full(late, u[0]), u[:-late]])
+def delayed(u: Vector, delay: int) -> Vector:
+    """Return ``u`` later by ``delay`` samples; before the record it has its first value."""
+    return u if delay == 0 else np.concatenate([np.full(delay, u[0]), u[:-delay]])
+
+
+def _columns(u: Vector, delay: int, bias: bool, friction: list[Vector]) -> Matrix:
+    return np.column_stack([delayed(u, delay), *([np.ones(u.size)] if bias else []), *friction])
 
 
 def fit(
@@ -62,179 +63,155 @@ def fit(
     order: int,
     zeros: int,
     integrators: int | None,
-    late: tuple[int, int],
+    delays: tuple[int, int],
     bias: bool,
     friction: bool,
 ) -> Fit:
-    """Return the model of least output error; ``late`` is the range of delays [samples] that is looked through."""
+    """Return the model of least output error; ``delays`` is the range of delays to search [samples]."""
     degrees = (zeros, *([0] if bias else []), *([max(order - 2, 0)] if friction else []))
     structure = Structure(order, integrators or 0, degrees, (0.0,) if friction else ())
-    v = np.column_stack(
-        [
-            delayed(u, late[0]),
-            *([np.ones(u.size)] if bias else []),
-            *([measured_sign(y, _HALF_WIDTH)] if friction else []),
-        ]
+    v = _columns(u, delays[0], bias, [measured_sign(y, _HALF_WIDTH)] if friction else [])
+    starts = initial_estimates(structure, v, y)
+    steps = _FEW_STEPS if len(starts) == 1 else _STEPS
+    estimate = min(
+        (refine(structure, theta, v, y, steps) for theta in starts), key=lambda one: one.cost
     )
-    starts = started(structure, v, y)
-    steps = _BRIEFLY if len(starts) == 1 else _THOROUGHLY
-    found = min(
-        (refined(structure, theta, v, y, steps) for theta in starts), key=lambda one: one.cost
-    )
-    if not np.isfinite(found.cost):
+    if not np.isfinite(estimate.cost):
         raise ValueError(
-            f"order = {order}, zeros = {zeros}: no model was found whose output is finite; lower the order, or scale u and y"
+            f"order = {order}, zeros = {zeros}: no model was found whose output is finite; "
+            "lower the order, or scale u and y"
         )
-    samples, found, v = _latest(structure, found, u, v, y, late, late[0])
+    delay, estimate, v = _best_delay(structure, estimate, u, v, y, delays, delays[0])
     if integrators is None:
-        structure, found = _with_integrator(structure, found, v, y)
+        structure, estimate = _set_integrators(structure, estimate, v, y)
     if friction and order > 3:
-        structure, found, v = _driven(structure, found, v, y)
+        structure, estimate, v = _add_driven_friction(structure, estimate, v, y)
         if integrators is None:
-            structure, found = _with_integrator(structure, found, v, y)
-    found, v = _settled(structure, found, v, y)
-    if friction and late[0] < late[1]:
-        # Beside a wrong sign of the speed another delay may have looked best.
-        again, found, v = _latest(structure, found, u, v, y, late, samples)
-        if again != samples:
-            samples = again
-            found, v = _settled(structure, found, v, y)
-    return Fit(structure, found, samples, bias)
+            structure, estimate = _set_integrators(structure, estimate, v, y)
+    estimate, v = _settle_signs(structure, estimate, v, y)
+    if friction and delays[0] < delays[1]:
+        # With wrong signs of the speed another delay may have been the best.
+        again, estimate, v = _best_delay(structure, estimate, u, v, y, delays, delay)
+        if again != delay:
+            delay = again
+            estimate, v = _settle_signs(structure, estimate, v, y)
+    return Fit(structure, estimate, delay, bias)
 
 
-def _settled(structure: Structure, found: Refined, v: Matrix, y: Vector) -> tuple[Refined, Matrix]:
-    """Return the parameters, with friction those for the signs of the speeds that they themselves give, and the inputs."""
-    best = (np.inf, found, v)
-    for _ in range(_PASSES if structure.rubbing else 0):
-        predicted, own = free_run(structure, found.theta, v, own_friction=True)
-        best = min(best, (float(np.mean((y - predicted) ** 2)), found, own), key=lambda one: one[0])
-        if np.mean(np.any(own != v, axis=1)) <= _AT_REST:
+def measured_sign(y: Vector, half_width: int) -> Vector:
+    """Return minus the sign of the speed of ``y``, from its mean slope over ``half_width`` samples to both sides."""
+    index = np.arange(y.size)
+    ahead, behind = np.minimum(index + half_width, y.size - 1), np.maximum(index - half_width, 0)
+    return -np.sign(y[ahead] - y[behind])
+
+
+def _settle_signs(
+    structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
+) -> tuple[ParameterEstimate, Matrix]:
+    """Return refined parameters and the inputs; the friction inputs are those of the model's own speeds."""
+    best = (np.inf, estimate, v)
+    for _ in range(_PASSES if structure.friction else 0):
+        predicted, own = free_run(structure, estimate.theta, v, own_friction=True)
+        error = float(np.mean((y - predicted) ** 2))
+        best = min(best, (error, estimate, own), key=lambda one: one[0])
+        if np.mean(np.any(own != v, axis=1)) <= _SETTLED:
             break
         v = own
-        found = refined(structure, found.theta, v, y, _BRIEFLY)
-    # On the way it may have been better than where it came to.
-    _, found, v = best
-    return refined(structure, found.theta, v, y, _THOROUGHLY), v
+        estimate = refine(structure, estimate.theta, v, y, _FEW_STEPS)
+    # An earlier pass may have been better than the last one.
+    _, estimate, v = best
+    return refine(structure, estimate.theta, v, y, _STEPS), v
 
 
-def _driven(
-    structure: Structure, found: Refined, v: Matrix, y: Vector
-) -> tuple[Structure, Refined, Matrix]:
-    """Return the structure with friction on what is driven too, where there is a resonance to tell the two apart; parameters and inputs."""
+def _add_driven_friction(
+    structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
+) -> tuple[Structure, ParameterEstimate, Matrix]:
+    """Return structure, parameters and inputs with friction on the driven side too, if a resonance separates the sides."""
     from scipy.optimize import minimize_scalar
 
-    v = free_run(structure, found.theta, v, own_friction=True)[1]
-    found = refined(structure, found.theta, v, y, _BRIEFLY)
-    omega = resonance(structure.denominator(found.theta))
+    v = free_run(structure, estimate.theta, v, own_friction=True)[1]
+    estimate = refine(structure, estimate.theta, v, y, _FEW_STEPS)
+    omega = _resonance(structure.denominator(estimate.theta))
     if omega == 0.0:
-        return structure, found, v
-    # A coefficient more, before those of friction on what is measured; what that had becomes the driven side's.
+        return structure, estimate, v
+    # A coefficient is added before those of friction on the measured side; it takes over the value of their first one.
     at = structure.free + sum(structure.degrees[:-1]) + len(structure.degrees) - 1
-    theta = np.insert(found.theta, at, found.theta[at])
-    theta[at + 1 : at + 2 + structure.degrees[-1]] = 0.0
+    start = np.insert(estimate.theta, at, estimate.theta[at])
+    start[at + 1 : at + 2 + structure.degrees[-1]] = 0.0
     wider = structure._replace(degrees=(*structure.degrees[:-1], 0, structure.degrees[-1]))
     v = np.column_stack([v, v[:, -1]])
     tried: list[tuple[float, Structure, Vector]] = []
 
     def error(share: float) -> float:
-        candidate = wider._replace(rubbing=(1.0 / (share * omega**2), 0.0))
-        value, after = min(tried, key=lambda one: one[0])[2] if tried else theta, 0.0
+        candidate = wider._replace(friction=(1.0 / (share * omega**2), 0.0))
+        theta, predicted = min(tried, key=lambda one: one[0])[2] if tried else start, 0.0
         for _ in range(2):
-            after, value = promised(
-                candidate, value, free_run(candidate, value, v, own_friction=True)[1], y
-            )
-        tried.append((after, candidate, value))
-        return after
+            own = free_run(candidate, theta, v, own_friction=True)[1]
+            predicted, theta = gauss_newton(candidate, theta, own, y)
+        tried.append((predicted, candidate, theta))
+        return predicted
 
-    minimize_scalar(
-        error, bounds=_SHARES, method="bounded", options={"xatol": 1e-2, "maxiter": _TRIALS}
-    )
+    options = {"xatol": 1e-2, "maxiter": _TRIALS}
+    minimize_scalar(error, bounds=_SHARES, method="bounded", options=options)
     _, wider, theta = min(tried, key=lambda one: one[0])
     v = free_run(wider, theta, v, own_friction=True)[1]
-    return wider, refined(wider, theta, v, y, _BRIEFLY), v
+    return wider, refine(wider, theta, v, y, _FEW_STEPS), v
 
 
-def _latest(
+def _resonance(a: Vector) -> float:
+    """Return |p| of the least damped pair of poles [1/sample]; 0.0 if there is no stable pair."""
+    poles = np.roots(np.append(1.0, a[::-1]))
+    pairs = poles[(poles.imag > 0.0) & (poles.real <= 0.0)]
+    return float(np.abs(pairs[np.argmin(-pairs.real / np.abs(pairs))])) if pairs.size else 0.0
+
+
+def _best_delay(
     structure: Structure,
-    found: Refined,
+    estimate: ParameterEstimate,
     u: Vector,
     v: Matrix,
     y: Vector,
-    late: tuple[int, int],
-    now: int,
-) -> tuple[int, Refined, Matrix]:
-    """Return the delay of least output error, found going down from ``now`` in steps of 8, 4, 2, 1; the parameters and inputs with it."""
+    delays: tuple[int, int],
+    delay: int,
+) -> tuple[int, ParameterEstimate, Matrix]:
+    """Return the delay of least output error near ``delay``, by steps of 8, 4, 2, 1 samples; and its parameters and inputs."""
 
-    def moved(samples: int) -> Matrix:
-        return np.column_stack([delayed(u, samples), v[:, 1:]])
+    def inputs(delay: int) -> Matrix:
+        return np.column_stack([delayed(u, delay), v[:, 1:]])
 
-    known = {now: found}
-    step = min(8, late[1] - late[0])
+    known = {delay: estimate}
+    step = min(8, delays[1] - delays[0])
     while step:
-        for samples in (now + step, now - step):
-            if late[0] <= samples <= late[1] and samples not in known:
-                known[samples] = refined(structure, known[now].theta, moved(samples), y, _BRIEFLY)
+        for other in (delay + step, delay - step):
+            if delays[0] <= other <= delays[1] and other not in known:
+                known[other] = refine(structure, known[delay].theta, inputs(other), y, _FEW_STEPS)
         best = min(known, key=lambda one: known[one].cost)
-        now, step = (best, step) if best != now else (now, step // 2)
-    return now, known[now], moved(now)
+        delay, step = (best, step) if best != delay else (delay, step // 2)
+    return delay, known[delay], inputs(delay)
 
 
-def _with_integrator(
-    structure: Structure, found: Refined, v: Matrix, y: Vector
-) -> tuple[Structure, Refined]:
-    """Return the structure with one or two poles at s = 0, and its parameters, where the slowest can't be told from that."""
+def _set_integrators(
+    structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
+) -> tuple[Structure, ParameterEstimate]:
+    """Return structure and parameters with one or two poles at s = 0, if the slowest can't be distinguished from that."""
     if structure.integrators:
-        return structure, found
-    a, free, covariance = structure.denominator(found.theta), structure.free, found.covariance
-    # An integrator whose zero can't be told from s = 0 either is none: the two cancel.
-    if structure.degrees[0] and abs(found.theta[free]) < _DEVIATIONS * np.sqrt(
-        covariance[free, free]
-    ):
-        return structure, found
+        return structure, estimate
+    a, free, covariance = structure.denominator(estimate.theta), structure.free, estimate.covariance
+    # An integrator and a zero that can't be distinguished from s = 0 would cancel.
+    zero_std = np.sqrt(covariance[free, free])
+    if structure.degrees[0] and abs(estimate.theta[free]) < _DEVIATIONS * zero_std:
+        return structure, estimate
     poles = np.roots(np.append(1.0, a[::-1]))
-    slow = poles[np.argsort(np.abs(poles))][:2]
+    slow = poles[np.argsort(np.abs(poles))][:2].astype(complex)
     for count, limit in ((2, _PAIR), (1, _DEVIATIONS**2)):
         if count > slow.size or (count == 1 and abs(slow[0].imag) > 0.0):
             continue
-        if (
-            abs(slow[count - 1]) * _SLOWER * y.size < 1.0
-            or _squares(a, covariance[: a.size, : a.size], slow[:count]) < limit
-        ):
+        slower_than_record = abs(slow[count - 1]) * _SLOWER * y.size < 1.0
+        part = covariance[: a.size, : a.size]
+        if slower_than_record or squared_distance_from_zero(a, part, slow[:count]) < limit:
             fewer = structure._replace(integrators=count)
-            without = refined(fewer, found.theta[count:], v, y, _BRIEFLY)
-            if without.cost <= _AS_GOOD[
-                count - 1
-            ] * found.cost or without.cost <= _ROUNDING * float(np.mean(y**2)):
+            without = refine(fewer, estimate.theta[count:], v, y, _FEW_STEPS)
+            rounding = _ROUNDING * float(np.mean(y**2))
+            if without.cost <= max(_MOST_COST[count] * estimate.cost, rounding):
                 return fewer, without
-    return structure, found
-
-
-def _squares(a: Vector, covariance: Matrix, roots: Any) -> float:
-    """Return how far from zero the coefficients of the polynomial of one root, or two, are, as the sum of squares in deviations."""
-    slopes = np.array([_slope(a, root) for root in roots])
-    if roots.size == 1:
-        coefficients, slopes = -roots, -slopes
-    else:
-        coefficients = np.array([roots[0] * roots[1], -roots[0] - roots[1]])
-        slopes = np.array([roots[1] * slopes[0] + roots[0] * slopes[1], -slopes[0] - slopes[1]])
-    part = slopes.real @ covariance @ slopes.real.T
-    size = np.sqrt(np.maximum(np.diag(part), 1e-300))
-    away = coefficients.real / size
-    return float(away @ np.linalg.pinv(part / np.outer(size, size), hermitian=True) @ away)
-
-
-def _slope(a: Vector, root: complex) -> Vector:
-    """Return the derivatives of a root of ``p^n + a_{n−1} p^(n−1) + …`` by its ``a``."""
-    found: Vector = -(root ** np.arange(a.size)) / np.polyval(
-        np.polyder(np.append(1.0, a[::-1])), root
-    )
-    return found
-
-
-def root_covariance(a: Vector, covariance: Matrix, root: complex) -> tuple[float, float]:
-    """Return the variances of real and imaginary part of a root of ``p^n + a_{n−1} p^(n−1) + …``, from the covariance of its ``a``.
-
-    To first order ``δp = −Σ p^i δa_i / A'(p)``.
-    """
-    slope = _slope(a, root)
-    return float(slope.real @ covariance @ slope.real), float(slope.imag @ covariance @ slope.imag)
+    return structure, estimate

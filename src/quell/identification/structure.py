@@ -1,38 +1,56 @@
-"""Which model is fitted: its parameters, how it answers, and how that changes with them.
+"""The model structure: its parameters θ, its output, and the derivatives of the output by θ.
 
     A(p) y = B(p) u + Σ_j F_j(p) v_j + D(p) δ(t),        A = p^q (p^(n−q) + … + a_q),   p = s dt
 
-with u held between samples, further known inputs v_j (1 for a constant force, −sign(speed) for Coulomb friction), and D for the state that
-the record starts with: ``D(p)/A(p) δ`` is the free motion from any state. The answer to held inputs is exact at the samples. With
-``ŷ = A⁻¹(B u + …)`` its derivatives are exact too, and as cheap::
+u is held between samples; v_j are further known inputs (1 for a constant force, −sign(speed) for Coulomb friction), and D
+stands for the initial state: ``D(p)/A(p) δ`` is the free motion from any state. The output is exact at the samples, and
+with ``ŷ = A⁻¹(B u + …)`` so are its derivatives::
 
     ∂ŷ/∂a_i = −p^i/A ŷ,      ∂ŷ/∂b_i = p^i/A u,      ∂ŷ/∂d_i = p^i/A δ
 
-(Ljung, *System Identification*, 2nd ed. 1999, eqs. (10.52)–(10.55) has them in the shift operator.)
+(Ljung, *System Identification*, 2nd ed. 1999, eqs. (10.52)–(10.55), in the shift operator.)
+
+**Coulomb friction** is an input of its own, minus the sign of a speed::
+
+    A y = B u + F₁ v₁ + F₂ v₂,      v₁ = −sign(speed of the driven side),   v₂ = −sign(y')
+
+For known v the model is linear in F. The v are taken from the motion of the last model (at first v₂ from the measured
+motion), then the parameters are fitted for these v, and so on until the v no longer change. A simulated model takes them
+from its own speeds. At standstill the sign changes at each sample, and its mean has the effect of sticking.
+
+Friction on the measured side acts on y″ directly: F₂ has degree n − 2. Friction on the driven side enters like u: F₁ has
+degree 0. Up to order 3 the sides move as one, and there is only v₂. From order 4 on there may be a spring between them. For
+inertias J₁ (driven) and J₂ with a spring k::
+
+    J₂ y″ = k (θ₁ − y) − …     so   θ₁' = y' + y‴/ω_a²,     ω_a² = k/J₂
+
+ω_a, the frequency at which the driven side stands still while the other oscillates, is not a zero of y and has to be
+searched for: it is below the resonance ``ω_r² = ω_a² (1 + J₂/J₁)``.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from quell.identification import sampling
-from quell.identification.sampling import chains, observable, sampled, states
+from quell.identification.sampling import chains, observable, sampled, states, states_with_friction
 from quell.types import Matrix, Vector
 
 
 class Structure(NamedTuple):
-    """How many parameters there are of what, in the order of the vector θ: a_q … a_{n−1}; each input's numerator; D."""
+    """The parameters θ, in this order: a_q … a_{n−1}; the numerator of each input; D."""
 
     order: int
     """n."""
     integrators: int
-    """q, how many poles are known to lie at s = 0."""
+    """q, the number of poles that are set to s = 0."""
     degrees: tuple[int, ...]
-    """degree of the numerator of each input, that of u first."""
-    rubbing: tuple[float, ...] = ()
-    """for each of the last inputs, those of friction, what the speed is that it goes by; see ``friction``."""
+    """Degree of the numerator of each input, u first."""
+    friction: tuple[float, ...] = ()
+    """For each friction input, the last ones: 1/ω_a² [samples²]; 0.0 for the one on the measured side."""
 
     @property
     def free(self) -> int:
@@ -58,40 +76,53 @@ class Structure(NamedTuple):
             at += degree + 1
         return found
 
-    def start(self, theta: Vector) -> Vector:
+    def initial(self, theta: Vector) -> Vector:
         """Return D (n,), in ascending powers."""
         return theta[self.size - self.order :]
 
     def powers(self, unit: float) -> Vector:
-        """Return what each parameter is multiplied with when time is counted in units ``unit`` times as long."""
+        """Return the factor of each parameter for a unit of time that is ``unit`` times as long."""
         n = self.order
-        parts = [unit ** (n - np.arange(degree + 1.0)) for degree in self.degrees]
-        return np.concatenate(
-            [
-                unit ** (n - np.arange(float(self.integrators), n)),
-                *parts,
-                unit ** (n - 1.0 - np.arange(n)),
-            ]
-        )
+        a = unit ** (n - np.arange(float(self.integrators), n))
+        numerators = [unit ** (n - np.arange(degree + 1.0)) for degree in self.degrees]
+        return np.concatenate([a, *numerators, unit ** (n - 1.0 - np.arange(n))])
 
 
 def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
-    """Return the derivatives of y by all parameters but those of A, which it is linear in (N, size − free)."""
-    bank = chains(a, v)
-    return np.hstack(
-        [
-            bank[:, : degree + 1, j]
-            for j, degree in enumerate((*structure.degrees, structure.order - 1))
-        ]
-    )
+    """Return the derivatives of y by all parameters except those of A (N, size − free); y is linear in them."""
+    bank, degrees = chains(a, v), (*structure.degrees, structure.order - 1)
+    return np.hstack([bank[:, : degree + 1, j] for j, degree in enumerate(degrees)])
 
 
 def output(structure: Structure, theta: Vector, v: Matrix) -> Vector:
     """Return y (N,) for the inputs ``v`` (N, inputs)."""
+    return free_run(structure, theta, v)[0]
+
+
+def free_run(
+    structure: Structure, theta: Vector, v: Matrix, own_friction: bool = False
+) -> tuple[Vector, Matrix]:
+    """Return y (N,) and the inputs; with ``own_friction`` the friction inputs follow from the model's own speeds."""
+    A = observable(structure.denominator(theta))
     B = np.ascontiguousarray(structure.numerators(theta)[:, ::-1].T)
-    return states(
-        sampled(observable(structure.denominator(theta)), B), v, structure.start(theta)[::-1]
-    )[:, 0]
+    system, initial = sampled(A, B), structure.initial(theta)[::-1]
+    if not (own_friction and structure.friction):
+        return states(system, v, initial)[:, 0], v
+    # y' and y‴ without the direct effect of the inputs; y = x_1
+    first = A[0]
+    third = first @ A @ A
+    speeds = np.array([first + weight * third for weight in structure.friction])
+    x, inputs = states_with_friction(system, v, speeds, initial)
+    return x[:, 0], inputs
+
+
+def cost(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> float:
+    """Return the mean square of the output error [y-unit²]; infinite if it is not finite."""
+    if not np.all(np.isfinite(theta)):
+        return math.inf
+    with np.errstate(all="ignore"):
+        value = float(np.mean((y - output(structure, theta, v)) ** 2))
+    return value if math.isfinite(value) else math.inf
 
 
 def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Matrix]:
@@ -101,11 +132,17 @@ def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Ma
     for j, degree in enumerate(degrees):
         columns[: degree + 1, j] = np.arange(at, at + degree + 1)
         at += degree + 1
-    B = structure.numerators(theta)[:, ::-1].T
-    a, start = structure.denominator(theta), structure.start(theta)[::-1]
-    return sampling.gradient(a, B, start, columns, structure.integrators, v, structure.size)
+    a, B = structure.denominator(theta), structure.numerators(theta)[:, ::-1].T
+    initial = structure.initial(theta)[::-1]
+    return sampling.gradient(a, B, initial, columns, structure.integrators, v, structure.size)
 
 
 def lengths(columns: Matrix) -> Vector:
-    """Return the columns' lengths."""
+    """Return the Euclidean lengths of the columns."""
     return np.sqrt(np.einsum("ki,ki->i", columns, columns))
+
+
+def nonzero_lengths(columns: Matrix) -> Vector:
+    """Return the lengths of the columns, 1 for a zero column, to divide by."""
+    size = lengths(columns)
+    return np.where(size > 0.0, size, 1.0)

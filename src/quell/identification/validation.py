@@ -1,14 +1,14 @@
-"""How well a model explains a record: simulation, prediction, and what is left.
+"""Quality of a model on a record: fits of simulation and prediction, and tests of the error.
 
-The fit is ``100 (1 − |y − ŷ| / |y − mean(y)|)`` in % (NRMSE). A simulation knows u and where the record begins, nothing else; friction
-comes from its own speed. A prediction k samples ahead knows y up to now: to the simulation is added what its own errors say of the error
-k samples later, a linear predictor of n + 1 terms found by least squares on the samples of the fit (Ljung 1999, sec. 3.2: an output-error
-model has no noise model of its own, so it gets the simplest).
+The fit is ``100 (1 − |y − ŷ| / |y − mean(y)|)`` in % (NRMSE). A simulation knows u and the state at the start; friction follows
+from its own speed. A prediction k samples ahead also knows y up to now: it adds to the simulation a linear prediction of its
+error from n + 1 earlier errors, fitted by least squares on the samples for the fit (an output-error model has no noise model
+of its own, so it gets the simplest; Ljung 1999, sec. 3.2).
 
-What is left, ε, is judged by the two tests of Ljung 1999, sec. 16.6. *Whiteness*: ``ζ = N Σ_{τ=1}^{M} (R_ε(τ)/R_ε(0))²`` is χ² with M
-degrees of freedom where ε is white. *Independence of u*: where ε does not depend on past u, ``√N R_εu(τ)`` is normal with variance ``Σ_k
-R_ε(k) R_u(k)``. The first says whether the noise is understood, which an output-error model does not claim; the second whether the plant
-is.
+The error ε of the simulation is tested as in Ljung 1999, sec. 16.6. *Whiteness*: ``ζ = N Σ_{τ=1}^{M} (R_ε(τ)/R_ε(0))²`` is χ² with
+M degrees of freedom for white ε. *Independence of u*: if ε does not depend on past u, ``√N R_εu(τ)`` is normal with variance
+``Σ_k R_ε(k) R_u(k)``. The first tests a model of the noise, which an output-error model does not have; the second tests the
+model of the plant.
 """
 
 from __future__ import annotations
@@ -17,41 +17,43 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.friction import free_run
 from quell.identification.sampling import chains
 from quell.identification.search import Fit
-from quell.identification.structure import lengths
+from quell.identification.structure import free_run, lengths
 from quell.types import Matrix, Vector
 
+# Rounds in which the start and the signs of friction are adapted to each other: chosen by hand; not tuned further.
 _ROUNDS = 6
+# Relative singular value that counts as zero.
+_RANK = 1e-12
 
 
 class Residuals(NamedTuple):
-    """The tests of what the simulation leaves."""
+    """Tests of the error ε of a simulation."""
 
     rms: float
-    """root mean square [y-unit]."""
+    """Root mean square [y-unit]."""
     lags: int
-    """M, how many lags the tests look at."""
+    """M, the number of lags in the tests."""
     autocorrelation: Vector
     """R_ε(τ)/R_ε(0) for τ = 0 … M (M + 1,)."""
     whiteness: float
     """ζ."""
     whiteness_limit: float
-    """what 99 % of white sequences stay below."""
+    """Limit that ζ of a white sequence exceeds with 1 % probability."""
     cross_correlation: Vector
-    """between ε and u, both of variance 1, for ε later than u by τ = −M … M samples (2 M + 1,)."""
+    """Correlation of ε and u, both with variance 1, for ε later than u by τ = −M … M samples (2 M + 1,)."""
     cross_limit: float
-    """what 99 % of them stay within, where ε does not depend on u."""
+    """Limit that 1 % of them exceed if ε does not depend on u."""
 
     @property
     def white(self) -> bool:
-        """Whether ε passes for white, at 99 %."""
+        """Whether ε passes the test of whiteness, at 99 %."""
         return self.whiteness <= self.whiteness_limit
 
     @property
     def independent(self) -> bool:
-        """Whether no more than 1 % of the correlations with past u (τ ≥ 0), but at least one, lie outside of the limit."""
+        """Whether at most 1 % of the correlations with past u (τ ≥ 0), or one of them, exceed the limit."""
         outside = np.abs(self.cross_correlation[self.lags :]) > self.cross_limit
         return bool(np.count_nonzero(outside) <= max(1, round(0.01 * outside.size)))
 
@@ -61,40 +63,39 @@ def nrmse(y: Vector, predicted: Vector) -> float:
     return float(100.0 * (1.0 - np.linalg.norm(y - predicted) / np.linalg.norm(y - np.mean(y))))
 
 
-def simulated(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
-    """Return the simulated output for the inputs ``v``, of which that of friction, if there is one, is taken from the model's own speed.
+def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
+    """Return the simulated output for the inputs ``v``; friction inputs follow from the model's own speeds.
 
-    With ``y`` it starts where ``y`` says, by least squares: a simulation has to be told n numbers, like any other. Without it starts as
-    the samples that the model was fitted to.
+    With ``y`` the initial state is fitted to ``y`` by least squares, n numbers; without, it is that of the samples for the fit.
     """
-    structure, theta = fit.structure, fit.found.theta
+    structure, theta = fit.structure, fit.estimate.theta
     if y is None:
-        return _kept(free_run(structure, theta, v, own_friction=True)[0])
+        return _finite(free_run(structure, theta, v, own_friction=True)[0])
     theta = theta.copy()
     theta[-structure.order :] = 0.0
     free = chains(structure.denominator(theta), np.zeros((y.size, 0)))[:, :, 0]
     size = lengths(free)
-    predicted = _kept(free_run(structure, theta, v)[0])
-    # With friction the start decides on the sign of the speed, and that on the start.
-    for _ in range(_ROUNDS if structure.rubbing else 1):
-        theta[-structure.order :] += (
-            np.linalg.lstsq(free / size, y - predicted, rcond=1e-12)[0] / size
-        )
-        predicted = _kept(free_run(structure, theta, v, own_friction=True)[0])
+    predicted = _finite(free_run(structure, theta, v)[0])
+    # With friction the start decides the sign of the speed, and the sign the start.
+    for _ in range(_ROUNDS if structure.friction else 1):
+        change = np.linalg.lstsq(free / size, y - predicted, rcond=_RANK)[0]
+        theta[-structure.order :] += change / size
+        predicted = _finite(free_run(structure, theta, v, own_friction=True)[0])
     return predicted
 
 
-def _kept(predicted: Vector) -> Vector:
-    """Return a simulated output, or say that there is none."""
+def _finite(predicted: Vector) -> Vector:
+    """Return a simulated output if it is finite."""
     if not np.all(np.isfinite(predicted)):
         raise ValueError(
-            "order: the model that was found runs away when it is simulated; lower the order, or give integrators"
+            "order: the model that was found runs away when it is simulated; "
+            "lower the order, or give integrators"
         )
     return predicted
 
 
 class Predictor(NamedTuple):
-    """Of the error of a simulation, ``horizon`` samples ahead, from its values now and at multiples of ``horizon`` before."""
+    """A linear predictor of a simulation's error, ``horizon`` samples ahead, from errors at multiples of ``horizon`` before."""
 
     horizon: int
     weights: Vector
@@ -103,12 +104,10 @@ class Predictor(NamedTuple):
     def fitted(cls, error: Vector, horizon: int, terms: int) -> Predictor:
         """Return the predictor of least squares."""
         past, ahead = cls._parts(error, horizon, terms)
-        return cls(
-            horizon, np.asarray(np.linalg.lstsq(past, ahead, rcond=1e-12)[0], dtype=np.float64)
-        )
+        return cls(horizon, np.asarray(np.linalg.lstsq(past, ahead, rcond=_RANK)[0]))
 
     def fit_percent(self, y: Vector, error: Vector) -> float:
-        """Return the fit of what is predicted of ``y`` whose simulation has this error."""
+        """Return the fit of the prediction of ``y``, whose simulation has this error."""
         past, ahead = self._parts(error, self.horizon, self.weights.size)
         later = y[y.size - ahead.size :]
         return nrmse(later, later - (ahead - past @ self.weights))
@@ -116,24 +115,22 @@ class Predictor(NamedTuple):
     @staticmethod
     def _parts(error: Vector, horizon: int, terms: int) -> tuple[Matrix, Vector]:
         first = horizon * terms
-        past = [
-            error[first - (j + 1) * horizon : error.size - (j + 1) * horizon] for j in range(terms)
-        ]
+        past = [error[first - j : error.size - j] for j in range(horizon, first + 1, horizon)]
         return np.column_stack(past), error[first:]
 
 
 def residuals(error: Vector, u: Vector, lags: int) -> Residuals:
-    """Return the tests of the errors of a simulation (N,) with the input ``u`` (N,)."""
+    """Return the tests of the error (N,) of a simulation with the input ``u`` (N,)."""
     from scipy.stats import chi2, norm
 
     e, v = error - np.mean(error), u - np.mean(u)
     count = e.size
     re, ru, cross = (_correlation(*pair, lags) for pair in ((e, e), (v, v), (e, v)))
-    # Without any error there is nothing to correlate.
+    # Without any error there is no correlation.
     power = re[lags] or 1.0
     auto = re[lags:] / power
     scale = float(np.sqrt(power * ru[lags]))
-    # Correlations beyond the lags looked at count as none.
+    # Correlations at greater lags count as zero.
     variance = max(float(np.sum(re * ru)), 0.0) / scale**2
     return Residuals(
         rms=float(np.sqrt(np.mean(error**2))),
