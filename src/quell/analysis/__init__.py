@@ -1,4 +1,4 @@
-"""Analysis of loops: poles, margins, sensitivity functions and noise, also as systems of python-control and as plots.
+"""Analysis of loops: poles, margins, sensitivity functions, noise, frozen learners, plots.
 
 May import ``simulation``, ``records``, ``controllers`` and what they import.
 """

@@ -93,7 +93,7 @@ def advise(
 
 
 def _assumed_plant(observer: ESO) -> tuple[LinearPlant, float]:
-    """Return the plant that an observer assumes, in its canonical form with the gain b0, and the delay before it [s]."""
+    """Return the plant that an observer assumes, with the gain b0, and its input delay [s]."""
     known = observer.plant
     A = np.diag(np.ones(observer.order - 1), 1)
     A[-1] = -known.a
@@ -117,8 +117,9 @@ def _judge_margin(loop: LoopAnalysis, observer: ESO | None) -> list[Finding]:
         "detune it" if observer is None else "raise omega_o (noise permitting) or lower omega_c"
     )
     message = (
-        f"modulus margin {margins.modulus:.3g} is below {_LEAST_MODULUS:g} (phase margin {margins.phase:.1f}°, "
-        f"worst at {margins.modulus_omega:.3g} rad/s): {what_to_do}"
+        f"modulus margin {margins.modulus:.3g} is below {_LEAST_MODULUS:g} "
+        f"(phase margin {margins.phase:.1f}°, worst at {margins.modulus_omega:.3g} rad/s): "
+        f"{what_to_do}"
     )
     return [Finding("margin", margins.modulus, _LEAST_MODULUS, message)]
 
@@ -145,9 +146,9 @@ def _judge_lag(
     cost = math.degrees(math.atan(at * actuator_lag) + at * delay)
     angle = "" if math.isnan(at) else f", {cost:.1f}° at the crossover of {at:.3g} rad/s,"
     message = (
-        f"{cause}{angle} leaves a phase margin of {after.phase:.1f}° of {before.phase:.1f}°, a modulus margin of "
-        f"{after.modulus:.3g} of {before.modulus:.3g}: shorten it, let the controller know of it, "
-        "or lower omega_o and omega_c together"
+        f"{cause}{angle} leaves a phase margin of {after.phase:.1f}° of {before.phase:.1f}°, "
+        f"a modulus margin of {after.modulus:.3g} of {before.modulus:.3g}: "
+        "shorten it, let the controller know of it, or lower omega_o and omega_c together"
     )
     return [Finding("lag", after.modulus, _LAG_LEAVES * before.modulus, message)]
 
@@ -168,7 +169,8 @@ def _judge_noise(loop: LoopAnalysis, controller: Controller, noise: float) -> li
             f"lower omega_o to about {lower:.2g} rad/s, and omega_c with it, or measure better"
         )
     message = (
-        f"noise of {noise:.3g} RMS in y makes u move by {rms:.3g} RMS, {100.0 * share:.3g} % of its range of {u_range:.3g}; "
+        f"noise of {noise:.3g} RMS in y makes u move by {rms:.3g} RMS, "
+        f"{100.0 * share:.3g} % of its range of {u_range:.3g}; "
         f"{100.0 * _NOISE:g} % is about what an actuator stands: {what_to_do}"
     )
     return [Finding("noise", share, _NOISE, message)]

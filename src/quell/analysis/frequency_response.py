@@ -63,13 +63,14 @@ def response(system: System, omega: Any, dt: float) -> Complex:
         )
     except np.linalg.LinAlgError:
         raise ValueError(
-            f"omega = {np.atleast_1d(omega).tolist()!r} rad/s: the response is infinite at one of them, a pole; leave it out"
+            f"omega = {np.atleast_1d(omega).tolist()!r} rad/s: the response is infinite at one of "
+            "them, a pole; leave it out"
         ) from None
     return np.asarray(solved[:, :, 0] @ system.C + system.D, dtype=np.complex128)
 
 
 def in_s_plane(shifted: Complex, dt: float) -> Complex:
-    """Return ``log(z)/dt`` for poles given as z − 1; a pole at z = 0, a sample of memory, is at −inf."""
+    """Return ``log(z)/dt`` for poles given as z − 1; a pole at z = 0 becomes −inf."""
     with np.errstate(divide="ignore"):
         size = np.where(
             np.abs(1.0 + shifted) < 1e-7,  # z = 0, found as an eigenvalue of a defective matrix
@@ -82,7 +83,7 @@ def in_s_plane(shifted: Complex, dt: float) -> Complex:
 
 
 def frequencies(poles: Complex, dt: float) -> Vector:
-    """Return frequencies [rad/s] up to half the sampling rate, dense near the poles (in the s-plane)."""
+    """Return frequencies [rad/s] up to half the sampling rate, dense near the s-plane poles."""
     top = math.pi / dt
     size = np.abs(poles)
     finite = size[(size > 1e-9 * top) & (size < top)]  # smaller ones are integrators, to rounding

@@ -72,7 +72,7 @@ for _generic in (adapt, commit, restart, coefficients):
 
 
 def frozen(controller: Controller, run: Any = None, t: float | None = None) -> Frozen:
-    """Freeze a controller's learner: in its present state, at the end of a run, or at any time of it.
+    """Freeze a controller's learner: now, at the end of a run, or at any time of it.
 
     Parameters
     ----------
@@ -98,9 +98,7 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
         calls a Python model, whose answer is held between calls.
     """
     if not isinstance(controller, ADRC):
-        raise ValueError(
-            f"controller = {controller!r}: must be an ADRC, which is the only one with a learner to freeze"
-        )
+        raise ValueError(f"controller = {controller!r}: must be an ADRC")
     if run is None:
         return _from_state(controller, controller._state)
     if not isinstance(run, Trajectory):
@@ -117,11 +115,13 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
     order = controller.observer.order
     if tuple(run.features) != tuple(controller.features):
         raise ValueError(
-            f"run has the features {run.features}: must be a run of this controller, which has {controller.features}"
+            f"run has the features {run.features}: must be a run of this controller, "
+            f"which has {controller.features}"
         )
     if not (run.features or isinstance(controller.learner, NoLearner)):
         raise ValueError(
-            f"t = {t!r}: {type(controller.learner).__name__} has no coefficients to record; {_USE_STATE}"
+            f"t = {t!r}: {type(controller.learner).__name__} has no coefficients to record; "
+            f"{_USE_STATE}"
         )
     gain, slope = np.zeros(order + 1), 0.0
     states = {f"x{i + 1}": i for i in range(order)}
@@ -132,7 +132,8 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
             slope += float(theta)
         elif not name.startswith(_FEEDFORWARD):
             raise ValueError(
-                f"t = {t!r}: the feature {name!r} is not linear, so its coefficient does not give a gain; {_USE_STATE}"
+                f"t = {t!r}: the feature {name!r} is not linear, so its coefficient is no gain; "
+                f"{_USE_STATE}"
             )
     authority = float(run["authority"][row]) if "authority" in run.names else 1.0
     return _with_authority(controller, gain, 0.0, slope, authority)
@@ -141,8 +142,8 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
 def _from_state(controller: ADRC, state: Any) -> Frozen:
     if hasattr(controller.learner, "external_fields"):
         raise ValueError(
-            f"learner = {type(controller.learner).__name__}: a Python model is asked once a period and its answer held, "
-            "so it has no gain at an instant; analyse the loop without it"
+            f"learner = {type(controller.learner).__name__}: a Python model is asked once a period "
+            "and its answer held, so it has no gain at an instant; analyse the loop without it"
         )
     learner, memory = controller.parameters.learner, copy_state(state.learner)
     known = controller.read(state)
@@ -185,7 +186,7 @@ def _with_authority(
 
 
 def _signal_sizes(controller: ADRC, memory: Any, seen: Vector, u: float) -> Vector:
-    """Return the sizes of x̂_1 … x̂_n, Δf̂ and u: the scales that the learner found, or an estimate from the present values."""
+    """Return the sizes of x̂_1 … x̂_n, Δf̂ and u: the learner's scales, or from present values."""
     scale = np.asarray(getattr(memory, "scale", ()))
     # A scale is at its floor, 1e-100 (``features.scaling``), until its signal was seen.
     if scale.shape == (seen.size + 1,) and np.all(scale > 1e-90):

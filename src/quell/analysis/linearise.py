@@ -20,6 +20,7 @@ from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller, control
 from quell.controllers.limits import Limits
 from quell.controllers.linear.law import LinearLaw
+from quell.controllers.stateful import named_arrays
 from quell.guard import UnguardedDesign, UnguardedMemory
 from quell.learners.base import NoLearnerMemory
 from quell.types import Matrix, Vector
@@ -72,13 +73,9 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
         np.array_equal(np.asarray(one), np.asarray(other))
         for one, other in zip(law, again, strict=True)
     ):
-        raise ValueError(
-            f"controller = {controller!r}: its law changes from sample to sample, so it has no linear law"
-        )
+        raise ValueError(f"controller = {controller!r}: its law changes from sample to sample")
     if not all(np.all(np.isfinite(part)) for part in law):
-        raise ValueError(
-            f"controller = {controller!r}: the gain b0 + ∂f_L/∂u is zero with this learner, so its law is not finite"
-        )
+        raise ValueError(f"controller = {controller!r}: b0 + ∂f_L/∂u is zero with this learner")
     return law
 
 
@@ -114,20 +111,15 @@ def _measured_law(design: Any, origin: Any) -> LinearLaw:
     return LinearLaw(kept_A, B_r[keep], B_y[keep], B_u[keep], C[keep], D_r, D_y)
 
 
+def _arrays(state: Any) -> list[Vector]:
+    return list(named_arrays(state).values())
+
+
 def _reached(A: Matrix, start: Vector) -> NDArray[np.bool_]:
-    """Return which states are ever reached along A from those that ``start`` drives; with A transposed, which ever reach them."""
+    """Return which states those in ``start`` reach along A; with A transposed, which reach them."""
     found: NDArray[np.bool_] = start != 0.0
     while True:
         more = found | np.any(A[:, found] != 0.0, axis=1)
         if np.array_equal(more, found):
             return found
         found = more
-
-
-def _arrays(state: Any) -> list[Vector]:
-    """Return the arrays of a nested NamedTuple."""
-    return (
-        [array for value in state for array in _arrays(value)]
-        if isinstance(state, tuple)
-        else [state]
-    )

@@ -1,9 +1,9 @@
-"""The loop of a linear plant and a controller at one instant: poles, margins, noise in u, sensitivity functions.
+"""The loop of a linear plant and a controller: poles, margins, noise, sensitivity functions.
 
 In discrete time, at the controller's samples, with a load d at the plant's input, the noise n of
 the measurement and the plant's disturbances w::
 
-    u = C_r r − C_y (y + n)        y = P (u + d) + P_w w        L = P C_y        S = 1/(1 + L),  T = 1 − S
+    u = C_r r − C_y (y + n),  y = P (u + d) + P_w w,  L = P C_y,  S = 1/(1 + L),  T = 1 − S
 
 so that the responses are ``r → y: P C_r S``, ``d → y: P S``, ``n → u: −C_y S``, ``n → y: −T``, ``w
 → y: P_w S``.
@@ -38,7 +38,7 @@ def analyse(
     delay: float = 0.0,
     actuator_lag: float = 0.0,
 ) -> LoopAnalysis:
-    """Analyse the loop of a linear plant and a controller, without limits and with its learner frozen.
+    """Analyse the loop of a linear plant and a controller, unlimited and with a frozen learner.
 
     Parameters
     ----------
@@ -114,7 +114,8 @@ class LoopAnalysis:
         }
 
     def __repr__(self) -> str:
-        return f"LoopAnalysis of {self.plant.N.shape[0]} + {self.law.A.shape[0]} states at dt = {self.dt:g} s:\n{self.summary()}"
+        states = f"{self.plant.N.shape[0]} + {self.law.A.shape[0]} states"
+        return f"LoopAnalysis of {states} at dt = {self.dt:g} s:\n{self.summary()}"
 
     def summary(self) -> str:
         """Return margins and noise gain in a few lines."""
@@ -123,21 +124,21 @@ class LoopAnalysis:
         m, (noise, peak) = self.margins, (self.noise_to_control, self.noise_to_control_peak)
         low, high = self.b_range
         what, unit = ("a gain", " times what it is") if self.b_over_b0 is None else ("b/b0", "")
-        least_gain, most_gain = m.disk_gain
-        return "\n".join(
-            [
-                f"gain margin {m.gain[0]:.3g} … {m.gain[1]:.3g}, phase margin {m.phase:.1f}° at {m.phase_omega:.3g} rad/s",
-                f"modulus margin {m.modulus:.3f}, delay margin {1e3 * m.delay:.3g} ms",
-                f"disk margin {m.disk:.3f}: gain {least_gain:.3g} … {most_gain:.3g} or phase ±{m.disk_phase:.1f}°, or some of both",
-                f"stable for {what} from {low:.3g} to {high:.3g}{unit}",
-                f"white noise of 1 in y makes u move by {noise:.3g} RMS, at most by a factor of {peak:.3g} at one frequency",
-            ]
+        return (
+            f"gain margin {m.gain[0]:.3g} … {m.gain[1]:.3g}, "
+            f"phase margin {m.phase:.1f}° at {m.phase_omega:.3g} rad/s\n"
+            f"modulus margin {m.modulus:.3f}, delay margin {1e3 * m.delay:.3g} ms\n"
+            f"disk margin {m.disk:.3f}: gain {m.disk_gain[0]:.3g} … {m.disk_gain[1]:.3g} "
+            f"or phase ±{m.disk_phase:.1f}°, or some of both\n"
+            f"stable for {what} from {low:.3g} to {high:.3g}{unit}\n"
+            f"white noise of 1 in y makes u move by {noise:.3g} RMS, "
+            f"at most by a factor of {peak:.3g} at one frequency"
         )
 
     # ---- poles
 
     def closed_loop_matrix(self, gain: float = 1.0) -> Matrix:
-        """Return ``A − I`` of the closed loop, the plant's states first, with the plant's gain multiplied by ``gain``."""
+        """Return ``A − I`` of the closed loop with ``gain`` times the plant's gain."""
         return closed_loop_matrix(
             self.plant.N, gain * self.plant.B, self.plant.C, self.law, self._N
         )
@@ -159,7 +160,7 @@ class LoopAnalysis:
 
     @cached_property
     def s_poles(self) -> Complex:
-        """The same as ``log(z)/dt`` [rad/s], to compare with a design in continuous time; a pole at z = 0 is at −inf."""
+        """The same as ``log(z)/dt`` [rad/s], as in continuous time; −inf for a pole at z = 0."""
         return in_s_plane(self._shifted_poles(), self.dt)
 
     @cached_property
@@ -226,7 +227,7 @@ class LoopAnalysis:
 
     @cached_property
     def b_range(self) -> tuple[float, float]:
-        """Values of b/b0 between which the loop is stable, with b the plant's input gain and unchanged dynamics.
+        """Range of b/b0 for which the loop is stable, with b the plant's input gain.
 
         If ``b_over_b0`` is None, it is in units of the plant's present gain.
         """
@@ -238,7 +239,7 @@ class LoopAnalysis:
 
     @cached_property
     def noise_to_control(self) -> float:
-        """Standard deviation of u for white measurement noise of standard deviation 1; infinite for an unstable loop."""
+        """RMS of u for white measurement noise of RMS 1; infinite for an unstable loop."""
         if not self.stable:
             return math.inf
         return math.sqrt(_h2_squared(System.balanced(*self.closed_loop("n", "u"))))
@@ -282,7 +283,7 @@ class LoopAnalysis:
         return closed_loop(self.plant, self.law, source, target)
 
     def system(self, name: str) -> Any:
-        """Return a part of the loop, or a closed loop, as a ``control.StateSpace`` in discrete time.
+        """Return a part of the loop, or a closed loop, as a sampled ``control.StateSpace``.
 
         Parameters
         ----------
@@ -311,9 +312,10 @@ class LoopAnalysis:
 
 
 def _h2_squared(system: System) -> float:
-    """Return the sum of the squared impulse response, by doubling: ``X ← X + M X Mᵀ``, ``M ← M²`` (Smith 1968).
+    """Return the sum of the squared impulse response.
 
-    Only positive terms are added, so nothing cancels; after k rounds 2ᵏ samples are summed.
+    By doubling, ``X ← X + M X Mᵀ``, ``M ← M²`` (Smith 1968): only positive terms are added, so
+    nothing cancels; after k rounds 2ᵏ samples are summed.
     """
     M, X = system.N + np.eye(system.N.shape[0]), np.outer(system.B, system.B)
     for _ in range(64):  # 2⁶⁴ samples: no stable loop in double precision is slower

@@ -41,7 +41,7 @@ _MINIMUM_TOLERANCE, _CROSSING_TOLERANCE = 1e-9, 1e-13
 
 
 class Margins(NamedTuple):
-    """Margins of a loop, each with its frequency [rad/s] (NaN if there is none); all zero for an unstable loop."""
+    """Margins of a loop, each with its frequency [rad/s] or NaN; zero for an unstable loop."""
 
     gain: tuple[float, float]
     """Range of factors of the gain; (1, 1) for an unstable loop."""
@@ -119,7 +119,7 @@ def _disk_distance(L: Complex) -> Vector:
 def _gain_margin(
     loop: Response, omega: Vector, L: Complex, dt: float, stable_with: Callable[[float], bool]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the range of factors of the gain for which the loop is stable, and the frequencies at its ends.
+    """Return the range of gain factors for which the loop is stable, and the frequencies there.
 
     A pole is on the unit circle for the factor κ where ``κ L = −1``: at crossings of the negative
     real axis, at ω → 0 and at half the sampling rate. Between two such factors stability does not
@@ -154,7 +154,7 @@ def _gain_margin(
 def least(
     function: Callable[[Vector], Vector], omega: Vector, values: Vector
 ) -> tuple[float, float]:
-    """Return the least value of a function of the frequency, and its frequency; ``values`` are those at ``omega``."""
+    """Return the minimum of a function and its frequency; ``values`` are those at ``omega``."""
     from scipy.optimize import minimize_scalar
 
     best = int(np.argmin(values))

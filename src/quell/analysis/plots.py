@@ -69,7 +69,7 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
 
 
 def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
-    """Plot the gains of S, T, PS (load to y) and CS (noise to u); return the four axes, in this order.
+    """Plot the gains of S, T, PS (load to y) and CS (noise to u); return these four axes.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def _axes(axes: Any, rows: int, columns: int) -> Any:
 
 
 def _limit_ratio(ax: Any, size: Any) -> None:
-    """Limit the axis to six decades about the median: poles on the imaginary axis and zeros reach further."""
+    """Limit the axis to six decades about the median, to leave out undamped poles and zeros."""
     finite = size[np.isfinite(size) & (size > 0.0)]
     middle = float(np.median(finite))
     ax.set_ylim(

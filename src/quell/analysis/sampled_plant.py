@@ -1,4 +1,4 @@
-"""The plant as the controller sees it: sampled with zero-order hold, with dead time and actuator lag.
+"""The plant as the controller sees it: zero-order hold, dead time and actuator lag included.
 
 Matrices are kept as ``A − I``: a double integrator sampled at 1 ms differs from the unit matrix in
 the sixth digit, and all slow dynamics are in that difference.
@@ -65,8 +65,8 @@ def sampled_plant(
     if getattr(plant, "dt", None):
         if actuator_lag > 0.0 or not math.isclose(delay / dt, round(delay / dt), abs_tol=1e-9):
             raise ValueError(
-                f"delay = {delay!r} s, actuator_lag = {actuator_lag!r} s: a sampled plant takes whole samples of delay and no lag; "
-                "give it in continuous time"
+                f"delay = {delay!r} s, actuator_lag = {actuator_lag!r} s: a sampled plant takes "
+                "whole samples of delay and no lag; give it in continuous time"
             )
         model = read_model(plant, dt=dt)
         model = to_state_space(model) if isinstance(model, TransferFunction) else model

@@ -22,7 +22,7 @@ _OPEN = ("P", "C_r", "C_y", "L")
 
 
 def closed_loop_matrix(A: Matrix, B: Matrix, C: Matrix, law: LinearLaw, inner: Matrix) -> Matrix:
-    """Return the matrix of a sampled plant in closed loop with a law, without limits; the plant's states come first.
+    """Return the matrix of a sampled plant in closed loop with a law, the plant's states first.
 
     ``inner`` is ``law.A + B_u C``, the law with its own output applied. Pass A and ``inner`` both
     as they are, or both less the unit matrix.

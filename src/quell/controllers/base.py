@@ -27,7 +27,7 @@ class Controller(Protocol):
 
     @property
     def features(self) -> tuple[str, ...]:
-        """Names of the features whose coefficients the channel ``theta`` holds; empty without it."""
+        """Names of the features whose coefficients are in the channel ``theta``."""
 
     @property
     def channels(self) -> tuple[tuple[str, int], ...]:

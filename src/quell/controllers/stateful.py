@@ -1,4 +1,4 @@
-"""The base class of all controllers of this package: a running state that can be stepped, saved, restored and copied."""
+"""The base class of controllers: a running state to step, save, restore and copy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step")
 
 
 class StatefulController:
-    """A controller with its own running state, which ``step`` advances and ``simulate`` does not touch.
+    """A controller with its own running state, which ``simulate`` does not touch.
 
     A subclass sets its attributes, then calls ``_initialise``. It defines ``_update_parameters``,
     which makes ``parameters`` from them, and ``initial_state``. If a field of the state refers to
@@ -59,7 +59,7 @@ class StatefulController:
         raise NotImplementedError
 
     def prepare(self) -> None:
-        """Compile ``step``, or load it from the disk cache, so that the first call takes no longer than the others."""
+        """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
         dispatcher = dispatcher_for(step_packed, self.parameters)
         self._packed = PackedController(self.parameters, self._state)
         # The first call runs on another state, because it must not count as a sample.
@@ -68,11 +68,11 @@ class StatefulController:
         self._step = entry_point(dispatcher, self._packed, 0.0, 0.0)
 
     def step(self, r: float, y: float) -> float:
-        """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
+        """Take one sample: return the control signal [u-unit] for reference and measurement.
 
-        A value that is not finite is replaced by the last finite one, or by the one that an
-        observer expects; ``status`` reports it. The controller assumes that the returned value is
-        applied: set limits by ``u_min``, ``u_max`` and ``rate_limit``.
+        ``r`` and ``y`` are in y-units. A value that is not finite is replaced by the last finite
+        one, or by the one that an observer expects; ``status`` reports it. The controller assumes
+        that the returned value is applied: set limits by ``u_min``, ``u_max`` and ``rate_limit``.
 
         The first call compiles, or loads from the disk cache; call ``prepare`` to do that
         beforehand.
@@ -85,7 +85,7 @@ class StatefulController:
             raise TypeError(f"r = {r!r}, y = {y!r}: must be numbers") from None
 
     def applied(self, u: float) -> None:
-        """Correct the control signal that was applied since the last ``step`` [u-unit], if it is not the one that was returned.
+        """Set the control signal that was really applied since the last ``step`` [u-unit].
 
         Call it before the next ``step``. Limits that are known beforehand belong in ``u_min``,
         ``u_max`` and ``rate_limit``.
@@ -99,7 +99,7 @@ class StatefulController:
 
     @property
     def limits(self) -> Limits:
-        """Limits of the control signal: ``low`` and ``high`` [u-unit], and ``most_change`` in a sample."""
+        """Limits of the control signal: ``low``, ``high`` and ``most_change`` in a sample."""
         return self._limits
 
     def __getstate__(self) -> dict[str, Any]:
@@ -120,11 +120,12 @@ class StatefulController:
 
     @property
     def state(self) -> dict[str, NDArray[Any]]:
-        """The whole running state as copies of named arrays: ``numpy.savez(file, **controller.state)`` saves it.
+        """The whole running state as copies of named arrays.
 
-        Assign such a dictionary to restore it; a ``ValueError`` names what does not fit, and then
-        nothing has changed. A learner that is a Python object appears as an array () of objects,
-        which is valid in this process; quell does not pickle or unpickle it.
+        ``numpy.savez(file, **controller.state)`` saves it. Assign such a dictionary to restore it;
+        a ``ValueError`` names what does not fit, and then nothing has changed. A learner that is a
+        Python object appears as an array () of objects, which is valid in this process; quell does
+        not pickle or unpickle it.
         """
         return self._saved(self._state)
 
@@ -174,7 +175,7 @@ class StatefulController:
 
 
 def named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of a nested NamedTuple by dotted name, not copied; ``Scalars`` as a vector."""
+    """Return the arrays of a nested NamedTuple by dotted name, ``Scalars`` as a vector."""
     found: dict[str, NDArray[np.float64]] = {}
     for name, value in state._asdict().items():
         if isinstance(value, tuple):

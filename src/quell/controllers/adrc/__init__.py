@@ -1,4 +1,4 @@
-"""Active disturbance rejection control: the control law around an observer, its estimate, and hand-over.
+"""Active disturbance rejection control: law around an observer, estimate, hand-over.
 
 May import ``controllers`` (base files only), ``guard``, ``learners``, ``observers`` and what they
 import.

@@ -1,4 +1,4 @@
-"""The ADRC controller: an ESO, the control law around it (``law.py``) and an optional learner with a guard."""
+"""The ADRC controller: an ESO, the law around it (``law.py``), optional learner and guard."""
 
 from __future__ import annotations
 
@@ -95,9 +95,8 @@ class ADRC(StatefulController):
         if isinstance(self.learner, type) or not all(
             hasattr(self.learner, name) for name in ("design", "memory", "feature_names")
         ):
-            raise ValueError(
-                f"learner = {learner!r}: must be a learner, for example quell.learners.Kalman(), or None"
-            )
+            example = "for example quell.learners.Kalman()"
+            raise ValueError(f"learner = {learner!r}: must be a learner, {example}, or None")
         if guard is not None and not isinstance(guard, Guard):
             raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
         self.feedforward = checks.flag("feedforward", feedforward)
@@ -164,10 +163,10 @@ class ADRC(StatefulController):
         )
 
     def step(self, r: float, y: float, *derivatives: float) -> float:
-        """Take one sample: return the control signal [u-unit] for the reference ``r`` and the measurement ``y`` [y-unit].
+        """Take one sample: return the control signal [u-unit] for reference and measurement.
 
-        With ``feedforward``, r', r'', … may follow [y-unit/s^i]; missing ones, and those that are
-        not finite, count as zero.
+        ``r`` and ``y`` are in y-units. With ``feedforward``, r', r'', … may follow [y-unit/s^i];
+        missing ones, and those that are not finite, count as zero.
 
         A measurement that is not finite is replaced by the one that the observer expects, a
         reference by the last finite one; ``estimate.status`` reports it. The observer assumes that
@@ -208,7 +207,7 @@ class ADRC(StatefulController):
         )
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
-        """Start at a plant that rests at ``y`` under the control signal ``u``: the next ``step`` continues from ``u`` without a bump.
+        """Start at a plant that rests at ``y`` under ``u``: the next ``step`` continues from ``u``.
 
         What was learned is kept. A controller that is not started begins at its first sample with
         f̂ = 0, which is right for a plant at rest without load and makes a bump under load.
@@ -234,7 +233,7 @@ class ADRC(StatefulController):
         start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), y, u, goal)
 
     def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
-        """Take one sample in manual operation: the observer receives ``u``, which someone else applies until the next sample.
+        """Take one sample in manual operation: ``u`` is applied until the next sample.
 
         Parameters
         ----------
@@ -259,7 +258,7 @@ class ADRC(StatefulController):
         return float(self._state.loop[0].u_limited)
 
     def hand_over(self) -> None:
-        """End manual operation: the next ``step`` continues from the u of the last ``track``, whatever the reference is.
+        """End manual operation: the next ``step`` continues from the u of the last ``track``.
 
         Raises
         ------
@@ -268,12 +267,12 @@ class ADRC(StatefulController):
         """
         if self._state.loop[0].started == 0.0:
             raise ValueError(
-                "hand_over: there was no sample yet; call track(r, y, u) in manual operation, or start(y, u)"
+                "hand_over: there was no sample yet; call track(r, y, u) or start(y, u) before"
             )
         self._state.loop[0].bumpless = 1.0
 
     def increment(self, r: float, y: float, *derivatives: float) -> float:
-        """Take one sample: return the change of the control signal [u-unit], within the limits of magnitude and rate.
+        """Take one sample: return the change of the control signal [u-unit], within the limits.
 
         For actuators that take increments (steppers, valves, a drive that holds its set point). The
         law is that of ``step`` (Herbst, arXiv 1908.04610, section IV, shows that the two are one).
@@ -284,7 +283,7 @@ class ADRC(StatefulController):
         return self.step(r, y, *derivatives) - before
 
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
-        """Change bandwidths while running, without a bump; allowed in every sample, so that gains can be scheduled.
+        """Change bandwidths while running, without a bump; allowed in every sample.
 
         The control signal continues from where the old gains would have it, and the difference
         decays with the new ``omega_c``. A faster observer still moves it in the middle of a motion,
@@ -345,11 +344,12 @@ class ADRC(StatefulController):
 
 
 def _check_zeros(observer: ESO) -> None:
-    """Check that the inverse of the plant is stable: u makes y^(r) what it should be, and the zeros from u become poles of u."""
+    """Check that the plant's inverse is stable: the zeros from u become poles of u."""
     unstable = observer.plant.unstable_zeros
     if unstable.size:
         raise ValueError(
-            f"observer: the plant has zeros from u at {format_roots(unstable)} rad/s, not in the left half plane; ADRC inverts the plant, "
-            "so that u would grow or oscillate without end while y looks well; control another output, or use a controller that does not "
-            "invert the plant (linear-quadratic, for instance)"
+            f"observer: the plant has zeros from u at {format_roots(unstable)} rad/s, not in the "
+            "left half plane; ADRC inverts the plant, so u would grow or oscillate while "
+            "y looks well; control another output, or use a controller that does not invert the "
+            "plant (linear-quadratic, for instance)"
         )

@@ -17,9 +17,9 @@ class Estimate(NamedTuple):
     """Estimates and status of an ADRC controller after a step."""
 
     x: Vector
-    """(n,): y and its derivatives, without what u and f feed through if the plant has zeros; see ``observer.states_of``."""
+    """(n,): y and its derivatives; if the plant has zeros, see ``observer.states_of``."""
     f: float
-    """Total disturbance [y-unit/s^n; with zeros in its way y-unit/s^f_degree]: ``f_learned + f_residual``."""
+    """Total disturbance ``f_learned + f_residual`` [y-unit/s^n; y-unit/s^f_degree with zeros]."""
     f_learned: float
     """The learner's share, f_L."""
     f_residual: float

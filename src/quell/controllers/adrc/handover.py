@@ -1,4 +1,4 @@
-"""Start under load, manual operation and retuning of a running ADRC, as functions of its parameters and its state.
+"""Start under load, manual operation and retuning of an ADRC: functions of parameters and state.
 
 A controller starts under load, or follows manual operation, by its observer: the observer receives
 y and the applied u and estimates f (Herbst, "Practical Active Disturbance Rejection Control:
@@ -39,7 +39,7 @@ _MOST_SAMPLES = 100_000_000
 def start_at_rest(
     design: AdrcDesign, state: AdrcState, samples: int, y: float, u: float, r: float
 ) -> None:
-    """Set the state to rest at y under u, with the reference r; ``samples`` is from ``samples_to_settle``."""
+    """Set the state to rest at y under u, with the reference r; see ``samples_to_settle``."""
     reset_loop(design, state)
     begin(design.eso, state.z, state.seen, y)
     loop = state.loop[0]
@@ -55,7 +55,7 @@ def start_at_rest(
 
 
 def samples_to_settle(observer: ESO) -> int:
-    """Return the number of samples after which the observer's initial state has no effect; poles kept at slow zeros count."""
+    """Return after how many samples an observer has forgotten its initial state."""
     samples = _TIME_CONSTANTS * observer.lag_time / observer.dt
     if not isinstance(without_delay(observer.model), NonlinearModel):
         slowest = float(
@@ -82,7 +82,7 @@ def _observe_at_rest(
 
 @contextmanager
 def manual_operation(state: AdrcState, u: float) -> Iterator[None]:
-    """Make samples inside the ``with`` block apply ``u`` in place of the law's own control signal."""
+    """Apply ``u`` instead of the law's own control signal inside the ``with`` block."""
     state.loop[0].manual, state.loop[0].u_manual = 1.0, u
     try:
         yield
@@ -91,7 +91,7 @@ def manual_operation(state: AdrcState, u: float) -> Iterator[None]:
 
 
 def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
-    """Convert a running state to new parameters: the next u goes on from where the old law would have it."""
+    """Convert a running state to new parameters, without a jump of u."""
     loop, size = state.loop[0], new.law.size
     if loop.started == 0.0:
         return
@@ -105,7 +105,7 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
 
 
 def check_replacement(old: ESO, new: Any, learns: bool) -> None:
-    """Check that an observer can replace ``old`` in a running controller; ``learns`` if that has a learner.
+    """Check that ``new`` can replace ``old`` in a running controller; ``learns`` with a learner.
 
     Raises
     ------
@@ -118,7 +118,8 @@ def check_replacement(old: ESO, new: Any, learns: bool) -> None:
     for name in ("order", "degree", "f_degree", "dt", "form", "states"):
         if getattr(new, name) != getattr(old, name):
             raise ValueError(
-                f"observer has {name} = {getattr(new, name)!r}, the present one {getattr(old, name)!r}: must be the same"
+                f"observer has {name} = {getattr(new, name)!r}, the present one "
+                f"{getattr(old, name)!r}: must be the same"
             )
     same_gain = new.b0 == old.b0
     if same_gain and all(
@@ -127,20 +128,22 @@ def check_replacement(old: ESO, new: Any, learns: bool) -> None:
         return
     if any(observer.plant.zeros.size or not observer.plant.matched for observer in (old, new)):
         raise ValueError(
-            "observer has another model or b0, which changes the meaning of its states for a plant with zeros; change omega_o only"
+            "observer has another model or b0, which changes the meaning of its states for a plant "
+            "with zeros; change omega_o only"
         )
     if learns and not (same_gain and np.array_equal(new.cancel, old.cancel)):
         raise ValueError(
-            f"observer has b0 = {new.b0!r} and a = {new.cancel.tolist()}, other than the present one: what was learned refers to that; "
-            "change omega_o only, or make a new controller"
+            f"observer has b0 = {new.b0!r} and a = {new.cancel.tolist()}, not those of the present "
+            "one: what was learned refers to that; change omega_o only, or make a new controller"
         )
 
 
 def check_structure(old: AdrcDesign, new: AdrcDesign) -> None:
-    """Raise a ``ValueError`` where compiled code and state arrays for ``old`` do not fit ``new``."""
+    """Raise a ``ValueError`` if compiled code and state arrays for ``old`` do not fit ``new``."""
     if _structure(new) != _structure(old):
         raise ValueError(
-            "observer is of another structure than the present one: make a new controller and call start(y, u)"
+            "observer is of another structure than the present one: make a new controller, and "
+            "call start(y, u)"
         )
 
 

@@ -80,27 +80,24 @@ def _check_linear(controller: Any) -> None:
     observer = controller.observer
     if not isinstance(controller.learner, NoLearner):
         raise ValueError(
-            f"controller has a learner, {type(controller.learner).__name__}: only a linear ADRC, without one, has an equivalent"
+            f"controller has a learner, {type(controller.learner).__name__}: only a linear ADRC, "
+            "without one, has an equivalent"
         )
     if observer.order > 2:
         raise ValueError(
-            f"controller is of order {observer.order}: must be of order 1 (PI) or 2 (PID); an ADRC of order n has n zeros from y, "
-            "a PID controller two at most"
+            f"controller is of order {observer.order}: must be of order 1 (PI) or 2 (PID); an ADRC "
+            "of order n has n zeros from y, a PID controller two at most"
         )
-    usual = ESO.model_free(
-        observer.order, observer.b0, observer.omega_o, observer.dt, form=observer.form
-    ).model
+    design = (observer.order, observer.b0, observer.omega_o, observer.dt)
+    usual = ESO.model_free(*design, form=observer.form).model
     if (
         observer.form == "reduced"
         or type(observer.model) is not type(usual)
-        or not all(
-            np.array_equal(one, other) for one, other in zip(observer.model, usual, strict=True)
-        )
+        or not all(map(np.array_equal, observer.model, usual))
     ):
-        raise ValueError(
-            "controller has an observer with a model, or of another kind: must be around ESO.model_free"
-        )
+        raise ValueError("controller has an observer with a model: it must be from ESO.model_free")
     if controller.derivatives:
         raise ValueError(
-            "controller has feedforward: a PID controller has no derivatives of the reference; use feedforward=False"
+            "controller has feedforward: a PID controller has no derivatives of the reference; "
+            "use feedforward=False"
         )

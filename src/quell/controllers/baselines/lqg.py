@@ -1,4 +1,4 @@
-"""LQG with a disturbance state: state feedback with a Kalman filter that also estimates a disturbance at the input.
+"""LQG: state feedback with a Kalman filter that also estimates a disturbance at the input.
 
 ::
 
@@ -128,12 +128,13 @@ def _check_zero(A: Matrix, B: Matrix, C: Matrix) -> None:
     singular = np.linalg.svd(np.block([[A, B], [C, np.zeros((1, 1))]]), compute_uv=False)
     if singular[-1] <= 1e-12 * singular[0]:  # singular, to rounding
         raise ValueError(
-            "plant has a zero at s = 0: a constant disturbance has no effect on y, and y cannot follow a constant reference"
+            "plant has a zero at s = 0: a constant disturbance has no effect on y, and y cannot "
+            "follow a constant reference"
         )
 
 
 def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vector:
-    """Return K (n,) of the sampled regulator with the cost ``∫ x'Qx + ρ u² dt``, u held over a sample."""
+    """Return K (n,) of the sampled regulator with the cost ``∫ x'Qx + ρ u² dt``."""
     from scipy.linalg import solve_discrete_are
 
     n = A.shape[0]

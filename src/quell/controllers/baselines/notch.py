@@ -2,7 +2,8 @@
 
 ::
 
-    N(s) = (s² + 2 ζ_z ω s + ω²) / (s² + 2 ζ_p ω s + ω²),      |N(jω)| = ζ_z/ζ_p = depth,      −3 dB over about  2 ζ_p ω = width · ω
+    N(s) = (s² + 2 ζ_z ω s + ω²) / (s² + 2 ζ_p ω s + ω²)
+    |N(jω)| = ζ_z/ζ_p = depth,      −3 dB over about  2 ζ_p ω = width · ω
 
 (Ellis, *Control System Design Guide*, 4th ed. 2012, chapter 9; Vukosavić & Stojić, *IEEE Trans.
 Industrial Electronics* 45, 1998, for drives with torsional resonance.) The filter removes the
@@ -34,7 +35,7 @@ class Notch(NamedTuple):
 
     @classmethod
     def at(cls, omega: float, *, depth: float = 0.1, width: float = 1.0) -> Notch:
-        """Return the notch at ``omega`` with the gain ``depth``, about ``width · omega`` wide at −3 dB.
+        """Return the notch with the gain ``depth`` at ``omega``, ``width · omega`` wide at −3 dB.
 
         A wider notch tolerates a larger error of the resonance and has more lag at low frequencies.
 
@@ -109,9 +110,8 @@ class NotchPID(PID):
         if not isinstance(notch, Notch):
             raise ValueError(f"notch = {notch!r}: must be from quell.baselines.Notch.at(omega)")
         if notch.omega * checks.positive("dt", dt, "s") >= math.pi:
-            raise ValueError(
-                f"notch at {notch.omega!r} rad/s with dt = {dt!r} s: must be below pi/dt = {math.pi / dt:.3g} rad/s"
-            )
+            rule = f"must be below pi/dt = {math.pi / dt:.3g} rad/s"
+            raise ValueError(f"notch at {notch.omega!r} rad/s with dt = {dt!r} s: {rule}")
         self.notch = notch
         self._prewarp = notch.omega
         options = {"name": "PID + notch" if kd else "PI + notch"} | options

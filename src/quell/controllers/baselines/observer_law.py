@@ -7,12 +7,12 @@ The sampled plant with a disturbance that is a random walk, z = (x, d)::
 A Kalman filter in its current form, as the observers of this package, driven by the applied u, and
 state feedback::
 
-    z  = z⁻ + L (y − H z⁻),     L = P H' (H P H' + V)⁻¹,     P from the Riccati equation of (F', H', W, V)
+    z  = z⁻ + L (y − H z⁻),     L = P H' (H P H' + V)⁻¹
     u  = N r − K z,             z⁻⁺ = F z + G u
 
-At rest the innovation is zero, and therefore ``y − r`` is zero for any plant and any constant
-disturbance: d̂ acts as integral action. Because the filter receives the applied u, it does not wind
-up.
+with P from the Riccati equation of (F', H', W, V). At rest the innovation is zero, and therefore
+``y − r`` is zero for any plant and any constant disturbance: d̂ acts as integral action. Because
+the filter receives the applied u, it does not wind up.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class SampledModel(NamedTuple):
 
 
 def with_disturbance(A: Matrix, B: Matrix, C: Matrix, E: Matrix, dt: float) -> SampledModel:
-    """Sample the plant with a constant disturbance that enters through ``E`` (n, 1), u and d held over a sample."""
+    """Sample the plant with a constant disturbance that enters through ``E`` (n, 1)."""
     n = A.shape[0]
     phi, (gamma, gamma_d) = zero_order_hold(A, [B, E], dt)
     F = np.block([[phi, gamma_d], [np.zeros((1, n)), np.ones((1, 1))]])

@@ -2,7 +2,8 @@
 
 ::
 
-    U = 1/F(s) · ( k_p (b R − Y) + k_i/s (R − Y) + k_d s (c R − Y) ),        F(s) = 1 + T_f s + (T_f s)²/2
+    U = 1/F(s) · ( k_p (b R − Y) + k_i/s (R − Y) + k_d s (c R − Y) )
+    F(s) = 1 + T_f s + (T_f s)²/2
 
 (Åström & Hägglund, *Advanced PID Control*, ISA 2006, sections 3.2 to 3.4: set-point weights b and
 c, and a filter of second order on the measurement, not one on the derivative alone, so that the
@@ -84,9 +85,8 @@ class PID(LinearController):
         self.b, self.c = checks.finite("b", b), checks.finite("c", c)
         self.filter = _filter(tf)
         if self.kd != 0.0 and self.filter == (0.0, 0.0):
-            raise ValueError(
-                f"kd = {kd!r}, tf = {tf!r}: a derivative needs a filter, tf greater than zero; a tenth of kd/kp is usual"
-            )
+            rule = "a derivative needs a filter, tf greater than zero; a tenth of kd/kp is usual"
+            raise ValueError(f"kd = {kd!r}, tf = {tf!r}: {rule}")
         self.tt = self._tracking_time() if tt is None else checks.positive("tt", tt, "s")
         self.setpoint = (
             (self.kd * self.c, self.kp * self.b, self.ki)
@@ -102,7 +102,7 @@ class PID(LinearController):
         super().__init__(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
 
     def polynomials(self) -> tuple[list[Any], Any]:
-        """Return the numerators from r and from y and their common denominator, as polynomials in s."""
+        """Return the numerators from r and y and their common denominator, polynomials in s."""
         f1, f2 = self.filter
         feedback = [-self.kd, -self.kp, -self.ki]
         if self.ki == 0.0 and self.setpoint[-1] == 0.0:  # no integrator: s cancels
@@ -158,7 +158,7 @@ class PID(LinearController):
     def simc_double_integrator(
         cls, gain: float, theta: float, *, tau_c: float | None = None, dt: float, **options: Any
     ) -> PID:
-        """Tune for ``gain e^(−θs) / s²`` by the SIMC rule for double integrating processes (Skogestad 2003, table 1).
+        """Tune for ``gain e^(−θs) / s²`` by the SIMC rule (Skogestad 2003, table 1).
 
         In series form ``K_c = 1 / (4 gain (τ_c + θ)²)``, ``τ_I = τ_D = 4 (τ_c + θ)``.
 

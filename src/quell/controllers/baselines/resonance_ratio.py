@@ -41,7 +41,7 @@ from quell.plants import two_mass_spring
 
 
 class ResonanceRatio(LinearController):
-    """Resonance ratio control from the position of either mass, for ``quell.plants.two_mass_spring``.
+    """Resonance ratio control of ``quell.plants.two_mass_spring``; y is either mass's position.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ def checked_law(law: Any) -> LinearLaw:
 
 
 def rest_state(law: LinearLaw) -> Vector:
-    """Return the state (m,) of a law that rests at r = y = 1 with u = 0, or as near to it as it can.
+    """Return the state (m,) of a law at rest at r = y = 1, with u = 0 or as close as possible.
 
     Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y))`` it is the one whose u
     is nearest to zero: an integrator holds whatever the rest of the law needs. By least squares,

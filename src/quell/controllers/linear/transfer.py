@@ -46,25 +46,20 @@ def as_state_space(num: Any, den: Any = None) -> System:
     if den is not None:
         return realised([num], den)
     if getattr(num, "dt", None):
-        raise ValueError(
-            f"transfer function has a sample time, dt = {num.dt!r}: must be in continuous time"
-        )
+        raise ValueError(f"transfer function has a sample time, dt = {num.dt!r}: must have none")
     if hasattr(num, "num") and hasattr(num, "den"):
         if np.shape(num.num)[:2] != (1, 1):
-            raise ValueError(
-                f"transfer function has {np.shape(num.num)[:2]} outputs and inputs: must have one of each"
-            )
+            shape = np.shape(num.num)[:2]
+            raise ValueError(f"transfer function has {shape} outputs and inputs: must have (1, 1)")
         return realised([num.num[0][0]], num.den[0][0])
     if all(hasattr(num, name) for name in "ABCD"):
         A = checks.matrix("A", num.A)
         m = A.shape[0]
         shapes = {"A": (m, m), "B": (m, 1), "C": (1, m), "D": (1, 1)}
-        return balanced(
-            *(checks.matrix(name, getattr(num, name), *shapes[name]) for name in "ABCD")
-        )
-    raise ValueError(
-        f"num = {num!r}: must be a polynomial, with den, or a control.TransferFunction or control.StateSpace"
-    )
+        system = (checks.matrix(name, getattr(num, name), *shape) for name, shape in shapes.items())
+        return balanced(*system)
+    kinds = "a polynomial, with den, or a control.TransferFunction or control.StateSpace"
+    raise ValueError(f"num = {num!r}: must be {kinds}")
 
 
 def realised(numerators: list[Any], den: Any) -> System:
@@ -87,8 +82,8 @@ def realised(numerators: list[Any], den: Any) -> System:
         polynomial = np.trim_zeros(checks.vector("num", given), "f")
         if polynomial.size > m + 1:
             raise ValueError(
-                f"num = {np.asarray(given).tolist()!r}: is of degree {polynomial.size - 1}, den of degree {m}: "
-                "C(s) must be proper; add a filter"
+                f"num = {np.asarray(given).tolist()!r}: is of degree {polynomial.size - 1}, den of "
+                f"degree {m}: C(s) must be proper; add a filter"
             )
         row[m + 1 - polynomial.size :] = polynomial
     last = np.flatnonzero(D)[-1]  # the coefficients after it stand for poles at zero
@@ -133,9 +128,8 @@ def tustin(system: System, dt: float, prewarp: float | None = None) -> System:
     h = 0.5 * dt
     if prewarp is not None:
         if checks.positive("prewarp", prewarp, "rad/s") * dt >= math.pi:
-            raise ValueError(
-                f"prewarp = {prewarp!r} rad/s with dt = {dt!r} s: must be below pi/dt = {math.pi / dt:.3g} rad/s"
-            )
+            rule = f"must be below pi/dt = {math.pi / dt:.3g} rad/s"
+            raise ValueError(f"prewarp = {prewarp!r} rad/s with dt = {dt!r} s: {rule}")
         h = math.tan(0.5 * prewarp * dt) / prewarp
     A, B, C, D = system
     one = np.eye(A.shape[0])
@@ -152,7 +146,7 @@ def sampled_law(
     prewarp: float | None = None,
     tracking_time: float | None = None,
 ) -> LinearLaw:
-    """Return the law of a continuous-time system with the inputs (r, y) and the output u; see ``from_transfer_function``."""
+    """Return the law of a continuous-time system from (r, y) to u; see ``LinearController``."""
     if checks.one_of("method", method, METHODS) == "tustin":
         A, B, C, D = tustin(system, dt, prewarp)
     else:
@@ -172,7 +166,7 @@ def sampled_law(
 
 
 def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
-    """Return the gain B_u (m,) of ``x⁺ = A x + … + B_u (u − u_wished)`` with which a law follows the applied u.
+    """Return the gain B_u (m,) of ``x⁺ = A x + … + B_u (u − u_wished)``, for anti-windup.
 
     The law is treated as an observer of its own state with the applied u as measurement (Åström &
     Wittenmark, *Computer-Controlled Systems*, 1997, section 3.5; Kothare, Campo, Morari & Nett,
@@ -202,7 +196,7 @@ def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
 
 
 def _default_tracking_time(system: System) -> float:
-    """Return the time constant of the slowest zero from y, or else of the slowest pole [s]; neither at zero."""
+    """Return the time constant of the slowest zero from y, else pole, other than zero [s]."""
     from scipy.linalg import eigvals
 
     A, B, C, D = system

@@ -44,7 +44,7 @@ class TrackingMemory(NamedTuple):
 
 @kernel
 def fhan(x1: float, x2: float, r0: float, h0: float) -> float:
-    """Return the acceleration, within ±r0, that takes position ``x1`` and speed ``x2`` to zero fastest."""
+    """Return the acceleration within ±r0 that takes position x1 and speed x2 to zero fastest."""
     d = r0 * h0 * h0
     a0 = h0 * x2
     y = x1 + a0
@@ -115,9 +115,8 @@ class TrackingDifferentiator:
         dt = checks.positive("dt", dt, "s")
         horizon = dt if self.horizon is None else float(self.horizon)
         if horizon < dt:
-            raise ValueError(
-                f"horizon = {horizon!r} s with dt = {dt!r} s: must be at least a sample, or the profile would oscillate"
-            )
+            rule = "must be at least a sample, or the profile would oscillate"
+            raise ValueError(f"horizon = {horizon!r} s with dt = {dt!r} s: {rule}")
         return TrackingDesign(float(self.acceleration), horizon, dt)
 
     def memory(self, design: TrackingDesign) -> TrackingMemory:

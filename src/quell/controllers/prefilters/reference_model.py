@@ -1,6 +1,6 @@
-"""A reference model: a lag between the given reference and the one that the loop follows, with its derivatives.
+"""A reference model: a lag between the reference and the loop, with derivatives of its output.
 
-    r_f = ω^m / (s + ω)^m · r,        r_f^(m) = ω^m (r − r_f) − Σ_{i=1}^{m−1} C(m, i) ω^(m−i) r_f^(i)
+    r_f = ω^m / (s + ω)^m · r,    r_f^(m) = ω^m (r − r_f) − Σ_{i=1}^{m−1} C(m, i) ω^(m−i) r_f^(i)
 
 If as many derivatives are fed forward as the plant has integrators, the ideal loop responds to r as
 the model does, for any ``omega_c``: two degrees of freedom, one for the reference and one for
@@ -112,9 +112,8 @@ class ReferenceModel:
         """Return the parameters for a sample time [s]."""
         m, rate = self.order, self.omega * checks.positive("dt", dt, "s")
         if rate > 1.0:
-            raise ValueError(
-                f"omega = {self.omega!r} rad/s with dt = {dt!r} s: omega * dt = {rate:.3g} must be at most 1; lower omega or dt"
-            )
+            rule = f"omega * dt = {rate:.3g} must be at most 1; lower omega or dt"
+            raise ValueError(f"omega = {self.omega!r} rad/s with dt = {dt!r} s: {rule}")
         rates = np.array([-math.comb(m, i) * rate ** (m - i) for i in range(m)])
         A = np.diag(np.ones(m - 1), 1)
         A[-1] = rates

@@ -73,7 +73,7 @@ def _settle(design: ShaperDesign, memory: ShaperMemory, value: float) -> None:
 
 @dataclass(frozen=True)
 class Shaper:
-    """A sequence of impulses that is convolved with the reference; ``ZV`` and ``ZVD`` make the usual ones.
+    """A sequence of impulses that is convolved with the reference; see also ``ZV`` and ``ZVD``.
 
     Parameters
     ----------
@@ -98,14 +98,12 @@ class Shaper:
         if times.size == 0 or times[0] != 0.0 or np.any(np.diff(times) <= 0.0):
             raise ValueError(f"times = {self.times!r}: must begin at 0.0 and increase")
         if not math.isclose(float(np.sum(amplitudes)), 1.0, rel_tol=1e-9):
-            raise ValueError(
-                f"amplitudes = {self.amplitudes!r}: must add up to 1, or the reference is not reached"
-            )
+            raise ValueError(f"amplitudes = {self.amplitudes!r}: must add up to 1")
         object.__setattr__(self, "times", tuple(times.tolist()))
         object.__setattr__(self, "amplitudes", tuple(amplitudes.tolist()))
 
     def residual(self, omega: float, zeta: float = 0.0) -> float:
-        """Return the vibration V of a mode after the last impulse, relative to that after a single impulse."""
+        """Return the vibration V of a mode after the last impulse; see this file's equation."""
         omega, zeta = _mode(omega, zeta)
         damped = omega * math.sqrt(1.0 - zeta**2)
         vibration = sum(
@@ -124,9 +122,8 @@ class Shaper:
             samples.
         """
         if self.times[-1] / checks.positive("dt", dt, "s") > _MOST_SAMPLES:
-            raise ValueError(
-                f"dt = {dt!r} s: the shaper's {self.times[-1]:.3g} s must be at most {_MOST_SAMPLES} samples"
-            )
+            rule = f"the shaper's {self.times[-1]:.3g} s must be at most {_MOST_SAMPLES} samples"
+            raise ValueError(f"dt = {dt!r} s: {rule}")
         weights: dict[int, float] = {}
         for time, amplitude in zip(self.times, self.amplitudes, strict=True):
             before = math.floor(time / dt + 1e-9)
@@ -165,7 +162,7 @@ def ZV(omega: float, zeta: float = 0.0) -> Shaper:  # noqa: N802 - the field's n
 
 
 def ZVD(omega: float, zeta: float = 0.0) -> Shaper:  # noqa: N802
-    """Return the zero-vibration-and-derivative shaper: three impulses, twice as long as ``ZV`` and more robust.
+    """Return the ZVD shaper: three impulses, twice as long as ``ZV`` and more robust.
 
     Parameters and errors as for ``ZV``.
     """
