@@ -5,18 +5,27 @@ from __future__ import annotations
 import math
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from quell.cli.interrupt import exit_on_signal
 from quell.cli.options import Whole, WholeOrNone
+from quell.realtime.devices.registry import examples
 
 if TYPE_CHECKING:
     from quell.realtime import Rig
 
 
+_DEVICE = (
+    f"Address to listen at, like {examples(listening=True)}. At 127.0.0.1 it serves this computer "
+    "only; give another address of this computer to serve others."
+)
+
+
 def rig(
     *,
-    device: str,
+    device: Annotated[str, Parameter(help=_DEVICE)],
     plant: str = "torsional",
     dt: float = 1e-3,
     watchdog: Whole = 20,
@@ -33,9 +42,6 @@ def rig(
 
     Parameters
     ----------
-    device
-        Address to listen at: udp://127.0.0.1:5005 (this computer only; another address of this
-        computer for other computers), shm://NAME, or serial:///dev/ttyX.
     plant
         Name of the plant, for example torsional; the message for an unknown name lists all names.
     dt

@@ -5,14 +5,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from cyclopts import Parameter
 from rich.console import Console
 
 from quell.cli.interrupt import exit_on_signal
 from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, WholeOrNone
 from quell.cli.output import check_outputs, print_line, table, write_record, write_results
 from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
+from quell.realtime.devices.registry import examples
 
 if TYPE_CHECKING:
     from quell.realtime import LiveSink, RigRun
@@ -21,13 +23,14 @@ if TYPE_CHECKING:
 
 DONE, TRIPPED, INTERRUPTED = 0, 3, 130
 """Exit codes of a run to its end, of one that a limit or fault ended, of one the user stopped."""
+_DEVICE = f"Device in place of the file's, like {examples()}."
 
 
 def run_rig(
     setup: Path | None = None,
     *,
     example: Switch = False,
-    device: str | None = None,
+    device: Annotated[str | None, Parameter(help=_DEVICE)] = None,
     seconds: float | None = None,
     omega_c: float | None = None,
     omega_o: float | None = None,
@@ -50,9 +53,6 @@ def run_rig(
         udp://127.0.0.1:5005.
     example
         Print that file, and do no more.
-    device
-        Device in place of the file's: udp://HOST:PORT, shm://NAME, serial:///dev/ttyACM0, ni://,
-        twin:torsional.
     seconds
         Duration in place of the scenario's [s].
     omega_c

@@ -28,16 +28,13 @@ class Scheme(NamedTuple):
 
 # fmt: off
 SCHEMES = {
-    "udp": Scheme("udp://127.0.0.1:5005", "a rig or your own device, over a network",
-                  "wire.udp", "UdpDevice", "UdpListener"),
-    "shm": Scheme("shm://rig", "a rig in another process, through shared memory",
+    "udp": Scheme("udp://127.0.0.1:5005", "network", "wire.udp", "UdpDevice", "UdpListener"),
+    "shm": Scheme("shm://rig", "shared memory",
                   "wire.shared_memory", "SharedMemoryDevice", "SharedMemoryListener"),
-    "serial": Scheme("serial:///dev/ttyACM0", "a microcontroller at a serial port",
+    "serial": Scheme("serial:///dev/ttyACM0", "serial port",
                      "wire.serial_line", "SerialDevice", "SerialListener"),
-    "ni": Scheme("ni://Dev1/ctr0+Dev2/ao0", "cards of National Instruments",
-                 "devices.ni.device", "ni_device"),
-    "twin": Scheme("twin:torsional", "a simulated plant in this process",
-                   "devices.twin", "twin_device"),
+    "ni": Scheme("ni://Dev1/ctr0+Dev2/ao0", "NI cards", "devices.ni.device", "ni_device"),
+    "twin": Scheme("twin:torsional", "simulation", "devices.twin", "twin_device"),
 }
 # fmt: on
 
@@ -45,7 +42,7 @@ SCHEMES = {
 def examples(listening: bool = False) -> str:
     """Return an example of each URL; if ``listening``, of those at which a rig can listen."""
     schemes = [scheme for scheme in SCHEMES.values() if scheme.listener or not listening]
-    return ", ".join(scheme.example for scheme in schemes)
+    return ", ".join(f"{scheme.example} ({scheme.description})" for scheme in schemes)
 
 
 def open_device(device: str | Device, dt: float) -> Any:
