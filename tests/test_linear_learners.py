@@ -13,7 +13,7 @@ from quell.features import RBF, Bias, Friction, Input, Polynomial, State
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.least_squares import RlsRule
 from quell.learners.regression.kernels import reset_uncertainty, update_theta
-from quell.learners.regression.nlms import NlmsMemory, NlmsRule
+from quell.learners.regression.nlms import NlmsRule
 from quell.learners.regression.rls import RlsMemory
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)
@@ -90,9 +90,7 @@ def test_nlms_projects_on_what_it_sees(rng: np.random.Generator) -> None:
     """With the step 1 and no regularisation the new θ explains the sample, and is the nearest that does (Haykin, section 7.1)."""
     features, theta = rng.normal(size=5), rng.normal(size=5)
     before = theta.copy()
-    update_theta(
-        NlmsRule(1.0, 0.0), NlmsMemory(np.zeros(0)), theta, features, 2.0 - theta @ features, 1.0
-    )
+    update_theta(NlmsRule(1.0, 0.0), np.zeros(0), theta, features, 2.0 - theta @ features, 1.0)
     assert theta @ features == pytest.approx(2.0, rel=1e-12)
     np.testing.assert_allclose(
         theta - before, features * ((theta - before) @ features) / (features @ features), atol=1e-12
@@ -105,7 +103,7 @@ def test_nlms_learns_at_its_rate_whatever_the_sample_time() -> None:
         observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=dt)
         rule = ql.learners.NLMS(rate=2.0, regularisation=1e-6).rule(observer, 1.0, 2)
         count = round(0.5 / dt)
-        theta = taught(rule, NlmsMemory(np.zeros(0)), np.full((count, 2), size), np.ones(count))
+        theta = taught(rule, np.zeros(0), np.full((count, 2), size), np.ones(count))
         assert 1.0 - theta @ [size, size] == pytest.approx(math.exp(-1.0), rel=0.02)
 
 
@@ -217,7 +215,7 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
     restart(design, memory)
     np.testing.assert_array_equal(memory.theta, np.zeros(3))
     np.testing.assert_array_equal(memory.rule.covariance, learner.memory(design).rule.covariance)
-    reset_uncertainty(NlmsRule(1.0, 1.0), NlmsMemory(np.zeros(0)))
+    reset_uncertainty(NlmsRule(1.0, 1.0), np.zeros(0))
 
 
 @pytest.mark.parametrize(

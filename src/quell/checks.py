@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
 from quell.types import Matrix, Vector
+
+T = TypeVar("T")
+
+
+def optional(check: Callable[..., T], name: str, value: Any, *rule: Any) -> T | None:
+    """Return ``check(name, value, *rule)``, or None if ``value`` is None."""
+    return None if value is None else check(name, value, *rule)
 
 
 def finite(name: str, value: Any) -> float:

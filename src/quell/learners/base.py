@@ -4,8 +4,8 @@ A learner is an immutable description (``Kalman(...)``). ``design(observer, omeg
 parameters (a NamedTuple), and ``memory(parameters)`` its whole state (a NamedTuple of arrays). The
 functions below are registered for the type of the parameters. In each sample the controller calls
 
-1. ``adapt`` with the newest estimates of the observer, then ``trouble``; 2. ``predict``, which
-returns the feedforward ``f_L = constant + slope · u``. It is affine in u, so that a
+1. ``adapt`` with the newest estimates of the observer, then ``trouble``;
+2. ``predict`` for the feedforward ``f_L = constant + slope · u``, which is affine in u so that a
    learner with u among its features is compensated exactly, not one sample late;
 3. ``commit`` with the u that was applied.
 
@@ -49,8 +49,8 @@ def adapt(
 ) -> None:
     """Learn from the observer's estimates ``seen = (x̂_1 … x̂_n, Δf̂)``.
 
-    ``y`` is the measurement they follow from and ``u_before`` the u applied before it. ``f_plain =
-    Δf̂ + f_L^F`` is the f that an ESO without a learner would have estimated (``lag.py``).
+    They follow from the measurement ``y`` and from ``u_before``, applied before it. An ESO without a
+    learner would have estimated ``f_plain = Δf̂ + f_L^F`` (``lag.py``).
     """
     raise TypeError
 

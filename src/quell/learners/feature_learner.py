@@ -10,7 +10,7 @@ from quell.features.base import checked_design, write
 from quell.features.scaling import Scaling, initial_scale, scaling
 from quell.kernels.dispatch import kernel
 from quell.learners.lag import startup_samples
-from quell.learners.noise_gate import NoiseGate, NoiseGateMemory, gated, noise_gate
+from quell.learners.noise_gate import NoiseGate, gated, noise_gate
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -33,20 +33,13 @@ class Inputs(NamedTuple):
 
 
 @kernel
-def write_features(
-    inputs: Inputs,
-    gate: NoiseGateMemory,
-    scale: Vector,
-    scaled: Vector,
-    seen: Vector,
-    u: float,
-    out: Vector,
-) -> None:
+def write_features(inputs: Inputs, memory: Any, seen: Vector, u: float, out: Vector) -> None:
     """Write the features of the estimates ``seen`` (n + 1,) and ``u`` into ``out`` (p,).
 
-    A signal that does not move is replaced by its mean. ``scale`` (n + 2,) divides x_1 … x_n, u and
-    f; ``scaled`` (n,) is work space.
+    A signal that does not move is replaced by its mean. ``memory`` is the learner's, with ``gate``,
+    ``scale`` (n + 2,), which divides x_1 … x_n, u and f, and the work space ``scaled`` (n,).
     """
+    gate, scale, scaled = memory.gate, memory.scale, memory.scaled
     for i in range(scaled.size):
         scaled[i] = gated(inputs.gate, gate, i, seen[i]) / scale[i]
     scaled_u = gated(inputs.gate, gate, scaled.size, u) / scale[scaled.size]
@@ -88,14 +81,10 @@ class FeatureLearner:
                 f"features = {features!r}: must be made of blocks from quell.features, "
                 "for example State() + Bias()"
             )
-        self.frequency = (
-            None if frequency is None else checks.positive("frequency", frequency, "rad/s")
-        )
-        self.scale = None if scale is None else checks.positive_vector("scale", scale)
-        self.bias_bandwidth = (
-            None
-            if bias_bandwidth is None
-            else checks.non_negative("bias_bandwidth", bias_bandwidth, "rad/s")
+        self.frequency = checks.optional(checks.positive, "frequency", frequency, "rad/s")
+        self.scale = checks.optional(checks.positive_vector, "scale", scale)
+        self.bias_bandwidth = checks.optional(
+            checks.non_negative, "bias_bandwidth", bias_bandwidth, "rad/s"
         )
 
     def _inputs(self, observer: ESO, omega_c: float) -> Inputs:

@@ -13,7 +13,8 @@ from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.function_pointers import call
 from quell.learners.adapters.instances import COUNTDOWN, DISABLED, PREDICTION, STATUS
 from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
-from quell.learners.online.learner import OnlineDesign, OnlineMemory, has_pairs, write_current
+from quell.learners.feature_learner import write_features
+from quell.learners.online.learner import OnlineDesign, OnlineMemory, has_pairs
 from quell.learners.online.model import infer, learn
 from quell.types import Matrix, Status, Vector
 
@@ -124,7 +125,7 @@ def _adapt(
     if answer[COUNTDOWN] > 0.0:
         return
     now, batch = online.features, online.model
-    write_current(learner.online, online, seen, u_before, now)
+    write_features(learner.online.inputs, online, seen, u_before, now)
     if batch.filled[0] > 0.0 and _finite(now):
         filled = int(batch.filled[0])
         call(

@@ -113,7 +113,7 @@ class PythonModel:
     ) -> None:
         self.name = name
         self.period = checks.whole("period", period, 1)
-        self.budget = None if budget is None else checks.positive("budget", budget, "s")
+        self.budget = checks.optional(checks.positive, "budget", budget, "s")
         self._online = Online(
             Batch(self.period),
             State() if features is None else features,

@@ -11,11 +11,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.features import Features
 from quell.features.base import checked_design, unit, write
 from quell.features.scaling import Scaling, initial_scale, scaling, update_scale
 from quell.kernels.dispatch import kernel
+from quell.kernels.scalars import Scalars
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.gradient.buffers import (
     BatchGradientMemory,
@@ -27,9 +29,6 @@ from quell.learners.gradient.buffers import (
 from quell.learners.lag import startup_samples
 from quell.observers.eso import ESO
 from quell.types import Vector
-
-# Indices of ScaledGradientMemory.counters.
-_SAMPLES, _SCALED = range(2)
 
 
 class ScaledGradientDesign(NamedTuple):
@@ -45,13 +44,19 @@ class ScaledGradientDesign(NamedTuple):
     """Samples after a start from rest in which nothing is learned."""
 
 
+class ScaledGradientLoop(Scalars):
+    """Scalars of the learner, kept from one sample to the next."""
+
+    samples: float  # since the start from rest
+    has_scale: float  # 1 once there are scales
+
+
 class ScaledGradientMemory(NamedTuple):
     """State for p features and a plant of order m."""
 
     buffers: BatchGradientMemory
     """All scaled."""
-    counters: Vector
-    """(2,): samples since the start from rest; 1 once there are scales."""
+    loop: NDArray[ScaledGradientLoop]
     scale: Vector
     """(m + 2,): what x_1 … x_m, u and Δf̂ are divided by."""
     scaled: Vector
@@ -77,7 +82,11 @@ def scaled_gradient_memory(design: ScaledGradientDesign, p: int) -> ScaledGradie
     """Return empty buffers and θ = 0 for ``p`` features."""
     scale = initial_scale(design.scaling)
     return ScaledGradientMemory(
-        empty_buffers(design.batch, p), np.zeros(2), scale, np.zeros(scale.size - 2), np.ones(p)
+        empty_buffers(design.batch, p),
+        ScaledGradientLoop.zeros(),
+        scale,
+        np.zeros(scale.size - 2),
+        np.ones(p),
     )
 
 
@@ -90,7 +99,7 @@ def _adapt(
     u_before: float,
     f_plain: float,
 ) -> None:
-    if memory.counters[_SAMPLES] <= learner.startup:
+    if memory.loop[0].samples <= learner.startup:
         return
     _rescale(learner, memory, seen, u_before, f_plain)
     _write(learner, memory, seen, u_before)
@@ -116,10 +125,10 @@ def _rescale(
     unit(learner.features, scale, current)
     for i in range(theta.size):
         ratio = current[i] / memory.units[i]
-        if memory.counters[_SCALED] > 0.0 and 0.0 < ratio <= 1.0:
+        if memory.loop[0].has_scale > 0.0 and 0.0 < ratio <= 1.0:
             theta[i] *= f_before / scale[scale.size - 1] / ratio
         memory.units[i] = current[i]
-    memory.counters[_SCALED] = 1.0
+    memory.loop[0].has_scale = 1.0
     clear_buffers(memory.buffers)
 
 
@@ -138,7 +147,7 @@ def _write(
 def _predict(
     learner: ScaledGradientDesign, memory: ScaledGradientMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
-    if memory.counters[_SCALED] == 0.0:
+    if memory.loop[0].has_scale == 0.0:
         return 0.0, 0.0
     _write(learner, memory, seen, u_before)
     output = 0.0
@@ -155,12 +164,12 @@ def _commit(
     u: float,
     f_learned: float,
 ) -> None:
-    memory.counters[_SAMPLES] += 1.0
+    memory.loop[0].samples += 1.0
 
 
 @restart.register(ScaledGradientDesign)
 def _restart(learner: ScaledGradientDesign, memory: ScaledGradientMemory) -> None:
-    memory.counters[_SAMPLES] = 0.0
+    memory.loop[0].samples = 0.0
     restart_buffers(memory.buffers)
 
 
@@ -168,6 +177,6 @@ def _restart(learner: ScaledGradientDesign, memory: ScaledGradientMemory) -> Non
 def _coefficients(
     learner: ScaledGradientDesign, memory: ScaledGradientMemory, theta: Vector
 ) -> None:
-    f_scale, scaled = memory.scale[memory.scale.size - 1], memory.counters[_SCALED] > 0.0
+    f_scale, scaled = memory.scale[memory.scale.size - 1], memory.loop[0].has_scale > 0.0
     for i in range(theta.size):
         theta[i] = memory.buffers.theta[i] * memory.units[i] * f_scale if scaled else 0.0

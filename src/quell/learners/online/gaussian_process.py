@@ -231,25 +231,14 @@ def _remove_point(memory: GaussianProcessMemory, count: int) -> None:
 
 @dataclass(frozen=True)
 class GaussianProcessModel:
-    """The model of ``GaussianProcess``.
-
-    Parameters
-    ----------
-    budget, length, every
-        as for ``GaussianProcess``.
-    memory_time
-        time after which a sample has the weight 1/e [s].
-    noise, noise_time
-        standard deviation of noise in the targets, in units of their scale, and its correlation
-        time [s].
-    """
+    """The model of ``GaussianProcess``, whose parameters have the same meaning."""
 
     budget: int
     length: float
     every: int
-    memory_time: float
-    noise: float
-    noise_time: float
+    memory_time: float  # [s]
+    noise: float  # standard deviation of noise in the targets, in units of their scale
+    noise_time: float  # correlation time of that noise [s]
 
     def __post_init__(self) -> None:
         checks.whole("budget", self.budget, 1)
@@ -334,9 +323,7 @@ class GaussianProcess(Online):
         scale: Any = None,
         bias_bandwidth: float | None = None,
     ) -> None:
-        self.memory_time = (
-            None if memory_time is None else checks.time_constant("memory_time", memory_time)
-        )
+        self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
         super().__init__(
             GaussianProcessModel(budget, length, every, 1.0, noise, 1.0),
             State() if features is None else features,

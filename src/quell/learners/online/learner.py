@@ -22,10 +22,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.features import Features
 from quell.features.scaling import update_scale
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.scalars import Scalars, clear
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.feature_learner import FeatureLearner, Inputs, write_features
 from quell.learners.lag import group_delay
@@ -45,9 +47,6 @@ _LEAST_CONFIDENCE = 0.5
 # A state beyond this is as good as infinite: squares of it overflow.
 _LARGEST = 1e100
 
-# Indices of OnlineMemory.scalars.
-_ROW, _SAMPLES, _BIAS = range(3)
-
 
 class OnlineDesign(NamedTuple):
     """Parameters of a learner around a model with p features."""
@@ -56,6 +55,14 @@ class OnlineDesign(NamedTuple):
     model: Any
     delay: int
     """D [samples]."""
+
+
+class OnlineLoop(Scalars):
+    """Scalars of a learner around a model, kept from one sample to the next."""
+
+    row: float  # of the ring, for the next features
+    samples: float  # since the start from rest
+    bias: float  # d, in the plant's units
 
 
 class OnlineMemory(NamedTuple):
@@ -69,8 +76,7 @@ class OnlineMemory(NamedTuple):
     """Work space for the features of a prediction (p,)."""
     ring: Matrix
     """The last features (D + 1, p)."""
-    scalars: Vector
-    """(3,): row of the next features; samples since the start from rest; d in the plant's units."""
+    loop: NDArray[OnlineLoop]
     gate: NoiseGateMemory
     model: Any
     flat: Vector
@@ -80,22 +86,14 @@ class OnlineMemory(NamedTuple):
 
 
 @kernel
-def write_current(
-    learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, out: Vector
-) -> None:
-    """Write the features of the estimates ``seen`` and of ``u`` into ``out`` (p,)."""
-    write_features(learner.inputs, memory.gate, memory.scale, memory.scaled, seen, u, out)
-
-
-@kernel
 def has_pairs(learner: OnlineDesign, memory: OnlineMemory) -> bool:
     """Return whether there are pairs to learn from and features to predict from."""
-    return bool(memory.scalars[_SAMPLES] > learner.inputs.startup + learner.delay + 1)
+    return bool(memory.loop[0].samples > learner.inputs.startup + learner.delay + 1)
 
 
 @kernel
 def _row(learner: OnlineDesign, memory: OnlineMemory) -> int:
-    return min(max(int(memory.scalars[_ROW]), 0), learner.delay)
+    return min(max(int(memory.loop[0].row), 0), learner.delay)
 
 
 @adapt.register(OnlineDesign)
@@ -107,9 +105,9 @@ def _adapt(
     u_before: float,
     f_plain: float,
 ) -> None:
-    inputs, scale, scalars = learner.inputs, memory.scale, memory.scalars
+    inputs, scale, loop = learner.inputs, memory.scale, memory.loop[0]
     moves = update_gate(inputs.gate, memory.gate, seen, y, u_before)
-    if scalars[_SAMPLES] <= inputs.startup:
+    if loop.samples <= inputs.startup:
         return
     update_scale(inputs.scaling, scale, seen, u_before, f_plain)
     if not has_pairs(learner, memory):
@@ -117,9 +115,9 @@ def _adapt(
     # The next row to be written is the oldest of the D + 1 rows: D samples older than the newest.
     features, f_scale = memory.ring[_row(learner, memory)], scale[scale.size - 1]
     if inputs.bias_gain > 0.0:
-        left = f_plain - f_scale * infer(learner.model, memory.model, features) - scalars[_BIAS]
+        left = f_plain - f_scale * infer(learner.model, memory.model, features) - loop.bias
         if is_finite(left):
-            scalars[_BIAS] += inputs.bias_gain * left
+            loop.bias += inputs.bias_gain * left
     if moves and confidence(inputs.gate, memory.gate, scale[0]) > _LEAST_CONFIDENCE:
         learn(learner.model, memory.model, features, f_plain / f_scale)
 
@@ -130,9 +128,9 @@ def _predict(
 ) -> tuple[float, float]:
     if not has_pairs(learner, memory):
         return 0.0, 0.0
-    write_current(learner, memory, seen, u_before, memory.features)
+    write_features(learner.inputs, memory, seen, u_before, memory.features)
     output = infer(learner.model, memory.model, memory.features)
-    return memory.scale[memory.scale.size - 1] * output + memory.scalars[_BIAS], 0.0
+    return memory.scale[memory.scale.size - 1] * output + memory.loop[0].bias, 0.0
 
 
 @commit.register(OnlineDesign)
@@ -140,14 +138,14 @@ def _commit(
     learner: OnlineDesign, memory: OnlineMemory, seen: Vector, u: float, f_learned: float
 ) -> None:
     row = _row(learner, memory)
-    write_current(learner, memory, seen, u, memory.ring[row])
-    memory.scalars[_ROW] = 0.0 if row == learner.delay else row + 1
-    memory.scalars[_SAMPLES] += 1.0
+    write_features(learner.inputs, memory, seen, u, memory.ring[row])
+    memory.loop[0].row = 0.0 if row == learner.delay else row + 1
+    memory.loop[0].samples += 1.0
 
 
 @restart.register(OnlineDesign)
 def _restart(learner: OnlineDesign, memory: OnlineMemory) -> None:
-    memory.scalars[_ROW] = memory.scalars[_SAMPLES] = memory.scalars[_BIAS] = 0.0
+    clear(memory.loop)
     reset_gate(memory.gate)
     finite = True
     for i in range(memory.flat.size):
@@ -219,7 +217,7 @@ class Online(FeatureLearner):
             scaled=np.zeros(n),
             features=np.zeros(p),
             ring=np.zeros((parameters.delay + 1, p)),
-            scalars=np.zeros(3),
+            loop=OnlineLoop.zeros(),
             gate=noise_gate_memory(n),
             model=model,
             flat=flat,

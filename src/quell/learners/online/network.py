@@ -118,25 +118,14 @@ def _learn(model: NetworkDesign, memory: NetworkMemory, features: Vector, target
 
 @dataclass(frozen=True)
 class Network:
-    """The model of ``MLP``.
-
-    Parameters
-    ----------
-    hidden, seed, every
-        as for ``MLP``.
-    memory_time
-        time after which a sample has the weight 1/e [s].
-    noise, noise_time
-        standard deviation of noise in the targets, in units of their scale, and its correlation
-        time [s].
-    """
+    """The model of ``MLP``, whose parameters have the same meaning."""
 
     hidden: int
     seed: int
     every: int
-    memory_time: float
-    noise: float
-    noise_time: float
+    memory_time: float  # [s]
+    noise: float  # standard deviation of noise in the targets, in units of their scale
+    noise_time: float  # correlation time of that noise [s]
 
     def __post_init__(self) -> None:
         checks.whole("hidden", self.hidden, 1)
@@ -221,9 +210,7 @@ class MLP(Online):
         scale: Any = None,
         bias_bandwidth: float | None = None,
     ) -> None:
-        self.memory_time = (
-            None if memory_time is None else checks.time_constant("memory_time", memory_time)
-        )
+        self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
         super().__init__(
             Network(hidden, seed, every, memory_time=1.0, noise=noise, noise_time=1.0),
             State() if features is None else features,

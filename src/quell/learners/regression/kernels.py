@@ -28,9 +28,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from numpy.typing import NDArray
+
 from quell.features.base import unit
 from quell.features.scaling import update_scale
 from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.scalars import Scalars
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.feature_learner import Inputs, write_features
 from quell.learners.lag import lag_push
@@ -40,9 +43,6 @@ from quell.types import Matrix, Vector
 # Below this confidence nothing is learned: noise that is held for several samples is stronger than
 # the gate's model of white noise says. Chosen by hand; not tuned further.
 _LEAST_CONFIDENCE = 0.1
-
-# Indices of LinearMemory.scalars.
-_SAMPLES, _SCALED, _BIAS, _LEARN_AFTER = range(4)
 
 
 @generic
@@ -79,6 +79,15 @@ class LinearDesign(NamedTuple):
     """(p, n + 1): 1 if a feature depends on the state or on u, else 0."""
 
 
+class LinearLoop(Scalars):
+    """Scalars of a linear learner, kept from one sample to the next."""
+
+    samples: float  # since the start from rest
+    has_scale: float  # 1 once there are scales
+    bias: float  # d, in the plant's units
+    learn_after: float  # number of the sample after which θ is updated
+
+
 class LinearMemory(NamedTuple):
     """State of a linear learner."""
 
@@ -98,9 +107,7 @@ class LinearMemory(NamedTuple):
     """(p, N): the lag filters of the features."""
     filtered: Vector
     """(p,): their outputs."""
-    scalars: Vector
-    """(4,): samples since the start from rest; 1 once there are scales; d, in the plant's units;
-    sample after which θ is updated."""
+    loop: NDArray[LinearLoop]
     gate: NoiseGateMemory
     rule: Any
 
@@ -114,12 +121,12 @@ def _adapt(
     u_before: float,
     f_plain: float,
 ) -> None:
-    scalars, theta, inputs = memory.scalars, memory.theta, learner.inputs
+    loop, theta, inputs = memory.loop[0], memory.theta, learner.inputs
     moves = update_gate(inputs.gate, memory.gate, seen, y, u_before)
-    if scalars[_SAMPLES] <= inputs.startup:
+    if loop.samples <= inputs.startup:
         return
     _rescale(learner, memory, seen, u_before, f_plain)
-    if scalars[_SAMPLES] <= inputs.startup:
+    if loop.samples <= inputs.startup:
         return
     scale = memory.scale
     error = f_plain / scale[scale.size - 1]
@@ -127,9 +134,9 @@ def _adapt(
         error -= theta[i] * memory.filtered[i]
     if not is_finite(error):
         return
-    scalars[_BIAS] += inputs.bias_gain * (error * scale[scale.size - 1] - scalars[_BIAS])
+    loop.bias += inputs.bias_gain * (error * scale[scale.size - 1] - loop.bias)
     sure = confidence(inputs.gate, memory.gate, scale[0])
-    if not moves or sure < _LEAST_CONFIDENCE or scalars[_SAMPLES] <= scalars[_LEARN_AFTER]:
+    if not moves or sure < _LEAST_CONFIDENCE or loop.samples <= loop.learn_after:
         return
     update_theta(learner.rule, memory.rule, theta, memory.filtered, error, sure)
     if learner.with_u:
@@ -144,14 +151,14 @@ def _adapt(
 def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float, f: float) -> None:
     """Let the scales grow, and convert what is in their units."""
     theta, scale, old, units = memory.theta, memory.scale, memory.old_scale, memory.units
-    scalars, inputs, last = memory.scalars, learner.inputs, scale.size - 1
+    loop, inputs, last = memory.loop[0], learner.inputs, scale.size - 1
     for i in range(scale.size):
         old[i] = scale[i]
     update_scale(inputs.scaling, scale, seen, u, f)
-    if scalars[_SCALED] == 0.0:
+    if loop.has_scale == 0.0:
         # There were no features before this sample: the filters have to settle once more.
-        scalars[_SCALED] = 1.0
-        scalars[_SAMPLES] = 0.0
+        loop.has_scale = 1.0
+        loop.samples = 0.0
         unit(inputs.features, scale, units)
         return
     if scale[last] != old[last]:
@@ -177,7 +184,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
             # The feature is another function now: its coefficient is zero until the filter has
             # settled.
             ratio = theta[i] = 0.0
-            scalars[_LEARN_AFTER] = scalars[_SAMPLES] + inputs.startup
+            loop.learn_after = loop.samples + inputs.startup
         else:
             theta[i] /= ratio
         memory.filtered[i] *= ratio
@@ -187,45 +194,39 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
         reset_uncertainty(learner.rule, memory.rule)
 
 
-@kernel
-def _write(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float) -> None:
-    scale, scaled = memory.scale, memory.scaled
-    write_features(learner.inputs, memory.gate, scale, scaled, seen, u, memory.features)
-
-
 @predict.register(LinearDesign)
 def _predict(
     learner: LinearDesign, memory: LinearMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
-    if memory.scalars[_SCALED] == 0.0:
+    if memory.loop[0].has_scale == 0.0:
         return 0.0, 0.0
     theta, scale = memory.theta, memory.scale
-    _write(learner, memory, seen, u_before)
+    write_features(learner.inputs, memory, seen, u_before, memory.features)
     size = theta.size - 1 if learner.with_u else theta.size
     constant = 0.0
     for i in range(size):
         constant += theta[i] * memory.features[i]
     f_scale = scale[scale.size - 1]
     slope = theta[size] * f_scale / scale[scale.size - 2] if learner.with_u else 0.0
-    return f_scale * constant + memory.scalars[_BIAS], slope
+    return f_scale * constant + memory.loop[0].bias, slope
 
 
 @commit.register(LinearDesign)
 def _commit(
     learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float, f_learned: float
 ) -> None:
-    memory.scalars[_SAMPLES] += 1.0
-    if memory.scalars[_SCALED] == 0.0:
+    memory.loop[0].samples += 1.0
+    if memory.loop[0].has_scale == 0.0:
         return
-    _write(learner, memory, seen, u)
+    write_features(learner.inputs, memory, seen, u, memory.features)
     for i in range(memory.filtered.size):
         memory.filtered[i] = lag_push(learner.lag, memory.chain, i, memory.features[i])
 
 
 @restart.register(LinearDesign)
 def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
-    scalars = memory.scalars
-    scalars[_SAMPLES] = scalars[_BIAS] = scalars[_LEARN_AFTER] = 0.0
+    loop = memory.loop[0]
+    loop.samples = loop.bias = loop.learn_after = 0.0
     for i in range(memory.filtered.size):
         memory.filtered[i] = 0.0
         for j in range(memory.chain.shape[1]):
@@ -243,8 +244,8 @@ def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
 @coefficients.register(LinearDesign)
 def _coefficients(learner: LinearDesign, memory: LinearMemory, theta: Vector) -> None:
     f_scale = memory.scale[memory.scale.size - 1]
-    scaled = memory.scalars[_SCALED] > 0.0
+    scaled = memory.loop[0].has_scale > 0.0
     for i in range(theta.size):
         theta[i] = memory.theta[i] * memory.units[i] * f_scale if scaled else 0.0
     if learner.constant >= 0:
-        theta[learner.constant] += memory.scalars[_BIAS]
+        theta[learner.constant] += memory.loop[0].bias

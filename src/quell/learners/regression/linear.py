@@ -12,7 +12,7 @@ from quell.features.base import write
 from quell.learners.feature_learner import FeatureLearner
 from quell.learners.lag import lag_memory, lag_of
 from quell.learners.noise_gate import noise_gate_memory
-from quell.learners.regression.kernels import LinearDesign, LinearMemory
+from quell.learners.regression.kernels import LinearDesign, LinearLoop, LinearMemory
 from quell.observers.eso import ESO
 from quell.types import Matrix
 
@@ -49,7 +49,7 @@ class Linear(FeatureLearner):
         raise NotImplementedError
 
     def rule_memory(self, rule: Any, features: int) -> Any:
-        """Return the state of the rule before anything is learned (a NamedTuple of arrays)."""
+        """Return the initial state of the rule (an array or a NamedTuple of arrays)."""
         raise NotImplementedError
 
     def design(self, observer: ESO, omega_c: float) -> LinearDesign:
@@ -81,7 +81,7 @@ class Linear(FeatureLearner):
             units=np.ones(p),
             chain=lag_memory(parameters.lag, p),
             filtered=np.zeros(p),
-            scalars=np.zeros(4),
+            loop=LinearLoop.zeros(),
             gate=noise_gate_memory(n),
             rule=self.rule_memory(parameters.rule, p),
         )

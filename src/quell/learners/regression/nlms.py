@@ -30,17 +30,10 @@ class NlmsRule(NamedTuple):
     """ρ."""
 
 
-class NlmsMemory(NamedTuple):
-    """State: only θ, which the learner holds."""
-
-    empty: Vector
-    """(0,)."""
-
-
 @update_theta.register(NlmsRule)
 def _update_theta(
     rule: NlmsRule,
-    memory: NlmsMemory,
+    memory: Vector,
     theta: Vector,
     features: Vector,
     error: float,
@@ -55,7 +48,7 @@ def _update_theta(
 
 
 @reset_uncertainty.register(NlmsRule)
-def _reset_uncertainty(rule: NlmsRule, memory: NlmsMemory) -> None:
+def _reset_uncertainty(rule: NlmsRule, memory: Vector) -> None:
     pass
 
 
@@ -98,13 +91,13 @@ class NLMS(Linear):
         bias_bandwidth: float | None = None,
     ) -> None:
         super().__init__(features, frequency, scale, gain_interval, bias_bandwidth)
-        self.rate = None if rate is None else checks.positive("rate", rate, "1/s")
+        self.rate = checks.optional(checks.positive, "rate", rate, "1/s")
         self.regularisation = checks.positive("regularisation", regularisation)
 
     def rule(self, observer: ESO, omega_c: float, features: int) -> NlmsRule:
         """Return step size and regularisation."""
         return NlmsRule(min((self.rate or omega_c) * observer.dt, 1.0), self.regularisation)
 
-    def rule_memory(self, rule: NlmsRule, features: int) -> NlmsMemory:
-        """Return an empty state."""
-        return NlmsMemory(np.zeros(0))
+    def rule_memory(self, rule: NlmsRule, features: int) -> Vector:
+        """Return an empty state; the learner holds θ."""
+        return np.zeros(0)

@@ -90,9 +90,7 @@ class RLS(Linear):
         bias_bandwidth: float | None = None,
     ) -> None:
         super().__init__(features, frequency, scale, gain_interval, bias_bandwidth)
-        self.memory_time = (
-            None if memory_time is None else checks.time_constant("memory_time", memory_time)
-        )
+        self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
         self.prior = checks.positive("prior", prior)
 
     def rule(self, observer: ESO, omega_c: float, features: int) -> RlsRule:
