@@ -262,7 +262,7 @@ def three(features: Any, x: Any, u: float, out: Any) -> None:
         (lambda: block_with(raises), "Own: write fails with KeyError"),
         (
             lambda: block_with(one),
-            r"Own: write leaves features \[1\] unwritten; .*room for 2 features",
+            r"Own: write does not write features \[1\]; .*room for 2 features",
         ),
         (lambda: block_with(three), "Own: write fails with IndexError"),
         (lambda: block_with(both, units=raises), "Own: unit fails with KeyError"),

@@ -173,7 +173,7 @@ class Callable:
     ("make", "message"),
     [
         (lambda: Polynomial(1), "degree = 1: must be a whole number of at least 2"),
-        (lambda: Polynomial(states=(1, 1)), r"states = \(1, 1\): a state may be named once"),
+        (lambda: Polynomial(states=(1, 1)), r"states = \(1, 1\): must not repeat a state"),
         (lambda: Polynomial(states=()), r"states = \(\): must be a tuple of the numbers of states"),
         (lambda: Polynomial(states=(0,)), r"states\[0\] = 0: must be a whole number of at least 1"),
         (
@@ -195,7 +195,7 @@ class Callable:
         (lambda: RBF(width=math.nan), "width = nan: must be finite and greater than zero"),
         (lambda: Custom(3, ("a",)), "function = 3: must be a function"),
         (lambda: Custom(halves, ()), r"names = \(\): must be a tuple with a name for each feature"),
-        (lambda: Custom(halves, ("a", "a")), r"names = \('a', 'a'\): each must be there once"),
+        (lambda: Custom(halves, ("a", "a")), r"names = \('a', 'a'\): must not repeat a name"),
         (
             lambda: Custom(halves, ("a",)).design(2),
             r"function returns shape \(2,\): must return a tuple of 1 numbers",
@@ -212,7 +212,7 @@ class Callable:
             lambda: Custom(lambda x, u: (float(str(x[0])),), ("a",)).design(2),
             "function can't be compiled by Numba",
         ),
-        (lambda: Input() + State(), r"Input\(\) must be the last of the blocks"),
+        (lambda: Input() + State(), r"Input\(\) must be the last block"),
     ],
 )
 def test_a_mistake_is_named(make: Any, message: str) -> None:

@@ -1,4 +1,8 @@
-"""Features: what a learner is shown of the estimated state and the control signal."""
+"""Features: the inputs of learners, functions of the estimated state and the control signal.
+
+May import ``observers``, ``kernels`` and what stands before them. A new block needs its own file
+and its name here; users can also write one, see ``base.py``.
+"""
 
 from quell.features.base import Features, Joined
 from quell.features.custom import Custom

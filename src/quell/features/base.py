@@ -1,8 +1,9 @@
-"""What a learner is shown: features of the estimated state and the control signal.
+"""The interface of a block of features.
 
-A block of features (``State()``, ``Bias()``, …) is an immutable description; blocks are joined by ``+``. ``design(order)`` turns it
-into a NamedTuple, for whose type ``write`` is registered. All blocks are given *scaled* inputs, which lie in about [−1, 1] whatever the
-plant's units (``scaling.py``), so that all features are O(1).
+A block (``State()``, ``Bias()``, …) is an immutable description; blocks are joined by ``+``.
+``design(order)`` returns its parameters, a NamedTuple, for whose type ``write`` and ``unit`` are
+registered. All blocks get *scaled* inputs, which lie in about [−1, 1] whatever the plant's units
+(``scaling.py``), so that all features are O(1).
 """
 
 from __future__ import annotations
@@ -18,14 +19,23 @@ from quell.types import Vector
 
 @generic
 def write(features: Any, x: Vector, u: float, out: Vector) -> None:
-    """Write the features of the scaled state ``x`` (n,) and the scaled control signal ``u`` into ``out`` (p,)."""
+    """Write the features of the scaled ``x`` (n,) and ``u`` to ``out`` (p,)."""
     raise TypeError
 
 
 @generic
 def unit(features: Any, scale: Vector, out: Vector) -> None:
-    """Write by what a coefficient must be multiplied to stand for the plant's units; ``scale`` (n + 2,) is that of x_1 … x_n, u, f."""
+    """Write to ``out`` (p,) the factors that convert coefficients to the plant's units.
+
+    ``scale`` (n + 2,) has the scales of x_1 … x_n, u, f. A factor is 1 if a feature has no unit.
+    """
     raise TypeError
+
+
+def dimensionless(features: Any, scale: Vector, out: Vector) -> None:
+    """Write factors of 1: ``unit`` of a block whose features have no unit."""
+    for j in range(out.size):
+        out[j] = 1.0
 
 
 class Features:
@@ -37,12 +47,12 @@ class Features:
         Raises
         ------
         ValueError
-            where the block does not fit a plant of this order.
+            if the block does not fit a plant of this order.
         """
         raise NotImplementedError
 
     def names(self, order: int) -> tuple[str, ...]:
-        """Return what each feature is called."""
+        """Return the name of each feature."""
         raise NotImplementedError
 
     @property
@@ -51,7 +61,7 @@ class Features:
         return False
 
     def constant(self, order: int) -> int:
-        """Return which feature is the constant 1; −1 where there is none."""
+        """Return the index of the constant feature 1, or −1 if there is none."""
         return -1
 
     def __add__(self, other: Features) -> Joined:
@@ -66,12 +76,12 @@ class Joined(Features):
     Raises
     ------
     ValueError
-        where ``first`` has the control signal, which must come last, and once.
+        if ``first`` has the control signal, which must be last and only once.
     """
 
     def __init__(self, first: Features, second: Features) -> None:
         if first.has_input:
-            raise ValueError("features: Input() must be the last of the blocks, and be there once")
+            raise ValueError("features: Input() must be the last block, and occur once")
         self.first, self.second = first, second
 
     def design(self, order: int) -> JoinedDesign:
@@ -81,13 +91,13 @@ class Joined(Features):
         )
 
     def names(self, order: int) -> tuple[str, ...]:
-        """Return both blocks' names; a name that comes again is numbered."""
+        """Return both blocks' names; repeated names are numbered."""
         found: list[str] = []
         for name in (*self.first.names(order), *self.second.names(order)):
-            again, number = name, 2
-            while again in found:
-                again, number = f"{name} ({number})", number + 1
-            found.append(again)
+            unique, number = name, 2
+            while unique in found:
+                unique, number = f"{name} ({number})", number + 1
+            found.append(unique)
         return tuple(found)
 
     @property
@@ -96,7 +106,7 @@ class Joined(Features):
         return self.second.has_input
 
     def constant(self, order: int) -> int:
-        """Return which feature is the constant 1; −1 where there is none."""
+        """Return the index of the constant feature 1, or −1 if there is none."""
         first, second = self.first.constant(order), self.second.constant(order)
         return first if first >= 0 or second < 0 else len(self.first.names(order)) + second
 
@@ -126,22 +136,23 @@ def _unit(features: JoinedDesign, scale: Vector, out: Vector) -> None:
 
 
 def checked_design(features: Features, order: int) -> Any:
-    """Return ``features.design(order)``; blocks of the user's own have to write their features once, interpreted.
+    """Return ``features.design(order)`` after a test of each user-defined block.
 
     Raises
     ------
     ValueError
-        that names the block's class and the rule, for whatever is wrong.
+        if a block breaks a rule; the message names its class and the rule.
     """
     if isinstance(features, Joined):
         checked_design(features.first, order)
         checked_design(features.second, order)
     elif validation.is_user_defined(features):
-        _try_block(features, order)
+        _check_block(features, order)
     return features.design(order)
 
 
-def _try_block(block: Features, order: int) -> None:
+def _check_block(block: Features, order: int) -> None:
+    """Call the functions of a user-defined block once, interpreted."""
     name = type(block).__name__
     what = f"{name}.design({order})"
     parameters = validation.attempt(what, "design takes the plant's order", block.design, order)
@@ -149,18 +160,13 @@ def _try_block(block: Features, order: int) -> None:
     names = validation.attempt(
         f"{name}.names({order})", "names takes the plant's order", block.names, order
     )
-    if (
-        not isinstance(names, tuple)
-        or not names
-        or not all(isinstance(label, str) for label in names)
-    ):
+    if not (isinstance(names, tuple) and names and all(isinstance(label, str) for label in names)):
         raise ValueError(
-            f"{name}.names({order}) returns {names!r}: must return a tuple with a name for each feature"
+            f"{name}.names({order}) returns {names!r}: must return a tuple with a name for each "
+            "feature"
         )
     validation.check_registered(name, parameters, write, unit)
-    rule = (
-        f"it is given x ({order},), u, and room for {len(names)} features, as many as it has names"
-    )
+    rule = f"it gets x ({order},), u, and room for {len(names)} features, one for each name"
     ones, marks = np.ones(order + 2), (7e77, -7e77)
     for function, arguments in ((write, (validation.sample_values(order), 0.5)), (unit, (ones,))):
         written = []
@@ -171,6 +177,7 @@ def _try_block(block: Features, order: int) -> None:
             )
             written.append(out != mark)
         if not np.all(written):
+            missing = np.flatnonzero(~np.all(written, axis=0)).tolist()
             raise ValueError(
-                f"{name}: {function.__name__} leaves features {np.flatnonzero(~np.all(written, axis=0)).tolist()} unwritten; {rule}"
+                f"{name}: {function.__name__} does not write features {missing}; {rule}"
             )

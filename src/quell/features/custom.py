@@ -1,4 +1,4 @@
-"""Features given by the user's own function."""
+"""Features computed by a function of the user."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numba.core import types as nb_types
 
-from quell.features.base import Features, unit, write
+from quell.features.base import Features, dimensionless, unit, write
 from quell.kernels.function_pointers import (
     POINTER,
     NotCompilableError,
@@ -27,57 +27,53 @@ class CustomDesign(NamedTuple):
     """Parameters of ``Custom``."""
 
     address: int
-    """Of the compiled function, which the ``Custom`` object keeps."""
-    width: int
+    """Address of the compiled function; the cache of ``_machine_code`` keeps it alive."""
 
 
 class Custom(Features):
-    """What ``function(x, u)`` returns, of the scaled state x (n,) and the scaled control signal u.
+    """The values of ``function(x, u)`` at the scaled state x (n,) and control signal u.
 
     Parameters
     ----------
     function
-        a plain function that returns a tuple of numbers; it is compiled by Numba, and called by address.
+        a plain function that returns a tuple of numbers; Numba compiles it, and it is called by
+        address.
     names
-        what each of the numbers is called.
+        name of each of the numbers.
 
     Raises
     ------
     ValueError
-        where there are no names, or, by ``design``, where the function returns another number of them or can't be compiled.
+        if there are no names; by ``design`` if the function returns another number of values or
+        can't be compiled.
 
     Examples
     --------
     >>> import math
-    >>> gravity = Custom(lambda x, u: (math.sin(3.0 * x[0]), math.cos(3.0 * x[0])), names=("sin", "cos"))
+    >>> gravity = Custom(lambda x, u: (math.sin(x[0]), math.cos(x[0])), names=("sin", "cos"))
     """
 
     def __init__(self, function: Callable[..., Any], names: Sequence[str]) -> None:
         if not callable(function):
             raise ValueError(f"function = {function!r}: must be a function f(x, u)")
-        if (
-            isinstance(names, str)
-            or not isinstance(names, Sequence)
-            or not names
-            or not all(isinstance(name, str) for name in names)
-        ):
+        listed = isinstance(names, Sequence) and not isinstance(names, str) and len(names) > 0
+        if not (listed and all(isinstance(name, str) for name in names)):
             raise ValueError(f"names = {names!r}: must be a tuple with a name for each feature")
         if len(set(names)) < len(names):
-            raise ValueError(f"names = {names!r}: each must be there once")
+            raise ValueError(f"names = {names!r}: must not repeat a name")
         self.function = function
         self.labels = tuple(names)
 
     def __repr__(self) -> str:
-        return (
-            f"Custom({getattr(self.function, '__name__', self.function)!s}, names={self.labels!r})"
-        )
+        name = getattr(self.function, "__name__", self.function)
+        return f"Custom({name!s}, names={self.labels!r})"
 
     def design(self, order: int) -> CustomDesign:
         """Compile the function, for a plant of order ``order``."""
         count = len(self.labels)
         try:
             returned = np.shape(self.function(np.zeros(order), 0.0))
-        except ArithmeticError:  # the origin is no place for it
+        except ArithmeticError:  # not defined at the origin, for example 1/x
             returned = (count,)
         except Exception as error:
             raise ValueError(
@@ -85,16 +81,17 @@ class Custom(Features):
             ) from error
         if returned != (count,):
             raise ValueError(
-                f"function returns shape {returned}: must return a tuple of {count} numbers, one for each of names"
+                f"function returns shape {returned}: must return a tuple of {count} numbers, one "
+                "for each of names"
             )
-        return CustomDesign(_machine_code(self.function, order, count).address, count)
+        return CustomDesign(_machine_code(self.function, order, count).address)
 
     def names(self, order: int) -> tuple[str, ...]:
-        """Return the names given."""
+        """Return ``names``."""
         return self.labels
 
 
-@cache  # never given up: designs hold addresses
+@cache  # keeps the code for ever, because designs hold its address
 def _machine_code(function: Callable[..., Any], order: int, count: int) -> Any:
     def features(px, u, pout):  # type: ignore[no-untyped-def]
         out = numba.carray(pout, (count,))
@@ -116,7 +113,4 @@ def _write(features: CustomDesign, x: Vector, u: float, out: Vector) -> None:
     call(features.address, x, u, out)
 
 
-@unit.register(CustomDesign)
-def _unit(features: CustomDesign, scale: Vector, out: Vector) -> None:
-    for j in range(features.width):
-        out[j] = 1.0
+unit.register(CustomDesign)(dimensionless)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.features.base import Features, unit, write
+from quell.features.base import Features, dimensionless, unit, write
 from quell.features.states import StateIndices, check_states, state_indices
 from quell.types import Matrix, Vector
 
@@ -29,20 +29,22 @@ class RandomFourierDesign(NamedTuple):
 
 @dataclass(frozen=True)
 class RandomFourier(Features):
-    """``sqrt(2/p) cos(w·x + b)`` with random w and b: a linear model in these approximates a Gaussian process in x.
+    """Random features ``sqrt(2/p) cos(w·x + b)``.
 
-    With w normal of standard deviation 1/length and b uniform, ``φ(x)·φ(x')`` approaches ``exp(−|x − x'|²/2 length²)`` as p grows.
+    A linear model in these features approximates a Gaussian process in x: with w normal of standard
+    deviation 1/length and b uniform, ``φ(x)·φ(x')`` approaches ``exp(−|x − x'|²/2 length²)`` as p
+    grows.
 
     Parameters
     ----------
     count
         number p of features.
     length
-        over which the function varies, in scaled states: those lie in [−1, 1].
+        length over which the function varies, in scaled states, which lie in [−1, 1].
     seed
         of w and b.
     states
-        which states, counted from 1; all by default.
+        numbers of the states, from 1; all by default.
 
     Raises
     ------
@@ -89,7 +91,4 @@ def _write(features: RandomFourierDesign, x: Vector, u: float, out: Vector) -> N
         out[j] = features.size * math.cos(angle)
 
 
-@unit.register(RandomFourierDesign)
-def _unit(features: RandomFourierDesign, scale: Vector, out: Vector) -> None:
-    for j in range(features.phase.size):
-        out[j] = 1.0
+unit.register(RandomFourierDesign)(dimensionless)

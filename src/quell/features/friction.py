@@ -1,4 +1,4 @@
-"""Dry friction: what depends on the direction of motion."""
+"""Dry friction: features that depend on the direction of motion."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from quell import checks
-from quell.features.base import Features, unit, write
+from quell.features.base import Features, dimensionless, unit, write
 from quell.features.states import StateIndices, check_states, state_indices
 from quell.types import Vector
 
@@ -28,12 +28,13 @@ class Friction(Features):
     Parameters
     ----------
     width
-        over which the friction reverses, as a share of the largest velocity. The estimated velocity lags the true one, and its noise
-        must not flip the feature: rather too wide than too narrow.
+        velocity over which the friction reverses, as a share of the largest velocity. Because the
+        estimated velocity lags and its noise must not flip the feature, choose it too wide rather
+        than too narrow.
     sign
         whether ``sign(v)`` is a feature too.
     states
-        the velocities, counted from 1; x_2 by default.
+        numbers of the velocities among the states, from 1; x_2 by default.
 
     Raises
     ------
@@ -42,8 +43,9 @@ class Friction(Features):
 
     References
     ----------
-    Armstrong-Hélouvry, Dupont & Canudas de Wit, *A survey of models, analysis tools and compensation methods for the control of machines
-    with friction*, Automatica 30 (1994), section 2.
+    Armstrong-Hélouvry, Dupont & Canudas de Wit, *A survey of models, analysis tools and
+    compensation methods for the control of machines with friction*, Automatica 30 (1994), section
+    2.
     """
 
     width: float = 0.05
@@ -56,19 +58,17 @@ class Friction(Features):
         check_states(self.states)
 
     def design(self, order: int) -> FrictionDesign:
-        """Return where the velocities are, and how friction reverses."""
+        """Return the indices of the velocities, the width and whether there are signs."""
         return FrictionDesign(state_indices(self.states, order), float(self.width), bool(self.sign))
 
     def names(self, order: int) -> tuple[str, ...]:
-        """Return ``("tanh(x2/0.05)",)``, and ``"sign(x2)"`` after each where that is a feature."""
-        return tuple(
-            name
-            for i in state_indices(self.states, order)
-            for name in (
-                f"tanh(x{i + 1}/{self.width:g})",
-                *([f"sign(x{i + 1})"] if self.sign else []),
-            )
-        )
+        """Return ``("tanh(x2/0.05)",)``, with ``"sign(x2)"`` after each if ``sign`` is set."""
+        names: list[str] = []
+        for i in state_indices(self.states, order):
+            names.append(f"tanh(x{i + 1}/{self.width:g})")
+            if self.sign:
+                names.append(f"sign(x{i + 1})")
+        return tuple(names)
 
 
 @write.register(FrictionDesign)
@@ -83,7 +83,4 @@ def _write(features: FrictionDesign, x: Vector, u: float, out: Vector) -> None:
             at += 1
 
 
-@unit.register(FrictionDesign)
-def _unit(features: FrictionDesign, scale: Vector, out: Vector) -> None:
-    for j in range(features.states.size * (2 if features.sign else 1)):
-        out[j] = 1.0
+unit.register(FrictionDesign)(dimensionless)

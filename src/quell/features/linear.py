@@ -1,4 +1,4 @@
-"""Features that a linear model needs: the state, the control signal, a constant."""
+"""The features of a linear model: the state, the control signal, a constant."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from quell import checks
-from quell.features.base import Features, unit, write
+from quell.features.base import Features, dimensionless, unit, write
 from quell.types import Vector
 
 
@@ -23,7 +23,7 @@ class State(Features):
     Parameters
     ----------
     count
-        how many; all n by default.
+        number of states; all n by default.
     """
 
     count: int | None = None
@@ -72,7 +72,7 @@ class Bias(Features):
         return ("bias",)
 
     def constant(self, order: int) -> int:
-        """Return 0: it is."""
+        """Return 0, the index of the only feature."""
         return 0
 
 
@@ -81,9 +81,7 @@ def _write_bias(features: BiasDesign, x: Vector, u: float, out: Vector) -> None:
     out[0] = 1.0
 
 
-@unit.register(BiasDesign)
-def _unit_bias(features: BiasDesign, scale: Vector, out: Vector) -> None:
-    out[0] = 1.0
+unit.register(BiasDesign)(dimensionless)
 
 
 class InputDesign(NamedTuple):
@@ -92,9 +90,10 @@ class InputDesign(NamedTuple):
 
 @dataclass(frozen=True)
 class Input(Features):
-    """The control signal that is applied, u. It must be the last of the blocks.
+    """The applied control signal u. It must be the last block.
 
-    A linear learner solves the loop through u exactly and keeps the effective gain in an interval; any other is shown the u before.
+    A linear learner solves the loop through u exactly and keeps the effective gain in an interval;
+    other learners get the u of the sample before.
     """
 
     def design(self, order: int) -> InputDesign:
@@ -107,7 +106,7 @@ class Input(Features):
 
     @property
     def has_input(self) -> bool:
-        """It is."""
+        """True: the last feature is u."""
         return True
 
 

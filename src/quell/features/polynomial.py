@@ -20,26 +20,27 @@ class PolynomialDesign(NamedTuple):
     """Parameters of ``Polynomial``."""
 
     factors: NDArray[np.int64]
-    """(p, degree): the states that are multiplied; −1 for none."""
+    """(p, degree): indices of the states that are multiplied; −1 for none."""
 
 
 @dataclass(frozen=True)
 class Polynomial(Features):
-    """All monomials of the state of total degree 2 to ``degree``: a spring that stiffens, a drag that grows with speed squared.
+    """All monomials of the state of total degree 2 to ``degree``.
 
-    Degree 1 is ``State()``, degree 0 ``Bias()``.
+    They describe a spring that stiffens or a drag that grows with the square of the speed. Degree 1
+    is ``State()``, degree 0 ``Bias()``.
 
     Parameters
     ----------
     degree
-        the largest.
+        the largest total degree.
     states
-        which states, counted from 1; all by default.
+        numbers of the states, from 1; all by default.
 
     Raises
     ------
     ValueError
-        for a degree below 2, or states that are none.
+        for a degree below 2, or a state that the plant does not have.
     """
 
     degree: int = 3
@@ -65,10 +66,8 @@ class Polynomial(Features):
 
 
 def _name(factors: list[int]) -> str:
-    powers = {i: factors.count(i) for i in factors}
-    return " ".join(
-        f"x{i + 1}^{power}" if power > 1 else f"x{i + 1}" for i, power in powers.items()
-    )
+    powers = {f"x{i + 1}": factors.count(i) for i in factors}
+    return " ".join(f"{x}^{power}" if power > 1 else x for x, power in powers.items())
 
 
 @write.register(PolynomialDesign)

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.features.base import Features, unit, write
+from quell.features.base import Features, dimensionless, unit, write
 from quell.features.states import StateIndices, check_states, state_indices
 from quell.types import Matrix, Vector
 
+# Bases of the Halton sequence, one for each state.
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
 
@@ -27,20 +28,20 @@ class RadialDesign(NamedTuple):
 
 
 class RBF(Features):
-    """Gaussians ``exp(−|x − c|²/(2 width²))`` around centres c that fill the scaled states' range [−1, 1].
+    """Gaussians ``exp(−|x − c|²/(2 width²))`` around centres c in the scaled states' range [−1, 1].
 
-    Each is felt near its centre only: what is learned in one place does not disturb what was learned in another.
+    Each is large only near its centre, so learning at one place does not change other places.
 
     Parameters
     ----------
     count
-        number p of centres, which then come from a Halton sequence.
+        number p of centres from a Halton sequence; 25 by default.
     width
         of a Gaussian; ``2 p^(−1/k)`` for k states by default, about the distance between centres.
     states
-        which states, counted from 1; the first two by default.
+        numbers of the states, from 1; the first two by default.
     centers
-        the centres themselves (p, k), instead of ``count``.
+        the centres (p, k), instead of ``count``.
 
     Raises
     ------
@@ -49,8 +50,9 @@ class RBF(Features):
 
     References
     ----------
-    Broomhead & Lowe, *Multivariable functional interpolation and adaptive networks*, Complex Systems 2 (1988), eq. (2.2); Halton, *On the
-    efficiency of certain quasi-random sequences of points*, Numerische Mathematik 2 (1960).
+    Broomhead & Lowe, *Multivariable functional interpolation and adaptive networks*, Complex
+    Systems 2 (1988), eq. (2.2); Halton, *On the efficiency of certain quasi-random sequences of
+    points*, Numerische Mathematik 2 (1960).
     """
 
     def __init__(
@@ -64,11 +66,9 @@ class RBF(Features):
         if count is not None and centers is not None:
             raise ValueError("count and centers: give one of them")
         self.centers = None if centers is None else checks.matrix("centers", centers)
-        self.count = (
-            checks.whole("count", 25 if count is None else count, 1)
-            if self.centers is None
-            else len(self.centers)
-        )
+        self.count = checks.whole("count", 25 if count is None else count, 1)
+        if self.centers is not None:
+            self.count = len(self.centers)
         self.width = None if width is None else checks.positive("width", width)
         check_states(states)
         self.states = None if states is None else tuple(states)
@@ -82,18 +82,12 @@ class RBF(Features):
         if self.centers is None:
             if chosen.size > len(_PRIMES):
                 raise ValueError(
-                    f"states = {self.states!r}: must be at most {len(_PRIMES)}, or centers must be given"
+                    f"states = {self.states!r}: must be at most {len(_PRIMES)}, or centers must be "
+                    "given"
                 )
-            centers = (
-                2.0
-                * np.array(
-                    [
-                        [_radical_inverse(i + 1, _PRIMES[k]) for k in range(chosen.size)]
-                        for i in range(self.count)
-                    ]
-                )
-                - 1.0
-            )
+            bases, points = _PRIMES[: chosen.size], range(1, self.count + 1)
+            halton = np.array([[_radical_inverse(i, base) for base in bases] for i in points])
+            centers = 2.0 * halton - 1.0
         else:
             centers = checks.matrix("centers", self.centers, columns=chosen.size)
         width = 2.0 * self.count ** (-1.0 / chosen.size) if self.width is None else self.width
@@ -105,12 +99,12 @@ class RBF(Features):
 
 
 def _radical_inverse(index: int, base: int) -> float:
-    """Return ``index`` mirrored at the point in ``base``: a coordinate of a Halton sequence, in (0, 1)."""
-    inverse, digit = 0.0, 1.0 / base
+    """Return ``index`` with its digits reversed behind the point, in (0, 1) (Halton 1960)."""
+    inverse, place = 0.0, 1.0 / base
     while index:
-        index, rest = divmod(index, base)
-        inverse += rest * digit
-        digit /= base
+        index, digit = divmod(index, base)
+        inverse += digit * place
+        place /= base
     return inverse
 
 
@@ -119,12 +113,9 @@ def _write(features: RadialDesign, x: Vector, u: float, out: Vector) -> None:
     for j in range(features.centers.shape[0]):
         distance = 0.0
         for k in range(features.states.size):
-            away = x[features.states[k]] - features.centers[j, k]
-            distance += away * away
+            difference = x[features.states[k]] - features.centers[j, k]
+            distance += difference * difference
         out[j] = math.exp(-features.weight * distance)
 
 
-@unit.register(RadialDesign)
-def _unit(features: RadialDesign, scale: Vector, out: Vector) -> None:
-    for j in range(features.centers.shape[0]):
-        out[j] = 1.0
+unit.register(RadialDesign)(dimensionless)

@@ -1,9 +1,10 @@
 """Automatic scaling: inputs and targets of O(1) whatever the plant's units.
 
-x̂_i is divided by a power of two that is no smaller than what x̂_i has reached, so that a scale changes seldom, and by a whole factor when
-it does. It is never smaller than what the scale of x̂_1 lets expect of a motion at the frequency ω: ``ω^(i−1)/8`` of it. At rest, where
-the higher derivatives are noise, noise is not blown up to O(1). The control signal and the total disturbance, which is what a learner has
-to predict, have scales of their own.
+The scale of x̂_i is the smallest power of two that is at least the largest ``|x̂_i|`` so far, so it
+changes seldom and by a whole factor. It is at least ``ω^(i−1)/8`` of the scale of x̂_1, with a
+frequency ω of the plant: at rest, where the higher derivatives are noise, noise is not scaled up to
+O(1). The control signal and the total disturbance, which a learner has to predict, have their own
+scales.
 """
 
 from __future__ import annotations
@@ -17,21 +18,25 @@ from quell.kernels.dispatch import is_finite, kernel
 from quell.observers.eso import ESO
 from quell.types import Vector
 
+# Avoids division by zero and the logarithm of zero; far below any signal.
 _LEAST = 1e-100
+# Least scale of a derivative, as a share of the one in a motion of x_1 at the frequency ω. Chosen
+# by hand; not tuned further.
+_FLOOR = 1.0 / 8.0
 
 
 class Scaling(NamedTuple):
     """Parameters, for a plant of order n."""
 
     floors: Vector
-    """ω^(i−1)/8 for x_2 … x_n; 0 for x_1, u and f (n + 2,)."""
+    """Least scales (n + 2,) over that of x_1: ω^(i−1)/8 for x_2 … x_n; 0 for x_1, u and f."""
     fixed: bool
-    """Whether the scales are given, not found."""
+    """Whether the scales are given and do not change."""
 
 
 def scaling(observer: ESO, frequency: float, fixed: bool) -> Scaling:
-    """Return the scaling for an observer and a frequency the plant has [rad/s]."""
-    floors = frequency ** np.arange(observer.order) / 8.0
+    """Return the scaling for an observer and a ``frequency`` of the plant [rad/s]."""
+    floors = frequency ** np.arange(observer.order) * _FLOOR
     floors[0] = 0.0
     return Scaling(np.append(floors, [0.0, 0.0]), fixed)
 
@@ -42,13 +47,13 @@ def initial_scale(scaling: Scaling) -> Vector:
 
 
 @kernel
-def update_scale(scaling: Scaling, scale: Vector, seen: Vector, u: float, f: float) -> None:
-    """Let ``scale`` (n + 2,) grow to hold the state in ``seen`` (n + 1,), ``u`` and ``f``."""
+def update_scale(scaling: Scaling, scale: Vector, estimate: Vector, u: float, f: float) -> None:
+    """Increase ``scale`` (n + 2,) to cover the state in ``estimate`` (n + 1,), ``u`` and ``f``."""
     if scaling.fixed:
         return
     order = scale.size - 2
     for i in range(scale.size):
-        size = abs(seen[i]) if i < order else (abs(u) if i == order else abs(f))
+        size = abs(estimate[i]) if i < order else (abs(u) if i == order else abs(f))
         size = max(size, scaling.floors[i] * scale[0], _LEAST)
         if size > scale[i] and is_finite(size):
             scale[i] = 2.0 ** math.ceil(math.log2(size))

@@ -1,4 +1,4 @@
-"""Which states a block of features looks at."""
+"""Selection of the states that a block of features uses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ StateIndices = NDArray[np.int64]
 
 
 def check_states(states: Sequence[int] | None) -> None:
-    """Check the argument ``states``: numbers from 1 on, each once; None for a default that depends on the order."""
+    """Raise a ``ValueError`` unless ``states`` is None or a tuple of different numbers from 1."""
     if states is None:
         return
     if not isinstance(states, tuple | list) or len(states) == 0:
@@ -23,18 +23,18 @@ def check_states(states: Sequence[int] | None) -> None:
     for i, state in enumerate(states):
         checks.whole(f"states[{i}]", state, 1)
     if len(set(states)) < len(states):
-        raise ValueError(f"states = {states!r}: a state may be named once")
+        raise ValueError(f"states = {states!r}: must not repeat a state")
 
 
 def state_indices(
     states: Sequence[int] | None, order: int, default: int | None = None
 ) -> StateIndices:
-    """Return the places (k,) of ``states`` in x, counted from 0; without ``states`` the first ``default``, or all.
+    """Return the indices (k,) of ``states`` in x, from 0; by default the first ``default`` or all.
 
     Raises
     ------
     ValueError
-        where a plant of order ``order`` has no such state.
+        if a plant of order ``order`` has no such state.
     """
     if states is None:
         return np.arange(order if default is None else min(order, default))
