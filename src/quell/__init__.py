@@ -1,6 +1,6 @@
 """quell: disturbance-rejection control that learns.
 
-The public names; each is imported when it is first used, so that ``import quell`` is quick::
+Public names are imported when they are first used, so that ``import quell`` is fast::
 
     import quell as ql
 
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+# Modules of the public classes and functions, and of modules that are deeper than ``quell.<name>``.
 _HOME = {
     "ADRC": "quell.controllers.adrc.adrc",
     "DesignWarning": "quell.types",
@@ -63,22 +64,7 @@ _HOME = {
     "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation.simulate",
 }
-_ELSEWHERE = {"baselines": "quell.controllers.baselines", "metrics": "quell.records.metrics"}
-_ROOMS = (
-    "analysis",
-    "baselines",
-    "controllers",
-    "experiments",
-    "features",
-    "identification",
-    "learners",
-    "metrics",
-    "observers",
-    "plants",
-    "realtime",
-    "setup",
-    "signals",
-)
+_MODULES = {"baselines": "quell.controllers.baselines", "metrics": "quell.records.metrics"}
 
 __all__ = [
     "ADRC",
@@ -112,12 +98,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'quell' has no attribute {name!r}")
     if name in _HOME:
         value = getattr(importlib.import_module(_HOME[name]), name)
-    elif name in _ROOMS:
-        value = importlib.import_module(_ELSEWHERE.get(name, f"quell.{name}"))
     else:
-        raise AttributeError(f"module 'quell' has no attribute {name!r}")
+        value = importlib.import_module(_MODULES.get(name, f"quell.{name}"))
     globals()[name] = value
     return value
 

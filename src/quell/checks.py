@@ -19,7 +19,7 @@ def optional(check: Callable[..., T], name: str, value: Any, *rule: Any) -> T | 
 
 
 def finite(name: str, value: Any) -> float:
-    """Return ``value`` as a float, or say that it must be a finite number."""
+    """Return ``value`` as a finite float."""
     number = _number(name, value)
     if not math.isfinite(number):
         raise ValueError(f"{name} = {value!r}: must be a finite number")
@@ -28,11 +28,9 @@ def finite(name: str, value: Any) -> float:
 
 def positive(name: str, value: Any, unit: str = "") -> float:
     """Return ``value`` as a float above zero."""
-    number = _number(name, value)
+    number, unit = _number(name, value), unit and f" [{unit}]"
     if not (math.isfinite(number) and number > 0.0):
-        raise ValueError(
-            f"{name} = {value!r}: must be finite and greater than zero{unit and f' [{unit}]'}"
-        )
+        raise ValueError(f"{name} = {value!r}: must be finite and greater than zero{unit}")
     return number
 
 
@@ -46,11 +44,9 @@ def time_constant(name: str, value: Any) -> float:
 
 def non_negative(name: str, value: Any, unit: str = "") -> float:
     """Return ``value`` as a float of at least zero."""
-    number = _number(name, value)
+    number, unit = _number(name, value), unit and f" [{unit}]"
     if not (math.isfinite(number) and number >= 0.0):
-        raise ValueError(
-            f"{name} = {value!r}: must be finite and not negative{unit and f' [{unit}]'}"
-        )
+        raise ValueError(f"{name} = {value!r}: must be finite and not negative{unit}")
     return number
 
 
@@ -64,15 +60,10 @@ def nonzero(name: str, value: Any, why: str) -> float:
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
     """Return ``value`` as an int between ``least`` and ``most``."""
-    rule = (
-        f"must be a whole number of at least {least}"
-        if most is None
-        else f"must be a whole number from {least} to {most}"
-    )
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ValueError(f"{name} = {value!r}: {rule}")
-    if value < least or (most is not None and value > most):
-        raise ValueError(f"{name} = {value!r}: {rule}")
+    is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_whole or value < least or (most is not None and value > most):
+        range_ = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name} = {value!r}: must be a whole number {range_}")
     return int(value)
 
 
@@ -88,7 +79,8 @@ def interval(low_name: str, low: Any, high_name: str, high: Any) -> tuple[float,
     low_value, high_value = _number(low_name, low), _number(high_name, high)
     if not low_value < high_value:
         raise ValueError(
-            f"{low_name} = {low!r}, {high_name} = {high!r}: {low_name} must be less than {high_name}"
+            f"{low_name} = {low!r}, {high_name} = {high!r}: "
+            f"{low_name} must be less than {high_name}"
         )
     return low_value, high_value
 
@@ -97,7 +89,7 @@ def samples(name: str, value: Any, dt: float) -> int:
     """Return the time ``value`` [s] as a whole number of samples of ``dt`` [s]."""
     time = non_negative(name, value, "s")
     count = round(time / dt)
-    if abs(time / dt - count) > 1e-6:
+    if abs(time / dt - count) > 1e-6:  # far above rounding errors; chosen by hand
         below = math.floor(time / dt)
         raise ValueError(
             f"{name} = {value!r} s with dt = {dt!r} s: must be a whole number of samples; "
@@ -107,7 +99,7 @@ def samples(name: str, value: Any, dt: float) -> int:
 
 
 def vector(name: str, value: Any, size: int | None = None) -> Vector:
-    """Return ``value`` as a finite, contiguous float vector, of ``size`` entries where that is given."""
+    """Return ``value`` as a finite, contiguous float vector, of ``size`` entries if given."""
     array = _array(name, value)
     if array.ndim == 0:
         array = array.reshape(1)
@@ -134,21 +126,21 @@ def around_one(name: str, value: Any) -> tuple[float, float]:
 
 
 def matrix(name: str, value: Any, rows: int | None = None, columns: int | None = None) -> Matrix:
-    """Return ``value`` as a finite, contiguous float matrix of the shape asked for."""
+    """Return ``value`` as a finite, contiguous float matrix, with so many rows and columns."""
     array = _array(name, value)
-    wanted = f"({'any' if rows is None else rows}, {'any' if columns is None else columns})"
-    if (
-        array.ndim != 2
-        or (rows is not None and array.shape[0] != rows)
-        or (columns is not None and array.shape[1] != columns)
+    wanted = (rows, columns)
+    if array.ndim != 2 or any(
+        w is not None and size != w for size, w in zip(array.shape, wanted, strict=True)
     ):
-        raise ValueError(f"{name} has shape {array.shape}: must be a matrix of shape {wanted}")
+        shape = ", ".join("any" if w is None else str(w) for w in wanted)
+        raise ValueError(f"{name} has shape {array.shape}: must be a matrix of shape ({shape})")
     return array
 
 
 def weight(name: str, value: Any, size: int) -> Matrix:
     """Return ``value`` as a symmetric matrix (size, size) without negative eigenvalues."""
     array = matrix(name, value, size, size)
+    # Both tolerances are far above rounding errors; chosen by hand.
     if not np.allclose(array, array.T, rtol=1e-9, atol=0.0):
         raise ValueError(f"{name}: must be symmetric")
     least, most = np.linalg.eigvalsh(array)[[0, -1]].tolist()
@@ -177,12 +169,10 @@ def _array(name: str, value: Any) -> Vector:
     try:
         array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):
-        raise ValueError(
-            f"{name}: must be an array of numbers, got {type(value).__name__}"
-        ) from None
+        got = type(value).__name__
+        raise ValueError(f"{name}: must be an array of numbers, got {got}") from None
     if not np.all(np.isfinite(array)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(
-            f"{name}: entry {where} is {float(array[where])!r}; every entry must be finite"
-        )
+        entry = float(array[where])
+        raise ValueError(f"{name}: entry {where} is {entry!r}; every entry must be finite")
     return array

@@ -14,18 +14,18 @@ from typing import Any
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check that ``written_atomically`` will be able to write ``path``, and leave what is there alone.
+    """Check that ``written_atomically`` can write ``path``; a file there is not changed.
 
     Raises
     ------
     ValueError
-        where the folder of ``path`` does not exist or can't be written to, or ``path`` is a folder.
+        if the folder of ``path`` does not exist or can't be written to, or ``path`` is a folder.
     """
-    _part_of(Path(path)).unlink()
+    _new_file_beside(Path(path)).unlink()
 
 
 def check_new_file(path: Path) -> None:
-    """Check that a recording can be begun at ``path``.
+    """Check that a recording can be written to ``path``.
 
     Raises
     ------
@@ -34,14 +34,15 @@ def check_new_file(path: Path) -> None:
     """
     if path.exists() and not path.is_dir():
         raise ValueError(
-            f"path = {str(path)!r}: the file exists; recordings are not overwritten: move it, or choose another name"
+            f"path = {str(path)!r}: the file exists; recordings are not overwritten: "
+            "move it, or choose another name"
         )
     check_writable(path)
 
 
 @contextmanager
 def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a path beside ``path`` to write to; put it in the place of ``path`` at the end, or remove it where something failed.
+    """Yield a path to write to; at the end it replaces ``path``, or is removed after an error.
 
     Raises
     ------
@@ -49,7 +50,7 @@ def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
         as ``check_writable``.
     """
     target = Path(path)
-    part = _part_of(target)
+    part = _new_file_beside(target)
     try:
         yield part
         part.replace(target)
@@ -66,36 +67,43 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
         as ``check_writable``, and for a number that is not finite.
     """
     with written_atomically(path) as part:
-        part.write_text(
-            json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n",
-            encoding="utf-8",
-        )
+        text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
+        part.write_text(text + "\n", encoding="utf-8")
 
 
 def read_text(path: str | os.PathLike[str], where: str) -> str:
-    """Return a text file's content; a ``ValueError`` that begins with ``where`` says why it can't be read."""
+    """Return a text file's content.
+
+    Raises
+    ------
+    ValueError
+        if it can't be read; the message begins with ``where``.
+    """
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(
-            f"{where}: can't be read as a text file ({getattr(error, 'strerror', None) or 'not UTF-8'})"
-        ) from None
+        reason = getattr(error, "strerror", None) or "not UTF-8"
+        raise ValueError(f"{where}: can't be read as a text file ({reason})") from None
 
 
-def csv_rows(text: str, where: str, between: str = ",") -> list[tuple[int, list[str]]]:
-    """Return number and stripped cells of each line that is not empty; a ``ValueError`` that begins with ``where`` where it is no CSV."""
+def csv_rows(text: str, where: str, delimiter: str = ",") -> list[tuple[int, list[str]]]:
+    """Return number and stripped cells of each line that is not empty.
+
+    Raises
+    ------
+    ValueError
+        if it is no CSV; the message begins with ``where``.
+    """
+    lines = csv.reader(text.splitlines(), delimiter=delimiter)
     try:
-        rows = [
-            (number, [cell.strip() for cell in row])
-            for number, row in enumerate(csv.reader(text.splitlines(), delimiter=between), 1)
-        ]
+        rows = [(number, [cell.strip() for cell in row]) for number, row in enumerate(lines, 1)]
     except csv.Error as error:
         raise ValueError(f"{where}: is no CSV file ({error})") from None
     return [(number, row) for number, row in rows if any(row)]
 
 
 def nonfinite_to_none(value: Any) -> Any:
-    """Return a value for ``write_json``: None in the place of each number that is not finite, lists in that of tuples."""
+    """Return a value for ``write_json``: non-finite numbers become None, and tuples lists."""
     if isinstance(value, dict):
         return {key: nonfinite_to_none(part) for key, part in value.items()}
     if isinstance(value, tuple | list):
@@ -103,7 +111,7 @@ def nonfinite_to_none(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _part_of(target: Path) -> Path:
+def _new_file_beside(target: Path) -> Path:
     if not target.parent.is_dir():
         raise ValueError(f"path = {str(target)!r}: the folder {str(target.parent)!r} must exist")
     if target.is_dir():

@@ -18,5 +18,6 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
-            f"{purpose} needs {module}, which can't be imported ({error}): pip install 'quell[{extra}]'"
+            f"{purpose} needs {module}, which can't be imported ({error}): "
+            f"pip install 'quell[{extra}]'"
         ) from error

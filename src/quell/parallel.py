@@ -1,4 +1,4 @@
-"""Independent simulations on all cores."""
+"""Independent jobs on all cores."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
-_LIMITING = threading.Lock()
+R = TypeVar("R")
+_BLAS_LOCK = threading.Lock()
 
 
 def in_parallel(
-    jobs: Iterable[Callable[[], Any]],
+    jobs: Iterable[Callable[[], R]],
     progress: Callable[[float], None] | None = None,
     workers: int | None = None,
-) -> list[Any]:
-    """Run jobs on all cores, or in so many threads, and return their results in order; compiled loops release the interpreter.
+) -> list[R]:
+    """Run jobs in ``workers`` threads, by default one a core; return their results in order.
 
-    ``progress`` is called with the share that is done. Where a job fails, or the run is
-    interrupted, those not yet begun are dropped.
+    Compiled loops release the interpreter lock. ``progress`` is called with the share done. If a
+    job fails or the run is interrupted, jobs that have not begun are dropped.
     """
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         futures = [pool.submit(job) for job in jobs]
@@ -38,14 +39,13 @@ def in_parallel(
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Around many operations on small matrices: keep BLAS from starting threads for them.
+    """Make BLAS use one thread, for many operations on small matrices.
 
-    OpenBLAS splits even the solution of seven equations between its threads, and where another
-    program has a core, each call then waits for the operating system: ten milliseconds instead of
-    ten microseconds.
+    OpenBLAS divides even the solution of seven equations among its threads. If another program uses
+    a core, each call then waits for the operating system: ten milliseconds, not ten microseconds.
     """
-    # What is set holds for the whole process, so two at a time could restore each other's setting.
-    with _LIMITING, _blas().limit(limits=1, user_api="blas"):
+    # The setting holds for the whole process: two at a time could restore each other's.
+    with _BLAS_LOCK, _blas().limit(limits=1, user_api="blas"):
         yield
 
 

@@ -1,4 +1,4 @@
-"""Array aliases, the status that a step or a run reports, and the warning for unwise designs."""
+"""Aliases of types, the status of a step or a run, and the warning for unwise designs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Matrix: TypeAlias = NDArray[np.float64]
 """Two-dimensional, C-contiguous, float64."""
 
 Progress: TypeAlias = Callable[[str, float], None]
-"""Called with the name of the present part of the work and the share of it that is done, from 0 to 1."""
+"""Called with the name of the present part of the work and the share of it done, 0 to 1."""
 
 
 class DesignWarning(UserWarning):
@@ -24,10 +24,7 @@ class DesignWarning(UserWarning):
 
 
 class Status(IntFlag):
-    """What a controller's last step, or a run as a whole, has to report; flags add up.
-
-    ``OK`` is zero. ``message`` says in words what happened and what to do.
-    """
+    """Flags of a controller's last step, or of all steps of a run; ``OK`` is zero."""
 
     OK = 0
     MEASUREMENT_HELD = 1
@@ -42,22 +39,43 @@ class Status(IntFlag):
 
     @property
     def message(self) -> str:
-        """All that is reported, as sentences."""
+        """A sentence for each flag: what happened and what to do."""
         return " ".join(text for flag, text in _MESSAGES.items() if flag in self) or "All is well."
 
 
 _MESSAGES = {
-    Status.MEASUREMENT_HELD: "The measurement was not finite; the expected or the last good one was used instead: look at the sensor.",
-    Status.REFERENCE_HELD: "The reference was not finite; the last good one was used instead: look at its source.",
-    Status.SATURATED: "The control signal lies on u_min or u_max; the observer was told the applied value.",
-    Status.RATE_LIMITED: "The control signal moves as fast as rate_limit allows; the observer was told the applied value.",
-    Status.OVERFLOWED: "The observer or the learner left the range of numbers and was started afresh: "
-    "lower the learning rate, omega_o or omega_c, or check b0.",
-    Status.LEARNER_CUT: "The learner's output was not a number; the guard cut it off and it began anew: look at the learner.",
-    Status.DIVERGED: "The loop diverged and the run ended early: check the sign and size of b0, lower omega_c or omega_o, "
-    "or the learning rate.",
-    Status.LEARNER_LATE: "The learner took longer than its budget and the loop went on with its last prediction: "
-    "raise budget or period, or take a smaller model.",
-    Status.LEARNER_FAILED: "The learner raised an error or returned no finite number and was not listened to; a warning said why, "
-    "and last_problem of the learner keeps it: mend the model or lower its learning rate.",
+    Status.MEASUREMENT_HELD: (
+        "The measurement was not finite; the expected or the last good one was used instead: "
+        "check the sensor."
+    ),
+    Status.REFERENCE_HELD: (
+        "The reference was not finite; the last good one was used instead: check its source."
+    ),
+    Status.SATURATED: (
+        "The control signal is at u_min or u_max; the observer got the applied value."
+    ),
+    Status.RATE_LIMITED: (
+        "The control signal moves as fast as rate_limit allows; the observer got the applied value."
+    ),
+    Status.OVERFLOWED: (
+        "The observer or the learner overflowed and was reset: lower the learning rate, omega_o or "
+        "omega_c, or check b0."
+    ),
+    Status.LEARNER_CUT: (
+        "The learner's output was not finite; the guard cut it off and the learner started anew: "
+        "check the learner."
+    ),
+    Status.DIVERGED: (
+        "The loop diverged and the run ended early: check the sign and size of b0, lower omega_c "
+        "or omega_o, or the learning rate."
+    ),
+    Status.LEARNER_LATE: (
+        "The learner took longer than its budget and the loop went on with its last prediction: "
+        "raise budget or period, or take a smaller model."
+    ),
+    Status.LEARNER_FAILED: (
+        "The learner raised an error or returned no finite number and was ignored; a warning gave "
+        "the reason, and last_problem of the learner has it: correct the model or lower its "
+        "learning rate."
+    ),
 }

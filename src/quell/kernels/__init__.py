@@ -1,4 +1,4 @@
-"""Compilation: generic functions over NamedTuples, compiled by Numba and interpreted alike.
+"""Compilation by Numba: generic functions over NamedTuples, disk cache, user-defined functions.
 
-May import nothing else of quell. Kernels of other folders use it.
+May import ``types`` only. Kernels of all other folders use it.
 """

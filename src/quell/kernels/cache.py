@@ -65,7 +65,7 @@ def cache_path() -> Path | None:
 
 
 def cache_key(package: Path) -> str:
-    """Return the hash of Numba's version and of the sources that compiled code of ``package`` can depend on."""
+    """Return a hash of Numba's version and of the sources that compiled code can depend on."""
     digest = hashlib.sha256(numba.__version__.encode())
     for module, source in sorted(kernel_sources(package).items()):
         digest.update(module.encode() + b"\0" + source + b"\0")

@@ -34,7 +34,7 @@ R_co = TypeVar("R_co", covariant=True)
 
 
 class Generic(Protocol[P, R_co]):
-    """A generic function: called as declared, with one implementation for each type of its first argument."""
+    """A function with one implementation for each type of its first argument."""
 
     __name__: str
     implementations: dict[type, Callable[..., Any]]
@@ -120,7 +120,7 @@ def is_finite(value: float) -> bool:
 
 
 def compiled(function: F) -> F:
-    """Compile an entry point for the types it is called with; it releases the interpreter while it runs.
+    """Compile an entry point for the types it is called with; it runs without the interpreter lock.
 
     Reference counting is switched off: it would cost more than the arithmetic, and without it Numba
     refuses to compile code that allocates memory, which proves that kernels allocate none.
@@ -131,7 +131,7 @@ def compiled(function: F) -> F:
 def compiled_call(function: F) -> F:
     """Compile an entry point for single calls from Python with a ``structref`` argument.
 
-    It counts references and keeps the interpreter.
+    It counts references and keeps the interpreter lock.
     """
     return _dispatcher(function)
 
@@ -146,7 +146,7 @@ def dispatcher_for(entry: Any, *arguments: Any) -> Any:
 
 
 def compilations(entry: Any) -> int:
-    """Return how many times an entry point was compiled in this process, not loaded from the disk."""
+    """Return how often an entry point was compiled in this process, not loaded from the disk."""
     return int(sum(entry.stats.cache_misses.values()))
 
 
@@ -156,7 +156,7 @@ def interpreted(function: Any) -> Any:
 
 
 def _dispatcher(function: Any, **options: Any) -> Any:
-    """Return a dispatcher with a disk cache if possible; its attribute ``uncached`` is one without."""
+    """Return a dispatcher with a disk cache if possible; its ``uncached`` is one without."""
     options |= OPTIONS
     dispatcher = numba.njit(function, **options)
     dispatcher.uncached = dispatcher

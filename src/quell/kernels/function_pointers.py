@@ -1,9 +1,9 @@
-"""Functions of the user's own, called by address.
+"""User-defined functions that kernels call by address.
 
-A user's function is compiled by Numba on its own, and parameters hold its address: one driver is
-compiled for all such functions, and kept on disk. ``call`` and ``evaluate`` jump to an address from
-compiled code, and do the same by ``ctypes`` from Python. Whoever holds an address must keep the
-compiled function as long; addresses mean nothing in another process.
+A user's function is compiled by Numba on its own, and parameters have its address: so one driver is
+compiled for all such functions and cached on disk. ``call`` and ``evaluate`` jump to an address
+from compiled code, and use ``ctypes`` from Python. Keep a reference to the compiled function as
+long as its address is in use; addresses are not valid in another process.
 """
 
 from __future__ import annotations
@@ -22,54 +22,46 @@ POINTER = nb_types.CPointer(nb_types.float64)
 
 
 def call(address: int, *arguments: Any) -> None:
-    """Call the function at ``address`` with whole numbers (int64), numbers (float64), and arrays by pointer.
+    """Call the function at ``address``.
 
-    From compiled code this is a plain jump.
+    Integers are passed as int64, other numbers as float64, arrays by pointer.
     """
-    _through_ctypes(None, address, arguments)
+    _call_by_ctypes(None, address, arguments)
 
 
 def evaluate(address: int, *arguments: Any) -> float:
-    """Do what ``call`` does with a function that returns a number, and return that."""
-    return float(_through_ctypes(ctypes.c_double, address, arguments))
+    """Call the function at ``address`` as ``call`` does and return its result, a float64."""
+    return float(_call_by_ctypes(ctypes.c_double, address, arguments))
 
 
-def _through_ctypes(returns: Any, address: int, arguments: tuple[Any, ...]) -> Any:
-    kinds = [_kind(argument) for argument in arguments]
-    passed = [
-        argument.ctypes.data if isinstance(argument, np.ndarray) else argument
-        for argument in arguments
-    ]
-    return ctypes.CFUNCTYPE(returns, *kinds)(address)(*passed)
+def _call_by_ctypes(result_type: Any, address: int, arguments: tuple[Any, ...]) -> Any:
+    types: list[Any] = []
+    values = []
+    for argument in arguments:
+        is_array = isinstance(argument, np.ndarray)
+        number = ctypes.c_int64 if isinstance(argument, int | np.integer) else ctypes.c_double
+        types.append(ctypes.c_void_p if is_array else number)
+        values.append(argument.ctypes.data if is_array else argument)
+    return ctypes.CFUNCTYPE(result_type, *types)(address)(*values)
 
 
-def _kind(argument: Any) -> Any:
-    if isinstance(argument, np.ndarray):
-        return ctypes.c_void_p
-    return ctypes.c_int64 if isinstance(argument, int | np.integer) else ctypes.c_double
-
-
-def _jump(address: Any, arguments: Any, returns: Any) -> Any:
-    """Return signature and code generator of a jump to an address."""
+def _jump(address: Any, arguments: Any, result_type: Any) -> Any:
+    """Return signature and code generator of a call of an address."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         target, packed = values
         passed = []
         for i, kind in enumerate(arguments):
             value = builder.extract_value(packed, i)
-            passed.append(
-                context.make_array(kind)(context, builder, value).data
-                if isinstance(kind, nb_types.Array)
-                else value
-            )
-        result = ir.VoidType() if returns is nb_types.none else ir.DoubleType()
-        function = builder.inttoptr(
-            target, ir.FunctionType(result, [value.type for value in passed]).as_pointer()
-        )
-        called = builder.call(function, passed)
-        return context.get_dummy_value() if returns is nb_types.none else called
+            if isinstance(kind, nb_types.Array):
+                value = context.make_array(kind)(context, builder, value).data
+            passed.append(value)
+        result = ir.VoidType() if result_type is nb_types.none else ir.DoubleType()
+        function_type = ir.FunctionType(result, [value.type for value in passed])
+        called = builder.call(builder.inttoptr(target, function_type.as_pointer()), passed)
+        return context.get_dummy_value() if result_type is nb_types.none else called
 
-    return returns(address, arguments), generate
+    return result_type(address, arguments), generate
 
 
 @intrinsic
@@ -93,20 +85,19 @@ def _compiled_evaluate(address: Any, *arguments: Any) -> Any:
 
 
 class NotCompilableError(Exception):
-    """Numba can't compile a user's function; the message says why, in a line."""
+    """Numba can't compile a user's function; the message gives the reason in one line."""
 
 
 def jit_user_function(function: Callable[..., Any]) -> Any:
-    """Return a user's function for use inside of one given to ``compile_cfunc``.
+    """Return a user's function for calls from a function that is passed to ``compile_cfunc``.
 
     Raises
     ------
     NotCompilableError
-        where it is no plain function: a bound method, a callable object.
+        if it is not a plain function but, for example, a bound method or a callable object.
     """
     try:
-        # Division by zero gives inf, as in numpy: an exception could not leave compiled code from
-        # here.
+        # Division by zero gives inf, as in numpy: an exception can't leave compiled code from here.
         return numba.njit(getattr(function, "py_func", function), error_model="numpy")
     except TypeError as error:
         raise NotCompilableError(str(error)) from error
@@ -118,10 +109,10 @@ def compile_cfunc(signature: Any, function: Callable[..., Any]) -> Any:
     Raises
     ------
     NotCompilableError
-        where Numba can't compile it.
+        if Numba can't compile it.
     """
     try:
         return numba.cfunc(signature)(function)
-    except Exception as error:  # whatever Numba makes of it
+    except Exception as error:  # compilation can raise anything
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise NotCompilableError(" ".join(lines[:2])) from error

@@ -1,11 +1,11 @@
-"""Kernels are linked into what calls them, and made machine code there only.
+"""Faster compilation: kernels become machine code only in the entry points they are linked into.
 
-Left to itself, Numba takes every function it meets through all of LLVM: what it calls is inlined,
-the whole optimised twice, made machine code and wrapped for calls from C. A kernel is called by
-compiled code alone and always inlined, so a loop was optimised again at each level of its calls,
-for code that nobody runs. Here a kernel gets the passes over one function at a time, which keep its
-code small, and the rest is left to the entry point it ends up in. This halves the time a loop takes
-to compile; the loop is as fast.
+By default Numba takes every function through all of LLVM: what it calls is inlined, the whole is
+optimised twice, made machine code and wrapped for calls from C. Kernels are called by compiled code
+only and always inlined, so each loop was optimised again at each level of its calls, for code that
+nobody runs. Here a kernel gets only the passes over single functions, which keep its code small;
+the entry point gets the rest. This halves the compile time of a loop; the loop is as fast as
+before.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import AnnotateTypes
 
-# What Numba calls the variables that point to a function's environment: what its ``print`` makes
-# Python objects with.
+# Prefix of Numba's variables that point to a function's environment, which ``print`` needs.
 _ENVIRONMENT = "_ZN08NumbaEnv"
 
 
@@ -30,10 +29,10 @@ class KernelLibrary(JITCodeLibrary):
     """The code of a kernel, to be linked into other code."""
 
     def _optimize_final_module(self) -> None:
-        """Leave it to the entry point."""
+        """Do nothing: the entry point is optimised as a whole."""
 
     def _finalize_final_module(self) -> None:
-        """Give the engine nothing but the variables that Numba sets once for a function, wherever that is linked into."""
+        """Add only the environment variables to the engine: Numba sets each of them once."""
         variables = self._codegen._create_empty_module(f"{self.name}.variables")
         pointer = ir.IntType(8).as_pointer()
         for variable in self._final_module.global_variables:
@@ -47,14 +46,14 @@ class KernelLibrary(JITCodeLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return zero, which is to say that Python can not call it."""
+        """Return zero: Python can not call a kernel."""
         self._ensure_finalized()
         return 0
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)
-class _ToLibrary(AnalysisPass):
-    _name = "kernel_to_library"
+class _UseKernelLibrary(AnalysisPass):
+    _name = "use_kernel_library"
 
     def __init__(self) -> None:
         AnalysisPass.__init__(self)
@@ -65,22 +64,21 @@ class _ToLibrary(AnalysisPass):
 
 
 class KernelCompiler(CompilerBase):
-    """Numba's compiler, with another place for the code."""
+    """Numba's compiler, writing to a ``KernelLibrary``."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return Numba's passes, with the place chosen before code is made."""
+        """Return Numba's passes, with the library replaced before code generation."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(_ToLibrary, AnnotateTypes)
+        passes.add_pass_after(_UseKernelLibrary, AnnotateTypes)
         passes.finalize()
         return [passes]
 
 
-# For ``overload`` and ``register_jitable``. What this stands on is no promise of Numba's: with
-# versions that it was not tried with, kernels take Numba's own way, which gives the same code and
-# takes twice as long.
-_TRIED = ("0.68.",)
+# Options for ``overload`` and ``register_jitable``. They depend on internals of Numba: with
+# versions that were not tested, kernels are compiled in Numba's own way, which takes twice as long.
+_TESTED_VERSIONS = ("0.68.",)
 KERNEL_OPTIONS: dict[str, Any] = (
     {"no_cfunc_wrapper": True, "pipeline_class": KernelCompiler}
-    if numba.__version__.startswith(_TRIED)
+    if numba.__version__.startswith(_TESTED_VERSIONS)
     else {}
 )

@@ -25,13 +25,13 @@ def add_user_type(cls: type) -> None:
 
 
 def set_display_name(cls: type, name: str) -> None:
-    """Use ``name`` for a user's type in messages: that of the class that makes it, which users know."""
+    """Use ``name`` for a user's type in messages: users know the class that makes it better."""
     if cls in _USER_TYPES:
         _USER_TYPES[cls] = name
 
 
 def uses_user_types(value: Any) -> bool:
-    """Return whether ``value``, or an entry of the tuple ``value`` at any depth, is of a user's type."""
+    """Return whether ``value``, or an entry of a tuple at any depth, is of a user's type."""
     if not _USER_TYPES:
         return False
     return type(value) in _USER_TYPES or (
@@ -70,7 +70,7 @@ def _explanation(text: str) -> str:
     return (
         f"{names[calls[-1][2]]}.{calls[-1][1]} (for {calls[-1][2]}) "
         f"{'allocates memory' if allocates else 'can not be compiled'} "
-        f"({reason.removesuffix(' found for signature:')}): use loops over numbers and arrays that are "
-        "there from the start, as fields of the memory; no new arrays, no lists, no slices that are "
-        "assigned to. simulate(..., interpret=True) runs it as Python"
+        f"({reason.removesuffix(' found for signature:')}): use loops over numbers and arrays that "
+        "are there from the start, as fields of the memory; no new arrays, no lists, no slices "
+        "that are assigned to. simulate(..., interpret=True) runs it as Python"
     )

@@ -1,7 +1,7 @@
-"""Trying what a user has written, interpreted and on a fresh memory, so that mistakes are named before anything is compiled.
+"""Trial of user-defined functions, interpreted, so that mistakes are reported before compilation.
 
-Each error names the user's class and the rule. What belongs to this package is not tried: its tests
-do that.
+Each error names the user's class and the rule. Classes of this package are not tried: they have
+tests.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ import numpy as np
 
 from quell.kernels.dispatch import Generic
 from quell.kernels.user_types import set_display_name
+from quell.types import Vector
 
 UNKNOWN = object()
-"""What a function returns is not known: numbers decide, and those of the trial were no good ones."""
+"""A function's result is not known, because it fails for the numbers of the trial."""
 
 
 def is_user_defined(thing: Any) -> bool:
@@ -24,7 +25,7 @@ def is_user_defined(thing: Any) -> bool:
 
 
 def attempt(what: str, rule: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return what ``function`` returns; an error becomes a ``ValueError`` with ``what`` failed and the ``rule``."""
+    """Return the result of ``function``; its errors become a ``ValueError`` with the ``rule``."""
     try:
         with np.errstate(all="ignore"):
             return function(*arguments)
@@ -33,7 +34,10 @@ def attempt(what: str, rule: str, function: Callable[..., Any], *arguments: Any)
 
 
 def attempt_kernel(what: str, rule: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Do what ``attempt`` does; ``UNKNOWN`` where there is a division by zero and the like, which gives inf or NaN once it is compiled."""
+    """Do the same as ``attempt``, but return ``UNKNOWN`` after an arithmetic error.
+
+    A division by zero, for example, is no error in compiled code: it gives inf or NaN.
+    """
     try:
         return attempt(what, rule, function, *arguments)
     except ValueError as error:
@@ -43,54 +47,51 @@ def attempt_kernel(what: str, rule: str, function: Callable[..., Any], *argument
 
 
 def check_registered(name: str, parameters: Any, *functions: Generic[Any, Any]) -> None:
-    """Say which of these generic functions have nothing registered for the type of ``parameters``, which belongs to ``name``."""
+    """Raise a ``ValueError`` if a function is not registered for the ``parameters`` of ``name``."""
     cls = type(parameters)
     set_display_name(cls, name)
-    missing = [
-        f.__name__
-        for f in functions
-        if cls not in f.implementations and object not in f.implementations
-    ]
+    missing = [f.__name__ for f in functions if not {cls, object} & f.implementations.keys()]
     if missing:
         rules = ", ".join(f"@{function}.register({cls.__name__})" for function in missing)
         raise ValueError(
-            f"{name}: nothing is registered for {', '.join(missing)} and its parameters {cls.__name__}; write it under {rules}"
+            f"{name}: nothing is registered for {', '.join(missing)} and its parameters "
+            f"{cls.__name__}; write it under {rules}"
         )
 
 
-def check_named_tuple(what: str, value: Any, of: str) -> Any:
-    """Return ``value`` if it is a NamedTuple; ``of`` says what of."""
+def check_named_tuple(what: str, value: Any, of: str) -> None:
+    """Raise a ``ValueError`` if ``value`` is not a NamedTuple; ``of`` describes its fields."""
     if not (isinstance(value, tuple) and hasattr(value, "_fields")):
         raise ValueError(f"{what} returns {type(value).__name__}: must return a NamedTuple of {of}")
-    return value
 
 
 def check_arrays(what: str, memory: Any, nested: bool) -> None:
-    """Say which field of a NamedTuple is no array of numbers; NamedTuples may stand among them where ``nested``."""
+    """Raise a ``ValueError`` if a field of a NamedTuple is not an array of numbers.
+
+    If ``nested``, arrays must be of floats, and NamedTuples of such arrays are allowed too.
+    """
     check_named_tuple(what, memory, "arrays")
     for name, value in zip(memory._fields, memory, strict=True):
         if nested and isinstance(value, tuple):
             check_arrays(f"{what}.{name}", value, nested)
-        elif not (
-            isinstance(value, np.ndarray) and value.dtype.kind in ("f" if nested else "fiub")
-        ):
-            kind = (
-                f"array of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
-            )
+            continue
+        is_array = isinstance(value, np.ndarray)
+        if not is_array or value.dtype.kind not in ("f" if nested else "fiub"):
+            kind = f"array of {value.dtype}" if is_array else type(value).__name__
             raise ValueError(
-                f"{what} has {name}, {kind}: all of its fields must be arrays of float64, one number in an array (1,)"
+                f"{what} has {name}, {kind}: all of its fields must be arrays of float64, "
+                "one number in an array (1,)"
             )
 
 
 def check_number(what: str, value: Any) -> None:
-    """Say so where a function does not return one number."""
+    """Raise a ``ValueError`` if ``value``, which ``what`` returned, is not one number."""
     if not isinstance(value, int | float | np.integer | np.floating):
-        shape = (
-            f" of shape {np.shape(value)}" if isinstance(value, np.ndarray | tuple | list) else ""
-        )
+        sized = isinstance(value, np.ndarray | tuple | list)
+        shape = f" of shape {np.shape(value)}" if sized else ""
         raise ValueError(f"{what} returns {type(value).__name__}{shape}: must return one number")
 
 
-def sample_values(size: int, start: float = 1.0) -> Any:
-    """Return some numbers within [−1, 1] (size,)."""
+def sample_values(size: int, start: float = 1.0) -> Vector:
+    """Return some numbers in [−1, 1] (size,)."""
     return np.sin(start + np.arange(size))

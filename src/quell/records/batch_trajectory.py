@@ -123,7 +123,7 @@ class BatchTrajectory(Record):
         target: float | None = None,
         band: float = 0.002,
     ) -> dict[str, Vector]:
-        """Return measures of each run in the window ``[start, stop)`` [s], as ``Trajectory.metrics`` does.
+        """Return measures of each run in ``[start, stop)`` [s], as ``Trajectory.metrics`` does.
 
         For a run that diverged within the window, its samples up to there count; see ``diverged``.
         All measures of a run that ended before the window are NaN, and so are those that are

@@ -36,7 +36,7 @@ _DESCRIPTIONS = {
     "lateness": ("wake-up behind the deadline", "s"),
     "step_time": ("from the wake-up until u was written", "s"),
     "mode": ("state of the supervisor", "1"),
-    "events": ("what befell the cycle (quell.realtime.telemetry.channels.Event)", "1"),
+    "events": ("events of the cycle (quell.realtime.telemetry.channels.Event)", "1"),
 }
 
 
@@ -46,12 +46,12 @@ def describe(name: str) -> tuple[str, str]:
 
 
 def is_vector(name: str, width: int) -> bool:
-    """Return whether a channel has an axis for its entries, although it may have only one in this run."""
+    """Return whether a channel has an axis for its entries, be it of length 1."""
     return width > 1 or name in _VECTORS
 
 
 def readable_names(channels: Channels) -> tuple[str, ...]:
-    """Return the names of the channels that can be read: those with columns, and ``f_hat`` if it can be computed."""
+    """Return the names of the channels that have columns, and ``f_hat`` if it can be computed."""
     recorded = tuple(name for name, width in channels if width)
     return (*recorded, "f_hat") if {"f_learned", "f_residual"} <= set(recorded) else recorded
 

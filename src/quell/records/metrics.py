@@ -15,7 +15,7 @@ from quell.types import Vector
 
 
 def overshoot(y: Vector, target: float, initial: float = 0.0) -> float:
-    """Return how far y goes beyond ``target``, as a fraction of the step from ``initial``; 0.0 if it never does."""
+    """Return how far y goes beyond ``target``, as a fraction of the step; 0.0 if it never does."""
     move = checks.nonzero("target - initial", target - initial, "there is no move to overshoot")
     return max(float(np.max((_record(y) - target) / move)), 0.0)
 
@@ -41,7 +41,7 @@ def settling_time(
 
 
 def rise_time(t: Vector, y: Vector, target: float, initial: float = 0.0) -> float:
-    """Return the time from 10 % to 90 % of the step, interpolated [s]; NaN if y does not reach it."""
+    """Return the time from 10 % to 90 % of the step, interpolated [s]; NaN if y stays below."""
     t, y = _pair(t, y)
     done = (y - initial) / checks.nonzero(
         "target - initial", target - initial, "there is no move to rise"

@@ -15,11 +15,7 @@ from quell.types import Vector
 _BANDS = ((100.0, "all", 0.15), (90.0, "90 %", 0.25), (50.0, "50 %", 0.4))
 # About two points for each pixel of a wide figure.
 _POINTS = 2000
-_ESTIMATES = {
-    "f_hat": "estimate of f",
-    "f_learned": "learned share",
-    "f_residual": "residual",
-}
+_ESTIMATES = {"f_hat": "estimate of f", "f_learned": "learned share", "f_residual": "residual"}
 # Reasons for a reduced authority that are marked in the plot of the guard.
 _MARKED = (
     Reason.TOO_LOUD,
@@ -31,7 +27,7 @@ _MARKED = (
 
 
 def thinned(t: Vector, values: Vector, points: int = _POINTS) -> tuple[Vector, Vector]:
-    """Return about ``points`` samples that draw the same line: minimum and maximum of each interval."""
+    """Return about ``points`` samples that draw the same line: the extremes of each interval."""
     interval = t.size // (points // 2)
     if interval < 4:
         return t, values
@@ -58,7 +54,8 @@ def plot_run(run: Record, diverged_at: float | None, axes: Any = None) -> Any:
         axes = _new_axes(4 if guarded else 3, 2.3)
     if np.size(axes) not in (3, 4) or (np.size(axes) == 4 and not guarded):
         raise ValueError(
-            f"axes: must be three matplotlib axes, or four for a run with a guard, got {np.size(axes)}"
+            "axes: must be three matplotlib axes, or four for a run with a guard, "
+            f"got {np.size(axes)}"
         )
     t = run.t
     draw_line(axes[0], t, run["y"], label="y", color="C0")
@@ -81,7 +78,7 @@ def plot_run(run: Record, diverged_at: float | None, axes: Any = None) -> Any:
 
 
 def plot_batch(runs: Record, diverged: NDArray[np.bool_], ended: Vector, axes: Any = None) -> Any:
-    """Draw output and control signal: median and bands of the complete runs, ends of the diverged ones.
+    """Draw output and control signal: median and bands of the runs, ends of diverged ones.
 
     ``diverged`` and ``ended`` [s] have an entry for each run. Returns the axes.
     """

@@ -1,4 +1,4 @@
-"""The common part of the records of one run and of a batch: channels by name, times, NetCDF files."""
+"""Common part of the records of one run and of a batch: channels, times, NetCDF files."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ class Record:
         return slice(first_sample_at(start, step, samples), first_sample_at(stop, step, samples))
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return the record as an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
+        """Return an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
         raise NotImplementedError
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the record to a NetCDF file, whole or not at all; ``load`` or any NetCDF reader opens it."""
+        """Write the record to a NetCDF file, whole or not at all; ``load`` reads it."""
         dataset = self.to_xarray()
         with written_atomically(path) as part:
             dataset.to_netcdf(part, engine="h5netcdf")
@@ -111,7 +111,8 @@ def read_dataset(
         data[name].dims[: len(axes)] != axes for name in data.data_vars
     ):
         raise ValueError(
-            f"{where}: has channels that are not over {' and '.join(axes)}: it was not written by {writer}"
+            f"{where}: has channels that are not over {' and '.join(axes)}: "
+            f"it was not written by {writer}"
         )
     return data
 

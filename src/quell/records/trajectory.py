@@ -150,7 +150,7 @@ class Trajectory(Record):
         )
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw output, control signal, estimates of f and, with a guard, its authority; return the axes.
+        """Draw output, control signal, estimates of f and, with a guard, its authority.
 
         Parameters
         ----------
@@ -162,7 +162,7 @@ class Trajectory(Record):
         return plot_run(self, self.ended if self.diverged else None, axes)
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return the record as an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
+        """Return an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
         attributes = {
             "plant": self.plant,
             "status": int(self.status),
