@@ -1,0 +1,204 @@
+"""Loops analysed: poles, ranges of b, noise, plants of every kind, what can not be analysed."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+import quell as ql
+from quell import analysis
+from quell.analysis.sampled_plant import sampled_plant
+from tests.analysed_loops import PLANT, TRAINING, adrc, chain
+
+
+def test_poles_are_those_of_the_design_where_the_plant_is_its_model() -> None:
+    """There are n at −omega_c and n + 1 at −omega_o, as far as sampling the law allows; u before is a pole at z = 0."""
+    loop = analysis.analyse(chain(2), adrc(2, model=True, dt=1e-4))
+    poles = loop.s_poles[np.isfinite(loop.s_poles)]
+    np.testing.assert_allclose(np.poly(poles), np.poly([-2.0] * 2 + [-12.0] * 3), rtol=2e-3)
+    assert np.min(np.abs(loop.poles)) < 1e-7
+
+
+@pytest.mark.parametrize("plant", [chain(3), ql.plants.two_mass_spring()])
+def test_the_range_of_b_ends_where_a_pole_reaches_the_unit_circle(plant: Any) -> None:
+    """Found from crossings of the negative real axis; found again by bisection on the eigenvalues."""
+    loop = analysis.analyse(plant, adrc(plant.order))
+    b = 1.3 if plant.order == 3 else 1.0  # b0 is 1
+    assert (loop.b_range[0] == 0.0) is (
+        plant.order == 3
+    )  # which is stable without control, the other is not
+    for end, outwards in zip(loop.b_range, (0.01, 100.0), strict=True):
+        if end == 0.0:
+            continue
+        inside, outside = 1.0, outwards
+        for _ in range(60):
+            middle = math.sqrt(inside * outside)
+            eigenvalues = 1.0 + np.linalg.eigvals(loop.closed_loop_matrix(middle))
+            inside, outside = (
+                (middle, outside) if np.all(np.abs(eigenvalues) < 1.0) else (inside, middle)
+            )
+        assert end == pytest.approx(inside * b, rel=1e-7)
+
+
+def test_the_range_of_b_does_not_depend_on_the_gain_that_the_plant_has() -> None:
+    """With zeros neither: b is the gain to the derivative that u reaches first, as b0 is."""
+    num, den = np.array([2.0, 6.0]), [1.0, 0.4, 9.0, 0.0]
+    controller = ql.ADRC(ql.ESO.model_based((num, den), omega_o=40.0, dt=1e-3), omega_c=4.0)
+    once, twice = (analysis.analyse((gain * num, den), controller) for gain in (1.0, 2.0))
+    assert (once.b_over_b0, twice.b_over_b0) == pytest.approx((1.0, 2.0))
+    assert once.b_range == pytest.approx(once.margins.gain)
+    assert twice.b_range == pytest.approx(once.b_range, rel=1e-7)
+    assert "stable for b/b0 from 0.197 to 4.35" in once.summary()
+
+
+def test_where_b_can_not_be_compared_with_b0_the_range_is_in_gains_of_the_plant() -> None:
+    """For a plant that was given sampled, and for one that u reaches later than the controller thinks; and that is what it is called."""
+    plt = importlib.import_module("matplotlib.pyplot")
+    sampled = control.sample_system(control.ss(PLANT.A, PLANT.B, PLANT.C, 0.0), 0.01, method="zoh")
+    later = ([200.0], np.polymul([1.0, 100.0], [1.0, 0.4, 3.0]))
+    for plant in (sampled, later):
+        loop = analysis.analyse(plant, adrc(2))
+        assert loop.b_over_b0 is None
+        assert loop.b_range == loop.margins.gain
+        assert (
+            f"stable for a gain from {loop.b_range[0]:.3g} to {loop.b_range[1]:.3g} times what it is"
+            in loop.summary()
+        )
+        axes = analysis.plot_margins_over_time([0.0], [loop])
+        assert axes[2].get_ylabel() == "gain for which\nit is stable"
+    known = analysis.analyse(PLANT, adrc(2))
+    assert known.b_range == pytest.approx([2.0 * gain for gain in known.margins.gain])
+    assert (
+        analysis.plot_margins_over_time([0.0], [known])[2].get_ylabel()
+        == "b/b0 for which\nit is stable"
+    )
+    plt.close("all")
+
+
+def test_a_fraction_of_a_sample_of_delay_is_exact() -> None:
+    """An integrator that u reaches 1.3 samples late moves by 0.7 dt u(k − 1) + 0.3 dt u(k − 2)."""
+    plant = sampled_plant(([1.0], [1.0, 0.0]), 0.1, delay=0.13)
+    x, y = np.zeros(3), []
+    for k in range(5):
+        y.append(plant.C @ x)
+        x = x + plant.N @ x + plant.B * float(k == 0)
+    np.testing.assert_allclose(np.diff(y), [0.0, 0.07, 0.03, 0.0], atol=1e-15)
+
+
+def test_an_actuator_lag_is_a_part_of_the_plant() -> None:
+    """The same margins come from a plant that has the lag in its transfer function."""
+    controller = adrc(2)
+    told = analysis.analyse(([2.0], [1.0, 0.4, 3.0]), controller, actuator_lag=0.05).margins
+    built_in = analysis.analyse(
+        ([2.0], np.polymul([0.05, 1.0], [1.0, 0.4, 3.0])), controller
+    ).margins
+    np.testing.assert_allclose(np.hstack([*told]), np.hstack([*built_in]), rtol=1e-6)
+
+
+def test_plants_of_every_kind_are_the_same_plant() -> None:
+    """A LinearPlant, a state space, a transfer function, a pair of polynomials, and one sampled by python-control."""
+    model = control.tf([2.0], [1.0, 0.4, 3.0])
+    space = control.ss(PLANT.A, PLANT.B, PLANT.C, 0.0)
+    expected = analysis.analyse(PLANT, adrc(2)).margins
+    for plant in (
+        model,
+        space,
+        ([2.0], [1.0, 0.4, 3.0]),
+        control.sample_system(space, 0.01, method="zoh"),
+    ):
+        found = analysis.analyse(plant, adrc(2)).margins
+        np.testing.assert_allclose(np.hstack([*found]), np.hstack([*expected]), rtol=1e-6)
+
+
+def test_noise_moves_u_as_much_as_is_said(rng: np.random.Generator) -> None:
+    """White noise in each of 200 000 samples, RMS to 1 %; and no sinusoid is amplified more than the peak says."""
+    controller = adrc(2)
+    noise = rng.normal(size=200_001)
+    loop = analysis.analyse(chain(2), controller)
+    scenario = ql.Scenario(
+        noise=ql.signals.Samples(np.arange(noise.size) * 0.01, noise), duration=2000.0
+    )
+    run = ql.simulate(chain(2), controller, scenario)
+    assert np.std(run["u"][1000:]) == pytest.approx(loop.noise_to_control, rel=0.01)
+    omega = np.geomspace(1.0, math.pi / 0.01, 5000)
+    size = np.abs(loop.response("CS", omega))
+    assert np.max(size) == pytest.approx(loop.noise_to_control_peak, rel=1e-4)
+    # The RMS is the mean square over all frequencies, Parseval says.
+    even = np.linspace(0.0, math.pi / 0.01, 20_001)[1:]
+    mean_square = np.mean(np.abs(loop.response("CS", even)) ** 2)
+    assert math.sqrt(mean_square) == pytest.approx(loop.noise_to_control, rel=1e-3)
+
+
+def test_a_prefilter_is_not_in_the_loop() -> None:
+    """What comes before a controller changes none of its margins."""
+    plant, law = ([1.0], [1.0, 1.0, 0.0]), ql.ADRC(ql.ESO.model_free(2, 1.0, 20.0, 0.01), 2.0)
+    behind = ql.controllers.Prefiltered(law, ql.baselines.ZV(3.0))
+    assert ql.analysis.analyse(plant, behind).margins == ql.analysis.analyse(plant, law).margins
+
+
+def test_a_response_at_a_pole_is_refused_by_its_frequency() -> None:
+    """An integrator has none at 0 rad/s."""
+    loop = ql.analysis.analyse(
+        ([1.0], [1.0, 0.0]), ql.ADRC(ql.ESO.model_free(1, 1.0, 20.0, 0.01), 2.0)
+    )
+    with pytest.raises(ValueError, match=r"omega = \[0.0\] rad/s: the response is infinite"):
+        loop.response("P", [0.0])
+
+
+class Python:
+    """A model in Python."""
+
+    def learn(self, features: np.ndarray, targets: np.ndarray) -> None:
+        """Learn nothing."""
+
+    def predict(self, features: np.ndarray) -> float:
+        """Return nothing."""
+        return 0.0
+
+
+def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
+    """By name, value and rule."""
+    controller = adrc(2, learner=ql.learners.MLP(hidden=2))
+    run = ql.simulate(chain(2), controller, TRAINING)
+    pendulum = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - np.sin(x[0])), order=2)
+    outside = adrc(2, learner=ql.learners.PythonModel(Python()))
+    other = ql.simulate(chain(2), adrc(2, learner=ql.learners.Kalman()), TRAINING)
+    for message, call in (
+        ("linearised first", lambda: analysis.analyse(pendulum, adrc(2))),
+        ("biproper", lambda: analysis.analyse(([1.0, 1.0], [1.0, 2.0]), adrc(2))),
+        (
+            "may not follow the input at once",
+            lambda: analysis.analyse(control.ss(-1.0, 1.0, 1.0, 1.0), adrc(2)),
+        ),
+        ("controller's dt", lambda: analysis.analyse(control.ss(0.5, 1.0, 1.0, 0.0, 0.5), adrc(2))),
+        (
+            "whole samples",
+            lambda: analysis.analyse(control.ss(0.5, 1.0, 1.0, 0.0, 0.01), adrc(2), delay=0.005),
+        ),
+        ("at most 200 samples", lambda: analysis.analyse(PLANT, adrc(2), delay=3.0)),
+        ("must be an ADRC", lambda: analysis.analyse(PLANT, "adrc")),
+        (
+            "MLP has no coefficients to record; pass the scenario to loops_over_time,",
+            lambda: analysis.frozen(controller, run, 3.0),
+        ),
+        (
+            "a time of the record",
+            lambda: analysis.frozen(adrc(2, learner=ql.learners.Kalman()), other, 30.0),
+        ),
+        ("a run of this controller", lambda: analysis.frozen(controller, other, 3.0)),
+        ("asked once a period", lambda: analysis.analyse(PLANT, outside)),
+        (
+            "a Trajectory or a Scenario",
+            lambda: analysis.loops_over_time(PLANT, controller, None, [1.0]),
+        ),
+        ("must be one of", lambda: analysis.analyse(PLANT, adrc(2)).response("Q", [1.0])),
+        ("source = 'w2'", lambda: analysis.analyse(PLANT, adrc(2)).system("w2 → y")),
+    ):
+        with pytest.raises(ValueError, match=message) as caught:
+            call()
+        assert "\n" not in str(caught.value)

@@ -1,0 +1,100 @@
+"""Margins, against closed forms, a textbook and python-control."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+import quell as ql
+from quell import analysis
+from quell.controllers.linear.law import LinearLaw
+from tests.analysed_loops import PLANT, adrc, chain
+
+
+def integrator(gain: float, dt: float) -> Any:
+    """Return a controller of proportional action."""
+    nothing = np.zeros(0)
+    return SimpleNamespace(
+        dt=dt, law=LinearLaw(np.zeros((0, 0)), nothing, nothing, nothing, nothing, gain, -gain)
+    )
+
+
+def test_margins_of_an_integrator_are_those_of_the_closed_form() -> None:
+    """``L = K dt/(z − 1)`` has the real part −K dt/2 at all frequencies."""
+    K, dt = 20.0, 0.01
+    m = analysis.analyse(([1.0], [1.0, 0.0]), integrator(K, dt)).margins
+    crossing = 2.0 / dt * math.asin(0.5 * K * dt)
+    assert m.gain == pytest.approx((0.0, 2.0 / (K * dt)), rel=1e-12)
+    assert m.gain_omega[1] == pytest.approx(math.pi / dt)
+    assert m.phase_omega == pytest.approx(crossing, rel=1e-12)
+    assert m.phase == pytest.approx(90.0 - math.degrees(0.5 * crossing * dt), rel=1e-12)
+    assert m.delay == pytest.approx(math.radians(m.phase) / crossing, rel=1e-12)
+    assert m.modulus == pytest.approx(1.0 - 0.5 * K * dt, rel=1e-12)
+    # |S − ½| is largest there too: (1 + 0.1)/(1 − 0.1)/2.
+    assert m.disk == pytest.approx(2.0 * 0.9 / 1.1, rel=1e-12)
+    assert m.disk_gain[1] == pytest.approx(m.gain[1], rel=1e-9)
+
+
+def test_margins_go_to_the_textbook_s_as_sampling_gets_faster() -> None:
+    """``1/(s(s + 1))`` with unit gain: crossover 0.786 rad/s, phase margin 51.83°."""
+    m = analysis.analyse(([1.0], [1.0, 1.0, 0.0]), integrator(1.0, 1e-4)).margins
+    crossing = math.sqrt((math.sqrt(5.0) - 1.0) / 2.0)
+    assert m.phase_omega == pytest.approx(crossing, rel=1e-4)
+    assert m.phase == pytest.approx(90.0 - math.degrees(math.atan(crossing)), rel=1e-4)
+
+
+@pytest.mark.parametrize("plant", [chain(2), chain(4), ql.plants.two_mass_spring()])
+def test_margins_are_those_of_python_control(plant: Any) -> None:
+    """Gain, phase, modulus and disk margin; ours are refined between the points of a grid, so ours are never larger."""
+    controller = adrc(plant.order)
+    loop = analysis.analyse(plant, controller)
+    m, L = loop.margins, loop.system("L")
+    omega = np.geomspace(0.1, 100.0, 4000)
+    data = control.FrequencyResponseData(loop.response("L", omega), omega)
+    gain, phase, modulus, _, at, _ = control.stability_margins(data)
+    assert m.gain[1] == pytest.approx(gain, rel=1e-4)
+    assert (m.phase, m.phase_omega) == pytest.approx((phase, at), rel=1e-4)
+    assert m.modulus == pytest.approx(modulus, rel=1e-4)
+    disk, _, disk_phase = control.disk_margins(L, omega)
+    assert (m.disk, m.disk_phase) == pytest.approx((disk, disk_phase), rel=1e-3)
+    np.testing.assert_allclose(
+        loop.response("L", omega), L(np.exp(1j * omega * loop.dt)), rtol=1e-6
+    )
+
+
+def test_the_summary_says_what_the_disk_margin_allows() -> None:
+    """As a factor of the gain and as an angle: a gain or a phase at its end, on the edge of the disk, keeps the loop stable."""
+    loop = analysis.analyse(PLANT, adrc(2))
+    m = loop.margins
+    said = f"disk margin {m.disk:.3f}: gain {m.disk_gain[0]:.3g} … {m.disk_gain[1]:.3g} or phase ±{m.disk_phase:.1f}°, or some of both"
+    assert said in loop.summary().splitlines()
+    assert m.gain[0] < m.disk_gain[0] < 1.0 < m.disk_gain[1] < m.gain[1]
+    assert 0.0 < m.disk_phase < m.phase
+
+
+def test_a_loop_is_lost_with_the_first_sample_of_delay_beyond_its_delay_margin() -> None:
+    """And with the last before it, it is stable."""
+    controller = adrc(2)
+    samples = analysis.analyse(chain(2), controller).margins.delay / controller.dt
+    assert samples > 3.0
+    for count, stable in ((math.floor(samples), True), (math.ceil(samples), False)):
+        assert analysis.analyse(chain(2), controller, delay=count * controller.dt).stable is stable
+
+
+def test_an_unstable_loop_has_no_margins() -> None:
+    """They are zero, not those of a formula that presumes stability; and it says so."""
+    loop = analysis.analyse(([-1.0], [1.0, 0.0, 0.0]), adrc(2))
+    assert not loop.stable
+    assert (loop.margins.phase, loop.margins.modulus, loop.margins.delay, loop.margins.gain) == (
+        0.0,
+        0.0,
+        0.0,
+        (1.0, 1.0),
+    )
+    assert loop.noise_to_control == math.inf
+    assert "unstable" in repr(loop)
