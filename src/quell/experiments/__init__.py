@@ -1,7 +1,7 @@
 """Published experiments, repeated and judged, and experiments of our own: one folder for each.
 
-A folder has the setting (``setup``: plants, controllers, scenarios), the ``study`` that runs and judges it, and
-its ``figures``; ``common`` has what several of them use. Nothing in here prints.
+A folder has the setting (``setup``: plants, controllers, scenarios), the ``study`` that runs and
+judges it, and its ``figures``; ``common`` has what several of them use. Nothing in here prints.
 """
 
 from quell.experiments import acc, compare, stress, torsional, two_mass_spring

@@ -1,6 +1,7 @@
-"""System identification: a transfer function from measured input and output, and the design of excitations.
+"""System identification: transfer functions from records, and the design of excitations.
 
-``identify`` is the search; ``structure`` has the model and its gradient, ``sampling`` the filters below it.
+``identify`` is the search; ``structure`` has the model and its gradient, ``sampling`` the filters
+below it.
 """
 
 from quell.identification.excitation import Excitation, excitation

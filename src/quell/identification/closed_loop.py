@@ -1,16 +1,18 @@
 """Instrumental variables from an external signal in a closed loop.
 
-In a closed loop u reacts to everything that disturbs y, and a fit takes this correlation for the plant. An external signal r,
-the reference, is not correlated with the disturbances: the part of u and y that follows r alone is free of them. The equation
-of ``initial_estimate``, divided by the model's own A, ``target = R θ + ε``, is projected onto signals Z made of r alone::
+In a closed loop u reacts to everything that disturbs y, and a fit takes this correlation for the
+plant. An external signal r, the reference, is not correlated with the disturbances: the part of u
+and y that follows r alone is free of them. The equation of ``initial_estimate``, divided by the
+model's own A, ``target = R θ + ε``, is projected onto signals Z made of r alone::
 
     R̂ = Z (ZᵀZ)⁻¹ Zᵀ R,       θ = (R̂ᵀ R)⁻¹ R̂ᵀ target,
     cov θ = (R̂ᵀR)⁻¹ (Σ_blocks s sᵀ) (R̂ᵀR)⁻ᵀ,   s = Σ R̂ ε
 
-and again with the resulting A, until θ no longer changes. This is two-stage least squares, the simplest of the refined
-instrumental variables for closed loops (Gilson, Garnier, Young & Van den Hof, *Closed-loop identification*, in Garnier & Wang
-2008, ch. 5; Ljung 1999, sec. 7.6 and 13.5). Z are r and its Laguerre filters at two rates, and the same of 1/A r: the better
-they span the loop's response, the smaller the variance. The estimate has no bias with any Z.
+and again with the resulting A, until θ no longer changes. This is two-stage least squares, the
+simplest of the refined instrumental variables for closed loops (Gilson, Garnier, Young & Van den
+Hof, *Closed-loop identification*, in Garnier & Wang 2008, ch. 5; Ljung 1999, sec. 7.6 and 13.5). Z
+are r and its Laguerre filters at two rates, and the same of 1/A r: the better they span the loop's
+response, the smaller the variance. The estimate has no bias with any Z.
 """
 
 from __future__ import annotations
@@ -25,11 +27,13 @@ from quell.types import Matrix, Vector
 
 # Most rounds, and the relative change of θ that ends them: chosen by hand; not tuned further.
 _ROUNDS, _CONVERGED = 30, 1e-4
-# Number of Laguerre filters at each rate, and the rates relative to the fastest pole: chosen by hand; any are free of bias.
+# Number of Laguerre filters at each rate, and the rates relative to the fastest pole: chosen by
+# hand; any are free of bias.
 _LAGUERRE, _LAGUERRE_RATES = 8, (1.0, 0.2)
 # Least number of blocks for the covariance, as in ``output_error``.
 _BLOCKS = 60
-# Relative singular value that counts as zero: above the rounding of products of nearly dependent signals.
+# Relative singular value that counts as zero: above the rounding of products of nearly dependent
+# signals.
 _RANK = 1e-12
 
 

@@ -21,7 +21,8 @@ KINDS = ("multisine", "prbs", "chirp")
 _BITS = (2, 20)
 # The spectrum of a PRBS, sinc², is 3 dB down at 0.443 of the rate of its values.
 _HALF_POWER = 2.0 * math.pi * 0.443
-# Most lines of a multisine: chosen by hand, as more lines look like one in a plot and have less power each.
+# Most lines of a multisine: chosen by hand, as more lines look like one in a plot and have less
+# power each.
 _LINES = 120
 # Rounds of clipping: chosen by hand; not tuned further.
 _ROUNDS = 400
@@ -60,8 +61,9 @@ class Excitation:
         """Return the design as text."""
         lines = [
             self.details,
-            f"excites {self.band[0]:.4g} to {self.band[1]:.4g} rad/s; crest factor {self.crest:.3f}, "
-            f"RMS {self.rms:.4g}, from {np.min(self.u):.4g} to {np.max(self.u):.4g}",
+            f"excites {self.band[0]:.4g} to {self.band[1]:.4g} rad/s; "
+            f"crest factor {self.crest:.3f}, RMS {self.rms:.4g}, "
+            f"from {np.min(self.u):.4g} to {np.max(self.u):.4g}",
         ]
         return "\n".join([*lines, *(f"NOT: {text}" for text in self.shortcomings)])
 
@@ -96,13 +98,15 @@ def excitation(
     Parameters
     ----------
     kind
-        * ``"multisine"``: up to 120 lines of equal size, logarithmically spread over the band, all with whole numbers of
-          periods, so that a steady response has no leakage. The phases are Schroeder's, improved by repeatedly clipping the
-          peaks and keeping the resulting phases (van der Ouderaa, Schoukens & Renneboog, *IEEE Trans. Instrumentation and
-          Measurement* 37, 1988).
-        * ``"prbs"``: two values, the least crest factor. The upper end of the band determines how long values are held (the
-          spectrum is 3 dB down there), the lower end the length of the register.
-        * ``"chirp"``: a sinusoid that sweeps through the band once, with the same time for each octave.
+        * ``"multisine"``: up to 120 lines of equal size, logarithmically spread over the band, all
+          with whole numbers of periods, so that a steady response has no leakage. The phases are
+          Schroeder's, improved by repeatedly clipping the peaks and keeping the resulting phases
+          (van der Ouderaa, Schoukens & Renneboog, *IEEE Trans. Instrumentation and Measurement* 37,
+          1988).
+        * ``"prbs"``: two values, the least crest factor. The upper end of the band determines how
+          long values are held (the spectrum is 3 dB down there), the lower end the length of the
+          register.
+        * ``"chirp"``: a sinusoid that sweeps once through the band, with equal time per octave.
     band
         lowest and highest frequency [rad/s], the highest below π/dt.
     duration
@@ -110,8 +114,9 @@ def excitation(
     dt
         sample time [s].
     u_min, u_max
-        limits of u, which are reached. With both of the same sign a motor does not turn back: then Coulomb friction is a
-        constant force, and does not disturb the identification (docs/identification).
+        limits of u, which are reached. With both of the same sign a motor does not turn back: then
+        Coulomb friction is a constant force, and does not disturb the identification
+        (docs/identification).
     seed
         start of a PRBS, and phase of the first line of a multisine.
 
@@ -253,7 +258,7 @@ def _multisine(low: float, high: float, count: int, dt: float, seed: int) -> _De
     if lines.size < last - first + 1:
         gap = float(np.max(np.diff(lines))) * base
         short.append(
-            f"lines are up to {gap:.3g} rad/s apart: a resonance narrower than that may lie between; "
+            f"lines are up to {gap:.3g} rad/s apart: a narrower resonance may lie between; "
             "take a PRBS or a narrower band"
         )
     reached = (float(lines[0] * base), float(lines[-1] * base))
@@ -261,7 +266,7 @@ def _multisine(low: float, high: float, count: int, dt: float, seed: int) -> _De
 
 
 def _flattened(lines: NDArray[np.int64], phases: Vector) -> Vector:
-    """Return phases with a lower peak: the best of repeated rounds of clipping and keeping the resulting phases."""
+    """Return phases with a lower peak: the best after rounds of clipping and keeping the phases."""
     from scipy.fft import irfft, next_fast_len, rfft
 
     # Eight samples per period of the highest line show its peaks.

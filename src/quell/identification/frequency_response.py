@@ -29,12 +29,13 @@ def frequency_response(
 ) -> FrequencyResponse:
     """Estimate the frequency response from u to y by averaged spectra, without a model.
 
-    ``Ĝ = S_yu/S_uu`` over half-overlapping segments with a Hann window (Welch, *IEEE Trans. Audio Electroacoustics* 15, 1967).
-    The spectra are those of the differences of u and y, which have the same ratio, and in which the drift of an integrator does
-    not leak over all frequencies. In a closed loop the ratio is biased, as u reacts to the noise in y; with the external signal
-    ``Ĝ = S_yr/S_ur`` is not (Söderström & Stoica, *System Identification*, 1989, sec. 10.3). The relative variance is about
-    ``(1 − γ²)/(2 γ² n)`` for the coherence γ² and n independent averages (Bendat & Piersol, *Random Data*, 4th ed. 2010,
-    sec. 9.2).
+    ``Ĝ = S_yu/S_uu`` over half-overlapping segments with a Hann window (Welch, *IEEE Trans. Audio
+    Electroacoustics* 15, 1967). The spectra are those of the differences of u and y, which have the
+    same ratio, and in which the drift of an integrator does not leak over all frequencies. In a
+    closed loop the ratio is biased, as u reacts to the noise in y; with the external signal ``Ĝ =
+    S_yr/S_ur`` is not (Söderström & Stoica, *System Identification*, 1989, sec. 10.3). The relative
+    variance is about ``(1 − γ²)/(2 γ² n)`` for the coherence γ² and n independent averages (Bendat
+    & Piersol, *Random Data*, 4th ed. 2010, sec. 9.2).
 
     Parameters
     ----------
@@ -45,7 +46,8 @@ def frequency_response(
     reference
         external signal of a closed loop (N,).
     segments
-        number of segments, 2 or more: with more the response is smoother, and resonances are blurred.
+        number of segments, 2 or more: with more the response is smoother, and resonances are
+        blurred.
 
     Returns
     -------

@@ -43,18 +43,20 @@ def identify(
 ) -> Identified:
     """Fit a continuous transfer function to recorded input and output.
 
-    The result is the model of least output error, ``min Σ (y − ŷ)²``, with ŷ simulated from u alone and exact at the samples for
-    a u that is held between them. The search starts at an ARX model in continuous time, found by least squares on filtered
-    signals and freed of bias by refined instrumental variables, and continues with Levenberg and Marquardt's method
-    (``quell.identification``: ``initial_estimate``, ``output_error`` and ``structure`` have equations and sources).
+    The result is the model of least output error, ``min Σ (y − ŷ)²``, with ŷ simulated from u alone
+    and exact at the samples for a u that is held between them. The search starts at an ARX model in
+    continuous time, found by least squares on filtered signals and freed of bias by refined
+    instrumental variables, and continues with Levenberg and Marquardt's method
+    (``quell.identification``: ``initial_estimate``, ``output_error`` and ``structure`` have
+    equations and sources).
 
     Parameters
     ----------
     u
         input of the plant (N,) [u-unit]; held between samples.
     y
-        measured output (N,) [y-unit], each at the time when its u began to act; noise and an encoder's steps are taken as
-        white.
+        measured output (N,) [y-unit], each at the time when its u began to act; noise and an
+        encoder's steps are taken as white.
     dt
         sample time [s].
     order
@@ -62,22 +64,24 @@ def identify(
     zeros
         number of zeros, less than n.
     integrators
-        number of poles at s = 0. By default a pole is set there if it can't be distinguished from s = 0: if it is within three
-        of its standard deviations, or slower than ten times the record; and two poles, if this holds for both at once.
+        number of poles at s = 0. By default a pole is set there if it can't be distinguished from s
+        = 0: if it is within three of its standard deviations, or slower than ten times the record;
+        and two poles, if this holds for both at once.
     delay
-        delay of u [s], a whole number of samples; or the least and the largest, to find the best between them.
+        delay of u [s], a whole number of samples; or the least and the largest, to find the best
+        between them.
     bias
         whether a constant force acts besides u, as an offset of u does.
     friction
-        whether Coulomb friction acts. The sign of the model's own speed is then a second input, with a numerator of its own
-        of degree n − 2.
+        whether Coulomb friction acts. The sign of the model's own speed is then a second input,
+        with a numerator of its own of degree n − 2.
     held_out
         share of the record, its end, that is not used for the fit but for its validation; 0 to 0.9.
     horizon
         number of samples that predictions look ahead.
     reference
-        external signal of a closed loop (N,), if it is known: the model is then fitted to the part of u and y that follows
-        it (see Notes).
+        external signal of a closed loop (N,), if it is known: the model is then fitted to the part
+        of u and y that follows it (see Notes).
 
     Returns
     -------
@@ -86,14 +90,16 @@ def identify(
     Raises
     ------
     ValueError
-        for records that differ in length, are not finite, are too short for the number of parameters or constant; and for an
-        order, a number of zeros, a delay or a share that is out of range.
+        for records that differ in length, are not finite, are too short for the number of
+        parameters or constant; and for an order, a number of zeros, a delay or a share that is out
+        of range.
 
     Notes
     -----
-    *Closed loop.* There u reacts to the noise in y. The output-error fit stays free of bias if the measurement error is white,
-    as an encoder's rounding nearly is (Ljung 1999, th. 8.3 and sec. 13.4), but not with forces on the plant or friction
-    that is not in the model. With ``reference`` the estimate uses only the external signal.
+    *Closed loop.* There u reacts to the noise in y. The output-error fit stays free of bias if the
+    measurement error is white, as an encoder's rounding nearly is (Ljung 1999, th. 8.3 and sec.
+    13.4), but not with forces on the plant or friction that is not in the model. With ``reference``
+    the estimate uses only the external signal.
 
     Examples
     --------
@@ -210,7 +216,8 @@ def _resolution(y: Vector) -> float:
     # The mean of the smallest steps, as the last digits in a file are rounded.
     step = float(np.mean(steps[steps < 1.5 * np.min(steps)]))
     counts = steps[steps < 50.0 * step] / step
-    # Without rounding the smallest difference is unrelated to the others. Thresholds are chosen by hand.
+    # Without rounding the smallest difference is unrelated to the others. Thresholds are chosen by
+    # hand.
     rounded = counts.size > 0.01 * y.size and np.all(np.abs(counts - np.round(counts)) < 0.1)
     return step if rounded else 0.0
 
@@ -229,7 +236,7 @@ def _delays(delay: Any, dt: float) -> tuple[int, int]:
 
 
 def _split(u: Vector, y: Vector, order: int, held_out: float, least: int, least_held: int) -> int:
-    """Return the index of the first held-out sample; ``least`` samples are needed before, ``least_held`` after it."""
+    """Return the index of the first held-out sample, with at least ``least`` samples before it."""
     share = checks.non_negative("held_out", held_out)
     if share > 0.9:
         raise ValueError(
@@ -257,6 +264,7 @@ def _split(u: Vector, y: Vector, order: int, held_out: float, least: int, least_
         if held and np.ptp(value[held_from:]) == 0.0:
             raise ValueError(
                 f"held_out = {held_out!r}: {name} is {value[-1]:g} all through these samples, "
-                "must move to be judged on; hold fewer out, or none, or cut the record where it rests"
+                "must move to be judged on; hold fewer out, or none, "
+                "or cut the record where it rests"
             )
     return held_from

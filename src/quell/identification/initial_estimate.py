@@ -1,18 +1,19 @@
 """Start of the search: least squares on filtered signals, then refined instrumental variables.
 
-Dividing ``A y = B u + …`` by any stable polynomial Λ of degree n gives an equation that is linear in θ, with signals that can
-be computed from samples::
+Dividing ``A y = B u + …`` by any stable polynomial Λ of degree n gives an equation that is linear
+in θ, with signals that can be computed from samples::
 
     p^n/Λ y = −Σ a_i p^i/Λ y + Σ b_i p^i/Λ u + … + Σ d_i p^i/Λ δ
 
-This is an ARX model in continuous time (Young, *Automatica* 17, 1981; Garnier & Wang, *Identification of Continuous-time Models
-from Sampled Data*, 2008, ch. 1). With ``Λ = (p + λ)^n`` it is solved by least squares; noise biases the poles. The *refined*
-method (SRIVC; Young & Jakeman, *Int. J. Control* 31, 1980) takes the A of the last model for Λ, and its noise-free output ŷ
-in place of y in the instruments. The instruments are then the gradient of ŷ, and after convergence noise does not bias θ.
-Several λ are tried, so that nothing has to be known of the plant's speed.
+This is an ARX model in continuous time (Young, *Automatica* 17, 1981; Garnier & Wang,
+*Identification of Continuous-time Models from Sampled Data*, 2008, ch. 1). With ``Λ = (p + λ)^n``
+it is solved by least squares; noise biases the poles. The *refined* method (SRIVC; Young & Jakeman,
+*Int. J. Control* 31, 1980) takes the A of the last model for Λ, and its noise-free output ŷ in
+place of y in the instruments. The instruments are then the gradient of ŷ, and after convergence
+noise does not bias θ. Several λ are tried, so that nothing has to be known of the plant's speed.
 
-This does not find a model with more poles than the plant: 1/Λ^n leaves little of u, and any poles fit the rest. So the model
-with one pole less, and a fast pole added, is tried too.
+This does not find a model with more poles than the plant: 1/Λ^n leaves little of u, and any poles
+fit the rest. So the model with one pole less, and a fast pole added, is tried too.
 """
 
 from __future__ import annotations
@@ -32,21 +33,25 @@ from quell.identification.structure import (
 )
 from quell.types import Matrix, Vector
 
-# Number of λ, log-spaced from 10 per length of the record (at most 0.01 per sample) to 0.5 per sample: chosen by hand.
+# Number of λ, log-spaced from 10 per length of the record (at most 0.01 per sample) to 0.5 per
+# sample: chosen by hand.
 _RATES = 7
-# Share of the output's power that may stay unexplained before lower orders are tried: chosen by hand.
+# Share of the output's power that may stay unexplained before lower orders are tried: chosen by
+# hand.
 _POOR = 1e-3
-# Fast pole that is added to a model of lower order [1/sample]: beyond the π per sample that samples show.
+# Fast pole that is added to a model of lower order [1/sample]: beyond the π per sample that samples
+# show.
 _FAST_POLE = 10.0
-# Rounds of refined instrumental variables, and the least relative gain of one: chosen by hand; not tuned further.
+# Rounds of refined instrumental variables, and the least relative gain of one: chosen by hand; not
+# tuned further.
 _ROUNDS, _GAIN = 8, 1e-3
-# For slow λ, samples are averaged: over this share of the filter's time constant at most, with this number of averages
-# for each parameter at least. Chosen by hand; the result is only a start.
+# For slow λ, samples are averaged: over this share of the filter's time constant at most, with this
+# number of averages for each parameter at least. Chosen by hand; the result is only a start.
 _SHARE, _AVERAGES = 0.1, 100
 
 
 def initial_estimates(structure: Structure, v: Matrix, y: Vector) -> tuple[Vector, ...]:
-    """Return one or more θ near the least output error, for the inputs ``v`` (N, inputs) and the output ``y`` (N,).
+    """Return one or more θ near the least output error, for inputs ``v`` and output ``y``.
 
     If the first leaves much unexplained, those of lower orders with added fast poles follow.
     """
@@ -73,7 +78,7 @@ def initial_estimates(structure: Structure, v: Matrix, y: Vector) -> tuple[Vecto
 
 
 def _with_fast_pole(structure: Structure, lower: Structure, theta: Vector) -> Vector:
-    """Return θ of the model ``lower`` with a fast pole added; coefficients that ``structure`` lacks are left out."""
+    """Return θ of the model ``lower`` with a fast pole added, cut to the terms of ``structure``."""
 
     def times(polynomial: Vector) -> Vector:
         return np.append(0.0, polynomial) + _FAST_POLE * np.append(polynomial, 0.0)
@@ -87,7 +92,7 @@ def _with_fast_pole(structure: Structure, lower: Structure, theta: Vector) -> Ve
 
 
 def stable(structure: Structure, theta: Vector) -> Vector:
-    """Return θ with the unstable poles of A mirrored into the left half plane, so that its output stays finite."""
+    """Return θ with the unstable poles of A mirrored into the left half plane."""
     free = theta[: structure.free]
     if structure.free == 0 or not np.all(np.isfinite(free)):
         return theta
@@ -100,7 +105,7 @@ def stable(structure: Structure, theta: Vector) -> Vector:
 
 
 def _filtered(structure: Structure, v: Matrix, y: Vector, rate: float) -> Vector:
-    """Return θ by least squares with ``Λ = (p + rate)^n``; for a slow rate, from averages over several samples."""
+    """Return θ by least squares with ``Λ = (p + rate)^n``, from averages if the rate is slow."""
     n = structure.order
     every = max(1, min(int(_SHARE / rate), y.size // (_AVERAGES * structure.size)))
     whole = y.size // every * every
@@ -129,7 +134,7 @@ def _refined(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Vecto
 
 
 def _solve(regressors: Matrix, target: Vector, instruments: Matrix | None = None) -> Vector:
-    """Solve ``Zᵀ R θ = Zᵀ target``, with Z = R without instruments; parameters that are not excited become zero."""
+    """Solve ``Zᵀ R θ = Zᵀ target``, Z = R by default; θ that are not excited become zero."""
     Z = regressors if instruments is None else instruments
     with np.errstate(all="ignore"):
         left, right = Z.T @ regressors, Z.T @ target

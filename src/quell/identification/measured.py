@@ -19,7 +19,8 @@ from quell.plants import Plant
 from quell.simulation import Scenario, simulate
 from quell.types import Vector
 
-# Times may be off the grid by this share of a sample: chosen by hand, so that rounded times pass and a gap does not.
+# Times may be off the grid by this share of a sample: chosen by hand, so that rounded times pass
+# and a gap does not.
 _JITTER = 0.2
 # Least number of samples: chosen by hand, ``identify`` asks for more.
 _FEWEST = 8
@@ -39,7 +40,7 @@ class Measured(NamedTuple):
 
 
 def excited(plant: Plant, design: Excitation) -> Measured:
-    """Simulate a plant in open loop, from rest, with a designed excitation as u; return the record for ``identify``.
+    """Return the simulated record of a plant at rest that gets a designed excitation as u.
 
     Raises
     ------
@@ -61,19 +62,20 @@ def read_record(
     Parameters
     ----------
     path
-        the file, separated by commas, semicolons or tabs, as its first line is; with semicolons or tabs a comma is a
-        decimal point. A first line that is not numbers has the names of the columns.
+        the file, separated by commas, semicolons or tabs, as its first line is; with semicolons or
+        tabs a comma is a decimal point. A first line that is not numbers has the names of the
+        columns.
     columns
-        columns of time [s], input and output, and optionally of the external signal of a closed loop: names if the file
-        has them, or numbers from 1 on. With ``dt`` there is no time.
+        columns of time [s], input and output, and optionally of the external signal of a closed
+        loop: names if the file has them, or numbers from 1 on. With ``dt`` there is no time.
     dt
         sample time [s] of a file without times.
 
     Raises
     ------
     ValueError
-        if the file can't be read, a column is missing, a value is not a number, or the times are not even; it names line and
-        column.
+        if the file can't be read, a column is missing, a value is not a number, or the times are
+        not even; it names line and column.
     """
     if dt is not None:
         checks.positive("dt", dt, "s")
@@ -120,7 +122,7 @@ def _with_point(cell: str) -> str:
 
 
 def _place(where: str, header: list[str] | None, width: int, name: str, role: int) -> int:
-    """Return the index of a column; without names in the file the first columns are time, input, output."""
+    """Return the index of a column; in a file without names the first are time, input, output."""
     if header is not None and name in header:
         if header.count(name) > 1:
             raise ValueError(f"{where}: column {name} is there {header.count(name)} times")

@@ -1,13 +1,15 @@
 """Output-error refinement: the parameters whose simulated output is nearest to the measured one.
 
-With e = y − ŷ(θ) and the gradient ψ of ŷ (``structure``), a step of Levenberg and Marquardt (Ljung 1999, sec. 10.2) solves::
+With e = y − ŷ(θ) and the gradient ψ of ŷ (``structure``), a step of Levenberg and Marquardt (Ljung
+1999, sec. 10.2) solves::
 
     (Σ ψ ψᵀ + μ diag(Σ ψ ψᵀ)) δθ = Σ ψ e
 
-and lowers μ after a step that reduces the error, or raises it. For white and normal e this is the maximum-likelihood
-estimate. For coloured e it is still consistent if u is open loop (Ljung 1999, th. 8.3), but the usual covariance is wrong.
-So the covariance is computed from sums of ψ e over blocks that are longer than the correlation of e (the sandwich of Huber
-and White; Liang & Zeger, *Biometrika* 73, 1986)::
+and lowers μ after a step that reduces the error, or raises it. For white and normal e this is the
+maximum-likelihood estimate. For coloured e it is still consistent if u is open loop (Ljung 1999,
+th. 8.3), but the usual covariance is wrong. So the covariance is computed from sums of ψ e over
+blocks that are longer than the correlation of e (the sandwich of Huber and White; Liang & Zeger,
+*Biometrika* 73, 1986)::
 
     cov θ = H⁻¹ (Σ_blocks s sᵀ) H⁻¹,     H = Σ ψ ψᵀ,  s = Σ_{k in block} ψ_k e_k
 """
@@ -25,14 +27,16 @@ from quell.types import Matrix, Vector
 
 # Convergence: relative gain of a step, chosen by hand; not tuned further.
 _CONVERGED = 1e-7
-# First μ, least μ after a failed step, and the μ at which the search ends: chosen by hand; not tuned further. The factor of 10
-# for each step is Marquardt's.
+# First μ, least μ after a failed step, and the μ at which the search ends: chosen by hand; not
+# tuned further. The factor of 10 for each step is Marquardt's.
 _MU, _LEAST_MU, _MOST_MU = 1e-4, 1e-8, 1e8
 # Relative singular value of H that counts as zero: some 50 units of rounding.
 _RANK = 1e-14
-# Relative mean square that counts as zero: errors of 1e-12, which rounding in long simulations adds up to.
+# Relative mean square that counts as zero: errors of 1e-12, which rounding in long simulations adds
+# up to.
 _ROUNDING = 1e-24
-# Least number of blocks: longer ones hold more correlation, fewer make the covariance uncertain; chosen by hand.
+# Least number of blocks: longer ones hold more correlation, fewer make the covariance uncertain;
+# chosen by hand.
 _BLOCKS = 60
 
 
@@ -50,9 +54,10 @@ class ParameterEstimate(NamedTuple):
 def refine(
     structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: int
 ) -> ParameterEstimate:
-    """Return the parameters of least output error near ``theta``, for the inputs ``v`` (N, inputs) and the output ``y``."""
+    """Return θ of least output error near ``theta``, for inputs ``v`` and output ``y``."""
     best, mu = cost(structure, theta, v, y), _MU
-    # Without noise the error is reduced to its own rounding, where no step is sure to reduce it further.
+    # Without noise the error is reduced to its own rounding, where no step is sure to reduce it
+    # further.
     rounding = _ROUNDING * float(np.mean(y**2))
     converged = best <= rounding
     near = _linearise(structure, theta, v, y)
@@ -79,7 +84,7 @@ def refine(
 
 
 def gauss_newton(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
-    """Return the mean square error that one step of Gauss and Newton predicts, and the parameters after it."""
+    """Return the mean square error that a Gauss-Newton step predicts, and θ after it."""
     near = _linearise(structure, theta, v, y)
     if not near.finite:
         return math.inf, theta
@@ -88,7 +93,7 @@ def gauss_newton(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> t
 
 
 def block_sums(columns: Matrix, error: Vector, blocks: int) -> Matrix:
-    """Return the sums of ``columns`` times ``error`` over blocks of the record (blocks, columns)."""
+    """Return the sums of ``columns`` times ``error`` over blocks (blocks, columns)."""
     edges = np.linspace(0, error.size, blocks + 1).astype(int)
     return np.array([error[i:j] @ columns[i:j] for i, j in pairwise(edges)])
 

@@ -21,7 +21,8 @@ _MOSAIC: Any = [
     ["coherence", "cross"],
 ]
 _NAMES = ("gain", "phase", "coherence", "output", "error", "auto", "cross")
-# Least coherence of the empirical points that are drawn; below it, noise is larger than the response.
+# Least coherence of the empirical points that are drawn; below it, noise is larger than the
+# response.
 _COHERENT = 0.5
 # Quantile of the normal distribution: 99 % of values lie within this many standard deviations.
 _WITHIN_99 = 2.576
@@ -48,7 +49,7 @@ def seven_axes(axes: Any) -> list[Any]:
 
 
 def draw_bode(axes: list[Any], measured: FrequencyResponse, response: Callable[[Any], Any]) -> None:
-    """Draw gain, phase and coherence of the empirical response, and of the model's ``response(omega)``."""
+    """Draw gain, phase and coherence of the empirical response, and the model's response."""
     gain, phase, coherence = axes
     good = measured.coherence > _COHERENT
     omega = np.geomspace(measured.omega[0], measured.omega[-1], 2000)

@@ -25,7 +25,8 @@ _DEVIATIONS = 3.0
 class Identified:
     """A transfer function found in a record, with measures of its quality.
 
-    ``str()`` gives the whole report; ``plant`` is the model for ``ESO.model_based`` and other functions.
+    ``str()`` gives the whole report; ``plant`` is the model for ``ESO.model_based`` and other
+    functions.
     """
 
     num: Vector
@@ -33,7 +34,7 @@ class Identified:
     den: Vector
     """Denominator, descending powers of s; the first is 1."""
     covariance: Matrix
-    """Covariance of the fitted coefficients, those of ``den`` first, then those of ``num``, in ascending powers."""
+    """Covariance of the fitted coefficients, ``den`` before ``num``, in ascending powers."""
     poles: tuple[Root, ...]
     zeros: tuple[Root, ...]
     integrators: int
@@ -43,14 +44,14 @@ class Identified:
     bias: float
     """Constant force on the plant [u-unit]; NaN if a constant u has no effect on the plant."""
     friction: float | None
-    """Coulomb friction, which |u| has to overcome in slow motion [u-unit]; None if it was not fitted."""
+    """Coulomb friction: the |u| needed for slow motion [u-unit]; None if it was not fitted."""
     dt: float
     """Sample time of the record [s]."""
     horizon: int
     """Number of samples that the predictions in ``fits`` look ahead."""
     fits: dict[str, float]
-    """NRMSE in %: ``"estimation"`` and ``"held out"`` of the simulation, ``"estimation, predicted"`` and
-    ``"held out, predicted"`` of the prediction."""
+    """NRMSE in %, of the simulation: ``"estimation"`` and ``"held out"``; of the prediction:
+    ``"estimation, predicted"`` and ``"held out, predicted"``."""
     residuals: Residuals
     """Tests of the error, on the held-out samples if there are any."""
     resolution: float
@@ -72,7 +73,7 @@ class Identified:
 
     @property
     def shortcomings(self) -> tuple[str, ...]:
-        """Faults of the model that the fit does not show: poles that are unstable, too fast for the samples, or cancelled."""
+        """Faults that the fit does not show: poles that are unstable, too fast, or cancelled."""
         fastest = math.pi / self.dt
         poles, zeros = (
             [root for root in roots if root.value.imag >= 0.0] for roots in (self.poles, self.zeros)
@@ -105,10 +106,10 @@ class Identified:
         return np.arange(float(self.y.size)) * self.dt
 
     def response(self, omega: Any) -> Any:
-        """Return the model's frequency response at ``omega`` [rad/s], including the delay and the hold of u.
+        """Return the frequency response at ``omega`` [rad/s], with the delay and the hold of u.
 
-        This is the response of the samples in a record with held u. Images of the hold, which matter near half the sampling
-        rate, are left out.
+        This is the response of the samples in a record with held u. Images of the hold, which
+        matter near half the sampling rate, are left out.
         """
         s = 1j * np.asarray(omega, dtype=np.float64)
         hold = np.exp(-0.5 * s * self.dt) * np.sinc(s.imag * self.dt / (2.0 * np.pi))
@@ -120,13 +121,13 @@ class Identified:
         return frequency_response(self.u, self.y, self.dt, reference=r, segments=segments)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw Bode plot and empirical response, coherence, output, error, and the tests of the error; return the axes.
+        """Draw Bode plot, coherence, output, error, and the tests of the error; return the axes.
 
         Parameters
         ----------
         axes
-            seven matplotlib axes: gain, phase, coherence, output, error, autocorrelation, cross-correlation; those of a new
-            figure by default.
+            seven matplotlib axes: gain, phase, coherence, output, error, autocorrelation,
+            cross-correlation; those of a new figure by default.
         """
         axes, split = plots.seven_axes(axes), self.held_from
         plots.draw_bode(axes[:3], self.empirical(), self.response)
@@ -161,7 +162,8 @@ class Identified:
             f"white: {'yes' if tests.white else 'no'} (zeta = {tests.whiteness:.3g}, "
             f"limit {tests.whiteness_limit:.3g}, {tests.lags} lags)",
             f"independent of past u: {'yes' if tests.independent else 'no'} "
-            f"(largest correlation {_largest_correlation(tests):.3g}, limit {tests.cross_limit:.3g})",
+            f"(largest correlation {_largest_correlation(tests):.3g}, "
+            f"limit {tests.cross_limit:.3g})",
             *(f"NOT: {text}" for text in self.shortcomings),
         ]
         return "\n".join(lines)
@@ -175,7 +177,7 @@ class Identified:
         return f"Identified(order={order}, poles {poles} rad/s, fit {percent(fit, 2)} %)"
 
     def to_json(self) -> dict[str, Any]:
-        """Return the results for ``quell.files.write_json``, without the record; None for numbers that are not finite."""
+        """Return the results without the record, for JSON; None for numbers that are not finite."""
         from quell.files import nonfinite_to_none
 
         tests = self.residuals

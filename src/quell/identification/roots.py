@@ -38,13 +38,13 @@ class Root(NamedTuple):
 
 
 def _root(a: Vector, covariance: Matrix, value: complex) -> Root:
-    """Return a root of ``p^n + a_{n−1} p^(n−1) + … + a_0`` with deviations from the covariance of a."""
+    """Return a root of ``p^n + a_{n−1} p^(n−1) + … + a_0`` with its deviations."""
     real, imag = (math.sqrt(max(part, 0.0)) for part in root_covariance(a, covariance, value))
     return Root(complex(value), real, imag if complex(value).imag else 0.0)
 
 
 def poles_of(a: Vector, covariance: Matrix, integrators: int) -> tuple[Root, ...]:
-    """Return the poles, slow ones first, with those at s = 0 that were set; a_i is zero for i < ``integrators``."""
+    """Return the poles, slow ones first; a_i is zero for i < ``integrators``."""
     free = a[integrators:]
     part = covariance[: free.size, : free.size]
     found = [_root(free, part, value) for value in np.roots(np.append(1.0, free[::-1])).tolist()]
@@ -53,7 +53,7 @@ def poles_of(a: Vector, covariance: Matrix, integrators: int) -> tuple[Root, ...
 
 
 def zeros_of(b: Vector, covariance: Matrix) -> tuple[Root, ...]:
-    """Return the roots of the numerator b (ascending powers); its covariance is taken relative to the leading coefficient."""
+    """Return the roots of the numerator b, in ascending powers."""
     if b.size < 2:
         return ()
     monic = b[:-1] / b[-1]
@@ -65,7 +65,7 @@ def zeros_of(b: Vector, covariance: Matrix) -> tuple[Root, ...]:
 def squared_distance_from_zero(
     a: Vector, covariance: Matrix, roots: NDArray[np.complex128]
 ) -> float:
-    """Return the squared distance of one or two roots from s = 0, in standard deviations of their polynomial's coefficients."""
+    """Return the squared distance of one or two roots from s = 0, in standard deviations."""
     slopes = np.array([_slope(a, root) for root in roots])
     if roots.size == 1:
         coefficients, slopes = -roots, -slopes
@@ -79,7 +79,7 @@ def squared_distance_from_zero(
 
 
 def root_covariance(a: Vector, covariance: Matrix, root: complex) -> tuple[float, float]:
-    """Return the variances of the real and the imaginary part of a root, from the covariance of a."""
+    """Return the variances of real and imaginary part of a root, from the covariance of a."""
     slope = _slope(a, root)
     return float(slope.real @ covariance @ slope.real), float(slope.imag @ covariance @ slope.imag)
 

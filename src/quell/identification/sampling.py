@@ -1,8 +1,9 @@
-"""Filters 1/A(s) and their derivatives, sampled exactly: the computations below all of identification.
+"""Filters 1/A(s) and their derivatives, sampled exactly: the basis of identification.
 
-Polynomials are in ``p = s dt``: a sample is a unit of time, and nothing depends on the user's seconds. The vector ``a`` (n,) holds
-the coefficients of ``A = p^n + a_{n−1} p^(n−1) + … + a_0`` in ascending powers. A *chain* is the filter bank ``p^i/A(p)``,
-i = 0 … n − 1, of one signal: the states of the controllable companion form.
+Polynomials are in ``p = s dt``: a sample is a unit of time, and nothing depends on the user's
+seconds. The vector ``a`` (n,) holds the coefficients of ``A = p^n + a_{n−1} p^(n−1) + … + a_0`` in
+ascending powers. A *chain* is the filter bank ``p^i/A(p)``, i = 0 … n − 1, of one signal: the
+states of the controllable companion form.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from quell.kernels.dispatch import compiled
 from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
-# States below this become zero: far below all values that matter, far above the denormal numbers (1e-308) that processors are
-# slow with.
+# States below this become zero: far below all values that matter, far above the denormal numbers
+# (1e-308) that processors are slow with.
 _TINY = 1e-140
 
 Bank = NDArray[np.float64]
@@ -25,7 +26,7 @@ Bank = NDArray[np.float64]
 
 
 class Sampled(NamedTuple):
-    """A sampled system ``x⁺ = Φ x + Γ v + Γ₁ (v⁺ − v)``, with inputs held or linear between samples."""
+    """A sampled system ``x⁺ = Φ x + Γ v + Γ₁ (v⁺ − v)``, with held or linear inputs."""
 
     phi: Matrix
     """Φ (n, n)."""
@@ -37,7 +38,7 @@ class Sampled(NamedTuple):
 
 @compiled
 def _states(phi: Matrix, gamma: Matrix, slope: Matrix, v: Matrix, x: Vector, out: Matrix) -> None:
-    """Write the states at all samples of ``v`` (N, m) into ``out`` (N, n); ``x`` (n,) is the first, and is changed."""
+    """Write the states for inputs ``v`` (N, m) into ``out`` (N, n), starting at ``x``."""
     n, m = gamma.shape
     last = v.shape[0] - 1
     for k in range(v.shape[0]):
@@ -55,7 +56,7 @@ def _states(phi: Matrix, gamma: Matrix, slope: Matrix, v: Matrix, x: Vector, out
 
 @compiled
 def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Bank) -> None:
-    """Write the states of a filter for held inputs ``v`` (N, m) into ``out`` (N, n, m); ``x`` (n, m) is changed."""
+    """Write the states for held inputs ``v`` (N, m) into ``out`` (N, n, m), starting at ``x``."""
     n, m = x.shape
     for k in range(v.shape[0]):
         for i in range(n):
@@ -84,8 +85,9 @@ def _gradient(
 ) -> None:
     """Write y (N,) and its derivatives ``out`` (N, size); see ``structure.gradient``.
 
-    ``one`` is the filter on each input, ``bank`` (2, n, inputs) its states now and at the next sample; ``columns`` (n, inputs)
-    are their columns in ``out``, negative for none. ``both`` is the model followed by the filter, ``x`` (2, 2 n) their states.
+    ``one`` is the filter on each input, ``bank`` (2, n, inputs) its states now and at the next
+    sample; ``columns`` (n, inputs) are their columns in ``out``, negative for none. ``both`` is the
+    model followed by the filter, ``x`` (2, 2 n) their states.
     """
     _, n, m = bank.shape
     now, then = 0, 1
@@ -119,7 +121,7 @@ def _gradient(
 def _states_with_friction(
     phi: Matrix, gamma: Matrix, v: Matrix, speeds: Matrix, x: Vector, out: Matrix
 ) -> None:
-    """As ``_states`` for held inputs; writes the last inputs: minus the signs of ``speeds`` (frictions, n) times the state."""
+    """Write the states and the last inputs: minus the signs of ``speeds`` times the state."""
     n, m = gamma.shape
     first = m - speeds.shape[0]
     for k in range(v.shape[0]):
@@ -140,7 +142,7 @@ def _states_with_friction(
 
 
 def companion(a: Vector) -> tuple[Matrix, Matrix]:
-    """Return A and B of the controllable companion form, whose states are ``p^i/A(p)`` times the input."""
+    """Return A and B of the controllable companion form, with states ``p^i/A(p) v``."""
     n = a.size
     A = np.diag(np.ones(n - 1), 1)
     A[-1] = -a
@@ -148,14 +150,14 @@ def companion(a: Vector) -> tuple[Matrix, Matrix]:
 
 
 def observable(a: Vector) -> Matrix:
-    """Return A of the observable companion form, ``y = x_1``; a numerator in descending powers is a column of B."""
+    """Return A of the observable companion form; numerators, descending, are columns of B."""
     A = np.diag(np.ones(a.size - 1), 1)
     A[:, 0] -= a[::-1]
     return A
 
 
 def sampled(A: Matrix, B: Matrix, straight: bool = False) -> Sampled:
-    """Sample ``x' = A x + B v`` exactly over a unit of time, with ``v`` held, or linear between samples (``straight``)."""
+    """Sample ``x' = A x + B v`` exactly over a unit of time; ``v`` is held or ``straight``."""
     n, m = B.shape
     if not straight:
         # An unstable model may give no finite numbers; the caller sees this in the output.
@@ -181,7 +183,7 @@ def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
 def states_with_friction(
     system: Sampled, v: Matrix, speeds: Matrix, x0: Vector
 ) -> tuple[Matrix, Matrix]:
-    """Return the states and the inputs; the last inputs are minus the signs of ``speeds`` (frictions, n) times the state."""
+    """Return states and inputs; the last are minus the signs of ``speeds`` times the state."""
     out, inputs = np.empty((v.shape[0], x0.size)), np.array(v, order="C")
     speeds, x = np.ascontiguousarray(speeds), np.array(x0, dtype=np.float64)
     _states_with_friction(system.phi, system.gamma, inputs, speeds, x, out)
@@ -194,7 +196,7 @@ def chain(a: Vector, v: Vector) -> Matrix:
 
 
 def chains(a: Vector, v: Matrix) -> Bank:
-    """Return ``p^i/A(p)`` (N, n, inputs + 1) of held inputs ``v`` (N, inputs) and, last, of an impulse at the start."""
+    """Return ``p^i/A(p)`` (N, n, inputs + 1) of held inputs ``v`` and of an initial impulse."""
     one, count = sampled(*companion(a)), v.shape[1] + 1
     out = np.empty((v.shape[0], a.size, count))
     _chains(one.phi, one.gamma[:, 0].copy(), _with_impulse(v), _first(a.size, count), out)
@@ -210,10 +212,10 @@ def gradient(
     v: Matrix,
     size: int,
 ) -> tuple[Vector, Matrix]:
-    """Return y (N,) of a model in observable companion form, from the state ``start``, and its derivatives (N, size).
+    """Return y (N,) of a model in observable companion form, and its derivatives (N, size).
 
-    The first are ``−p^i/A y`` for i from ``skipped`` on; the others are the states of ``chains``, in the columns given by
-    ``columns`` (n, inputs + 1).
+    The first are ``−p^i/A y`` for i from ``skipped`` on; the others are the states of ``chains``,
+    in the columns given by ``columns`` (n, inputs + 1).
     """
     n = a.size
     A, both = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, B.shape[1]))

@@ -12,23 +12,27 @@ from quell.identification.roots import squared_distance_from_zero
 from quell.identification.structure import Structure, free_run
 from quell.types import Matrix, Vector
 
-# Half width of the mean slope that stands for the measured speed until there is a model [samples]: chosen by hand, the sign
-# of the model's own speed replaces it.
+# Half width of the mean slope that stands for the measured speed until there is a model [samples]:
+# chosen by hand, the sign of the model's own speed replaces it.
 _HALF_WIDTH = 10
-# Most passes until the signs of friction settle, and the share of them that may still change: chosen by hand; not tuned further.
+# Most passes until the signs of friction settle, and the share of them that may still change:
+# chosen by hand; not tuned further.
 _PASSES, _SETTLED = 12, 5e-4
-# Range of ω_a²/ω_r² and most trials for the driven side. The ratio is J₁'s share of both inertias; a driven side of less than
-# a tenth of them is rare. The number of trials is chosen by hand.
+# Range of ω_a²/ω_r² and most trials for the driven side. The ratio is J₁'s share of both inertias;
+# a driven side of less than a tenth of them is rare. The number of trials is chosen by hand.
 _SHARES, _TRIALS = (0.1, 1.0), 10
-# Steps of the refinement on the way, and most of them at the end: chosen by hand; not tuned further.
+# Steps of the refinement on the way, and most of them at the end: chosen by hand; not tuned
+# further.
 _FEW_STEPS, _STEPS = 2, 30
-# A pole is set to s = 0 within three standard deviations of it (99.7 %), or if its time constant is more than ten times the
-# record (chosen by hand). For two poles, χ² with two degrees of freedom exceeds 11.8 as rarely.
+# A pole is set to s = 0 within three standard deviations of it (99.7 %), or if its time constant is
+# more than ten times the record (chosen by hand). For two poles, χ² with two degrees of freedom
+# exceeds 11.8 as rarely.
 _DEVIATIONS = 3.0
 _PAIR = 11.8
 _SLOWER = 10.0
-# These tests are of first order. So one and two integrators may increase the mean square error by these factors at most, or
-# to this share of the output's mean square. Chosen by hand; signs of friction that are not settled increase it too.
+# These tests are of first order. So one and two integrators may increase the mean square error by
+# these factors at most, or to this share of the output's mean square. Chosen by hand; signs of
+# friction that are not settled increase it too.
 _MOST_COST = {1: 30.0, 2: 1.05}
 _ROUNDING = 1e-18
 
@@ -43,7 +47,7 @@ class Fit(NamedTuple):
     bias: bool
 
     def inputs(self, u: Vector) -> Matrix:
-        """Return the inputs (N, inputs) for ``u``; friction inputs are zero, ``free_run`` fills them in."""
+        """Return the inputs (N, inputs) for ``u``; ``free_run`` fills in friction inputs."""
         zero = np.zeros(u.size)
         return _columns(u, self.delay, self.bias, [zero] * len(self.structure.friction))
 
@@ -67,7 +71,7 @@ def fit(
     bias: bool,
     friction: bool,
 ) -> Fit:
-    """Return the model of least output error; ``delays`` is the range of delays to search [samples]."""
+    """Return the model of least output error; ``delays`` is their range to search [samples]."""
     degrees = (zeros, *([0] if bias else []), *([max(order - 2, 0)] if friction else []))
     structure = Structure(order, integrators or 0, degrees, (0.0,) if friction else ())
     v = _columns(u, delays[0], bias, [measured_sign(y, _HALF_WIDTH)] if friction else [])
@@ -99,7 +103,7 @@ def fit(
 
 
 def measured_sign(y: Vector, half_width: int) -> Vector:
-    """Return minus the sign of the speed of ``y``, from its mean slope over ``half_width`` samples to both sides."""
+    """Return minus the sign of the mean slope of ``y``, over ``half_width`` samples each way."""
     index = np.arange(y.size)
     ahead, behind = np.minimum(index + half_width, y.size - 1), np.maximum(index - half_width, 0)
     return -np.sign(y[ahead] - y[behind])
@@ -108,7 +112,7 @@ def measured_sign(y: Vector, half_width: int) -> Vector:
 def _settle_signs(
     structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
 ) -> tuple[ParameterEstimate, Matrix]:
-    """Return refined parameters and the inputs; the friction inputs are those of the model's own speeds."""
+    """Return refined parameters, and inputs with friction from the model's own speeds."""
     best = (np.inf, estimate, v)
     for _ in range(_PASSES if structure.friction else 0):
         predicted, own = free_run(structure, estimate.theta, v, own_friction=True)
@@ -126,7 +130,7 @@ def _settle_signs(
 def _add_driven_friction(
     structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
 ) -> tuple[Structure, ParameterEstimate, Matrix]:
-    """Return structure, parameters and inputs with friction on the driven side too, if a resonance separates the sides."""
+    """Add friction on the driven side if there is a resonance; return model and inputs."""
     from scipy.optimize import minimize_scalar
 
     v = free_run(structure, estimate.theta, v, own_friction=True)[1]
@@ -134,7 +138,8 @@ def _add_driven_friction(
     omega = _resonance(structure.denominator(estimate.theta))
     if omega == 0.0:
         return structure, estimate, v
-    # A coefficient is added before those of friction on the measured side; it takes over the value of their first one.
+    # A coefficient is added before those of friction on the measured side; it takes over the value
+    # of their first one.
     at = structure.free + sum(structure.degrees[:-1]) + len(structure.degrees) - 1
     start = np.insert(estimate.theta, at, estimate.theta[at])
     start[at + 1 : at + 2 + structure.degrees[-1]] = 0.0
@@ -174,7 +179,7 @@ def _best_delay(
     delays: tuple[int, int],
     delay: int,
 ) -> tuple[int, ParameterEstimate, Matrix]:
-    """Return the delay of least output error near ``delay``, by steps of 8, 4, 2, 1 samples; and its parameters and inputs."""
+    """Return the delay of least output error, by steps of 8, 4, 2, 1, its parameters and inputs."""
 
     def inputs(delay: int) -> Matrix:
         return np.column_stack([delayed(u, delay), v[:, 1:]])
@@ -193,7 +198,7 @@ def _best_delay(
 def _set_integrators(
     structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vector
 ) -> tuple[Structure, ParameterEstimate]:
-    """Return structure and parameters with one or two poles at s = 0, if the slowest can't be distinguished from that."""
+    """Set one or two poles to s = 0 if they can't be distinguished from it; return the model."""
     if structure.integrators:
         return structure, estimate
     a, free, covariance = structure.denominator(estimate.theta), structure.free, estimate.covariance

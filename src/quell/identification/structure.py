@@ -2,9 +2,9 @@
 
     A(p) y = B(p) u + Σ_j F_j(p) v_j + D(p) δ(t),        A = p^q (p^(n−q) + … + a_q),   p = s dt
 
-u is held between samples; v_j are further known inputs (1 for a constant force, −sign(speed) for Coulomb friction), and D
-stands for the initial state: ``D(p)/A(p) δ`` is the free motion from any state. The output is exact at the samples, and
-with ``ŷ = A⁻¹(B u + …)`` so are its derivatives::
+u is held between samples; v_j are further known inputs (1 for a constant force, −sign(speed) for
+Coulomb friction), and D stands for the initial state: ``D(p)/A(p) δ`` is the free motion from any
+state. The output is exact at the samples, and with ``ŷ = A⁻¹(B u + …)`` so are its derivatives::
 
     ∂ŷ/∂a_i = −p^i/A ŷ,      ∂ŷ/∂b_i = p^i/A u,      ∂ŷ/∂d_i = p^i/A δ
 
@@ -14,18 +14,19 @@ with ``ŷ = A⁻¹(B u + …)`` so are its derivatives::
 
     A y = B u + F₁ v₁ + F₂ v₂,      v₁ = −sign(speed of the driven side),   v₂ = −sign(y')
 
-For known v the model is linear in F. The v are taken from the motion of the last model (at first v₂ from the measured
-motion), then the parameters are fitted for these v, and so on until the v no longer change. A simulated model takes them
-from its own speeds. At standstill the sign changes at each sample, and its mean has the effect of sticking.
+For known v the model is linear in F. The v are taken from the motion of the last model (at first v₂
+from the measured motion), then the parameters are fitted for these v, and so on until the v no
+longer change. A simulated model takes them from its own speeds. At standstill the sign changes at
+each sample, and its mean has the effect of sticking.
 
-Friction on the measured side acts on y″ directly: F₂ has degree n − 2. Friction on the driven side enters like u: F₁ has
-degree 0. Up to order 3 the sides move as one, and there is only v₂. From order 4 on there may be a spring between them. For
-inertias J₁ (driven) and J₂ with a spring k::
+Friction on the measured side acts on y″ directly: F₂ has degree n − 2. Friction on the driven side
+enters like u: F₁ has degree 0. Up to order 3 the sides move as one, and there is only v₂. From
+order 4 on there may be a spring between them. For inertias J₁ (driven) and J₂ with a spring k::
 
     J₂ y″ = k (θ₁ − y) − …     so   θ₁' = y' + y‴/ω_a²,     ω_a² = k/J₂
 
-ω_a, the frequency at which the driven side stands still while the other oscillates, is not a zero of y and has to be
-searched for: it is below the resonance ``ω_r² = ω_a² (1 + J₂/J₁)``.
+ω_a, the frequency at which the driven side stands still while the other oscillates, is not a zero
+of y and has to be searched for: it is below the resonance ``ω_r² = ω_a² (1 + J₂/J₁)``.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Structure(NamedTuple):
     degrees: tuple[int, ...]
     """Degree of the numerator of each input, u first."""
     friction: tuple[float, ...] = ()
-    """For each friction input, the last ones: 1/ω_a² [samples²]; 0.0 for the one on the measured side."""
+    """1/ω_a² [samples²] of each friction input, the last ones; 0.0 on the measured side."""
 
     @property
     def free(self) -> int:
@@ -89,7 +90,7 @@ class Structure(NamedTuple):
 
 
 def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
-    """Return the derivatives of y by all parameters except those of A (N, size − free); y is linear in them."""
+    """Return the derivatives of y by all parameters except those of A (N, size − free)."""
     bank, degrees = chains(a, v), (*structure.degrees, structure.order - 1)
     return np.hstack([bank[:, : degree + 1, j] for j, degree in enumerate(degrees)])
 
@@ -102,7 +103,7 @@ def output(structure: Structure, theta: Vector, v: Matrix) -> Vector:
 def free_run(
     structure: Structure, theta: Vector, v: Matrix, own_friction: bool = False
 ) -> tuple[Vector, Matrix]:
-    """Return y (N,) and the inputs; with ``own_friction`` the friction inputs follow from the model's own speeds."""
+    """Return y (N,) and the inputs, with ``own_friction`` those of the model's own speeds."""
     A = observable(structure.denominator(theta))
     B = np.ascontiguousarray(structure.numerators(theta)[:, ::-1].T)
     system, initial = sampled(A, B), structure.initial(theta)[::-1]

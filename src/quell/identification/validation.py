@@ -1,14 +1,16 @@
 """Quality of a model on a record: fits of simulation and prediction, and tests of the error.
 
-The fit is ``100 (1 − |y − ŷ| / |y − mean(y)|)`` in % (NRMSE). A simulation knows u and the state at the start; friction follows
-from its own speed. A prediction k samples ahead also knows y up to now: it adds to the simulation a linear prediction of its
-error from n + 1 earlier errors, fitted by least squares on the samples for the fit (an output-error model has no noise model
-of its own, so it gets the simplest; Ljung 1999, sec. 3.2).
+The fit is ``100 (1 − |y − ŷ| / |y − mean(y)|)`` in % (NRMSE). A simulation knows u and the state at
+the start; friction follows from its own speed. A prediction k samples ahead also knows y up to now:
+it adds to the simulation a linear prediction of its error from n + 1 earlier errors, fitted by
+least squares on the samples for the fit (an output-error model has no noise model of its own, so it
+gets the simplest; Ljung 1999, sec. 3.2).
 
-The error ε of the simulation is tested as in Ljung 1999, sec. 16.6. *Whiteness*: ``ζ = N Σ_{τ=1}^{M} (R_ε(τ)/R_ε(0))²`` is χ² with
-M degrees of freedom for white ε. *Independence of u*: if ε does not depend on past u, ``√N R_εu(τ)`` is normal with variance
-``Σ_k R_ε(k) R_u(k)``. The first tests a model of the noise, which an output-error model does not have; the second tests the
-model of the plant.
+The error ε of the simulation is tested as in Ljung 1999, sec. 16.6. *Whiteness*: ``ζ = N
+Σ_{τ=1}^{M} (R_ε(τ)/R_ε(0))²`` is χ² with M degrees of freedom for white ε. *Independence of u*: if
+ε does not depend on past u, ``√N R_εu(τ)`` is normal with variance ``Σ_k R_ε(k) R_u(k)``. The first
+tests a model of the noise, which an output-error model does not have; the second tests the model of
+the plant.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from quell.identification.search import Fit
 from quell.identification.structure import free_run, lengths
 from quell.types import Matrix, Vector
 
-# Rounds in which the start and the signs of friction are adapted to each other: chosen by hand; not tuned further.
+# Rounds in which the start and the signs of friction are adapted to each other: chosen by hand; not
+# tuned further.
 _ROUNDS = 6
 # Relative singular value that counts as zero.
 _RANK = 1e-12
@@ -42,7 +45,7 @@ class Residuals(NamedTuple):
     whiteness_limit: float
     """Limit that ζ of a white sequence exceeds with 1 % probability."""
     cross_correlation: Vector
-    """Correlation of ε and u, both with variance 1, for ε later than u by τ = −M … M samples (2 M + 1,)."""
+    """Correlation of ε and u, of variance 1, for ε later by τ = −M … M samples (2 M + 1,)."""
     cross_limit: float
     """Limit that 1 % of them exceed if ε does not depend on u."""
 
@@ -53,7 +56,7 @@ class Residuals(NamedTuple):
 
     @property
     def independent(self) -> bool:
-        """Whether at most 1 % of the correlations with past u (τ ≥ 0), or one of them, exceed the limit."""
+        """Whether at most 1 % of the correlations with past u, or one of them, exceed the limit."""
         outside = np.abs(self.cross_correlation[self.lags :]) > self.cross_limit
         return bool(np.count_nonzero(outside) <= max(1, round(0.01 * outside.size)))
 
@@ -64,9 +67,10 @@ def nrmse(y: Vector, predicted: Vector) -> float:
 
 
 def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
-    """Return the simulated output for the inputs ``v``; friction inputs follow from the model's own speeds.
+    """Return the simulated output for inputs ``v``, with friction from the model's own speeds.
 
-    With ``y`` the initial state is fitted to ``y`` by least squares, n numbers; without, it is that of the samples for the fit.
+    With ``y`` the initial state is fitted to ``y`` by least squares, n numbers; without, it is that
+    of the samples for the fit.
     """
     structure, theta = fit.structure, fit.estimate.theta
     if y is None:
@@ -95,7 +99,7 @@ def _finite(predicted: Vector) -> Vector:
 
 
 class Predictor(NamedTuple):
-    """A linear predictor of a simulation's error, ``horizon`` samples ahead, from errors at multiples of ``horizon`` before."""
+    """A linear predictor of a simulation's error, ``horizon`` samples ahead, from past errors."""
 
     horizon: int
     weights: Vector

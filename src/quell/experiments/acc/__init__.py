@@ -1,4 +1,4 @@
-"""The ACC robust-control benchmark: published controllers and ours on a thousand uncertain plants."""
+"""The ACC robust-control benchmark: published controllers and ours on uncertain plants."""
 
 from quell.experiments.acc.cases import CaseResult, study_cases
 from quell.experiments.acc.controllers import DT, PUBLISHED, TransferFunction, designs

@@ -1,13 +1,13 @@
-"""The three design cases of Wie & Bernstein (*Benchmark Problems for Robust Control Design*, J. Guidance 15, 1992).
+"""The three design cases of Wie & Bernstein (*J. Guidance, Control, and Dynamics* 15, 1992).
 
 Masses of 1 kg, no actuator lag, u on m1, y = x2:
 
 1. a unit impulse on m2; stable for all 0.5 < k < 2, and settled by 15 s at k = 1;
 2. the same, and stable for m1, m2 and k as far from 1 as possible, all at once;
-3. a sinusoid of 0.5 rad/s on m2, of unknown amplitude and phase, rejected within 20 s, for all 0.5 < k < 2.
+3. a sinusoid of 0.5 rad/s and unknown phase on m2, rejected within 20 s for all 0.5 < k < 2.
 
-The controllers in the first two cases are those of ``acc.controllers``. In the third u has no limit, as a load of 1 N on
-m2 needs more than 0.5 N.
+The controllers in the first two cases are those of ``acc.controllers``. In the third u has no
+limit, as a load of 1 N on m2 needs more than 0.5 N.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ from quell.signals import Sinusoid
 from quell.simulation import Scenario, simulate
 
 STIFFNESSES = np.linspace(0.5, 2.0, 13)
-"""Stiffnesses of cases 1 and 3 [N/m]: the range is given by the problem, the step of 0.125 chosen by hand."""
+"""Stiffnesses of cases 1 and 3 [N/m]: the problem's range, in steps chosen by hand."""
 LOAD = 0.5
 """Frequency of the load in case 3 [rad/s]."""
 # Phases of the load [rad]: a start with no force, and with the full one.
 _PHASES = (0.0, 0.5 * np.pi)
-# Duration of the runs [s]: for the impulse four times, for the load four times the time that the problem gives.
+# Duration of the runs [s]: for the impulse four times, for the load four times the time that the
+# problem gives.
 _IMPULSE_TIME, _LOAD_TIME = 60.0, 80.0
 
 
@@ -49,7 +50,7 @@ class CaseResult:
     margins: Margins
     """Margins of the nominal loop."""
     settled_at: float
-    """Time from which on ``|y|`` stays below 0.1 m after the impulse, at k = 1 [s]; infinite if it takes more than 60 s."""
+    """Time after which ``|y|`` stays below 0.1 m, at k = 1 [s]; infinite beyond 60 s."""
     settled_at_worst: float
     """The same for the worst k."""
     stable_from: float
@@ -59,7 +60,7 @@ class CaseResult:
     parameter_bound: float
     """Largest p such that the loop is stable for every m1, m2, k in [1 − p, 1 + p]."""
     load_peak: float
-    """Largest ``|y|`` from 20 s on under a sinusoid of 1 N, at the worst k and phase [m]; infinite if a loop is unstable."""
+    """Largest ``|y|`` from 20 s on, at the worst k and phase [m]; infinite if unstable."""
     load_remains: float
     """The same over the last period of 80 s."""
 

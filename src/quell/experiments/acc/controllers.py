@@ -1,12 +1,13 @@
-"""Controllers for the ACC benchmark: ours, each one fixed controller for all plants, and the published ones.
+"""Controllers for the ACC benchmark: ours, each fixed for all plants, and the published ones.
 
-Ours have one rule. The impulse gives m2 a momentum of 1 N s; u = ±0.5 N takes at least 2 s to absorb it, and as long again
-to bring the masses back. That leaves a linear law about ten of the fifteen seconds. Four poles at ``omega_c`` go from 1 to
-0.1 in ``6.7/omega_c``, so ``omega_c = 1 rad/s`` takes seven of them and leaves room for a plant slower than nominal. The
-observer is ten times as fast. ``b0`` is 1.5 times the nominal gain ``k/(m1 m2) = 1``: a loop with light masses or a strong
-actuator, whose gain is above nominal, is lost sooner than one whose gain is below. ``docs/acc`` shows how little the
-failure rate changes around these values, and on which plants they were chosen: drawn ones, up to three times as uncertain
-as the published.
+Ours have one rule. The impulse gives m2 a momentum of 1 N s; u = ±0.5 N takes at least 2 s to
+absorb it, and as long again to bring the masses back. That leaves a linear law about ten of the
+fifteen seconds. Four poles at ``omega_c`` go from 1 to 0.1 in ``6.7/omega_c``, so ``omega_c = 1
+rad/s`` takes seven of them and leaves room for a plant slower than nominal. The observer is ten
+times as fast. ``b0`` is 1.5 times the nominal gain ``k/(m1 m2) = 1``: a loop with light masses or a
+strong actuator, whose gain is above nominal, is lost sooner than one whose gain is below.
+``docs/acc`` shows how little the failure rate changes around these values, and on which plants they
+were chosen: drawn ones, up to three times as uncertain as the published.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ BASELINES = {
     "LQG": "lqg",
     "resonance ratio": "resonance-ratio",
 }
-"""Names of the controllers of ``quell compare``, designed for the nominal plant; none was tuned for this benchmark."""
+"""Controllers of ``quell compare``, for the nominal plant; not tuned for this benchmark."""
 
 
 class TransferFunction(NamedTuple):
@@ -56,7 +57,7 @@ PUBLISHED = {
         (0.76003349, 1.94907798, 3.04966829, 2.73439891, 1.05935063),
     ),
 }
-"""The nominal design of Rocchetta, Crespo & Kenny (DSCC 2019), and two by scenario optimisation over their samples."""
+"""Rocchetta, Crespo & Kenny (DSCC 2019): the nominal design, two by scenario optimisation."""
 
 
 def designs(
@@ -68,12 +69,13 @@ def designs(
     most_u: float = MOST_U,
     load: float | None = None,
 ) -> dict[str, Any]:
-    """Return baselines and our controllers by name, sampled at ``dt`` [s], with ``|u| <= most_u`` [N].
+    """Return baselines and our controllers by name, with sample time ``dt`` and ``|u| <= most_u``.
 
-    MF-ESO knows the plant's order and gain, MB-ESO the nominal masses and spring. L-ESO knows as much as MF-ESO and
-    learns during control, with a guard. None knows the actuator's lag. With a sinusoidal ``load`` of known frequency
-    [rad/s] L-ESO learns the load too, and has no guard: after a load that begins with a jolt, the guard would keep it
-    from learning for more than a minute.
+    MF-ESO knows the plant's order and gain, MB-ESO the nominal masses and spring. L-ESO knows as
+    much as MF-ESO and learns during control, with a guard. None knows the actuator's lag. With a
+    sinusoidal ``load`` of known frequency [rad/s] L-ESO learns the load too, and has no guard:
+    after a load that begins with a jolt, the guard would keep it from learning for more than a
+    minute.
     """
     model_free = ESO.model_free(order=4, b0=b0, omega_o=omega_o, dt=dt)
     model_based = ESO.model_based(two_mass_spring(), omega_o=omega_o, dt=dt, b0=b0)

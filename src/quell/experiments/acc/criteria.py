@@ -11,7 +11,7 @@ from quell.experiments.acc.controllers import MOST_U
 from quell.types import Matrix, Vector
 
 SETTLED_AT, MOST_Y = 15.0, 0.1
-"""Time from which on y must stay small [s], and its limit [m], of Rocchetta, Crespo & Kenny (DSCC 2019)."""
+"""Time from which on y must stay small [s], and its limit [m] (Rocchetta et al., DSCC 2019)."""
 DURATION = 30.0
 """Duration of a run [s]: theirs is 25 s; chosen longer, so that slowly growing loops show."""
 # Relative to 0.5 N: a control signal on its limit is not beyond it, whatever the rounding.
@@ -28,7 +28,7 @@ class Judged(NamedTuple):
 
     @property
     def fails(self) -> NDArray[np.bool_]:
-        """Whether each plant fails: unstable, ``|y| > 0.1`` at any time from 15 s on, or ``|u| > 0.5`` at any time; NaN fails."""
+        """Whether each plant fails: unstable, ``|y| > 0.1`` from 15 s on, ``|u| > 0.5``, or NaN."""
         return ~((self.late_peak <= MOST_Y) & (self.most_u <= MOST_U + _ROUNDING))
 
     def to_json(self) -> dict[str, Any]:
@@ -43,9 +43,10 @@ class Judged(NamedTuple):
 
 
 def judge(t: Vector, y: Matrix, u: Matrix, unstable: NDArray[np.bool_]) -> Judged:
-    """Judge the records ``y`` and ``u`` (count, samples) at the times ``t``; they are NaN after an early end of a run.
+    """Judge records ``y`` and ``u`` (count, samples) at the times ``t``, NaN after an early end.
 
-    ``unstable`` (count,) marks loops with an unstable pole, which may be too slow to show in the records.
+    ``unstable`` (count,) marks loops with an unstable pole, which may be too slow to show in the
+    records.
     """
     late = np.max(np.abs(y[:, t >= SETTLED_AT - 1e-9]), axis=1)
     return Judged(
@@ -55,7 +56,7 @@ def judge(t: Vector, y: Matrix, u: Matrix, unstable: NDArray[np.bool_]) -> Judge
 
 
 def interval(failures: int, count: int) -> tuple[float, float]:
-    """Return the 95 % confidence interval of a failure probability (Clopper & Pearson, *Biometrika* 26, 1934; never too narrow)."""
+    """Return the 95 % confidence interval of a rate (Clopper & Pearson, *Biometrika* 26, 1934)."""
     from scipy.stats import binomtest
 
     found = binomtest(failures, count).proportion_ci(0.95, method="exact")

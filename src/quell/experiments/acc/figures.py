@@ -1,4 +1,4 @@
-"""The benchmark's figures: failure rates, responses, and failure rates against the uncertainty of the plants."""
+"""The benchmark's figures: failure rates, responses, and failure rates against uncertainty."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Rates = Mapping[str, Mapping[str, Sequence[tuple[float, float, float]]]]
 
 
 def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
-    """Draw the figures of a result and write them into ``folder``, which is created if need be; return the paths."""
+    """Draw the figures into ``folder``, which is created if need be; return the paths."""
     drawings: dict[str, Callable[[], Any]] = {
         "acc-failures": partial(_failures, result),
         "acc-responses": partial(_responses, result.samples[:_RESPONSES]),
@@ -38,7 +38,7 @@ def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> 
 def against_spread(
     progress: Progress, spreads: Sequence[float] = SPREADS, count: int = _COUNT
 ) -> Rates:
-    """Return by spring and controller, for each spread, the failure rate on ``count`` drawn samples, and its interval."""
+    """Return by spring and controller the failure rate and its interval for each spread."""
     found: dict[str, dict[str, list[tuple[float, float, float]]]] = {s: {} for s in SPRINGS}
     ours = designs(DT)
     for i, spread in enumerate(spreads):
@@ -79,7 +79,7 @@ def _failures(result: Result) -> Any:
 
 
 def _responses(samples: Matrix) -> Any:
-    """Draw y and u of our controllers on plants with cubic springs: median, 90 % of the runs, and all."""
+    """Draw y and u of our controllers with cubic springs: median, 90 % of the runs, and all."""
     ours = {name: controller for name, controller in designs(DT).items() if name in OURS}
     figure = new_figure(9.0, 5.2)
     axes = figure.subplots(2, len(ours), sharex=True, sharey="row")
@@ -110,7 +110,9 @@ def _responses(samples: Matrix) -> Any:
     axes[1, 0].set_ylabel("control signal [N]")
     axes[0, 0].legend(fontsize="small")
     lost = f"; {ended} runs that flew apart end where they did" if ended else ""
-    title = f"Impulse on m2, the first {len(samples)} plants with cubic springs; dashed: what is required{lost}"
+    title = (
+        f"Impulse on m2, the first {len(samples)} plants with cubic springs; dashed: limits{lost}"
+    )
     figure.suptitle(title, fontsize="medium")
     return figure
 

@@ -1,8 +1,8 @@
 """The published controllers, which are in continuous time: their loops, computed exactly.
 
-Plant and ``u = −C(s) y`` together are one linear system without inputs, ``x' = A x``, and ``x(t + h) = exp(A h) x(t)`` has no
-error; the force of the cubic spring acts between the samples, as in ``plants.cubic_spring``. None of this is shared with
-the simulation or a controller of this package.
+Plant and ``u = −C(s) y`` together are one linear system without inputs, ``x' = A x``, and ``x(t +
+h) = exp(A h) x(t)`` has no error; the force of the cubic spring acts between the samples, as in
+``plants.cubic_spring``. None of this is shared with the simulation or a controller of this package.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STEP = 0.01
 def judge_published(
     design: TransferFunction, samples: Matrix, cubic: bool, duration: float = DURATION
 ) -> Judged:
-    """Judge a continuous-time controller on samples (count, 6); a loop is unstable unless all poles are in the left half-plane."""
+    """Judge a continuous-time controller on samples (count, 6)."""
     with one_blas_thread():
         return _judged(design, samples, cubic, duration)
 
@@ -60,7 +60,7 @@ def _push(x: Matrix, push1: Vector, push2: Vector) -> None:
 
 
 def _closed_loops(design: TransferFunction, samples: Matrix) -> tuple[Matrix, Vector]:
-    """Return A (count, 5 + n, 5 + n), the plant's states first, and C (n,) of the controller in companion form, ``u = C x_c``."""
+    """Return A (count, 5 + n, 5 + n), the plant's states first, and the controller's C (n,)."""
     m1, m2, k, _, effectiveness, lag = samples.T
     den = np.array(design.den) / design.den[0]
     output = -np.array(design.num)[::-1] / design.den[0]

@@ -1,10 +1,11 @@
 """Uncertain plants of the ACC benchmark: read from a file, or drawn.
 
-A sample is a row ``(m1, m2, k_lin, k_nonlin, lambda, tau)``: masses [kg], stiffness [N/m] and its cubic part [N/m³],
-effectiveness and lag [s] of the actuator. ``generated`` draws samples like those that Rocchetta, Crespo & Kenny (DSCC 2019)
-published: each parameter has the quantiles of their 1000 samples of small uncertainty; spring, cubic part and effectiveness
-have the rank correlations of theirs (a Gaussian copula). In the original, light and heavy m1 also tend to have soft
-springs; without that the drawn samples are a little harsher.
+A sample is a row ``(m1, m2, k_lin, k_nonlin, lambda, tau)``: masses [kg], stiffness [N/m] and its
+cubic part [N/m³], effectiveness and lag [s] of the actuator. ``generated`` draws samples like those
+that Rocchetta, Crespo & Kenny (DSCC 2019) published: each parameter has the quantiles of their 1000
+samples of small uncertainty; spring, cubic part and effectiveness have the rank correlations of
+theirs (a Gaussian copula). In the original, light and heavy m1 also tend to have soft springs;
+without that the drawn samples are a little harsher.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from quell.types import Matrix, Vector
 
 COLUMNS = ("m1", "m2", "k_lin", "k_nonlin", "lambda", "tau")
 NOMINAL = np.array([1.0, 1.0, 1.0, 0.0, 1.0, 0.0065])
-"""The nominal plant; the lag is about the least of the published ones, as uncertainty only adds to it."""
+"""The nominal plant; the lag is about the least published one, as uncertainty only adds to it."""
 
-# Largest value (and the inverse of the smallest), and least lag [s]: far beyond real plants; chosen by hand, as the poles
-# of such loops are lost in rounding.
+# Largest value (and the inverse of the smallest), and least lag [s]: far beyond real plants; chosen
+# by hand, as the poles of such loops are lost in rounding.
 _MOST, _LEAST_LAG = 1e6, 1e-9
 _UNITS = {"m1": "kg", "m2": "kg", "k_lin": "N/m", "tau": "s"}
 # Quantiles of the published samples, one row for each parameter.
@@ -68,7 +69,8 @@ def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
     checks.whole("count", count, 1)
     if checks.positive("spread", spread) > _MOST_SPREAD:
         raise ValueError(
-            f"spread = {spread!r}: must be at most {_MOST_SPREAD:g}, the published samples do not cover more"
+            f"spread = {spread!r}: must be at most {_MOST_SPREAD:g}, "
+            "the published samples do not cover more"
         )
     from scipy.stats import norm
 
@@ -83,7 +85,7 @@ def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
 
 
 def widened(samples: Matrix, spread: float) -> Matrix:
-    """Return samples ``spread`` times as far from nominal: cubic part and lag linearly, the others as a factor, ``value^spread``."""
+    """Return samples ``spread`` times as far from nominal."""
     wide = np.empty_like(samples)
     for j in range(6):
         wide[:, j] = (
@@ -98,13 +100,14 @@ def widened(samples: Matrix, spread: float) -> Matrix:
 def read(path: str | os.PathLike[str]) -> Matrix:
     """Read samples from a CSV file, (count, 6).
 
-    The first line names the columns, in any order: ``m1, m2, k_lin, k_nonlin, lambda, tau``, or ``theta_1`` to ``theta_6`` as
-    published. Other columns are ignored.
+    The first line names the columns, in any order: ``m1, m2, k_lin, k_nonlin, lambda, tau``, or
+    ``theta_1`` to ``theta_6`` as published. Other columns are ignored.
 
     Raises
     ------
     ValueError
-        if the file can't be read, a column is missing, or a value is no number or out of range; it names line and column.
+        if the file can't be read, a column is missing, or a value is no number or out of range; it
+        names line and column.
     """
     where = f"samples = {os.fspath(path)!r}"
     rows = csv_rows(read_text(path, where), where)
@@ -125,7 +128,8 @@ def _column(where: str, header: list[str], j: int) -> int:
     if len(found) != 1:
         fault = "is missing" if not found else "is there more than once"
         raise ValueError(
-            f"{where}: column {names[0]} (or {names[1]}) {fault}; the first line has {', '.join(header)}"
+            f"{where}: column {names[0]} (or {names[1]}) {fault}; "
+            f"the first line has {', '.join(header)}"
         )
     return found[0]
 
@@ -148,12 +152,13 @@ def _value(where: str, number: int, row: list[str], place: int, j: int) -> float
     least = 0.0 if name == "k_nonlin" else _LEAST_LAG if name == "tau" else 1.0 / _MOST
     if not least <= abs(value) <= _MOST:
         raise ValueError(
-            f"{where}, line {number}: {name} = {value!r}: must be between {least:g} and {_MOST:g}, is the unit right?"
+            f"{where}, line {number}: {name} = {value!r}: "
+            f"must be between {least:g} and {_MOST:g}, is the unit right?"
         )
     return value
 
 
 def plant(sample: Vector, cubic: bool) -> LinearPlant | CubicSpringPlant:
-    """Return the plant of a sample; with ``cubic`` always one with a cubic part, even if that is zero, so that all have one type."""
+    """Return the plant of a sample; with ``cubic`` its spring has a cubic part, perhaps zero."""
     m1, m2, k, k_cubic, effectiveness, lag = map(float, sample)
     return lagged_two_mass_spring(m1, m2, k, k_cubic if cubic else None, effectiveness, lag)

@@ -1,4 +1,4 @@
-"""Stability of the benchmark's loops while no limit holds: for many plants at once, as ``analysis`` is for one."""
+"""Stability of the benchmark's loops without limits, for many plants at once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from quell.plants import CubicSpringPlant, LinearPlant
 def unstable(
     plants: Sequence[LinearPlant | CubicSpringPlant], controller: Any
 ) -> NDArray[np.bool_]:
-    """Return for each plant whether its loop is unstable around y = 0, where a cubic spring has no effect, with nothing learned."""
+    """Return for each plant whether its loop is unstable at rest, with nothing learned."""
     law = linear_law(controller)
     inner = law.A + np.outer(law.B_u, law.C)
     linear = [p.linear if isinstance(p, CubicSpringPlant) else p for p in plants]

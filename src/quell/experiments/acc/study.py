@@ -1,8 +1,9 @@
 """The ACC benchmark, a test designed by others: fixed controllers on a thousand uncertain plants.
 
-Two masses on a spring, moved through an actuator with lag; all parameters are uncertain. After a unit impulse on m2 the
-output must be within 0.1 m from 15 s on, with ``|u| ≤ 0.5`` N always (Rocchetta, Crespo & Kenny, DSCC 2019). Each plant is
-simulated twice, without and with the cubic part of its spring, for 30 s at dt = 10 ms.
+Two masses on a spring, moved through an actuator with lag; all parameters are uncertain. After a
+unit impulse on m2 the output must be within 0.1 m from 15 s on, with ``|u| ≤ 0.5`` N always
+(Rocchetta, Crespo & Kenny, DSCC 2019). Each plant is simulated twice, without and with the cubic
+part of its spring, for 30 s at dt = 10 ms.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from quell.types import Matrix, Progress, Vector
 SPRINGS = {"linear": False, "cubic": True}
 # Number of plants for the timing on one core: about a second on the machines used here.
 _ONE_CORE = 100
-# |y| at which a run ends [m]: a softening spring can break. Chosen by hand; any |y| far above 0.1 m is a failure.
+# |y| at which a run ends [m]: a softening spring can break. Chosen by hand; any |y| far above 0.1 m
+# is a failure.
 _LOST = 1e3
 
 
@@ -103,7 +105,7 @@ def records(
     progress: Callable[[float], None] | None = None,
     workers: int | None = None,
 ) -> tuple[Vector, Matrix, Matrix]:
-    """Return times (samples,), y and u (count, samples); m2 starts with ``speeds`` [m/s]. NaN stands after an early end of a run."""
+    """Return times (samples,), y and u (count, samples); m2 starts with ``speeds`` [m/s]."""
     impulses = [
         Scenario(duration=DURATION, x0=[0.0, 0.0, 0.0, speed, 0.0]) for speed in speeds.tolist()
     ]

@@ -1,1 +1,1 @@
-"""Parts that several experiments use: judged claims, scores and figures. It imports no experiment."""
+"""Parts that several experiments use: claims, scores and figures. It imports no experiment."""

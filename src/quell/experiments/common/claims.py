@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of a paper, judged by a stated rule; a claim about a value that was not measured does not hold."""
+    """One claim of a paper, judged by a stated rule; it does not hold without a measured value."""
 
     claim: str
     paper: float | str
@@ -45,7 +45,7 @@ class Claim:
     def at_most(
         cls, claim: str, paper: str, measured: float | None, most: float | None, unit: str = ""
     ) -> Claim:
-        """Judge a value that must not exceed another measured one; it holds if there is no other one."""
+        """Judge a value that must not exceed another; the claim holds if there is no other."""
         holds = measured is not None and (most is None or measured <= most * (1.0 + 1e-9))
         return cls(claim, paper, measured, holds, "any" if most is None else f"≤ {most:.5g}", unit)
 

@@ -29,7 +29,7 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def wide_figure(height: float) -> Any:
-    """Return an empty figure with fixed margins, as an automatic layout takes longer than drawing; independent of ``pyplot``."""
+    """Return an empty figure with fixed margins; an automatic layout takes longer than drawing."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, height))
@@ -64,7 +64,7 @@ def make_folder(folder: str | os.PathLike[str]) -> Path:
 
 
 def save_figure(figure: Any, folder: str | os.PathLike[str], name: str) -> list[Path]:
-    """Write a figure into ``folder`` as PNG and SVG; return the paths. Equal figures give equal files.
+    """Write a figure into ``folder`` as PNG and SVG; return the paths.
 
     Raises
     ------
@@ -89,23 +89,10 @@ def save_figures(
     progress: Progress | None = None,
     style: Any = None,
 ) -> list[Path]:
-    """Draw figures and write each as PNG and SVG.
+    """Draw figures and write each as PNG and SVG; return the paths.
 
-    Parameters
-    ----------
-    drawings
-        functions that return a figure, by the name of the file.
-    folder
-        created if it does not exist.
-    progress
-        called before each figure.
-    style
-        settings of matplotlib.
-
-    Returns
-    -------
-    list of Path
-        the files.
+    ``drawings`` has a function that returns a figure for each name of a file, ``style`` settings of
+    matplotlib.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Scores of runs, as numbers for tables and JSON files; None stands for a number that a run does not have."""
+"""Scores of runs for tables and JSON files; None stands for a number that a run does not have."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ METRICS = (
 
 
 def step_scores(t: Vector, y: Vector, target: float, band: float, initial: float = 0.0) -> Scores:
-    """Return overshoot (fraction) and settling time [s] of a move; the latter is None if y does not settle."""
+    """Return overshoot (fraction) and settling time [s], None if y does not settle."""
     settling = metrics.settling_time(t, y, target, band, initial)
     return {
         "overshoot": metrics.overshoot(y, target, initial),

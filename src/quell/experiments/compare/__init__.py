@@ -1,4 +1,4 @@
-"""Controllers side by side: on any plant, and on the two-mass-spring benchmark as ``quell compare`` shows it."""
+"""Controllers side by side: on any plant, and on the benchmark of ``quell compare``."""
 
 from quell.experiments.compare.benchmark import (
     END,

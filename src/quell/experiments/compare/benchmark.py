@@ -1,12 +1,13 @@
 """The comparison that ``quell compare`` shows: controllers on the two-mass-spring benchmark.
 
-The benchmark is that of Wie & Bernstein (1992) without friction; the load's position is measured and controlled. From
-rest there is a unit step, then a constant force on the load, with measurement noise. All controllers are designed for
-m1 = m2 = k = 1, whatever the plant is.
+The benchmark is that of Wie & Bernstein (1992) without friction; the load's position is measured
+and controlled. From rest there is a unit step, then a constant force on the load, with measurement
+noise. All controllers are designed for m1 = m2 = k = 1, whatever the plant is.
 
-This plant is hard for a PID controller: between force and load there is the phase of four integrators. Tuned by SIMC for
-the rigid body, with the filter's lag as its delay, it is stable and slow. PI control with a notch can't be stable on a
-plant that is free to move; ``pi-notch`` has a derivative part.
+This plant is hard for a PID controller: between force and load there is the phase of four
+integrators. Tuned by SIMC for the rigid body, with the filter's lag as its delay, it is stable and
+slow. PI control with a notch can't be stable on a plant that is free to move; ``pi-notch`` has a
+derivative part.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ OMEGA_C, OMEGA_O = 1.0, 10.0
 RESONANCE = math.sqrt(2.0)
 """Resonance of the nominal plant, free at both ends [rad/s]: √(k/m1 + k/m2)."""
 FORCE_AT, END = 40.0, 100.0
-"""Start of the constant force, end of the scenario [s]: chosen by hand, the slowest controller settles before."""
+"""Start of the constant force, end of the scenario [s]: chosen by hand."""
 FORCE = 0.1
-"""Constant force on the load [N]: a tenth of the force that moves it by the step within a second."""
+"""Force on the load [N]: a tenth of the force that moves it by the step within a second."""
 # Longest sample time [s]: omega_o dt = 1 with the bandwidth above.
 _LONGEST_DT = 0.1
 # About 1 GB of records for each controller.
@@ -71,11 +72,13 @@ class Benchmark:
     def __post_init__(self) -> None:
         if checks.positive("dt", self.dt, "s") > _LONGEST_DT:
             raise ValueError(
-                f"dt = {self.dt!r}: must be at most {_LONGEST_DT:g} s, the observers' bandwidth is {OMEGA_O:g} rad/s"
+                f"dt = {self.dt!r}: must be at most {_LONGEST_DT:g} s, "
+                f"the observers' bandwidth is {OMEGA_O:g} rad/s"
             )
         if END / self.dt > _MOST_SAMPLES:
             raise ValueError(
-                f"dt = {self.dt!r}: must be at least {END / _MOST_SAMPLES:g} s, or the records do not fit in memory"
+                f"dt = {self.dt!r}: must be at least {END / _MOST_SAMPLES:g} s, "
+                "or the records do not fit in memory"
             )
         if not self.u_max > 0.0:
             raise ValueError(f"u_max = {self.u_max!r}: must be greater than zero [N], inf for none")
@@ -84,7 +87,7 @@ class Benchmark:
 
 
 def scenario(settings: Benchmark) -> Scenario:
-    """Return the benchmark's scenario: a unit step from rest, a constant force on the load from ``FORCE_AT`` on, noise."""
+    """Return the scenario: a unit step from rest, a force from ``FORCE_AT`` on, noise."""
     return Scenario(
         reference=1.0,
         disturbances=(0.0, Step(at=FORCE_AT, height=FORCE)),
@@ -100,7 +103,8 @@ def controller(name: str, dt: float, u_max: float = math.inf) -> Any:
     Parameters
     ----------
     name
-        one of ``NAMES``, with ``zv+`` or ``zvd+`` before it to shape the reference for the plant's resonance.
+        one of ``NAMES``, with ``zv+`` or ``zvd+`` before it to shape the reference for the plant's
+        resonance.
     dt
         sample time [s].
     u_max
@@ -114,7 +118,8 @@ def controller(name: str, dt: float, u_max: float = math.inf) -> Any:
     *shapers, base = name.split("+")
     if base not in _DESIGNS or len(shapers) > 1 or not set(shapers) <= set(_SHAPERS):
         raise ValueError(
-            f"controllers: {name!r} must be one of {', '.join(NAMES)}, or zv+ or zvd+ and one of these, as zv+pid"
+            f"controllers: {name!r} must be one of {', '.join(NAMES)}, "
+            "or zv+ or zvd+ and one of these, as zv+pid"
         )
     design = _DESIGNS[base](dt, {"u_min": -u_max, "u_max": u_max})
     return Prefiltered(design, _SHAPERS[shapers[0]](RESONANCE)) if shapers else design
@@ -123,7 +128,7 @@ def controller(name: str, dt: float, u_max: float = math.inf) -> Any:
 def two_mass(
     settings: Benchmark, names: Sequence[str], progress: Callable[[float], None] | None = None
 ) -> Comparison:
-    """Run the controllers ``names`` on the plant of ``settings``; ``progress`` is called with the finished share.
+    """Run the controllers ``names`` on the plant of ``settings``.
 
     Raises
     ------
@@ -136,13 +141,15 @@ def two_mass(
 
 
 def _pid(dt: float, limits: dict[str, Any]) -> PID:
-    # The slow filter lags at the resonance by more than the derivative leads, which damps it (phase stabilisation).
+    # The slow filter lags at the resonance by more than the derivative leads, which damps it (phase
+    # stabilisation).
     tf = 2.0 * math.sqrt(2.0) / RESONANCE
     return PID.simc_double_integrator(0.5, tf, tau_c=0.5 * tf, dt=dt, tf=tf, b=0.6, **limits)
 
 
 def _notch_pid(dt: float, limits: dict[str, Any]) -> NotchPID:
-    # Above the resonance, where the notch lags. At the resonance it would take the resonance out of the loop, undamped.
+    # Above the resonance, where the notch lags. At the resonance it would take the resonance out of
+    # the loop, undamped.
     notch, tf = Notch.at(1.5 * RESONANCE), math.sqrt(2.0) / RESONANCE
     tuned = PID.simc_double_integrator(0.5, tf + notch.delay, tau_c=tf, dt=dt)
     return NotchPID(notch, tuned.kp, tuned.ki, tuned.kd, tf=tf, b=0.6, dt=dt, **limits)

@@ -15,7 +15,7 @@ from quell.records.plotting import draw_line
 
 
 def draw(result: Comparison) -> Any:
-    """Return the figure: y and r above, u below with quiet signals in front; extreme values are cut off."""
+    """Return the figure: y and r above, u below; quiet signals in front, extreme values cut off."""
     figure = new_figure(10.0, 7.0)
     above, below = figure.subplots(2, 1, sharex=True)
     first = next(iter(result.runs.values()))
@@ -43,7 +43,7 @@ def save(result: Comparison, folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def _limits(signals: list[Any]) -> tuple[float, float]:
-    """Return limits of an axis that hold all signals, except for values far beyond the median of the extremes."""
+    """Return limits of an axis that hold all signals except for extreme values."""
     low, high = (float(np.median([pick(s) for s in signals])) for pick in (np.min, np.max))
     room = 1.5 * max(high - low, 1e-9)
     clipped = [np.clip(s, low - room, high + room) for s in signals]

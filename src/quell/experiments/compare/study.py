@@ -56,7 +56,7 @@ def compare(
     record_every: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
-    """Run controllers on a plant through the same scenario, with the same noise, on all cores, and score the runs.
+    """Run controllers on a plant through one scenario with the same noise, and score the runs.
 
     Parameters
     ----------
@@ -65,8 +65,9 @@ def compare(
     controllers
         by name, any number, with any sample times.
     load_at
-        time from which on a disturbance is scored [s]. The run before it is scored as a step, from its first value to the
-        last reference before ``load_at``. By default the whole run is the step.
+        time from which on a disturbance is scored [s]. The run before it is scored as a step, from
+        its first value to the last reference before ``load_at``. By default the whole run is the
+        step.
     band
         half width of the settling band, as a fraction of the step.
     record_every
@@ -77,8 +78,9 @@ def compare(
     Returns
     -------
     Comparison
-        with ``overshoot`` (fraction), ``settling_time`` [s], ``disturbance_peak`` (largest ``|r − y|`` from ``load_at``
-        on) and ``rms`` of r − y over the whole run [y-unit], and ``control_variation`` over the whole run [u-unit].
+        with ``overshoot`` (fraction), ``settling_time`` [s], ``disturbance_peak`` (largest ``|r −
+        y|`` from ``load_at`` on) and ``rms`` of r − y over the whole run [y-unit], and
+        ``control_variation`` over the whole run [u-unit].
 
     Raises
     ------
@@ -90,7 +92,8 @@ def compare(
     >>> from quell.controllers.baselines import PID
     >>> from quell.plants import LinearPlant
     >>> lag = LinearPlant([[-1.0]], [1.0], [1.0])
-    >>> result = compare(lag, {"PI": PID(kp=4.0, ki=4.0, dt=0.01)}, Scenario(reference=1.0, duration=5.0))
+    >>> step = Scenario(reference=1.0, duration=5.0)
+    >>> result = compare(lag, {"PI": PID(kp=4.0, ki=4.0, dt=0.01)}, step)
     >>> round(result.scores["PI"]["settling_time"], 2)
     0.96
     """
@@ -114,7 +117,7 @@ def compare(
 def score(
     run: Trajectory, duration: float, load_at: float | None = None, band: float = BAND
 ) -> Scores:
-    """Return the scores of one run; see ``compare``. None if the run ended too early, or y did not settle."""
+    """Return the scores of one run; None if it ended too early, or y did not settle."""
     found: Scores = dict.fromkeys(
         ("overshoot", "settling_time", "disturbance_peak", "rms", "control_variation")
     )

@@ -1,7 +1,8 @@
 """Hostile learners, which a guard has to withstand.
 
-One type serves for most of them, so that a trial compiles once; ``kind`` selects the behaviour. Algorithm 1 is the real
-one (``learners.BatchGradient``), and ``Turncoat`` is a ``Kalman`` or ``Harmonic`` learner that turns hostile later.
+One type serves for most of them, so that a trial compiles once; ``kind`` selects the behaviour.
+Algorithm 1 is the real one (``learners.BatchGradient``), and ``Turncoat`` is a ``Kalman`` or
+``Harmonic`` learner that turns hostile later.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class AdversaryMemory(NamedTuple):
     past: Vector
     """Ring buffer of the last estimates f̂ (delay + 1,)."""
     now: Vector
-    """(5,): place in the ring, number of samples, f_L, f̂ of an ESO without learner, present sign."""
+    """(5,): place in ``past``, number of samples, f_L, f̂ of an ESO without learner, sign."""
     seed: Vector
     """(1,): state of the random numbers."""
 
@@ -57,7 +58,7 @@ _AT, _COUNT, _F_L, _F_PLAIN, _SIGN = range(5)
 
 @kernel
 def uniform(seed: Vector) -> float:
-    """Return a uniform number in [0, 1): a linear congruence modulo 2^31 − 1 (Park & Miller 1988), exact in floating point."""
+    """Return a uniform number in [0, 1) (Park & Miller 1988), exact in floating point."""
     seed[0] = (16807.0 * seed[0]) % 2147483647.0
     return seed[0] / 2147483647.0
 
@@ -189,7 +190,8 @@ class Adversary:
         return ()
 
 
-# Hostile learners by name. Ranges are chosen by hand: from harmless to far beyond the size of f in these loops.
+# Hostile learners by name. Ranges are chosen by hand: from harmless to far beyond the size of f in
+# these loops.
 _DRAWS: dict[str, Callable[[np.random.Generator], Learner]] = {
     "opposite sign": lambda rng: Adversary(MULTIPLE, -_log_uniform(rng, 0.1, 10.0)),
     "over-prediction": lambda rng: Adversary(

@@ -1,8 +1,9 @@
 """Random loops: two-mass-spring plants, all controlled by one design without tuning.
 
-Masses in [0.5, 2] kg, stiffness in [0.3, 3] N/m, b0 wrong by a factor in [0.6, 1.6], sample times of 1, 2 and 5 ms, a load
-on m2 of 0.1 to 1.5 rad/s and 0.1 to 2 N; omega_c = 1 and omega_o = 10 rad/s for all. From rest the output follows sin t for
-60 s, then a unit step; the load acts from 90 s on.
+Masses in [0.5, 2] kg, stiffness in [0.3, 3] N/m, b0 wrong by a factor in [0.6, 1.6], sample times
+of 1, 2 and 5 ms, a load on m2 of 0.1 to 1.5 rad/s and 0.1 to 2 N; omega_c = 1 and omega_o = 10
+rad/s for all. From rest the output follows sin t for 60 s, then a unit step; the load acts from 90
+s on.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from quell.signals import BandLimitedNoise, Sinusoid, Step
 from quell.simulation.scenario import Scenario
 
 STEP_AT, LOAD_AT, END = 60.0, 90.0, 150.0
-"""Start of the step and of the load, end of a run [s]: chosen by hand, a guard has time to trust a learner before each."""
+"""Start of the step and of the load, end of a run [s]: chosen by hand."""
 REFERENCE = Sinusoid().until(STEP_AT, then=Step(at=STEP_AT))
 
 

@@ -1,8 +1,8 @@
-"""The guard's trial: hostile learners, and an honest one, in random loops, each beside plain MF-ESO with the same seed.
+"""The guard's trial: hostile learners and an honest one in random loops, each beside MF-ESO.
 
-Errors are those of y against the response that the loop is designed for, ``(omega_c/(s + omega_c))^n`` times r, so that
-they do not contain the lag of the design. The ratio of a run is its RMS error divided by that of MF-ESO: over the whole
-run, and over the 60 s of load.
+Errors are those of y against the response that the loop is designed for, ``(omega_c/(s +
+omega_c))^n`` times r, so that they do not contain the lag of the design. The ratio of a run is its
+RMS error divided by that of MF-ESO: over the whole run, and over the 60 s of load.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def run_one(kind: str, loop: Loop, learner: Learner, guard: Guard | None) -> Out
 def errors(
     loop: Loop, learner: Learner | None, guard: Guard | None
 ) -> tuple[float, float, float] | None:
-    """Return the RMS errors over the whole run, under load, and late; None if the loop is unstable."""
+    """Return the RMS errors of the whole run, under load, and late; None if unstable."""
     every, controller = round(_RECORD_DT / loop.dt), loop.controller(learner, guard)
     run = simulate(loop.plant, controller, loop.scenario, record_every=every, limit=_LIMIT)
     if run.diverged:

@@ -71,7 +71,7 @@ def _coefficients_turncoat(learner: TurncoatDesign, memory: TurncoatMemory, thet
 
 @dataclass(frozen=True)
 class Turncoat:
-    """A learner that is honest for ``turns`` seconds, and then returns ``size`` times its prediction."""
+    """A learner that returns ``size`` times its prediction after ``turns`` seconds."""
 
     honest: Learner
     turns: float

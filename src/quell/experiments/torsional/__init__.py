@@ -1,4 +1,4 @@
-"""The paper's hardware experiment on a simulated twin of its torsional testbed, every claim judged."""
+"""The paper's hardware experiment on a twin of its torsional testbed, every claim judged."""
 
 from quell.experiments.torsional.figures import save
 from quell.experiments.torsional.setup import (

@@ -1,4 +1,4 @@
-"""The figures of the torsional experiment: the paper's two, for each pair of bandwidths, and what was learned."""
+"""The figures of the torsional experiment: the paper's two, and what was learned."""
 
 from __future__ import annotations
 
@@ -53,13 +53,7 @@ _SMOOTHED = 0.02
 
 
 def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
-    """Draw all figures into ``folder``, each as PNG and SVG; return the paths.
-
-    Raises
-    ------
-    ValueError
-        if the folder can't be created.
-    """
+    """Draw all figures into ``folder``, which is created if need be; return the paths."""
     drawings = {
         "torsional-position": partial(_position, result),
         "torsional-control": partial(_control, result),
@@ -119,18 +113,21 @@ def _control(result: Result) -> Any:
 
 
 def _learning(case: Case) -> Any:
-    """Draw the coefficients of L-ESO on the plant with friction, and the parts of its estimate of f."""
+    """Draw the coefficients of L-ESO with friction, and the parts of its estimate of f."""
     run = case.outcomes[FRICTION].records[L]
     figure = wide_figure(7.2)
     figure.subplots_adjust(left=0.1)
     above, below = figure.subplots(2, 1)
-    # The identified plant's own coefficients, f = −(b0/b) a·x + (1 − b0/b)(…), as its gain is b and not b0.
+    # The identified plant's own coefficients, f = −(b0/b) a·x + (1 − b0/b)(…), as its gain is b and
+    # not b0.
     numbers = -torsional_identified().A[-1] * B0 / float(torsional_identified().B[-1, 0])
     for i, feature in enumerate(run.features[:3]):
         draw_line(above, run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         above.axhline(-numbers[i], color=f"C{i}", linestyle=":", linewidth=1.2)
     above.set_ylim(-4000.0, 2000.0)
-    title = f"coefficients of L-ESO at {case.label} with friction; dotted: the identified plant's, for b0"
+    title = (
+        f"coefficients of L-ESO at {case.label} with friction; dotted: identified plant's, for b0"
+    )
     above.set_title(title, fontsize="medium")
     above.set_ylabel("theta")
     for channel, label in (

@@ -1,14 +1,16 @@
-"""The paper's hardware experiment (section V) on the twin: the ECP 205 torsional testbed under MF-ESO, MB-ESO and L-ESO.
+"""The paper's hardware experiment (section V) on a twin of the ECP 205 torsional testbed.
 
-From rest the upper disk follows (π/2) sin(π t/2) for 40 s, while a learner learns; then the loop starts from rest again,
-with what was learned, and follows a trapezoidal profile to π within 2 s. The output comes from an encoder of 16 000 counts.
-There are two plants: *friction*, the twin with Coulomb friction, converter and current limit, and *linear*, the transfer
-function that the paper identified, behind the encoder.
+From rest the upper disk follows (π/2) sin(π t/2) for 40 s, while a learner learns; then the loop
+starts from rest again, with what was learned, and follows a trapezoidal profile to π within 2 s.
+The output comes from an encoder of 16 000 counts. There are two plants: *friction*, the twin with
+Coulomb friction, converter and current limit, and *linear*, the transfer function that the paper
+identified, behind the encoder.
 
-The paper leaves open: the duration of the training (40 s here), the ramps of the profile (0.5 s each), the settling band
-(±0.2 % of the move; settling counts from the profile's start, as in the two-mass study), and the observers (those of that
-study). u is limited to the range of the drive, and the observers get the limited u. The only random quantity is the start
-between two edges of the encoder; results are medians over several starts.
+The paper leaves open: the duration of the training (40 s here), the ramps of the profile (0.5 s
+each), the settling band (±0.2 % of the move; settling counts from the profile's start, as in the
+two-mass study), and the observers (those of that study). u is limited to the range of the drive,
+and the observers get the limited u. The only random quantity is the start between two edges of the
+encoder; results are medians over several starts.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ B0 = 5.5e4
 STARTS = 5
 """Number of starts: chosen by hand, an odd number for medians."""
 CASES = ((90.0, 40.0), (40.0, 90.0), (20.0, 90.0))
-"""omega_c and omega_o [rad/s]: as in the paper, exchanged, and where the claims hold best (docs/torsional)."""
+"""omega_c and omega_o [rad/s]: the paper's, exchanged, and where the claims hold best."""
 
 MF, MB, L = "MF-ESO", "MB-ESO", "L-ESO"
 MB_OFF, LG = "MB-ESO (10 % off)", "L-ESO (guarded)"
@@ -79,7 +81,8 @@ class Settings:
     def __post_init__(self) -> None:
         if not _SHORTEST_DT <= checks.positive("dt", self.dt, "s") <= _LONGEST_DT:
             raise ValueError(
-                f"dt = {self.dt!r}: must be from {_SHORTEST_DT:g} to {_LONGEST_DT:g} s, as the loops have up to 90 rad/s"
+                f"dt = {self.dt!r}: must be from {_SHORTEST_DT:g} to {_LONGEST_DT:g} s, "
+                "as the loops have up to 90 rad/s"
             )
         checks.whole("seed", self.seed, 0)
 
@@ -109,7 +112,7 @@ def model_off(share: float = 0.1) -> LinearPlant:
 
 
 def controllers(settings: Settings, omega_c: float, omega_o: float) -> dict[str, ADRC]:
-    """Return the controllers by name, with bandwidths in rad/s; the learner is ``Kalman()`` without tuning in all cases."""
+    """Return the controllers by name, with bandwidths in rad/s; the learner is not tuned."""
     free = ESO.model_free(order=4, b0=B0, omega_o=omega_o, dt=settings.dt)
     exact = ESO.model_based(torsional_identified(), omega_o=omega_o, dt=settings.dt)
     off = ESO.model_based(model_off(), omega_o=omega_o, dt=settings.dt)
@@ -128,10 +131,11 @@ def controllers(settings: Settings, omega_c: float, omega_o: float) -> dict[str,
 
 
 def score(run: Trajectory) -> Scores:
-    """Return the scores of the profile, over [40, 50] s; None if the run ended too early, or y did not settle.
+    """Return the scores over [40, 50] s; None if the run ended too early, or y did not settle.
 
-    Overshoot (a fraction of π), settling time [s] from the profile's start, control variation [V], and the RMS of y − r
-    [rad]. ``disturbance_peak`` and ``disturbance_rms`` are None: nothing but friction disturbs.
+    Overshoot (a fraction of π), settling time [s] from the profile's start, control variation [V],
+    and the RMS of y − r [rad]. ``disturbance_peak`` and ``disturbance_rms`` are None: nothing but
+    friction disturbs.
     """
     found: Scores = dict.fromkeys(METRICS)
     if run.ended >= END - 2 * run.dt:

@@ -37,8 +37,8 @@ from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
 from quell.types import Progress
 
-# One count of the encoder as a fraction of the move, the resolution of an overshoot. Overshoots are whole counts, up to
-# rounding, for which there is the last factor.
+# One count of the encoder as a fraction of the move, the resolution of an overshoot. Overshoots are
+# whole counts, up to rounding, for which there is the last factor.
 _COUNT = 2.0 / COUNTS * (1.0 + 1e-6)
 
 
@@ -78,7 +78,7 @@ class Case:
         return f"{self.omega_c:g}/{self.omega_o:g}"
 
     def to_json(self) -> dict[str, Any]:
-        """Return the results: with friction at the top level, of the linear plant under its name."""
+        """Return the results: those with friction at the top, the linear plant's under its name."""
         bandwidths = {"omega_c": self.omega_c, "omega_o": self.omega_o}
         return (
             bandwidths
@@ -98,12 +98,14 @@ class Result:
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries and lists for ``json.dump``."""
         about = {
-            "plant": "ECP 205 torsional plant, two disks, y = angle of the upper one; with friction, and (linear) as identified",
+            "plant": "ECP 205 torsional plant, two disks, y = angle of the upper one; "
+            "with friction, and (linear) as identified",
             "encoder_counts": COUNTS,
             "profile_window": (PROFILE_AT, END),
             "settling_band": BAND,
             "starts": STARTS,
-            "units": "SI; overshoot as a fraction of the move; settling time from the profile's start; medians over the starts",
+            "units": "SI; overshoot as a fraction of the move; "
+            "settling time from the profile's start; medians over the starts",
         }
         return {
             "settings": asdict(self.settings) | about,
@@ -158,8 +160,9 @@ def _over_starts(scores: Sequence[Scores], summary: Callable[[list[float]], Any]
 def _claims(scores: Mapping[str, Scores], dt: float) -> Iterable[Claim]:
     """Judge the paper's two observations.
 
-    L-ESO has the least overshoot and settles first; its control variation is below MF-ESO's and above MB-ESO's. Overshoots
-    differ by at least a count of the encoder, settling times by a sample.
+    L-ESO has the least overshoot and settles first; its control variation is below MF-ESO's and
+    above MB-ESO's. Overshoots differ by at least a count of the encoder, settling times by a
+    sample.
     """
     for key, name, unit, resolution in (
         ("overshoot", "overshoot", "", _COUNT),

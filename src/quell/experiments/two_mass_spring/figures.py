@@ -1,4 +1,4 @@
-"""The figures of the two-mass study: the paper's two, what was learned, and the range in which Algorithm 1 is stable."""
+"""The figures of the two-mass study: the paper's two, what was learned, and Algorithm 1."""
 
 from __future__ import annotations
 
@@ -33,18 +33,13 @@ _STYLES: Mapping[str, dict[str, Any]] = {
     L1: {"color": "0.55", "linewidth": 1.0, "linestyle": "--"},
     L: STYLES[L],
 }
-# The benchmark's f is −2 y'' + disturbance (paper eq. (disturbance-twomass-MFESO) with m1 = m2 = k = 1, b0 = b).
+# The benchmark's f is −2 y'' + disturbance (paper eq. (disturbance-twomass-MFESO) with m1 = m2 = k
+# = 1, b0 = b).
 _TRUE_THETA = {"x1": 0.0, "x2": 0.0, "x3": -2.0, "x4": 0.0}
 
 
 def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
-    """Draw all figures into ``folder``, each as PNG and SVG; return the paths.
-
-    Raises
-    ------
-    ValueError
-        if the folder can't be created.
-    """
+    """Draw all figures into ``folder``, which is created if need be; return the paths."""
     drawings = {
         "position": partial(_comparison, result, "y", "position of m2 [m]"),
         "control": partial(_comparison, result, "u", "control force [N]"),
@@ -73,7 +68,8 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
     whole = axes["all"]
     whole.set_ylabel(label)
     whole.set_title(
-        f"{label.split(' [')[0]}, from {_FROM:g} s: step at {STEP_AT:g} s, force on m2 from {FORCE_AT:g} s"
+        f"{label.split(' [')[0]}, from {_FROM:g} s: step at {STEP_AT:g} s, "
+        f"force on m2 from {FORCE_AT:g} s"
     )
     whole.legend(ncols=2, loc="upper left" if channel == "u" else "lower left", fontsize="small")
     for start, stop in _ZOOMS:
@@ -84,7 +80,7 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
 
 
 def _learning(result: Result) -> Any:
-    """Draw the coefficients of L-ESO, its estimate of f, and the estimation errors of the three observers."""
+    """Draw the coefficients of L-ESO, its estimate of f, and the errors of the three observers."""
     run = result.runs[L]
     figure = wide_figure(8.0)
     axes = figure.subplots(3, 1, sharex=True)
@@ -121,7 +117,7 @@ def _learning(result: Result) -> Any:
 
 
 def _true_disturbance(run: Trajectory, known: bool = False) -> Vector:
-    """Return the true f of a record, ``−2 y'' + w2 + w2''``; without the first term for an observer with a model."""
+    """Return the true f, ``−2 y'' + w2 + w2''``; without the first term for a ``known`` model."""
     x, w2 = run["x"], run["w"][:, 1]
     y2 = x[:, 0] - x[:, 1] + w2
     step = run.dt * run.every

@@ -1,4 +1,4 @@
-"""The time until Algorithm 1 diverges, by learning rate, in the two-mass study's scenario extended to ten times its length."""
+"""The time until Algorithm 1 diverges, in the two-mass study's scenario, ten times as long."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from quell.types import Progress
 BATCHES = (1, 10, 1000)
 """Samples in a batch: chosen by hand, to show that the limit does not depend on it."""
 RATES = tuple(float(rate) for rate in np.geomspace(1e-3, 1.0, 13))
-"""rate · batch / dt [1/s]: the speed of θ, for any sample time and batch. A range around the limit of 0.015/s."""
+"""rate · batch / dt [1/s], the speed of θ: a range around the limit of 0.015/s."""
 HORIZON = 2500.0
 """Duration of a run that does not diverge [s]: ten times that of the study."""
 
@@ -42,7 +42,8 @@ def trials(
 ) -> tuple[Trial, ...]:
     """Run Algorithm 1 with every batch and rate.
 
-    The sample time is 10 ms if the observer allows it: the result depends on the rate per second, not per sample.
+    The sample time is 10 ms if the observer allows it: the result depends on the rate per second,
+    not per sample.
     """
     coarse = replace(settings, dt=max(settings.dt, min(0.01, 0.1 / settings.omega_o)))
     plant, long = two_mass_spring(), replace(scenario(coarse), duration=HORIZON)
@@ -63,7 +64,7 @@ def trials(
 
 
 def stable_up_to(found: Sequence[Trial], batch: int) -> float | None:
-    """Return the largest rate up to which all trials with ``batch`` are stable [1/s]; None if the smallest rate is not."""
+    """Return the largest rate up to which all trials with ``batch`` are stable [1/s], or None."""
     largest = None
     for trial in sorted((t for t in found if t.batch == batch), key=lambda t: t.rate):
         if not trial.stable:

@@ -1,9 +1,10 @@
-"""The paper's simulation study (section IV): the two-mass-spring benchmark under MF-ESO, MB-ESO and L-ESO.
+"""The paper's simulation study (section IV) on the two-mass-spring benchmark.
 
-From rest the output follows sin t for 110 s, while a learner learns; then the loop starts from rest again, with what was
-learned, and follows a unit step. From 150 s a force sin(π(t − 150)/10) N acts on m2. The paper leaves open the start from
-rest, the settling band of 0.2 %, the force's amplitude and the observer's discretisation. They are chosen here to
-reproduce the paper's figures; docs/theory describes how.
+From rest the output follows sin t for 110 s, while a learner learns; then the loop starts from rest
+again, with what was learned, and follows a unit step. From 150 s a force sin(π(t − 150)/10) N acts
+on m2. The paper leaves open the start from rest, the settling band of 0.2 %, the force's amplitude
+and the observer's discretisation. They are chosen here to reproduce the paper's figures;
+docs/theory describes how.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ STEP_WINDOW = (STEP_AT, FORCE_AT)
 FORCE_WINDOW = (170.0, END)
 """Time in which the force is scored [s], after its transient, as in the paper's figure."""
 BAND = 0.002
-"""Half width of the settling band, as a fraction of the step: with it, the paper's settling times come out (docs/theory)."""
+"""Half width of the settling band, as a fraction of the step: gives the paper's settling times."""
 
 MF, MB, L, L1 = "MF-ESO", "MB-ESO", "L-ESO", "L-ESO (Algorithm 1)"
 MF3, MB3 = "MF-ESO (3x bandwidth)", "MB-ESO (3x bandwidth)"
@@ -37,9 +38,9 @@ NAMES = (MF, MB, L, L1, MF3, MB3)
 # About 4 GB of records.
 _MOST_SAMPLES = 5e6
 GRADIENT_RATE = 0.01
-"""Learning rate of Algorithm 1, rate · batch / dt [1/s]: it is stable below about 0.015/s, whatever the batch (docs/theory)."""
+"""Algorithm 1's rate · batch / dt [1/s]: it is stable below about 0.015/s (docs/theory)."""
 GRADIENT_BATCH = 10
-"""Samples in a batch of Algorithm 1: chosen by hand, its effect is small at the same rate (docs/theory)."""
+"""Samples in a batch of Algorithm 1: chosen by hand; the stable range does not depend on it."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,8 @@ class Settings:
             )
         if END / self.dt > _MOST_SAMPLES:
             raise ValueError(
-                f"dt = {self.dt!r}: must be at least {END / _MOST_SAMPLES:g} s, or six whole records do not fit in memory"
+                f"dt = {self.dt!r}: must be at least {END / _MOST_SAMPLES:g} s, "
+                "or six whole records do not fit in memory"
             )
         checks.whole("seed", self.seed, 0)
         checks.positive("omega_o", self.omega_o, "rad/s")
@@ -96,7 +98,7 @@ def scenario(settings: Settings) -> Scenario:
 
 
 def gradient_rate(settings: Settings) -> float:
-    """Return Algorithm 1's learning rate per sample; per second it is the same for every sample time."""
+    """Return Algorithm 1's learning rate per sample; per second it is independent of dt."""
     return GRADIENT_RATE * settings.dt / GRADIENT_BATCH
 
 
@@ -132,8 +134,9 @@ def controller(
 def score(run: Trajectory) -> Scores:
     """Return the study's scores; None if the run ended too early, or y did not settle.
 
-    Overshoot (a fraction), settling time [s] and control variation [N] are those of the step over [110, 150) s; peak and RMS
-    of y − 1 [m] are those under the force over [170, 250] s; ``rms_from_step`` is the RMS over [110, 250] s.
+    Overshoot (a fraction), settling time [s] and control variation [N] are those of the step over
+    [110, 150) s; peak and RMS of y − 1 [m] are those under the force over [170, 250] s;
+    ``rms_from_step`` is the RMS over [110, 250] s.
     """
     found: Scores = dict.fromkeys(METRICS)
     t, y = run.t, run["y"]

@@ -39,7 +39,8 @@ from quell.records.trajectory import Trajectory
 from quell.simulation.simulate import simulate
 from quell.types import Progress
 
-# Multiples of omega_o at which the ESOs without learner are measured: a grid around the claimed factor of 3, chosen by hand.
+# Multiples of omega_o at which the ESOs without learner are measured: a grid around the claimed
+# factor of 3, chosen by hand.
 _BANDWIDTHS = (0.9, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
 
 
@@ -54,7 +55,7 @@ class Result:
     gradient_trials: tuple[Trial, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain dictionaries and lists for ``json.dump``; None for values that were not measured."""
+        """Return plain data for ``json.dump``; None for values that were not measured."""
         about = {
             "plant": "two-mass-spring, m1 = m2 = 1 kg, k = 1 N/m, y = x2",
             "step_window": STEP_WINDOW,
@@ -94,10 +95,11 @@ def run(settings: Settings, progress: Progress | None = None) -> Result:
 def _bandwidth_for(
     settings: Settings, model: bool, scores: Mapping[str, Scores], progress: Progress
 ) -> Scores:
-    """Return for each learner the multiple of ``omega_o`` at which the ESO without a learner has the same disturbance peak.
+    """Return for each learner the multiple of ``omega_o`` at which an ESO has the same peak.
 
-    Peaks are measured on a grid of bandwidths that the sample time allows and the loop is stable at; between them logarithms
-    are interpolated. A peak below all of them gives the largest multiple that was measured, one above all gives None.
+    Peaks are measured on a grid of bandwidths that the sample time allows and the loop is stable
+    at; between them logarithms are interpolated. A peak below all of them gives the largest
+    multiple that was measured, one above all gives None.
     """
     grid = [factor for factor in _BANDWIDTHS if factor * settings.omega_o * settings.dt < math.pi]
     progress("bandwidths", 0.5 if model else 0.0)
@@ -119,7 +121,7 @@ def _bandwidth_for(
 
 
 def _batch_variations(settings: Settings) -> tuple[float | None, float | None]:
-    """Return Algorithm 1's control variation with a batch ten times as large, at the same rate per sample and per second."""
+    """Return Algorithm 1's variation with ten times the batch, at equal rate per sample and per s."""
     rate, batch = gradient_rate(settings), 10 * GRADIENT_BATCH
     candidates = [controller(settings, learner=BatchGradient(r, batch)) for r in (rate, rate / 10)]
     jobs = [partial(simulate, two_mass_spring(), c, scenario(settings)) for c in candidates]
@@ -164,7 +166,7 @@ def _claims(
 
 
 def _apart(one: Trajectory, other: Trajectory) -> float | None:
-    """Return the largest distance of two outputs in the paper's zoom of the step [m]; None if a run ended before."""
+    """Return the largest distance of two outputs in the paper's zoom [m]; None after early ends."""
     part = one.window(126.0, 134.0)
     if min(one.ended, other.ended) < 134.0:
         return None
