@@ -1,7 +1,8 @@
 /* The device's side of quell's serial line, to put into a microcontroller.
  *
- * Frames, packets and sessions are those of src/quell/realtime/{frames,cobs,rig}.py. Give the four board_ functions, call quell_byte() for
- * each byte that the UART has received, and quell_tick() every DT, from a timer. Little-endian, with 64-bit double (not AVR).
+ * Frames, packets and sessions are those of wire/frames.py, wire/cobs.py and rig/kernel.py in src/quell/realtime. Give the four board_
+ * functions, call quell_byte() for each byte that the UART has received, and quell_tick() every DT, from a timer. Little-endian, with
+ * 64-bit double (not AVR).
  *
  * With -DQUELL_HOST it is a program that simulates y' = u at the other end of a pseudoterminal, whose name it prints.
  */

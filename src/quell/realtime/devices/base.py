@@ -35,7 +35,10 @@ class Device(Protocol):
 
 
 class Listener(Protocol):
-    """The device's end of a wire; ``listen`` of the registry makes it from a URL."""
+    """The device's end of a wire, made from a URL by ``listen`` of the registry.
+
+    Constructors raise a ``ValueError`` for a wrong URL, and if it is in use or can't be opened.
+    """
 
     url: str
     transport: Any

@@ -12,7 +12,7 @@ from numba import typeof
 from quell import checks
 from quell.kernels.dispatch import compiled, dispatcher_for
 from quell.realtime.devices.base import read_measurement, write_command
-from quell.realtime.system.clock import system_clock
+from quell.realtime.system.clock import SystemClock, system_clock
 from quell.realtime.wire import frames
 from quell.realtime.wire.handle import GONE, NOT_SENT, TRIPPED, WireHandle, is_own
 from quell.realtime.wire.transport import receive, send, wait_for_frame
@@ -31,12 +31,12 @@ _FAULTS = {
 
 
 @compiled
-def _read(handle: Any, clock: Any, until: int) -> tuple[float, int]:
+def _read(handle: WireHandle, clock: SystemClock, until: int) -> tuple[float, int]:
     return read_measurement(handle, clock, until)
 
 
 @compiled
-def _write(handle: Any, u: float) -> int:
+def _write(handle: WireHandle, u: float) -> int:
     return write_command(handle, u)
 
 
@@ -71,10 +71,10 @@ class WireDevice:
         self.url = url
         self.dt = checks.positive("dt", dt, "s")
         own = frames.endpoint(frames.MEASUREMENT, _new_session(), _MOST_AGE)
+        inbox, outbox, watch = frames.buffer(), frames.buffer(), system_clock()
+        self.handle = WireHandle(self._connect(), own, inbox, outbox, watch)
+        # Not the handle's: compiled code takes it that its arguments share no memory.
         self._clock = system_clock()
-        self.handle = WireHandle(
-            self._connect(), own, frames.buffer(), frames.buffer(), self._clock
-        )
         self._timeout = timeout
         self._open, self._compiled = True, False
         try:

@@ -27,7 +27,7 @@ frames ago. Each rejected frame is counted under the first rule that it breaks.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -227,6 +227,6 @@ def _ahead(number: int, of: int) -> int:
     return (number - of + _MODULUS // 2) % _MODULUS - _MODULUS // 2
 
 
-def counts_by_name(counters: Any) -> dict[str, int]:
+def counts_by_name(counters: NDArray[np.int64]) -> dict[str, int]:
     """Return the counters by their names."""
     return dict(zip(COUNTERS, map(int, counters), strict=True))

@@ -145,15 +145,7 @@ class SerialDevice(WireDevice):
 
 
 class SerialListener:
-    """The device's end of a serial line.
-
-    ``serial://pty`` makes a line without a cable; ``url`` is then the URL of its other end.
-
-    Raises
-    ------
-    ValueError
-        for a URL of another form, and a port that can't be opened.
-    """
+    """The device's end of a serial line; with ``serial://pty``, ``url`` names the other end."""
 
     def __init__(self, url: str) -> None:
         path, baud = _parsed(url)

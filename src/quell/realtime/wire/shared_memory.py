@@ -1,25 +1,15 @@
 """Frames through shared memory, between processes of one computer.
 
-A mailbox is a file in memory with two slots. Each slot is a counter and a frame: one slot for
-hello, welcome and goodbye, one for measurements or commands. A new frame replaces the one before
-it. A mailbox has one writer; its reader compares the counters. A wire has two mailboxes,
-``quell-NAME-measurements`` and ``quell-NAME-commands``. The writer's process locks its mailbox as
-long as it lives, so two loops can't write to one mailbox, and a new rig can take over the mailboxes
-of a rig that was killed.
+A wire has two mailboxes, files in memory: ``quell-NAME-measurements`` and ``quell-NAME-commands``.
+A mailbox has two slots, the first for hello, welcome and goodbye, the second for measurements or
+commands. A slot is a counter (8 bytes), twice the number of frames written, and the newest frame
+(40 bytes). A mailbox has one writer, whose process locks it as long as it lives. So two loops can't
+write to one mailbox, and a new rig can take over the mailboxes of a rig that was killed.
 
 *Writing* (a sequence lock, see Boehm, "Can seqlocks get along with programming language memory
 models?", MSPC 2012): make the counter odd, store the five words of the frame, make the counter
 even; each store is a release. *Reading:* load the counter, the words and the counter again, each
 load an acquire; try again if the counter was odd or has changed.
-
-======  ====  ====================================================
-offset  size  content
-======  ====  ====================================================
-0       8     counter: twice the number of hellos, welcomes and goodbyes
-8       40    the newest of them
-48      8     counter: twice the number of measurements or commands
-56      40    the newest of them
-======  ====  ====================================================
 """
 
 from __future__ import annotations
@@ -148,13 +138,7 @@ class SharedMemoryDevice(WireDevice):
 
 
 class SharedMemoryListener:
-    """The device's end of a wire through shared memory; it takes over what a killed rig has left.
-
-    Raises
-    ------
-    ValueError
-        for a URL that is not ``shm://NAME``, and a name that another rig has.
-    """
+    """The device's end of the wire; it takes over the files of a rig that was killed."""
 
     def __init__(self, url: str) -> None:
         self._paths = _paths(url)

@@ -105,15 +105,7 @@ class UdpDevice(WireDevice):
 
 
 class UdpListener:
-    """The device's end: a port at which it listens.
-
-    Port 0 takes any free port; ``url`` contains the port taken.
-
-    Raises
-    ------
-    ValueError
-        for a URL of another form, and if the port is in use.
-    """
+    """The device's end: a port at which it listens. Port 0 takes a free one, see ``url``."""
 
     def __init__(self, url: str) -> None:
         family, address = resolved(url)
@@ -135,14 +127,8 @@ class UdpListener:
         self.socket.close()
 
 
-def resolved(url: str) -> tuple[int, Any]:
-    """Return address family and address of ``udp://HOST:PORT``.
-
-    Raises
-    ------
-    ValueError
-        if the URL does not have this form, or the host is unknown.
-    """
+def resolved(url: str) -> tuple[int, tuple[Any, ...]]:
+    """Return family and address of ``udp://HOST:PORT``; raise a ``ValueError`` for others."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port

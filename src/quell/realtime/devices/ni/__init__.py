@@ -1,1 +1,1 @@
-"""Cards of National Instruments: the driver and its errors, tasks and channels, and the device."""
+"""Cards of National Instruments: the driver with its errors, its tasks, and the device."""

@@ -24,7 +24,7 @@ class Tasks:
 
     def __init__(self) -> None:
         self._ni = driver()
-        self._closing: list[tuple[str, Callable[[], Any]]] = []
+        self._closing: list[tuple[str, Callable[[], object]]] = []
         self._watchdog: Any = None
         self._waiting: list[Any] = []
 
@@ -84,7 +84,7 @@ class Tasks:
         read = self._ni.stream_readers.CounterReader(task.in_stream).read_one_sample_uint32
         return lambda: read(_TIMEOUT)
 
-    def open_output(self, output: str, low: float, high: float) -> Callable[[float], Any]:
+    def open_output(self, output: str, low: float, high: float) -> Callable[[float], object]:
         """Return the function that sets an analog output [V], from ``low`` to ``high``."""
         task = self._new("the output's task")
         with translated_errors(f"output = {output!r} from {low:g} to {high:g} V"):
@@ -94,7 +94,7 @@ class Tasks:
             failure = f"{output} can't be set to zero, switch the amplifier off"
             return self._start(task, write, 0.0, failure)
 
-    def open_line(self, name: str, line: str | None) -> Callable[[bool], Any]:
+    def open_line(self, name: str, line: str | None) -> Callable[[bool], object]:
         """Return the function that sets a digital line, if there is one."""
         if line is None:
             return lambda level: None
@@ -123,7 +123,7 @@ class Tasks:
         self._closing.append((f"{what} can't be cleared", task.close))
         return task
 
-    def _start(self, task: Any, write: Any, zero: Any, failure: str) -> Callable[[Any], Any]:
+    def _start(self, task: Any, write: Any, zero: Any, failure: str) -> Callable[[Any], object]:
         """Set an output to zero, now and at the end; return the function that sets it."""
         write(zero, _TIMEOUT)
         if self._watchdog is None:
