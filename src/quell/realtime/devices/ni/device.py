@@ -20,8 +20,8 @@ from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 from quell import checks
-from quell.realtime.devices.ni.tasks import Tasks
 from quell.realtime.devices.ni.driver import translated_errors
+from quell.realtime.devices.ni.tasks import Tasks
 
 
 class NiDevice:
