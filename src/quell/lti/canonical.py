@@ -83,22 +83,10 @@ def canonical(plant: Any, E: Any = None) -> Canonical:
     Parameters
     ----------
     plant
-        one of
-
-        * a plant with ``A`` (n, n), ``B`` (n, 1), ``C`` (1, n): ``LinearPlant``,
-          ``control.StateSpace``; D must be zero,
-        * matrices ``(A, B, C)``, or ``(A, B, E, C)`` as in the paper's eq. (1); B, E and C may be
-          vectors,
-        * ``control.TransferFunction``, or the pair ``(numerator, denominator)`` of sequences in
-          descending powers of s,
-        * the pair ``(a, b)`` with a number b: ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u``.
+        a linear model of any kind that ``LinearPlant.of`` accepts.
     E
         input of the disturbance: a column (n,) or (n, 1), or the index of one of the plant's own
         disturbance inputs. By default it enters where u does.
-
-    Returns
-    -------
-    Canonical
 
     Raises
     ------

@@ -164,9 +164,7 @@ class ESO:
         ratio: float = 2.0,
         delay: float = 0.0,
     ) -> ESO:
-        """Design a cascade of model-free observers (``cascade.py``).
-
-        For the same rejection of disturbances it has less noise in u.
+        """Design a cascade of model-free observers (``cascade.py``): less noise in u.
 
         Parameters
         ----------
@@ -179,11 +177,6 @@ class ESO:
         ratio
             ratio α > 1 of the bandwidths of successive levels; the first level has
             ``omega_o / α^(p−1)``.
-
-        Raises
-        ------
-        ValueError
-            naming the argument, its value and the rule.
         """
         last = cls.model_free(order, b0, omega_o, dt)
         bandwidths = level_bandwidths(last.omega_o, levels, ratio)
@@ -216,11 +209,6 @@ class ESO:
         alpha
             the powers α (n + 1,) beyond δ, above 0 and at most 1; 1, 1/2, 1/4, … by default, as in
             Han's paper.
-
-        Raises
-        ------
-        ValueError
-            naming the argument, its value and the rule.
         """
         linear = cls.model_free(order, b0, omega_o, dt)
         return linear._with_model(nonlinear_model(linear.model, delta, alpha), delay)
@@ -256,11 +244,6 @@ class ESO:
             density of white noise in f itself [(y-unit/s^n)² s].
         form
             ``"current"`` or ``"predictor"``.
-
-        Raises
-        ------
-        ValueError
-            naming the argument, its value and the rule.
         """
         n = checks.whole("order", order, 1, 8)
         noise = checks.positive("noise_variance", noise_variance)

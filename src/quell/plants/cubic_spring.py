@@ -21,20 +21,13 @@ from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.linear import LinearModel, LinearPlant
 from quell.plants.two_mass_spring import two_mass_matrices
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
 
 class CubicSpringModel(NamedTuple):
-    """The sampled plant: the fields of a ``LinearModel``, and the impulses of the cubic spring."""
+    """The sampled plant: its linear part and the impulses of the cubic spring."""
 
-    transition: Matrix
-    """Φ (5, 5)."""
-    input: Vector
-    """Γ (5,)."""
-    disturbance: Matrix
-    """Γ_w (5, 2)."""
-    output: Vector
-    """C (5,)."""
+    linear: LinearModel
     impulse1: float
     """Velocity that m1 gains in half a sample at a spring length of 1 m, ``−k_cubic dt / 2 m1``."""
     impulse2: float
@@ -51,8 +44,7 @@ def _advance(
     plant: CubicSpringModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
 ) -> None:
     _apply_cubic_force(plant, x)
-    linear = LinearModel(plant.transition, plant.input, plant.disturbance, plant.output)
-    advance(linear, x, scratch, t, u, w)
+    advance(plant.linear, x, scratch, t, u, w)
     _apply_cubic_force(plant, x)
 
 
@@ -96,7 +88,7 @@ class CubicSpringPlant:
     def sampled(self, dt: float, interpret: bool = False) -> CubicSpringModel:
         """Return the parameters for a sample time ``dt`` [s]."""
         half = 0.5 * self.k_cubic * checks.positive("dt", dt, "s")
-        return CubicSpringModel(*self.linear.sampled(dt), -half / self.m1, half / self.m2)
+        return CubicSpringModel(self.linear.sampled(dt), -half / self.m1, half / self.m2)
 
 
 def lagged_two_mass_spring(
