@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import math
 import struct
 import termios
 import threading
@@ -16,12 +17,10 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.realtime.devices.base import read_measurement
 from quell.realtime.devices.registry import listen
 from quell.realtime.rig.kernel import APPLIED
 from quell.realtime.rig.server import Rig
-from quell.realtime.system.clock import system_clock
-from quell.realtime.wire.frames import LENGTH
+from quell.realtime.wire.frames import LENGTH, RECEIVED, SENT
 from quell.realtime.wire.serial_line import SerialDevice
 from quell.realtime.wire.shared_memory import SharedMemoryDevice
 from quell.realtime.wire.transport import wait_for_frame
@@ -103,8 +102,17 @@ class Bench:
         if isinstance(made[0], Exception):
             raise made[0]
         self._stack.callback(made[0].close)
-        read_all(made[0])
+        self.catch_up(made[0])
         return made[0]
+
+    def catch_up(self, device: Any) -> float:
+        """Read until the rig's newest measurement has come, and return it."""
+        y, sent = math.nan, self.rig.model.endpoint.numbers
+        while device.handle.endpoint.numbers[RECEIVED] < sent[SENT]:
+            y = device.read()
+            if math.isnan(y):
+                self.rig.tick()
+        return y
 
     def tick_during(
         self, work: Callable[[], Any], meanwhile: Callable[[], Any] = lambda: None
@@ -135,8 +143,3 @@ class Bench:
             device.write(law(measured[-1]))
             self.await_frame()
         return measured
-
-
-def read_all(device: Any) -> None:
-    """Take all that has come so far."""
-    read_measurement(device.handle, system_clock(), 0)

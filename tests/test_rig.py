@@ -17,7 +17,7 @@ from quell.realtime.rig.kernel import serve
 from quell.realtime.rig.server import Rig
 from quell.realtime.system.clock import virtual_clock
 
-from .rig_bench import DT, PLANT, Bench, law, read_all, url_of
+from .rig_bench import DT, PLANT, Bench, law, url_of
 
 
 def test_ticks_that_were_slept_over_are_caught_up(bench: Callable[..., Bench]) -> None:
@@ -42,7 +42,7 @@ def test_the_watchdog_waits_for_the_first_command(bench: Callable[..., Bench]) -
     device = here.open()
     here.rig.tick(200)
     assert here.rig.state == "waiting"
-    read_all(device)
+    here.catch_up(device)
     here.cycle(device, law, 2)
     assert here.rig.state == "live"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -68,7 +67,7 @@ def test_the_watchdog_sets_u_to_zero_for_good(wire: str, bench: Callable[..., Be
     assert applied == [2.0, 2.0, 2.0, 2.0, 2.0, 0.0, 0.0, 0.0]
     assert here.rig.state == "tripped"
     assert not device.lost
-    assert np.isfinite(device.read())
+    assert np.isfinite(here.catch_up(device))
     assert device.lost
     with pytest.raises(ConnectionError, match="watchdog"):
         device.write(2.0)
@@ -87,25 +86,21 @@ def test_the_watchdog_sets_u_to_zero_for_good(wire: str, bench: Callable[..., Be
 def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(
     wire: str, bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Over UDP a frame may not arrive, in shared memory the hello may take its place: the goodbye is said again, and the rig serves."""
+    """Over UDP a frame may not arrive, in shared memory the hello may take its place: the goodbye is sent again, and the rig serves."""
     here = bench(wire)
-    device, said = here.open(), []
-    say = device._send
+    device, sent = here.open(), []
+    send = device._send
 
     def lossy(kind: int, value: float, session: int) -> None:
-        said.append(kind)
-        if said.count(frames.GOODBYE) != 1 or kind != frames.GOODBYE:
-            say(kind, value, session)
+        sent.append(kind)
+        if sent.count(frames.GOODBYE) != 1 or kind != frames.GOODBYE:
+            send(kind, value, session)
 
     monkeypatch.setattr(device, "_send", lossy)
-    thread = threading.Thread(target=device.restart_session)
-    thread.start()
-    while thread.is_alive():
-        here.rig.tick()
-        thread.join(0.002)
+    here.tick_during(device.restart_session)
     assert here.rig.state == "waiting"
     assert here.rig.counters["sessions"] == 2
-    assert said.count(frames.GOODBYE) >= 2
+    assert sent.count(frames.GOODBYE) >= 2
     here.rig.tick()
     assert (
         here.rig.model.endpoint.numbers[frames.SESSION]
