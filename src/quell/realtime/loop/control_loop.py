@@ -19,7 +19,7 @@ from quell.realtime.loop.modes import Mode
 from quell.realtime.loop.reference import ReferenceSamples
 from quell.realtime.loop.supervisor import FLUSH, Rules, SupervisorState, initial_state
 from quell.realtime.system.histogram import Histogram, Timing, empty_counts
-from quell.realtime.telemetry.channels import LOOP_WIDTH, row_channels
+from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.ring import Ring
 from quell.records.channels import columns_of
 
@@ -62,9 +62,6 @@ class ControlLoop:
         design, state = controller.parameters, controller.initial_state()
         channels = row_channels(controller.channels)
         row = np.zeros(sum(width for _, width in channels))
-        if needs_python and not interpret:
-            spare = controller.initial_state(), reference.current.copy(), row[LOOP_WIDTH:].copy()
-            design = compile_controller(design, *spare)
         known = {name for name, width in channels if width}
         f_learned, f_residual = (
             columns_of(channels, name).start if {"f_learned", "f_residual"} <= known else -1
@@ -82,9 +79,12 @@ class ControlLoop:
             log=CycleLog(ring, row, f_learned, f_residual, empty_counts(), empty_counts()),
             interpreted=interpret or needs_python,
         )
-        # Compile by a run that is finished before it begins.
+        # Compile by a run that is finished before it begins, or by a step after the end of a run.
         over = copy.deepcopy(loop.supervisor)
         over.memory[0].mode, over.memory[0].samples = Mode.STOPPED, FLUSH + 1
+        if needs_python and not interpret:
+            spare = controller.initial_state(), rules, over, reference, loop.log
+            return replace(loop, design=compile_controller(design, *spare))
         replace(loop, supervisor=over).run()
         return loop
 

@@ -28,7 +28,7 @@ from quell.controllers.base import (
     set_reference_derivatives,
     write_row,
 )
-from quell.kernels.dispatch import compiled, is_finite, kernel
+from quell.kernels.dispatch import compiled, generic, is_finite, kernel
 from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.loop.modes import Cause, Mode, Request
 from quell.realtime.loop.reference import ReferenceSamples
@@ -146,7 +146,7 @@ def run_cycles(
         y, waited, shift = _measure(handle, clock, times, supervisor, deadline)
         origin += shift
         changed, clipped = supervisor.changed[0], counters.clipped
-        u = _control_step(design, state, rules, supervisor, reference, log, k, left_out, y)
+        u = control_step(design, state, rules, supervisor, reference, log, k, left_out, y)
         fault = write_command(handle, u)
         memory.unsent_in_row = memory.unsent_in_row + 1 if fault == 1 else 0
         memory.tripped = 1 if fault > 1 else 0
@@ -248,8 +248,8 @@ def _measure(
     return y, waited, -times.earlier
 
 
-@kernel
-def _control_step(
+@generic
+def control_step(
     design: Any,
     state: Any,
     rules: Rules,
@@ -265,6 +265,21 @@ def _control_step(
     First the controller is told of the ``left_out`` deadlines before k, except those that end the
     run anyway.
     """
+    raise TypeError
+
+
+@control_step.register(object)
+def _control_step(
+    design: Any,
+    state: Any,
+    rules: Rules,
+    supervisor: SupervisorState,
+    reference: ReferenceSamples,
+    log: CycleLog,
+    k: int,
+    left_out: int,
+    y: float,
+) -> float:
     memory, row = supervisor.memory[0], log.row
     update_mode(rules, supervisor, k, y, reference.r.size)
     first = k - min(left_out, rules.hold)

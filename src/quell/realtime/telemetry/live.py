@@ -62,10 +62,7 @@ class LiveSink:
         self._next, self._events = -math.inf, 0
         try:
             self._server = foxglove.start_server(
-                name=header.device or "quell",
-                host=self.host,
-                port=self.port,
-                context=self._context,
+                name=header.device or "quell", host=self.host, port=self.port, context=self._context
             )
         except RuntimeError as error:
             reason = str(error).removeprefix("FoxgloveError: ")
