@@ -67,8 +67,7 @@ def draw_bode(axes: list[Any], measured: FrequencyResponse, response: Callable[[
     coherence.semilogx(measured.omega, measured.coherence, color="0.4", linewidth=0.8)
     coherence.set_ylim(0.0, 1.05)
     for ax, label in ((gain, "|G|"), (phase, "phase of G [°]"), (coherence, "coherence")):
-        ax.set_ylabel(label)
-        ax.set_xlim(omega[0], omega[-1])
+        ax.set(ylabel=label, xlim=(omega[0], omega[-1]))
     if points.size:
         largest = max(np.max(size), np.max(np.abs(model[omega >= points[0]])))
         gain.set_ylim(0.3 * np.min(size), 3.0 * largest)
@@ -94,8 +93,7 @@ def draw_output(
             draw_line(error, t[part], (y - simulated)[part], color=color, linewidth=0.8)
     output.set_ylabel("output")
     output.legend(fontsize="small")
-    error.set_ylabel("error")
-    error.set_xlabel("time [s]")
+    error.set(xlabel="time [s]", ylabel="error")
     error.sharex(output)
 
 

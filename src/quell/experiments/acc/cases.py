@@ -22,6 +22,7 @@ import numpy as np
 
 from quell.analysis import analyse
 from quell.analysis.margins import Margins
+from quell.controllers import Controller
 from quell.experiments.acc.controllers import DT, OURS, designs
 from quell.experiments.acc.criteria import MOST_Y
 from quell.experiments.acc.stability import unstable
@@ -80,7 +81,7 @@ def study_cases() -> dict[str, CaseResult]:
     }
 
 
-def _study(controller: Any, loaded: Any) -> CaseResult:
+def _study(controller: Controller, loaded: Controller) -> CaseResult:
     impulses = in_parallel([partial(_impulse, controller, k) for k in (1.0, *STIFFNESSES)])
     settled = [_settled_at(run) for run in impulses]
     loads = in_parallel(
@@ -100,12 +101,12 @@ def _study(controller: Any, loaded: Any) -> CaseResult:
     )
 
 
-def _impulse(controller: Any, k: float) -> Trajectory:
+def _impulse(controller: Controller, k: float) -> Trajectory:
     scenario = Scenario(duration=_IMPULSE_TIME, x0=[0.0, 0.0, 0.0, 1.0])
     return simulate(two_mass_spring(k=k), controller, scenario)
 
 
-def _load(controller: Any, k: float, phase: float) -> Trajectory:
+def _load(controller: Controller, k: float, phase: float) -> Trajectory:
     load = Sinusoid(1.0, LOAD, phase)
     scenario = Scenario(duration=_LOAD_TIME, disturbances=(0.0, load))
     return simulate(two_mass_spring(k=k), controller, scenario)
@@ -122,14 +123,14 @@ def _peak(run: Trajectory, start: float) -> float:
     return np.inf if run.diverged else float(np.max(np.abs(run["y"][run.t >= start])))
 
 
-def _edge(controller: Any, factor: float) -> float:
+def _edge(controller: Controller, factor: float) -> float:
     """Return the last stable k on the way from 1 in steps of ``factor``, up to 0.01 or 100 N/m."""
     stiffnesses = factor ** np.arange(math.ceil(math.log(100.0) / abs(math.log(factor))))
     lost = unstable([two_mass_spring(k=k) for k in stiffnesses], controller)
     return float(stiffnesses[max(int(np.argmax(lost)) - 1, 0) if np.any(lost) else -1])
 
 
-def _parameter_bound(controller: Any) -> float:
+def _parameter_bound(controller: Controller) -> float:
     """Return p, to 0.005, from the corners and middles of the box of m1, m2 and k."""
     for step in range(1, 199):
         p = 0.005 * step

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from quell.controllers import ADRC
+from quell.controllers import ADRC, Controller
 from quell.experiments.compare.benchmark import controller
 from quell.guard import Guard
 from quell.learners import Harmonic, Kalman
@@ -68,7 +68,7 @@ def designs(
     *,
     most_u: float = MOST_U,
     load: float | None = None,
-) -> dict[str, Any]:
+) -> dict[str, Controller]:
     """Return baselines and our controllers by name, with sample time ``dt`` and ``|u| <= most_u``.
 
     MF-ESO knows the plant's order and gain, MB-ESO the nominal masses and spring. L-ESO knows as
@@ -82,7 +82,9 @@ def designs(
     learner = Kalman() if load is None else Harmonic(omegas=(load,), bias_bandwidth=2.0)
     guard = Guard() if load is None else None
     limits: dict[str, Any] = {"u_min": -most_u, "u_max": most_u}
-    baselines = {name: controller(key, dt, most_u) for name, key in BASELINES.items()}
+    baselines: dict[str, Controller] = {
+        name: controller(key, dt, most_u) for name, key in BASELINES.items()
+    }
     return baselines | {
         MF: ADRC(model_free, omega_c, **limits),
         MB: ADRC(model_based, omega_c, **limits),

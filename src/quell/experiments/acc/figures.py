@@ -70,8 +70,7 @@ def _failures(result: Result) -> Any:
             ax.text(100.0 * high + 1.0, y, f"{100.0 * rate:.1f} %", va="center", fontsize="small")
     ax.set_yticks(range(len(judged)), list(judged))
     ax.invert_yaxis()
-    ax.set_xlim(0.0, 112.0)
-    ax.set_xlabel("plants that fail [%], with 95 % confidence interval")
+    ax.set(xlim=(0.0, 112.0), xlabel="plants that fail [%], with 95 % confidence interval")
     title = f"ACC benchmark, {len(result.samples)} plants ({result.source})"
     ax.set_title(title, fontsize="medium")
     ax.legend(loc="lower right", fontsize="small")
@@ -105,8 +104,7 @@ def _responses(samples: Matrix) -> Any:
             ax.grid(alpha=0.3)
         axes[0, j].set_title(name, fontsize="medium")
         axes[1, j].set_xlabel("time [s]")
-    axes[0, 0].set_ylabel("position of m2 [m]")
-    axes[0, 0].set_ylim(-1.0, 2.5)
+    axes[0, 0].set(ylabel="position of m2 [m]", ylim=(-1.0, 2.5))
     axes[1, 0].set_ylabel("control signal [N]")
     axes[0, 0].legend(fontsize="small")
     lost = f"; {ended} runs that flew apart end where they did" if ended else ""

@@ -78,21 +78,18 @@ def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
     scores = random.standard_normal((count, 6))
     scores[:, 2:5] = scores[:, 2:5] @ np.linalg.cholesky(_CORRELATIONS).T
     ranks = norm.cdf(scores)
-    small = np.column_stack(
-        [np.interp(ranks[:, j], _LEVELS, row) for j, row in enumerate(_QUANTILES)]
-    )
-    return widened(small, spread)
+    small = [np.interp(ranks[:, j], _LEVELS, row) for j, row in enumerate(_QUANTILES)]
+    return widened(np.column_stack(small), spread)
 
 
 def widened(samples: Matrix, spread: float) -> Matrix:
-    """Return samples ``spread`` times as far from nominal."""
-    wide = np.empty_like(samples)
-    for j in range(6):
-        wide[:, j] = (
-            NOMINAL[j] + spread * (samples[:, j] - NOMINAL[j])
-            if j in (3, 5)
-            else samples[:, j] ** spread
-        )
+    """Return samples ``spread`` times as far from nominal: as a factor, ``value^spread``.
+
+    The cubic part, which may be negative, and the lag are widened linearly.
+    """
+    wide, factors, linear = np.empty_like(samples), [0, 1, 2, 4], [3, 5]
+    wide[:, factors] = samples[:, factors] ** spread
+    wide[:, linear] = NOMINAL[linear] + spread * (samples[:, linear] - NOMINAL[linear])
     wide[:, 5] = np.maximum(wide[:, 5], _LEAST_DRAWN_LAG)
     return wide
 
@@ -142,11 +139,9 @@ def _value(where: str, number: int, row: list[str], place: int, j: int) -> float
     except ValueError:
         raise ValueError(f"{where}, line {number}: {name} = {text!r}: must be a number") from None
     try:
-        value = (
-            checks.finite(name, value)
-            if name == "k_nonlin"
-            else checks.positive(name, value, _UNITS.get(name, ""))
-        )
+        checks.finite(name, value)
+        if name != "k_nonlin":
+            checks.positive(name, value, _UNITS.get(name, ""))
     except ValueError as error:
         raise ValueError(f"{where}, line {number}: {error}") from None
     least = 0.0 if name == "k_nonlin" else _LEAST_LAG if name == "tau" else 1.0 / _MOST

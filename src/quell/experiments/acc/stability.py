@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quell.analysis.linearise import linear_law
 from quell.analysis.subsystems import closed_loop_matrix
+from quell.controllers import Controller
 from quell.parallel import one_blas_thread
 from quell.plants import CubicSpringPlant, LinearPlant
 
 
 def unstable(
-    plants: Sequence[LinearPlant | CubicSpringPlant], controller: Any
+    plants: Sequence[LinearPlant | CubicSpringPlant], controller: Controller
 ) -> NDArray[np.bool_]:
     """Return for each plant whether its loop is unstable at rest, with nothing learned."""
     law = linear_law(controller)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from quell.controllers import Controller
 from quell.experiments.acc.cases import CaseResult, study_cases
 from quell.experiments.acc.controllers import DT, PUBLISHED, designs
 from quell.experiments.acc.criteria import DURATION, Judged, judge
@@ -86,7 +87,7 @@ def run(samples: Matrix, source: str = "given", progress: Progress | None = None
 
 
 def judge_sampled(
-    controller: Any,
+    controller: Controller,
     samples: Matrix,
     cubic: bool,
     progress: Callable[[float], None] | None = None,
@@ -99,7 +100,7 @@ def judge_sampled(
 
 
 def records(
-    controller: Any,
+    controller: Controller,
     plants: Sequence[LinearPlant | CubicSpringPlant],
     speeds: Vector,
     progress: Callable[[float], None] | None = None,

@@ -17,6 +17,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "L-ESO": {"color": "black", "linewidth": 1.2},
 }
 """Line styles of the paper's three controllers, in all figures."""
+ESTIMATES = {"f_hat": "estimate", "f_learned": "learned", "f_residual": "residual"}
+"""Channels of the estimates of f, with their names in legends."""
 PAPER_STYLE = {"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}
 """Settings of matplotlib for the figures of the paper's experiments."""
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from quell import checks
-from quell.controllers import ADRC, Prefiltered
+from quell.controllers import ADRC, Controller, Prefiltered
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio
 from quell.experiments.compare.study import Comparison, compare
 from quell.learners import Kalman
@@ -97,7 +97,7 @@ def scenario(settings: Benchmark) -> Scenario:
     )
 
 
-def controller(name: str, dt: float, u_max: float = math.inf) -> Any:
+def controller(name: str, dt: float, u_max: float = math.inf) -> Controller:
     """Return one of the benchmark's controllers, designed for m1 = m2 = k = 1.
 
     Parameters
@@ -159,7 +159,7 @@ def _model_free(dt: float) -> ESO:
     return ESO.model_free(order=4, b0=1.0, omega_o=OMEGA_O, dt=dt)
 
 
-_DESIGNS: Mapping[str, Callable[[float, dict[str, Any]], Any]] = {
+_DESIGNS: Mapping[str, Callable[[float, dict[str, Any]], Controller]] = {
     "mf-eso": lambda dt, limits: ADRC(_model_free(dt), OMEGA_C, **limits),
     "mb-eso": lambda dt, limits: ADRC(
         ESO.model_based(two_mass_spring(), OMEGA_O, dt), OMEGA_C, **limits

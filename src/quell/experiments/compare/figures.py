@@ -29,8 +29,8 @@ def draw(result: Comparison) -> Any:
         draw_line(above, run.t, run["y"], label=label, **style)
         draw_line(below, run.t, run["u"], zorder=depth, **style)
     for ax, channel, title in ((above, "y", "output"), (below, "u", "control signal")):
-        ax.set_ylim(*_limits([run[channel] for run in result.runs.values()]))
-        ax.set_ylabel(title)
+        limits = _limits([run[channel] for run in result.runs.values()])
+        ax.set(ylim=limits, ylabel=title)
         ax.grid(alpha=0.3)
     above.legend(fontsize="small", ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     below.set_xlabel("time [s]")

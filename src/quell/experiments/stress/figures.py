@@ -27,9 +27,7 @@ def draw(result: Result) -> Any:
                 style = {"color": color, "linewidth": width, "linestyle": "-" if i < 10 else "--"}
                 ax.step(values, shares, where="post", label=kind, **style)
         ax.axvline(1.0, color="0.5", linewidth=0.8)
-        ax.set_xscale("log")
-        ax.set_title(title)
-        ax.set_xlabel("RMS error over that of MF-ESO")
+        ax.set(xscale="log", title=title, xlabel="RMS error over that of MF-ESO")
         ax.grid(alpha=0.3, which="both")
     whole.set_ylabel("share of runs")
     load.legend(fontsize="small", loc="upper left")

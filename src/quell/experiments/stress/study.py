@@ -32,7 +32,7 @@ _LATE_AT = LOAD_AT + 50.0
 _LIMIT = 100.0
 # Time between recorded samples [s]: a multiple of all sample times.
 _RECORD_DT = 0.02
-# More runs take days.
+# Chosen by hand: a trial of a million runs takes days.
 _MOST_RUNS = 1_000_000
 
 

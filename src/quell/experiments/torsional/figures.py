@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from quell.experiments.common.figures import (
+    ESTIMATES,
     PAPER_STYLE,
     STYLES,
     legend_label,
@@ -124,28 +125,21 @@ def _learning(case: Case) -> Any:
     for i, feature in enumerate(run.features[:3]):
         draw_line(above, run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         above.axhline(-numbers[i], color=f"C{i}", linestyle=":", linewidth=1.2)
-    above.set_ylim(-4000.0, 2000.0)
     title = (
         f"coefficients of L-ESO at {case.label} with friction; dotted: identified plant's, for b0"
     )
     above.set_title(title, fontsize="medium")
-    above.set_ylabel("theta")
-    for channel, label in (
-        ("f_hat", "estimate"),
-        ("f_learned", "learned"),
-        ("f_residual", "residual"),
-    ):
+    above.set(ylabel="theta", ylim=(-4000.0, 2000.0))
+    for channel, label in ESTIMATES.items():
         draw_line(
             below, run.t, _smooth(run[channel], run.dt * run.every), label=label, linewidth=1.0
         )
     below.set_title("total disturbance as L-ESO has it, averaged over 20 ms", fontsize="medium")
-    below.set_ylabel("f [rad/s⁴]")
-    below.set_ylim(-2e4, 2e4)
+    below.set(xlabel="time [s]", ylabel="f [rad/s⁴]", ylim=(-2e4, 2e4))
     for ax in (above, below):
         ax.axvline(PROFILE_AT, color="0.3", linewidth=1.0, linestyle="--")
         ax.set_xlim(0.0, END)
         ax.legend(fontsize="small", ncols=3, loc="upper right")
-    below.set_xlabel("time [s]")
     return figure
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from quell.experiments.common.figures import (
+    ESTIMATES,
     PAPER_STYLE,
     STYLES,
     legend_label,
@@ -57,14 +58,11 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
     for place, (start, stop) in spans.items():
         ax = axes[place]
         for name, style in _STYLES.items():
-            run = result.runs[name]
+            run, label_of_run = result.runs[name], legend_label(name, result.runs[name])
             part = run.window(start, stop)
             if part.stop > part.start:
-                draw_line(
-                    ax, run.t[part], run[channel][part], label=legend_label(name, run), **style
-                )
-        ax.set_xlim(start, stop)
-        ax.set_xlabel("time [s]")
+                draw_line(ax, run.t[part], run[channel][part], label=label_of_run, **style)
+        ax.set(xlim=(start, stop), xlabel="time [s]")
     whole = axes["all"]
     whole.set_ylabel(label)
     whole.set_title(
@@ -88,15 +86,10 @@ def _learning(result: Result) -> Any:
         draw_line(axes[0], run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         if feature in _TRUE_THETA:
             axes[0].axhline(_TRUE_THETA[feature], color=f"C{i}", linestyle=":", linewidth=1.0)
-    axes[0].set_ylim(-3.0, 1.5)
+    axes[0].set(ylim=(-3.0, 1.5), ylabel="theta")
     axes[0].set_title("coefficients of L-ESO; dotted: the plant's own", fontsize="medium")
-    axes[0].set_ylabel("theta")
     truth, dotted = _true_disturbance(run), {"color": "black", "linestyle": ":"}
-    for channel, label in (
-        ("f_hat", "estimate"),
-        ("f_learned", "learned"),
-        ("f_residual", "residual"),
-    ):
+    for channel, label in ESTIMATES.items():
         draw_line(axes[1], run.t, run[channel], label=label, linewidth=1.0)
     draw_line(axes[1], run.t, truth, label="true f", linewidth=1.0, **dotted)
     axes[1].set_title("total disturbance as L-ESO has it", fontsize="medium")
@@ -145,8 +138,7 @@ def _algorithm_1(result: Result) -> Any:
         if peak is not None:
             below.axhline(peak, color=color, linestyle="--", linewidth=1.0, label=name)
     below.set_ylim(bottom=0.0)
-    below.set_ylabel("disturbance peak, 170–250 s [m]")
-    below.set_xlabel("rate · batch / dt [1/s]")
+    below.set(ylabel="disturbance peak, 170–250 s [m]", xlabel="rate · batch / dt [1/s]")
     for ax in axes:
         ax.legend(fontsize="small")
     return figure
