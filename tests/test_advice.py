@@ -150,7 +150,7 @@ def test_a_thin_margin_and_a_lost_loop_are_found_with_the_true_plant() -> None:
     assert analysis.advise(controller) == []
     findings = [analysis.advise(controller, ([gain], [1.0, 0.0, 0.0])) for gain in (5.0, -1.0)]
     assert [finding.subject for found in findings for finding in found] == ["margin", "stability"]
-    with pytest.raises(ValueError, match="does not say which plant"):
+    with pytest.raises(ValueError, match="does not know its plant"):
         analysis.advise(SimpleNamespace(law=None, dt=0.1))
 
 

@@ -191,7 +191,7 @@ def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
             lambda: analysis.frozen(adrc(2, learner=ql.learners.Kalman()), other, 30.0),
         ),
         ("a run of this controller", lambda: analysis.frozen(controller, other, 3.0)),
-        ("asked once a period", lambda: analysis.analyse(PLANT, outside)),
+        ("called once a period", lambda: analysis.analyse(PLANT, outside)),
         (
             "a Trajectory or a Scenario",
             lambda: analysis.loops_over_time(PLANT, controller, None, [1.0]),

@@ -66,9 +66,7 @@ def advise(
     known_delay = 0.0
     if plant is None:
         if observer is None:
-            raise ValueError(
-                "plant = None: this controller does not say which plant it is made for; give one"
-            )
+            raise ValueError("plant = None: this controller does not know its plant; give one")
         plant, known_delay = _assumed_plant(observer)
     actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")
     delay = checks.non_negative("delay", delay, "s")
@@ -171,6 +169,6 @@ def _judge_noise(loop: LoopAnalysis, controller: Controller, noise: float) -> li
     message = (
         f"noise of {noise:.3g} RMS in y makes u move by {rms:.3g} RMS, "
         f"{100.0 * share:.3g} % of its range of {u_range:.3g}; "
-        f"{100.0 * _NOISE:g} % is about what an actuator stands: {what_to_do}"
+        f"{100.0 * _NOISE:g} % is about what an actuator tolerates: {what_to_do}"
     )
     return [Finding("noise", share, _NOISE, message)]

@@ -114,15 +114,11 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
         raise ValueError(f"t = {t!r}: must be a time of the record, from 0 to {run.t[-1]:g} s")
     order = controller.observer.order
     if tuple(run.features) != tuple(controller.features):
-        raise ValueError(
-            f"run has the features {run.features}: must be a run of this controller, "
-            f"which has {controller.features}"
-        )
+        rule = f"must be a run of this controller, which has {controller.features}"
+        raise ValueError(f"run has the features {run.features}: {rule}")
     if not (run.features or isinstance(controller.learner, NoLearner)):
-        raise ValueError(
-            f"t = {t!r}: {type(controller.learner).__name__} has no coefficients to record; "
-            f"{_USE_STATE}"
-        )
+        name = type(controller.learner).__name__
+        raise ValueError(f"t = {t!r}: {name} has no coefficients to record; {_USE_STATE}")
     gain, slope = np.zeros(order + 1), 0.0
     states = {f"x{i + 1}": i for i in range(order)}
     for name, theta in zip(run.features, run["theta"][row] if run.features else (), strict=True):
@@ -131,10 +127,7 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
         elif name == "u":
             slope += float(theta)
         elif not name.startswith(_FEEDFORWARD):
-            raise ValueError(
-                f"t = {t!r}: the feature {name!r} is not linear, so its coefficient is no gain; "
-                f"{_USE_STATE}"
-            )
+            raise ValueError(f"t = {t!r}: the feature {name!r} is not linear; {_USE_STATE}")
     authority = float(run["authority"][row]) if "authority" in run.names else 1.0
     return _with_authority(controller, gain, 0.0, slope, authority)
 
@@ -142,8 +135,8 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
 def _from_state(controller: ADRC, state: Any) -> Frozen:
     if hasattr(controller.learner, "external_fields"):
         raise ValueError(
-            f"learner = {type(controller.learner).__name__}: a Python model is asked once a period "
-            "and its answer held, so it has no gain at an instant; analyse the loop without it"
+            f"learner = {type(controller.learner).__name__}: a Python model is called once a "
+            "period and its answer held, so it has no gain at an instant; analyse the loop without it"
         )
     learner, memory = controller.parameters.learner, copy_state(state.learner)
     known = controller.read(state)
@@ -172,15 +165,11 @@ def _with_authority(
 ) -> Frozen:
     """Return β times all of it; a slope outside of the guard's interval acts on the u before."""
     if not (np.all(np.isfinite(gain)) and math.isfinite(before) and math.isfinite(slope)):
-        raise ValueError(
-            "learner: its output is not finite at this instant, so there is nothing to analyse"
-        )
+        raise ValueError("learner: its output is not finite at this instant")
     gain, before, slope = authority * gain, authority * before, authority * slope
     guard = controller.parameters.guard
-    if (
-        not isinstance(guard, UnguardedDesign)
-        and not guard.least_slope <= slope <= guard.largest_slope
-    ):
+    guarded = not isinstance(guard, UnguardedDesign)
+    if guarded and not guard.least_slope <= slope <= guard.largest_slope:
         before, slope = before + slope, 0.0
     return Frozen(gain, float(before), float(slope))
 

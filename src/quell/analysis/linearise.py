@@ -58,21 +58,15 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     if not isinstance(controller, ADRC):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     learner = at if isinstance(at, Frozen) else frozen(controller, at)
-    design = controller.parameters._replace(
-        learner=learner, guard=UnguardedDesign(), limits=_UNLIMITED
-    )
-    nothing = np.zeros(0)
-    state = controller.initial_state()._replace(
-        learner=NoLearnerMemory(nothing), guard=UnguardedMemory(nothing)
-    )
+    design = controller.parameters._replace(learner=learner, guard=UnguardedDesign())
+    design, nothing = design._replace(limits=_UNLIMITED), np.zeros(0)
+    nothing_learned, unguarded = NoLearnerMemory(nothing), UnguardedMemory(nothing)
+    state = controller.initial_state()._replace(learner=nothing_learned, guard=unguarded)
     control(design, state, 0.0, 0.0)
     law = _measured_law(design, state)
     control(design, state, 0.0, 0.0)
-    again = _measured_law(design, state)
-    if not all(
-        np.array_equal(np.asarray(one), np.asarray(other))
-        for one, other in zip(law, again, strict=True)
-    ):
+    pairs = zip(law, _measured_law(design, state), strict=True)
+    if not all(np.array_equal(np.asarray(one), np.asarray(other)) for one, other in pairs):
         raise ValueError(f"controller = {controller!r}: its law changes from sample to sample")
     if not all(np.all(np.isfinite(part)) for part in law):
         raise ValueError(f"controller = {controller!r}: b0 + ∂f_L/∂u is zero with this learner")
@@ -82,23 +76,22 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
 def _measured_law(design: Any, origin: Any) -> LinearLaw:
     """Return the law around a state ``origin`` that no limit and no flag is about to change."""
     fixed_u = [design._replace(limits=Limits(u, u, math.inf)) for u in (0.0, _UNIT)]
+    # Entries that are not zero are flags and the like, which do not change any more.
     places = [
-        (i, where)
-        for i, array in enumerate(_arrays(origin))
-        for where in np.ndindex(array.shape)
-        if array[where] == 0.0
+        (name, at)
+        for name, array in named_arrays(origin).items()
+        for at in np.argwhere(array == 0.0)
     ]
 
-    def respond(
-        design: Any, place: Any = None, r: float = 0.0, y: float = 0.0
-    ) -> tuple[Vector, float]:
+    def respond(design: Any, place: Any = None, r: float = 0.0, y: float = 0.0) -> Any:
+        """Return the next state and u, in units, for one entry of the state, r or y."""
         state = copy_state(origin)
-        arrays = _arrays(state)
+        arrays = named_arrays(state)
         if place is not None:
-            arrays[place[0]][place[1]] = _UNIT
+            arrays[place[0]][tuple(place[1])] = _UNIT
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             u = control(design, state, r, y)
-        return np.array([arrays[i][where] for i, where in places]) / _UNIT, u / _UNIT
+        return np.array([arrays[name][tuple(at)] for name, at in places]) / _UNIT, u / _UNIT
 
     # The next state is measured with u fixed at zero by the limits, u without limits.
     A = np.array([respond(fixed_u[0], place)[0] for place in places]).T
@@ -109,10 +102,6 @@ def _measured_law(design: Any, origin: Any) -> LinearLaw:
     keep = np.flatnonzero(_reached(A.T, C) & _reached(A, np.abs(B_r) + np.abs(B_y) + np.abs(B_u)))
     kept_A = np.ascontiguousarray(A[np.ix_(keep, keep)])
     return LinearLaw(kept_A, B_r[keep], B_y[keep], B_u[keep], C[keep], D_r, D_y)
-
-
-def _arrays(state: Any) -> list[Vector]:
-    return list(named_arrays(state).values())
 
 
 def _reached(A: Matrix, start: Vector) -> NDArray[np.bool_]:

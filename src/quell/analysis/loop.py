@@ -69,21 +69,14 @@ def analyse(
     """
     while isinstance(controller, Prefiltered):
         controller = controller.controller
-    if not (
-        hasattr(controller, "dt")
-        and (hasattr(controller, "law") or hasattr(controller, "observer"))
-    ):
+    if not (hasattr(controller, "law") or hasattr(controller, "observer")):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     dt = float(controller.dt)
     sampled = sampled_plant(plant, dt, delay, actuator_lag)
     observer = getattr(controller, "observer", None)
-    # b and b0 are comparable if they are gains to the same derivative of y.
-    comparable = observer is not None and observer.degree in sampled.b
-    b_over_b0 = (
-        sampled.b[observer.degree] / float(observer.b0)
-        if observer is not None and comparable
-        else None
-    )
+    b_over_b0 = None
+    if observer is not None and observer.degree in sampled.b:  # gains to the same derivative of y
+        b_over_b0 = sampled.b[observer.degree] / float(observer.b0)
     return LoopAnalysis(sampled, linear_law(controller, at), dt, b_over_b0)
 
 
@@ -109,9 +102,8 @@ class LoopAnalysis:
     ) -> None:
         self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
         self._N = law_matrix(law)
-        self._open = {
-            name: System.balanced(*subsystem(plant, law, name)) for name in ("P", "C_r", "C_y")
-        }
+        names = ("P", "C_r", "C_y")
+        self._open = {name: System.balanced(*subsystem(plant, law, name)) for name in names}
 
     def __repr__(self) -> str:
         states = f"{self.plant.N.shape[0]} + {self.law.A.shape[0]} states"

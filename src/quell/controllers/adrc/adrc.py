@@ -65,9 +65,15 @@ class ADRC(StatefulController):
         for a bandwidth or rate limit that is not positive, limits in the wrong order, and an
         observer of a plant with zeros outside of the left half plane.
 
-    Examples -------- >>> from quell.observers import ESO >>> controller =
-    ADRC(ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=2.0, u_min=-1.0, u_max=1.0)
-    >>> controller.step(r=1.0, y=0.0) 1.0 >>> controller.estimate.status <Status.SATURATED: 4>
+    Examples
+    --------
+    >>> from quell.observers import ESO
+    >>> observer = ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01)
+    >>> controller = ADRC(observer, omega_c=2.0, u_min=-1.0, u_max=1.0)
+    >>> controller.step(r=1.0, y=0.0)
+    1.0
+    >>> controller.estimate.status
+    <Status.SATURATED: 4>
     """
 
     def __init__(
@@ -84,9 +90,7 @@ class ADRC(StatefulController):
         half_gain: bool = False,
     ) -> None:
         if not isinstance(observer, ESO):
-            raise ValueError(
-                f"observer = {observer!r}: must be an ESO, from ESO.model_free or ESO.model_based"
-            )
+            raise ValueError(f"observer = {observer!r}: must be an ESO, as from ESO.model_free")
         self.observer = observer
         _check_zeros(observer)
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
@@ -138,18 +142,13 @@ class ADRC(StatefulController):
     @property
     def channels(self) -> tuple[tuple[str, int], ...]:
         """Name and width of each recorded channel, in order."""
-        return (
-            ("x_hat", self.observer.order),
-            ("f_residual", 1),
-            ("f_learned", 1),
-            ("status", 1),
-            *(() if self.guard is None else GUARD_CHANNELS),
-            ("theta", len(self.features)),
-        )
+        estimates = (("x_hat", self.observer.order), ("f_residual", 1), ("f_learned", 1))
+        guard = () if self.guard is None else GUARD_CHANNELS
+        return (*estimates, ("status", 1), *guard, ("theta", len(self.features)))
 
     def initial_state(self) -> AdrcState:
         """Return a state before the first sample, with nothing learned."""
-        design = self.parameters
+        design, guard = self.parameters, UnguardedMemory(np.zeros(0))
         return AdrcState(
             z=np.zeros(self.observer.states),
             seen=np.zeros(self.observer.order + 1),
@@ -157,9 +156,7 @@ class ADRC(StatefulController):
             loop=AdrcLoop.zeros(),
             learner=self.learner.memory(design.learner),
             shadow=lag_memory(design.lag, 1),
-            guard=UnguardedMemory(np.zeros(0))
-            if self.guard is None
-            else self.guard.memory(design.guard),
+            guard=guard if self.guard is None else self.guard.memory(design.guard),
         )
 
     def step(self, r: float, y: float, *derivatives: float) -> float:
@@ -194,17 +191,12 @@ class ADRC(StatefulController):
 
     def _set_derivatives(self, derivatives: tuple[float, ...]) -> None:
         if len(derivatives) > self.derivatives:
-            rule = (
-                f"it uses {self.derivatives} at most"
-                if self.feedforward
-                else "make the controller with feedforward=True"
-            )
-            raise ValueError(
-                f"step was given {len(derivatives)} derivatives of the reference: {rule}"
-            )
-        set_reference_derivatives(
-            self.parameters, self._state, np.array(derivatives, dtype=np.float64)
-        )
+            usable = f"it uses {self.derivatives} at most"
+            rule = usable if self.feedforward else "make the controller with feedforward=True"
+            given = f"step was given {len(derivatives)} derivatives of the reference"
+            raise ValueError(f"{given}: {rule}")
+        values = np.array(derivatives, dtype=np.float64)
+        set_reference_derivatives(self.parameters, self._state, values)
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
         """Start at a plant that rests at ``y`` under ``u``: the next ``step`` continues from ``u``.
@@ -266,9 +258,7 @@ class ADRC(StatefulController):
             before the first sample.
         """
         if self._state.loop[0].started == 0.0:
-            raise ValueError(
-                "hand_over: there was no sample yet; call track(r, y, u) or start(y, u) before"
-            )
+            raise ValueError("hand_over: there was no sample yet; call track or start before")
         self._state.loop[0].bumpless = 1.0
 
     def increment(self, r: float, y: float, *derivatives: float) -> float:
@@ -306,16 +296,14 @@ class ADRC(StatefulController):
             coefficients or the state do not allow, and for a bandwidth that is not positive. The
             controller is then unchanged.
         """
-        new_omega_c = (
-            self.omega_c if omega_c is None else checks.positive("omega_c", omega_c, "rad/s")
-        )
-        new_observer = self.observer if observer is None else observer
+        omega_c = checks.optional(checks.positive, "omega_c", omega_c, "rad/s") or self.omega_c
         if observer is not None:
             check_replacement(self.observer, observer, not isinstance(self.learner, NoLearner))
-        old, new = self.parameters, self._design(new_observer, new_omega_c)
+        observer = observer or self.observer
+        old, new = self.parameters, self._design(observer, omega_c)
         check_structure(old, new)
-        self.observer, self.omega_c, self.parameters = new_observer, new_omega_c, new
-        warn_if_unwise(new_observer, new_omega_c)
+        self.observer, self.omega_c, self.parameters = observer, omega_c, new
+        warn_if_unwise(observer, omega_c)
         change_design(old, new, self._state)
         self._pack_again()
 

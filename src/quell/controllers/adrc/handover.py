@@ -29,8 +29,7 @@ from quell.observers.nonlinear import NonlinearModel
 from quell.observers.response import scaled_response
 from quell.types import Vector
 
-# Time constants after which nothing is left of an initial error in double precision: exp(−40) =
-# 4e-18.
+# Time constants after which an initial error is below the unit roundoff: exp(−40) = 4e-18.
 _TIME_CONSTANTS = 40.0
 # Bound on the time that ``start`` takes: some seconds of calculation. Chosen by hand.
 _MOST_SAMPLES = 100_000_000
@@ -58,16 +57,10 @@ def samples_to_settle(observer: ESO) -> int:
     """Return after how many samples an observer has forgotten its initial state."""
     samples = _TIME_CONSTANTS * observer.lag_time / observer.dt
     if not isinstance(without_delay(observer.model), NonlinearModel):
-        slowest = float(
-            np.max(
-                np.abs(
-                    np.linalg.eigvals(scaled_response(observer.model, observer.units).transition)
-                )
-            )
-        )
-        samples = (
-            max(samples, _TIME_CONSTANTS / -math.log(slowest)) if 0.0 < slowest < 1.0 else samples
-        )
+        transition = scaled_response(observer.model, observer.units).transition
+        slowest = float(np.max(np.abs(np.linalg.eigvals(transition))))
+        if 0.0 < slowest < 1.0:
+            samples = max(samples, _TIME_CONSTANTS / -math.log(slowest))
     return min(round(samples), _MOST_SAMPLES) + observer.states
 
 
@@ -117,14 +110,13 @@ def check_replacement(old: ESO, new: Any, learns: bool) -> None:
         raise ValueError(f"observer = {new!r}: must be an ESO")
     for name in ("order", "degree", "f_degree", "dt", "form", "states"):
         if getattr(new, name) != getattr(old, name):
+            present = f"the present one {getattr(old, name)!r}"
             raise ValueError(
-                f"observer has {name} = {getattr(new, name)!r}, the present one "
-                f"{getattr(old, name)!r}: must be the same"
+                f"observer has {name} = {getattr(new, name)!r}, {present}: must be the same"
             )
     same_gain = new.b0 == old.b0
-    if same_gain and all(
-        np.array_equal(getattr(new.plant, name), getattr(old.plant, name)) for name in "aBE"
-    ):
+    plants = [(getattr(new.plant, name), getattr(old.plant, name)) for name in "aBE"]
+    if same_gain and all(np.array_equal(*pair) for pair in plants):
         return
     if any(observer.plant.zeros.size or not observer.plant.matched for observer in (old, new)):
         raise ValueError(
@@ -141,10 +133,7 @@ def check_replacement(old: ESO, new: Any, learns: bool) -> None:
 def check_structure(old: AdrcDesign, new: AdrcDesign) -> None:
     """Raise a ``ValueError`` if compiled code and state arrays for ``old`` do not fit ``new``."""
     if _structure(new) != _structure(old):
-        raise ValueError(
-            "observer is of another structure than the present one: make a new controller, and "
-            "call start(y, u)"
-        )
+        raise ValueError("observer is of another structure than the present one: make a new ADRC")
 
 
 def _structure(value: Any) -> Any:

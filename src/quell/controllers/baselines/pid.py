@@ -87,16 +87,11 @@ class PID(LinearController):
         if self.kd != 0.0 and self.filter == (0.0, 0.0):
             rule = "a derivative needs a filter, tf greater than zero; a tenth of kd/kp is usual"
             raise ValueError(f"kd = {kd!r}, tf = {tf!r}: {rule}")
-        self.tt = self._tracking_time() if tt is None else checks.positive("tt", tt, "s")
-        self.setpoint = (
-            (self.kd * self.c, self.kp * self.b, self.ki)
-            if setpoint is None
-            else tuple(checks.vector("setpoint", setpoint))
-        )
+        self.tt = checks.optional(checks.positive, "tt", tt, "s") or self._tracking_time()
+        usual = (self.kd * self.c, self.kp * self.b, self.ki)
+        self.setpoint = usual if setpoint is None else tuple(checks.vector("setpoint", setpoint))
         if not self.setpoint:
-            raise ValueError(
-                f"setpoint = {setpoint!r}: must be a polynomial in s, highest power first"
-            )
+            raise ValueError(f"setpoint = {setpoint!r}: must be a polynomial in s")
         system, dt = realised(*self.polynomials()), checks.positive("dt", dt, "s")
         law = sampled_law(system, dt, prewarp=self._prewarp, tracking_time=self.tt)
         super().__init__(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)

@@ -11,7 +11,7 @@ from quell.types import Matrix, Vector
 
 
 class LinearLaw(NamedTuple):
-    """A sampled linear law of m states that is told what was really applied.
+    """A sampled linear law of m states that receives the applied u.
 
     ::
 
@@ -47,8 +47,7 @@ def checked_law(law: Any) -> LinearLaw:
     Raises
     ------
     ValueError
-        for what is no ``LinearLaw``, shapes that do not fit, or an entry that is not finite; the
-        message names the matrix.
+        for anything but a ``LinearLaw``, shapes that do not fit, or an entry that is not finite.
     """
     if not isinstance(law, LinearLaw):
         raise ValueError(f"law = {law!r}: must be a quell.controllers.LinearLaw")
@@ -69,8 +68,8 @@ def rest_state(law: LinearLaw) -> Vector:
     """Return the state (m,) of a law at rest at r = y = 1, with u = 0 or as close as possible.
 
     Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y))`` it is the one whose u
-    is nearest to zero: an integrator holds whatever the rest of the law needs. By least squares,
-    where there is none.
+    is closest to zero: an integrator balances the rest of the law. Without such a state, it is the
+    least-squares solution.
     """
     D = law.D_r + law.D_y
     pull = np.eye(law.C.size) - law.A - np.outer(law.B_u, law.C)

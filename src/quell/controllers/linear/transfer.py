@@ -48,8 +48,8 @@ def as_state_space(num: Any, den: Any = None) -> System:
     if getattr(num, "dt", None):
         raise ValueError(f"transfer function has a sample time, dt = {num.dt!r}: must have none")
     if hasattr(num, "num") and hasattr(num, "den"):
-        if np.shape(num.num)[:2] != (1, 1):
-            shape = np.shape(num.num)[:2]
+        shape = np.shape(num.num)[:2]
+        if shape != (1, 1):
             raise ValueError(f"transfer function has {shape} outputs and inputs: must have (1, 1)")
         return realised([num.num[0][0]], num.den[0][0])
     if all(hasattr(num, name) for name in "ABCD"):
@@ -116,9 +116,10 @@ def balanced(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> System:
 def tustin(system: System, dt: float, prewarp: float | None = None) -> System:
     """Sample by the trapezoidal rule ``s = (z − 1) / (h (z + 1))``.
 
-    h = dt/2, or with prewarping at ω h = tan(ω dt/2)/ω, which is exact at ω: ``A_d = (I − hA)⁻¹ (I
-    + hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``, ``D_d = D + h C (I − hA)⁻¹ B``
-    (Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, section 6.1).
+    With h = dt/2, or tan(ω dt/2)/ω for prewarping, which is exact at ω:
+    ``A_d = (I − hA)⁻¹ (I + hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``,
+    ``D_d = D + h C (I − hA)⁻¹ B`` (Franklin, Powell & Workman, *Digital Control of Dynamic
+    Systems*, 1998, section 6.1).
 
     Raises
     ------
@@ -153,16 +154,11 @@ def sampled_law(
         if prewarp is not None:
             raise ValueError(f"prewarp = {prewarp!r}: goes with method = 'tustin' only")
         (B, C, D), (A, [B]) = system[1:], zero_order_hold(system[0], [system[1]], dt)
-    time = (
-        _default_tracking_time(system)
-        if tracking_time is None
-        else checks.positive("tracking_time", tracking_time, "s")
-    )
-    back = anti_windup(A, C[0], math.exp(-dt / time))
-    (D_r, D_y) = D[0]
-    return LinearLaw(
-        A - np.outer(back, C[0]), B[:, 0] - back * D_r, B[:, 1] - back * D_y, back, C[0], D_r, D_y
-    )
+    time = checks.optional(checks.positive, "tracking_time", tracking_time, "s")
+    B_u = anti_windup(A, C[0], math.exp(-dt / (time or _default_tracking_time(system))))
+    D_r, D_y = D[0]
+    B_r, B_y = B[:, 0] - B_u * D_r, B[:, 1] - B_u * D_y
+    return LinearLaw(A - np.outer(B_u, C[0]), B_r, B_y, B_u, C[0], D_r, D_y)
 
 
 def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
@@ -178,10 +174,11 @@ def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
 
     if A.shape[0] == 0:
         return np.zeros(0)
-    marginal = 1.0 - _MARGINAL
-    block, basis, count = schur(
-        A, output="real", sort=lambda re, im=0.0: abs(complex(re, im)) > marginal
-    )
+
+    def is_marginal(re: float, im: float = 0.0) -> bool:
+        return abs(complex(re, im)) > 1.0 - _MARGINAL
+
+    block, basis, count = schur(A, output="real", sort=is_marginal)
     # The pole placement needs an observable pair; an unobservable block does not reach u and stays.
     inner, output = block[:count, :count], C @ basis[:, :count]
     rows, power, moved = np.empty((count, count)), np.eye(count), np.eye(count)
@@ -190,9 +187,8 @@ def anti_windup(A: Matrix, C: Vector, pole: float) -> Vector:
         power, moved = power @ (inner - np.eye(count)), moved @ (inner - pole * np.eye(count))
     if count == 0 or np.linalg.matrix_rank(rows) < count:
         return np.zeros(A.shape[0])
-    return np.ascontiguousarray(
-        basis[:, :count] @ (moved @ np.linalg.solve(rows, np.eye(count)[-1]))
-    )
+    gain = moved @ np.linalg.solve(rows, np.eye(count)[-1])
+    return np.ascontiguousarray(basis[:, :count] @ gain)
 
 
 def _default_tracking_time(system: System) -> float:
