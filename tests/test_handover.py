@@ -223,7 +223,7 @@ def test_a_controller_behind_a_prefilter_starts_hands_over_and_is_retuned() -> N
     behind.hand_over()
     assert behind.step(1.0, rig.y) == pytest.approx(3.25, abs=0.1)
     assert copied.controller.omega_c == 6.0
-    with pytest.raises(ValueError, match="controller = PID: only an ADRC starts under load"):
+    with pytest.raises(ValueError, match="controller = PID: must be an ADRC to start under load"):
         ql.controllers.Prefiltered(ql.baselines.PID(1.0, dt=DT), ql.baselines.ZV(3.0)).start(0.0)
 
 

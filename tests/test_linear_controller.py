@@ -301,7 +301,7 @@ make = LinearController.from_transfer_function
                 ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0, feedforward=True),
                 ql.baselines.ZV(1.0),
             ),
-            "controller has feedforward, and Shaper knows no derivatives",
+            "controller has feedforward, and Shaper provides no derivatives",
         ),
         (
             lambda: Prefiltered(ql.baselines.PID(1.0, dt=0.1), 3),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.prefilters.prefilter import prefilter, settle, slopes
+from quell.controllers.prefilters.prefilter import prefilter, settle, write_derivatives
 
 DT = 0.01
 
@@ -21,7 +21,7 @@ def followed(model: object, r: np.ndarray) -> np.ndarray:
     rows = []
     for value in r:
         rows.append([prefilter(design, memory, value)])
-        slopes(design, memory, known)
+        write_derivatives(design, memory, known)
         rows[-1].extend(known)
     return np.array(rows)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, generic_with_default
 from quell.types import Vector
 
 
@@ -49,15 +49,9 @@ def control(controller: Any, state: Any, r: float, y: float) -> float:
     raise TypeError
 
 
-@generic
+@generic_with_default
 def set_reference_derivatives(controller: Any, state: Any, derivatives: Vector) -> None:
     """Set r', r'', … for the next sample; ignored by a controller that does not use them."""
-    raise TypeError
-
-
-@set_reference_derivatives.register(object)
-def _ignore_reference_derivatives(controller: Any, state: Any, derivatives: Vector) -> None:
-    pass
 
 
 @generic
@@ -88,16 +82,10 @@ def set_applied_control(controller: Any, state: Any, u: float) -> None:
     raise TypeError
 
 
-@generic
+@generic_with_default
 def bumpless_transfer(controller: Any, state: Any) -> None:
     """Continue from the applied u at the next sample, as if the loop had been at rest until now.
 
     If the reference differs from y, the difference acts as a step of the reference. A controller
     whose state always follows the applied u needs no implementation.
     """
-    raise TypeError
-
-
-@bumpless_transfer.register(object)
-def _follows_applied_control(controller: Any, state: Any) -> None:
-    pass

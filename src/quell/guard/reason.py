@@ -24,12 +24,10 @@ class Reason(IntEnum):
 
 _MESSAGES = {
     Reason.TRUSTED: "The learner explains what the observer would have missed; full authority.",
-    Reason.UNPROVEN: "The learner explains too little of what the observer misses, "
-    "or has not done so for long enough.",
+    Reason.UNPROVEN: "The learner has so far explained too little of what the observer misses.",
     Reason.TOO_LOUD: "The learner's output is larger than what it should explain; scaled down.",
-    Reason.OUT_OF_BOUNDS: "The learner's output is further from the observer's estimate "
-    "than f can be; clipped or set to zero.",
-    Reason.TOO_FAST: "The learner's output changes faster than f can; its rate was limited.",
+    Reason.OUT_OF_BOUNDS: "The learner's output is further from f than its bound; clipped or zero.",
+    Reason.TOO_FAST: "The learner's output changes faster than f can; its rate is limited.",
     Reason.EXPLODED: "The learner's output is a hundred times larger than f; "
     "it was cut off and starts again without authority.",
     Reason.NOT_FINITE: "The learner's output is not finite; "

@@ -109,6 +109,13 @@ def generic(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
     return cast("Generic[P, R_co]", call)
 
 
+def generic_with_default(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
+    """Make a generic function whose declaration implements it for all types without their own."""
+    function = generic(declaration)
+    function.register(object)(declaration)
+    return function
+
+
 @kernel
 def is_finite(value: float) -> bool:
     """Return whether ``value`` is finite.

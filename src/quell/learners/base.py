@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from quell.kernels import validation
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, generic_with_default
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -82,14 +82,9 @@ def coefficients(learner: Any, memory: Any, theta: Vector) -> None:
     raise TypeError
 
 
-@generic
+@generic_with_default
 def trouble(learner: Any, memory: Any) -> int:
     """Return the learner's ``Status`` flags for this sample; by default none."""
-    raise TypeError
-
-
-@trouble.register(object)
-def _no_trouble(learner: Any, memory: Any) -> int:
     return 0
 
 

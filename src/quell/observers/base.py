@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quell.kernels.dispatch import generic, kernel
+from quell.kernels.dispatch import generic, generic_with_default, kernel
 from quell.types import Vector
 
 
@@ -25,14 +25,9 @@ def observe(model: Any, z: Vector, estimate: Vector, y: float, u: float, f_learn
     raise TypeError
 
 
-@generic
+@generic_with_default
 def expected_measurement(model: Any, z: Vector, u: float, f_learned: float) -> float:
     """Return the measurement for which ``observe`` makes no correction, given the same inputs."""
-    raise TypeError
-
-
-@expected_measurement.register(object)
-def _predicted_output(model: Any, z: Vector, u: float, f_learned: float) -> float:
     total = model.input[0] * u + model.feed[0] * f_learned
     for j in range(model.feed.size):
         total += model.transition[0, j] * z[j]
@@ -45,14 +40,9 @@ def begin(model: Any, z: Vector, estimate: Vector, y: float) -> None:
     raise TypeError
 
 
-@generic
+@generic_with_default
 def acting_control(model: Any, z: Vector, u: float) -> float:
     """Return the u that reaches the plant while ``u`` is applied: ``u`` itself unless delayed."""
-    raise TypeError
-
-
-@acting_control.register(object)
-def _not_delayed(model: Any, z: Vector, u: float) -> float:
     return u
 
 

@@ -1,4 +1,4 @@
-"""Linear controllers of two degrees of freedom in discrete time: one kernel for every linear law there is."""
+"""The controller of a sampled linear law of two degrees of freedom."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class LinearDesign(NamedTuple):
 
     law: LinearLaw
     start: Vector
-    """The state (m,) of rest at y = 1."""
+    """Initial state for y = 1 (m,), see ``rest_state``."""
     limits: Limits
 
 
@@ -47,15 +47,16 @@ class LinearState(NamedTuple):
     """State of the controller."""
 
     x: Vector
-    """The law's state (m,)."""
+    """State of the law (m,)."""
     next: Vector
-    """Room for the one after it (m,)."""
+    """Memory for the next state (m,)."""
     loop: NDArray[LinearLoop]
     """(1,)."""
 
 
 @kernel
-def _start(design: LinearDesign, state: LinearState, y: float) -> None:
+def _set_rest(design: LinearDesign, state: LinearState, y: float) -> None:
+    """Set the state of the law to rest at ``y``."""
     for i in range(state.x.size):
         state.x[i] = design.start[i] * y
 
@@ -69,16 +70,16 @@ def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> fl
             loop.u = loop.u_unlimited = control_at_rest(design.limits)
             loop.status = status
             return loop.u
-        _start(design, state, loop.y)
+        _set_rest(design, state, loop.y)
         loop.started = 1.0
-    wished = law.D_r * loop.r + law.D_y * loop.y
+    unlimited = law.D_r * loop.r + law.D_y * loop.y
     for i in range(x.size):
-        wished += law.C[i] * x[i]
-    if not is_finite(wished):
+        unlimited += law.C[i] * x[i]
+    if not is_finite(unlimited):
         status |= _OVERFLOWED
-        _start(design, state, loop.y)
-        wished = loop.u
-    u, cut = apply_limits(design.limits, wished, loop.u)
+        _set_rest(design, state, loop.y)
+        unlimited = loop.u
+    u, cut = apply_limits(design.limits, unlimited, loop.u)
     for i in range(x.size):
         total = law.B_r[i] * loop.r + law.B_y[i] * loop.y + law.B_u[i] * u
         for j in range(x.size):
@@ -87,7 +88,7 @@ def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> fl
     for i in range(x.size):
         x[i] = state.next[i]
     loop.u = u
-    loop.u_unlimited = wished
+    loop.u_unlimited = unlimited
     loop.status = status | cut
     return u
 
@@ -110,7 +111,7 @@ def _reset_loop(design: LinearDesign, state: LinearState) -> None:
 
 @set_applied_control.register(LinearDesign)
 def _set_applied_control(design: LinearDesign, state: LinearState, u: float) -> None:
-    # The law's state went on with the u that was returned.
+    # The state was updated with the u that ``control`` returned.
     correction = u - state.loop[0].u
     for i in range(state.x.size):
         state.x[i] += design.law.B_u[i] * correction
@@ -118,37 +119,40 @@ def _set_applied_control(design: LinearDesign, state: LinearState, u: float) -> 
 
 
 class LinearController(StatefulController):
-    """Any sampled linear law of two degrees of freedom, with limits, as a controller.
+    """A sampled linear law of two degrees of freedom, with limits.
 
-    It starts from rest: at the first good measurement y_0 the state is the one that a loop would have that had been resting at
-    r = y = y_0 with u = 0. So no bump comes from y_0 ≠ 0 where the law has such a state; every law with integral action has. Where it has
-    none, the state is at rest and u is what the law makes of it.
+    It starts from rest: the initial state is that of a loop at rest at r = y = y_0 with u = 0,
+    where y_0 is the first finite measurement. So u starts without a bump if the law has such a
+    state, as every law with integral action has. Otherwise the state is constant and u follows from
+    it.
 
-    What is applied, after limits, drives the law through ``B_u``; ``from_transfer_function`` chooses it. Bad samples are held, and u waits
-    for a first good measurement, as in ``ADRC``.
+    The applied control signal, after limits, drives the law through ``B_u``, which
+    ``from_transfer_function`` chooses. Values that are not finite are replaced by the last finite
+    ones, and u waits for a first finite measurement, as in ``ADRC``.
 
     Parameters
     ----------
     law
-        the law, for the sample time ``dt``.
+        the law, sampled with ``dt``.
     dt
         sample time [s].
     u_min, u_max
         limits of the control signal [u-unit].
     rate_limit
-        how fast it may move, in either direction [u-unit/s].
+        limit of its rate of change, in both directions [u-unit/s].
     name
-        for tables and plots.
+        label in tables and plots.
 
     Raises
     ------
     ValueError
-        for matrices whose shapes do not fit or that hold what is not finite, limits in the wrong order, a rate limit or sample time
-        that is not positive.
+        for matrices of unsuitable shape or with entries that are not finite, limits in the wrong
+        order, or a rate limit or sample time that is not positive.
 
     Examples
     --------
-    >>> controller = LinearController.from_transfer_function([2.0, 1.0], [1.0, 0.0], dt=0.1, u_max=1.5)  # 2 + 1/s
+    >>> num, den = [2.0, 1.0], [1.0, 0.0]  # 2 + 1/s
+    >>> controller = LinearController.from_transfer_function(num, den, dt=0.1, u_max=1.5)
     >>> controller.step(r=1.0, y=0.0)
     1.5
     >>> controller.status
@@ -190,34 +194,37 @@ class LinearController(StatefulController):
         rate_limit: float = math.inf,
         name: str = "transfer function",
     ) -> LinearController:
-        """Make a controller of one degree of freedom from C(s): ``u = C (r − y)``, or ``u = −C y``.
+        """Return the controller ``u = C (r − y)`` or ``u = −C y`` for a transfer function C(s).
 
-        It is realised in scaled, balanced coordinates and sampled there, never as polynomials in z, whose roots crowd at 1.
+        C is sampled in scaled, balanced coordinates of its state, not as polynomials in z: their
+        roots are close to 1, where coefficients determine them badly.
 
         Parameters
         ----------
         num, den
-            polynomials in s, highest power first; or ``num`` is a ``control.TransferFunction`` or ``control.StateSpace`` in continuous
-            time, and ``den`` is left out.
+            polynomials in s, highest power first; or ``num`` is a ``control.TransferFunction`` or
+            ``control.StateSpace`` in continuous time, without ``den``.
         dt
             sample time [s].
         feedback
-            ``"error"``: C acts on r − y; ``"output"``: on −y alone.
+            ``"error"``: C acts on r − y; ``"output"``: C acts on −y.
         method
-            ``"tustin"``: ``s = 2 (z − 1) / (dt (z + 1))``, or ``"zoh"``: as if r and y were held over a sample, which is half a sample
-            later.
+            ``"tustin"``: ``s = 2 (z − 1) / (dt (z + 1))``; or ``"zoh"``: r and y are constant
+            between samples, which delays by half a sample.
         prewarp
-            frequency [rad/s] at which Tustin's response is that of C(s) exactly.
+            frequency [rad/s] at which the response with Tustin's method is exactly that of C(s).
         tracking_time
-            how fast integrators follow u at its limits [s]; see ``quell.controllers.linear.transfer.anti_windup``. By default the time
-            constant of C's slowest zero, or of its slowest pole, where it has none, other than zero.
+            time constant with which integrators follow u at its limits [s]; see
+            ``quell.controllers.linear.transfer.anti_windup``. By default that of C's slowest zero
+            other than s = 0, or of its slowest pole if it has no such zero.
         u_min, u_max, rate_limit, name
             as for the class.
 
         Raises
         ------
         ValueError
-            for a C(s) that is not proper or not of one input and output, or arguments out of range.
+            for a C(s) that is not proper or has several inputs or outputs, or for arguments out of
+            range.
         """
         from quell.controllers.linear.transfer import as_state_space, sampled_law
 
@@ -243,5 +250,5 @@ class LinearController(StatefulController):
 
     @property
     def status(self) -> Status:
-        """What the last step had to report."""
+        """Status flags of the last step."""
         return Status(int(self._state.loop[0].status))

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.prefilters.prefilter import prefilter, settle, slopes
+from quell.controllers.prefilters.prefilter import prefilter, settle, write_derivatives
 from quell.kernels.dispatch import kernel
 from quell.types import Vector
 
@@ -61,8 +61,8 @@ def _prefilter(design: TrackingDesign, memory: TrackingMemory, r: float) -> floa
     return float(v[0])
 
 
-@slopes.register(TrackingDesign)
-def _slopes(design: TrackingDesign, memory: TrackingMemory, derivatives: Vector) -> None:
+@write_derivatives.register(TrackingDesign)
+def _write_derivatives(design: TrackingDesign, memory: TrackingMemory, derivatives: Vector) -> None:
     derivatives[0] = memory.v[1]
 
 

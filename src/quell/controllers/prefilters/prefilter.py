@@ -1,8 +1,8 @@
-"""A prefilter of the reference before any controller.
+"""A prefilter of the reference in front of any controller.
 
-A prefilter is an object with ``design(dt)``, which returns a NamedTuple of parameters, and ``memory(design)``, which returns its state, a
-NamedTuple of arrays. For the type of the parameters two functions are registered: ``prefilter`` and ``settle``. One that knows derivatives
-of what it makes of the reference says how many with ``derivatives``, and registers ``slopes``.
+``prefilter`` and ``settle`` are registered for the type of a prefilter's parameters. A prefilter
+that provides derivatives of the shaped reference has an attribute ``derivatives``, their number,
+and registers ``write_derivatives``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from quell import checks
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.handover import manual_operation
 from quell.controllers.base import (
+    Controller,
     bumpless_transfer,
+    check_controller,
     control,
     reset_loop,
     set_applied_control,
@@ -28,7 +30,7 @@ from quell.controllers.base import (
 )
 from quell.controllers.limits import Limits
 from quell.controllers.stateful import StatefulController
-from quell.kernels.dispatch import generic, is_finite
+from quell.kernels.dispatch import generic, generic_with_default, is_finite
 from quell.kernels.scalars import Scalars, clear
 from quell.observers.eso import ESO
 from quell.types import Status, Vector
@@ -37,10 +39,10 @@ _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 
 
 class Prefilter(Protocol):
-    """What ``Prefiltered`` asks of a prefilter."""
+    """The interface of a prefilter."""
 
     def design(self, dt: float) -> Any:
-        """Return the parameters for a sample time ``dt`` [s], a NamedTuple."""
+        """Return the parameters, a NamedTuple, for a sample time ``dt`` [s]."""
 
     def memory(self, design: Any) -> Any:
         """Return the state, a NamedTuple of arrays."""
@@ -48,25 +50,19 @@ class Prefilter(Protocol):
 
 @generic
 def prefilter(design: Any, memory: Any, r: float) -> float:
-    """Take one sample: the reference to follow instead of ``r``, which is finite."""
+    """Take one sample: return the shaped reference for the finite reference ``r``."""
     raise TypeError
 
 
 @generic
 def settle(design: Any, memory: Any, value: float) -> None:
-    """Come to rest at ``value``, as if the reference had been there for ever."""
+    """Set the state to rest at ``value``, as after a constant reference."""
     raise TypeError
 
 
-@generic
-def slopes(design: Any, memory: Any, derivatives: Vector) -> None:
-    """Write the derivatives of the last shaped reference, from the first on, into ``derivatives``."""
-    raise TypeError
-
-
-@slopes.register(object)
-def _no_slopes(design: Any, memory: Any, derivatives: Vector) -> None:
-    pass
+@generic_with_default
+def write_derivatives(design: Any, memory: Any, derivatives: Vector) -> None:
+    """Write the first, second, … derivative of the last shaped reference."""
 
 
 class PrefilteredDesign(NamedTuple):
@@ -92,7 +88,7 @@ class PrefilteredState(NamedTuple):
     controller: Any
     prefilter: Any
     derivatives: Vector
-    """Of the shaped reference, as many as the prefilter knows."""
+    """Derivatives of the shaped reference; empty if the controller uses none."""
     loop: NDArray[PrefilteredLoop]
     """(1,)."""
 
@@ -113,7 +109,7 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
     if loop.started != 0.0 and loop.has_reference != 0.0:
         shaped = prefilter(design.prefilter, state.prefilter, loop.r)
         if state.derivatives.size > 0:
-            slopes(design.prefilter, state.prefilter, state.derivatives)
+            write_derivatives(design.prefilter, state.prefilter, state.derivatives)
             set_reference_derivatives(design.controller, state.controller, state.derivatives)
     loop.r_shaped = shaped if is_finite(shaped) else y
     return control(design.controller, state.controller, shaped, y)
@@ -149,9 +145,10 @@ def _bumpless_transfer(design: PrefilteredDesign, state: PrefilteredState) -> No
 class Prefiltered(StatefulController):
     """A controller that follows a prefiltered reference.
 
-    The prefilter starts at rest at the first good measurement, so that a reference that stands elsewhere from the first sample on is a
-    step to it. What it makes of the reference is the channel ``r_shaped``. The controller that is passed stays as it is: its copy here
-    runs. Around an ADRC there are ``start``, ``track``, ``hand_over``, ``applied``, ``increment`` and ``retune`` as there.
+    The prefilter starts at rest at the first finite measurement, so another reference in the first
+    sample acts as a step. The shaped reference is the channel ``r_shaped``. The given controller is
+    copied and not changed. If it is an ADRC, its methods ``start``, ``track``, ``hand_over``,
+    ``applied``, ``increment`` and ``retune`` are available here.
 
     Parameters
     ----------
@@ -163,8 +160,8 @@ class Prefiltered(StatefulController):
     Raises
     ------
     ValueError
-        for something that is no controller or no prefilter, and for a controller with feedforward behind a prefilter that knows no
-        derivatives of what it makes of the reference.
+        for an object that is no controller or no prefilter, and for a controller with feedforward
+        behind a prefilter without derivatives.
 
     Examples
     --------
@@ -174,54 +171,54 @@ class Prefiltered(StatefulController):
     1.0
     """
 
-    def __init__(self, controller: Any, prefilter: Prefilter) -> None:
-        if isinstance(controller, type) or not all(
-            hasattr(controller, name) for name in ("parameters", "initial_state", "channels")
-        ):
-            raise ValueError(
-                f"controller = {controller!r}: must be a controller, for example quell.ADRC(...)"
-            )
+    def __init__(self, controller: Controller, prefilter: Prefilter) -> None:
+        check_controller(controller)
         if isinstance(prefilter, type) or not all(
             hasattr(prefilter, name) for name in ("design", "memory")
         ):
             raise ValueError(
-                f"prefilter = {prefilter!r}: must be a prefilter, for example quell.baselines.ZV(omega=1.4)"
+                f"prefilter = {prefilter!r}: must be a prefilter, "
+                "for example quell.baselines.ZV(omega=1.4)"
             )
         if getattr(controller, "derivatives", 0) and not getattr(prefilter, "derivatives", 0):
             raise ValueError(
-                f"controller has feedforward, and {type(prefilter).__name__} knows no derivatives of what it makes of the reference: "
-                "use feedforward=False, or a prefilter such as ReferenceModel"
+                f"controller has feedforward, and {type(prefilter).__name__} provides no "
+                "derivatives of the shaped reference: use feedforward=False, or a prefilter with "
+                "derivatives such as ReferenceModel"
             )
-        self.controller = copy.copy(controller)
+        self.controller: Any = copy.copy(controller)
         self.prefilter = prefilter
         self._initialise()
 
     def _initialise(self) -> None:
         super()._initialise()
-        # One running state: what is done to the controller is done to what runs here.
+        # The controller shares its part of the running state, so its methods act on it.
         if isinstance(self.controller, StatefulController):
             self.controller._use_state(self._state.controller)
 
     @property
-    def _hands_over(self) -> ADRC | Prefiltered:
+    def _inner(self) -> ADRC | Prefiltered:
+        """The controller; an error if it has no methods for hand-over."""
         if isinstance(self.controller, ADRC | Prefiltered):
             return self.controller
         raise ValueError(
-            f"controller = {type(self.controller).__name__}: only an ADRC starts under load, hands over and is retuned"
+            f"controller = {type(self.controller).__name__}: must be an ADRC to start under load, "
+            "hand over or retune"
         )
 
     @property
     def _adrc(self) -> ADRC:
-        inner = self._hands_over
+        """The ADRC behind all prefilters."""
+        inner = self._inner
         return inner if isinstance(inner, ADRC) else inner._adrc
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
-        """Start where the plant rests, see ``ADRC.start``; the prefilter comes to rest at ``y``."""
-        self._hands_over.start(y, u, r)
-        state = self._state
-        settle(self.parameters.prefilter, state.prefilter, float(y))
-        state.loop[0].started = state.loop[0].has_reference = 1.0
-        state.loop[0].r = float(y if r is None else r)
+        """Start at rest at ``y``, see ``ADRC.start``; the prefilter is at rest there too."""
+        self._inner.start(y, u, r)
+        settle(self.parameters.prefilter, self._state.prefilter, float(y))
+        loop = self._state.loop[0]
+        loop.started = loop.has_reference = 1.0
+        loop.r = float(y if r is None else r)
 
     def track(self, r: float, y: float, u: float) -> float:
         """Take one sample in manual operation, see ``ADRC.track``."""
@@ -232,7 +229,7 @@ class Prefiltered(StatefulController):
 
     def hand_over(self) -> None:
         """End manual operation, see ``ADRC.hand_over``."""
-        self._hands_over.hand_over()
+        self._inner.hand_over()
 
     def increment(self, r: float, y: float) -> float:
         """Take one sample and return the change of the control signal, see ``ADRC.increment``."""
@@ -241,7 +238,7 @@ class Prefiltered(StatefulController):
 
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, see ``ADRC.retune``."""
-        self._hands_over.retune(omega_c=omega_c, observer=observer)
+        self._inner.retune(omega_c=omega_c, observer=observer)
         self.parameters = self.parameters._replace(controller=self.controller.parameters)
         self._pack_again()
 
@@ -257,45 +254,42 @@ class Prefiltered(StatefulController):
 
     @property
     def limits(self) -> Limits:
-        """What the control signal keeps to."""
+        """Limits of the control signal."""
         return self.controller.limits
 
     @property
     def features(self) -> tuple[str, ...]:
-        """What the entries of the channel ``theta`` multiply, where there is one."""
+        """Names of the features whose coefficients the channel ``theta`` has."""
         return tuple(self.controller.features)
 
     @property
     def channels(self) -> tuple[tuple[str, int], ...]:
-        """Name and width of what ``report`` writes, in order."""
+        """Name and width of what ``write_row`` writes, in order."""
         return (("r_shaped", 1), *self.controller.channels)
 
     def initial_state(self) -> PrefilteredState:
         """Return a state before the first sample, with nothing learned."""
-        known = (
-            getattr(self.prefilter, "derivatives", 0)
-            if getattr(self.controller, "derivatives", 0)
-            else 0
-        )
+        used = getattr(self.controller, "derivatives", 0) > 0
+        count = getattr(self.prefilter, "derivatives", 0) if used else 0
         return PrefilteredState(
             self.controller.initial_state(),
             self.prefilter.memory(self.parameters.prefilter),
-            np.zeros(known),
+            np.zeros(count),
             PrefilteredLoop.zeros(),
         )
 
     @property
     def status(self) -> Status:
-        """What the last step had to report."""
+        """Status flags of the last step."""
         return Status(int(status_flags(self.parameters, self._state)))
 
     @property
     def estimate(self) -> Any:
-        """What an ADRC behind the prefilter knows after the last step."""
+        """Estimates of the ADRC behind the prefilter after the last step."""
         return self.read(self._state)
 
     def read(self, state: PrefilteredState) -> Any:
-        """Return what the controller knows in ``state``; an error where it is none that reads."""
+        """Return the estimates of the ADRC in ``state``."""
         return self.controller.read(state.controller)
 
     @property

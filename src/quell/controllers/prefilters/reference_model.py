@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.controllers.prefilters.prefilter import prefilter, settle, slopes
+from quell.controllers.prefilters.prefilter import prefilter, settle, write_derivatives
 from quell.lti.discretize import zero_order_hold
 from quell.types import Matrix, Vector
 
@@ -57,8 +57,8 @@ def _prefilter(design: ReferenceModelDesign, memory: ReferenceModelMemory, r: fl
     return x[0]
 
 
-@slopes.register(ReferenceModelDesign)
-def _slopes(
+@write_derivatives.register(ReferenceModelDesign)
+def _write_derivatives(
     design: ReferenceModelDesign, memory: ReferenceModelMemory, derivatives: Vector
 ) -> None:
     m, unit = design.input.size, 1.0
