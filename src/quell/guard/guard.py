@@ -115,7 +115,7 @@ class GuardSample(Scalars):
     typical_error: float  # e [y-unit/s^n]
     output: float  # g [y-unit/s^n]
     f_learned: float  # f_L [y-unit/s^n]
-    reason: float  # A ``Reason``
+    reason: float  # a Reason
     samples: float  # number of samples so far
 
 
