@@ -1,7 +1,7 @@
 # ruff: noqa: D102, N802
-"""A stand-in for the C library of NI-DAQmx: the functions that are used, with its codes, and cards behind it that move a plant.
+"""A stand-in for the C library of NI-DAQmx: its functions in use, its error codes, and cards.
 
-It takes the library's place below the package ``nidaqmx``, whose own code, ctypes and all, then runs as it does with metal.
+It replaces the library below the package ``nidaqmx``, whose own code runs as with real cards.
 """
 
 import ctypes
@@ -24,13 +24,16 @@ INVALID_TASK = -200088
 
 _SAYS = {
     INVALID_DEVICE: "Device identifier is invalid.",
-    NO_CHANNEL: "Physical channel specified does not exist on this device.\n\nRefer to the documentation for its channels.",
+    NO_CHANNEL: "Physical channel specified does not exist on this device.\n\n"
+    "Refer to the documentation for its channels.",
     INVALID_VALUE: "Requested value is not a supported value for this property.",
     INVALID_AO_DATA: "Attempted writing analog data that is too large or too small.",
     NO_WATCHDOG: "Watchdog timer is not supported on this device.",
     WATCHDOG_EXPIRED: "Write failed, because the watchdog timer expired.",
-    RESERVED: "The specified resource is reserved. The operation could not be completed as specified.",
-    GONE: "Device not available for routing. It is possible that the device needs to be reset or that the device is being reset.",
+    RESERVED: "The specified resource is reserved. "
+    "The operation could not be completed as specified.",
+    GONE: "Device not available for routing. "
+    "It is possible that the device needs to be reset or that the device is being reset.",
     NOT_STARTED: "The task is not started and auto_start is false.",
     INVALID_TASK: "Task specified is invalid or does not exist.",
 }
@@ -78,7 +81,7 @@ class Task:
 
 
 class _Function:
-    """One function of the library: it checks what it is given against ``argtypes``, as ctypes does."""
+    """A function of the library: it checks its arguments against ``argtypes``, as ctypes does."""
 
     def __init__(self, body):
         self.body, self.argtypes, self.arg_lock = body, None, threading.Lock()

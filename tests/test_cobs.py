@@ -67,7 +67,7 @@ def test_a_run_of_254_bytes_has_a_code_of_its_own():
     )
 )
 def test_what_is_encoded_is_decoded(data):
-    """For any bytes: none inside is zero, no more than one in 254 is added, and a plain decoder finds the same."""
+    """No byte inside is zero, at most one in 254 is added, and a plain decoder agrees."""
     packet = encoded(data)
     assert packet[-1] == 0
     assert 0 not in packet[:-1]

@@ -69,7 +69,7 @@ def test_random_plans_have_all_kinds_and_are_the_same_again() -> None:
 def test_through_a_relay_every_fault_is_counted_and_no_wrong_number_gets_through(
     bench: Callable[..., Bench],
 ) -> None:
-    """Both ways; what was lost is missed, what was spoiled is refused, and the rig applies nothing that was not commanded."""
+    """Both ways: lost frames are missed, corrupted ones refused; the rig applies commands only."""
     here = bench("udp", watchdog=30)
     plan = [
         Fault("nan", "rig", 10, 2),

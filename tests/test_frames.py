@@ -139,7 +139,7 @@ def test_numbers_go_on_behind_the_largest() -> None:
     ],
 )
 def test_what_breaks_a_rule_is_counted_by_it(data: bytes, rule: str) -> None:
-    """And changes nothing else. The receiver has sent a hundred frames, of which the last twenty may be answered."""
+    """And changes nothing else. Of a hundred frames sent the last twenty may be answered."""
     own = endpoint(COMMAND, SESSION, 20)
     own.numbers[frames.SENT] = 100
     before = own.numbers.copy()

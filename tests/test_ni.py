@@ -74,7 +74,7 @@ def test_zero_is_where_the_device_was_opened(rack):
 
 @given(st.lists(st.integers(-(2**23) + 1, 2**23 - 1), max_size=30), st.sampled_from([24, 32]))
 def test_a_counter_that_rolls_over_is_followed_across(steps, bits):
-    """Both ways, as often as it likes, for counters of 24 and of 32 bits: the position is the sum of what the shaft turned."""
+    """In both directions, with 24 and 32 bits: the position is the sum of all turns."""
     rack = paper_s_rack()
     rack.cards["Dev1"].bits = bits
     with pytest.MonkeyPatch.context() as patch:
@@ -115,7 +115,7 @@ def test_a_u_that_is_no_number_is_zero_on_the_card(rack, device):
 
 
 def test_the_output_is_zero_before_and_after(rack):
-    """Whatever voltage the last program left on it; the amplifier is enabled by the first write, and disabled at the end."""
+    """Whatever voltage was on it; the amplifier is enabled from the first write to the end."""
     card = rack.cards["Dev2"]
     card.volts["ao0"] = 7.0
     device = NiDevice("Dev1/ctr0", "Dev2/ao0", enable="Dev2/port0/line0")
@@ -135,7 +135,8 @@ def test_the_output_is_zero_when_python_ends():
     """Also where nobody closed the device: here the program ends by an exception."""
     program = (
         "from quell.realtime.devices.ni.device import NiDevice\n"
-        "from tests.daqmx_standin import Card, Rack; from nidaqmx._lib import lib_importer as library\n"
+        "from tests.daqmx_standin import Card, Rack\n"
+        "from nidaqmx._lib import lib_importer as library\n"
         "import atexit\n"
         "rack = Rack(Dev1=Card(counters=1), Dev2=Card(outputs=1))\n"
         "library._windll = library._cdll = rack; library._encoding = 'utf-8'\n"
@@ -170,7 +171,7 @@ def test_the_heartbeat_changes_its_level_at_each_write(rack):
 
 
 def test_the_card_s_watchdog_stops_the_motor_when_the_loop_does_not_write(rack):
-    """On a card that has one: zero volts, amplifier off, and the late loop is told; it begins with the first write."""
+    """On a card that has one: zero volts, amplifier off, an error for the late loop."""
     rack.cards["Dev3"] = Card(outputs=1, lines=1, watchdog=True)
     device = NiDevice("Dev1/ctr0", "Dev3/ao0", watchdog=0.01, enable="Dev3/port0/line0")
     rack.pass_time(30.0)
@@ -274,7 +275,7 @@ def test_without_the_package_one_line_says_which_extra(monkeypatch):
 
 
 def test_a_card_that_is_lost_is_an_error_that_the_loop_counts(rack, device):
-    """Reading gives no number then, writing says that it failed; when it is closed, a warning says that the output could not be zeroed."""
+    """Reading gives NaN, writing fails, and closing warns that the output is not zero."""
     handle = handle_of(device)
     rack.cards["Dev1"].present = rack.cards["Dev2"].present = False
     value, _ = read_measurement(handle, virtual_clock(), 0)
@@ -300,8 +301,6 @@ def test_an_address_says_all_that_the_arguments_say(rack):
 @pytest.mark.parametrize(
     ("address", "says"),
     [
-        ("ni://Dev1/ctr0", "must be ni://COUNTER\\+OUTPUT"),
-        ("ni://Dev1/ctr0+", "must be ni://COUNTER\\+OUTPUT"),
         ("ni://Dev1/ctr0+Dev2/ao0?count=3", "count is none of counts, bits, ratio"),
         ("ni://Dev1/ctr0+Dev2/ao0?counts=1.5", "counts = '1.5' must be a whole number"),
         ("ni://Dev1/ctr0+Dev2/ao0?ratio=x", "ratio = 'x' must be a number"),
@@ -314,7 +313,7 @@ def test_addresses_that_are_none_are_refused(rack, address, says):
 
 
 def test_a_loop_through_the_cards_is_the_simulated_loop(rack):
-    """The paper's testbed, but without encoder and converter, behind these cards is the testbed with them, count for count."""
+    """The testbed without encoder and converter behind the cards is the one with them."""
     dt = 1e-3
     observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=dt)
     controller = ql.ADRC(observer, omega_c=20.0, u_min=-5, u_max=5)
@@ -367,7 +366,7 @@ class Shaft:
 
 
 def test_the_loop_goes_to_its_safe_state_when_the_counter_card_is_lost(rack):
-    """It holds u for as many samples as it may, ramps it to zero within as many as it says, and the amplifier loses its enable."""
+    """It holds u, ramps it to zero in the samples allowed, and the amplifier is disabled."""
     device = NiDevice("Dev1/ctr0", "Dev2/ao0", enable="Dev2/port0/line0", u_min=-3.0, u_max=3.0)
     shaft = Shaft(rack, device, scripted.PLANT)
     done = scripted.run(shaft, duration=5.0, hold=5, ramp=20)

@@ -21,7 +21,7 @@ from .rig_bench import DT, PLANT, Bench, law, url_of
 
 
 def test_ticks_that_were_slept_over_are_caught_up(bench: Callable[..., Bench]) -> None:
-    """Where the plant goes depends on the commands at the ticks, not on how late those were; and none is skipped."""
+    """The motion depends on the commands at the ticks, not on when they happen; none is skipped."""
     positions = []
     for late in ([0], [0, 0, 0, 70_500_000, 0]):
         here = bench("udp")
@@ -48,7 +48,7 @@ def test_the_watchdog_waits_for_the_first_command(bench: Callable[..., Bench]) -
 
 
 def test_a_session_that_never_begins_gives_way(bench: Callable[..., Bench]) -> None:
-    """After a minute of ticks; before that a second hello is refused, however long the first takes."""
+    """After a minute of ticks; before that a second hello is refused."""
     here = bench("udp")
     here.open()
     here.rig.tick(int(30.0 / DT))

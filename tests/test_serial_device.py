@@ -1,4 +1,4 @@
-"""The device's side in C, for microcontrollers: it is compiled, and talks with the loop's side over a pseudoterminal."""
+"""The device's side in C: it is compiled, and connected to the loop's by a pseudoterminal."""
 
 import os
 import shutil
@@ -78,7 +78,7 @@ def board(program):
 
 
 def test_a_board_in_c_keeps_step_with_the_loop(board):
-    """Y as it was sent; u from the tick after the one whose y it answers, cut to the board's limit; goodbye ends the session."""
+    """Y as sent; u acts a sample late and within the board's limit; goodbye ends the session."""
     y, u = 0.0, 0.0
     with board.opened() as device:
         for k in range(200):

@@ -24,7 +24,7 @@ from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed, url_of
 
 @pytest.mark.parametrize("wire", WIRES)
 def test_a_wire_is_a_delay_of_one_sample(wire: str, bench: Callable[..., Bench]) -> None:
-    """Bit for bit, where no frame is late: a twin behind ``delayed(plant, dt, dt)``, and so the simulation."""
+    """Bit for bit, if no frame is late: a twin of ``delayed(plant, dt, dt)``."""
     here = bench(wire)
     device = here.open()
     assert device.paced
@@ -56,7 +56,7 @@ def test_a_controller_over_the_wire_does_as_in_the_simulation(bench: Callable[..
 
 @pytest.mark.parametrize("wire", WIRES)
 def test_the_watchdog_sets_u_to_zero_for_good(wire: str, bench: Callable[..., Bench]) -> None:
-    """After so many ticks without a command, on that very tick; commands that come later change nothing, a new session does."""
+    """On the tick after so many without a command; only a new session ends it."""
     here = bench(wire, watchdog=5)
     device = here.open()
     here.cycle(device, lambda y: 2.0, 3)
@@ -86,7 +86,7 @@ def test_the_watchdog_sets_u_to_zero_for_good(wire: str, bench: Callable[..., Be
 def test_a_loop_may_begin_anew_though_its_goodbye_is_lost(
     wire: str, bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Over UDP a frame may not arrive, in shared memory the hello may take its place: the goodbye is sent again, and the rig serves."""
+    """It may be lost, or replaced by the hello: it is sent again."""
     here = bench(wire)
     device, sent = here.open(), []
     send = device._send
@@ -231,7 +231,7 @@ def test_what_waited_behind_many_others_is_not_taken_for_new(bench: Callable[...
 
 
 def test_a_rig_that_was_killed_leaves_nothing_in_the_way(bench: Callable[..., Bench]) -> None:
-    """Its mailboxes are taken over, and a loop that was killed at writing does not stop the next."""
+    """Its mailboxes are taken over, also one that was left in the middle of a write."""
     url = url_of("shm")
     dead = listen(url)
     dead.transport.own[:] = 7

@@ -1,4 +1,4 @@
-"""What every device in the registry must do: measure and move its plant, refuse what is wrong, end safely."""
+"""Contracts of every device in the registry: it measures and moves its plant and ends safely."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_it_is_a_device_and_opened_by_its_url(example: Any) -> None:
 
 @every
 def test_it_measures_the_plant_that_u_moves(example: Any) -> None:
-    """As a twin does, behind a delay of one sample over a wire; to the card's quanta, otherwise bit for bit."""
+    """Bit for bit as a twin, delayed by a sample over a wire; to the quanta of the card."""
     device = example.open()
     plant = ql.plants.delayed(PLANT, example.delay, DT) if example.delay else PLANT
     twin = TwinDevice(plant, DT)
@@ -295,9 +295,14 @@ def test_a_device_with_a_clock_has_the_loop_s_sample_time(example: Any) -> None:
     assert example.bench.rig.state == "idle"
 
 
-URLS = ["", "foo", "tcp://127.0.0.1:5", "udp://127.0.0.1", "udp://:5", "udp://127.0.0.1:70000", "udp://127.0.0.1:5/x", "udp://127.0.0.1:0", "shm://",
-        "shm://a/b", "serial://", "serial:///dev/ttyUSB0?baud=fast", "serial:///dev/ttyUSB0?baud=0", "serial:///dev/ttyUSB0?parity=odd", "ni://Dev1/ctr0",
-        "ni://Dev1/ctr0+", "ni://Dev1/ctr0+Dev2/ao0?counts=1.5", "ni://Dev1/ctr0+Dev2/ao0?ratio=x", "twin:nothing"]  # fmt: skip
+URLS = [
+    *("", "foo", "tcp://127.0.0.1:5", "shm://", "shm://a/b", "twin:nothing"),
+    *("udp://127.0.0.1", "udp://:5", "udp://127.0.0.1:70000", "udp://127.0.0.1:5/x"),
+    *("udp://127.0.0.1:0", "udp:///dev/ttyUSB0", "serial://", "serial:///dev/ttyUSB0?baud=fast"),
+    *("serial:///dev/ttyUSB0?baud=0", "serial:///dev/ttyUSB0?parity=odd"),
+    *("ni://Dev1/ctr0", "ni://Dev1/ctr0+"),
+    *("ni://Dev1/ctr0+Dev2/ao0?counts=1.5", "ni://Dev1/ctr0+Dev2/ao0?ratio=x"),
+]
 
 
 @pytest.mark.parametrize("url", URLS)

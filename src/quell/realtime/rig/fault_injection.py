@@ -92,7 +92,7 @@ def random_faults(number: int, frames: int, seed: int = 0, longest: int = 50) ->
             draw.choice(DIRECTIONS),
             draw.randint(0, last),
             round(most ** draw.random()),  # log-uniform: short faults are as frequent as long ones
-            draw.randint(1, 10),
+            draw.randint(1, 10),  # a delay in frames; chosen by hand
         )
         for _ in range(number)
     ]

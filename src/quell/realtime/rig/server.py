@@ -31,9 +31,9 @@ from quell.realtime.wire import frames
 from quell.realtime.wire.transport import send
 from quell.types import Vector
 
-# Time between two writes to the log, and the time that its buffer holds [s]. Chosen by hand.
+# Time between two writes to the log [s]; time that its buffer holds [s], and least rows. By hand.
 _WRITE_EVERY = 0.05
-_BUFFERED = 5.0
+_BUFFERED, _LEAST_ROWS = 5.0, 100
 # Time that a new session is protected while its first command is missing [s]: its loop may have to
 # be compiled first. Chosen by hand; not tuned further.
 _PATIENCE = 60.0
@@ -97,6 +97,7 @@ class Rig:
         u_max = u_max if u_max == np.inf else checks.positive("u_max", u_max)
         watchdog = checks.whole("watchdog", watchdog, 1, _MOST_TICKS)
         start = np.zeros(plant.order) if x0 is None else checks.vector("x0", x0, plant.order)
+        rows = max(round(_BUFFERED / dt), _LEAST_ROWS)
         self.listener = listener
         self.dt = dt
         self.model = RigModel(
@@ -117,7 +118,7 @@ class Rig:
             counts=np.zeros(9, dtype=np.int64),
             signals=np.zeros(3),
             row=np.zeros(len(kernels.LOG)),
-            log=ring(max(round(_BUFFERED / dt), 100) if log is not None else 1, len(kernels.LOG)),
+            log=ring(1 if log is None else rows, len(kernels.LOG)),
             logged=log is not None,
             lateness=empty_counts(),
             stop=np.zeros(1, dtype=np.int64),
