@@ -14,7 +14,7 @@ _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 
 @kernel
 def hold_last_good(loop: Any, r: float, y: float) -> int:
-    """Store a sample in ``loop``, without the values that are not finite; return their status flags.
+    """Store the finite values of a sample in ``loop``; return the status flags of the others.
 
     The fields ``r``, ``y`` and ``has_reference`` of ``loop`` are set. Before the first finite
     reference r is the last y, so that the loop stays where it is.
@@ -36,5 +36,5 @@ def hold_last_good(loop: Any, r: float, y: float) -> int:
 
 @kernel
 def control_at_rest(limits: Limits) -> float:
-    """Return the u to wait with for a first good measurement: zero, or as near as the limits let it."""
+    """Return u before the first finite measurement: zero, or the limit nearest to it."""
     return min(max(0.0, limits.low), limits.high)

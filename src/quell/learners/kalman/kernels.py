@@ -34,7 +34,7 @@ mean.
 **Start.** After a start from rest Δf̂ contains the observer's initial error, which is no
 disturbance: the learner does not learn for 2 τ.
 
-docs/theory, "The lag-compensated learner", has the derivation and measurements.
+docs/theory, "Learning without lag", has the derivation and measurements.
 """
 
 from __future__ import annotations
