@@ -11,12 +11,11 @@ import pytest
 import quell as ql
 from quell.features import Bias, State
 from quell.learners.base import adapt, commit, predict, restart
-from quell.learners.lag import group_delay, lag_memory, lag_of, lag_push
+from quell.learners.lag import lag_of, lag_push
 from quell.learners.least_squares import RlsRule, least_squares_gain
 from quell.learners.online.gaussian_process import GaussianProcessModel
 from quell.learners.online.model import infer, learn
 from quell.learners.online.network import Network
-from quell.observers.design import FORMS
 from quell.types import Matrix, Vector
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=2e-3)
@@ -97,22 +96,6 @@ def test_pairs_without_lag_teach_without_bias() -> None:
     """Delayed by the observer's group delay the features give the plant; paired with the newest features they do not."""
     np.testing.assert_allclose(learned(None), [-3.0, -0.4, 0.5], atol=0.1)
     assert np.max(np.abs(learned(0) - [-3.0, -0.4, 0.5])) > 0.3
-
-
-@pytest.mark.parametrize(
-    "observer",
-    [
-        *(ql.ESO.model_free(order=3, b0=1.0, omega_o=20.0, dt=2e-3, form=form) for form in FORMS),
-        ql.ESO.model_free(order=3, b0=1.0, omega_o=20.0, dt=2e-3, half_gain=True),
-        ql.ESO.cascade(order=3, b0=1.0, omega_o=20.0, dt=2e-3),
-    ],
-)
-def test_the_group_delay_is_that_of_the_filter(observer: ql.ESO) -> None:
-    """A ramp comes through the lag filter so many samples late."""
-    lag = lag_of(observer)
-    chain = lag_memory(lag, 1)
-    shown = [lag_push(lag, chain, 0, float(k)) for k in range(4000)]
-    assert 3999.0 - shown[-1] == pytest.approx(group_delay(observer), abs=1e-6)
 
 
 def surface(x: np.ndarray) -> float:

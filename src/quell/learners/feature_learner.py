@@ -21,14 +21,12 @@ class Inputs(NamedTuple):
     features: Any
     scaling: Scaling
     gate: NoiseGate
-    bias_gain: float
-    """λ dt, at most 1."""
-    startup: int
-    """Samples after a start from rest in which nothing is learned."""
+    bias_gain: float  # λ dt, at most 1
+    startup: int  # samples after a start from rest in which nothing is learned
 
     @property
     def order(self) -> int:
-        """N."""
+        """Order n of the plant."""
         return int(self.scaling.floors.size) - 2
 
 

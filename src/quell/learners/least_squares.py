@@ -21,12 +21,9 @@ from quell.types import Matrix, Vector
 class RlsRule(NamedTuple):
     """Parameters."""
 
-    noise: float
-    """R."""
-    forget: float
-    """1 − λ."""
-    prior: float
-    """Variance of θ before anything is known."""
+    noise: float  # R
+    forget: float  # 1 − λ
+    prior: float  # variance of θ before anything is known
 
 
 @kernel

@@ -25,9 +25,9 @@ from quell.observers.noise import noise_gains
 from quell.types import Vector
 
 # Least ratio of a moving signal's standard deviation to that of its noise. White noise has ratio 1,
-# noise that is held for ten samples 3; twice the latter, not tuned further.
+# noise that is held for ten samples 3; with a margin of two above that, not tuned further.
 SIGNAL_TO_NOISE = 6.0
-# Standard deviations of noise in f that ``confidence`` counts: the usual three-sigma bound.
+# Standard deviations of noise in f that ``confidence`` counts: a three-sigma bound.
 _NOISE_DEVIATIONS = 3.0
 # Rounding in y counts as noise of this share of y: no sensor resolves better.
 RESOLUTION = 1e-8
@@ -38,29 +38,23 @@ AVERAGING_LAGS = 10.0
 class NoiseGate(NamedTuple):
     """Parameters for a plant of order n."""
 
+    # Least variance of moving x_1 … x_n and u, in units of the variance of y − x̂_1 (n + 1,).
     threshold: Vector
-    """Least variance of x_1 … x_n and u when they move, in units of that of y − x̂_1 (n + 1,)."""
-    forget: float
-    """dt over the averaging time."""
-    f_noise: float
-    """Variance that white noise of unit variance in y causes in f̂."""
-    power: float
-    """ω^n."""
+    forget: float  # dt over the averaging time
+    f_noise: float  # variance that white noise of unit variance in y causes in f̂
+    power: float  # ω^n
 
 
 class NoiseGateMemory(NamedTuple):
     """Running means of the signals and of the noise."""
 
-    mean: Vector
-    """Of x_1 … x_n and u (n + 1,)."""
-    variance: Vector
-    """(n + 1,)."""
-    noise: Vector
-    """(2,): mean square of y − x̂_1; sum of the weights in that mean, which grows from 0 to 1."""
+    mean: Vector  # of x_1 … x_n and u (n + 1,)
+    variance: Vector  # (n + 1,)
+    noise: Vector  # (2,): mean square of y − x̂_1; sum of its weights, which grows from 0 to 1
 
 
 def relative_noise(observer: ESO) -> Vector:
-    """Return ``noise_gains`` divided by the part of the noise in y that ``y − x̂_1`` shows.
+    """Return the variances of noise in the estimates (N,), in units of that of ``y − x̂_1``.
 
     Raises
     ------

@@ -31,7 +31,8 @@ _MAX_FAILURES = 3
 _INTERRUPT_DELAY = 0.05
 _LATE, _FAILED = int(Status.LEARNER_LATE), int(Status.LEARNER_FAILED)
 
-# Indices of the array in which a loop gets its answer.
+# Indices of the array in which a loop gets its answer: last prediction, scaled; status flags;
+# samples until the next call; 1 once the model is disabled.
 PREDICTION, STATUS, COUNTDOWN, DISABLED = range(4)
 
 INSTANCES: dict[int, Instance] = {}

@@ -24,42 +24,32 @@ _FAILED = int(Status.LEARNER_FAILED)
 class BatchDesign(NamedTuple):
     """Parameters of a model that only collects its pairs."""
 
-    size: int
-    """Number of pairs."""
-    width: int
-    """Number of features p."""
+    size: int  # number of pairs
+    width: int  # number of features p
 
 
 class BatchMemory(NamedTuple):
     """State of a model that only collects its pairs."""
 
-    features: Matrix
-    """(size, p)."""
-    targets: Vector
-    """(size,)."""
-    filled: Vector
-    """(1,): number of pairs."""
+    features: Matrix  # (size, p)
+    targets: Vector  # (size,)
+    filled: Vector  # (1,): number of pairs
 
 
 class PythonDesign(NamedTuple):
     """Parameters of a learner whose model is a Python object."""
 
-    online: OnlineDesign
-    """Features, scaling and lag."""
-    period: int
-    """Samples between two calls."""
-    address: int
-    """Address of the function that calls the model."""
+    online: OnlineDesign  # features, scaling and lag
+    period: int  # samples between two calls
+    address: int  # address of the function that calls the model
 
 
 class PythonMemory(NamedTuple):
     """State of a learner whose model is a Python object."""
 
     online: OnlineMemory
-    answer: Vector
-    """(4,): last prediction, scaled; status flags; samples until the next call; 1 once disabled."""
-    model: Vector
-    """(1,): number of the instance that learns (``instances.py``)."""
+    answer: Vector  # (4,), see ``instances.PREDICTION`` and the other indices
+    model: Vector  # (1,): number of the instance that learns (``instances.py``)
 
 
 class Batch:

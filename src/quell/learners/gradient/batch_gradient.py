@@ -8,8 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from quell import checks
 from quell.features import Features
+from quell.features.base import checked_design
+from quell.features.scaling import initial_scale, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.gradient.buffers import (
     BatchGradientMemory,
@@ -19,10 +23,10 @@ from quell.learners.gradient.buffers import (
 )
 from quell.learners.gradient.scaled_features import (
     ScaledGradientDesign,
+    ScaledGradientLoop,
     ScaledGradientMemory,
-    scaled_gradient_design,
-    scaled_gradient_memory,
 )
+from quell.learners.lag import startup_samples
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -30,12 +34,9 @@ from quell.types import Vector
 class BatchGradientDesign(NamedTuple):
     """Parameters of Algorithm 1."""
 
-    rate: float
-    """α, per sample."""
-    batch: int
-    """n."""
-    order: int
-    """Order of the plant; there are two more features."""
+    rate: float  # α, per sample
+    batch: int  # n
+    order: int  # order of the plant; there are two more features
 
 
 @adapt.register(BatchGradientDesign)
@@ -127,17 +128,31 @@ class BatchGradient:
 
         The bandwidth ``omega_c`` [rad/s] is used only to scale features other than the paper's.
         """
-        rate = float(self.rate)
+        rate, order = float(self.rate), observer.order
         if self.features is None:
-            return BatchGradientDesign(rate, self.batch, observer.order)
-        return scaled_gradient_design(rate, self.batch, self.features, observer, omega_c)
+            return BatchGradientDesign(rate, self.batch, order)
+        return ScaledGradientDesign(
+            rate=rate,
+            batch=self.batch,
+            features=checked_design(self.features, order),
+            scaling=scaling(observer, omega_c, False),
+            startup=startup_samples(observer),
+        )
 
     def memory(self, parameters: Any) -> BatchGradientMemory | ScaledGradientMemory:
         """Return empty buffers and θ = 0."""
-        if isinstance(parameters, ScaledGradientDesign):
-            order = parameters.scaling.floors.size - 2
-            return scaled_gradient_memory(parameters, len(self.feature_names(order)))
-        return empty_buffers(parameters.batch, parameters.order + 2)
+        if isinstance(parameters, BatchGradientDesign):
+            return empty_buffers(parameters.batch, parameters.order + 2)
+        scale = initial_scale(parameters.scaling)
+        order = scale.size - 2
+        p = len(self.feature_names(order))
+        return ScaledGradientMemory(
+            buffers=empty_buffers(parameters.batch, p),
+            loop=ScaledGradientLoop.zeros(),
+            scale=scale,
+            scaled=np.zeros(order),
+            units=np.ones(p),
+        )
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return ``("x1", …, "u", "bias")``, or the names of other features."""

@@ -30,20 +30,13 @@ from quell.types import Matrix, Vector
 class BatchGradientMemory(NamedTuple):
     """State of Algorithm 1 with p features and buffers of size n."""
 
-    theta: Vector
-    """(p,)."""
-    features: Matrix
-    """I (n, p), a ring."""
-    residuals: Vector
-    """ΔF (n,), a ring."""
-    total: Vector
-    """Σ Δf̂ I over the ring (p,)."""
-    fresh: Vector
-    """The same over the entries written since the ring last wrapped around (p,)."""
-    current: Vector
-    """Work space for the newest features (p,)."""
-    position: Vector
-    """(2,): row of the next entry; 1 once the ring has been full."""
+    theta: Vector  # (p,)
+    features: Matrix  # I (n, p), a ring
+    residuals: Vector  # ΔF (n,), a ring
+    total: Vector  # Σ Δf̂ I over the ring (p,)
+    fresh: Vector  # the same over the entries written since the ring last wrapped around (p,)
+    current: Vector  # work space for the newest features (p,)
+    position: Vector  # (2,): row of the next entry; 1 once the ring has been full
 
 
 def empty_buffers(n: int, p: int) -> BatchGradientMemory:

@@ -10,38 +10,30 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
-from quell.features import Features
-from quell.features.base import checked_design, unit, write
-from quell.features.scaling import Scaling, initial_scale, scaling, update_scale
+from quell.features.base import unit, write
+from quell.features.scaling import Scaling, update_scale
 from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.gradient.buffers import (
     BatchGradientMemory,
     clear_buffers,
-    empty_buffers,
     restart_buffers,
     take_step,
 )
-from quell.learners.lag import startup_samples
-from quell.observers.eso import ESO
 from quell.types import Vector
 
 
 class ScaledGradientDesign(NamedTuple):
     """Parameters."""
 
-    rate: float
-    """α, per sample."""
-    batch: int
-    """n."""
+    rate: float  # α, per sample
+    batch: int  # n
     features: Any
     scaling: Scaling
-    startup: int
-    """Samples after a start from rest in which nothing is learned."""
+    startup: int  # samples after a start from rest in which nothing is learned
 
 
 class ScaledGradientLoop(Scalars):
@@ -54,40 +46,11 @@ class ScaledGradientLoop(Scalars):
 class ScaledGradientMemory(NamedTuple):
     """State for p features and a plant of order m."""
 
-    buffers: BatchGradientMemory
-    """All scaled."""
+    buffers: BatchGradientMemory  # all scaled
     loop: NDArray[ScaledGradientLoop]
-    scale: Vector
-    """(m + 2,): what x_1 … x_m, u and Δf̂ are divided by."""
-    scaled: Vector
-    """Work space for the scaled state (m,)."""
-    units: Vector
-    """(p,): ``unit`` of the features for ``scale``."""
-
-
-def scaled_gradient_design(
-    rate: float, batch: int, features: Features, observer: ESO, frequency: float
-) -> ScaledGradientDesign:
-    """Return the parameters for an observer and a frequency of the plant [rad/s]."""
-    return ScaledGradientDesign(
-        rate=rate,
-        batch=batch,
-        features=checked_design(features, observer.order),
-        scaling=scaling(observer, frequency, False),
-        startup=startup_samples(observer),
-    )
-
-
-def scaled_gradient_memory(design: ScaledGradientDesign, p: int) -> ScaledGradientMemory:
-    """Return empty buffers and θ = 0 for ``p`` features."""
-    scale = initial_scale(design.scaling)
-    return ScaledGradientMemory(
-        empty_buffers(design.batch, p),
-        ScaledGradientLoop.zeros(),
-        scale,
-        np.zeros(scale.size - 2),
-        np.ones(p),
-    )
+    scale: Vector  # (m + 2,): what x_1 … x_m, u and Δf̂ are divided by
+    scaled: Vector  # work space for the scaled state (m,)
+    units: Vector  # (p,): ``unit`` of the features for ``scale``
 
 
 @adapt.register(ScaledGradientDesign)

@@ -12,13 +12,12 @@ from quell.learners.kalman.kalman import Kalman
 from quell.learners.kalman.oscillators import Oscillators
 from quell.observers.eso import ESO
 
-# Initial frequencies by default: omega_c, then each this multiple of the one before. It spreads
-# three oscillators over a decade; not tuned further.
+# Initial frequencies by default: omega_c, then each this multiple of the one before. This and the
+# other defaults are from 300 random loops (docs/theory; quell.experiments.stress.random_loops).
 _SPREAD = 0.3
-# Default limits of the frequencies as multiples of omega_c and omega_o. A slower load is a drifting
-# bias, and near omega_o the observer does not see the load. Chosen by hand; not tuned further.
+# Default limits of the frequencies as multiples of omega_c and omega_o.
 _LOWEST, _HIGHEST = 0.02, 0.5
-# Default bandwidth of the pairs as a multiple of the bias's bandwidth; chosen by hand.
+# Default bandwidth of the pairs as a multiple of the bias's bandwidth.
 _PAIR_BANDWIDTH = 2.5
 
 

@@ -28,14 +28,10 @@ _FREQUENCY_GAIN, _UNEXPLAINED_WEIGHT = 0.4, 60.0
 class Oscillators(NamedTuple):
     """Parameters of m oscillators, whose features are consecutive in θ."""
 
-    first: int
-    """Index in θ of the first pair."""
-    omega: Vector
-    """Initial frequencies [rad/s] (m,)."""
-    low: float
-    """Least frequency [rad/s]."""
-    high: float
-    """Largest frequency [rad/s]."""
+    first: int  # index in θ of the first pair
+    omega: Vector  # initial frequencies [rad/s] (m,)
+    low: float  # least frequency [rad/s]
+    high: float  # largest frequency [rad/s]
 
 
 @kernel

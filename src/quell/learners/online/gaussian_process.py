@@ -43,39 +43,25 @@ class GaussianProcessDesign(NamedTuple):
 
     inputs: int
     budget: int
-    weight: float
-    """``1/(2 length²)``."""
-    noise: float
-    """σ²."""
-    forget: float
-    """1 − λ."""
-    every: int
-    """Learn from every ``every``-th pair."""
+    weight: float  # ``1/(2 length²)``
+    noise: float  # σ²
+    forget: float  # 1 − λ
+    every: int  # learn from every ``every``-th pair
 
 
 class GaussianProcessMemory(NamedTuple):
     """State for m features; one row more than the budget, for the point that is added last."""
 
-    points: Matrix
-    """c (M + 1, m)."""
-    kernel: Matrix
-    """K (M + 1, M + 1)."""
-    inverse: Matrix
-    """Q (M + 1, M + 1)."""
-    covariance: Matrix
-    """Σ (M + 1, M + 1)."""
-    mean: Vector
-    """μ (M + 1,)."""
-    weights: Vector
-    """Qμ (M + 1,)."""
-    k: Vector
-    """Work space (M + 1,)."""
-    q: Vector
-    """Work space (M + 1,)."""
-    h: Vector
-    """Work space (M + 1,)."""
-    counters: Vector
-    """(2,): number of points; pairs since the last one that was learned from."""
+    points: Matrix  # c (M + 1, m)
+    kernel: Matrix  # K (M + 1, M + 1)
+    inverse: Matrix  # Q (M + 1, M + 1)
+    covariance: Matrix  # Σ (M + 1, M + 1)
+    mean: Vector  # μ (M + 1,)
+    weights: Vector  # Qμ (M + 1,)
+    k: Vector  # work space (M + 1,)
+    q: Vector  # work space (M + 1,)
+    h: Vector  # work space (M + 1,)
+    counters: Vector  # (2,): number of points; pairs since the last one that was learned from
 
 
 @kernel

@@ -53,8 +53,7 @@ class OnlineDesign(NamedTuple):
 
     inputs: Inputs
     model: Any
-    delay: int
-    """D [samples]."""
+    delay: int  # D [samples]
 
 
 class OnlineLoop(Scalars):
@@ -68,21 +67,15 @@ class OnlineLoop(Scalars):
 class OnlineMemory(NamedTuple):
     """State of a learner around a model."""
 
-    scale: Vector
-    """(n + 2,): what x_1 … x_n, u and f are divided by."""
-    scaled: Vector
-    """Work space for the scaled state (n,)."""
-    features: Vector
-    """Work space for the features of a prediction (p,)."""
-    ring: Matrix
-    """The last features (D + 1, p)."""
+    scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
+    scaled: Vector  # work space for the scaled state (n,)
+    features: Vector  # work space for the features of a prediction (p,)
+    ring: Matrix  # the last features (D + 1, p)
     loop: NDArray[OnlineLoop]
     gate: NoiseGateMemory
     model: Any
-    flat: Vector
-    """All arrays of ``model``, end to end: the same memory."""
-    initial: Vector
-    """``flat`` before anything was learned."""
+    flat: Vector  # all arrays of ``model``, end to end: the same memory
+    initial: Vector  # ``flat`` before anything was learned
 
 
 @kernel

@@ -42,24 +42,18 @@ class NetworkDesign(NamedTuple):
     rule: RlsRule
     inputs: int
     hidden: int
-    every: int
-    """Learn from every ``every``-th pair."""
+    every: int  # learn from every ``every``-th pair
     seed: int
 
 
 class NetworkMemory(NamedTuple):
     """State of a network."""
 
-    theta: Vector
-    """(p,): v_j, c_j, W_j for each hidden unit, then v_0."""
-    covariance: Matrix
-    """(p, p)."""
-    gradient: Vector
-    """Work space for ∂h/∂θ (p,)."""
-    gain: Vector
-    """Work space (p,)."""
-    skipped: Vector
-    """(1,): pairs since the last one that was learned from."""
+    theta: Vector  # (p,): v_j, c_j, W_j for each hidden unit, then v_0
+    covariance: Matrix  # (p, p)
+    gradient: Vector  # work space for ∂h/∂θ (p,)
+    gain: Vector  # work space (p,)
+    skipped: Vector  # (1,): pairs since the last one that was learned from
 
 
 @infer.register(NetworkDesign)

@@ -68,15 +68,11 @@ class LinearDesign(NamedTuple):
     inputs: Inputs
     lag: Any
     rule: Any
-    constant: int
-    """Index of the feature that is the constant 1; −1 without one."""
+    constant: int  # index of the feature that is the constant 1; −1 without one
     with_u: bool
-    slope_low: float
-    """Least θ_u, in the plant's units."""
-    slope_high: float
-    """Largest θ_u."""
-    depends: Matrix
-    """(p, n + 1): 1 if a feature depends on the state or on u, else 0."""
+    slope_low: float  # least θ_u, in the plant's units
+    slope_high: float  # largest θ_u
+    depends: Matrix  # (p, n + 1): 1 if a feature depends on the state or on u, else 0
 
 
 class LinearLoop(Scalars):
@@ -91,22 +87,14 @@ class LinearLoop(Scalars):
 class LinearMemory(NamedTuple):
     """State of a linear learner."""
 
-    theta: Vector
-    """(p,), scaled."""
-    scale: Vector
-    """(n + 2,): what x_1 … x_n, u and f are divided by."""
-    old_scale: Vector
-    """Work space (n + 2,)."""
-    scaled: Vector
-    """Work space for the scaled state (n,)."""
-    features: Vector
-    """Work space (p,)."""
-    units: Vector
-    """(p,): ``unit`` of the features for ``scale``."""
-    chain: Matrix
-    """(p, N): the lag filters of the features."""
-    filtered: Vector
-    """(p,): their outputs."""
+    theta: Vector  # (p,), scaled
+    scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
+    old_scale: Vector  # work space (n + 2,)
+    scaled: Vector  # work space for the scaled state (n,)
+    features: Vector  # work space (p,)
+    units: Vector  # (p,): ``unit`` of the features for ``scale``
+    chain: Matrix  # (p, N): the lag filters of the features
+    filtered: Vector  # (p,): their outputs
     loop: NDArray[LinearLoop]
     gate: NoiseGateMemory
     rule: Any

@@ -24,20 +24,13 @@ from quell.types import Vector
 class NlmsRule(NamedTuple):
     """Parameters."""
 
-    gain: float
-    """rate · dt, at most 1."""
-    floor: float
-    """ρ."""
+    gain: float  # rate · dt, at most 1
+    floor: float  # ρ
 
 
 @update_theta.register(NlmsRule)
 def _update_theta(
-    rule: NlmsRule,
-    memory: Vector,
-    theta: Vector,
-    features: Vector,
-    error: float,
-    confidence: float,
+    rule: NlmsRule, memory: Vector, theta: Vector, features: Vector, error: float, confidence: float
 ) -> None:
     power = rule.floor
     for i in range(theta.size):

@@ -27,10 +27,8 @@ _MEMORY = 100.0
 class RlsMemory(NamedTuple):
     """State besides θ."""
 
-    covariance: Matrix
-    """P (p, p)."""
-    gain: Vector
-    """Work space for Pφ (p,)."""
+    covariance: Matrix  # P (p, p)
+    gain: Vector  # work space for Pφ (p,)
 
 
 @update_theta.register(RlsRule)

@@ -1,4 +1,4 @@
-"""The lag filter, Algorithm 1 and the Kalman learner, each against an independent form."""
+"""The Kalman learner against closed forms and limit cases."""
 
 from __future__ import annotations
 
@@ -6,154 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import quell as ql
 from quell.learners.base import adapt, commit, predict, restart
-from quell.learners.gradient.buffers import outputs
-from quell.learners.lag import lag_memory, lag_of, lag_push
-from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
-
-LINEAR = {
-    "current": ESO.model_free(3, 2.0, 15.0, 2e-3),
-    "predictor": ESO.model_free(3, 2.0, 15.0, 2e-3, form="predictor"),
-    "model-based": ESO.model_based(([3.0, -1.0, 0.5], 2.0), 15.0, 2e-3),
-    "zeros": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), 15.0, 2e-3),
-    "zeros kept": ESO.model_based(([1.5, 6.0], [1.0, 0.5, 2.0, 1.0]), 15.0, 2e-3, keep_zeros=True),
-    "reduced": ESO.model_free(3, 2.0, 15.0, 2e-3, form="reduced"),
-    "half gain": ESO.model_free(3, 2.0, 15.0, 2e-3, half_gain=True),
-    "half gain, predictor": ESO.model_free(3, 2.0, 15.0, 2e-3, half_gain=True, form="predictor"),
-    "Kalman": ESO.kalman(3, 2.0, 2e-3, noise_variance=1e-6, drift=10.0),
-    "Kalman, predictor": ESO.kalman(
-        3, 2.0, 2e-3, noise_variance=1e-6, drift=10.0, form="predictor"
-    ),
-    "cascade": ESO.cascade(3, 2.0, 15.0, 2e-3, levels=3, ratio=1.5),
-    "delay": ESO.model_free(3, 2.0, 15.0, 2e-3, delay=0.01),
-    "cascade with delay": ESO.cascade(3, 2.0, 15.0, 2e-3, delay=0.01),
-}
-
-
-@settings(max_examples=40)
-@given(
-    order=st.integers(1, 8),
-    dt=st.sampled_from([1e-3, 1e-2]),
-    form=st.sampled_from(["current", "predictor"]),
-    model=st.booleans(),
-    seed=st.integers(0, 100),
-)
-def test_the_lag_filter_is_the_observers_own_shadow(
-    order: int, dt: float, form: str, model: bool, seed: int
-) -> None:
-    """Against the definition: the full observer, fed y = 0 and the input through Γ_f, for a thousand samples."""
-    rng = np.random.default_rng(seed)
-    observer = (
-        ESO.model_based((rng.normal(size=order), 1.0), omega_o=10.0, dt=dt, form=form)
-        if model
-        else ESO.model_free(order=order, b0=1.0, omega_o=10.0, dt=dt, form=form)
-    )
-    lag, size = lag_of(observer), order + 1
-    inputs = rng.normal(size=1000)
-    z, seen, chain = np.zeros(size), np.zeros(size), np.zeros((1, size))
-    shadow, quick = np.zeros(1000), np.zeros(1000)
-    for k in range(1, 1000):
-        observe(observer.model, z, seen, 0.0, 0.0, inputs[k - 1])
-        shadow[k] = -seen[-1]
-        quick[k] = lag_push(lag, chain, 0, inputs[k - 1])
-    np.testing.assert_allclose(quick, shadow, atol=1e-7 * max(np.max(np.abs(shadow)), 1e-3))
-
-
-@pytest.mark.parametrize("order", range(1, 9))
-def test_a_constant_passes_the_lag_filter_unchanged(order: int) -> None:
-    """Its gain at rest is one: the observer finds a constant disturbance."""
-    lag = lag_of(ESO.model_free(order=order, b0=1.0, omega_o=10.0, dt=1e-3))
-    assert np.sum(lag.taps) == pytest.approx(1.0, abs=1e-8)
-
-
-@pytest.mark.parametrize("name", LINEAR)
-def test_what_a_plain_eso_would_have_estimated_is_known_exactly(
-    name: str, rng: np.random.Generator
-) -> None:
-    """``Δf̂ + f_L^F`` is the plain ESO's estimate from the same y and u, whatever was fed forward; for every linear form."""
-    observer = LINEAR[name]
-    lag = lag_of(observer)
-    chain = lag_memory(lag, 1)
-    y, u, f_learned = (np.cumsum(rng.normal(size=2000)) * 1e-2 for _ in range(3))
-    z, plain = np.zeros(observer.states), np.zeros(observer.states)
-    seen, plainly = np.zeros(4), np.zeros(4)
-    begin(observer.model, z, seen, y[0])
-    begin(observer.model, plain, plainly, y[0])
-    for k in range(1, y.size):
-        observe(observer.model, z, seen, y[k], u[k - 1], f_learned[k - 1])
-        observe(observer.model, plain, plainly, y[k], u[k - 1], 0.0)
-        shown = lag_push(lag, chain, 0, f_learned[k - 1])
-        assert seen[-1] + shown == pytest.approx(plainly[-1], rel=1e-9, abs=1e-6)
-
-
-def literal_algorithm_1(seen: np.ndarray, u: np.ndarray, rate: float, batch: int) -> np.ndarray:
-    """Algorithm 1 as printed: three lists, popped and pushed, the whole batch labelled anew; O(n) a sample."""
-    inputs: list[np.ndarray] = []
-    residuals: list[float] = []
-    labels: list[float] = []
-    theta = np.zeros(seen.shape[1] + 1)
-    history = []
-    for row, before in zip(seen, u, strict=True):
-        feature = np.array([*row[:-1], before, 1.0])
-        if len(inputs) == batch:
-            inputs.pop(0)
-            residuals.pop(0)
-            labels.pop(0)
-        inputs.append(feature)
-        residuals.append(row[-1])
-        labels.append(feature @ theta)
-        if len(inputs) == batch:
-            batch_inputs = np.array(inputs)
-            targets = np.array(labels) + np.array(residuals)
-            theta = theta - rate * batch_inputs.T @ (batch_inputs @ theta - targets)
-            labels = list(batch_inputs @ theta)
-        history.append(theta.copy())
-    return np.array(history)
-
-
-@pytest.mark.parametrize("batch", [1, 2, 7, 50])
-def test_algorithm_1_by_sliding_sums_is_algorithm_1_as_printed(
-    batch: int, rng: np.random.Generator
-) -> None:
-    """The same θ at every sample, and the same third buffer at the end."""
-    seen, u = rng.normal(size=(200, 4)), rng.normal(size=200)
-    learner = ql.learners.BatchGradient(rate=1e-3, batch=batch).design(
-        ESO.model_free(order=3, b0=1.0, omega_o=10.0, dt=1e-2), 1.0
-    )
-    memory = ql.learners.BatchGradient(rate=1e-3, batch=batch).memory(learner)
-    expected = literal_algorithm_1(seen, u, 1e-3, batch)
-    for row, before, theta in zip(seen, u, expected, strict=True):
-        adapt(learner, memory, row, row[0], before, row[-1])
-        np.testing.assert_allclose(memory.theta, theta, atol=1e-12)
-    newest = np.column_stack([seen[-batch:, :3], u[-batch:], np.ones(batch)]) @ memory.theta
-    np.testing.assert_allclose(np.sort(outputs(memory)), np.sort(newest), atol=1e-12)
-
-
-def test_algorithm_1_is_silent_until_its_buffers_are_full(rng: np.random.Generator) -> None:
-    """Warm-up as MF-ESO: no feedforward for the first n samples less one."""
-    learner = ql.learners.BatchGradient(rate=1.0, batch=20)
-    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
-    memory = learner.memory(design)
-    for k in range(20):
-        assert predict(design, memory, np.ones(3), 1.0) == (0.0, 0.0), k
-        adapt(design, memory, rng.normal(size=3), 0.0, 0.1, 0.0)
-    assert predict(design, memory, np.ones(3), 1.0) != (0.0, 0.0)
-
-
-def test_the_sliding_sum_of_algorithm_1_does_not_drift(rng: np.random.Generator) -> None:
-    """A datum 1e12 times larger than the rest leaves no trace once the ring has come round twice."""
-    learner = ql.learners.BatchGradient(rate=0.0, batch=16)
-    design = learner.design(ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
-    memory = learner.memory(design)
-    adapt(design, memory, np.array([1e6, 1e6]), 0.0, 0.0, 1e6)
-    for _ in range(40):
-        adapt(design, memory, rng.normal(size=2), 0.0, 0.3, 0.0)
-    np.testing.assert_allclose(memory.total, memory.residuals @ memory.features, rtol=1e-12)
 
 
 def kalman_memory(learner: ql.learners.Kalman, observer: ESO) -> tuple[object, object]:
@@ -398,11 +254,9 @@ def test_the_learner_watches_before_it_learns() -> None:
     np.testing.assert_array_equal(memory.theta, before)
 
 
-@pytest.mark.parametrize(
-    "learner", [ql.learners.Kalman(u=True), ql.learners.BatchGradient(batch=4)]
-)
-def test_a_learner_that_left_the_range_of_numbers_begins_anew(learner: object) -> None:
+def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
     """Restarting keeps what was learned, but not where it is no number."""
+    learner = ql.learners.Kalman(u=True)
     design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
     memory = learner.memory(design)
     memory.theta[:] = 0.25
@@ -440,14 +294,6 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew(learner: object) -
         (
             lambda: ql.learners.Kalman(gain_interval=(1.2, 2.0)),
             r"gain_interval = \(1.2, 2.0\): must be \(low, high\) with 0 < low <= 1 <= high",
-        ),
-        (
-            lambda: ql.learners.BatchGradient(rate=-1e-3),
-            "rate = -0.001: must be finite and not negative",
-        ),
-        (
-            lambda: ql.learners.BatchGradient(batch=0),
-            "batch = 0: must be a whole number of at least 1",
         ),
     ],
 )
