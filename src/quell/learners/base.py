@@ -49,8 +49,8 @@ def adapt(
 ) -> None:
     """Learn from the observer's estimates ``seen = (x̂_1 … x̂_n, Δf̂)``.
 
-    They follow from the measurement ``y`` and from ``u_before``, which was applied before it. An ESO
-    without a learner would have estimated ``f_plain = Δf̂ + f_L^F`` (``lag.py``).
+    They follow from the measurement ``y`` and from the u applied before it. An ESO without a
+    learner would have estimated ``f_plain = Δf̂ + f_L^F`` (``lag.py``).
     """
     raise TypeError
 
