@@ -2,9 +2,9 @@
 
 An observer is an ``ESO``. Its ``model`` is a NamedTuple of parameters with ``states``, the length
 of the running state ``z``. Entry n of ``z`` is a summand of the estimated f, so a controller may
-shift the estimate there. A new kind of model registers ``observe`` and ``begin``; it registers
-``expected_measurement`` if it lacks ``transition``, ``input`` and ``feed`` for the first entries
-of ``z``, and ``acting_control`` if u is delayed.
+shift the estimate there. A new kind of model registers ``observe``. It registers ``begin`` if its
+``z`` does not start with the estimates, ``expected_measurement`` if it lacks ``transition``,
+``input`` and ``feed`` for the first entries of ``z``, and ``acting_control`` if u is delayed.
 """
 
 from __future__ import annotations
@@ -34,10 +34,12 @@ def expected_measurement(model: Any, z: Vector, u: float, f_learned: float) -> f
     return total
 
 
-@generic
+@generic_with_default
 def begin(model: Any, z: Vector, estimate: Vector, y: float) -> None:
     """Start at rest at the first measurement: ``x̂_1 = y``, all else zero."""
-    raise TypeError
+    for i in range(z.size):
+        z[i] = estimate[i] = 0.0
+    z[0] = estimate[0] = y
 
 
 @generic_with_default
@@ -54,11 +56,3 @@ def predict_state(model: Any, z: Vector, predicted: Vector, u: float, f: float) 
         for j in range(z.size):
             total += model.transition[i, j] * z[j]
         predicted[i] = total
-
-
-@kernel
-def begin_at(z: Vector, estimate: Vector, y: float) -> None:
-    """Set the first entry of both vectors (N,) to ``y`` and all others to zero."""
-    for i in range(z.size):
-        z[i] = estimate[i] = 0.0
-    z[0] = estimate[0] = y

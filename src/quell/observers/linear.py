@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from quell.observers.base import begin, begin_at, observe, predict_state
+from quell.observers.base import observe, predict_state
 from quell.types import Matrix, Vector
 
 
@@ -48,8 +48,3 @@ def _observe(
     if not model.predictor:
         for i in range(z.size):
             estimate[i] = z[i]
-
-
-@begin.register(EsoModel)
-def _begin(model: EsoModel, z: Vector, estimate: Vector, y: float) -> None:
-    begin_at(z, estimate, y)

@@ -25,7 +25,7 @@ import numpy as np
 
 from quell import checks
 from quell.kernels.dispatch import kernel
-from quell.observers.base import begin, begin_at, observe, predict_state
+from quell.observers.base import observe, predict_state
 from quell.observers.linear import EsoModel
 from quell.types import Matrix, Vector
 
@@ -77,11 +77,6 @@ def _observe(
             * fal(error, model.alpha[i], model.delta)
         )
         z[i] = estimate[i]
-
-
-@begin.register(NonlinearModel)
-def _begin(model: NonlinearModel, z: Vector, estimate: Vector, y: float) -> None:
-    begin_at(z, estimate, y)
 
 
 def nonlinear_model(linear: EsoModel, delta: float, alpha: Any) -> NonlinearModel:

@@ -92,29 +92,27 @@ def _derivatives(
 
 @measure.register(PythonNonlinear)
 def _measure_python(plant: PythonNonlinear, x: Vector) -> float:
-    try:
-        return float(plant.output(x))
-    except Exception as error:
-        if not _out_of_range(error):
-            raise
-        return float("nan")
+    return float(_value_or_nan(plant.output, x))
 
 
 @derivatives.register(PythonNonlinear)
 def _derivatives_python(
     plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
 ) -> None:
+    dx[:] = _value_or_nan(plant.rate, t, x, u, w)
+
+
+def _value_or_nan(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the function's value, or NaN as compiled code does, for example for log(-1.0).
+
+    A run with NaN ends as diverged.
+    """
     try:
-        dx[:] = plant.rate(t, x, u, w)
+        return function(*arguments)
     except Exception as error:
-        if not _out_of_range(error):
-            raise
-        dx[:] = np.nan  # as in the compiled function; the run ends as diverged
-
-
-def _out_of_range(error: Exception) -> bool:
-    """Return whether a function failed because its value is not a number, such as exp(1000.0)."""
-    return isinstance(error, ArithmeticError) or "math domain" in str(error)
+        if isinstance(error, ArithmeticError) or "math domain" in str(error):
+            return np.nan
+        raise
 
 
 @dataclass(frozen=True, eq=False)

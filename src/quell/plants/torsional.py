@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -135,12 +135,16 @@ class TorsionalPlant:
         """Angle of one count of the encoder [rad]; 0.0 without an encoder."""
         return 0.0 if self.counts is None else math.tau / self.counts
 
-    def sampled(self, dt: float, interpret: bool = False) -> Any:
+    def sampled(
+        self, dt: float, interpret: bool = False
+    ) -> TorsionalModel | DelayedPlantModel | EncodedPlantModel:
         """Return the parameters for a sample time ``dt`` [s]: disks, in a delay, in an encoder."""
         dry = any(c > 0.0 for c in self.coulomb)
         substeps = math.ceil(checks.positive("dt", dt, "s") / _SUBSTEP - 1e-9) if dry else 1
         disks = self.linear.sampled(dt / substeps)
-        model: Any = TorsionalModel(disks, substeps, np.array(self.coulomb), self.u_max, self.step)
+        model: TorsionalModel | DelayedPlantModel = TorsionalModel(
+            disks, substeps, np.array(self.coulomb), self.u_max, self.step
+        )
         if self.late:
             model = DelayedPlantModel(model, self.linear.order)
         return model if self.counts is None else EncodedPlantModel(model, self.resolution)

@@ -195,7 +195,7 @@ def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:
     return tuple(signal.seeded(child) for signal, child in zip(signals, children, strict=True))
 
 
-def check_finite_fields(signal: Signal) -> None:
-    """Raise a ``ValueError`` if a parameter of ``signal`` is not a finite number."""
-    for f in fields(signal):
-        checks.finite(f.name, getattr(signal, f.name))
+def check_finite_fields(signal: Signal, *names: str) -> None:
+    """Raise a ``ValueError`` if a parameter, by default any, is not a finite number."""
+    for name in names or [f.name for f in fields(signal)]:
+        checks.finite(name, getattr(signal, name))

@@ -100,8 +100,7 @@ class Chirp(Signal):
     logarithmic: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("amplitude", "omega_start", "omega_end", "start"):
-            checks.finite(name, getattr(self, name))
+        check_finite_fields(self, "amplitude", "omega_start", "omega_end", "start")
         checks.positive("duration", self.duration, "s")
         if checks.flag("logarithmic", self.logarithmic):
             checks.positive("omega_start", self.omega_start, "rad/s")
@@ -151,8 +150,7 @@ class Trapezoid(Signal):
     start: float = 0.0
 
     def __post_init__(self) -> None:
-        checks.finite("distance", self.distance)
-        checks.finite("start", self.start)
+        check_finite_fields(self, "distance", "start")
         checks.positive("duration", self.duration, "s")
         ramp = self._ramp
         if not 0.0 < ramp <= self.duration / 2:
@@ -211,8 +209,7 @@ class SmoothMove(Signal):
     order: int = 0
 
     def __post_init__(self) -> None:
-        checks.finite("distance", self.distance)
-        checks.finite("start", self.start)
+        check_finite_fields(self, "distance", "start")
         checks.positive("duration", self.duration, "s")
         checks.whole("smoothness", self.smoothness, 1, 12)
         checks.whole("order", self.order, 0)
