@@ -136,7 +136,7 @@ def _from_state(controller: ADRC, state: Any) -> Frozen:
     if hasattr(controller.learner, "external_fields"):
         raise ValueError(
             f"learner = {type(controller.learner).__name__}: a Python model is called once a "
-            "period and its answer held, so it has no gain at an instant; analyse the loop without it"
+            "period, so it has no gain at an instant; analyse the loop without it"
         )
     learner, memory = controller.parameters.learner, copy_state(state.learner)
     known = controller.read(state)

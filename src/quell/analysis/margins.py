@@ -33,7 +33,7 @@ _LEAST_FACTOR, _LARGEST_FACTOR = 1e-9, 1e9
 # How far below the lowest frequency of the grid ω → 0 is evaluated.
 _TOWARDS_ZERO = 1e-3
 # Local minima to refine: a sharp dip may lie beside a grid point that is not the lowest. Chosen by
-# hand.
+# hand; one was enough in the loops that ``frequency_response`` names.
 _MINIMA = 3
 # Relative errors of the refined frequencies. A minimum is flat, so that its value is exact well
 # before its place.

@@ -12,9 +12,9 @@ The weights follow from two bandwidths. If u reaches y through ν integrators wi
 control places ν poles of the loop in a Butterworth pattern of radius ``(b²/ρ)^(1/(2ν))``, and the
 others at the plant's zeros. With a random walk of density q at the input and measurement noise of
 density v the filter's N − (n − ν) fast poles have the radius ``(q b²/v)^(1/(2(ν + 1)))``
-(Kwakernaak & Sivan, *Linear Optimal Control Systems*, 1972, sections 3.8 and 4.4). So ``ρ =
-b²/omega_c^(2ν)`` and ``q b²/v = omega_o^(2(ν+1))``: exact for a chain of integrators, else valid
-for bandwidths above the plant's own frequencies.
+(Kwakernaak & Sivan, *Linear Optimal Control Systems*, 1972, sections 3.8 and 4.4). So
+``ρ = b²/omega_c^(2ν)`` and ``q b²/v = omega_o^(2(ν+1))``: exact for a chain of integrators, else
+valid for bandwidths above the plant's own frequencies.
 """
 
 from __future__ import annotations
@@ -106,12 +106,11 @@ class LQG(LinearController):
         if first is None:
             raise ValueError("u does not reach y: B or C is zero, or they have no mode in common")
         b, degree = first
-        rho = b**2 / omega_c ** (2 * degree) if rho is None else checks.positive("rho", rho)
+        rho = checks.optional(checks.positive, "rho", rho) or b**2 / omega_c ** (2 * degree)
         weight = C.T @ C if Q is None else checks.weight("Q", Q, n)
         self.K = _state_gain(A, B, weight, rho, dt)
         self.model = with_disturbance(A, B, C, B, dt)
-        # From densities to variances per sample: that of y divided by dt, that of the walk times
-        # dt.
+        # Variances per sample: the density of y divided by dt, that of the walk times dt.
         W = np.zeros((n + 1, n + 1))
         W[n, n] = dt * omega_o ** (2 * (degree + 1)) / b**2
         if process_noise is not None:
@@ -127,10 +126,7 @@ class LQG(LinearController):
 def _check_zero(A: Matrix, B: Matrix, C: Matrix) -> None:
     singular = np.linalg.svd(np.block([[A, B], [C, np.zeros((1, 1))]]), compute_uv=False)
     if singular[-1] <= 1e-12 * singular[0]:  # singular, to rounding
-        raise ValueError(
-            "plant has a zero at s = 0: a constant disturbance has no effect on y, and y cannot "
-            "follow a constant reference"
-        )
+        raise ValueError("plant has a zero at s = 0: y cannot follow a constant reference")
 
 
 def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vector:
@@ -147,8 +143,7 @@ def _state_gain(A: Matrix, B: Matrix, Q: Matrix, rho: float, dt: float) -> Vecto
     try:
         P = solve_discrete_are(phi, gamma, sampled[:n, :n], R, s=S)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(
-            f"no stabilising state feedback: {error}; Q must weight every mode that does not decay"
-        ) from None
+        rule = "Q must weight every mode that does not decay"
+        raise ValueError(f"no stabilising state feedback: {error}; {rule}") from None
     gain: Vector = np.linalg.solve(R + gamma.T @ P @ gamma, gamma.T @ P @ phi + S.T)[0]
     return gain

@@ -13,7 +13,7 @@ x_1'`` the characteristic polynomial of the loop is::
 
 which for ``H = √5, k_v = 4 ω_a, k_p = ω_a²`` is ``(s + ω_a)⁴`` (Yuki, Murakami & Ohnishi, *IECON*
 1993; Hori, Sawada & Chun, *IEEE Trans. Industrial Electronics* 46, 1999, with a disturbance
-observer slow enough for the whole of both masses).
+observer so slow that both masses move as one).
 
 They measure the motor and estimate T by a disturbance observer there. Here the only measurement y
 is the position of either mass, so x_1, x_1' and T come from a Kalman filter of both masses with a
@@ -100,19 +100,16 @@ class ResonanceRatio(LinearController):
         plant = two_mass_spring(m1, m2, k, c1, 1.0 - c1)
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         if not checks.positive("ratio", ratio) > 1.0:
-            raise ValueError(
-                f"ratio = {ratio!r}: must be above 1, the resonance is above the anti-resonance"
-            )
+            raise ValueError(f"ratio = {ratio!r}: must be above 1, as the resonance always is")
         antiresonance = math.sqrt(k / m2)
         self.kappa = round((ratio**2 - 1.0) * m1 / m2, 12)  # 4 for √5, not 4.000000000000001
-        omega_d = checks.positive(
-            "omega_d", 0.5 * antiresonance if omega_d is None else omega_d, "rad/s"
+        omega_d = (
+            checks.optional(checks.positive, "omega_d", omega_d, "rad/s") or 0.5 * antiresonance
         )
         kp, kv = antiresonance**2, 4.0 * antiresonance
         torque = (1.0 - self.kappa) * k
         self.K = np.array([m1 * kp - torque, torque, m1 * kv, 0.0])
-        # At rest under d the spring carries it: x1 − x2 = −d/k, u = −d, and y = x2 + c1 (x1 − x2) =
-        # r.
+        # At rest under d the spring carries it: x1 − x2 = −d/k, u = −d, y = x2 + c1 (x1 − x2) = r.
         self.K_d = float(1.0 + (self.K[0] * (1.0 - c1) - self.K[1] * c1) / k)
         model = with_disturbance(plant.A, plant.B, plant.C, plant.E[:, 1:], dt)
         # White noise in the force on the other mass, and a random walk in d that crosses it at
@@ -123,10 +120,8 @@ class ResonanceRatio(LinearController):
         gains = [leading_gain(plant.A, column, plant.C) for column in (far, plant.E[:, 1:])]
         # The spring joins both masses, so no gain is None.
         (b_far, degree_far), (b_d, degree_d) = (found for found in gains if found is not None)
-        density = min(
-            omega_o ** (2 * degree_far) / b_far**2,
-            omega_o ** (2 * degree_d + 2) / (b_d * omega_d) ** 2,
-        )
+        density_far = omega_o ** (2 * degree_far) / b_far**2
+        density = min(density_far, omega_o ** (2 * degree_d + 2) / (b_d * omega_d) ** 2)
         W = np.zeros((5, 5))
         W[:4, :4] = gramian(plant.A, far @ far.T * density, dt)
         W[4, 4] = dt * density * omega_d**2

@@ -6,9 +6,8 @@ Seering, *ASME J. Dynamic Systems, Measurement, and Control* 112, 1990, eqs. (11
     ZV    amplitudes (1, K) / (1 + K)            at the times (0, π/ω_d)
     ZVD   amplitudes (1, 2K, K²) / (1 + K)²      at the times (0, π/ω_d, 2π/ω_d)
 
-ZV leaves no vibration of exactly this mode, ZVD none to first order in an error of ω. After the
-last of the impulses a_i at t_i, the vibration of a mode, relative to that after a single impulse,
-is::
+ZV leaves no vibration of exactly this mode, ZVD none to first order in an error of ω. Relative to
+that after a single impulse, the vibration of a mode after the last of impulses a_i at t_i is::
 
     V = e^(−ζω t_N) √( (Σ a_i e^(ζω t_i) cos ω_d t_i)² + (Σ a_i e^(ζω t_i) sin ω_d t_i)² )
 
