@@ -166,6 +166,6 @@ def run(
         ring(4096, width),
         interpret=interpret,
     )
-    loop.requests[0] = asked
+    loop.controller.supervisor.requests[0] = asked
     loop.run()
-    return Outcome(loop, drain(loop.log.ring), device)
+    return Outcome(loop, drain(loop.controller.log.ring), device)

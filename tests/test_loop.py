@@ -136,7 +136,7 @@ def test_the_grid_follows_a_devices_clock(drift: float) -> None:
     y = found[:, LOOP_WIDTH - 2]
     np.testing.assert_array_equal(np.diff(y), 1.0)
     assert len(y) > 10_000
-    assert loop.supervisor.counters[0].overruns == 0
+    assert loop.controller.supervisor.counters[0].overruns == 0
 
 
 # Of two cycles one wakes just before the tick, the next one just after.
@@ -166,7 +166,9 @@ def test_after_a_hiccup_of_the_loop_no_measurement_is_old(hiccup: int, k: int) -
 def test_a_device_that_sends_nothing_is_not_started() -> None:
     """It stops before the first cycle, within two seconds, and says why."""
     found, loop = ticks(TickingDevice(1e18), 1.0)
-    assert [change.cause for change in mode_changes(loop.supervisor, DT)] == [Cause.NO_MEASUREMENT]
+    assert [change.cause for change in mode_changes(loop.controller.supervisor, DT)] == [
+        Cause.NO_MEASUREMENT
+    ]
     assert now(loop.clock) < 2.1e9
     assert np.all(found[:, LOOP_WIDTH - 1] == 0.0)
 
@@ -181,7 +183,7 @@ def test_deadlines_that_are_left_out_are_no_blow() -> None:
     k = found["K"]
     assert 3 in np.diff(k) - 1
     assert np.max(np.abs(np.diff(found["U"][:60]))) > 1e-3
-    f_residual = found.rows[:, found.loop.log.f_residual]
+    f_residual = found.rows[:, found.loop.controller.log.f_residual]
     np.testing.assert_allclose(f_residual, 0.0, atol=1e-9)
 
 
@@ -288,7 +290,7 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
     width = sum(width for _, width in row_channels(controller.channels))
     loop = ControlLoop.of(device, controller, points, rules, virtual_clock(), ring(4096, width))
     assert device.handle.at.tolist() == [0, 0]
-    for array in named_arrays(loop.state).values():
+    for array in named_arrays(loop.controller.state).values():
         assert not np.any(array)
     compiled = compilations(run_cycles)
     loop.run()

@@ -29,7 +29,7 @@ def modes(outcome: Outcome) -> list[tuple[int, Mode, Cause]]:
     """Return when which mode began, and why."""
     return [
         (round(change.t / DT), change.mode, change.cause)
-        for change in mode_changes(outcome.loop.supervisor, DT)
+        for change in mode_changes(outcome.loop.controller.supervisor, DT)
     ]
 
 
@@ -310,7 +310,7 @@ def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(
     # Where u was held, it was held.
     held = np.flatnonzero(mode == Mode.HOLD)
     np.testing.assert_array_equal(u[held], u[held - 1])
-    began = outcome.loop.supervisor.memory[0].began
+    began = outcome.loop.controller.supervisor.memory[0].began
     assert (began >= SETTLE) == bool(np.any(mode == Mode.RUN))
 
 

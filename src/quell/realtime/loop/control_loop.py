@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quell.controllers.base import Controller
 from quell.kernels.dispatch import dispatcher_for, interpreted
 from quell.kernels.user_types import explain_compile_errors
 from quell.realtime.devices.base import Device, PythonHandle, handle_of
-from quell.realtime.loop.compiled_controller import compile_controller
-from quell.realtime.loop.cycle import CycleLog, CycleTimes, cycle_times, run_cycles
+from quell.realtime.loop.compiled_controller import compiled_controller
+from quell.realtime.loop.cycle import (
+    CycleLog,
+    CycleTimes,
+    SupervisedController,
+    control_step,
+    cycle_times,
+    run_cycles,
+)
 from quell.realtime.loop.modes import Mode
 from quell.realtime.loop.reference import ReferenceSamples
-from quell.realtime.loop.supervisor import FLUSH, Rules, SupervisorState, initial_state
+from quell.realtime.loop.supervisor import FLUSH, Rules, initial_state
 from quell.realtime.system.histogram import Histogram, Timing, empty_counts
 from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.ring import Ring
@@ -26,19 +32,17 @@ from quell.records.channels import columns_of
 
 @dataclass(frozen=True, eq=False)
 class ControlLoop:
-    """Arguments of ``run_cycles``, and the way to call it; ``of`` makes and compiles one."""
+    """A supervised controller around a device; ``of`` makes and compiles one.
+
+    If the device needs Python, the loop is interpreted and only its control step is compiled;
+    ``interpret`` makes both plain Python, to debug.
+    """
 
     handle: Any
     clock: Any
-    design: Any
-    state: Any
-    rules: Rules
-    supervisor: SupervisorState
-    reference: ReferenceSamples
     times: CycleTimes
-    log: CycleLog
-    interpreted: bool
-    """Whether the loop runs as plain Python."""
+    controller: SupervisedController
+    interpret: bool = False
 
     @classmethod
     def of(
@@ -52,14 +56,7 @@ class ControlLoop:
         *,
         interpret: bool = False,
     ) -> ControlLoop:
-        """Return the compiled loop of a device and a controller that has learned nothing yet.
-
-        If the device needs Python, the loop is interpreted and only the controller is compiled;
-        ``interpret`` makes both plain Python, to debug.
-        """
-        handle = handle_of(device)
-        needs_python = isinstance(handle, PythonHandle)
-        design, state = controller.parameters, controller.initial_state()
+        """Return the compiled loop of a device and a controller that has learned nothing yet."""
         channels = row_channels(controller.channels)
         row = np.zeros(sum(width for _, width in channels))
         known = {name for name, width in channels if width}
@@ -67,47 +64,49 @@ class ControlLoop:
             columns_of(channels, name).start if {"f_learned", "f_residual"} <= known else -1
             for name in ("f_learned", "f_residual")
         )
-        loop = cls(
-            handle=handle,
-            clock=clock,
-            design=design,
-            state=state,
+        supervised = SupervisedController(
+            design=controller.parameters,
+            state=controller.initial_state(),
             rules=rules,
             supervisor=initial_state(),
             reference=reference,
-            times=cycle_times(controller.dt, getattr(device, "paced", False)),
             log=CycleLog(ring, row, f_learned, f_residual, empty_counts(), empty_counts()),
-            interpreted=interpret or needs_python,
         )
-        # Compile by a run that is finished before it begins, or by a step after the end of a run.
-        over = copy.deepcopy(loop.supervisor)
-        over.memory[0].mode, over.memory[0].samples = Mode.STOPPED, FLUSH + 1
-        if needs_python and not interpret:
-            spare = controller.initial_state(), rules, over, reference, loop.log
-            return replace(loop, design=compile_controller(design, *spare))
-        replace(loop, supervisor=over).run()
+        times = cycle_times(controller.dt, getattr(device, "paced", False))
+        loop = cls(handle_of(device), clock, times, supervised, interpret)
+        loop._compile()
         return loop
 
     @property
-    def requests(self) -> NDArray[np.int64]:
-        """The ``Request`` to the loop (1,), which another thread may write."""
-        return self.supervisor.requests
+    def interpreted(self) -> bool:
+        """Whether the loop runs as plain Python."""
+        return self.interpret or isinstance(self.handle, PythonHandle)
 
     @property
     def timing(self) -> Timing:
         """Punctuality so far."""
-        return Timing(Histogram.of(self.log.lateness), Histogram.of(self.log.step_time))
+        log = self.controller.log
+        return Timing(Histogram.of(log.lateness), Histogram.of(log.step_time))
 
     def run(self) -> None:
         """Run all cycles."""
-        entry = (
-            interpreted(run_cycles)
-            if self.interpreted
-            else dispatcher_for(run_cycles, self.handle, self.clock, self.design)
+        controller: Any = self.controller
+        if self.interpreted:
+            entry = interpreted(run_cycles)
+            controller = controller if self.interpret else compiled_controller(controller)
+        else:
+            entry = dispatcher_for(run_cycles, self.handle, self.clock, controller)
+        with np.errstate(over="ignore", invalid="ignore"):
+            entry(self.handle, self.clock, self.times, controller)
+
+    def _compile(self) -> None:
+        """Compile by a run that is finished before it begins, or by a step after the end of a run."""
+        finished = copy.deepcopy(self.controller.supervisor)
+        finished.memory[0].mode, finished.memory[0].samples = Mode.STOPPED, FLUSH + 1
+        over = self.controller._replace(
+            supervisor=finished, state=copy.deepcopy(self.controller.state)
         )
-        arguments = list(vars(self).values())[:-1]  # all fields but ``interpreted``, in order
-        with (
-            np.errstate(over="ignore", invalid="ignore"),
-            explain_compile_errors(self.handle, self.design),
-        ):
-            entry(*arguments)
+        with explain_compile_errors(self.handle, self.controller.design):
+            ControlLoop(self.handle, self.clock, self.times, over, self.interpret).run()
+            if self.interpreted and not self.interpret:
+                control_step(compiled_controller(over), 0, 0, 0.0)

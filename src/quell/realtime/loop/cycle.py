@@ -109,6 +109,19 @@ class CycleLog(NamedTuple):
     """Histogram."""
 
 
+class SupervisedController(NamedTuple):
+    """A controller, its supervisor, its reference and its log: the arguments of a control step."""
+
+    design: Any
+    """Parameters of the controller."""
+    state: Any
+    """State of the controller."""
+    rules: Rules
+    supervisor: SupervisorState
+    reference: ReferenceSamples
+    log: CycleLog
+
+
 def cycle_times(dt: float, paced: bool) -> CycleTimes:
     """Return the times of a cycle for a sample time ``dt`` [s]."""
     period = dt * 1e9
@@ -117,18 +130,9 @@ def cycle_times(dt: float, paced: bool) -> CycleTimes:
 
 
 @compiled
-def run_cycles(
-    handle: Any,
-    clock: Any,
-    design: Any,
-    state: Any,
-    rules: Rules,
-    supervisor: SupervisorState,
-    reference: ReferenceSamples,
-    times: CycleTimes,
-    log: CycleLog,
-) -> None:
+def run_cycles(handle: Any, clock: Any, times: CycleTimes, controller: Any) -> None:
     """Run until the supervisor has stopped the device."""
+    supervisor, log = controller.supervisor, controller.log
     memory, counters = supervisor.memory[0], supervisor.counters[0]
     origin = 0
     if not finished(supervisor):
@@ -146,7 +150,7 @@ def run_cycles(
         y, waited, shift = _measure(handle, clock, times, supervisor, deadline)
         origin += shift
         changed, clipped = supervisor.changed[0], counters.clipped
-        u = control_step(design, state, rules, supervisor, reference, log, k, left_out, y)
+        u = control_step(controller, k, left_out, y)
         fault = write_command(handle, u)
         memory.unsent_in_row = memory.unsent_in_row + 1 if fault == 1 else 0
         memory.tripped = 1 if fault > 1 else 0
@@ -249,38 +253,20 @@ def _measure(
 
 
 @generic
-def control_step(
-    design: Any,
-    state: Any,
-    rules: Rules,
-    supervisor: SupervisorState,
-    reference: ReferenceSamples,
-    log: CycleLog,
-    k: int,
-    left_out: int,
-    y: float,
-) -> float:
+def control_step(controller: Any, k: int, left_out: int, y: float) -> float:
     """Take a sample of supervisor and controller; return the u to apply.
 
     First the controller is told of the ``left_out`` deadlines before k, except those that end the
-    run anyway.
+    run anyway. Reference and channels of the controller are written into the row.
     """
     raise TypeError
 
 
-@control_step.register(object)
-def _control_step(
-    design: Any,
-    state: Any,
-    rules: Rules,
-    supervisor: SupervisorState,
-    reference: ReferenceSamples,
-    log: CycleLog,
-    k: int,
-    left_out: int,
-    y: float,
-) -> float:
-    memory, row = supervisor.memory[0], log.row
+@control_step.register(SupervisedController)
+def _control_step(controller: SupervisedController, k: int, left_out: int, y: float) -> float:
+    design, state, rules = controller.design, controller.state, controller.rules
+    supervisor, reference, row = controller.supervisor, controller.reference, controller.log.row
+    memory = supervisor.memory[0]
     update_mode(rules, supervisor, k, y, reference.r.size)
     first = k - min(left_out, rules.hold)
     if memory.mode == Mode.RUN and memory.began == k:
@@ -296,8 +282,8 @@ def _control_step(
             if i < k:
                 set_applied_control(design, state, memory.u)
     write_row(design, state, row[LOOP_WIDTH:])
-    if log.f_learned >= 0:
-        f_hat = row[log.f_learned] + row[log.f_residual]
+    if controller.log.f_learned >= 0:
+        f_hat = row[controller.log.f_learned] + row[controller.log.f_residual]
     u = supervised_output(rules, supervisor, k, wished, r, f_hat)
     if awake and u != wished:
         set_applied_control(design, state, u)

@@ -128,13 +128,14 @@ def run_rig(
         if isinstance(handle, PythonHandle):
             device.read()  # an error of the driver comes before compiling
         loop = ControlLoop.of(device, controller, reference, rules, system_clock(spin), writer.ring)
+        supervisor = loop.controller.supervisor
         writer.urgent = loop.interpreted and priority > 1
         if hasattr(device, "restart_session"):
             device.restart_session()  # compiling may have taken longer than the device waits
         writer.header = replace(writer.header, started=time.time_ns())
         real_time = real_time_process(priority, loop.interpreted)
         # Signals first and last: a second Ctrl-C must not lose the end of the record.
-        with _requests_by_signals(loop.requests), writer, real_time as notes:
+        with _requests_by_signals(supervisor.requests), writer, real_time as notes:
             _run_thread(loop, dt, priority, cpu, notes, on_change)
             device.close()  # before the record is finished, which may take time
     if scenario.disturbances or scenario.noise != 0.0:
@@ -143,14 +144,14 @@ def run_rig(
     if isinstance(handle, PythonHandle) and handle.errors:
         count, last = int(handle.faults[0]), handle.errors[0]
         notes.append(f"the device raised {count} errors, the last of them: {last!r}")
-    notes += [*lost_changes(loop.supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
+    notes += [*lost_changes(supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
     record = memory.trajectory()
     return RigRun(
-        trajectory=scenario_part(record, loop.supervisor, reference.r.size),
+        trajectory=scenario_part(record, supervisor, reference.r.size),
         record=record,
         timing=loop.timing,
-        changes=mode_changes(loop.supervisor, dt),
-        tally=tally(loop.supervisor, writer.dropped),
+        changes=mode_changes(supervisor, dt),
+        tally=tally(supervisor, writer.dropped),
         counters=dict(getattr(device, "counters", {})),
         notes=tuple(notes),
     )
@@ -202,12 +203,13 @@ def _run_thread(
 
     thread = threading.Thread(target=work, name="quell-loop", daemon=True)
     thread.start()
-    counters = loop.supervisor.counters[0]
+    supervisor = loop.controller.supervisor
+    counters = supervisor.counters[0]
     seen, cycles, progressed, hung = 0, -1, time.monotonic(), False
     try:
         while thread.is_alive() and not hung:
             thread.join(_LOOK)
-            for change in mode_changes(loop.supervisor, dt, seen):
+            for change in mode_changes(supervisor, dt, seen):
                 seen += 1
                 if on_change is not None:
                     on_change(change)
@@ -215,8 +217,8 @@ def _run_thread(
                 cycles, progressed = int(counters.cycles), time.monotonic()
             hung = time.monotonic() - progressed > max(_HUNG, _HUNG_SAMPLES * dt)
     except BaseException:
-        loop.requests[0] = max(int(loop.requests[0]), Request.RAMP)
-        thread.join(max(_HUNG, (loop.rules.ramp + _HUNG_SAMPLES) * dt))
+        supervisor.requests[0] = max(int(supervisor.requests[0]), Request.RAMP)
+        thread.join(max(_HUNG, (loop.controller.rules.ramp + _HUNG_SAMPLES) * dt))
         raise
     if hung:
         seconds = time.monotonic() - progressed
