@@ -43,19 +43,8 @@ from quell.realtime.loop.supervisor import (
 from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.clock import now, wait_until
 from quell.realtime.system.histogram import count_duration
-from quell.realtime.telemetry.channels import (
-    EVENTS,
-    LATENESS,
-    LOOP_WIDTH,
-    MODE,
-    STEP_TIME,
-    Y_MEASURED,
-    Event,
-    K,
-    R,
-    U,
-    Y,
-)
+from quell.realtime.telemetry import channels
+from quell.realtime.telemetry.channels import LOOP_WIDTH, Event
 from quell.realtime.telemetry.ring import Ring, push
 from quell.types import Vector
 
@@ -181,14 +170,14 @@ def _log_cycle(
 ) -> None:
     """Complete the row, in which reference and controller's channels are already, and push it."""
     row = log.row
-    row[K] = k
-    row[LATENESS] = 1e-9 * lateness
-    row[STEP_TIME] = 1e-9 * step_time
-    row[MODE] = memory.mode
-    row[EVENTS] = events
-    row[Y] = memory.y
-    row[Y_MEASURED] = y
-    row[U] = memory.u
+    row[channels.K] = k
+    row[channels.LATENESS] = 1e-9 * lateness
+    row[channels.STEP_TIME] = 1e-9 * step_time
+    row[channels.MODE] = memory.mode
+    row[channels.EVENTS] = events
+    row[channels.Y] = memory.y
+    row[channels.Y_MEASURED] = y
+    row[channels.U] = memory.u
     push(log.ring, row)
     count_duration(log.lateness, lateness)
     count_duration(log.step_time, step_time)
@@ -288,7 +277,7 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
     if awake and u != wished:
         set_applied_control(design, state, u)
         supervisor.counters[0].clipped += 1 if memory.mode == Mode.RUN else 0
-    row[R] = r
+    row[channels.R] = r
     return u
 
 

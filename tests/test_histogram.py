@@ -1,0 +1,56 @@
+"""Histograms of durations, against the durations themselves."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quell.realtime.system.histogram import BINS, Histogram, count_duration, empty_counts
+
+
+@given(st.lists(st.integers(0, 10**12), min_size=1, max_size=300))
+def test_a_histograms_percentiles_are_those_of_what_was_counted(durations: list[int]) -> None:
+    """Rounded up, by a thirty-second at most; the longest as it is."""
+    counts = empty_counts()
+    for duration in durations:
+        count_duration(counts, duration)
+    histogram = Histogram.of(counts)
+    assert len(histogram) == len(durations)
+    assert histogram.max == pytest.approx(1e-9 * max(durations))
+    ordered = sorted(durations)
+    for percent in (1.0, 50.0, 99.0, 99.9, 100.0):
+        exact = 1e-9 * ordered[math.ceil(percent / 100.0 * len(ordered) - 1e-9) - 1]
+        assert (
+            exact - 1e-15 <= histogram.percentile(percent) <= exact * (1.0 + 1.0 / 32.0) + 1.001e-9
+        )
+
+
+def test_a_histogram_tells_and_shows_itself() -> None:
+    """As text, a line for each quarter of a decade, and as a picture; an empty one has nothing to tell."""
+    counts = empty_counts()
+    for duration in [20_000] * 990 + [300_000] * 10:
+        count_duration(counts, duration)
+    histogram = Histogram.of(counts)
+    assert (
+        histogram.text("lateness")
+        .splitlines()[0]
+        .startswith("lateness: p50 20.5 µs, p99 20.5 µs, p99.9 300 µs, max 300 µs of 1000")
+    )
+    assert [int(line.split()[4]) for line in histogram.text().splitlines()[1:]] == [
+        990,
+        0,
+        0,
+        0,
+        10,
+    ]
+    ax = histogram.plot()
+    assert ax.get_xlabel() == "duration [µs]"
+    empty = Histogram.of(empty_counts())
+    assert math.isnan(empty.p50)
+    assert empty.text().endswith("of 0")
+    with pytest.raises(ValueError, match="percent = 0"):
+        histogram.percentile(0.0)
+    assert len(histogram.edges) == BINS
