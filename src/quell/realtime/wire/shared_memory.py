@@ -131,7 +131,7 @@ class SharedMemoryDevice(WireDevice):
         return _transport(own, theirs)
 
     def _release(self) -> None:
-        # The device reads the goodbye within a tick, and must do so before the hello of the next loop
+        # The device reads the goodbye within a tick, and must do so before the next loop's hello
         # replaces it. Closing takes at most 0.1 s (chosen by hand), even if ticks are longer.
         time.sleep(min(2.0 * self.dt, 0.1))
         for box in self._boxes:
