@@ -6,9 +6,8 @@ is right only for a complete record.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.types import Vector
@@ -93,7 +92,7 @@ def _first_crossing(t: Vector, done: Vector, level: float) -> float:
     return float(t[k - 1] + share * (t[k] - t[k - 1]))
 
 
-def _record(values: Any) -> Vector:
+def _record(values: ArrayLike) -> Vector:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1 or array.size == 0:
         raise ValueError(
@@ -108,7 +107,7 @@ def _record(values: Any) -> Vector:
     return array
 
 
-def _pair(t: Any, values: Any) -> tuple[Vector, Vector]:
+def _pair(t: ArrayLike, values: ArrayLike) -> tuple[Vector, Vector]:
     t, values = _record(t), _record(values)
     if t.size != values.size:
         raise ValueError(f"t has {t.size} samples, the record {values.size}: must be the same")

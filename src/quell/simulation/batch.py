@@ -47,7 +47,10 @@ def simulate_batch(
     width = sum(width for _, width in logged)
     channels = _selected(_RECORDED if record is None else record, logged)
     columns = [k for name, _ in channels for k in range(width)[columns_of(logged, name)]]
-    loops = _loops(plants, controllers, sampled, interpret)
+    loops = [
+        Loop(*parts, interpret)
+        for parts in zip(plants, _models(plants, dt, interpret), controllers, sampled, strict=True)
+    ]
     # Column by column, so that a channel of all runs is contiguous in memory.
     log = np.moveaxis(np.empty((len(columns), runs, (samples - 1) // every + 1)), 0, -1)
     lengths = np.zeros(runs, dtype=np.int64)
@@ -161,21 +164,12 @@ def _sampled(
     return sampled
 
 
-def _loops(
-    plants: Sequence[Plant],
-    controllers: Sequence[Controller],
-    sampled: Sequence[SampledScenario],
-    interpret: bool,
-) -> list[Loop]:
-    models: dict[int, Any] = {}
+def _models(plants: Sequence[Plant], dt: float, interpret: bool) -> list[Any]:
+    """Return the sampled model of each plant; a plant that occurs in many runs is sampled once."""
+    distinct = {id(plant): plant for plant in plants}
     with one_blas_thread():
-        for plant in plants:
-            if id(plant) not in models:
-                models[id(plant)] = plant.sampled(sampled[0].dt, interpret)
-    return [
-        Loop(plant, models[id(plant)], controllers[i], sampled[i], interpret)
-        for i, plant in enumerate(plants)
-    ]
+        models = {key: plant.sampled(dt, interpret) for key, plant in distinct.items()}
+    return [models[id(plant)] for plant in plants]
 
 
 def _selected(record: Sequence[str], logged: Channels) -> Channels:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.signals import Constant, Signal, as_signal, seeded_apart
@@ -46,7 +47,7 @@ class Scenario:
     duration: float = 10.0
     disturbances: Sequence[Signal | float] = ()
     noise: Signal | float = 0.0
-    x0: Any = None
+    x0: ArrayLike | None = None
     rest_at: Sequence[float] = field(default=())
     seed: int = 0
 
