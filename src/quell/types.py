@@ -15,6 +15,9 @@ Vector: TypeAlias = NDArray[np.float64]
 Matrix: TypeAlias = NDArray[np.float64]
 """Two-dimensional, C-contiguous, float64."""
 
+Channels: TypeAlias = tuple[tuple[str, int], ...]
+"""Name and width of the channels that are side by side in a log, in order."""
+
 Progress: TypeAlias = Callable[[str, float], None]
 """Called with the name of the present part of the work and the share of it done, 0 to 1."""
 

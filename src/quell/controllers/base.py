@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from quell.kernels.dispatch import generic, generic_with_default
-from quell.types import Vector
+from quell.types import Channels, Vector
 
 
 class Controller(Protocol):
@@ -30,7 +30,7 @@ class Controller(Protocol):
         """Names of the features whose coefficients are in the channel ``theta``."""
 
     @property
-    def channels(self) -> tuple[tuple[str, int], ...]:
+    def channels(self) -> Channels:
         """Name and width of each recorded channel, in order."""
 
     def initial_state(self) -> Any:

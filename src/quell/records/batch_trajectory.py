@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.records.channels import Channels
 from quell.records.record import Record, read_dataset, record_fields
 from quell.records.trajectory import Trajectory
-from quell.types import Matrix, Status, Vector
+from quell.types import Channels, Matrix, Status, Vector
 
 if TYPE_CHECKING:
     import xarray
@@ -78,7 +77,7 @@ class BatchTrajectory(Record):
 
     @property
     def diverged(self) -> NDArray[np.bool_]:
-        """Which runs ended early: (runs,)."""
+        """True for the runs that ended early (runs,)."""
         return (self.status & int(Status.DIVERGED)) != 0
 
     @property

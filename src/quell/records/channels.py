@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
-Channels: TypeAlias = tuple[tuple[str, int], ...]
-"""Name and width of the channels that are side by side in a log, in order."""
+from quell.types import Channels
 
 # Channels that are vectors even if their width is one.
 _VECTORS = ("w", "x", "x_hat", "theta")

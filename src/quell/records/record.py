@@ -10,9 +10,9 @@ import numpy as np
 
 from quell import checks
 from quell.files import written_atomically
-from quell.records.channels import Channels, columns_of, describe, is_vector, readable_names
+from quell.records.channels import columns_of, describe, is_vector, readable_names
 from quell.records.sample_times import first_sample_at
-from quell.types import Matrix, Vector
+from quell.types import Channels, Matrix, Vector
 
 if TYPE_CHECKING:
     import xarray

@@ -11,9 +11,8 @@ import numpy as np
 
 from quell import checks
 from quell.records import metrics
-from quell.records.channels import Channels
 from quell.records.record import Record, read_dataset, record_fields
-from quell.types import Matrix, Status
+from quell.types import Channels, Matrix, Status
 
 if TYPE_CHECKING:
     import xarray
@@ -63,7 +62,7 @@ class Trajectory(Record):
 
     @property
     def diverged(self) -> bool:
-        """Whether the run ended early."""
+        """True if the run ended early."""
         return Status.DIVERGED in self.status
 
     @property

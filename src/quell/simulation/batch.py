@@ -15,10 +15,11 @@ from quell.parallel import in_parallel, one_blas_thread
 from quell.plants.base import Plant, check_plant
 from quell.plants.batch import PlantBatch
 from quell.records.batch_trajectory import BatchTrajectory
-from quell.records.channels import Channels, columns_of, readable_names
+from quell.records.channels import columns_of, readable_names
 from quell.simulation.driver import Loop, logged_channels
 from quell.simulation.sampled_scenario import SampledScenario, Segment, segment_bounds
 from quell.simulation.scenario import Scenario, check_scenario
+from quell.types import Channels
 
 _RECORDED = ("r", "y", "u")
 # Runs in a job: enough that threads seldom wait for the next one, few enough that progress is

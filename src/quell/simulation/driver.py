@@ -17,9 +17,8 @@ from quell.controllers.base import (
 from quell.kernels.dispatch import compiled, dispatcher_for, interpreted
 from quell.kernels.user_types import explain_compile_errors
 from quell.plants.base import Plant, advance, measure
-from quell.records.channels import Channels
 from quell.simulation.sampled_scenario import SampledScenario, Segment
-from quell.types import Matrix, Status, Vector
+from quell.types import Channels, Matrix, Status, Vector
 
 
 @compiled
@@ -105,7 +104,7 @@ class Loop:
 
     @property
     def diverged(self) -> bool:
-        """Whether it has ended early."""
+        """True if it has ended early."""
         return bool(self.status & Status.DIVERGED)
 
     @property

@@ -31,7 +31,7 @@ class Segment(NamedTuple):
     first: int
     dt: float
     from_rest: bool
-    """Whether the loop starts from rest at the first of them."""
+    """True if the loop starts from rest at the first of them."""
     r: Vector
     derivatives: Matrix
     w: Matrix

@@ -28,6 +28,7 @@ from quell.learners.base import Learner, NoLearner, checked_design
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
+from quell.types import Channels
 
 
 class ADRC(StatefulController):
@@ -140,7 +141,7 @@ class ADRC(StatefulController):
         return self.observer.degree if self.feedforward else 0
 
     @property
-    def channels(self) -> tuple[tuple[str, int], ...]:
+    def channels(self) -> Channels:
         """Name and width of each recorded channel, in order."""
         estimates = (("x_hat", self.observer.order), ("f_residual", 1), ("f_learned", 1))
         guard = () if self.guard is None else GUARD_CHANNELS

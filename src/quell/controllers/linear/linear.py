@@ -16,7 +16,7 @@ from quell.controllers.linear.law import LinearLaw, checked_law, rest_state
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
-from quell.types import Status, Vector
+from quell.types import Channels, Status, Vector
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _OVERFLOWED = int(Status.OVERFLOWED)
@@ -160,7 +160,7 @@ class LinearController(StatefulController):
     """
 
     features: tuple[str, ...] = ()
-    channels: tuple[tuple[str, int], ...] = (("u_wished", 1), ("status", 1))
+    channels: Channels = (("u_wished", 1), ("status", 1))
 
     def __init__(
         self,

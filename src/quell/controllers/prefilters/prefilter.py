@@ -33,7 +33,7 @@ from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import generic, generic_with_default, is_finite
 from quell.kernels.scalars import Scalars, clear
 from quell.observers.eso import ESO
-from quell.types import Status, Vector
+from quell.types import Channels, Status, Vector
 
 _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 
@@ -263,7 +263,7 @@ class Prefiltered(StatefulController):
         return tuple(self.controller.features)
 
     @property
-    def channels(self) -> tuple[tuple[str, int], ...]:
+    def channels(self) -> Channels:
         """Name and width of what ``write_row`` writes, in order."""
         return (("r_shaped", 1), *self.controller.channels)
 

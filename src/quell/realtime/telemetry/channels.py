@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import IntFlag
 
+from quell.types import Channels
+
 LOOP_CHANNELS = (
     ("k", 1),  # index of the deadline, its time is k dt; it jumps where deadlines were skipped
     ("lateness", 1),  # time from the deadline until the loop woke [s]
@@ -38,6 +40,6 @@ class Event(IntFlag):
     """No recorded cycle: its deadline was skipped, or its row lost; ``load`` filled it in."""
 
 
-def row_channels(controller_channels: tuple[tuple[str, int], ...]) -> tuple[tuple[str, int], ...]:
+def row_channels(controller_channels: Channels) -> Channels:
     """Return the channels of a row for a controller with these channels."""
     return (*LOOP_CHANNELS, *controller_channels)

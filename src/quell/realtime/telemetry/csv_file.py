@@ -17,7 +17,7 @@ import numpy as np
 from quell.files import check_new_file, written_atomically
 from quell.realtime.telemetry.channels import K
 from quell.realtime.telemetry.header import Header
-from quell.types import Matrix, Vector
+from quell.types import Channels, Matrix, Vector
 
 
 class CsvSink:
@@ -116,7 +116,7 @@ def read_csv(path: Path) -> tuple[Header, Matrix]:
     return header, rows
 
 
-def _channels(columns: list[str]) -> tuple[tuple[str, int], ...]:
+def _channels(columns: list[str]) -> Channels:
     """Return the channels with these columns."""
     widths: dict[str, int] = {}
     for column in columns:

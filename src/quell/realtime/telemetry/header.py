@@ -11,6 +11,7 @@ from typing import Any
 from quell import checks
 from quell.realtime.telemetry.channels import LOOP_CHANNELS
 from quell.records.channels import is_vector
+from quell.types import Channels
 
 VERSION = 1
 """Version of the recording's layout; a reader refuses others."""
@@ -44,7 +45,7 @@ class Header:
         for a dt that is not positive, and for channels that do not begin with those of a loop.
     """
 
-    channels: tuple[tuple[str, int], ...]
+    channels: Channels
     dt: float
     features: tuple[str, ...] = ()
     device: str = ""
