@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,11 +11,15 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.analysis.sweeps import loops_over_omega_o
 from quell.controllers.base import Controller
+from quell.types import Vector
 
-_AID = {"color": "0.5", "linewidth": 0.8}
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_AID: dict[str, Any] = {"color": "0.5", "linewidth": 0.8}
 
 
-def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
+def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
     """Plot gain and phase of the loop ``L = P C_y`` with its margins; return the axes.
 
     The margins' numbers are written only into a new figure: with a second loop they would overlap.
@@ -48,7 +52,7 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     top.axhline(1.0, **_AID)
     low.axhline(-180.0, **_AID)
 
-    def mark(ax: Any, omega: float, ends: tuple[float, float], text: str, middle: float) -> None:
+    def mark(ax: Axes, omega: float, ends: tuple[float, float], text: str, middle: float) -> None:
         ax.vlines(omega, *ends, color=line.get_color(), linewidth=2.5, alpha=0.6)
         if new_figure:
             ax.annotate(text, (omega, middle), xytext=(5, -3), textcoords="offset points")
@@ -68,7 +72,7 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
     return axes
 
 
-def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any:
+def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
     """Plot the gains of S, T, PS (load to y) and CS (noise to u); return these four axes.
 
     Parameters
@@ -107,7 +111,7 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> Any
 
 def plot_margins_over_time(
     times: Any, loops: Sequence[LoopAnalysis], axes: Any = None, **style: Any
-) -> Any:
+) -> list[Axes]:
     """Plot the margins of the loop with its learner frozen at each instant; return the axes.
 
     Parameters
@@ -137,7 +141,7 @@ def plot_margins_against_omega_o(
     omegas: Any,
     axes: Any = None,
     **lags: float,
-) -> Any:
+) -> list[Axes]:
     """Plot the margins, and the noise in u, over the observer's bandwidth; return the axes.
 
     Parameters
@@ -164,11 +168,11 @@ def plot_margins_against_omega_o(
     return axes
 
 
-def _plot_margins(x: Any, loops: Sequence[LoopAnalysis], axes: Any, style: dict[str, Any]) -> Any:
+def _plot_margins(
+    x: Vector, loops: Sequence[LoopAnalysis], axes: Any, style: dict[str, Any]
+) -> list[Axes]:
     if len(x) != len(loops):
-        raise ValueError(
-            f"loops has {len(loops)} entries: must have one for each of the {len(x)} abscissae"
-        )
+        raise ValueError(f"loops has {len(loops)} entries: must have {len(x)}, one for each point")
     axes = _axes(axes, 3, 1)
     for ax, name in ((axes[0], "modulus"), (axes[0], "disk"), (axes[1], "phase")):
         legend = {} if name == "phase" else {"label": f"{name} margin"}
@@ -189,7 +193,7 @@ def _plot_margins(x: Any, loops: Sequence[LoopAnalysis], axes: Any, style: dict[
     return axes
 
 
-def _axes(axes: Any, rows: int, columns: int) -> Any:
+def _axes(axes: Any, rows: int, columns: int) -> list[Axes]:
     """Return the axes as a list; those of a new figure for None."""
     if axes is None:
         import matplotlib.pyplot as plt
@@ -202,7 +206,7 @@ def _axes(axes: Any, rows: int, columns: int) -> Any:
     return axes
 
 
-def _limit_ratio(ax: Any, size: Any) -> None:
+def _limit_ratio(ax: Axes, size: Vector) -> None:
     """Limit the axis to six decades about the median, to leave out undamped poles and zeros."""
     finite = size[np.isfinite(size) & (size > 0.0)]
     middle = float(np.median(finite))
@@ -212,7 +216,7 @@ def _limit_ratio(ax: Any, size: Any) -> None:
     )
 
 
-def _finish(ax: Any, label: str, loop: LoopAnalysis | None = None) -> None:
+def _finish(ax: Axes, label: str, loop: LoopAnalysis | None = None) -> None:
     """Add label and grid and, for a ``loop``, a line at half its sampling rate."""
     if loop is not None:
         ax.axvline(np.pi / loop.dt, color="0.7", linestyle=":", linewidth=1.0)

@@ -83,7 +83,7 @@ def sampled_plant(
         C, E = np.append(C, 0.0), np.vstack([E, np.zeros((1, E.shape[1]))])
     if delay > _MOST_SAMPLES * dt:
         raise ValueError(
-            f"delay = {delay!r} s: must be at most {_MOST_SAMPLES} samples of dt = {dt!r} s"
+            f"delay = {delay!r} s: must be at most {_MOST_SAMPLES} samples of {dt!r} s"
         )
     samples = math.floor(delay / dt * (1.0 + 1e-12))
     late = max(delay - samples * dt, 0.0)

@@ -1,4 +1,4 @@
-"""Bad samples: what a controller works with where the reference or the measurement is no number."""
+"""Replacement of references and measurements that are not finite."""
 
 from __future__ import annotations
 

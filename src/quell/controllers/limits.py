@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from quell import checks
 from quell.kernels.dispatch import kernel
@@ -22,7 +22,7 @@ class Limits(NamedTuple):
     """Largest change in a sample."""
 
 
-def checked_limits(u_min: Any, u_max: Any, rate_limit: Any, dt: float) -> Limits:
+def checked_limits(u_min: float, u_max: float, rate_limit: float, dt: float) -> Limits:
     """Check and return limits; ``rate_limit`` in u-units a second."""
     low, high = checks.interval("u_min", u_min, "u_max", u_max)
     if rate_limit != math.inf:

@@ -143,10 +143,9 @@ class StatefulController:
                 checked[name] = np.asarray(saved[name], dtype=np.float64)
             except (TypeError, ValueError):
                 raise ValueError(f"state[{name!r}]: must be an array of numbers") from None
-            if checked[name].shape != array.shape:
-                raise ValueError(
-                    f"state[{name!r}] has shape {checked[name].shape}: must have {array.shape}"
-                )
+            shape = checked[name].shape
+            if shape != array.shape:
+                raise ValueError(f"state[{name!r}] has shape {shape}: must have {array.shape}")
         if snapshots:
             self._restore_external(self._state, snapshots)
         for name, value in checked.items():

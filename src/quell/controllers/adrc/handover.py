@@ -110,10 +110,8 @@ def check_replacement(old: ESO, new: Any, learns: bool) -> None:
         raise ValueError(f"observer = {new!r}: must be an ESO")
     for name in ("order", "degree", "f_degree", "dt", "form", "states"):
         if getattr(new, name) != getattr(old, name):
-            present = f"the present one {getattr(old, name)!r}"
-            raise ValueError(
-                f"observer has {name} = {getattr(new, name)!r}, {present}: must be the same"
-            )
+            rule = f"the present one {getattr(old, name)!r}: must be the same"
+            raise ValueError(f"observer has {name} = {getattr(new, name)!r}, {rule}")
     same_gain = new.b0 == old.b0
     plants = [(getattr(new.plant, name), getattr(old.plant, name)) for name in "aBE"]
     if same_gain and all(np.array_equal(*pair) for pair in plants):

@@ -101,12 +101,10 @@ class ResonanceRatio(LinearController):
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         if not checks.positive("ratio", ratio) > 1.0:
             raise ValueError(f"ratio = {ratio!r}: must be above 1, as the resonance always is")
-        antiresonance = math.sqrt(k / m2)
+        w_a = math.sqrt(k / m2)
         self.kappa = round((ratio**2 - 1.0) * m1 / m2, 12)  # 4 for √5, not 4.000000000000001
-        omega_d = (
-            checks.optional(checks.positive, "omega_d", omega_d, "rad/s") or 0.5 * antiresonance
-        )
-        kp, kv = antiresonance**2, 4.0 * antiresonance
+        omega_d = checks.optional(checks.positive, "omega_d", omega_d, "rad/s") or 0.5 * w_a
+        kp, kv = w_a**2, 4.0 * w_a
         torque = (1.0 - self.kappa) * k
         self.K = np.array([m1 * kp - torque, torque, m1 * kv, 0.0])
         # At rest under d the spring carries it: x1 − x2 = −d/k, u = −d, y = x2 + c1 (x1 − x2) = r.

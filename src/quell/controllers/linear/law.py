@@ -9,6 +9,10 @@ import numpy as np
 from quell import checks
 from quell.types import Matrix, Vector
 
+# Singular values below this share of the largest one count as zero: they belong to integrators.
+# Chosen by hand, above rounding errors.
+_RANK = 1e-10
+
 
 class LinearLaw(NamedTuple):
     """A sampled linear law of m states that receives the applied u.
@@ -18,8 +22,8 @@ class LinearLaw(NamedTuple):
         u_wished = C x + D_r r + D_y y          u = limited(u_wished)
         x⁺       = A x + B_r r + B_y y + B_u u
 
-    Without limits, u is u_wished and the law is the linear system with A + B_u C and so on. B_u is
-    what keeps it from winding up.
+    Without limits, u is u_wished and the law is the linear system with A + B_u C and so on. B_u
+    prevents windup.
     """
 
     A: Matrix
@@ -54,9 +58,8 @@ def checked_law(law: Any) -> LinearLaw:
     A = checks.matrix("law.A", law.A)
     m = A.shape[0]
     checks.matrix("law.A", A, m, m)
-    B_r, B_y, B_u, C = (
-        checks.vector(f"law.{name}", getattr(law, name), m) for name in ("B_r", "B_y", "B_u", "C")
-    )
+    names = ("B_r", "B_y", "B_u", "C")
+    B_r, B_y, B_u, C = (checks.vector(f"law.{name}", getattr(law, name), m) for name in names)
     for array in (A, B_r, B_y, B_u, C):
         array.flags.writeable = False
     return LinearLaw(
@@ -71,16 +74,14 @@ def rest_state(law: LinearLaw) -> Vector:
     is closest to zero: an integrator balances the rest of the law. Without such a state, it is the
     least-squares solution.
     """
+    if law.C.size == 0:
+        return np.zeros(0)
     D = law.D_r + law.D_y
-    pull = np.eye(law.C.size) - law.A - np.outer(law.B_u, law.C)
-    x = (
-        np.linalg.pinv(pull, rcond=1e-10) @ (law.B_r + law.B_y + law.B_u * D)
-        if law.C.size
-        else np.zeros(0)
-    )
-    _, singular, rows = np.linalg.svd(pull)
-    free = rows[singular <= 1e-10 * np.max(singular, initial=0.0)]
-    seen = free @ law.C
-    if seen @ seen > 0.0:
-        x = x - free.T @ seen * ((law.C @ x + D) / (seen @ seen))
+    difference = np.eye(law.C.size) - law.A - np.outer(law.B_u, law.C)
+    x = np.linalg.pinv(difference, rcond=_RANK) @ (law.B_r + law.B_y + law.B_u * D)
+    _, singular, rows = np.linalg.svd(difference)
+    free = rows[singular <= _RANK * np.max(singular)]
+    output = free @ law.C
+    if output @ output > 0.0:
+        x = x - free.T @ output * ((law.C @ x + D) / (output @ output))
     return np.ascontiguousarray(x)

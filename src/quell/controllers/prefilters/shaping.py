@@ -173,9 +173,7 @@ def ZVD(omega: float, zeta: float = 0.0) -> Shaper:  # noqa: N802
 def _mode(omega: float, zeta: float) -> tuple[float, float]:
     omega, zeta = checks.positive("omega", omega, "rad/s"), checks.non_negative("zeta", zeta)
     if zeta >= 1.0:
-        raise ValueError(
-            f"zeta = {zeta!r}: must be below 1, a mode with more damping does not vibrate"
-        )
+        raise ValueError(f"zeta = {zeta!r}: must be below 1, or the mode does not vibrate")
     return omega, zeta
 
 
