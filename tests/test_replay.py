@@ -187,7 +187,7 @@ def test_what_can_not_be_replayed_is_refused() -> None:
     for other, u, rule in [
         (controller(), math.nan, "u_before = nan"),
         (PID(kp=1.0, dt=DT), 1.0, "u_before = 1.0: only an ADRC"),
-        (Prefiltered(PID(kp=1.0, dt=DT), ZV(omega=3.0)), 1.0, "only an ADRC"),
+        (Prefiltered(PID(kp=1.0, dt=DT), ZV(omega=3.0)), 1.0, "must be an ADRC"),
     ]:
         with pytest.raises(ValueError, match=rule):
             replay(run, other, u_before=u)
