@@ -34,7 +34,7 @@ class Excitation:
 
     kind: str
     signal: Signal
-    """The same for a scenario or a rig; equals ``u`` if it is sampled at ``dt`` and held."""
+    """The excitation for a scenario or a rig; equals ``u`` if it is sampled at ``dt`` and held."""
     dt: float
     """[s]."""
     u: Vector

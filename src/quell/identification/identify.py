@@ -12,7 +12,13 @@ from quell.identification.result import Identified
 from quell.identification.roots import poles_of, zeros_of
 from quell.identification.search import Fit, fit
 from quell.identification.structure import free_run
-from quell.identification.validation import Predictor, nrmse, residuals, simulate_fit
+from quell.identification.validation import (
+    fit_predictor,
+    nrmse,
+    prediction_fit,
+    residuals,
+    simulate_fit,
+)
 from quell.parallel import one_blas_thread
 from quell.types import Vector
 
@@ -162,17 +168,17 @@ def _validated(
     first, last = slice(0, held_from), slice(held_from, y.size)
     model = simulate_fit(fitted, v[first])
     error, tested_u = y[first] - model, u[first]
-    predictor = Predictor.fitted(error, horizon, structure.order + 1)
+    weights = fit_predictor(error, horizon, structure.order + 1)
     fits = {
         "estimation": nrmse(y[first], model),
-        "estimation, predicted": predictor.fit_percent(y[first], error),
+        "estimation, predicted": prediction_fit(y[first], error, horizon, weights),
     }
     if held_from < y.size:
         fresh = simulate_fit(fitted, v[last], y[last])
         model, error, tested_u = np.append(model, fresh), y[last] - fresh, u[last]
         fits |= {
             "held out": nrmse(y[last], fresh),
-            "held out, predicted": predictor.fit_percent(y[last], error),
+            "held out, predicted": prediction_fit(y[last], error, horizon, weights),
         }
     seconds = 1.0 / structure.powers(dt)
     theta = fitted.estimate.theta * seconds

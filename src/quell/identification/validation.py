@@ -51,12 +51,12 @@ class Residuals(NamedTuple):
 
     @property
     def white(self) -> bool:
-        """Whether ε passes the test of whiteness, at 99 %."""
+        """True if ε passes the test of whiteness, at 99 %."""
         return self.whiteness <= self.whiteness_limit
 
     @property
     def independent(self) -> bool:
-        """Whether at most 1 % of the correlations with past u, or one of them, exceed the limit."""
+        """True if at most 1 % of the correlations with past u, or one of them, exceed the limit."""
         outside = np.abs(self.cross_correlation[self.lags :]) > self.cross_limit
         return bool(np.count_nonzero(outside) <= max(1, round(0.01 * outside.size)))
 
@@ -98,29 +98,24 @@ def _finite(predicted: Vector) -> Vector:
     return predicted
 
 
-class Predictor(NamedTuple):
-    """A linear predictor of a simulation's error, ``horizon`` samples ahead, from past errors."""
+def fit_predictor(error: Vector, horizon: int, terms: int) -> Vector:
+    """Return weights that predict a simulation's error, ``horizon`` samples ahead."""
+    past, ahead = _error_history(error, horizon, terms)
+    return np.asarray(np.linalg.lstsq(past, ahead, rcond=_RANK)[0])
 
-    horizon: int
-    weights: Vector
 
-    @classmethod
-    def fitted(cls, error: Vector, horizon: int, terms: int) -> Predictor:
-        """Return the predictor of least squares."""
-        past, ahead = cls._parts(error, horizon, terms)
-        return cls(horizon, np.asarray(np.linalg.lstsq(past, ahead, rcond=_RANK)[0]))
+def prediction_fit(y: Vector, error: Vector, horizon: int, weights: Vector) -> float:
+    """Return the fit [%] of the prediction of ``y``, whose simulation has this error."""
+    past, ahead = _error_history(error, horizon, weights.size)
+    later = y[y.size - ahead.size :]
+    return nrmse(later, later - (ahead - past @ weights))
 
-    def fit_percent(self, y: Vector, error: Vector) -> float:
-        """Return the fit of the prediction of ``y``, whose simulation has this error."""
-        past, ahead = self._parts(error, self.horizon, self.weights.size)
-        later = y[y.size - ahead.size :]
-        return nrmse(later, later - (ahead - past @ self.weights))
 
-    @staticmethod
-    def _parts(error: Vector, horizon: int, terms: int) -> tuple[Matrix, Vector]:
-        first = horizon * terms
-        past = [error[first - j : error.size - j] for j in range(horizon, first + 1, horizon)]
-        return np.column_stack(past), error[first:]
+def _error_history(error: Vector, horizon: int, terms: int) -> tuple[Matrix, Vector]:
+    """Return past errors, at multiples of ``horizon`` before (samples, terms), and the errors."""
+    first = horizon * terms
+    past = [error[first - j : error.size - j] for j in range(horizon, first + 1, horizon)]
+    return np.column_stack(past), error[first:]
 
 
 def residuals(error: Vector, u: Vector, lags: int) -> Residuals:

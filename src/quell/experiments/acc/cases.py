@@ -53,7 +53,7 @@ class CaseResult:
     settled_at: float
     """Time after which ``|y|`` stays below 0.1 m, at k = 1 [s]; infinite beyond 60 s."""
     settled_at_worst: float
-    """The same for the worst k."""
+    """That time at the worst k [s]."""
     stable_from: float
     """Least k of the interval around k = 1 in which the loop is stable [N/m]."""
     stable_to: float
@@ -63,7 +63,7 @@ class CaseResult:
     load_peak: float
     """Largest ``|y|`` from 20 s on, at the worst k and phase [m]; infinite if unstable."""
     load_remains: float
-    """The same over the last period of 80 s."""
+    """Largest ``|y|`` over the last period of 80 s [m]."""
 
     def to_json(self) -> dict[str, Any]:
         """Return numbers for ``json.dump``; None for infinite ones."""

@@ -28,7 +28,7 @@ class Judged(NamedTuple):
 
     @property
     def fails(self) -> NDArray[np.bool_]:
-        """Whether each plant fails: unstable, ``|y| > 0.1`` from 15 s on, ``|u| > 0.5``, or NaN."""
+        """True if a plant fails: unstable, ``|y| > 0.1`` from 15 s on, ``|u| > 0.5``, or NaN."""
         return ~((self.late_peak <= MOST_Y) & (self.most_u <= MOST_U + _ROUNDING))
 
     def to_json(self) -> dict[str, Any]:

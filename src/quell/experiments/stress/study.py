@@ -46,11 +46,11 @@ class Outcome:
     plain_unstable: bool
     unstable: bool
     ratio: float
-    """Over the whole run."""
+    """Ratio over the whole run."""
     load_ratio: float
-    """Over the 60 s of load."""
+    """Ratio over the 60 s of load."""
     late_ratio: float
-    """From 50 s after the load began."""
+    """Ratio from 50 s after the start of the load."""
 
 
 @dataclass(frozen=True)

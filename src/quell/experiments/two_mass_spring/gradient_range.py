@@ -33,7 +33,7 @@ class Trial:
     ended: float
     """End of the run [s]: ``HORIZON``, or the time of divergence."""
     stable: bool
-    """Whether it did not diverge within the study's duration."""
+    """True if the run did not diverge within the study's duration."""
     disturbance_peak: float | None
 
 

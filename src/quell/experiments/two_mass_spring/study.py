@@ -121,7 +121,7 @@ def _bandwidth_for(
 
 
 def _batch_variations(settings: Settings) -> tuple[float | None, float | None]:
-    """Return Algorithm 1's variation with ten times the batch; equal rate per sample, per second."""
+    """Return Algorithm 1's variation with ten times the batch, at equal rate per sample or time."""
     rate, batch = gradient_rate(settings), 10 * GRADIENT_BATCH
     candidates = [controller(settings, learner=BatchGradient(r, batch)) for r in (rate, rate / 10)]
     jobs = [partial(simulate, two_mass_spring(), c, scenario(settings)) for c in candidates]
