@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.files import written_atomically
 from quell.records.plotting import thinned
 
 
@@ -129,19 +128,6 @@ def test_a_file_that_is_no_record_is_refused(tmp_path: Path) -> None:
         ql.Trajectory.load(tmp_path / "other.nc")
     with pytest.raises(FileNotFoundError):
         ql.Trajectory.load(tmp_path / "missing.nc")
-
-
-def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    """A failure leaves the old file and no other."""
-    path = tmp_path / "file.txt"
-    path.write_text("old")
-    with pytest.raises(ZeroDivisionError), written_atomically(path) as part:
-        part.write_text(f"new {1 / 0}")
-    assert [p.name for p in tmp_path.iterdir()] == ["file.txt"]
-    assert path.read_text() == "old"
-    with written_atomically(path) as part:
-        part.write_text("new")
-    assert path.read_text() == "new"
 
 
 def test_a_place_that_cannot_be_written_is_named(run: ql.Trajectory, tmp_path: Path) -> None:

@@ -83,11 +83,9 @@ class BatchTrajectory(Record):
     @property
     def message(self) -> str:
         """The number of runs that reported each flag, and the time at which the first diverged."""
-        counts = {flag: int(np.count_nonzero(self.status & int(flag))) for flag in Status if flag}
+        counts = [(np.count_nonzero(self.status & int(flag)), flag.message) for flag in Status]
         sentences = [
-            f"{count} of {len(self)} runs: {flag.message}"
-            for flag, count in counts.items()
-            if count
+            f"{count} of {len(self)} runs: {message}" for count, message in counts if count
         ]
         if np.any(self.diverged):
             first = int(np.argmin(np.where(self.diverged, self.ended, np.inf)))
@@ -130,13 +128,8 @@ class BatchTrajectory(Record):
 
         Parameters
         ----------
-        start, stop
-            the window [s]; to the end of the record by default.
-        target
-            final value that y should reach [y-unit]; each run's reference at the end of the window
-            by default.
-        band
-            half width of the settling band, as a fraction of the step.
+        start, stop, target, band
+            as those of ``Trajectory.metrics``.
 
         Returns
         -------
@@ -148,8 +141,7 @@ class BatchTrajectory(Record):
         Raises
         ------
         ValueError
-            as ``Trajectory.metrics``; because of runs that ended before the window, only if all
-            did.
+            as ``Trajectory.metrics``, but for runs that ended before the window only if all did.
         """
         window = self.window(start, np.inf if stop is None else stop)
         reached = np.flatnonzero((self.lengths > window.start) | ~self.diverged).tolist()
@@ -207,8 +199,8 @@ class BatchTrajectory(Record):
             ended=data["ended"].values,
             limit=data["limit"].values,
             parameters={
-                str(c.attrs["parameter"]): c.values
-                for c in data.coords.values()
-                if "parameter" in c.attrs
+                str(coordinate.attrs["parameter"]): coordinate.values
+                for coordinate in data.coords.values()
+                if "parameter" in coordinate.attrs
             },
         )
