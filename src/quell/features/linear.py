@@ -29,8 +29,7 @@ class State(Features):
     count: int | None = None
 
     def __post_init__(self) -> None:
-        if self.count is not None:
-            checks.whole("count", self.count, 1)
+        checks.optional(checks.whole, "count", self.count, 1)
 
     def design(self, order: int) -> StateDesign:
         """Return the number of states."""

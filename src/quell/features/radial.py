@@ -65,11 +65,11 @@ class RBF(Features):
     ) -> None:
         if count is not None and centers is not None:
             raise ValueError("count and centers: give one of them")
-        self.centers = None if centers is None else checks.matrix("centers", centers)
+        self.centers = checks.optional(checks.matrix, "centers", centers)
         self.count = checks.whole("count", 25 if count is None else count, 1)
         if self.centers is not None:
             self.count = len(self.centers)
-        self.width = None if width is None else checks.positive("width", width)
+        self.width = checks.optional(checks.positive, "width", width)
         check_states(states)
         self.states = None if states is None else tuple(states)
 

@@ -253,11 +253,9 @@ def torsional(
     c2 = checks.non_negative("upper_viscous", upper_viscous, "N m s/rad")
     dry_lower = checks.non_negative("lower_coulomb", lower_coulomb, "N m")
     dry_upper = checks.non_negative("upper_coulomb", upper_coulomb, "N m")
-    step = 0.0
-    if dac_bits is not None:
-        step = 2.0 * _RANGE / 2 ** checks.whole("dac_bits", dac_bits, 2, 32)
-    if counts is not None:
-        counts = checks.whole("counts", counts, 1)
+    bits = checks.optional(checks.whole, "dac_bits", dac_bits, 2, 32)
+    step = 0.0 if bits is None else 2.0 * _RANGE / 2**bits
+    counts = checks.optional(checks.whole, "counts", counts, 1)
     late = checks.whole("late", late, 0, 1000)
     A, E = np.zeros((4, 4)), np.zeros((4, 2))
     A[0, 2] = A[1, 3] = 1.0
