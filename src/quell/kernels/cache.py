@@ -2,8 +2,7 @@
 
 Numba's own cache checks only the file that an entry point is in. Kernels call kernels of other
 files, so each version of them has a folder of its own, named by a hash of all files that compiled
-code can depend on. Files of the cache that are damaged or can not be written lead to a new
-compilation.
+code can depend on. Cache files that are damaged or can't be written lead to a new compilation.
 """
 
 from __future__ import annotations
@@ -27,8 +26,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache
 
 # Versions kept: the current one and those of a few other branches or environments. Chosen by hand.
 _VERSIONS_KEPT = 4
-# Marks a folder as one that quell may remove, and tells backup programs to skip it
-# (bford.info/cachedir).
+# Marks a folder that quell may remove; backup programs skip such folders (bford.info/cachedir).
 _MARKER_NAME = "CACHEDIR.TAG"
 _MARKER = (
     "Signature: 8a477f597d28d172789f06886806bc55\n"
@@ -45,17 +43,16 @@ def cache_path() -> Path | None:
     """Return the folder of this version's compiled code; None if it can't be created or written to.
 
     It is in ``quell-compiled`` under ``NUMBA_CACHE_DIR`` if that is set, else under the user's
-    cache directory. Folders of older versions are removed; only folders with quell's marker file
-    are.
+    cache directory. Versions that were not used lately are removed, if they have quell's marker.
     """
     root = os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_dir("quell")
     versions = Path(root) / "quell-compiled"
     path = versions / cache_key(Path(__file__).parents[1])
     try:
         path.mkdir(parents=True, exist_ok=True)
-        # Checks for write access, and makes the folder the one that was used last.
-        with tempfile.TemporaryFile(dir=path):
+        with tempfile.TemporaryFile(dir=path):  # checks for write access
             pass
+        os.utime(path)  # it is the version that was used last
         if not (path / _MARKER_NAME).exists():
             (path / _MARKER_NAME).write_text(_MARKER, encoding="utf-8")
             _remove_old_versions(versions, path)
