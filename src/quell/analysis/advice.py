@@ -34,6 +34,8 @@ def advise(
 ) -> list[Finding]:
     """Return the weak points of a design, each with its number, the limit, and what to do.
 
+    They are in the order sampling, margin, lag, noise.
+
     Parameters
     ----------
     controller
@@ -51,11 +53,6 @@ def advise(
         that the observer assumes.
     at
         instant at which the learner is frozen; see ``analyse``.
-
-    Returns
-    -------
-    list of Finding
-        in the order sampling, margin, lag, noise; empty if nothing was found.
 
     Raises
     ------
@@ -111,9 +108,9 @@ def _judge_margin(loop: LoopAnalysis, observer: ESO | None) -> list[Finding]:
     margins = loop.margins
     if margins.modulus >= _LEAST_MODULUS:
         return []
-    what_to_do = (
-        "detune it" if observer is None else "raise omega_o (noise permitting) or lower omega_c"
-    )
+    what_to_do = "detune it"
+    if observer is not None:
+        what_to_do = "raise omega_o (noise permitting) or lower omega_c"
     message = (
         f"modulus margin {margins.modulus:.3g} is below {_LEAST_MODULUS:g} "
         f"(phase margin {margins.phase:.1f}°, worst at {margins.modulus_omega:.3g} rad/s): "
@@ -163,9 +160,7 @@ def _judge_noise(loop: LoopAnalysis, controller: Controller, noise: float) -> li
     if observer is not None:
         # Noise in f̂ grows with the power n + 1/2 of omega_o.
         lower = observer.omega_o * (_NOISE / share) ** (1.0 / (observer.order + 0.5))
-        what_to_do = (
-            f"lower omega_o to about {lower:.2g} rad/s, and omega_c with it, or measure better"
-        )
+        what_to_do = f"lower omega_o to about {lower:.2g} rad/s and omega_c, or measure better"
     message = (
         f"noise of {noise:.3g} RMS in y makes u move by {rms:.3g} RMS, "
         f"{100.0 * share:.3g} % of its range of {u_range:.3g}; "

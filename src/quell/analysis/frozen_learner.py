@@ -74,6 +74,8 @@ for _generic in (adapt, commit, restart, coefficients):
 def frozen(controller: Controller, run: Any = None, t: float | None = None) -> Frozen:
     """Freeze a controller's learner: now, at the end of a run, or at any time of it.
 
+    The gains include the authority that a guard gave it.
+
     Parameters
     ----------
     controller
@@ -85,11 +87,6 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
         time of the run [s]; by default its end. The coefficients at that time come from the record,
         so the learner's features must be states, u, a constant and sinusoids. Freeze any other
         learner at the end of a run that ends at that time.
-
-    Returns
-    -------
-    Frozen
-        its gains, times the authority that a guard gave it.
 
     Raises
     ------

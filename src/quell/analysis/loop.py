@@ -56,11 +56,6 @@ def analyse(
     actuator_lag
         time constant of a first-order lag between u and the plant [s].
 
-    Returns
-    -------
-    LoopAnalysis
-        computed on access.
-
     Raises
     ------
     ValueError
@@ -172,7 +167,7 @@ class LoopAnalysis:
         return frequencies(np.concatenate([self.s_poles, *open_loop]), self.dt)
 
     def response(self, name: str, omega: Any) -> Complex:
-        """Return a frequency response.
+        """Return a frequency response (k,).
 
         Parameters
         ----------
@@ -181,10 +176,6 @@ class LoopAnalysis:
             (noise to −u) or ``"closed_loop"`` (r to y).
         omega
             frequencies [rad/s] (k,).
-
-        Returns
-        -------
-        (k,) complex array
 
         Raises
         ------
@@ -252,7 +243,7 @@ class LoopAnalysis:
     # ---- state space
 
     def closed_loop(self, source: str, target: str) -> System:
-        """Return the closed loop from an input to an output.
+        """Return the closed loop from an input to an output, the plant's states first.
 
         Parameters
         ----------
@@ -261,11 +252,6 @@ class LoopAnalysis:
             (the plant's disturbances).
         target
             ``"y"``, ``"u"`` or ``"e"``, which is r − y.
-
-        Returns
-        -------
-        System
-            A − I, B, C and D, the plant's states first.
 
         Raises
         ------
@@ -280,8 +266,7 @@ class LoopAnalysis:
         Parameters
         ----------
         name
-            ``"P"``, ``"C_r"``, ``"C_y"``, ``"L"``, ``"S"``, ``"T"``, ``"PS"``, ``"CS"``,
-            ``"closed_loop"`` (r to y), or ``"source → target"`` as for ``closed_loop``, for example
+            as for ``response``, or ``"source → target"`` as for ``closed_loop``, for example
             ``"w2 → y"``.
 
         Raises

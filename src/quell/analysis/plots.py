@@ -77,12 +77,8 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> lis
 
     Parameters
     ----------
-    loop
-        from ``analyse``.
-    axes
-        four matplotlib axes; a new figure by default.
-    style
-        of the lines, for example ``label``.
+    loop, axes, style
+        as for ``plot_bode``, but with four axes.
 
     Raises
     ------
@@ -120,10 +116,8 @@ def plot_margins_over_time(
         instants [s].
     loops
         one for each, from ``loops_over_time``.
-    axes
-        three matplotlib axes; a new figure by default.
-    style
-        of the lines.
+    axes, style
+        as for ``plot_bode``, but with three axes.
 
     Raises
     ------

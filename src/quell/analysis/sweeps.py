@@ -34,11 +34,6 @@ def loops_over_time(
     lags
         ``delay`` and ``actuator_lag``, as for ``analyse``.
 
-    Returns
-    -------
-    list of LoopAnalysis
-        one for each instant.
-
     Raises
     ------
     ValueError
@@ -79,11 +74,6 @@ def loops_over_omega_o(
         the bandwidths [rad/s], at least one.
     lags
         ``delay`` and ``actuator_lag``, as for ``analyse``.
-
-    Returns
-    -------
-    list of LoopAnalysis
-        one for each bandwidth.
 
     Raises
     ------

@@ -6,7 +6,7 @@ from quell import checks
 
 
 def omega_c_for(settling_time: float, order: int, band: float = 0.02) -> float:
-    """Return the controller bandwidth with which the ideal loop settles in a given time.
+    """Return the controller bandwidth [rad/s] with which the ideal loop settles in a given time.
 
     The unit step response of the ideal loop ``omega_c^n / (s + omega_c)^n`` is the regularised
     incomplete gamma function ``P(n, omega_c t)``. It rises without overshoot, so the loop settles
@@ -22,11 +22,6 @@ def omega_c_for(settling_time: float, order: int, band: float = 0.02) -> float:
         order n of the plant.
     band
         half width of the band, as a fraction of the step.
-
-    Returns
-    -------
-    float
-        omega_c [rad/s].
 
     Raises
     ------

@@ -41,12 +41,6 @@ def equivalent_pid(controller: ADRC, **options: Any) -> PID:
         limits and name of the PID controller; by default the limits of ``controller``, except its
         rate limit.
 
-    Returns
-    -------
-    PID
-        with ``kp``, ``ki``, ``kd``, ``filter`` and ``setpoint`` as in the equations above, at the
-        sample time of ``controller``.
-
     Raises
     ------
     ValueError

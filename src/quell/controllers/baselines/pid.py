@@ -163,17 +163,8 @@ class PID(LinearController):
             of the model [y-unit/u-unit/s²]: acceleration per unit of u.
         theta
             its delay [s]; include half of the sample time and the filter's lag.
-        tau_c
-            time constant of the loop [s]; θ by default.
-        dt
-            sample time [s].
-        **options
-            passed on to ``PID``. The filter time is τ_D/10 by default.
-
-        Raises
-        ------
-        ValueError
-            as ``simc``.
+        tau_c, dt, **options
+            as for ``simc``, with the same errors. The filter time is τ_D/10 by default.
         """
         gain = checks.nonzero("gain", gain, "or u does not reach y")
         theta = checks.non_negative("theta", theta, "s")

@@ -13,6 +13,7 @@ from quell.controllers.bad_samples import control_at_rest, hold_last_good
 from quell.controllers.base import control, reset_loop, set_applied_control, status_flags, write_row
 from quell.controllers.limits import Limits, apply_limits, checked_limits
 from quell.controllers.linear.law import LinearLaw, checked_law, rest_state
+from quell.controllers.linear.transfer import as_state_space, sampled_law
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
@@ -226,17 +227,11 @@ class LinearController(StatefulController):
             for a C(s) that is not proper or has several inputs or outputs, or for arguments out of
             range.
         """
-        from quell.controllers.linear.transfer import as_state_space, sampled_law
-
         dt = checks.positive("dt", dt, "s")
         on_error = checks.one_of("feedback", feedback, ("error", "output")) == "error"
         A, B, C, D = as_state_space(num, den)
-        system = (
-            A,
-            np.hstack([B if on_error else 0.0 * B, -B]),
-            C,
-            np.hstack([D if on_error else 0.0 * D, -D]),
-        )
+        from_r = 1.0 if on_error else 0.0
+        system = (A, np.hstack([from_r * B, -B]), C, np.hstack([from_r * D, -D]))
         law = sampled_law(system, dt, method=method, prewarp=prewarp, tracking_time=tracking_time)
         return LinearController(law, dt, u_min=u_min, u_max=u_max, rate_limit=rate_limit, name=name)
 
