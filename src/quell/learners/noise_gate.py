@@ -1,15 +1,14 @@
 """A gate that separates motion from measurement noise.
 
-The observer's estimates of higher derivatives are noisy, and at rest they are only noise. A
-regression on noise slowly finds coefficients that mean nothing, and trusts them. So a signal counts
-as moving only while its variance exceeds ``SIGNAL_TO_NOISE²`` times the variance that measurement
-noise, estimated from y − x̂_1, causes in it; rounding counts as noise. A signal that does not move
-is replaced by its running mean. Means are exponential, over ``AVERAGING_LAGS`` lags of the
-observer.
+The observer's estimates of higher derivatives are noisy, and at rest they are only noise. From
+noise, a regression slowly learns coefficients that mean nothing. So a signal counts as moving only
+while its variance exceeds ``SIGNAL_TO_NOISE²`` times the variance that measurement noise, estimated
+from y − x̂_1, causes in it; rounding counts as noise. Otherwise it is replaced by its running mean,
+an exponential one over ``AVERAGING_LAGS`` lags of the observer.
 
-The same noise disturbs the learning target, f as the observer shows it, and grows there with the
-power n + 1 of omega_o. ``confidence`` compares it with what a motion at a frequency ω of the plant
-would show, ``F = ω^n |x_1|``.
+The same noise is in the learning target f̂, where it grows with the power n + 1 of omega_o.
+``confidence`` compares it with what a motion at a frequency ω of the plant would show,
+``F = ω^n |x_1|``.
 """
 
 from __future__ import annotations

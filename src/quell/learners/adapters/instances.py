@@ -40,19 +40,11 @@ _NUMBERS = itertools.count(1)
 
 
 class Instance:
-    """One copy of a model, called by one loop.
+    """One copy of the model ``source``, called by one loop.
 
-    Parameters
-    ----------
-    source
-        the object that is copied, with ``learn`` and ``predict``; it is never changed.
-    name
-        its name in messages.
-    budget
-        longest time that the loop waits for an answer [s]; None to call the model in the loop's
-        thread.
-    report
-        called with the text of each problem.
+    The loop waits for an answer for ``budget`` [s] at most; with None the model is called in the
+    loop's thread. ``report`` is called with the text of each problem, in which ``name`` stands for
+    the model.
     """
 
     def __init__(

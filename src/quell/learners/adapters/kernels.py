@@ -21,14 +21,14 @@ from quell.types import Matrix, Status, Vector
 _FAILED = int(Status.LEARNER_FAILED)
 
 
-class BatchDesign(NamedTuple):
+class PairsDesign(NamedTuple):
     """Parameters of a model that only collects its pairs."""
 
     size: int  # number of pairs
     width: int  # number of features p
 
 
-class BatchMemory(NamedTuple):
+class PairsMemory(NamedTuple):
     """State of a model that only collects its pairs."""
 
     features: Matrix  # (size, p)
@@ -52,30 +52,30 @@ class PythonMemory(NamedTuple):
     model: Vector  # (1,): number of the instance that learns (``instances.py``)
 
 
-class Batch:
+class Pairs:
     """A description of a model that only collects ``size`` pairs."""
 
     def __init__(self, size: int) -> None:
         self.size = size
 
-    def design(self, features: int, dt: float) -> BatchDesign:
+    def design(self, features: int, dt: float) -> PairsDesign:
         """Return the parameters for the number of features."""
-        return BatchDesign(self.size, features)
+        return PairsDesign(self.size, features)
 
-    def memory(self, parameters: BatchDesign) -> BatchMemory:
+    def memory(self, parameters: PairsDesign) -> PairsMemory:
         """Return an empty batch."""
-        return BatchMemory(
+        return PairsMemory(
             np.zeros((parameters.size, parameters.width)), np.zeros(parameters.size), np.zeros(1)
         )
 
 
-@infer.register(BatchDesign)
-def _infer(model: BatchDesign, memory: BatchMemory, features: Vector) -> float:
+@infer.register(PairsDesign)
+def _infer(model: PairsDesign, memory: PairsMemory, features: Vector) -> float:
     return 0.0
 
 
-@learn.register(BatchDesign)
-def _learn(model: BatchDesign, memory: BatchMemory, features: Vector, target: float) -> None:
+@learn.register(PairsDesign)
+def _learn(model: PairsDesign, memory: PairsMemory, features: Vector, target: float) -> None:
     k = int(memory.filled[0])
     if k == model.size or not is_finite(target) or not _finite(features):
         return

@@ -19,7 +19,7 @@ from quell.learners.adapters.instances import (
     instance_of,
     register,
 )
-from quell.learners.adapters.kernels import Batch, PythonDesign, PythonMemory
+from quell.learners.adapters.kernels import Pairs, PythonDesign, PythonMemory
 from quell.learners.online.learner import Online
 from quell.observers.eso import ESO
 
@@ -115,7 +115,7 @@ class PythonModel:
         self.period = checks.whole("period", period, 1)
         self.budget = checks.optional(checks.positive, "budget", budget, "s")
         self._online = Online(
-            Batch(self.period),
+            Pairs(self.period),
             State() if features is None else features,
             frequency=frequency,
             scale=scale,

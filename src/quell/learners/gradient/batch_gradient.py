@@ -15,23 +15,14 @@ from quell.features import Features
 from quell.features.base import checked_design
 from quell.features.scaling import initial_scale, scaling
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.gradient.buffers import (
-    BatchGradientMemory,
-    empty_buffers,
-    restart_buffers,
-    take_step,
-)
-from quell.learners.gradient.scaled_features import (
-    ScaledGradientDesign,
-    ScaledGradientLoop,
-    ScaledGradientMemory,
-)
+from quell.learners.gradient.buffers import Buffers, empty_buffers, restart_buffers, take_step
+from quell.learners.gradient.scaled_features import ScaledDesign, ScaledLoop, ScaledMemory
 from quell.learners.lag import startup_samples
 from quell.observers.eso import ESO
 from quell.types import Vector
 
 
-class BatchGradientDesign(NamedTuple):
+class BatchDesign(NamedTuple):
     """Parameters of Algorithm 1."""
 
     rate: float  # α, per sample
@@ -39,14 +30,9 @@ class BatchGradientDesign(NamedTuple):
     order: int  # order of the plant; there are two more features
 
 
-@adapt.register(BatchGradientDesign)
+@adapt.register(BatchDesign)
 def _adapt(
-    learner: BatchGradientDesign,
-    memory: BatchGradientMemory,
-    seen: Vector,
-    y: float,
-    u_before: float,
-    f_plain: float,
+    learner: BatchDesign, memory: Buffers, seen: Vector, y: float, u_before: float, f_plain: float
 ) -> None:
     for i in range(learner.order):
         memory.current[i] = seen[i]
@@ -55,9 +41,9 @@ def _adapt(
     take_step(memory, seen[learner.order], learner.rate)
 
 
-@predict.register(BatchGradientDesign)
+@predict.register(BatchDesign)
 def _predict(
-    learner: BatchGradientDesign, memory: BatchGradientMemory, seen: Vector, u_before: float
+    learner: BatchDesign, memory: Buffers, seen: Vector, u_before: float
 ) -> tuple[float, float]:
     output = memory.theta[learner.order] * u_before + memory.theta[learner.order + 1]
     for i in range(learner.order):
@@ -65,24 +51,20 @@ def _predict(
     return output, 0.0
 
 
-@commit.register(BatchGradientDesign)
+@commit.register(BatchDesign)
 def _commit(
-    learner: BatchGradientDesign,
-    memory: BatchGradientMemory,
-    seen: Vector,
-    u: float,
-    f_learned: float,
+    learner: BatchDesign, memory: Buffers, seen: Vector, u: float, f_learned: float
 ) -> None:
     pass
 
 
-@restart.register(BatchGradientDesign)
-def _restart(learner: BatchGradientDesign, memory: BatchGradientMemory) -> None:
+@restart.register(BatchDesign)
+def _restart(learner: BatchDesign, memory: Buffers) -> None:
     restart_buffers(memory)
 
 
-@coefficients.register(BatchGradientDesign)
-def _coefficients(learner: BatchGradientDesign, memory: BatchGradientMemory, theta: Vector) -> None:
+@coefficients.register(BatchDesign)
+def _coefficients(learner: BatchDesign, memory: Buffers, theta: Vector) -> None:
     for i in range(theta.size):
         theta[i] = memory.theta[i]
 
@@ -123,15 +105,15 @@ class BatchGradient:
                 f"features = {self.features!r}: must be made of blocks from quell.features, or None"
             )
 
-    def design(self, observer: ESO, omega_c: float) -> BatchGradientDesign | ScaledGradientDesign:
+    def design(self, observer: ESO, omega_c: float) -> BatchDesign | ScaledDesign:
         """Return the parameters for an observer.
 
         The bandwidth ``omega_c`` [rad/s] is used only to scale features other than the paper's.
         """
         rate, order = float(self.rate), observer.order
         if self.features is None:
-            return BatchGradientDesign(rate, self.batch, order)
-        return ScaledGradientDesign(
+            return BatchDesign(rate, self.batch, order)
+        return ScaledDesign(
             rate=rate,
             batch=self.batch,
             features=checked_design(self.features, order),
@@ -139,16 +121,16 @@ class BatchGradient:
             startup=startup_samples(observer),
         )
 
-    def memory(self, parameters: Any) -> BatchGradientMemory | ScaledGradientMemory:
+    def memory(self, parameters: Any) -> Buffers | ScaledMemory:
         """Return empty buffers and θ = 0."""
-        if isinstance(parameters, BatchGradientDesign):
+        if isinstance(parameters, BatchDesign):
             return empty_buffers(parameters.batch, parameters.order + 2)
         scale = initial_scale(parameters.scaling)
         order = scale.size - 2
         p = len(self.feature_names(order))
-        return ScaledGradientMemory(
+        return ScaledMemory(
             buffers=empty_buffers(parameters.batch, p),
-            loop=ScaledGradientLoop.zeros(),
+            loop=ScaledLoop.zeros(),
             scale=scale,
             scaled=np.zeros(order),
             units=np.ones(p),

@@ -17,16 +17,11 @@ from quell.features.scaling import Scaling, update_scale
 from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars
 from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.gradient.buffers import (
-    BatchGradientMemory,
-    clear_buffers,
-    restart_buffers,
-    take_step,
-)
+from quell.learners.gradient.buffers import Buffers, clear_buffers, restart_buffers, take_step
 from quell.types import Vector
 
 
-class ScaledGradientDesign(NamedTuple):
+class ScaledDesign(NamedTuple):
     """Parameters."""
 
     rate: float  # α, per sample
@@ -36,27 +31,27 @@ class ScaledGradientDesign(NamedTuple):
     startup: int  # samples after a start from rest in which nothing is learned
 
 
-class ScaledGradientLoop(Scalars):
+class ScaledLoop(Scalars):
     """Scalars of the learner, kept from one sample to the next."""
 
     samples: float  # since the start from rest
     has_scale: float  # 1 once there are scales
 
 
-class ScaledGradientMemory(NamedTuple):
+class ScaledMemory(NamedTuple):
     """State for p features and a plant of order m."""
 
-    buffers: BatchGradientMemory  # all scaled
-    loop: NDArray[ScaledGradientLoop]
+    buffers: Buffers  # all scaled
+    loop: NDArray[ScaledLoop]
     scale: Vector  # (m + 2,): what x_1 … x_m, u and Δf̂ are divided by
     scaled: Vector  # work space for the scaled state (m,)
     units: Vector  # (p,): ``unit`` of the features for ``scale``
 
 
-@adapt.register(ScaledGradientDesign)
+@adapt.register(ScaledDesign)
 def _adapt(
-    learner: ScaledGradientDesign,
-    memory: ScaledGradientMemory,
+    learner: ScaledDesign,
+    memory: ScaledMemory,
     seen: Vector,
     y: float,
     u_before: float,
@@ -71,9 +66,7 @@ def _adapt(
 
 
 @kernel
-def _rescale(
-    learner: ScaledGradientDesign, memory: ScaledGradientMemory, seen: Vector, u: float, f: float
-) -> None:
+def _rescale(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float, f: float) -> None:
     """Let the scales grow; if one does, convert θ and empty the buffers."""
     theta, current, scale = memory.buffers.theta, memory.buffers.current, memory.scale
     f_before = scale[scale.size - 1]
@@ -96,9 +89,7 @@ def _rescale(
 
 
 @kernel
-def _write(
-    learner: ScaledGradientDesign, memory: ScaledGradientMemory, seen: Vector, u: float
-) -> None:
+def _write(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float) -> None:
     """Write the scaled features into the buffers' ``current``."""
     scale, scaled = memory.scale, memory.scaled
     for i in range(scaled.size):
@@ -106,9 +97,9 @@ def _write(
     write(learner.features, scaled, u / scale[scaled.size], memory.buffers.current)
 
 
-@predict.register(ScaledGradientDesign)
+@predict.register(ScaledDesign)
 def _predict(
-    learner: ScaledGradientDesign, memory: ScaledGradientMemory, seen: Vector, u_before: float
+    learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
     if memory.loop[0].has_scale == 0.0:
         return 0.0, 0.0
@@ -119,27 +110,21 @@ def _predict(
     return output * memory.scale[memory.scale.size - 1], 0.0
 
 
-@commit.register(ScaledGradientDesign)
+@commit.register(ScaledDesign)
 def _commit(
-    learner: ScaledGradientDesign,
-    memory: ScaledGradientMemory,
-    seen: Vector,
-    u: float,
-    f_learned: float,
+    learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float, f_learned: float
 ) -> None:
     memory.loop[0].samples += 1.0
 
 
-@restart.register(ScaledGradientDesign)
-def _restart(learner: ScaledGradientDesign, memory: ScaledGradientMemory) -> None:
+@restart.register(ScaledDesign)
+def _restart(learner: ScaledDesign, memory: ScaledMemory) -> None:
     memory.loop[0].samples = 0.0
     restart_buffers(memory.buffers)
 
 
-@coefficients.register(ScaledGradientDesign)
-def _coefficients(
-    learner: ScaledGradientDesign, memory: ScaledGradientMemory, theta: Vector
-) -> None:
+@coefficients.register(ScaledDesign)
+def _coefficients(learner: ScaledDesign, memory: ScaledMemory, theta: Vector) -> None:
     f_scale, scaled = memory.scale[memory.scale.size - 1], memory.loop[0].has_scale > 0.0
     for i in range(theta.size):
         theta[i] = memory.buffers.theta[i] * memory.units[i] * f_scale if scaled else 0.0

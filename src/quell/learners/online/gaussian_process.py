@@ -38,7 +38,7 @@ _LEAST_NOVELTY = 1e-2
 _MEMORY = 1000.0
 
 
-class GaussianProcessDesign(NamedTuple):
+class ProcessDesign(NamedTuple):
     """Parameters of a process with a budget of M points."""
 
     inputs: int
@@ -49,7 +49,7 @@ class GaussianProcessDesign(NamedTuple):
     every: int  # learn from every ``every``-th pair
 
 
-class GaussianProcessMemory(NamedTuple):
+class ProcessMemory(NamedTuple):
     """State for m features; one row more than the budget, for the point that is added last."""
 
     points: Matrix  # c (M + 1, m)
@@ -65,9 +65,7 @@ class GaussianProcessMemory(NamedTuple):
 
 
 @kernel
-def _similarity(
-    model: GaussianProcessDesign, memory: GaussianProcessMemory, i: int, features: Vector
-) -> float:
+def _similarity(model: ProcessDesign, memory: ProcessMemory, i: int, features: Vector) -> float:
     distance = 0.0
     for j in range(features.size):
         away = features[j] - memory.points[i, j]
@@ -76,22 +74,20 @@ def _similarity(
 
 
 @kernel
-def _point_count(model: GaussianProcessDesign, memory: GaussianProcessMemory) -> int:
+def _point_count(model: ProcessDesign, memory: ProcessMemory) -> int:
     return min(max(int(memory.counters[0]), 0), model.budget)
 
 
-@infer.register(GaussianProcessDesign)
-def _infer(model: GaussianProcessDesign, memory: GaussianProcessMemory, features: Vector) -> float:
+@infer.register(ProcessDesign)
+def _infer(model: ProcessDesign, memory: ProcessMemory, features: Vector) -> float:
     output = 0.0
     for i in range(_point_count(model, memory)):
         output += memory.weights[i] * _similarity(model, memory, i, features)
     return output
 
 
-@learn.register(GaussianProcessDesign)
-def _learn(
-    model: GaussianProcessDesign, memory: GaussianProcessMemory, features: Vector, target: float
-) -> None:
+@learn.register(ProcessDesign)
+def _learn(model: ProcessDesign, memory: ProcessMemory, features: Vector, target: float) -> None:
     memory.counters[1] += 1.0
     if memory.counters[1] < model.every or not is_finite(target):
         return
@@ -139,7 +135,7 @@ def _learn(
 
 
 @kernel
-def _forget(model: GaussianProcessDesign, memory: GaussianProcessMemory, count: int) -> None:
+def _forget(model: ProcessDesign, memory: ProcessMemory, count: int) -> None:
     """Move mean and covariance back towards the prior."""
     if model.forget == 0.0:
         return
@@ -155,7 +151,7 @@ def _forget(model: GaussianProcessDesign, memory: GaussianProcessMemory, count: 
 
 @kernel
 def _add_point(
-    memory: GaussianProcessMemory,
+    memory: ProcessMemory,
     count: int,
     features: Vector,
     novelty: float,
@@ -180,7 +176,7 @@ def _add_point(
 
 
 @kernel
-def _update_weights(memory: GaussianProcessMemory, count: int) -> None:
+def _update_weights(memory: ProcessMemory, count: int) -> None:
     for i in range(count):
         total = 0.0
         for j in range(count):
@@ -189,7 +185,7 @@ def _update_weights(memory: GaussianProcessMemory, count: int) -> None:
 
 
 @kernel
-def _remove_point(memory: GaussianProcessMemory, count: int) -> None:
+def _remove_point(memory: ProcessMemory, count: int) -> None:
     """Remove the point whose loss changes the mean least; the last point moves to its row."""
     least, out, last = math.inf, count - 1, count - 1
     for i in range(count):
@@ -234,10 +230,10 @@ class GaussianProcessModel:
         checks.positive("noise", self.noise)
         checks.positive("noise_time", self.noise_time, "s")
 
-    def design(self, features: int, dt: float) -> GaussianProcessDesign:
+    def design(self, features: int, dt: float) -> ProcessDesign:
         """Return the parameters for the number of features and a sample time [s]."""
         step = self.every * dt
-        return GaussianProcessDesign(
+        return ProcessDesign(
             inputs=features,
             budget=self.budget,
             weight=0.5 / self.length**2,
@@ -246,10 +242,10 @@ class GaussianProcessModel:
             every=self.every,
         )
 
-    def memory(self, parameters: GaussianProcessDesign) -> GaussianProcessMemory:
+    def memory(self, parameters: ProcessDesign) -> ProcessMemory:
         """Return a process without points."""
         size = parameters.budget + 1
-        return GaussianProcessMemory(
+        return ProcessMemory(
             points=np.zeros((size, parameters.inputs)),
             kernel=np.zeros((size, size)),
             inverse=np.zeros((size, size)),
@@ -310,12 +306,10 @@ class GaussianProcess(Online):
         bias_bandwidth: float | None = None,
     ) -> None:
         self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
+        model = GaussianProcessModel(budget, length, every, 1.0, noise, 1.0)
+        features = State() if features is None else features
         super().__init__(
-            GaussianProcessModel(budget, length, every, 1.0, noise, 1.0),
-            State() if features is None else features,
-            frequency=frequency,
-            scale=scale,
-            bias_bandwidth=bias_bandwidth,
+            model, features, frequency=frequency, scale=scale, bias_bandwidth=bias_bandwidth
         )
 
     def fitted_model(self, observer: ESO, omega_c: float) -> GaussianProcessModel:

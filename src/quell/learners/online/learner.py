@@ -1,16 +1,14 @@
 """A learner around any model: features, scaling, and pairs that compensate the observer's lag.
 
-The observer's estimate of f, ``f^F = Δf̂ + f_L^F``, is f filtered (``lag.py``): approximately f as
-it was D samples ago, with the filter's group delay D. So the model learns from the pair
+The observer's estimate ``f^F = Δf̂ + f_L^F`` is f filtered (``lag.py``): approximately f as it
+was D samples ago, with the filter's group delay D. So the model learns from the pair
 
     ( φ(k − D),  f^F(k) )
 
 without lag bias, up to second order in frequency over omega_o. (A model that is linear in its
-parameters does not need the approximation: ``regression/kernels.py``.)
-
-A signal that does not move is replaced by its mean, and nothing is learned while nothing moves or
-noise hides f (``noise_gate.py``): at rest a model would learn the noise it is shown and forget the
-rest. A fast bias d follows what the model does not explain, as in ``regression/kernels.py``.
+parameters does not need the approximation: ``regression/kernels.py``, where the bias is described.)
+A model at rest would learn the noise it is shown and forget the rest, so it learns nothing while
+nothing moves or noise hides f (``noise_gate.py``).
 
 When a scale grows, by a factor of at least two, the same motion gives smaller features, and the
 model has to learn them again. This happens in the first motions, and when a motion is larger than

@@ -205,12 +205,10 @@ class MLP(Online):
         bias_bandwidth: float | None = None,
     ) -> None:
         self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
+        model = Network(hidden, seed, every, memory_time=1.0, noise=noise, noise_time=1.0)
+        features = State() if features is None else features
         super().__init__(
-            Network(hidden, seed, every, memory_time=1.0, noise=noise, noise_time=1.0),
-            State() if features is None else features,
-            frequency=frequency,
-            scale=scale,
-            bias_bandwidth=bias_bandwidth,
+            model, features, frequency=frequency, scale=scale, bias_bandwidth=bias_bandwidth
         )
 
     def fitted_model(self, observer: ESO, omega_c: float) -> Network:

@@ -26,11 +26,6 @@ class Linear(FeatureLearner):
         limits of the effective gain ``(b0 + θ_u)/b0`` if ``Input()`` is a feature.
 
     The other parameters are described in the base class ``FeatureLearner``.
-
-    Raises
-    ------
-    ValueError
-        for an argument out of range.
     """
 
     def __init__(
