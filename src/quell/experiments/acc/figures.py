@@ -109,7 +109,8 @@ def _responses(samples: Matrix) -> Any:
     axes[0, 0].legend(fontsize="small")
     lost = f"; {ended} runs that flew apart end where they did" if ended else ""
     title = (
-        f"Impulse on m2, the first {len(samples)} plants with cubic springs; dashed: limits{lost}"
+        f"Impulse on m2, the first {len(samples)} plants with cubic springs; "
+        f"dashed: what is required{lost}"
     )
     figure.suptitle(title, fontsize="medium")
     return figure

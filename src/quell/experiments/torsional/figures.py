@@ -126,7 +126,8 @@ def _learning(case: Case) -> Any:
         draw_line(above, run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         above.axhline(-numbers[i], color=f"C{i}", linestyle=":", linewidth=1.2)
     title = (
-        f"coefficients of L-ESO at {case.label} with friction; dotted: identified plant's, for b0"
+        f"coefficients of L-ESO at {case.label} with friction; "
+        "dotted: the identified plant's, for b0"
     )
     above.set_title(title, fontsize="medium")
     above.set(ylabel="theta", ylim=(-4000.0, 2000.0))
