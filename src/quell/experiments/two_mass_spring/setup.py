@@ -27,7 +27,7 @@ STEP_AT, FORCE_AT, END = 110.0, 150.0, 250.0
 """Start of the step and of the force, end of the study [s], of the paper."""
 STEP_WINDOW = (STEP_AT, FORCE_AT)
 FORCE_WINDOW = (170.0, END)
-"""Time in which the force is scored [s], after its transient, as in the paper's figure."""
+"""Time in which the force is scored [s], from the start of the paper's second zoom on."""
 BAND = 0.002
 """Half width of the settling band, as a fraction of the step: gives the paper's settling times."""
 
