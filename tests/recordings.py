@@ -1,4 +1,4 @@
-"""Rows of a loop, for the tests of what becomes of them."""
+"""Rows of a loop, for tests of telemetry and replay."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0]
 
 
 def controller(**options: object) -> ql.ADRC:
-    """An ADRC with a learner under guard, whose channels are of all kinds."""
+    """Return an ADRC with a guarded learner, which has all kinds of channels."""
     return ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman(), guard=ql.Guard(), **options)  # type: ignore[arg-type]
 
 
 def simulated(duration: float = 10.0, **options: object) -> ql.Trajectory:
-    """A run of it under noise."""
+    """Return a simulated run of this controller under noise."""
     noise = ql.signals.BandLimitedNoise(power=1e-9, sample_time=DT)
     scenario = ql.Scenario(reference=ql.signals.Sinusoid(omega=2.0), duration=duration, noise=noise)
     return ql.simulate(PLANT, controller(**options), scenario)
 
 
 def rows_of(run: ql.Trajectory, design: ql.ADRC) -> Matrix:
-    """The rows that a loop would have written of a run."""
+    """Return the rows that a loop would have written of a run."""
     loop = {
         "k": np.arange(float(len(run))),
         "lateness": np.linspace(1e-7, 3e-4, len(run)),
@@ -40,7 +40,7 @@ def rows_of(run: ql.Trajectory, design: ql.ADRC) -> Matrix:
 
 
 def header_of(run: ql.Trajectory, design: ql.ADRC) -> Header:
-    """What a loop would have said of it."""
+    """Return the header that a loop would have written."""
     return Header(
         row_channels(design.channels),
         run.dt,

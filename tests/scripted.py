@@ -1,4 +1,4 @@
-"""A line whose measurements, and whatever goes wrong with it, come from arrays; and a loop around it on a virtual clock."""
+"""A device whose measurements and faults come from arrays, and a loop on a virtual clock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DT = 0.01
 
 
 class Scripted(NamedTuple):
-    """A plant behind a wire that does what a script says; sample by sample, the last entry for all that follow."""
+    """A plant with scripted faults; the last entry of a script holds for all later samples."""
 
     plant: Any
     x: Any
@@ -71,7 +71,7 @@ def _write_command(handle: Scripted, u: float) -> int:
 
 
 class ScriptedDevice:
-    """The line as a device; scripts as dictionaries from sample to value."""
+    """The handle as a device; scripts are dictionaries from sample to value."""
 
     def __init__(
         self, plant: Any, *, samples: int = 3000, x0: Any = None, **scripts: dict[int, Any]
@@ -80,10 +80,10 @@ class ScriptedDevice:
         model = plant.sampled(DT, False)
         x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=float)
         kinds = {"y": float, "stall": np.int64, "moves": np.int64, "refused": np.int64}
-        told = {name: np.zeros(samples, dtype=kind) for name, kind in kinds.items()}
+        arrays = {name: np.zeros(samples, dtype=kind) for name, kind in kinds.items()}
         for name, script in scripts.items():
             for k, value in script.items():
-                told[name][k] = value
+                arrays[name][k] = value
         room = np.full(samples, math.nan)
         self.handle = Scripted(
             model,
@@ -91,21 +91,21 @@ class ScriptedDevice:
             np.zeros(6 * plant.order),
             np.zeros(plant.disturbances),
             np.zeros(2, np.int64),
-            **told,
+            **arrays,
             written=room,
         )
 
     @property
     def written(self) -> Any:
-        """What was put."""
+        """Commands so far."""
         return self.handle.written[: self.handle.at[1]]
 
     def read(self) -> float:
-        """Not used: there is a line."""
+        """Not used: the loop uses the handle."""
         raise NotImplementedError
 
     def write(self, u: float) -> None:
-        """Not used: there is a line."""
+        """Not used: the loop uses the handle."""
         raise NotImplementedError
 
     def close(self) -> None:
@@ -125,7 +125,7 @@ def adrc(**options: Any) -> ql.ADRC:
 
 
 class Outcome(NamedTuple):
-    """What a scripted loop did."""
+    """Result of a scripted loop."""
 
     loop: ControlLoop
     rows: Any
@@ -150,7 +150,7 @@ def run(
     asked: int = 0,
     **safety: Any,
 ) -> Outcome:
-    """Run a loop around a scripted device to its end; settle in ten samples, where nothing else is said."""
+    """Run a loop around a scripted device to its end; ``settle`` is 10 by default."""
     controller = adrc() if controller is None else controller
     width = sum(width for _, width in row_channels(controller.channels))
     points = reference_samples(

@@ -28,8 +28,8 @@ def test_a_histograms_percentiles_are_those_of_what_was_counted(durations: list[
         )
 
 
-def test_a_histogram_tells_and_shows_itself() -> None:
-    """As text, a line for each quarter of a decade, and as a picture; an empty one has nothing to tell."""
+def test_a_histogram_as_text_and_plot() -> None:
+    """Text has a line for each quarter of a decade; an empty histogram has one line."""
     counts = empty_counts()
     for duration in [20_000] * 990 + [300_000] * 10:
         count_duration(counts, duration)

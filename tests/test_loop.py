@@ -1,4 +1,4 @@
-"""The loop's own dealings: with a device's clock, with the reference, with controllers of other kinds, with time."""
+"""The loop: clocks of devices, reference, other controllers, compilation."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ SAMPLE = round(1e9 * DT)
 
 
 class Ticking(NamedTuple):
-    """A device with a clock of its own: at its ticks it sends the number of the tick."""
+    """A paced device that sends the number of each tick at its time."""
 
     period: float
-    """Of its ticks, by the loop's clock [ns]."""
+    """Time between ticks by the loop's clock [ns]."""
     late: Any
-    """How much later the k-th comes [ns]; one that is never sent comes after all others."""
+    """Delay of tick k [ns]."""
     seen: Any
-    """Number of the last one fetched, and the greatest age of one when it was fetched, but for the first thousand [ns] (2,)."""
+    """Last tick that was read, and greatest age of one after the first thousand [ns] (2,)."""
 
 
 @read_measurement.register(Ticking)
@@ -73,7 +73,7 @@ def _write_command(handle: Ticking, u: float) -> int:
 
 
 class TickingDevice:
-    """The line as a device."""
+    """The handle as a device."""
 
     paced = True
 
@@ -106,7 +106,7 @@ FLAT = ql.controllers.LinearController(
 
 
 def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: Any) -> Any:
-    """Run an idle controller around a device with a clock; return the rows, and how old each measurement was [ticks]."""
+    """Run a controller with u = 0 around a paced device; return rows and loop."""
     clock = virtual_clock(late)
     width = sum(width for _, width in row_channels(FLAT.channels))
     rows = ring(40_000, width)
@@ -126,7 +126,7 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
 
 @pytest.mark.parametrize("drift", [-50e-6, 0.0, 50e-6, 1e-3])
 def test_the_grid_follows_a_devices_clock(drift: float) -> None:
-    """Whether it is as quick as the loop's or not: each cycle gets the next tick, none twice, none left out, none old."""
+    """For slower and faster clocks each cycle gets the next tick, and none is old."""
     device = TickingDevice(SAMPLE * (1.0 + drift))
     found, loop = ticks(device, 100.0)
     assert device.handle.seen[1] <= SAMPLE // 5_000
@@ -139,8 +139,8 @@ def test_the_grid_follows_a_devices_clock(drift: float) -> None:
 # Of two cycles one wakes just before the tick, the next one just after.
 @pytest.mark.parametrize("k", [300, 301])
 @pytest.mark.parametrize("hiccup", [SAMPLE // 2 + 1000, SAMPLE, 5 * SAMPLE // 2])
-def test_after_a_hiccup_of_the_device_no_measurement_is_old(hiccup: int, k: int) -> None:
-    """Ticks that come late are in the way of those that come in time; two cycles after the last late one, all are fresh again."""
+def test_after_a_delay_of_the_device_no_measurement_is_old(hiccup: int, k: int) -> None:
+    """Shortly after the last late tick all measurements are fresh again."""
     late = {k + i: max(hiccup - i * SAMPLE, 0) for i in range(4)}
     found, _ = ticks(TickingDevice(SAMPLE, late), 10.0)
     ahead = found[:, LOOP_WIDTH - 2] - found[:, 0]
@@ -150,8 +150,8 @@ def test_after_a_hiccup_of_the_device_no_measurement_is_old(hiccup: int, k: int)
 
 @pytest.mark.parametrize("k", [300, 301])
 @pytest.mark.parametrize("hiccup", [SAMPLE // 2, 3 * SAMPLE - 1000, 3 * SAMPLE + 1000])
-def test_after_a_hiccup_of_the_loop_no_measurement_is_old(hiccup: int, k: int) -> None:
-    """It wakes late: the newest tick counts, and the grid stays."""
+def test_after_a_delay_of_the_loop_no_measurement_is_old(hiccup: int, k: int) -> None:
+    """The loop wakes late: it takes the newest tick, and the grid stays."""
     late = np.zeros(20_000, dtype=np.int64)
     late[k] = hiccup
     found, _ = ticks(TickingDevice(SAMPLE), 10.0, late)
@@ -161,7 +161,7 @@ def test_after_a_hiccup_of_the_loop_no_measurement_is_old(hiccup: int, k: int) -
 
 
 def test_a_device_that_sends_nothing_is_not_started() -> None:
-    """It stops before the first cycle, within two seconds, and says why."""
+    """The loop stops before the first cycle, within two seconds, and names the cause."""
     found, loop = ticks(TickingDevice(1e18), 1.0)
     assert [change.cause for change in mode_changes(loop.controller.supervisor, DT)] == [
         Cause.NO_MEASUREMENT
@@ -170,8 +170,8 @@ def test_a_device_that_sends_nothing_is_not_started() -> None:
     assert np.all(found[:, LOOP_WIDTH - 1] == 0.0)
 
 
-def test_deadlines_that_are_left_out_are_no_blow() -> None:
-    """While the loop stands still for three samples the plant moves on; an observer that knows it goes with it, and finds nothing amiss."""
+def test_skipped_deadlines_do_not_disturb_the_observer() -> None:
+    """A stall of three samples leaves the estimates of a model-based observer exact."""
     stalled = ScriptedDevice(PLANT, stall={40: 35_000_000}, moves={41: 3})
     controller = ql.ADRC(
         ql.ESO.model_based(PLANT, omega_o=12.0, dt=DT), omega_c=1.5, u_min=-3.0, u_max=3.0
@@ -185,7 +185,7 @@ def test_deadlines_that_are_left_out_are_no_blow() -> None:
 
 
 def test_the_reference_slides_from_where_y_is() -> None:
-    """With the least jerk, at rest at both ends; derivatives to match; after ``approach`` it is the scenario's own, to the bit."""
+    """With the least jerk and matching derivatives; after ``approach`` it is the scenario's own."""
     controller = adrc()
     fed = ql.ADRC(controller.observer, 1.5, feedforward=True, u_min=-3.0, u_max=3.0)
     reference = ql.signals.Sinusoid(omega=1.0)
@@ -215,7 +215,7 @@ def test_the_reference_slides_from_where_y_is() -> None:
 
 
 def test_it_takes_over_without_a_bump() -> None:
-    """Where the plant rests at y = 0.4 with u = 0, u begins at zero and stays small, though the scenario begins elsewhere."""
+    """From rest at y = 0.4 and u = 0 the control signal starts at zero and stays small."""
     free = ql.plants.LinearPlant([[0.0, 1.0], [0.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
     u = run(ScriptedDevice(free, x0=[0.4, 0.0]), reference=1.0, approach=2.0, settle=50)["U"]
     assert np.all(np.abs(np.diff(u)[:60]) < 0.02)
@@ -229,7 +229,7 @@ def test_it_takes_over_without_a_bump() -> None:
 
 
 class ThroughPython:
-    """A device that only Python can use."""
+    """A device without a compiled handle."""
 
     def __init__(self, device: ScriptedDevice) -> None:
         self.inner, self.clock = device, virtual_clock()
@@ -242,7 +242,7 @@ class ThroughPython:
         return y
 
     def write(self, u: float) -> None:
-        """Write; the driver may refuse."""
+        """Write; the driver may fail."""
         if write_command(self.inner.handle, u):
             raise OSError("the driver is not well")
 
@@ -260,7 +260,7 @@ CONTROLLERS = {
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_controller_is_stepped_compiled_though_the_device_is_python(name: str) -> None:
-    """The same run as compiled, as plain Python, or half and half; what a driver raises is a miss, or a command that did not get out."""
+    """Plain Python and a compiled step agree; errors of the driver count as missed samples."""
     scripts: dict[str, Any] = {"y": {60: math.inf}, "refused": {90: 1}}
     plain = run(ScriptedDevice(PLANT, **scripts), CONTROLLERS[name], interpret=True)
     device: Any = ThroughPython(ScriptedDevice(PLANT, **scripts))
@@ -276,7 +276,7 @@ def test_a_controller_is_stepped_compiled_though_the_device_is_python(name: str)
 
 
 def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> None:
-    """Preparing is no cycle; the second loop of the same types compiles nothing; the controller's own state is as it was."""
+    """No cycle runs, a second loop compiles nothing, the controller's own state is unchanged."""
     controller = adrc()
     before = controller.state
     device = ScriptedDevice(PLANT)
@@ -306,16 +306,16 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
         (ql.Scenario(1.0, 1e6), None, "must be at most 1e\\+07 samples"),
     ],
 )
-def test_a_course_that_can_not_be_run_is_refused(
+def test_a_scenario_that_can_not_be_run_is_refused(
     scenario: Any, duration: float | None, message: str
 ) -> None:
-    """Before anything moves."""
+    """The error comes before anything moves."""
     with pytest.raises(ValueError, match=message):
         reference_samples(as_scenario(scenario, duration), DT, 0, 1.0)
 
 
-def test_a_reference_that_is_no_number_is_refused() -> None:
-    """Before anything moves, with the time at which it is not."""
+def test_a_reference_that_is_not_finite_is_refused() -> None:
+    """The error names the time of the first bad sample."""
 
     class Gap(ql.signals.Signal):
         def evaluate(self, t: Any) -> Any:

@@ -26,7 +26,7 @@ from tests.test_telemetry import recorded
 
 
 def check_same_estimates(again: ql.Trajectory, run: ql.Trajectory, tolerance: float = 0.0) -> None:
-    """Compare what the controller knew, against its size."""
+    """Compare the estimates, relative to their size."""
     for name in {"x_hat", "f_residual", "f_learned", "theta", "authority"} & set(run.names):
         np.testing.assert_allclose(
             again[name],
@@ -38,8 +38,8 @@ def check_same_estimates(again: ql.Trajectory, run: ql.Trajectory, tolerance: fl
 
 
 @pytest.mark.parametrize("options", [{}, {"u_min": -0.3, "u_max": 0.4}], ids=["free", "limited"])
-def test_the_controller_that_made_a_run_knows_the_same_again(options: dict[str, Any]) -> None:
-    """To the last bit, and it would have applied what was applied."""
+def test_the_controller_that_made_a_run_gives_the_same_estimates(options: dict[str, Any]) -> None:
+    """Estimates and u are equal to the last bit."""
     run = simulated(**options)
     again = replay(run, controller(**options))
     check_same_estimates(again, run)
@@ -61,7 +61,7 @@ def test_it_does_so_from_a_file(make: Any, tmp_path: Path) -> None:
 
 
 def test_a_prefilter_is_replayed_too() -> None:
-    """With what it makes of the reference."""
+    """The shaped reference is equal too."""
     shaped = Prefiltered(ql.ADRC(OBSERVER, omega_c=3.0), ZV(omega=3.0))
     run = ql.simulate(PLANT, shaped, ql.Scenario(reference=ql.signals.Step(at=0.5), duration=3.0))
     again = replay(run, shaped)
@@ -70,7 +70,7 @@ def test_a_prefilter_is_replayed_too() -> None:
 
 
 def test_a_run_of_the_loop_is_replayed_from_its_first_cycle_to_its_last() -> None:
-    """Settling, taking over, missing samples, coming to rest: estimates as on the rig, and the u that the controller wished there."""
+    """All modes and missing samples: the estimates and the wished u are those of the rig."""
     missing = dict.fromkeys((3, 80, 81, 82, 150), math.nan)
     rig = scripted.run(ScriptedDevice(scripted.PLANT, y=missing), reference=1.0, approach=0.5)
     run = trajectory_of(Header(row_channels(scripted.adrc().channels), DT), rig.rows)
@@ -86,8 +86,8 @@ def test_a_run_of_the_loop_is_replayed_from_its_first_cycle_to_its_last() -> Non
     assert ql.Status.MEASUREMENT_HELD in again.status
 
 
-def test_a_start_under_load_is_replayed_when_the_load_is_told() -> None:
-    """Else the observer has to find it, as in a cold start."""
+def test_a_start_under_load_is_replayed_with_u_before() -> None:
+    """Without ``u_before`` the observer has to find the load first."""
     rig = controller()
     model, x, scratch = PLANT.sampled(DT), np.array([0.5, 0.0]), np.zeros(12)
     rig.start(0.5, 3.25, r=0.7)
@@ -95,9 +95,9 @@ def test_a_start_under_load_is_replayed_when_the_load_is_told() -> None:
     for k in range(200):
         y = measure(model, x)
         u = rig.step(0.7, y)
-        told = np.zeros(sum(width for _, width in rig.channels))
-        ql.controllers.base.write_row(rig.parameters, rig._state, told)
-        rows.append([k, 0.0, 0.0, 0.0, 0.0, 0.7, y, y, u, *told])
+        row = np.zeros(sum(width for _, width in rig.channels))
+        ql.controllers.base.write_row(rig.parameters, rig._state, row)
+        rows.append([k, 0.0, 0.0, 0.0, 0.0, 0.7, y, y, u, *row])
         advance(model, x, scratch, 0.0, u, np.array([-3.0]))
     run = trajectory_of(header_of(simulated(1.0), rig), np.array(rows))
     check_same_estimates(replay(run, controller(), u_before=3.25), run, tolerance=1e-12)
@@ -105,7 +105,7 @@ def test_a_start_under_load_is_replayed_when_the_load_is_told() -> None:
 
 
 def test_another_observer_sees_what_happened() -> None:
-    """Sample by sample what ``step`` and ``applied`` give; a quicker observer follows f more closely than a slow one."""
+    """Equal to ``step`` and ``applied`` by hand; a faster observer follows f more closely."""
     run = simulated()
     other, by_hand = (
         ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=60.0, dt=DT), omega_c=5.0)
@@ -130,7 +130,7 @@ def test_another_observer_sees_what_happened() -> None:
 
 
 def test_controllers_of_other_kinds_are_replayed_too() -> None:
-    """A PID would have applied what it applied, and follows what an ADRC applied."""
+    """A PID controller gives its own u again, and follows an ADRC's run."""
     pid = PID(kp=2.0, ki=1.0, dt=DT, u_min=-1.0, u_max=1.0)
     run = ql.simulate(PLANT, pid, ql.Scenario(reference=1.0, duration=2.0))
     np.testing.assert_array_equal(replay(run, pid)["u_wished"], run["u"])
@@ -138,7 +138,7 @@ def test_controllers_of_other_kinds_are_replayed_too() -> None:
 
 
 def test_the_controller_that_is_passed_stays_as_it_is() -> None:
-    """Its running state is another one."""
+    """The replay uses a state of its own."""
     run, design = simulated(2.0), controller()
     design.step(1.0, 0.3)
     before = design.state
@@ -147,8 +147,8 @@ def test_the_controller_that_is_passed_stays_as_it_is() -> None:
     assert all(np.array_equal(value, before[name]) for name, value in design.state.items())
 
 
-def test_deadlines_that_the_loop_slept_over_are_replayed_as_it_took_them() -> None:
-    """It told its controller of them, as of samples without a measurement."""
+def test_skipped_deadlines_are_replayed_as_on_the_rig() -> None:
+    """They are samples without a measurement, as on the rig."""
     rig = scripted.run(
         ScriptedDevice(scripted.PLANT, stall={40: 35_000_000}, moves={41: 3}), reference=1.0
     )
@@ -164,7 +164,7 @@ def test_deadlines_that_the_loop_slept_over_are_replayed_as_it_took_them() -> No
 
 
 def test_what_can_not_be_replayed_is_refused() -> None:
-    """In a line that says what to do."""
+    """The message says what to do."""
     run = simulated(1.0)
     thin = ql.simulate(
         PLANT, controller(), ql.Scenario(reference=1.0, duration=1.0), record_every=5

@@ -1,4 +1,4 @@
-"""The ring between the loop and whoever records it."""
+"""The ring buffer between loop and telemetry writer."""
 
 from threading import Thread
 from typing import Any
@@ -14,7 +14,7 @@ WIDTH = 7
 
 @compiled
 def _produce(out: Any, row: Any, count: int) -> int:
-    """Push ``count`` rows as fast as it goes; row k is (k, k, …). Rows that find no place are offered again. Return how often that was."""
+    """Push ``count`` rows (k, k, …), repeatedly if the ring is full; return the repetitions."""
     again = 0
     for k in range(count):
         for i in range(row.size):
@@ -26,7 +26,7 @@ def _produce(out: Any, row: Any, count: int) -> int:
 
 @compiled
 def _try_all(out: Any, row: Any, count: int) -> int:
-    """Push ``count`` rows once each, never waiting; return how many went in."""
+    """Push ``count`` rows once each; return how many found room."""
     went = 0
     for k in range(count):
         for i in range(row.size):
@@ -37,12 +37,12 @@ def _try_all(out: Any, row: Any, count: int) -> int:
 
 @pytest.fixture(params=[_produce, interpreted(_produce)], ids=["compiled", "interpreted"])
 def produce(request: pytest.FixtureRequest) -> Any:
-    """Both ways to run the same producer."""
+    """The producer, compiled and interpreted."""
     return request.param
 
 
 def test_rows_come_out_in_order_as_they_went_in(produce: Any) -> None:
-    """Also where the ring has gone round, and compiled as interpreted."""
+    """Also after the ring has wrapped around."""
     shared = ring(8, WIDTH)
     for start in (0, 8, 16):
         produce(shared, np.empty(WIDTH), 5)
@@ -58,7 +58,7 @@ def test_rows_come_out_in_order_as_they_went_in(produce: Any) -> None:
     "attempt", [_try_all, interpreted(_try_all)], ids=["compiled", "interpreted"]
 )
 def test_a_full_ring_drops_the_newest_rows_and_counts_them(attempt: Any) -> None:
-    """The producer never waits; what it could not say is known by number."""
+    """The producer never waits; dropped rows are counted."""
     shared = ring(4, WIDTH)
     assert attempt(shared, np.empty(WIDTH), 10) == 4
     assert dropped(shared) == 6
@@ -66,9 +66,9 @@ def test_a_full_ring_drops_the_newest_rows_and_counts_them(attempt: Any) -> None
 
 
 def test_no_row_is_torn_lost_or_repeated_between_two_threads() -> None:
-    """A compiled producer at full speed, without the interpreter's lock, on a ring that is full and empty in turn."""
-    count, shared, told = 200_000, ring(61, WIDTH), []
-    producer = Thread(target=lambda: told.append(_produce(shared, np.empty(WIDTH), count)))
+    """A compiled producer at full speed on a small ring."""
+    count, shared, pushed = 200_000, ring(61, WIDTH), []
+    producer = Thread(target=lambda: pushed.append(_produce(shared, np.empty(WIDTH), count)))
     parts = []
     producer.start()
     while producer.is_alive() or waiting(shared):
@@ -76,19 +76,19 @@ def test_no_row_is_torn_lost_or_repeated_between_two_threads() -> None:
     producer.join()
     rows = np.concatenate(parts)
     np.testing.assert_array_equal(rows, np.repeat(np.arange(float(count))[:, None], WIDTH, axis=1))
-    assert dropped(shared) == told[0]
+    assert dropped(shared) == pushed[0]
 
 
-def test_a_producer_that_never_waits_is_told_of_every_row_it_lost() -> None:
-    """What came out and what was dropped add up; what came out is whole and in order, with gaps where rows were dropped."""
-    count, shared, told = 10_000_000, ring(1024, WIDTH), []
-    producer = Thread(target=lambda: told.append(_try_all(shared, np.empty(WIDTH), count)))
+def test_every_lost_row_is_counted() -> None:
+    """Rows read and rows dropped add up; rows read are whole and in order."""
+    count, shared, pushed = 10_000_000, ring(1024, WIDTH), []
+    producer = Thread(target=lambda: pushed.append(_try_all(shared, np.empty(WIDTH), count)))
     parts = []
     producer.start()
     while producer.is_alive() or waiting(shared):
         parts.append(drain(shared))
     rows = np.concatenate(parts)
-    assert rows.shape[0] == told[0] == count - dropped(shared)
+    assert rows.shape[0] == pushed[0] == count - dropped(shared)
     assert np.all(rows == rows[:, :1])
     assert np.all(np.diff(rows[:, 0]) > 0)
 

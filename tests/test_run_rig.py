@@ -1,4 +1,4 @@
-"""``run_rig`` from end to end, in real time: nothing here depends on how punctual the machine is."""
+"""``run_rig`` from end to end, in real time; results do not depend on punctuality."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATIENT = Safety(settle=5, hold=10_000, most_overruns=10_000, ramp=10)
 
 
 class Rig:
-    """A plant as somebody would write it who has read two lines of documentation."""
+    """A device with the three required methods only."""
 
     def __init__(self) -> None:
         self.twin = TwinDevice(PLANT, DT)
@@ -53,7 +53,7 @@ class Rig:
 
 
 def short(device: Any, duration: float = 0.3, **options: Any) -> Any:
-    """Run something short."""
+    """Run a short scenario."""
     return run_rig(
         device,
         adrc(),
@@ -64,13 +64,13 @@ def short(device: Any, duration: float = 0.3, **options: Any) -> Any:
 
 
 def test_a_run_from_end_to_end(tmp_path: Path) -> None:
-    """The scenario as a trajectory, all cycles as a record, both also in the files; what was counted; the device closed."""
-    device, told = Rig(), list[ModeChange]()
+    """Trajectory, record, files and counters agree; the device is closed."""
+    device, reported = Rig(), list[ModeChange]()
     paths = [tmp_path / "run.csv", tmp_path / "run.mcap"]
-    run = short(device, telemetry=paths, on_change=told.append)
+    run = short(device, telemetry=paths, on_change=reported.append)
     assert run.completed
     assert [change.mode for change in run.changes] == [Mode.RUN, Mode.RAMP, Mode.STOPPED]
-    assert tuple(told) == run.changes
+    assert tuple(reported) == run.changes
     assert run.verdict.endswith("RAMP: the scenario is over")
     assert device.closed >= 1
     assert device.written[-1] == 0.0
@@ -100,8 +100,8 @@ def test_a_run_from_end_to_end(tmp_path: Path) -> None:
         assert part in text
 
 
-def test_ctrl_c_ramps_down_and_what_stood_before_is_put_back() -> None:
-    """A signal to this process: the run ends as it should, with a record; the handlers and the collector are as before."""
+def test_ctrl_c_ramps_down_and_handlers_are_restored() -> None:
+    """A signal ends the run with a ramp and a record; handlers and collector are restored."""
     before, device = signal.getsignal(signal.SIGINT), Rig()
     collecting = gc.isenabled()
 
@@ -118,8 +118,8 @@ def test_ctrl_c_ramps_down_and_what_stood_before_is_put_back() -> None:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no terminals that can be closed")
-def test_a_terminal_that_is_closed_ramps_down_unless_nobody_minds() -> None:
-    """SIGHUP is as Ctrl-C; where it is ignored, as by nohup, it stays so."""
+def test_a_terminal_that_is_closed_ramps_down_unless_ignored() -> None:
+    """SIGHUP acts as Ctrl-C; if it is ignored, as by nohup, it stays ignored."""
 
     def close_terminal(change: ModeChange) -> None:
         if change.mode is Mode.RUN:
@@ -158,8 +158,8 @@ def test_a_second_ctrl_c_is_zero_at_once() -> None:
     assert device.written[-5] != 0.0
 
 
-def test_who_is_impatient_loses_nothing_of_the_record(tmp_path: Path) -> None:
-    """Ctrl-C while the last rows are written changes nothing, as the run is over."""
+def test_ctrl_c_after_the_run_loses_nothing_of_the_record(tmp_path: Path) -> None:
+    """Ctrl-C while the last rows are written changes nothing: the run is over."""
 
     class Slow(MemorySink):
         def close(self) -> None:
@@ -172,7 +172,7 @@ def test_who_is_impatient_loses_nothing_of_the_record(tmp_path: Path) -> None:
 
 
 def test_nothing_is_written_to_a_device_before_the_loop_can_go_on() -> None:
-    """The first write may start a watchdog: compiling, and whatever else takes its time, is over by then."""
+    """The first write may start a watchdog: it comes after compiling and opening files."""
     happened: list[str] = []
 
     class Watched(Rig):
@@ -190,7 +190,7 @@ def test_nothing_is_written_to_a_device_before_the_loop_can_go_on() -> None:
 
 
 def test_a_driver_that_fails_leads_to_the_safe_action() -> None:
-    """Whatever it raises, when it is read or written; the run says what it was."""
+    """An error in read or write ends the run with a ramp; the notes name it."""
 
     class Failing(Rig):
         def read(self) -> float:
@@ -206,7 +206,7 @@ def test_a_driver_that_fails_leads_to_the_safe_action() -> None:
 
 
 def test_a_driver_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It does not come back from a call: the device is closed from outside."""
+    """A call that does not return: the device is closed by the main thread."""
     monkeypatch.setattr("quell.realtime.loop.run._HUNG", 0.2)
     monkeypatch.setattr("quell.realtime.loop.run._HUNG_SAMPLES", 1.0)
     release = threading.Event()
@@ -224,8 +224,8 @@ def test_a_driver_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> Non
     release.set()
 
 
-def test_what_a_listener_raises_ends_the_run_safely() -> None:
-    """The loop is asked to ramp down, and the device is closed, before the error goes on its way."""
+def test_an_error_in_on_change_ends_the_run_safely() -> None:
+    """The loop ramps down and the device is closed before the error is passed on."""
     device = Rig()
 
     def listen(change: ModeChange) -> None:
@@ -238,7 +238,7 @@ def test_what_a_listener_raises_ends_the_run_safely() -> None:
 
 
 def test_an_error_in_the_loops_thread_comes_out_of_it() -> None:
-    """What is no driver's error is raised here; the device is closed."""
+    """An error other than the driver's is raised in the main thread; the device is closed."""
 
     class Exiting(Rig):
         def read(self) -> float:
@@ -253,7 +253,7 @@ def test_an_error_in_the_loops_thread_comes_out_of_it() -> None:
 
 
 def test_a_run_may_be_made_from_another_thread() -> None:
-    """Signals can't be caught there; all else is the same."""
+    """Signals are not handled there; everything else is the same."""
     found: list[Any] = []
     thread = threading.Thread(target=lambda: found.append(short(Rig())))
     thread.start()
@@ -276,7 +276,7 @@ def test_a_run_may_be_made_from_another_thread() -> None:
 def test_what_is_out_of_range_is_named_and_the_device_closed(
     options: dict[str, Any], message: str
 ) -> None:
-    """Nothing was written, and the caller need not clean up."""
+    """Nothing is written, and the caller need not clean up."""
     device = Rig()
     with pytest.raises(ValueError, match=message):
         short(device, **options)
@@ -285,7 +285,7 @@ def test_what_is_out_of_range_is_named_and_the_device_closed(
 
 
 def test_a_device_of_another_sample_time_is_refused() -> None:
-    """As is what is no device, and what is no controller."""
+    """So are objects that are not a device or not a controller."""
     with pytest.raises(
         ValueError, match=r"device has dt = 0.02 s, the controller 0.01 s: must be the same"
     ):
@@ -299,7 +299,7 @@ def test_a_device_of_another_sample_time_is_refused() -> None:
 
 
 def test_the_scenarios_own_disturbances_are_left_to_the_rig() -> None:
-    """A scenario made for simulation can be run as it is; that is said."""
+    """A scenario made for simulation can be run; a note says what is ignored."""
     scenario = ql.Scenario(
         1.0, 0.1, disturbances=(1.0,), noise=ql.signals.BandLimitedNoise(1e-6, DT)
     )
@@ -307,10 +307,10 @@ def test_the_scenarios_own_disturbances_are_left_to_the_rig() -> None:
     assert any("the rig has its own" in note for note in run.notes)
 
 
-def test_what_real_time_scheduling_is_not_permitted_is_said(
+def test_real_time_scheduling_that_is_not_permitted_is_noted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In a sentence each, with what to do; the run goes on."""
+    """One note for each refusal, with a remedy; the run goes on."""
 
     def refuse(*_: Any) -> None:
         raise PermissionError(1, "Operation not permitted")

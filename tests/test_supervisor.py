@@ -1,4 +1,4 @@
-"""What the loop does where something goes wrong: the table of docs/rig, row by row, on a virtual clock."""
+"""The supervisor: the table of faults in docs/rig, row by row, on a virtual clock."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MISS = math.nan
 
 
 def modes(outcome: Outcome) -> list[tuple[int, Mode, Cause]]:
-    """Return when which mode began, and why."""
+    """Return cycle, mode and cause of each change."""
     return [
         (round(change.t / DT), change.mode, change.cause)
         for change in mode_changes(outcome.loop.controller.supervisor, DT)
@@ -34,7 +34,7 @@ def modes(outcome: Outcome) -> list[tuple[int, Mode, Cause]]:
 
 
 def check_ramped(outcome: Outcome, k: int, ramp: int = RAMP) -> None:
-    """From cycle ``k`` on u goes to zero in a straight line, in ``ramp`` samples, and stays there."""
+    """Check that from cycle ``k`` on u is ramped to zero in ``ramp`` samples and stays there."""
     u = outcome["U"]
     first = int(np.flatnonzero(outcome["K"] == k)[0])
     before = u[first - 1]
@@ -48,7 +48,7 @@ def check_ramped(outcome: Outcome, k: int, ramp: int = RAMP) -> None:
 
 
 def check_ended_by(outcome: Outcome, k: int, cause: Cause) -> None:
-    """At cycle ``k``, for this reason, the ramp began, and ended as it should."""
+    """Check that a ramp began at cycle ``k`` for this cause, and was completed."""
     assert modes(outcome)[-2:] == [
         (k, Mode.RAMP, cause),
         (int(outcome["K"][-1]) - FLUSH - 1, Mode.STOPPED, Cause.RAMPED),
@@ -57,7 +57,7 @@ def check_ended_by(outcome: Outcome, k: int, cause: Cause) -> None:
 
 
 def test_nothing_happens_where_nothing_goes_wrong() -> None:
-    """Watch, run to the end, ramp, stop; and in between it is ``simulate``, sample for sample."""
+    """A run without faults equals ``simulate``, sample for sample."""
     outcome = run(ScriptedDevice(PLANT))
     run_ = ql.simulate(PLANT, adrc(), ql.Scenario(1.0, 3.0))
     mine = slice(SETTLE, SETTLE + len(run_))
@@ -73,7 +73,7 @@ def test_nothing_happens_where_nothing_goes_wrong() -> None:
 
 
 def test_plain_python_does_what_compiled_code_does() -> None:
-    """Through misses, a stall, a device that is not reached, and a trip: the same modes, the same numbers."""
+    """Missed samples, a stall, an unsent command and a trip: same modes, same numbers."""
     scripts: dict[str, Any] = {
         "y": {60: MISS, 61: MISS, 200: 1.0},
         "stall": {100: 3 * SAMPLE},
@@ -91,7 +91,7 @@ def test_plain_python_does_what_compiled_code_does() -> None:
 @pytest.mark.parametrize("value", [MISS, math.inf, -math.inf])
 @pytest.mark.parametrize("missed", [1, HOLD])
 def test_a_few_missed_samples_hold_u(value: float, missed: int) -> None:
-    """The last u stays; with the first good sample the controller goes on, and says that it held y."""
+    """The last u is held; the controller goes on with the first good sample."""
     outcome = run(ScriptedDevice(PLANT, y={60 + i: value for i in range(missed)}))
     u = outcome["U"]
     assert np.all(u[60 : 60 + missed] == u[59])
@@ -109,20 +109,20 @@ def test_a_few_missed_samples_hold_u(value: float, missed: int) -> None:
 
 @pytest.mark.parametrize("value", [MISS, math.inf])
 def test_one_missed_sample_too_many_ramps_u_down(value: float) -> None:
-    """With the sample after ``hold`` held ones; good ones that come later change nothing."""
+    """The ramp begins after ``hold`` samples; later good ones do not stop it."""
     outcome = run(ScriptedDevice(PLANT, y={60 + i: value for i in range(HOLD + 1)}))
     check_ended_by(outcome, 60 + HOLD, Cause.LOST)
 
 
 def test_a_device_that_never_comes_back_is_lost() -> None:
-    """As above, and the ramp needs no measurement."""
+    """The ramp needs no measurement."""
     check_ended_by(
         run(ScriptedDevice(PLANT, y=dict.fromkeys(range(60, 3000), MISS))), 60 + HOLD, Cause.LOST
     )
 
 
 def test_a_stall_skips_deadlines_and_never_catches_up() -> None:
-    """Fetching takes 3.5 samples: three deadlines are left out, then the loop is where it would have been, on the grid."""
+    """Reading takes 3.5 samples: three deadlines are skipped, then the grid is as before."""
     outcome = run(ScriptedDevice(PLANT, stall={60: 7 * SAMPLE // 2}))
     k = outcome["K"]
     np.testing.assert_array_equal(np.diff(k)[:70], [1.0] * 60 + [4.0] + [1.0] * 9)
@@ -132,8 +132,8 @@ def test_a_stall_skips_deadlines_and_never_catches_up() -> None:
     assert modes(outcome)[1] == (SETTLE + 301, Mode.RAMP, Cause.COMPLETED)
 
 
-def test_to_oversleep_skips_deadlines_as_well() -> None:
-    """It woke 2.2 samples late: the cycle is that of the newest deadline, its lateness is told."""
+def test_oversleeping_skips_deadlines_as_well() -> None:
+    """The loop wakes 2.2 samples late: the cycle is that of the newest deadline."""
     late = np.zeros(100, dtype=np.int64)
     late[60] = 11 * SAMPLE // 5
     outcome = run(ScriptedDevice(PLANT), late=late)
@@ -143,7 +143,7 @@ def test_to_oversleep_skips_deadlines_as_well() -> None:
 
 
 def test_a_stall_of_too_many_samples_ramps_u_down() -> None:
-    """The first cycle after it begins the ramp: what the plant did meanwhile nobody knows."""
+    """The first cycle after it begins the ramp."""
     outcome = run(ScriptedDevice(PLANT, stall={60: (HOLD + 1) * SAMPLE + 1}))
     check_ended_by(outcome, 60 + HOLD + 2, Cause.STALLED)
     assert not any(
@@ -152,8 +152,8 @@ def test_a_stall_of_too_many_samples_ramps_u_down() -> None:
     )
 
 
-def test_one_cycle_after_the_other_that_overruns_ramps_u_down() -> None:
-    """``most_overruns`` are put up with, one more is not."""
+def test_too_many_overruns_in_a_row_ramp_u_down() -> None:
+    """``most_overruns`` in a row are allowed, one more is not."""
     enough = run(ScriptedDevice(PLANT, stall=dict.fromkeys(range(60, 65), SAMPLE)))
     assert modes(enough)[1][2] is Cause.COMPLETED
     outcome = run(ScriptedDevice(PLANT, stall=dict.fromkeys(range(60, 66), SAMPLE)))
@@ -161,7 +161,7 @@ def test_one_cycle_after_the_other_that_overruns_ramps_u_down() -> None:
 
 
 def test_a_device_that_is_not_reached_too_often_is_given_up() -> None:
-    """``hold`` commands in a row may fail; what is written after that is the ramp, in case somebody hears it."""
+    """``hold`` commands in a row may fail; then the ramp is written, in case it arrives."""
     few = run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 60 + HOLD), 1)))
     assert modes(few)[1][2] is Cause.COMPLETED
     assert np.sum(few["EVENTS"].astype(int) & Event.UNSENT > 0) == HOLD
@@ -174,7 +174,7 @@ def test_a_device_that_is_not_reached_too_often_is_given_up() -> None:
 
 @pytest.mark.parametrize("fault", [2, 3])
 def test_a_device_that_has_set_u_to_zero_itself_ends_the_run(fault: int) -> None:
-    """At the sample after it said so: the controller would be working on a plant that does not listen."""
+    """The ramp begins one sample after the device has reported it."""
     check_ended_by(
         run(ScriptedDevice(PLANT, refused=dict.fromkeys(range(60, 3000), fault))),
         61,
@@ -183,7 +183,7 @@ def test_a_device_that_has_set_u_to_zero_itself_ends_the_run(fault: int) -> None
 
 
 def test_a_tracking_error_beyond_its_limit_trips() -> None:
-    """In the very sample that shows it."""
+    """The ramp begins in the sample that exceeds the limit."""
     check_ended_by(
         run(ScriptedDevice(PLANT, y={200: 2.0}), most_error=1.5), 200, Cause.TRACKING_ERROR
     )
@@ -191,7 +191,7 @@ def test_a_tracking_error_beyond_its_limit_trips() -> None:
 
 
 def test_an_f_hat_beyond_its_limit_trips() -> None:
-    """In the very sample that shows it: the controller's own estimate, learned part included."""
+    """The limit is on the whole estimate, with the learned part."""
     outcome = run(ScriptedDevice(PLANT), most_f=1.0)
     plain = run(ScriptedDevice(PLANT))
     f_hat = plain.rows[:, 11] + plain.rows[:, 12]
@@ -199,7 +199,7 @@ def test_an_f_hat_beyond_its_limit_trips() -> None:
 
 
 def test_a_u_that_stays_at_its_limit_trips() -> None:
-    """After ``most_saturated`` samples; it is allowed to touch it for as long."""
+    """The ramp begins after ``most_saturated`` samples, not before."""
     outcome = run(ScriptedDevice(PLANT), most_saturated=30, u_min=-0.5, u_max=0.5)
     check_ended_by(outcome, SETTLE + 30, Cause.SATURATED)
     assert np.max(np.abs(outcome["U"])) == 0.5
@@ -211,7 +211,7 @@ def test_a_u_that_stays_at_its_limit_trips() -> None:
 
 
 class Broken(NamedTuple):
-    """A controller of somebody else's, which breaks after so many samples."""
+    """A user's controller that returns NaN after some samples."""
 
     good: int
 
@@ -239,7 +239,7 @@ def _write_row(design: Broken, state: BrokenState, row: Any) -> None:
 
 
 class BrokenController:
-    """As an object."""
+    """The controller as an object."""
 
     dt, parameters, features, channels = DT, Broken(70), (), ()
 
@@ -248,14 +248,14 @@ class BrokenController:
         return BrokenState(np.zeros(1))
 
 
-def test_a_u_that_is_no_number_is_never_written() -> None:
-    """The controller says NaN: the ramp begins in that sample, from what was applied."""
+def test_a_u_that_is_not_finite_is_never_written() -> None:
+    """If the controller returns NaN, the ramp begins in that sample from the last u."""
     outcome = run(ScriptedDevice(PLANT), BrokenController(), interpret=True, u_min=-2.0, u_max=2.0)
     check_ended_by(outcome, 70, Cause.NOT_A_NUMBER)
 
 
-def test_asked_to_stop_it_ramps_and_asked_again_it_is_zero_at_once() -> None:
-    """Before it took over, there is nothing to ramp."""
+def test_the_first_request_ramps_and_the_second_is_zero_at_once() -> None:
+    """Before the controller takes over there is nothing to ramp."""
     assert modes(run(ScriptedDevice(PLANT), asked=Request.RAMP)) == [
         (0, Mode.RAMP, Cause.STOP_REQUESTED),
         (0, Mode.STOPPED, Cause.RAMPED),
@@ -266,7 +266,7 @@ def test_asked_to_stop_it_ramps_and_asked_again_it_is_zero_at_once() -> None:
 
 
 def test_it_takes_over_only_after_good_samples_in_a_row() -> None:
-    """A missed one begins the count anew; u is zero all the while."""
+    """A missed sample restarts the count; u is zero meanwhile."""
     outcome = run(ScriptedDevice(PLANT, x0=[0.3, 0.0], y={4: MISS}), settle=SETTLE)
     assert modes(outcome)[0] == (5 + SETTLE, Mode.RUN, Cause.SETTLED)
     assert np.all(outcome["U"][: 5 + SETTLE] == 0.0)
@@ -274,7 +274,7 @@ def test_it_takes_over_only_after_good_samples_in_a_row() -> None:
 
 
 def test_a_device_that_stutters_never_starts() -> None:
-    """Where there are never enough good samples in a row, it gives up, and says so."""
+    """Without enough good samples in a row the run ends, and the cause says so."""
     outcome = run(ScriptedDevice(PLANT, y=dict.fromkeys(range(0, 3000, 5), MISS)))
     assert [cause for _, _, cause in modes(outcome)] == [Cause.UNSETTLED, Cause.RAMPED]
     assert np.all(outcome.device.written == 0.0)
@@ -293,10 +293,10 @@ faults = st.fixed_dictionaries(
 
 @settings(max_examples=200)
 @given(scripts=faults)
-def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(
+def test_under_any_faults_u_is_within_limits_and_ends_at_zero(
     scripts: dict[str, dict[int, Any]],
 ) -> None:
-    """Random drops, bursts, nonsense, stalls, refusals: the modes go one way, the ramp only shrinks u, the last commands are zeros."""
+    """Random faults: modes only advance, the ramp only reduces |u|, the last commands are zero."""
     outcome = run(ScriptedDevice(PLANT, **scripts), duration=1.0)
     u, mode = outcome.device.written, outcome["MODE"]
     assert np.all(np.abs(u) <= 3.0)
@@ -330,13 +330,13 @@ def test_whatever_happens_u_is_a_number_within_limits_and_ends_at_zero(
     ],
 )
 def test_what_is_out_of_range_is_named(options: dict[str, Any], message: str) -> None:
-    """One line: the argument, its value, the rule."""
+    """The message names the argument, its value and the rule."""
     with pytest.raises(ValueError, match=message.replace("(", r"\(")):
         Safety(**options)
 
 
 def test_without_limits_of_u_no_loop_is_closed() -> None:
-    """They come from the controller, from the safety, or from both: then the narrower ones hold."""
+    """Limits of the controller and of Safety combine to the narrower ones."""
     bare = ql.ADRC(ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT), omega_c=1.5)
     with pytest.raises(
         ValueError, match="u_min = -inf, u_max = inf: must be finite for a real device"

@@ -33,7 +33,7 @@ NARROW = Header(row_channels((("status", 1),)), dt=DT)
 
 @pytest.fixture(scope="module")
 def run() -> ql.Trajectory:
-    """What the loop is thought to have done."""
+    """A simulated run in place of a loop's."""
     return simulated()
 
 
@@ -50,7 +50,7 @@ def header(run: ql.Trajectory) -> Header:
 
 
 def recorded(header: Header, rows: Matrix, *sinks: Any) -> TelemetryWriter:
-    """Send rows through a ring to sinks, as quickly as they find a place."""
+    """Send rows through a ring to sinks."""
     with TelemetryWriter(header, sinks) as telemetry:
         offer(telemetry, rows)
     assert telemetry.rows == len(rows)
@@ -59,14 +59,14 @@ def recorded(header: Header, rows: Matrix, *sinks: Any) -> TelemetryWriter:
 
 
 def offer(telemetry: TelemetryWriter, rows: Matrix) -> None:
-    """Push rows; wait where the ring is full."""
+    """Push rows; wait while the ring is full."""
     for row in rows:
         while not push(telemetry.ring, row):
             time.sleep(0.01)
 
 
 def counted(count: int, width: int = LOOP_WIDTH + 1) -> Matrix:
-    """Rows with k, and zeros."""
+    """Return rows of zeros with k."""
     rows = np.zeros((count, width))
     rows[:, K] = np.arange(count)
     return rows
@@ -91,7 +91,7 @@ def test_a_run_comes_back_to_the_last_bit(
 
 @pytest.mark.parametrize("suffix", ["csv", "mcap"])
 def test_numbers_at_the_ends_of_the_range_come_back(suffix: str, tmp_path: Path) -> None:
-    """The largest, the smallest, infinities, minus zero and NaN, also in the first row, which CSV writes without exponents."""
+    """Extreme values, infinities, −0 and NaN, also in the first row (in CSV without exponents)."""
     rows = counted(8)
     rows[:, Y_MEASURED] = [
         5e-324,
@@ -120,7 +120,7 @@ def test_a_trajectory_of_a_recording_is_saved_as_any_other(
 
 
 def test_skipped_deadlines_are_filled_in() -> None:
-    """What was known stays, what was not measured is NaN, and an event says so; deadlines count on."""
+    """Known channels stay, unmeasured ones are NaN, and an event marks the sample."""
     rows = counted(6)
     rows[:, 1:EVENTS] = rows[:, EVENTS + 1 :] = np.arange(6.0)[:, None]
     rows[:, EVENTS] = 3.0
@@ -167,7 +167,7 @@ def test_a_csv_file_without_its_header_still_knows_its_sample_time(
 def test_a_message_is_what_its_definition_says(
     header: Header, rows: Matrix, tmp_path: Path
 ) -> None:
-    """Read field by field as ROS 2 lays plain CDR out, from nothing but the definition in the file."""
+    """A message is read field by field with nothing but the definition in the file."""
     from mcap.reader import make_reader
 
     recorded(header, rows, McapSink(tmp_path / "run.mcap"))
@@ -181,15 +181,15 @@ def test_a_message_is_what_its_definition_says(
         "cdr",
     )
     assert message.log_time == header.started + round(17 * DT * 1e9)
-    told, at = {}, 4
+    fields, at = {}, 4
     for line in schema.data.decode().splitlines():
         kind, name = line.split("#")[0].split()
         count = int(kind.removeprefix("float64").strip("[]") or 1)
-        told[name] = struct.unpack_from(f"<{count}d", message.data, at)
+        fields[name] = struct.unpack_from(f"<{count}d", message.data, at)
         at += 8 * count
     assert at == len(message.data)
-    assert told["x_hat"] == tuple(rows[17, LOOP_WIDTH : LOOP_WIDTH + 2])
-    assert told["y"] == (rows[17, 6],)
+    assert fields["x_hat"] == tuple(rows[17, LOOP_WIDTH : LOOP_WIDTH + 2])
+    assert fields["y"] == (rows[17, 6],)
     assert b"float64 y  # output [m]" in schema.data
 
 
@@ -197,7 +197,7 @@ def test_a_message_is_what_its_definition_says(
 def test_a_file_cut_short_anywhere_is_readable_up_to_there(
     suffix: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    """Whole rows, the first ones, or one line that says there is none."""
+    """The first rows are read, or a one-line message says that there is none."""
     sink, rows = file_sink(tmp_path / f"run.{suffix}"), counted(400)
     sink.open(NARROW)
     for first in range(0, 400, 40):
@@ -217,15 +217,15 @@ def test_a_file_cut_short_anywhere_is_readable_up_to_there(
 
 
 def whole_rows(path: Path, rows: Matrix) -> int:
-    """Return how many of the rows are in a file; where there are none, that has to be said in a line."""
+    """Return how many of the rows are in a file; check the message if there are none."""
     try:
         run = load(path)
     except ValueError as error:
-        told = str(error)
+        message = str(error)
     else:
         np.testing.assert_array_equal(run.log, rows[: len(run)])
         return len(run)
-    assert "\n" not in told
+    assert "\n" not in message
     return 0
 
 
@@ -261,7 +261,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_what_is_a_second_old_survives_the_end_of_the_process(tmp_path: Path) -> None:
-    """At 1 kHz as at 10 Hz: however few rows there are, no buffer waits to be full."""
+    """At 1 kHz and 10 Hz: no buffer waits until it is full."""
     ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], timeout=120)
     assert ended.returncode == -9
     for count in (2000, 3):
@@ -272,7 +272,7 @@ def test_what_is_a_second_old_survives_the_end_of_the_process(tmp_path: Path) ->
 
 
 class Broken(MemorySink):
-    """A sink that fails at its third piece, and again when it is closed."""
+    """A sink that fails at its third write, and again when it is closed."""
 
     name = "broken"
     pieces = 0
@@ -292,7 +292,7 @@ class Broken(MemorySink):
 def test_a_sink_that_fails_is_closed_and_reported_and_the_others_go_on(
     header: Header, rows: Matrix
 ) -> None:
-    """One line says which, and why."""
+    """One line names the sink and the reason."""
     broken, kept = Broken(), MemorySink()
     with TelemetryWriter(header, [broken, kept]) as telemetry:
         offer(telemetry, rows)
@@ -306,7 +306,7 @@ def test_a_sink_that_fails_is_closed_and_reported_and_the_others_go_on(
 def test_a_full_disk_ends_a_recording_and_nothing_else(
     header: Header, rows: Matrix, suffix: str, tmp_path: Path
 ) -> None:
-    """The limit on the size of a file stands for the disk; what was written before can be read."""
+    """A limit on the file size acts as a full disk; what was written before can be read."""
     sink, kept = file_sink(tmp_path / f"run.{suffix}"), MemorySink()
     telemetry = TelemetryWriter(header, [sink, kept])
     telemetry.start()
@@ -326,7 +326,7 @@ def test_a_full_disk_ends_a_recording_and_nothing_else(
 
 
 class Stuck(MemorySink):
-    """A sink that lets nothing through until it is told."""
+    """A sink that blocks until it is freed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -339,7 +339,7 @@ class Stuck(MemorySink):
 
 
 def test_a_disk_that_hangs_costs_rows_not_time() -> None:
-    """Rows that find the ring full are dropped and counted; the recording has a gap where they were."""
+    """Rows that find the ring full are counted; the recording has a gap in their place."""
     stuck = Stuck()
     with TelemetryWriter(NARROW, [stuck]) as telemetry:
         capacity = telemetry.ring.rows.shape[0]
@@ -356,7 +356,7 @@ def test_a_disk_that_hangs_costs_rows_not_time() -> None:
 
 
 def test_a_writer_that_does_not_end_is_given_up() -> None:
-    """The loop's process is not held up; the result says that rows may be missing."""
+    """The process is not blocked; the result says that rows may be missing."""
     stuck = Stuck()
     telemetry = TelemetryWriter(NARROW, [stuck])
     telemetry.start()
@@ -380,7 +380,7 @@ def test_a_writer_that_does_not_end_is_given_up() -> None:
 def test_what_can_not_be_written_is_refused_before_the_loop_starts(
     make: Any, rule: str, tmp_path: Path
 ) -> None:
-    """In one line; and what was opened before it is closed."""
+    """One line says why; sinks that were open already are closed."""
     for suffix in ("csv", "mcap"):
         (tmp_path / f"old.{suffix}").write_text("precious")
     first = CsvSink(tmp_path / "first.csv")
@@ -392,8 +392,8 @@ def test_what_can_not_be_written_is_refused_before_the_loop_starts(
     assert (tmp_path / "old.csv").read_text() == "precious"
 
 
-def test_other_suffixes_and_lazy_writers_are_refused() -> None:
-    """With what to do."""
+def test_other_suffixes_and_long_periods_are_refused() -> None:
+    """The message says what to do."""
     with pytest.raises(ValueError, match=r"path = 'run.txt': must end in .csv or .mcap"):
         file_sink("run.txt")
     with pytest.raises(ValueError, match="period = 2 s: must be at most 0.25 s"):
@@ -406,7 +406,7 @@ def test_other_suffixes_and_lazy_writers_are_refused() -> None:
 def test_a_missing_package_is_named_with_the_extra_that_brings_it(
     module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In one line, before the loop starts."""
+    """One line, before the loop starts."""
     recorded(NARROW, counted(3), McapSink(tmp_path / "run.mcap"))
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match=r"pip install 'quell\[telemetry\]'"):
@@ -418,7 +418,7 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(
 def test_files_that_are_no_recordings_are_refused_in_one_line(
     run: ql.Trajectory, tmp_path: Path
 ) -> None:
-    """Text, tables of something else, a NetCDF record, an empty file, a folder, no file, an MCAP file of others, broken rows."""
+    """Text, other tables, NetCDF, an empty file, a folder, no file, foreign MCAP, broken rows."""
     import foxglove
 
     (tmp_path / "empty.csv").touch()
@@ -446,13 +446,13 @@ def test_files_that_are_no_recordings_are_refused_in_one_line(
 
 
 async def _watch(url: str, wanted: int, begin: Any) -> tuple[dict[str, Any], list[bytes]]:
-    """Subscribe to all there is, as a Foxglove viewer does; call ``begin`` then; return the channel and so many messages."""
+    """Subscribe as a Foxglove viewer does, call ``begin``; return the channel and messages."""
     async with websockets.connect(
         url, subprotocols=["foxglove.sdk.v1", "foxglove.websocket.v1"]
     ) as socket:  # type: ignore[list-item]
-        while (told := json.loads(await socket.recv()))["op"] != "advertise":
+        while (reply := json.loads(await socket.recv()))["op"] != "advertise":
             pass
-        channel = told["channels"][0]
+        channel = reply["channels"][0]
         await socket.send(
             json.dumps(
                 {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]}
@@ -471,7 +471,7 @@ async def _watch(url: str, wanted: int, begin: Any) -> tuple[dict[str, Any], lis
 
 
 def test_a_viewer_sees_rows_at_a_rate_it_can_follow_and_no_event_is_lost() -> None:
-    """A loop at 1 kHz, 50 rows a second: every twentieth row, with the events of those before it."""
+    """At 1 kHz and 50 rows/s: every twentieth row, with the events since the one before."""
     live = LiveSink(port=0, rate=50.0)
     live.open(Header(NARROW.channels, dt=1e-3))
     rows = counted(400)
@@ -517,7 +517,7 @@ def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
 def test_the_writer_has_the_priority_that_it_should(
     urgent: bool, permitted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The lowest real-time priority for a loop in Python, where that is permitted; else none, even where it inherits one."""
+    """The lowest real-time priority for an interpreted loop if permitted, else an ordinary one."""
     from quell.realtime.system import scheduling as module
 
     now = [module.os.SCHED_RR]
@@ -537,7 +537,7 @@ def test_the_writer_has_the_priority_that_it_should(
 
 
 def test_a_table_of_times_alone_is_no_recording(tmp_path: Path) -> None:
-    """It is refused in a line, as any other table is."""
+    """It is refused in one line, as any other table is."""
     (tmp_path / "run.csv").write_text("time\n0.0\n1.0\n")
     with pytest.raises(
         ValueError,

@@ -33,6 +33,7 @@ from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.loop.modes import Cause, Mode, Request
 from quell.realtime.loop.reference import ReferenceSamples
 from quell.realtime.loop.supervisor import (
+    Memory,
     Rules,
     SupervisorState,
     change_mode,
@@ -120,7 +121,10 @@ def cycle_times(dt: float, paced: bool) -> CycleTimes:
 
 @compiled
 def run_cycles(handle: Any, clock: Any, times: CycleTimes, controller: Any) -> None:
-    """Run until the supervisor has stopped the device."""
+    """Run until the supervisor has stopped the device.
+
+    ``controller`` is a ``SupervisedController``, or a ``CompiledController`` around one.
+    """
     supervisor, log = controller.supervisor, controller.log
     memory, counters = supervisor.memory[0], supervisor.counters[0]
     origin = 0
@@ -166,7 +170,7 @@ def run_cycles(handle: Any, clock: Any, times: CycleTimes, controller: Any) -> N
 
 @kernel
 def _log_cycle(
-    log: CycleLog, memory: Any, k: int, lateness: int, step_time: int, events: int, y: float
+    log: CycleLog, memory: Memory, k: int, lateness: int, step_time: int, events: int, y: float
 ) -> None:
     """Complete the row, in which reference and controller's channels are already, and push it."""
     row = log.row
@@ -283,7 +287,7 @@ def _control_step(controller: SupervisedController, k: int, left_out: int, y: fl
 
 @kernel
 def _set_reference(
-    design: Any, state: Any, reference: ReferenceSamples, memory: Any, k: int
+    design: Any, state: Any, reference: ReferenceSamples, memory: Memory, k: int
 ) -> float:
     """Return the reference of sample k (y before the scenario begins); pass its derivatives on."""
     if memory.began < 0:
