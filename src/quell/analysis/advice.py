@@ -9,6 +9,7 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
+from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
 from quell.controllers.design_checks import Finding, sampling_findings
 from quell.observers.eso import ESO
@@ -59,27 +60,24 @@ def advise(
     ValueError
         as ``analyse``; without a plant for a controller that assumes none.
     """
-    observer: ESO | None = getattr(controller, "observer", None)
-    known_delay = 0.0
+    observer = controller.observer if isinstance(controller, ADRC) else None
+    known_delay, found = 0.0, []
     if plant is None:
         if observer is None:
             raise ValueError("plant = None: this controller does not know its plant; give one")
         plant, known_delay = _assumed_plant(observer)
     actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")
     delay = checks.non_negative("delay", delay, "s")
-    omega_c = getattr(controller, "omega_c", math.nan)
-    found = [] if observer is None else sampling_findings(observer, omega_c)
+    if isinstance(controller, ADRC):
+        found = sampling_findings(controller.observer, controller.omega_c)
     loop = analyse(plant, controller, at=at, delay=known_delay)
     if not loop.stable:
-        return [
-            *found,
-            _unstable(loop, "with this plant", "check b0, raise omega_o or lower omega_c"),
-        ]
+        what_to_do = "check b0, raise omega_o or lower omega_c"
+        return [*found, _unstable(loop, "with this plant", what_to_do)]
     found += _judge_margin(loop, observer)
     if actuator_lag > 0.0 or delay > 0.0:
-        late = analyse(
-            plant, controller, at=at, delay=known_delay + delay, actuator_lag=actuator_lag
-        )
+        lags = {"delay": known_delay + delay, "actuator_lag": actuator_lag}
+        late = analyse(plant, controller, at=at, **lags)
         found += _judge_lag(loop, late, actuator_lag, delay)
         loop = late
     if noise_std is not None and loop.stable:
@@ -92,10 +90,9 @@ def _assumed_plant(observer: ESO) -> tuple[LinearPlant, float]:
     known = observer.plant
     A = np.diag(np.ones(observer.order - 1), 1)
     A[-1] = -known.a
-    plant = LinearPlant(
-        A, known.B * (observer.b0 / known.b), np.eye(observer.order)[0], known.E[:, None]
-    )
-    return plant, observer.dt * getattr(observer.model, "samples", 0)
+    B, C = known.B * (observer.b0 / known.b), np.eye(observer.order)[0]
+    delay = observer.dt * getattr(observer.model, "samples", 0)
+    return LinearPlant(A, B, C, known.E[:, None]), delay
 
 
 def _unstable(loop: LoopAnalysis, when: str, what_to_do: str) -> Finding:
@@ -156,8 +153,8 @@ def _judge_noise(loop: LoopAnalysis, controller: Controller, noise: float) -> li
     if share <= _NOISE:
         return []
     what_to_do = "lower the gains"
-    observer: ESO | None = getattr(controller, "observer", None)
-    if observer is not None:
+    if isinstance(controller, ADRC):
+        observer = controller.observer
         # Noise in f̂ grows with the power n + 1/2 of omega_o.
         lower = observer.omega_o * (_NOISE / share) ** (1.0 / (observer.order + 0.5))
         what_to_do = f"lower omega_o to about {lower:.2g} rad/s and omega_c, or measure better"
