@@ -134,7 +134,7 @@ def test_radial_features_are_gaussians_around_centres_that_fill_the_range() -> N
 
 
 def test_blocks_are_joined_in_order() -> None:
-    """Values one after the other; names that come again are numbered; the bias is found, u comes last."""
+    """Values follow each other; repeated names are numbered; the bias is found, u comes last."""
     joined = State() + RBF(4) + Bias() + Input()
     np.testing.assert_array_equal(written(joined), [*STATE, *written(RBF(4)), 1.0, U])
     assert joined.constant(3) == 7

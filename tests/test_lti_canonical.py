@@ -1,4 +1,4 @@
-"""The canonical form of any plant with one input and one output, the ESO built on it, and the loop around a plant with zeros."""
+"""The canonical form of linear plants, the ESO built on it, and loops around plants with zeros."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from quell.observers.placement import place_poles
 
 
 def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:
-    """Return the transfer function ``num/den`` as a plant in coordinates that nobody would choose."""
+    """Return the transfer function ``num/den`` as a plant in badly scaled, rotated coordinates."""
     A, B, C, _ = scipy.signal.tf2ss(num, den)
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=A.shape))[0] @ np.diag(
         10.0 ** np.linspace(-1.0, 2.0, len(A))
@@ -55,7 +55,7 @@ NUM, DEN = 3.0 * np.poly([-0.8, -2.0]), np.poly([0.3, -0.4 + 1.0j, -0.4 - 1.0j, 
     ],
 )
 def test_a_plant_is_the_same_however_it_is_given(plant: Any) -> None:
-    """Matrices, systems of python-control and scipy, coefficients, even with the rounding of a conversion in front."""
+    """Matrices, systems of python-control and scipy, coefficients, also with rounding errors."""
     found = canonical(plant)
     np.testing.assert_allclose(found.a, DEN[:0:-1], rtol=1e-8)
     assert found.b == pytest.approx(3.0)
@@ -70,7 +70,7 @@ def test_a_plant_is_the_same_however_it_is_given(plant: Any) -> None:
 
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 6))
 def test_the_zeros_are_those_of_the_numerator(seed: int, n: int) -> None:
-    """Found again from matrices in coordinates that hide them; and Ā, B̄, C̄ are S applied to the plant."""
+    """Zeros are found in any coordinates; Ā, B̄, C̄ are the plant transformed by S."""
     rng = np.random.default_rng(seed)
     zeros, poles = rng.uniform(-3.0, 3.0, rng.integers(0, n)), rng.uniform(-2.0, 0.5, n)
     plant = hidden(np.atleast_1d(np.poly(zeros)), np.poly(poles), seed)
@@ -89,7 +89,7 @@ def test_the_zeros_are_those_of_the_numerator(seed: int, n: int) -> None:
 
 
 def error_polynomial(observer: ESO) -> np.ndarray:
-    """Return the characteristic polynomial of (I − L C) Φ in ``(z − 1)/(1 − β)``, in the observer's own time."""
+    """Return the characteristic polynomial of (I − L C) Φ in ``(z − 1)/(1 − β)``."""
     model = observer.model
     scale = observer.omega_o ** np.append(np.arange(observer.order), observer.f_degree)
     transition, gain = model.transition * scale[None, :] / scale[:, None], model.gain / scale
@@ -128,7 +128,7 @@ def test_poles_may_differ_and_be_complex(rng: np.random.Generator) -> None:
 def estimates(
     observer: ESO, plant: ql.plants.LinearPlant, f: float, samples: int = 4000
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Drive a plant, from a state that is not zero, with a chirp and a constant disturbance; return the true and the estimated end."""
+    """Return the true and the estimated state after a chirp under a constant disturbance."""
     model = plant.sampled(observer.dt)
     u = np.sin(np.cumsum(np.linspace(0.0, 3.0, samples)) * observer.dt)
     x = np.linspace(0.5, -0.4, plant.order)
@@ -144,7 +144,7 @@ STABLE = np.poly([-0.5, -0.4 + 1.0j, -0.4 - 1.0j, -3.0])
 
 
 def test_estimates_are_found_in_the_states_of_the_user() -> None:
-    """A plant with zeros in odd coordinates, under u and an unknown f where u enters: both are exact in the end."""
+    """In badly scaled coordinates, with an unknown f that enters where u does: both get exact."""
     plant = hidden(NUM, STABLE)
     observer = ESO.model_based(plant, omega_o=20.0, dt=2e-3)
     x, x_hat, f = estimates(observer, plant, 0.7)
@@ -153,7 +153,7 @@ def test_estimates_are_found_in_the_states_of_the_user() -> None:
 
 
 def test_a_disturbance_with_a_channel_of_its_own_is_found_there() -> None:
-    """S E = e_n while u enters earlier: z has what u feeds through in it, and no derivative of u is needed."""
+    """S E = e_n while u enters earlier: z excludes the feedthrough of u; no derivative is used."""
     free = hidden(NUM, STABLE)
     S = canonical(free).S
     E = np.linalg.solve(S, [0.0, 0.0, 0.0, -2.0])
@@ -195,7 +195,7 @@ def test_a_record_is_mapped_like_a_sample() -> None:
     ],
 )
 def test_the_loop_of_a_plant_with_zeros_steps_as_if_it_had_none(num: Any, den: Any) -> None:
-    """The output follows ``(omega_c/(s + omega_c))^r``, r being the relative degree, and a constant load is rejected without error."""
+    """Y follows ``(omega_c/(s + omega_c))^r``, r the relative degree, and rejects a load."""
     plant, omega_c, dt = hidden(num, den), 2.0, 1e-3
     controller = ql.ADRC(ESO.model_based(plant, omega_o=20.0, dt=dt), omega_c=omega_c)
     run = ql.simulate(plant, controller, ql.Scenario(1.0, 20.0, (ql.signals.Step(at=10.0),)))
@@ -210,7 +210,7 @@ def test_the_loop_of_a_plant_with_zeros_steps_as_if_it_had_none(num: Any, den: A
 
 
 def test_a_disturbance_of_its_own_is_rejected_by_its_effect_on_the_state() -> None:
-    """Where f does not enter as u does (r < n), u_0 − z_{r+1} alone brings y to rest under a constant f."""
+    """If f does not enter as u does (r < n), u_0 − z_{r+1} alone brings y to rest."""
     free = hidden(NUM, STABLE)
     E = np.linalg.solve(canonical(free).S, [0.0, 0.0, 0.0, 1.0])
     plant = ql.plants.LinearPlant(free.A, free.B, free.C, E[:, None])
@@ -234,7 +234,7 @@ def test_noise_in_f_is_as_much_as_its_gain_says(rng: np.random.Generator) -> Non
 
 
 def test_a_learner_learns_on_a_plant_with_zeros() -> None:
-    """What the observer shows of f is what lag compensation says it is, zeros or not: a coefficient that is off is found."""
+    """f̂ is what lag compensation computes, with and without zeros: a wrong coefficient is found."""
     observer = ESO.model_based(([1.0, 4.0], [1.0, 0.5, 2.0, 1.0]), omega_o=20.0, dt=2e-3)
     # The real plant has f = −1.5 y on top, entering as u does.
     plant = hidden([1.0, 4.0], np.polyadd([1.0, 0.5, 2.0, 1.0], 1.5 * np.array([1.0, 4.0])))
@@ -259,7 +259,8 @@ BESIDE = ql.plants.two_mass_spring(c1=1.0, c2=0.0)
         (
             TWO_MASS,
             1,
-            r"invariant zeros to y \(assumption 3\), ±1j rad/s, its relative degree is 2 and not 4; leave E out",
+            r"invariant zeros to y \(assumption 3\), ±1j rad/s, its relative degree is 2 and "
+            "not 4; leave E out",
         ),
         ((np.diag([-1.0, -2.0]), [1.0, 1.0], [0.0, 0.0], [1.0, 1.0]), None, "E is zero"),
         ((np.eye(2), [1.0, 0.0], [0.0, 1.0], [1.0, 0.0]), None, "not observable"),
@@ -338,7 +339,7 @@ def test_the_condition_says_how_near_a_plant_is_to_unobservable() -> None:
 def test_with_its_poles_at_the_zeros_the_observer_shows_f_as_if_there_were_none(
     zeros: list[complex],
 ) -> None:
-    """What it shows of f needs as many lags as it has poles at β, of gain one together; a zero faster than omega_o is not kept."""
+    """f̂ has one lag for each pole at β, with a total gain of 1; faster zeros are not kept."""
     plant = (np.poly(zeros).real, np.poly([-1.0, -0.3, 0.5, 0.0]))
     observer = ESO.model_based(plant, omega_o=20.0, dt=2e-3, keep_zeros=True)
     kept = sum(zero.real > -20.0 for zero in np.array(zeros))
@@ -350,7 +351,7 @@ def test_with_its_poles_at_the_zeros_the_observer_shows_f_as_if_there_were_none(
 
 
 def test_poles_at_slow_zeros_spare_noise_and_learn_where_the_other_observer_cannot() -> None:
-    """A zero at −0.1 rad/s under omega_o = 20: f̂ a hundred times quieter, and a learner reduces the error instead of adding to it."""
+    """A zero at −0.1 rad/s, omega_o = 20: f̂ has a hundredth of the noise, and a learner helps."""
     plant = hidden(3.0 * np.poly([-0.1]), np.poly([-1.0, -0.3, 0.5]))
     scenario = ql.Scenario(0.0, 40.0, (ql.signals.Sinusoid(omega=1.3),))
     errors, noise = {}, {}

@@ -38,7 +38,7 @@ def forms() -> dict[str, Any]:
 
 @pytest.mark.parametrize("form", forms())
 def test_every_form_is_taken_everywhere_and_is_the_same_plant(form: str) -> None:
-    """Observer, loop, state feedback and run agree with those of the plant made by hand from its companion matrix."""
+    """Observer, loop, state feedback and run agree with those of the companion matrix."""
     model, by_hand = (
         forms()[form],
         LinearPlant([[0, 1, 0], [0, 0, 1], [-0.5, -4.0, -1.5]], [0, 0, 1.0], [3.0, 2.0, 0]),
@@ -67,7 +67,7 @@ def test_every_form_is_taken_everywhere_and_is_the_same_plant(form: str) -> None
 
 
 def test_the_states_of_a_transfer_function_are_said_and_its_coefficients_kept() -> None:
-    """Without zeros y and its derivatives, as the observer has them; with zeros y first, and no coefficient is rounded."""
+    """Without zeros y and its derivatives; with zeros y first. No coefficient is rounded."""
     motor = LinearPlant.of(([50.0], [1.0, 22.0, 40.0, 0.0]))
     np.testing.assert_array_equal(motor.A, [[0, 1, 0], [0, 0, 1], [0, -40.0, -22.0]])
     np.testing.assert_array_equal(motor.B, [[0], [0], [50.0]])
@@ -82,7 +82,7 @@ def test_the_states_of_a_transfer_function_are_said_and_its_coefficients_kept() 
 
 
 def test_a_fast_pole_costs_no_digits_of_slow_zeros() -> None:
-    """Zeros at 0.1 and 0.2 rad/s beside an actuator of 0.1 ms: the loop's plant is that of its partial fractions to 1e-12."""
+    """Zeros at 0.1 and 0.2 rad/s, a lag of 0.1 ms: the plant is its partial fractions to 1e-12."""
     zeros, poles, dt = np.array([-0.1, -0.2]), np.array([-1.0, -2.0, -3.0, -1e4]), LAW.dt
     omega = np.geomspace(1e-3, 100.0, 30)
     z = np.exp(1j * omega * dt)
@@ -158,7 +158,8 @@ A2, B2, C2 = [[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0]
     [
         (
             (A2, B2, C2, [[0.0]]),
-            r"C, the last of four, has shape \(1, 1\): four entries are \(A, B, E, C\), not \(A, B, C, D\)",
+            r"C, the last of four, has shape \(1, 1\): four entries are \(A, B, E, C\), "
+            r"not \(A, B, C, D\)",
         ),
         (
             ([[-1.0]], [1.0], [1.0], [0.0]),

@@ -1,4 +1,4 @@
-"""Forms of the observer beyond the plain one: each against an independent form, a closed form or a limit case."""
+"""Other forms of the observer, against independent forms, closed forms or limit cases."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def records(rng: np.random.Generator, samples: int = 800) -> tuple[np.ndarray, n
 def test_the_reduced_form_is_the_reduced_order_observer(
     order: int, rng: np.random.Generator
 ) -> None:
-    """Luenberger's: y is taken as it is, and w = (x_2 … f) estimated from what y does not explain."""
+    """Luenberger's reduced-order observer: x̂_1 = y, and w = (x_2 … f) is estimated."""
     b0, omega_o = 2.0, 15.0
     y, u = records(rng)
     observer = ESO.model_free(order=order, b0=b0, omega_o=omega_o, dt=DT, form="reduced")
@@ -70,7 +70,7 @@ def test_the_reduced_form_is_the_reduced_order_observer(
 
 
 def test_half_gain_is_half_of_the_bandwidth_design_and_less_noise() -> None:
-    """Exactly L/2, and stable. Noise in f̂ falls to 0.7 of what it was at first order; from the fifth on nothing is gained."""
+    """Exactly L/2, and stable. Noise in f̂ falls by 30 % at order 1 and not from order 5 on."""
     noise = []
     for order in range(1, 9):
         full, half = (
@@ -90,7 +90,7 @@ def test_half_gain_is_half_of_the_bandwidth_design_and_less_noise() -> None:
 def test_kalman_gains_for_a_drifting_f_put_the_poles_in_a_butterworth_pattern(
     order: int, dt: float
 ) -> None:
-    """Symmetric root locus of a chain of integrators: radius ``(drift/(noise dt))^(1/2N)``, which is also omega_o."""
+    """Symmetric root locus of integrators: omega_o is the radius ``(drift/(noise dt))^(1/2N)``."""
     radius, noise, size = 12.0, 1e-6, order + 1
     observer = ESO.kalman(
         order, 1.0, dt, noise_variance=noise, drift=noise * dt * radius ** (2 * size)
@@ -154,7 +154,7 @@ def test_a_cascade_of_one_level_is_the_plain_observer(rng: np.random.Generator) 
 
 
 def test_the_levels_of_a_cascade_have_the_poles_they_were_given() -> None:
-    """What one level tells the next does not come back: (z − β_1)^N (z − β_2)^N (z − β_3)^N."""
+    """No level feeds back to one before it: (z − β_1)^N (z − β_2)^N (z − β_3)^N."""
     observer = ESO.cascade(1, 1.0, 40.0, DT, levels=3, ratio=2.0)
     wanted = np.repeat(np.exp(-np.array([10.0, 20.0, 40.0]) * DT), 2)
     np.testing.assert_allclose(
@@ -175,7 +175,7 @@ PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0]
 
 
 def rejection_and_noise(observer: ESO) -> tuple[float, float]:
-    """Return the largest answer of y to a step of the load, and the standard deviation of u that white noise makes."""
+    """Return the largest y after a step of the load, and the standard deviation of u from noise."""
 
     def run(noise: Any) -> ql.Trajectory:
         scenario = ql.Scenario(
@@ -190,7 +190,7 @@ def rejection_and_noise(observer: ESO) -> tuple[float, float]:
 
 
 def test_a_cascade_rejects_the_same_load_with_half_the_noise_in_u() -> None:
-    """The claim of Łakomy & Madonski, measured: ratio 3 against the plain ESO of the same bandwidth."""
+    """The claim of Łakomy & Madonski: ratio 3 against the plain ESO of the same bandwidth."""
     plain, cascade = ESO.model_free(2, 1.5, 30.0, 1e-3), ESO.cascade(2, 1.5, 30.0, 1e-3, ratio=3.0)
     (peak, noise), (cascade_peak, cascade_noise) = (
         rejection_and_noise(plain),
@@ -234,7 +234,7 @@ def test_the_nonlinear_observer_with_powers_of_one_is_the_linear_one(
 
 
 def test_the_nonlinear_observer_is_hans_for_short_samples() -> None:
-    """Against his own, of Euler's kind, with ``β_i = L_i δ^(1−α_i)/dt``: the difference falls with dt."""
+    """Against his Euler form with ``β_i = L_i δ^(1−α_i)/dt``: the difference falls with dt."""
     alpha, delta, errors = (1.0, 0.5, 0.25), 0.02, []
     for dt in (1e-3, 1e-4):
         observer = ESO.nonlinear(2, 1.0, 20.0, dt, delta=delta, alpha=alpha)
@@ -257,7 +257,7 @@ def test_the_nonlinear_observer_is_hans_for_short_samples() -> None:
 
 
 def test_the_nonlinear_observer_answers_an_outlier_gently() -> None:
-    """One bad measurement, a hundred times delta, moves f̂ by an eighth of what it moves the linear one's."""
+    """An outlier of a hundred times delta changes f̂ by an eighth of the linear one's change."""
     moved = []
     for observer in (ESO.model_free(2, 1.0, 20.0, DT), ESO.nonlinear(2, 1.0, 20.0, DT, delta=0.01)):
         y = np.zeros(50)
@@ -290,7 +290,7 @@ def test_an_observer_behind_a_delay_is_the_plain_one_fed_the_u_of_then(
     "ignore::quell.DesignWarning"
 )  # a delay of that size is unwise, and said to be
 def test_a_known_delay_saves_a_loop_that_swings_without() -> None:
-    """With u 0.2 s late at omega_o = 20 rad/s the plain observer works against its own u; the one that knows the delay settles."""
+    """With a delay of 0.2 s at omega_o = 20 rad/s only the observer that knows it settles."""
     plant = ql.plants.delayed(
         ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [1.0, 0.0]),
         delay=0.2,
@@ -309,7 +309,7 @@ def test_a_known_delay_saves_a_loop_that_swings_without() -> None:
 
 
 def test_a_delayed_plant_is_the_plant_with_the_u_of_then() -> None:
-    """Its own states are those of the plant; behind them stand the u under way, the newest first."""
+    """Its states are those of the plant, followed by the delayed values of u, newest first."""
     run = ql.simulate(
         ql.plants.delayed(PLANT, 0.03, 0.01),
         ql.ADRC(ESO.model_free(2, 1.5, 10.0, 0.01), 1.0),
@@ -393,7 +393,7 @@ def test_a_guarded_learner_serves_other_forms(name: str) -> None:
 
 
 def test_time_scales_are_those_of_the_poles() -> None:
-    """N/omega_o where all are one, n/omega_o for the reduced form, the sum over the levels for a cascade."""
+    """N/omega_o if all are equal, n/omega_o for the reduced form, a sum over a cascade's levels."""
     assert FORMS["half gain"].lag_time == pytest.approx(3 / 20.0, rel=0.05)
     assert FORMS["reduced"].lag_time == pytest.approx(2 / 20.0, rel=0.05)
     assert FORMS["cascade"].lag_time == pytest.approx(3 / 20.0 + 3 / 10.0, rel=0.02)
@@ -439,7 +439,7 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
             lambda: ESO.model_free(2, 1.0, 10.0, 0.01, half_gain=True, form="reduced"),
             "half_gain = True",
         ),
-        (lambda: ESO.model_free(2, 1.0, 10.0, 0.01, half_gain=1), "half_gain = 1"),  # type: ignore[arg-type]
+        (lambda: ESO.model_free(2, 1.0, 10.0, 0.01, half_gain=1), "half_gain = 1"),  # type: ignore
         (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, levels=0), "levels = 0"),
         (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, ratio=0.0), "ratio = 0.0"),
         (lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=0.0, drift=1.0), "noise_variance = 0.0"),

@@ -20,7 +20,8 @@ from quell.observers.eso import ESO
 def error_polynomial(observer: ESO) -> np.ndarray:
     """Return the characteristic polynomial of (I − L C) Φ about z = 1, in scaled coordinates.
 
-    A pole of multiplicity N moves by ε^(1/N), so polynomials are compared, not eigenvalues; about z = 1, where the poles crowd.
+    A pole of multiplicity N moves by ε^(1/N), so polynomials are compared, not eigenvalues; about
+    z = 1, close to all poles.
     """
     model, size = observer.model, observer.order + 1
     scale = observer.dt ** np.arange(size)
@@ -49,7 +50,7 @@ def test_all_poles_lie_at_exp_minus_omega_o_dt(order: int, dt: float, omega_o: f
     omega_o=st.floats(5.0, 50.0),
 )
 def test_a_model_moves_no_pole(a: list[float], dt: float, omega_o: float) -> None:
-    """Whatever the plant's coefficients, the model-based observer has the poles it was asked for."""
+    """The model-based observer has the requested poles for any coefficients of the plant."""
     observer = ESO.model_based((a, 2.0), omega_o=omega_o, dt=dt)
     rise = -math.expm1(-omega_o * dt)
     wanted = np.array([math.comb(len(a) + 1, i) * rise**i for i in range(len(a) + 2)])
@@ -57,7 +58,7 @@ def test_a_model_moves_no_pole(a: list[float], dt: float, omega_o: float) -> Non
 
 
 def test_the_sampled_gain_tends_to_the_continuous_one() -> None:
-    """L/dt approaches the gain that places the poles of A − lC at −omega_o, with an error of order dt."""
+    """L/dt approaches, with an error of order dt, the gain with the poles of A − lC at −omega_o."""
     a, omega_o = np.array([3.0, -1.0, 2.0, 0.5]), 10.0
     errors = []
     for dt in (1e-3, 1e-4):
@@ -68,7 +69,7 @@ def test_the_sampled_gain_tends_to_the_continuous_one() -> None:
 
 
 def test_the_fifth_gain_of_the_papers_table_is_wrong() -> None:
-    """Erratum to Table I: with its ``L_MB,5`` the poles are not at −omega_o; with ``omega_o^5`` they are.
+    """Erratum to Table I: with ``omega_o^5`` in place of ``L_MB,5`` the poles are at −omega_o.
 
     For a = −2 and omega_o = 10 the printed gain puts the slowest pole at −2.8.
     """
@@ -142,7 +143,7 @@ def test_what_is_learned_is_not_estimated_again() -> None:
 
 
 def test_the_predictor_form_is_the_current_form_a_sample_late(rng: np.random.Generator) -> None:
-    """Φ times what the current form knew, plus the input's effect: the same poles, y a sample later."""
+    """Its state is Φ times that of the current form, plus the inputs: the same poles, later y."""
     y, u = rng.normal(size=50), rng.normal(size=50)
     current, predictor = (
         ESO.model_free(order=3, b0=1.5, omega_o=8.0, dt=0.01, form=form)
@@ -217,7 +218,7 @@ UNOBSERVABLE = ql.plants.LinearPlant(np.diag([-1.0, -2.0]), [1.0, 1.0], [1.0, 0.
 def test_a_mistake_in_a_model_free_design_is_named(change: dict[str, object], message: str) -> None:
     """With the argument, its value and the rule."""
     with pytest.raises(ValueError, match=message):
-        ESO.model_free(**{"order": 4, "b0": 1.0, "omega_o": 10.0, "dt": 1e-3} | change)  # type: ignore[arg-type]
+        ESO.model_free(**({"order": 4, "b0": 1.0, "omega_o": 10.0, "dt": 1e-3} | change))
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ def test_a_sinusoid_is_a_sine_from_its_start() -> None:
 
 
 def test_a_chirp_has_the_frequency_it_names_at_both_ends() -> None:
-    """The derivative of its phase, seen through its zero crossings, goes from start to end and stays."""
+    """The frequency between its zero crossings goes from the first to the last value and stays."""
     t = np.linspace(0.0, 40.0, 400_001)
     wave = s.Chirp(omega_start=2.0, omega_end=10.0, duration=20.0)(t)
     crossings = t[1:][(wave[:-1] < 0.0) & (wave[1:] >= 0.0)]
@@ -223,7 +223,7 @@ def test_a_derivative_is_the_slope_of_the_signal(signal: s.Signal) -> None:
 
 
 def test_a_smooth_move_has_the_derivatives_it_promises() -> None:
-    """M of them are continuous, zero at both ends; the move of m = 2 is the minimum-jerk polynomial 10σ³ − 15σ⁴ + 6σ⁵."""
+    """The first m are continuous and zero at both ends; for m = 2 it is 10σ³ − 15σ⁴ + 6σ⁵."""
     sigma = np.linspace(0.0, 1.0, 101)
     np.testing.assert_allclose(
         s.SmoothMove(1.0, 1.0, smoothness=2)(sigma),

@@ -59,8 +59,9 @@ def test_without_friction_and_rounding_it_is_its_linear_plant(rng: np.random.Gen
 
 def test_it_obeys_newton(rng: np.random.Generator) -> None:
     """Torques over inertias; the motor's inertia counts by the square of the belt's ratio."""
-    twin = ql.plants.torsional(0.01, 0.002, motor_inertia=1e-4, belt=2.0, stiffness=2.0, shaft_damping=0.003, lower_viscous=0.02,
-                               upper_viscous=0.001, torque_constant=0.1, amplifier=1.5).linear  # fmt: skip
+    twin = ql.plants.torsional(
+        0.01, 0.002, 1e-4, 2.0, 2.0, 0.003, 0.02, 0.001, torque_constant=0.1, amplifier=1.5
+    ).linear
     x, u, w = rng.normal(size=4), 0.7, rng.normal(size=2)
     shaft = 2.0 * (x[0] - x[1]) + 0.003 * (x[2] - x[3])
     lower = (2.0 * 0.1 * 1.5 * u - shaft - 0.02 * x[2] + w[0]) / (0.01 + 4.0 * 1e-4)
@@ -100,7 +101,7 @@ def test_friction_only_takes_energy() -> None:
 
 
 def test_a_free_disk_stops_when_and_where_coulomb_says() -> None:
-    """Both disks turning as one, without viscous friction: ``ω0² J / 2C`` further, after ``ω0 J / C``."""
+    """Both disks together, without viscous friction: stop after ``ω0² J / 2C`` and ``ω0 J / C``."""
     inertia, coulomb, speed = np.array([0.0192, 0.0019]), 0.02, 3.0
     each = coulomb * inertia / inertia.sum()  # decelerates both alike, so the shaft stays straight
     twin = ql.plants.torsional(
@@ -147,7 +148,7 @@ def test_a_steady_speed_costs_coulomb_and_viscous_friction() -> None:
 
 
 def test_its_friction_agrees_with_an_independent_solution() -> None:
-    """Against Runge-Kutta on ``C tanh(ω/ε)`` with a tiny ε, through several reversals, under a sinusoid that keeps it moving."""
+    """Against Runge-Kutta on ``C tanh(ω/ε)`` with a tiny ε, through several reversals."""
     twin = ql.plants.torsional(dac_bits=None, counts=None)
     A, B = twin.linear.A, twin.linear.B[:, 0]
     samples = 1500
@@ -186,7 +187,7 @@ def test_halving_the_sample_time_changes_little() -> None:
 
 
 def test_the_encoder_counts() -> None:
-    """Y is the next whole count, of either sign, and never further than half a count from the angle."""
+    """Y is the nearest whole count, of either sign: at most half a count from the angle."""
     states, y = record(ql.plants.torsional(counts=1000), 0.3 * np.sin(np.arange(3000) * DT * 4.0))
     counts = y / (math.tau / 1000)
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
@@ -195,7 +196,7 @@ def test_the_encoder_counts() -> None:
 
 
 def test_any_plant_can_have_an_encoder() -> None:
-    """The wrapper moves the plant as it is and counts its output; the twin's encoder is the same."""
+    """The wrapper quantizes the output of an unchanged plant; the twin's encoder is the same."""
     plain, u = ql.plants.torsional_identified(), 0.2 * np.ones(400)
     states, y = record(plain, u)
     seen_states, seen = record(ql.plants.encoded(plain, 16_000), u)
@@ -276,7 +277,7 @@ def test_only_a_plant_can_have_an_encoder() -> None:
 
 
 def test_a_figure_is_judged_against_anothers() -> None:
-    """At most the other's, equal is enough; where the other has none there is nothing to exceed; what was not reached does not hold."""
+    """It holds if it is at most the other value, or the other is missing; not if it is missing."""
     judged = [
         Claim.at_most("a", "best", *values).holds
         for values in ((1.0, 1.0), (1.1, 1.0), (1.0, None), (None, 1.0))

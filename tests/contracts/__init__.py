@@ -1,1 +1,1 @@
-"""What every plant, observer and learner must do, found by itself: a new one is tested by existing."""
+"""The rules that every plant, observer and learner must keep; new ones are found and tested."""

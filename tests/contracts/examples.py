@@ -1,7 +1,7 @@
 """An example of everything there is.
 
-Learners are found in ``quell.learners`` and plants in their registry; both are made with their defaults. What needs arguments has
-an example here; a test fails for a plant without one.
+Learners are found in ``quell.learners`` and plants in their registry; both are made with their
+defaults. What needs arguments has an example here; a test fails for a plant without one.
 """
 
 from __future__ import annotations
