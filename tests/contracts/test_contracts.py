@@ -66,7 +66,7 @@ def flat(parameters: Any) -> list[Any]:
 
 
 def test_every_plant_has_an_example() -> None:
-    """Nothing public escapes the contracts: functions are registered, and each class has an instance."""
+    """Public functions of plants are registered, and each public class has an instance."""
     names = set(plant_room.__all__) - {"Plant", "PlantBatch", "batch"}
     public = {getattr(plant_room, name) for name in names}
     classes = {thing for thing in public if isinstance(thing, type)}
@@ -123,7 +123,7 @@ def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state
 
 @pytest.mark.parametrize("name", OBSERVERS)
 def test_an_observer_runs_the_same_again_and_interpreted(name: str) -> None:
-    """In a loop with the plant it was made for: same seed, same output; no second compilation; interpreted = compiled."""
+    """In a loop: same seed, same output; no second compilation; interpreted = compiled."""
     observer = OBSERVERS[name]
     companion = np.diag(np.ones(observer.order - 1), 1)
     companion[-1] = -observer.a
@@ -133,7 +133,7 @@ def test_an_observer_runs_the_same_again_and_interpreted(name: str) -> None:
     )
 
 
-# Other features for the same learner: what they do compiled is seen below, without a loop, which takes long to compile.
+# Other features for the same learner: tested below without a loop, which takes long to compile.
 IN_LOOPS = [name for name in LEARNERS if not name.endswith(("radial features", "random features"))]
 
 
@@ -145,7 +145,7 @@ def test_a_learner_runs_the_same_again_and_interpreted(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["Kalman", "MLP", "PythonModel"])
 def test_a_guarded_learner_runs_the_same_again_and_interpreted(name: str) -> None:
-    """The guard changes nothing of that, and compiles with a learner of each kind (with every one in its steps, below)."""
+    """The same holds with a guard, for a learner of each kind (for every one below, step by step)."""
     check_run(CHAIN, law_for(CHAIN, learner=LEARNERS[name], guard=ql.Guard(time=0.5)), SHORT)
 
 
@@ -210,7 +210,7 @@ def drive(design: Any, memory: Any, seen: Any, y: Any, u: Any, f: Any, said: Any
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.Generator) -> None:
-    """1e5 samples of anything that is finite, wild in size: all it holds and says stays a number, and it is the same again."""
+    """1e5 finite samples of very different size: state and output stay finite and repeatable."""
     # Models that are Python objects take their time.
     learner, samples = LEARNERS[name], 20_000 if name in PYTHON_LEARNERS else 100_000
     design = learner.design(OBSERVERS["model-free, order 2, current"], 1.0)
@@ -237,7 +237,7 @@ def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
-    """Saved and restored by named arrays, copied, or sent: the same bits from there on. Interpreted: compiled steps are for controllers."""
+    """Saved and restored by named arrays, copied or pickled: the same bits afterwards, interpreted."""
 
     def step(law: ql.ADRC, y: float) -> float:
         return control(law.parameters, law._state, 0.5, y)
