@@ -272,7 +272,7 @@ def test_each_way_to_end_has_its_exit_code() -> None:
         (
             "duration = 0.5",
             "duration = 0.5\nrest_at = [0.2]",
-            "rig: rest_at = (0.2,): a plant of metal can't be put back to rest",
+            "rig: rest_at = (0.2,): a real plant can't be put back to rest",
         ),
     ],
 )
