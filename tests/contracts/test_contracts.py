@@ -145,7 +145,7 @@ def test_a_learner_runs_the_same_again_and_interpreted(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["Kalman", "MLP", "PythonModel"])
 def test_a_guarded_learner_runs_the_same_again_and_interpreted(name: str) -> None:
-    """The same holds with a guard, for a learner of each kind (for every one below, step by step)."""
+    """The same holds with a guard, for one learner of each kind (all of them in steps below)."""
     check_run(CHAIN, law_for(CHAIN, learner=LEARNERS[name], guard=ql.Guard(time=0.5)), SHORT)
 
 
@@ -237,7 +237,7 @@ def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
-    """Saved and restored by named arrays, copied or pickled: the same bits afterwards, interpreted."""
+    """Saved and restored by named arrays, copied or pickled: the same bits follow, interpreted."""
 
     def step(law: ql.ADRC, y: float) -> float:
         return control(law.parameters, law._state, 0.5, y)
