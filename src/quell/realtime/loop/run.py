@@ -56,10 +56,10 @@ def run_rig(
     *,
     duration: float | None = None,
     safety: Safety | None = None,
-    approach: float = 1.0,
+    approach: float = 1.0,  # chosen by hand
     telemetry: Sequence[str | PathLike[str] | Sink] = (),
     spin: float = 0.0,
-    priority: int = 50,
+    priority: int = 50,  # the middle of the range; chosen by hand
     cpu: int | None = None,
     on_change: Callable[[ModeChange], None] | None = None,
 ) -> RigRun:

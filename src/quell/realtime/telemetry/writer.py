@@ -75,7 +75,7 @@ class TelemetryWriter:
         header: Header,
         sinks: Sequence[Sink] = (),
         *,
-        period: float = 0.05,
+        period: float = 0.05,  # chosen by hand: short for a viewer, long for the interpreter
         urgent: bool = False,
     ) -> None:
         self.header, self.period = header, checks.positive("period", period, "s")
@@ -125,7 +125,7 @@ class TelemetryWriter:
         drain(self.ring)  # compiles it, or loads it from disk
         self._thread.start()
 
-    def stop(self, timeout: float = 10.0) -> None:
+    def stop(self, timeout: float = _CAPACITY) -> None:
         """Write the rest of the ring and close all sinks; give up after ``timeout`` [s]."""
         self._stopped.set()
         self._thread.join(timeout)
