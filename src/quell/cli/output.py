@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Table
 
 from quell.cli.options import Outputs, RunOutputs
 
 if TYPE_CHECKING:
+    from rich.progress import ProgressColumn
+
     from quell.controllers import Controller
     from quell.plants import Plant
     from quell.records.trajectory import Trajectory
@@ -132,6 +133,8 @@ def progress_bar(
     width
         least width of the label.
     """
+    from rich.progress import BarColumn, Progress, TextColumn
+
     label = TextColumn(f"{{task.description:<{width}}}")
     with Progress(label, BarColumn(), *more, console=console, transient=True) as bar:
         task = bar.add_task(first, total=1.0)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import TextColumn, TimeRemainingColumn
 
 from quell.cli.options import OUTPUTS, Outputs, Whole
 from quell.cli.output import check_outputs, number, progress_bar, table, write_results
@@ -43,6 +42,8 @@ def stress(
     guard
         With the guard, or without it, for comparison.
     """
+    from rich.progress import TextColumn, TimeRemainingColumn
+
     from quell.experiments.stress import figures, study
     from quell.guard import Guard
 
