@@ -100,7 +100,7 @@ class ControlLoop:
             entry(self.handle, self.clock, self.times, controller)
 
     def _compile(self) -> None:
-        """Compile by a run that is finished before it begins, or by a step after the end of a run."""
+        """Compile by a run that is finished before it begins, or by a step after its end."""
         finished = copy.deepcopy(self.controller.supervisor)
         finished.memory[0].mode, finished.memory[0].samples = Mode.STOPPED, FLUSH + 1
         over = self.controller._replace(

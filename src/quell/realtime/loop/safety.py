@@ -51,8 +51,8 @@ class Safety:
     most_error: float = math.inf
     most_f: float = math.inf
     most_saturated: int | None = None
-    # Chosen by hand; not tuned further: hold must be shorter than the device's watchdog (20 ticks for
-    # a rig), and settle as long as the observer needs.
+    # Chosen by hand; not tuned further: hold must be shorter than the device's watchdog (20 ticks
+    # for a rig), and settle as long as the observer needs.
     hold: int = 5
     most_overruns: int = 5
     ramp: int = 50

@@ -31,7 +31,8 @@ _LOG = logging.getLogger(__name__)
 # sleeps as long [s].
 _BURST = 100
 _PAUSE = 1e-4
-# The ring holds the rows of so many seconds, so that a disk may stall as long; chosen by hand.
+# The ring holds the rows of so many seconds, so that a disk may stall as long, and at least so many
+# rows; chosen by hand.
 _CAPACITY = 10.0
 _LEAST_ROWS = 256
 
