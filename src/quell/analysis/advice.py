@@ -17,8 +17,7 @@ from quell.plants.linear import LinearPlant
 
 # RMS of u as a share of its range: six standard deviations are then 30 % of it. Chosen by hand.
 _NOISE = 0.05
-# Between the loops of a chain of four integrators with omega_o = 10 omega_c, 0.41, and with 3
-# omega_c, 0.24.
+# Between loops of four integrators with omega_o = 10 omega_c, 0.41, and with 3 omega_c, 0.24.
 _LEAST_MODULUS = 0.3
 # Share of the modulus margin that a lag must leave. Chosen by hand.
 _LAG_LEAVES = 0.8

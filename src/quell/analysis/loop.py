@@ -43,8 +43,7 @@ def analyse(
     Parameters
     ----------
     plant
-        a ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction``, or ``(num, den)``
-        in powers of s.
+        ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction`` or ``(num, den)``.
     controller
         an ``ADRC`` or a linear controller; a prefilter in front of it is left out.
     at
@@ -282,8 +281,7 @@ class LoopAnalysis:
         Use it to read, and ``system`` to compute: coefficients in double precision do not determine
         poles that lie close together near z = 1. With omega_o dt = 0.12 the step response of P, C_r
         and C_y, closed by python-control in state space, is exact to 1e-9 up to order 3 and to 3e-8
-        for order 4; that of the closed loop as one fraction to 1e-9, 1e-6 and 3e-3 for orders 2, 3
-        and 4.
+        for order 4; that of the closed loop as one fraction to 1e-9, 1e-6, 3e-3 for orders 2 to 4.
         """
         return transfer_function(subsystem(self.plant, self.law, name), self.dt)
 

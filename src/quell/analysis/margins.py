@@ -27,16 +27,14 @@ from quell.types import Vector
 
 Response = Callable[[Vector], Complex]
 
-# Gains beyond these factors are not searched for the edge of stability: they are far from any
-# physical gain error.
+# Range of the search for the edge of stability: far beyond any physical error of a gain.
 _LEAST_FACTOR, _LARGEST_FACTOR = 1e-9, 1e9
 # How far below the lowest frequency of the grid ω → 0 is evaluated.
 _TOWARDS_ZERO = 1e-3
 # Local minima to refine: a sharp dip may lie beside a grid point that is not the lowest. Chosen by
 # hand; one was enough in the loops that ``frequency_response`` names.
 _MINIMA = 3
-# Relative errors of the refined frequencies. A minimum is flat, so that its value is exact well
-# before its place.
+# Relative errors of the refined frequencies. The value of a flat minimum is exact before.
 _MINIMUM_TOLERANCE, _CROSSING_TOLERANCE = 1e-9, 1e-13
 
 
@@ -83,8 +81,7 @@ def margins(
     dt
         sample time [s].
     stable_with
-        function that returns whether the closed loop is stable with its gain multiplied by a
-        factor.
+        function that returns whether the closed loop is stable with its gain times a factor.
     """
     nan = math.nan
     if not stable_with(1.0):

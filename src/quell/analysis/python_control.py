@@ -34,8 +34,7 @@ def transfer_function(system: System, dt: float) -> Any:
         impulse_response.append(float(C @ x))
         x = x + N @ x
     numerator = np.convolve(denominator, impulse_response)[: denominator.size]
-    # Cancel a common pole and zero at z = 0: the u of the sample before, which is a state of both
-    # plant and controller.
+    # Cancel poles and zeros at z = 0: the last u may be a state of both plant and controller.
     while denominator.size > 1 and all(
         abs(part[-1]) < _ROUNDING * np.max(np.abs(part)) for part in (numerator, denominator)
     ):

@@ -17,8 +17,7 @@ from quell.lti.models import TransferFunction, leading_gain, read_model, to_stat
 from quell.plants.linear import LinearPlant
 from quell.types import Matrix, Vector
 
-# Limit on the number of states that a dead time adds; the cost of eigenvalues grows with its cube.
-# Chosen by hand.
+# Limit on the states that a dead time adds; eigenvalues cost its cube. Chosen by hand.
 _MOST_SAMPLES = 200
 
 
@@ -57,8 +56,7 @@ def sampled_plant(
     Raises
     ------
     ValueError
-        for an object that is not such a plant, direct feedthrough, or a dead time of more than 200
-        samples.
+        for another object, direct feedthrough, or a dead time of more than 200 samples.
     """
     delay = checks.non_negative("delay", delay, "s")
     actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")

@@ -64,8 +64,7 @@ def _open_loop(plant: SampledPlant, law: LinearLaw, name: str) -> System:
     if name == "C_y":
         return C_y
     n, m = plant.N.shape[0], N.shape[0]
-    # L, with the loop broken at the plant's input: from there through the plant to the output of
-    # C_y.
+    # L: the loop is broken at the plant's input, from which it leads through the plant to C_y.
     A: Matrix = np.block([[plant.N, np.zeros((n, m))], [np.outer(C_y.B, plant.C), N]])
     return System(A, np.append(plant.B, np.zeros(m)), np.concatenate([C_y.D * plant.C, C_y.C]), 0.0)
 

@@ -15,8 +15,7 @@ from quell.controllers.limits import Limits
 from quell.kernels.dispatch import dispatcher_for
 from quell.kernels.user_types import explain_compile_errors
 
-# Attributes that are made again in a copy: compiled functions and shared arrays belong to one
-# process.
+# A copy makes these again: compiled functions and shared arrays belong to one process.
 _NOT_COPIED = ("parameters", "_state", "_arrays", "_packed", "_step")
 
 
@@ -74,8 +73,7 @@ class StatefulController:
         one, or by the one that an observer expects; ``status`` reports it. The controller assumes
         that the returned value is applied: set limits by ``u_min``, ``u_max`` and ``rate_limit``.
 
-        The first call compiles, or loads from the disk cache; call ``prepare`` to do that
-        beforehand.
+        The first call compiles, or loads from the disk cache; ``prepare`` does that beforehand.
         """
         if self._packed is None:
             self.prepare()

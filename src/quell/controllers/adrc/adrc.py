@@ -46,8 +46,7 @@ class ADRC(StatefulController):
     learner
         predicts f and feeds it forward; none by default.
     guard
-        limits the learner to the authority that it has earned; without one the learner has full
-        authority.
+        limits the learner to the authority that it has earned, which is full without a guard.
     feedforward
         whether to feed the reference's derivatives forward. ``simulate`` takes them from the
         signal, ``step`` from its arguments. The ideal loop then follows the reference without lag.
@@ -171,8 +170,7 @@ class ADRC(StatefulController):
         the returned value is applied: set limits by ``u_min``, ``u_max`` and ``rate_limit``, or
         call ``applied`` with what was applied.
 
-        The first call compiles, or loads from the disk cache; call ``prepare`` to do that
-        beforehand.
+        The first call compiles, or loads from the disk cache; ``prepare`` does that beforehand.
 
         Raises
         ------
@@ -210,8 +208,7 @@ class ADRC(StatefulController):
         y
             measurement [y-unit].
         u
-            control signal that holds the plant there [u-unit]; outside of the limits, the next step
-            jumps to them.
+            control signal that holds the plant there [u-unit]; should be within the limits.
         r
             reference of the next step [y-unit]; ``y`` by default. With another one u still
             continues without a jump, and the move begins with the observer's own dynamics.
@@ -238,8 +235,7 @@ class ADRC(StatefulController):
         Returns
         -------
         float
-            the control signal that the controller would have applied; ``hand_over`` bridges the
-            difference.
+            the control signal that the controller would have applied [u-unit].
 
         Raises
         ------

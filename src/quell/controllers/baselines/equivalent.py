@@ -38,14 +38,12 @@ def equivalent_pid(controller: ADRC, **options: Any) -> PID:
     controller
         an ``ADRC`` without learner around a model-free ESO of order 1 or 2.
     **options
-        limits and name of the PID controller; by default the limits of ``controller``, except its
-        rate limit.
+        limits and name; by default the limits of ``controller``, except its rate limit.
 
     Raises
     ------
     ValueError
-        for an ADRC of another order, with a learner, feedforward or another observer, and for
-        anything but an ADRC.
+        for an ADRC with another order or observer, a learner or feedforward, or another type.
     """
     _check_linear(controller)
     observer, gains = controller.observer, controller.parameters.law.tolist()

@@ -39,8 +39,7 @@ class PID(LinearController):
     b, c
         set-point weights of the proportional and the derivative part, usually 0 to 1.
     tt
-        tracking time [s]; by default √(T_i T_d), or T_i without derivative (Åström & Hägglund 2006,
-        section 3.5).
+        tracking time [s]; by default √(T_i T_d), or T_i without derivative (section 3.5, as above).
     dt
         sample time [s].
     setpoint

@@ -21,8 +21,7 @@ slow force d on the load (observer_law.py). The reference is corrected for d at 
 
     r_1 = r − d̂/k − κ d̂/(m_1 k_p)
 
-that is, for the twist of the spring that carries d, and for the deflection of the motor's position
-control under it.
+that is, for the twist of the spring and the deflection of the motor's position control under d.
 """
 
 from __future__ import annotations
@@ -46,15 +45,13 @@ class ResonanceRatio(LinearController):
     Parameters
     ----------
     m1, m2, k
-        motor and load [kg], spring [N/m] of the design; inertias and torsional stiffness for a
-        torsional system.
+        motor and load [kg], spring [N/m] of the design; for torsion inertias and stiffness.
     omega_o
         bandwidth of the filter [rad/s]: the radius of its fastest poles, if above the resonance.
     dt
         sample time [s].
     omega_d
-        bandwidth of the estimate of the force on the load [rad/s]; by default half the
-        anti-resonance.
+        bandwidth of the estimated load force [rad/s]; by default half the anti-resonance.
     ratio
         H, above 1; √5 by default.
     measured

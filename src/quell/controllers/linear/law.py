@@ -22,8 +22,7 @@ class LinearLaw(NamedTuple):
         u_wished = C x + D_r r + D_y y          u = limited(u_wished)
         x⁺       = A x + B_r r + B_y y + B_u u
 
-    Without limits, u is u_wished and the law is the linear system with A + B_u C and so on. B_u
-    prevents windup.
+    Without limits, u is u_wished and the law is linear with A + B_u C etc. B_u prevents windup.
     """
 
     A: Matrix

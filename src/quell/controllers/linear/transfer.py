@@ -40,8 +40,7 @@ def as_state_space(num: Any, den: Any = None) -> System:
     Raises
     ------
     ValueError
-        for several inputs or outputs, a transfer function that is not proper, or one with a sample
-        time.
+        for several inputs or outputs, a system that is not proper, or one with a sample time.
     """
     if den is not None:
         return realised([num], den)

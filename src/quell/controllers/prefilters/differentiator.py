@@ -80,8 +80,7 @@ class TrackingDifferentiator:
     acceleration
         largest second derivative, r_0 [y-unit/s²].
     horizon
-        h_0 [s]: the sample time (by default) for the shortest transition, larger for a smoother
-        one.
+        h_0 [s]: by default the sample time, for the shortest transition; larger is smoother.
 
     Raises
     ------

@@ -4,8 +4,7 @@
 
 If as many derivatives are fed forward as the plant has integrators, the ideal loop responds to r as
 the model does, for any ``omega_c``: two degrees of freedom, one for the reference and one for
-disturbances (Horowitz, *Synthesis of Feedback Systems*, 1963). The model is sampled with zero-order
-hold.
+disturbances (Horowitz, *Synthesis of Feedback Systems*, 1963). It is sampled with zero-order hold.
 """
 
 from __future__ import annotations
@@ -92,8 +91,7 @@ class ReferenceModel:
     Raises
     ------
     ValueError
-        for a bandwidth that is not positive, and in ``design`` for one too high for the sample
-        time.
+        for a bandwidth that is not positive, or in ``design`` too high for the sample time.
     """
 
     omega: float

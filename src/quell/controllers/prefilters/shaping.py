@@ -84,8 +84,7 @@ class Shaper:
     Raises
     ------
     ValueError
-        for different numbers of both, times that do not begin at 0 or do not increase, and another
-        sum than 1.
+        for different numbers of both, times that do not increase from 0, and another sum than 1.
     """
 
     times: tuple[float, ...]
@@ -117,8 +116,7 @@ class Shaper:
         Raises
         ------
         ValueError
-            for a dt that is not positive, or with which the shaper takes more than ten million
-            samples.
+            for a dt that is not positive, or a shaper of more than ten million samples.
         """
         if self.times[-1] / checks.positive("dt", dt, "s") > _MOST_SAMPLES:
             rule = f"the shaper's {self.times[-1]:.3g} s must be at most {_MOST_SAMPLES} samples"
