@@ -1,8 +1,9 @@
-"""Why Algorithm 1 diverges: the same algorithm with and without the control signal among its features.
+"""Divergence of Algorithm 1 with and without the control signal among its features.
 
     python benchmarks/algorithm_1.py
 
-The two-mass scenario at dt = 10 ms, drawn out to 1000 s, with a batch of one, in plain numpy: an implementation apart from quell's.
+The two-mass scenario at dt = 10 ms, extended to 1000 s, with a batch of one, in plain numpy. The
+implementation is independent of that in quell.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ DT, HORIZON = 0.01, 1000.0
 
 
 def run(rate: float, with_u: bool) -> tuple[float, np.ndarray, float]:
-    """Return when the run ended, θ shortly before (at 99 % of it), and the effective gain (b0 + θ_u)/b0 then."""
+    """Return the end of the run, and θ and the gain ratio (b0 + θ_u)/b0 at 99 % of this time."""
     settings = study.Settings(dt=DT)
     observer, scenario = (
         ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT).model,

@@ -1,9 +1,10 @@
-"""How many runs a second a batch does.
+"""Speed of batch simulation in runs per second.
 
     python benchmarks/batch.py [--runs 1000]
 
-Random two-mass plants, 30 s at 10 ms, with an ADRC around a model-based ESO: as a batch on all cores, as a batch in one thread, and as a
-Python loop over ``simulate``. Times on a shared machine mean little; the best of several interleaved trials means more.
+Random two-mass plants, 30 s at 10 ms, with an ADRC and a model-based ESO: as a batch on all cores,
+as a batch in one thread, and as a Python loop over ``simulate``. Each time is the best of several
+interleaved trials, because single times on a shared machine vary.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import quell as ql
 
 
 def main() -> None:
-    """Print runs a second, and the ratio to a loop over ``simulate``."""
+    """Print runs per second, and the ratio to a loop over ``simulate``."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -37,9 +38,10 @@ def main() -> None:
     plants = ql.plants.batch(ql.plants.two_mass_spring, m1=m1, m2=m2, k=k)
     result = ql.simulate(plants, controller, scenario)
     print(
-        f"{runs} runs of {scenario.duration:g} s at {controller.dt * 1e3:g} ms, {np.count_nonzero(result.diverged)} diverged"
+        f"{runs} runs of {scenario.duration:g} s at {controller.dt * 1e3:g} ms, "
+        f"{np.count_nonzero(result.diverged)} diverged"
     )
-    # By the clock on the wall, since threads are to be judged.
+    # Elapsed time, because several threads are measured.
     candidates = (
         lambda: ql.plants.batch(ql.plants.two_mass_spring, m1=m1, m2=m2, k=k),
         lambda: ql.simulate(plants, controller, scenario),
@@ -57,7 +59,8 @@ def main() -> None:
     )
     for label, time in zip(labels, times, strict=True):
         print(
-            f"{label:24s} {time:7.3f} s {runs / time:9.0f} runs/s {times[-1] / time:7.1f} × the loop"
+            f"{label:24s} {time:7.3f} s {runs / time:9.0f} runs/s {times[-1] / time:7.1f} × "
+            f"the loop"
         )
 
 

@@ -1,4 +1,4 @@
-"""The two-mass loop in C (``reference.c``) and the stop-watch: what the benchmarks of speed share."""
+"""Common parts of the speed benchmarks: the two-mass loop in C (``reference.c``), timing, tables."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ SOURCE = Path(__file__).with_name("reference.c")
 def c_reference(
     folder: Path, settings: study.Settings, duration: float = study.END
 ) -> Callable[[bool], np.ndarray]:
-    """Build ``reference.c``; return a function that runs the study's L-ESO in it, and returns the log where it is to be recorded.
+    """Build ``reference.c``; return a function that runs the study's L-ESO in it.
 
-    Design and noise are made here, so that running takes no longer than the loop does.
+    The function returns the log if its argument is true. Design and noise are computed in advance,
+    so only the loop itself is timed.
     """
     library = folder / "reference.so"
     command = [
@@ -90,7 +91,7 @@ def c_reference(
 
 
 def best(*candidates: Callable[[], object], trials: int) -> list[float]:
-    """Time candidates in turn, several times; return the best time of each [s], that of this thread: others on the machine don't count."""
+    """Time the candidates in turn ``trials`` times; return the best thread time of each [s]."""
     found = [float("inf")] * len(candidates)
     for _ in range(trials):
         for i, candidate in enumerate(candidates):
@@ -101,12 +102,12 @@ def best(*candidates: Callable[[], object], trials: int) -> list[float]:
 
 
 def row(what: str, ratio: float, bar: str, times: str) -> dict[str, object]:
-    """Return a line of the table."""
+    """Return a row of the table."""
     return {"what": what, "ratio": ratio, "bar": bar, "times": times}
 
 
 def show(rows: Sequence[dict[str, object]], file: Path | None, title: str | None = None) -> None:
-    """Print a table, and write its rows to ``file`` where there is one."""
+    """Print a table, and write its rows to ``file`` unless it is None."""
     table = Table("what", "measured", "bar", "times", title=title)
     for line in rows:
         table.add_row(

@@ -1,15 +1,18 @@
-"""The loop on trial: random faults on the wire, stalls of either side, either side killed.
+"""Test of the real-time loop with random faults: frames on the wire, stalls and kills of processes.
 
-    python benchmarks/faults.py                          # 200 trials over UDP, on an idle machine: about 15 minutes
+    python benchmarks/faults.py                # 200 trials over UDP, on an idle machine: 15 minutes
     python benchmarks/faults.py --trials 20 --seed 7 --json faults.json
 
-Each trial is a loop in a process of its own, around a twin in another, with a relay between them. What is asked:
+Each trial runs a loop in one process, a twin in another, and a relay between them. It checks:
 
-* on the wire: every command that reached the rig, as the rig's own log has it, is a number within the limits;
-* the loop: after more than ``hold`` deadlines in a row without a good sample, or whatever else its rules name, u goes to zero in ``ramp``
-  samples and stays there; where it has no reason to end, it runs to the end. The record is judged here anew, without the supervisor;
-* the rig: when the loop is killed, or silent for ``watchdog`` ticks, u is zero from that tick on; in any case it is zero in the end;
-* telemetry: of a loop that is killed, both files can be read and lack at most the last second; else they lack nothing.
+* the wire: every command in the rig's log is finite and within the limits;
+* the loop: after more than ``hold`` deadlines in a row without a good sample, or another violation
+  of its rules, u goes to zero in ``ramp`` samples and stays there; otherwise the loop runs to its
+  end. The record is checked here independently of the supervisor;
+* the rig: when the loop is killed, or silent for ``watchdog`` ticks, u is zero from that tick on;
+  at the end it is always zero;
+* telemetry: after a kill both files are readable and lack at most the last second; otherwise they
+  are complete.
 """
 
 from __future__ import annotations
@@ -52,7 +55,7 @@ TROUBLES = (
 
 
 def controller() -> ql.ADRC:
-    """Return an L-ESO that often lies at its limits, as the reference is too quick for it."""
+    """Return an L-ESO that is often at its limits, because the reference is too fast for it."""
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=40.0, dt=DT)
     return ql.ADRC(
         observer,
@@ -65,7 +68,7 @@ def controller() -> ql.ADRC:
 
 
 class RigProcess:
-    """The twin in a process of its own, with its log; it serves trial after trial until it is killed."""
+    """The twin in its own process, with its log. It serves all trials until it is killed."""
 
     def __init__(self, folder: Path, number: int) -> None:
         self.log = folder / f"rig-{number}.csv"
@@ -92,8 +95,8 @@ class RigProcess:
         self._seen = 0
 
     def rows(self) -> np.ndarray:
-        """Return the log's rows since the last call: columns as in ``LOG``."""
-        time.sleep(0.2)  # it is written every 50 ms
+        """Return the rows of the log since the last call, with the columns of ``LOG``."""
+        time.sleep(0.2)  # the log is written every 50 ms
         with self.log.open(encoding="utf-8") as file:
             file.seek(self._seen)
             text = file.read()
@@ -108,13 +111,13 @@ class RigProcess:
         ).reshape(-1, len(LOG))
 
     def end(self) -> None:
-        """End it."""
+        """Stop the process."""
         self.process.terminate()
         self.process.wait()
 
 
 def loop(url: str, folder: Path) -> None:
-    """Be the loop's process."""
+    """Run the loop and write its results; this is the child process of a trial."""
     device = open_device(url, DT)
     files = [folder / "run.csv", folder / "run.mcap"]
     run = run_rig(
@@ -137,7 +140,7 @@ def loop(url: str, folder: Path) -> None:
 
 
 def warm_up(url: str) -> None:
-    """Compile or load what every trial needs, once; they are forked from here."""
+    """Compile or load the loop once; the trials are forked from this process."""
     run_rig(
         open_device(url, DT),
         controller(),
@@ -149,7 +152,7 @@ def warm_up(url: str) -> None:
 
 
 def trial(number: int, rig: RigProcess, folder: Path, draw: random.Random) -> dict[str, Any]:
-    """Run one, and judge it."""
+    """Run and check one trial."""
     kind = draw.choice(TROUBLES)
     first, many = draw.randint(150, 1200), max(round(500 ** draw.random()), 1)
     towards, late = draw.choice(("loop", "rig")), draw.randint(1, 10)
@@ -183,13 +186,12 @@ def trial(number: int, rig: RigProcess, folder: Path, draw: random.Random) -> di
 
 
 def disturb(kind: str, pid: int, rig: RigProcess, relay: Relay, first: int, many: int) -> bool:
-    """Do what no relay can; tell whether the loop was killed."""
+    """Stall, kill or interrupt a process; return whether the loop was killed."""
     if kind in KINDS:
         return False
     deadline = time.monotonic() + 20.0
-    while (
-        relay.passed["rig"] < first and time.monotonic() < deadline
-    ):  # so many commands have gone by
+    # Wait until ``first`` commands have passed.
+    while relay.passed["rig"] < first and time.monotonic() < deadline:
         time.sleep(0.001)
     whom = rig.process.pid if kind.endswith("the rig") else pid
     if kind.startswith("stall"):
@@ -206,7 +208,7 @@ def disturb(kind: str, pid: int, rig: RigProcess, relay: Relay, first: int, many
 
 
 def judged(folder: Path, log: np.ndarray, *, loop_killed: bool, rig_killed: bool) -> dict[str, Any]:
-    """Return what was wrong, if anything, and how it ended."""
+    """Return the errors found and how the trial ended."""
     wrong = judge_wire(log, rig_killed)
     found: dict[str, Any] = {"ended": "the loop was killed", "wrong": wrong}
     files = [folder / "run.csv", folder / "run.mcap"]
@@ -227,12 +229,12 @@ def judged(folder: Path, log: np.ndarray, *, loop_killed: bool, rig_killed: bool
 
 
 def judge_wire(log: np.ndarray, rig_killed: bool) -> list[str]:
-    """Judge what the rig saw and did."""
+    """Return the errors in the rig's log."""
     wrong: list[str] = []
     state, u, command = (log[:, LOG.index(name)] for name in ("state", "u", "command"))
     came = command[np.isfinite(command)]
     if came.size == 0:
-        wrong.append("no command came at all")
+        wrong.append("no command arrived")
     if np.any(np.abs(came) > LIMIT) or np.any(np.abs(u) > LIMIT) or not np.all(np.isfinite(u)):
         wrong.append(
             f"u of {max(np.max(np.abs(came), initial=0.0), np.max(np.abs(u))):g} on the wire"
@@ -251,12 +253,12 @@ def judge_wire(log: np.ndarray, rig_killed: bool) -> list[str]:
     if any(
         np.any(np.diff(state[(session == one) & (state >= LIVE)]) < 0) for one in np.unique(session)
     ):
-        wrong.append("a tripped session came back to life")
+        wrong.append("a tripped session became live again")
     return wrong
 
 
 def judge_loss(path: Path, log: np.ndarray, wrong: list[str]) -> float:
-    """Return how much of a killed loop's last commands its record lacks [s]."""
+    """Return the time that is missing at the end of a killed loop's record [s]."""
     command = log[:, LOG.index("command")]
     commands = int(
         np.flatnonzero(np.isfinite(command))[-1] - np.flatnonzero(np.isfinite(command))[0]
@@ -265,9 +267,9 @@ def judge_loss(path: Path, log: np.ndarray, wrong: list[str]) -> float:
         last = load(path)["k"][-1]
     except ValueError as error:
         if "has no row" not in str(error):
-            wrong.append(f"{path.name} can't be read: {error}")
+            wrong.append(f"{path.name} cannot be read: {error}")
             return math.nan
-        last = -1.0  # killed before the first row got there: all is lost
+        last = -1.0  # killed before the first row was written: the whole record is lost
     lost = (commands - last) * DT
     if lost > 1.0:
         wrong.append(f"{path.name} lacks the last {lost:.2f} s")
@@ -275,13 +277,13 @@ def judge_loss(path: Path, log: np.ndarray, wrong: list[str]) -> float:
 
 
 def judge_record(path: Path, told: dict[str, Any], wrong: list[str]) -> None:
-    """Judge a whole record by the rules, without the supervisor's own word."""
+    """Check a complete record against the rules, independently of the supervisor."""
     record = load(path)
     mode, u, good = record["mode"].astype(int), record["u"], np.isfinite(record["y_measured"])
     if np.any(np.abs(u) > LIMIT) or not np.all(np.isfinite(u)):
         wrong.append(f"{path.name}: u beyond its limits")
     if mode[-1] != Mode.STOPPED or u[-1] != 0.0:
-        wrong.append(f"{path.name}: did not end at zero")
+        wrong.append(f"{path.name}: u did not end at zero")
     if (
         len(record) - np.count_nonzero(record["events"].astype(int) >> 16 & 1)
         != told["tally"]["cycles"]
@@ -297,17 +299,17 @@ def judge_record(path: Path, told: dict[str, Any], wrong: list[str]) -> None:
             break
     down = np.flatnonzero(mode >= Mode.RAMP)
     if np.any(np.diff(mode[down]) < 0) or np.any(mode[down[0] :] < Mode.RAMP):
-        wrong.append(f"{path.name}: it went on after it had begun to stop")
+        wrong.append(f"{path.name}: the run continued after the ramp began")
     if down.size > SAFETY.ramp + FLUSH + 1 + np.count_nonzero(
         record["events"][down].astype(int) >> 16 & 1
     ):
-        wrong.append(f"{path.name}: it took {down.size} samples to stop")
+        wrong.append(f"{path.name}: the loop took {down.size} samples to stop")
     if np.any(np.diff(np.abs(u[down])) > 1e-12):
-        wrong.append(f"{path.name}: u grew on its way to zero")
+        wrong.append(f"{path.name}: |u| increased during the ramp")
 
 
 def main() -> None:
-    """Run the trials, print how they ended."""
+    """Run the trials and print how they ended."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -345,9 +347,9 @@ def main() -> None:
         print(f"{kind:<20} {len(mine):>6}  {ends}")
     lost = [part for found in results for part in found.get("lost", ())]
     if lost:
-        print(f"telemetry that a killed loop lost: at most {np.nanmax(lost):.3f} s")
+        print(f"telemetry lost by a killed loop: at most {np.nanmax(lost):.3f} s")
     bad = sum(bool(found["wrong"]) for found in results)
-    print(f"{len(results)} trials, {bad} with something wrong")
+    print(f"{len(results)} trials, {bad} with errors")
     if options.json is not None:
         write_json(options.json, nonfinite_to_none(results))
     sys.exit(1 if bad else 0)

@@ -1,4 +1,4 @@
-"""What L-ESO still knows of the plant after a sinusoidal load that went on for a while, without and with a feature for the load.
+"""Effect of a long sinusoidal load on the learned model, with and without a feature for the load.
 
 python benchmarks/forgetting.py
 """

@@ -1,15 +1,17 @@
-"""What a nonlinear learner gains where friction and a stiffening spring are what disturbs.
+"""Nonlinear learners on a plant with friction and a stiffening spring.
 
-    y'' = 2 u − y − 2 y³ − tanh(y'/0.05),     model-free ESO of 30 rad/s,     omega_c = 5 rad/s,     dt = 2 ms
+    y'' = 2 u − y − 2 y³ − tanh(y'/0.05), model-free ESO of 30 rad/s, omega_c = 5 rad/s, dt = 2 ms
 
-The error is against the ideal closed loop, ``omega_c²/(s + omega_c)²`` of the reference: what is left of it is what was not rejected. It
-is taken over the second minute. All learners have their defaults, but for the features named.
+The error is the difference from the ideal closed loop ``omega_c²/(s + omega_c)²``, so it is caused
+by the part of the disturbance that is not rejected. It is evaluated in the second minute. The
+learners have their defaults except for the features named.
 
-Why it works: at each reversal friction jumps by 2. The observer sees that about N/omega_o = 0.1 s late, and so does the bias of a linear
-learner, which can only add damping that is too strong at high speed and too weak at low. A nonlinear learner knows from the last
-reversals what the next will be, and cancels it as the velocity changes sign. Best is who is told what to look for (``Friction``). In
-the moves to and fro the stage stands still in between. What friction does then depends on the force, which no function of the state
-can know, and black boxes gain nothing over the linear learner, whose bias is as quick as theirs.
+At each reversal the friction jumps by 2. Observer and bias detect it about N/omega_o = 0.1 s late.
+A linear learner can only add damping that is too strong at high speed and too weak at low speed. A
+nonlinear learner predicts the jump from earlier reversals. Features that match the plant
+(``Friction``) are best. During the rests of the moves back and forth the friction depends on the
+applied force, which no function of the state can represent, so black-box models bring no advantage
+over the linear learner, whose bias is as fast as theirs.
 
 python benchmarks/friction.py
 """
@@ -63,12 +65,12 @@ LEARNERS: dict[str, Any] = {
 
 
 def stage(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
-    """Return the derivatives: a mass with friction on a spring that stiffens."""
+    """Return the derivatives: a mass with friction on a stiffening spring."""
     return x[1], 2.0 * u - x[0] - 2.0 * x[0] ** 3 - math.tanh(x[1] / 0.05) + w[0]
 
 
 def rms_error(run: ql.Trajectory, since: float) -> float:
-    """Return the RMS of y less the ideal response to r, from ``since`` [s] on."""
+    """Return the RMS of y minus the ideal response to r, from ``since`` [s] on."""
     ideal = signal.lsim(([OMEGA_C**2], [1.0, 2.0 * OMEGA_C, OMEGA_C**2]), run["r"], run.t)[1]
     return float(np.sqrt(np.mean((run["y"] - ideal)[run.t >= since] ** 2)))
 

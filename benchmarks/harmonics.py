@@ -1,4 +1,4 @@
-"""Loads of unknown frequency in the paper's scenario: one sinusoid from any first guess, and two at once.
+"""Loads of unknown frequency: one sinusoid with different initial frequencies, and two sinusoids.
 
 python benchmarks/harmonics.py
 """
@@ -21,9 +21,10 @@ LOAD_AT, JUDGED_AT, END = 150.0, 210.0, 250.0
 
 
 def peaks(learner: ql.learners.Learner | None, omegas: Sequence[float]) -> tuple[float, float]:
-    """Return the largest error over the last 40 s of the study, and 240 s later; the load has a newton at each of ``omegas``.
+    """Return the largest error over the last 40 s of the study, and 240 s later.
 
-    A load of 1 rad/s, at which m1 and the spring absorb it, does not show in y.
+    The load has 1 N at each of ``omegas``. A load of 1 rad/s has no effect on y, because m1 and the
+    spring absorb it.
     """
     settings = study.Settings()
     paper = study.scenario(settings)

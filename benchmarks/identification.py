@@ -1,10 +1,11 @@
-"""Identification of the torsional twin: how long, how well; open loop, in a closed loop, with friction and without a model of it.
+"""Accuracy and time of the identification of the torsional twin, with and without a friction model.
 
     python benchmarks/identification.py [--json FILE]
 
-60 s at 1 kHz, with the twin's own friction, converter and encoder. The slow pole and the resonance are compared with those of its linear
-part. Times are the best of several, after the kernels are compiled or loaded, of the whole of ``identify``, search and judgement: by the
-clock, and of the processor, which is what the clock shows on an idle machine.
+60 s at 1 kHz in open and closed loop, with the friction, converter and encoder of the twin. The
+slow pole and the resonance are compared with those of its linear part. Times are the best of
+several, with compiled kernels, for the whole of ``identify`` (search and validation): elapsed time
+and processor time, which are equal on an idle machine.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ TWIN = ql.plants.torsional()
 
 
 def closed_loop(reference: Any) -> tuple[Any, Any]:
-    """Return u and y of the twin in a loop with an ADRC that knows no model."""
+    """Return u and y of the twin in a loop with a model-free ADRC."""
     observer = ql.ESO.model_free(order=4, b0=5.5e4, omega_o=90.0, dt=DT)
     controller = ql.ADRC(observer, omega_c=20.0, u_min=-5.0, u_max=5.0)
     run = ql.simulate(TWIN, controller, ql.Scenario(reference=reference, duration=60.0))
@@ -34,7 +35,7 @@ def closed_loop(reference: Any) -> tuple[Any, Any]:
 
 
 def records() -> dict[str, tuple[Any, Any]]:
-    """Return what is identified."""
+    """Return the records by name."""
     found: dict[str, tuple[Any, Any]] = {}
     for name, kind, band, low, high in (
         ("PRBS to 20 rad/s, ±2 V", "prbs", (0.2, 20.0), -2.0, 2.0),
@@ -58,7 +59,7 @@ def records() -> dict[str, tuple[Any, Any]]:
 
 
 def judged(found: Identified) -> dict[str, float]:
-    """Return how far off the poles are [%], and the fits [%]."""
+    """Return the errors of the poles [%], and the fits [%]."""
     truth = np.linalg.eigvals(TWIN.linear.A)
     slow = min((p for p in truth if abs(p) > 1e-6), key=abs)
     resonance = max(truth, key=lambda p: p.imag)
@@ -75,7 +76,7 @@ def judged(found: Identified) -> dict[str, float]:
 
 
 def main() -> None:
-    """Run all and print one table."""
+    """Run all cases and print one table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -83,7 +84,8 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = []
     print(
-        f"{'record':44} friction  time [s]  CPU [s]  slow [%]  resonance [%]  its damping [%]  held out [%]"
+        f"{'record':44} friction  time [s]  CPU [s]  slow [%]  resonance [%]  its damping [%] "
+        f" held out [%]"
     )
     for name, (u, y) in records().items():
         for friction in (True, False):
@@ -102,7 +104,8 @@ def main() -> None:
             }
             rows.append(row)
             print(
-                f"{name:44} {'yes' if friction else 'no':8} {row['seconds']:9.2f} {row['cpu']:8.2f} "
+                f"{name:44} {'yes' if friction else 'no':8} {row['seconds']:9.2f} "
+                f"{row['cpu']:8.2f} "
                 f"{row['slow']:9.3f} {row['resonance']:14.3f} "
                 f"{row['damping']:16.2f} {row['held out']:13.3f}",
                 flush=True,

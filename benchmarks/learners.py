@@ -1,10 +1,12 @@
-"""What a learner costs, and what its guard adds.
+"""Cost of the learners and of the guard.
 
     python benchmarks/learners.py [--json FILE]
 
-All in the study's two-mass loop, the first 60 s of it at 1 ms with nothing recorded, as ratios of the best of several interleaved trials;
-the reference is the same loop with the Kalman learner in C (``reference.c``), timed among them. A *loop sample* is plant and controller;
-a *step* is the controller alone, called from compiled code with r and y from a table; ``controller.step`` is called from Python.
+The first 60 s of the study's two-mass loop at 1 ms, without recording, as ratios of the best of
+several interleaved trials. The reference is the same loop with the Kalman learner in C
+(``reference.c``), timed among them. A *loop sample* is plant and controller; a *step* is the
+controller alone, called from compiled code with r and y from a table; ``controller.step`` is called
+from Python.
 """
 
 from __future__ import annotations
@@ -35,20 +37,20 @@ SCENARIO = dataclasses.replace(study.scenario(SETTINGS), duration=DURATION, rest
 
 
 class LmsDesign(NamedTuple):
-    """Parameters of a model as a user writes it."""
+    """Parameters of a user-defined model."""
 
     width: int
     rate: float
 
 
 class LmsMemory(NamedTuple):
-    """Its state."""
+    """State of a user-defined model."""
 
     theta: Any
 
 
 class Lms:
-    """The smallest model: linear, by normalised gradient descent."""
+    """A linear model, learned by normalised gradient descent."""
 
     def design(self, features: int, dt: float) -> LmsDesign:
         """Return the parameters."""
@@ -77,13 +79,13 @@ def _learn(model: LmsDesign, memory: LmsMemory, features: Any, target: float) ->
 
 
 class PythonLms:
-    """The same as a Python object."""
+    """The same model as a Python object."""
 
     def __init__(self) -> None:
         self.theta = np.zeros(4)
 
     def learn(self, features: np.ndarray, targets: np.ndarray) -> None:
-        """Go a step down for each pair."""
+        """Take a gradient step for each pair."""
         for phi, target in zip(features, targets, strict=True):
             self.theta += 2e-3 * (target - self.theta @ phi) * phi / (1.0 + phi @ phi)
 
@@ -114,14 +116,14 @@ GUARDED = ("Kalman", "Harmonic")
 
 
 def law(learner: Any, guard: ql.Guard | None = None) -> ql.ADRC:
-    """Return the study's controller around a learner."""
+    """Return the study's controller with the given learner."""
     return ql.ADRC(
         study.controller(SETTINGS).observer, SETTINGS.omega_c, learner=learner, guard=guard
     )
 
 
 def with_one_tap(controller: ql.ADRC) -> ql.ADRC:
-    """Return a copy whose filters, all but the guard's, are a single lag with the delay of the exact one."""
+    """Return a copy with a single lag in place of each exact filter, except in the guard."""
     other, parameters = copy.copy(controller), controller.parameters
     exact = parameters.lag
     rise = exact.rise / exact.taps.size
@@ -131,13 +133,13 @@ def with_one_tap(controller: ql.ADRC) -> ql.ADRC:
 
 
 def loop(controller: ql.ADRC) -> Any:
-    """Return what runs the closed loop."""
+    """Return a function that runs the closed loop."""
     return lambda: ql.simulate(PLANT, controller, SCENARIO, record_every=SAMPLES)
 
 
 @compiled
 def steps(design: Any, state: Any, r: Any, y: Any) -> float:
-    """Take all samples of a table; return the last u."""
+    """Run the controller on all samples of a table; return the last u."""
     u = 0.0
     for k in range(r.size):
         u = control(design, state, r[k], y[k])
@@ -145,18 +147,18 @@ def steps(design: Any, state: Any, r: Any, y: Any) -> float:
 
 
 def stepping(controller: ql.ADRC, r: np.ndarray, y: np.ndarray) -> Any:
-    """Return what calls the controller alone."""
+    """Return a function that runs the controller alone."""
     dispatcher = dispatcher_for(steps, controller.parameters)
     return lambda: dispatcher(controller.parameters, controller.initial_state(), r, y)
 
 
 def nanoseconds(*runs: float, of: str) -> str:
-    """Say how long a sample takes in runs that took so long [s]."""
+    """Return the time per sample as text, for the given times of a run [s]."""
     return " / ".join(f"{run / SAMPLES * 1e9:.0f}" for run in runs) + f" ns a {of}"
 
 
 def learners(rows: list[dict[str, object]]) -> None:
-    """Time each learner's loop beside the loop in C."""
+    """Time the loop with each learner and the loop in C."""
     with tempfile.TemporaryDirectory() as folder:
         reference = c_reference(Path(folder), SETTINGS, DURATION)
         laws = {name: law(learner) for name, learner in LEARNERS.items()}
@@ -228,7 +230,7 @@ def from_python(rows: list[dict[str, object]]) -> None:
 
 
 def main() -> None:
-    """Run all and print one table."""
+    """Run all benchmarks and print one table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""Memory of a run of 10^8 samples, above that of the process before it began.
+"""Memory use of a run of 10^8 samples, relative to the process before the run.
 
 python benchmarks/memory.py [--samples N]
 """
@@ -35,7 +35,8 @@ def main() -> None:
     took = time.perf_counter() - began
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"{samples:.0e} samples in {took:.1f} s ({took / samples * 1e9:.0f} ns each), {len(run)} rows recorded"
+        f"{samples:.0e} samples in {took:.1f} s ({took / samples * 1e9:.0f} ns each), "
+        f"{len(run)} rows recorded"
     )
     print(f"memory: {before:.0f} MB before, {after - before:.0f} MB more at the most (bar: 200 MB)")
 

@@ -1,7 +1,8 @@
-/* The two-mass loop of the paper's simulation study in plain C: plant, model-free ESO of order 4, control law, and the lag-compensated
- * Kalman learner with state and bias features. All sizes are known to the compiler, all arrays are static or on the stack: this is
- * what a careful programmer would put on a target by hand. Built by speed.py with gcc -O3 -march=native; the design (Phi, L, the taps
- * of the lag filter) is handed over, so that the trajectory can be compared with quell's.
+/* The two-mass loop of the paper's simulation study in plain C: plant, model-free ESO of order 4,
+ * control law, and the lag-compensated Kalman learner with state and bias features. All sizes are
+ * compile-time constants, all arrays are static or on the stack, as in a careful implementation by
+ * hand. c_reference.py builds it with gcc -O3 -march=native and passes the design (Phi, L, the taps
+ * of the lag filter), so that the trajectory can be compared with that of quell.
  *
  * Each row of the log holds r, y, measured y, u, w1, w2, x (4), x-hat (4), residual f, learned f, status, theta (5): 22 numbers. */
 #include <math.h>

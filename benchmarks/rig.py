@@ -1,13 +1,14 @@
-"""How punctual the loop is: 1 kHz against the twin in another process, and whether the wire changes what the controller achieves.
+"""Timing of the real-time loop at 1 kHz, and the effect of the wire on the control performance.
 
     python benchmarks/rig.py                              # 60 s over UDP, on an idle machine
     python benchmarks/rig.py --seconds 10 --wire shm --spin 0.0001
 
-Beside it stands what the machine can do at best: a program in C that sleeps until each deadline and does nothing else (``wakeup.c``), run
-just before. A virtual machine whose processors are lent to others for milliseconds makes both late.
+The twin runs in another process. A C program that only sleeps until each deadline (``wakeup.c``)
+runs before the loop and shows the limit of the machine. On a virtual machine whose host takes the
+processors away for milliseconds both are late.
 
-The second part runs the same scenario in process (``simulate``) and over the wire, with the same delay of a sample, and prints the metrics
-of both.
+The second part prints the metrics of the same scenario over the wire and in ``simulate``, with the
+same delay of one sample.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ PLANT = ql.plants.two_mass_spring()
 
 
 def controller() -> ql.ADRC:
-    """L-ESO on the two-mass-spring system, as in the paper's simulation."""
+    """Return an L-ESO for the two-mass-spring system, as in the paper's simulation."""
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=DT)
     return ql.ADRC(
         observer,
@@ -46,7 +47,7 @@ def controller() -> ql.ADRC:
 
 @contextlib.contextmanager
 def rig(wire: str, priority: int) -> Iterator[str]:
-    """Start ``quell rig`` as a process of its own; yield its URL, and print what it says when it ends."""
+    """Start ``quell rig`` in its own process; yield its URL, and print its output at the end."""
     url = "udp://127.0.0.1:0" if wire == "udp" else f"shm://quell-benchmark-{os.getpid()}"
     command = [
         sys.executable,
@@ -69,21 +70,20 @@ def rig(wire: str, priority: int) -> Iterator[str]:
         yield first.partition(" at ")[2].partition(": ")[0]
     finally:
         process.terminate()
-        print("the rig says:", *process.stdout.read().splitlines(), sep="\n  ")
+        print("output of the rig:", *process.stdout.read().splitlines(), sep="\n  ")
         process.wait()
 
 
 def over_the_wire(
     url: str, reference: ql.signals.Signal, seconds: float, options: argparse.Namespace
 ) -> RigRun:
-    """Run at the rig."""
+    """Run the controller over the wire."""
     return run_rig(
         *(open_device(url, DT), controller(), reference),
         duration=seconds,
         approach=0.0,
-        safety=Safety(
-            settle=500, hold=15
-        ),  # the rig itself may be late now and then; its watchdog has 20 ticks
+        # The rig itself may be late at times; its watchdog has 20 ticks.
+        safety=Safety(settle=500, hold=15),
         spin=options.spin,
         priority=options.priority,
         on_change=lambda change: print(change, flush=True),
@@ -91,7 +91,7 @@ def over_the_wire(
 
 
 def floor(seconds: float) -> np.ndarray | None:
-    """Return how late the wake-ups of a program in C are that does nothing else [s]; None without a compiler."""
+    """Return the lateness of ``wakeup.c``, which only sleeps [s]; None without a compiler."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         return None
@@ -127,17 +127,20 @@ def main() -> None:
         run = over_the_wire(url, reference, options.seconds, options)
     print(run.text())
     print(
-        f"\nno overrun: {run.overruns == 0}; p99.9 of the lateness {1e6 * run.timing.lateness.p999:.0f} µs (at most 500 wanted)"
+        f"\nno overrun: {run.overruns == 0}; p99.9 of the lateness "
+        f"{1e6 * run.timing.lateness.p999:.0f} µs (limit 500)"
     )
     if late is not None:
         p50, p999 = np.percentile(late, [50.0, 99.9])
         a_minute = 60.0 / DT * np.mean(late > DT)
         print(
-            f"the machine at best (C): p50 {1e6 * p50:.0f} µs, p99.9 {1e6 * p999:.0f} µs, max {1e6 * np.max(late):.0f} µs,",
+            f"limit of the machine (C): p50 {1e6 * p50:.0f} µs, p99.9 {1e6 * p999:.0f} µs, "
+            f"max {1e6 * np.max(late):.0f} µs,",
             end=" ",
         )
         print(
-            f"{a_minute:.0f} a minute later than a sample; p99.9 of the loop over that {run.timing.lateness.p999 / p999:.2f}"
+            f"{a_minute:.0f} a minute later than a sample; p99.9 of the loop over that "
+            f"{run.timing.lateness.p999 / p999:.2f}"
         )
     print()
     delayed = ql.plants.delayed(PLANT, delay=DT, dt=DT)

@@ -1,10 +1,11 @@
-"""How fast quell is, as ratios against references timed in the same run.
+"""Speed of quell, as ratios to references timed in the same run.
 
     python benchmarks/speed.py [--json FILE]
 
-Times on a shared machine mean little; ratios of the best of several interleaved trials mean more. The references: the same loop in C
-(``reference.c``, which must give the same trajectory), pyadrc on the same second-order loop, python-control on the same two-mass loop.
-``learners.py`` has the learners.
+The ratios use the best of several interleaved trials, because times on a shared machine vary. The
+references are the same loop in C (``reference.c``, which must give the same trajectory), pyadrc on
+the same second-order loop, and python-control on the same two-mass loop. ``learners.py`` measures
+the learners.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ SAMPLES = round(study.END / study.Settings().dt) + 1
 
 
 def each(*runs: float) -> str:
-    """Say how long a sample takes in runs of the study that took so long [s]."""
+    """Return the time per sample as text, for the given times of a run of the study [s]."""
     return " / ".join(f"{run / SAMPLES * 1e9:.0f}" for run in runs) + " ns a sample"
 
 
@@ -78,7 +79,7 @@ def algorithm_1(rows: list[dict[str, object]]) -> None:
 
 
 def one_call(rows: list[dict[str, object]]) -> None:
-    """Time ``step`` from Python beside pyadrc's ``StateSpace``, after checking that both do the same."""
+    """Time ``step`` from Python and pyadrc's ``StateSpace``, after checking that both agree."""
     import pyadrc
 
     observer = ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=0.01)
@@ -115,7 +116,7 @@ def one_call(rows: list[dict[str, object]]) -> None:
 
 
 def against_python_control(rows: list[dict[str, object]]) -> None:
-    """Time the two-mass loop with MF-ESO beside python-control's ``input_output_response``, after checking that both agree."""
+    """Time MF-ESO and python-control's ``input_output_response``, and check that both agree."""
     import control as ct
 
     settings, plant = study.Settings(), ql.plants.two_mass_spring()

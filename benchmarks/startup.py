@@ -1,4 +1,4 @@
-"""What it costs to begin: import, help, the second run of the study. Best of several processes.
+"""Start-up time: import, help, and the second run of the study. Best of several processes.
 
 python benchmarks/startup.py
 """

@@ -1,4 +1,4 @@
-"""The figures of the two-mass study over ten seeds and four sample times, as ranges.
+"""Ranges of the results of the two-mass study over ten seeds and four sample times.
 
 python benchmarks/study.py
 """
@@ -14,7 +14,7 @@ COLUMNS = ("overshoot", "settling_time", "disturbance_peak", "control_variation"
 
 
 def main() -> None:
-    """Run the study's main controllers with every seed and sample time, L-ESO also without the reset."""
+    """Run the main controllers with every seed and sample time, L-ESO also without reset."""
     table = Table("dt [s]", "controller", *COLUMNS)
     cases = [(name, True) for name in (study.MF, study.MB, study.L, study.MF3)] + [(study.L, False)]
     for dt in (1e-3, 2e-3, 5e-3, 1e-2):

@@ -1,8 +1,9 @@
-"""What telemetry costs: a row's way to disk, what a loop in Python notices of it, what a kill loses.
+"""Cost of telemetry: writing a row, the delay of a loop in Python, and the loss after a kill.
 
     python benchmarks/telemetry.py [seconds]
 
-A loop in Python shares the interpreter with the writer's thread, a compiled one does not; the first is the worse case.
+A loop in Python shares the interpreter with the writer's thread, a compiled loop does not. The
+benchmark measures the first, which is the worse case.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ CHANNELS = row_channels(
 
 
 def rows_like_a_loops(count: int) -> np.ndarray:
-    """Numbers with all their digits, as estimates have."""
+    """Return random rows; the numbers have all their digits, like estimates."""
     rows = np.random.default_rng(1).standard_normal((count, sum(width for _, width in CHANNELS)))
     rows[:, 0] = np.arange(count)
     rows[:, 3:5] = 0.0
@@ -39,7 +40,7 @@ def rows_like_a_loops(count: int) -> np.ndarray:
 
 
 def cost(folder: Path) -> None:
-    """Print what a row costs the writer."""
+    """Print the processor time of the writer for each row."""
     rows = rows_like_a_loops(20_000)
     for sink in (
         MemorySink(),
@@ -56,12 +57,13 @@ def cost(folder: Path) -> None:
         sink.close()
         size = sink.path.stat().st_size / len(rows) if hasattr(sink, "path") else 0
         print(
-            f"{type(sink).__name__:10s} {took / len(rows) * 1e6:6.2f} µs a row of {rows.shape[1]}, {size:4.0f} bytes"
+            f"{type(sink).__name__:10s} {took / len(rows) * 1e6:6.2f} µs a row of "
+            f"{rows.shape[1]}, {size:4.0f} bytes"
         )
 
 
 def lateness(folder: Path, seconds: float) -> None:
-    """Print how late a loop in Python wakes up at 1 kHz, without telemetry and with."""
+    """Print the lateness of a loop in Python at 1 kHz, without and with telemetry."""
     header = Header(CHANNELS, 1e-3)
     rows = rows_like_a_loops(round(seconds * 1000))
     kinds = {
@@ -86,21 +88,22 @@ def lateness(folder: Path, seconds: float) -> None:
             in_front(False)
         shares = np.percentile(late, [50, 99, 99.9, 100]) * 1e6
         print(
-            f"{name:16s} wakes up late by p50 {shares[0]:.0f}, p99 {shares[1]:.0f}, p99.9 {shares[2]:.0f}, most {shares[3]:.0f} µs"
+            f"{name:16s} lateness p50 {shares[0]:.0f}, p99 {shares[1]:.0f}, p99.9 "
+            f"{shares[2]:.0f}, max {shares[3]:.0f} µs"
         )
 
 
 def in_front(wanted: bool) -> None:
-    """Give the loop's thread a real-time priority, where that is permitted, or take it back."""
+    """Set or reset the real-time priority of the loop's thread, if this is permitted."""
     policy, priority = (os.SCHED_FIFO, 50) if wanted else (os.SCHED_OTHER, 0)
     try:
         os.sched_setscheduler(0, policy, os.sched_param(priority))
     except OSError as error:
-        print(f"no real-time priority ({error.strerror}): other processes show in what follows")
+        print(f"no real-time priority ({error.strerror}): other processes affect the results")
 
 
 def produce(dt: float, *paths: str) -> None:
-    """Push rows for ever, and say each time which one."""
+    """Push rows until the process is killed, and write the index of each to the standard output."""
     telemetry = TelemetryWriter(Header(CHANNELS, dt), [file_sink(path) for path in paths])
     telemetry.start()
     row, start = np.zeros(telemetry.header.width), time.monotonic()
@@ -112,7 +115,7 @@ def produce(dt: float, *paths: str) -> None:
 
 
 def killed(folder: Path, trials: int = 8) -> None:
-    """Print what a kill -9 loses at most."""
+    """Print the largest and mean loss after ``kill -9``."""
     rng = np.random.default_rng(2)
     for dt in (1e-3, 0.1):
         lost: dict[str, list[float]] = {".csv": [], ".mcap": []}
@@ -133,7 +136,8 @@ def killed(folder: Path, trials: int = 8) -> None:
                 lost[path.suffix].append((last - load(path)["k"][-1]) * dt)
         for suffix, seconds in lost.items():
             print(
-                f"killed at {1 / dt:g} Hz: {suffix[1:]} lost {max(seconds):.3f} s at most, {np.mean(seconds):.3f} s on average of {trials}"
+                f"killed at {1 / dt:g} Hz: {suffix[1:]} lost {max(seconds):.3f} s at most, "
+                f"{np.mean(seconds):.3f} s on average of {trials}"
             )
 
 

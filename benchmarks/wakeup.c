@@ -1,5 +1,6 @@
-/* What a machine can do at best: sleep until each absolute deadline, at SCHED_FIFO, with memory locked and processors kept awake, and nothing else.
- * Arguments: period [ns], number of deadlines. Prints how late each wake-up was [ns], one a line. */
+/* Limit of a machine's timing: only sleep until each absolute deadline, with SCHED_FIFO, locked
+ * memory and no deep sleep states.
+ * Arguments: period [ns], number of deadlines. Prints the lateness of each wake-up [ns], one per line. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <sched.h>
@@ -26,8 +27,9 @@ int main(int count, char **arguments)
     memset(late, 0, deadlines * sizeof *late);
     const struct sched_param priority = {.sched_priority = 50};
     const int latency = 0, file = open("/dev/cpu_dma_latency", O_WRONLY);
-    if (sched_setscheduler(0, SCHED_FIFO, &priority) || mlockall(MCL_CURRENT | MCL_FUTURE) || write(file, &latency, sizeof latency) < 0)
-        fprintf(stderr, "wakeup: not all that real time asks for is permitted\n");
+    if (sched_setscheduler(0, SCHED_FIFO, &priority) || mlockall(MCL_CURRENT | MCL_FUTURE) ||
+        write(file, &latency, sizeof latency) < 0)
+        fprintf(stderr, "wakeup: some real-time settings are not permitted\n");
     const long long begin = now() + period;
     for (long long k = 0; k < deadlines; k++) {
         const long long deadline = begin + k * period;

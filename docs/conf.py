@@ -4,7 +4,7 @@ import os
 
 import quell
 
-# Whatever the surroundings say: pages without their pictures would be built without a word.
+# Override the environment: with another backend the figures would be missing, without a warning.
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
 
 project = "quell"
@@ -25,7 +25,7 @@ html_show_sourcelink = False
 html_sidebars = {"**": []}
 exclude_patterns = ["_build", "jupyter_execute"]
 
-# Every cell of the pages is run when they are built: an example that fails stops the build.
+# All code cells are run during the build; a cell that fails stops it.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300

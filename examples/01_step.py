@@ -1,4 +1,4 @@
-"""A flexible drive follows a step: an observer without model, one with the model, and one that learns it."""
+"""Step response of a flexible drive: an observer without model, with model, and with a learner."""
 
 import quell as ql
 
@@ -22,6 +22,7 @@ for name, (observer, learner) in observers.items():
     run = ql.simulate(plant, ql.ADRC(observer, omega_c=1.2, learner=learner), scenario)
     step, load = run.metrics(60.0, 90.0), run.metrics(90.0)
     print(
-        f"{name}: overshoot {100 * step['overshoot']:.2f} %, settles in {step['settling_time']:.1f} s, "
+        f"{name}: overshoot {100 * step['overshoot']:.2f} %, settles in "
+        f"{step['settling_time']:.1f} s, "
         f"error under load {load['peak_error']:.3f} m"
     )

@@ -1,4 +1,4 @@
-"""The controller in a loop of one's own: read, step, write; a sensor that fails for a while; a state kept in a file."""
+"""A controller sample by sample: read, step, write; lost measurements; a state kept in a file."""
 
 import math
 import tempfile

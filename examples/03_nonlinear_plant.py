@@ -1,4 +1,4 @@
-"""A pendulum given by its differential equation, with friction and a load that the observer was told nothing of."""
+"""A pendulum given by its differential equation; the observer has no model of friction and load."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ import quell as ql
 
 
 def pendulum(t, x, u, w):
-    """Angle and speed; torque u, load w[0]; gravity, and friction that changes its sign with the speed."""
+    """Return the derivatives of angle and speed, for torque u, load w[0], gravity and friction."""
     return x[1], 8.0 * u + w[0] - 9.81 * np.sin(x[0]) - 0.4 * np.tanh(x[1] / 0.1)
 
 
@@ -25,5 +25,6 @@ for learner in (None, ql.learners.Kalman()):
     run = ql.simulate(plant, controller, scenario)
     loaded = run.metrics(start=30.0)
     print(
-        f"{'L-ESO ' if learner else 'MF-ESO'}: error under load, largest {loaded['peak_error']:.4f} rad, RMS {loaded['rms']:.4f} rad"
+        f"{'L-ESO ' if learner else 'MF-ESO'}: error under load, largest "
+        f"{loaded['peak_error']:.4f} rad, RMS {loaded['rms']:.4f} rad"
     )

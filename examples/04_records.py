@@ -1,4 +1,4 @@
-"""What a run returns: channels, metrics, an xarray dataset, a file, a plot."""
+"""Results of a run: channels, metrics, an xarray dataset, a file, a plot."""
 
 import tempfile
 from pathlib import Path

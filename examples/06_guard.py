@@ -1,4 +1,4 @@
-"""A learner that is honest for 20 s and then lies: what it does to a loop, and what a guard leaves of that."""
+"""A learner that is right for 20 s and then returns wrong values, without and with a guard."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from quell.learners import Online, infer, learn
 
 
 class LiarDesign(NamedTuple):
-    """Parameters."""
+    """Parameters of the model."""
 
     features: int
     step: float
@@ -17,27 +17,27 @@ class LiarDesign(NamedTuple):
 
 
 class LiarMemory(NamedTuple):
-    """State: the coefficients, and how many pairs were seen."""
+    """State: the coefficients, and the number of pairs so far."""
 
     theta: np.ndarray
     pairs: np.ndarray
 
 
 class Liar:
-    """A linear model, learned by least mean squares, that returns ten times the opposite of it once it has seen 20 s of pairs."""
+    """A linear model that returns −10 times its prediction after it has learned for 20 s."""
 
     def design(self, features, dt):
-        """Return the parameters; the compiled functions below are registered for their type."""
+        """Return the parameters. The functions below are registered for their type."""
         return LiarDesign(features, dt, 20.0 / dt)
 
     def memory(self, parameters):
-        """Return the state before anything was learned."""
+        """Return the initial state."""
         return LiarMemory(np.zeros(parameters.features), np.zeros(1))
 
 
 @infer.register(LiarDesign)
 def predicted(model, memory, features):
-    """Return what the model says for the features."""
+    """Return the prediction for the features."""
     total = 0.0
     for i in range(features.size):
         total += memory.theta[i] * features[i]
@@ -46,7 +46,7 @@ def predicted(model, memory, features):
 
 @learn.register(LiarDesign)
 def learned(model, memory, features, target):
-    """Learn from a pair."""
+    """Update the coefficients by normalised least mean squares."""
     error, power = target, 0.01
     for i in range(features.size):
         error -= memory.theta[i] * features[i]
@@ -56,7 +56,7 @@ def learned(model, memory, features, target):
     memory.pairs[0] += 1.0
 
 
-# What the loop would do if it knew the disturbance: the same controller on a plant without any.
+# The ideal loop: the same controller on a plant without disturbance.
 free = ql.plants.LinearPlant(np.eye(4, k=1), [0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0])
 plant = ql.plants.two_mass_spring()
 observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=2e-3)
@@ -81,10 +81,12 @@ for name, learner, guard in (
     run = ql.simulate(plant, controller, scenario)
     error = np.sqrt(np.mean((run["y"] - ideal["y"][: len(run)]) ** 2))
     print(
-        f"{name:>14}: RMS deviation from the ideal loop {error:.3g} m, over {run.t[-1]:.0f} s. {run.message}"
+        f"{name:>14}: RMS deviation from the ideal loop {error:.3g} m, over {run.t[-1]:.0f} "
+        f"s. {run.message}"
     )
     if guard:
         now = controller.read(run.final_state)
         print(
-            f"{'':16}Authority {run['authority'].max():.2f} at most, {now.authority:.2f} at the end. {now.reason.message}"
+            f"{'':16}Authority {run['authority'].max():.2f} at most, {now.authority:.2f} at "
+            f"the end. {now.reason.message}"
         )

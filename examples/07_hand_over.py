@@ -1,18 +1,18 @@
-"""Start under load, take over from an operator, retune while running: the control signal never jumps."""
+"""Start under load, manual operation and retuning, without a jump of the control signal."""
 
 import quell as ql
 
 DT = 2e-3
-WEIGHT, HELD = -3.0, 3.0  # a load, and the control signal that holds it
+WEIGHT, U_HOLD = -3.0, 3.0  # a load, and the control signal that holds it
 controller = ql.ADRC(
     ql.ESO.model_free(order=2, b0=2.0, omega_o=40.0, dt=DT), omega_c=4.0, u_min=-10.0, u_max=10.0
 )
 height = speed = largest_jump = 0.0
-u = HELD
+u = U_HOLD
 
 for k in range(4000):
     if k < 500:
-        before, u = u, HELD + 0.001 * (k % 250)  # an operator lifts
+        before, u = u, U_HOLD + 0.001 * (k % 250)  # manual operation
         controller.track(r=1.0, y=height, u=u)
         jump = 0.0
     else:

@@ -1,6 +1,7 @@
-"""The loop in real time around a twin in this process, its record, and what another observer would have made of it.
+"""The real-time loop around a twin in this process, its record, and a replay with another observer.
 
-For a twin in another process say ``quell rig --device udp://127.0.0.1:5005`` in another shell, and open that URL here.
+For a twin in another process run ``quell rig --device udp://127.0.0.1:5005`` in another terminal,
+and open that URL here.
 """
 
 import tempfile
@@ -13,7 +14,7 @@ DT = 5e-3
 
 
 def controller(omega_o: float) -> ql.ADRC:
-    """Return an ADRC that knows the order of the plant and the gain, no more."""
+    """Return an ADRC with a model-free observer."""
     return ql.ADRC(
         ql.ESO.model_free(order=4, b0=4.6e4, omega_o=omega_o, dt=DT),
         omega_c=10.0,
@@ -38,6 +39,4 @@ with tempfile.TemporaryDirectory() as folder:
     again = replay(load(path), controller(30.0))
 
 apart = again["x_hat"][:, 1] - run.record["x_hat"][:, 1]
-print(
-    f"half the bandwidth would have seen the speed otherwise by up to {abs(apart).max():.3f} rad/s"
-)
+print(f"speed estimated with half the bandwidth: difference up to {abs(apart).max():.3f} rad/s")

@@ -1,25 +1,27 @@
-/* The device's side of quell's serial line, to put into a microcontroller.
+/* The device's side of quell's serial line, for a microcontroller.
  *
- * Frames, packets and sessions are those of wire/frames.py, wire/cobs.py and rig/kernel.py in src/quell/realtime. Give the four board_
- * functions, call quell_byte() for each byte that the UART has received, and quell_tick() every DT, from a timer. Little-endian, with
- * 64-bit double (not AVR).
+ * Frames, packets and sessions are those of wire/frames.py, wire/cobs.py and rig/kernel.py in
+ * src/quell/realtime. Write the four board_ functions, call quell_byte() for each received byte and
+ * quell_tick() every DT from a timer. The processor must be little-endian, with 64-bit double (not
+ * AVR).
  *
- * With -DQUELL_HOST it is a program that simulates y' = u at the other end of a pseudoterminal, whose name it prints.
+ * With -DQUELL_HOST this is a program that simulates y' = u on a pseudoterminal and prints the name
+ * of its other end.
  */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
 
 #define DT 0.001     /* sample time [s] */
-#define U_MAX 10.0   /* larger commands are cut to it [u-unit] */
-#define WATCHDOG 20  /* after so many ticks without a fresh command u is zero until a new session */
-#define PATIENCE 60000 /* so many ticks a session may wait for its first command */
-#define MOST_AGE 20  /* a command that answers a measurement from more ticks ago is stale */
+#define U_MAX 10.0   /* larger commands are limited to it [u-unit] */
+#define WATCHDOG 20  /* ticks without a fresh command until u is zero; reset by a new session */
+#define PATIENCE 60000 /* ticks that a session may wait for its first command */
+#define MOST_AGE 20  /* a command is stale if the answered measurement is older [ticks] */
 
-double board_measure(void);                     /* y, now [y-unit] */
-void board_apply(double u);                     /* u, until the next call [u-unit] */
-void board_send(const uint8_t *data, int size); /* into the UART's queue; must not wait */
-int64_t board_time(void);                       /* any monotonic clock [ns] */
+double board_measure(void);                     /* return y [y-unit] */
+void board_apply(double u);                     /* apply u until the next call [u-unit] */
+void board_send(const uint8_t *data, int size); /* append to the UART's queue; must not wait */
+int64_t board_time(void);                       /* return the time of any monotonic clock [ns] */
 
 enum { MEASUREMENT = 1, COMMAND, HELLO, WELCOME, GOODBYE };
 enum { TRIPPED_FLAG = 1, BUSY_FLAG = 2, OTHER_DT_FLAG = 4 };
@@ -74,7 +76,7 @@ static void greet(const Frame *hello)
     uint32_t refusal = 0;
     int known = hello->session == session;
     if (hello->session == 0 || (known && (mode == IDLE || mode == TRIPPED)))
-        return; /* a session that is over does not come back */
+        return; /* a finished session does not come back */
     if (!known) {
         if (!(fabs(hello->value - DT) <= 1e-9 * DT)) {
             refusal = OTHER_DT_FLAG;
@@ -189,7 +191,7 @@ int64_t board_time(void)
     return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
 }
 
-/* Each t on the standard input is a tick, each c waits for a packet: so a test goes step by step. */
+/* For tests: each t on the standard input runs a tick, each c waits for a packet. */
 int main(void)
 {
     uint8_t byte;
@@ -197,7 +199,7 @@ int main(void)
     line = posix_openpt(O_RDWR | O_NOCTTY);
     if (line < 0 || grantpt(line) || unlockpt(line))
         return 1;
-    int other = open(ptsname(line), O_RDWR | O_NOCTTY); /* kept open, or the line hangs up whenever nobody has it */
+    int other = open(ptsname(line), O_RDWR | O_NOCTTY); /* kept open, so that the line does not hang up */
     printf("serial://%s\n", ptsname(line));
     fflush(stdout);
     while ((c = getchar()) != EOF) {
