@@ -1,4 +1,4 @@
-"""What a run returns: recorded samples, trajectories, metrics and their plots.
+"""Results of runs: recorded samples, trajectories, metrics and their plots.
 
 May import ``types``, ``checks``, ``files``, and ``guard`` for its reasons.
 """

@@ -1,1 +1,1 @@
-"""What each command does: one file for each."""
+"""The commands: one file for each, with its options, its help and its work."""

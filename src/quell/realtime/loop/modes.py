@@ -16,7 +16,7 @@ class Mode(IntEnum):
 
 
 class Request(IntEnum):
-    """What another thread asks of the loop; a higher one prevails."""
+    """A request of another thread to the loop; a higher one prevails."""
 
     NONE = 0
     RAMP = 1
@@ -26,7 +26,7 @@ class Request(IntEnum):
 
 
 class Ending(IntEnum):
-    """How a cause ends the run."""
+    """The way in which a cause ends the run."""
 
     NO = 0
     """It does not: the run goes on, or had ended already."""

@@ -60,7 +60,7 @@ class Rules(NamedTuple):
 
 
 class Memory(Scalars):
-    """What the supervisor remembers from one cycle to the next."""
+    """State of the supervisor from one cycle to the next."""
 
     mode: int
     samples: int
