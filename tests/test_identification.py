@@ -210,7 +210,7 @@ def test_a_reference_frees_a_closed_loop_of_bias() -> None:
 
 
 def test_in_its_loop_an_unstable_plant_is_found_with_the_reference() -> None:
-    """Its pole is not mirrored, and the report says that it runs away."""
+    """Its pole is not mirrored, and the report names it as unstable."""
     dt, plant = 0.01, ql.plants.LinearPlant.of(([2.0], [1.0, -0.3, 0.0]))
     controller = ql.ADRC(ql.ESO.model_free(order=2, b0=2.0, omega_o=15.0, dt=dt), omega_c=3.0)
     scenario = ql.Scenario(
@@ -221,7 +221,7 @@ def test_in_its_loop_an_unstable_plant_is_found_with_the_reference() -> None:
     run = ql.simulate(plant, controller, scenario)
     found = ql.identify(run["u"], run["y_measured"], dt, order=2, reference=run["r"])
     assert sorted(pole.value.real for pole in found.poles) == pytest.approx([0.0, 0.3], abs=0.02)
-    assert "runs away" in found.shortcomings[0]
+    assert "unstable" in found.shortcomings[0]
 
 
 def test_the_gradient_is_that_of_differences() -> None:
@@ -353,10 +353,10 @@ def test_the_report_says_what_speaks_against_the_model() -> None:
     y = answer(([3.0], [1.0, 2.0]), u, 0.01) + noise
     assert ql.identify(u, y, 0.01, order=1).shortcomings == ()
     found = ql.identify(u, y, 0.01, order=2, zeros=1)
-    assert any("can't be told from a zero" in text for text in found.shortcomings)
+    assert any("nearly equals a zero" in text for text in found.shortcomings)
     assert found.integrators == 0
     astray = ql.identify(u, answer(([3.0], [1.0, -0.1, 0.3]), u, 0.01), 0.01, order=2)
-    assert ["runs away" in text for text in astray.shortcomings] == [True]
+    assert ["unstable" in text for text in astray.shortcomings] == [True]
     assert astray.to_json()["shortcomings"] == list(astray.shortcomings)
 
 

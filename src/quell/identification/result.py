@@ -79,7 +79,7 @@ class Identified:
             [root for root in roots if root.value.imag >= 0.0] for roots in (self.poles, self.zeros)
         )
         found = [
-            f"the pole at {_format(pole)} runs away; if the plant does not, take a lower order "
+            f"the pole at {_format(pole)} is unstable; if the plant is stable, use a lower order "
             "or set integrators"
             for pole in poles
             if pole.value.real > 0.0
@@ -87,13 +87,13 @@ class Identified:
         for kind, roots in (("pole", poles), ("zero", zeros)):
             found += [
                 f"the {kind} at {_format(root)} is faster than samples show, {fastest:.4g} rad/s; "
-                f"take fewer {kind}s"
+                f"use fewer {kind}s"
                 for root in roots
                 if root.omega > fastest
             ]
         for zero in zeros:
             cancelled = [
-                f"the pole at {_format(pole)} can't be told from a zero; take one of each less"
+                f"the pole at {_format(pole)} nearly equals a zero; use one pole and one zero less"
                 for pole in poles
                 if abs(pole.value - zero.value) <= _DEVIATIONS * (pole.deviation + zero.deviation)
             ]
@@ -142,7 +142,7 @@ class Identified:
         delay = f" · exp(−{self.delay:g} s)" if self.delay else ""
         lines = [
             f"G(s) = ({_polynomial(self.num)}) / ({_polynomial(self.den)}){delay}",
-            f"{self.method}{'' if self.converged else '; the search did NOT come to rest'}",
+            f"{self.method}{'' if self.converged else '; the search did NOT converge'}",
             "",
             "pole [rad/s]                  ± real      ± imag     |p|       damping",
             *(_row(root) for root in self.poles),

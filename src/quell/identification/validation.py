@@ -92,7 +92,7 @@ def _finite(predicted: Vector) -> Vector:
     """Return a simulated output if it is finite."""
     if not np.all(np.isfinite(predicted)):
         raise ValueError(
-            "order: the model that was found runs away when it is simulated; "
+            "order: the simulation of the fitted model is unstable; "
             "lower the order, or give integrators"
         )
     return predicted
