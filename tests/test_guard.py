@@ -181,7 +181,7 @@ def test_status_and_reason_say_what_happened() -> None:
         flags |= controller.estimate.status
         reasons.add(controller.estimate.reason)
     assert Status.LEARNER_CUT in flags
-    assert "began anew" in flags.message
+    assert "started anew" in flags.message
     assert {ql.Reason.NOT_FINITE, ql.Reason.UNPROVEN} <= reasons
     assert all(reason.message.endswith(".") for reason in ql.Reason)
     assert controller.estimate.error_plain > 0.0
