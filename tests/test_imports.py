@@ -100,3 +100,10 @@ def test_no_files_import_each_other_in_a_circle() -> None:
         tuple(TopologicalSorter(IMPORTS).static_order())
     except CycleError as error:
         pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_every_folder_says_what_it_may_import() -> None:
+    """In the docstring of its ``__init__.py``, beside what belongs there."""
+    folders = list(ROOT.glob("*/**/__init__.py"))
+    silent = [file for file in folders if "May import" not in file.read_text(encoding="utf-8")]
+    assert not silent, silent

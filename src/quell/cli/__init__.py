@@ -1,4 +1,7 @@
-"""The command line: ``quell`` and its commands."""
+"""The command line: ``quell`` and its commands.
+
+May import every folder; nothing imports it.
+"""
 
 from quell.cli.app import main
 

@@ -1,5 +1,7 @@
 """System identification: transfer functions from records, and the design of excitations.
 
+May import ``controllers``, ``plants``, ``simulation`` and what they import.
+
 ``identify`` is the search; ``structure`` has the model and its gradient, ``sampling`` the filters
 below it.
 """

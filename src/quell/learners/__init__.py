@@ -1,4 +1,8 @@
-"""Learners: what feeds forward the disturbance that has been seen before."""
+"""Learners: feedforward of the disturbance that was learned from the observer's estimates.
+
+Files of this folder itself are the base of its subfolders. May import ``features`` and what it
+imports.
+"""
 
 from quell.learners.adapters import JaxModel, PythonModel, RiverModel, SklearnModel, TorchModel
 from quell.learners.base import Learner, NoLearner

@@ -1,5 +1,7 @@
 """Real time: a controller closed around a device at a fixed rate, with safe actions for faults.
 
+May import ``simulation``, ``plants``, ``controllers`` and what they import.
+
 The public names, imported when first used::
 
     from quell.realtime import Safety, open_device, run_rig

@@ -1,4 +1,7 @@
-"""The ACC robust-control benchmark: published controllers and ours on uncertain plants."""
+"""The ACC robust-control benchmark: published controllers and ours on uncertain plants.
+
+May import ``experiments.common`` and ``experiments.compare``.
+"""
 
 from quell.experiments.acc.cases import CaseResult, study_cases
 from quell.experiments.acc.controllers import DT, PUBLISHED, TransferFunction, designs

@@ -1,1 +1,4 @@
-"""Parts that several experiments use: claims, scores and figures. It imports no experiment."""
+"""Parts that several experiments use: claims, scores and figures.
+
+May import ``records`` and ``files``, and no experiment.
+"""

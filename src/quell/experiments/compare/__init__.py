@@ -1,4 +1,7 @@
-"""Controllers side by side: on any plant, and on the benchmark of ``quell compare``."""
+"""Controllers side by side: on any plant, and on the benchmark of ``quell compare``.
+
+May import ``experiments.common``.
+"""
 
 from quell.experiments.compare.benchmark import (
     END,

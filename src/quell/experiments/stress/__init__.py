@@ -1,4 +1,7 @@
-"""The trial of the guard: hostile and honest learners in random loops, beside MF-ESO."""
+"""The trial of the guard: hostile and honest learners in random loops, beside MF-ESO.
+
+May import ``experiments.common``.
+"""
 
 from quell.experiments.stress.adversaries import KINDS, Adversary, draw_adversary
 from quell.experiments.stress.figures import draw, save

@@ -1,4 +1,7 @@
-"""The paper's hardware experiment on a twin of its torsional testbed, every claim judged."""
+"""The paper's hardware experiment on a twin of its torsional testbed, every claim judged.
+
+May import ``experiments.common``.
+"""
 
 from quell.experiments.torsional.figures import save
 from quell.experiments.torsional.setup import (

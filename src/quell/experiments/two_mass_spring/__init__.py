@@ -1,4 +1,7 @@
-"""The paper's simulation study on two masses and a spring, every claim judged."""
+"""The paper's simulation study on two masses and a spring, every claim judged.
+
+May import ``experiments.common``.
+"""
 
 from quell.experiments.two_mass_spring.figures import save
 from quell.experiments.two_mass_spring.gradient_range import Trial, stable_up_to, trials

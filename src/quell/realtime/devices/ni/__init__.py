@@ -1,1 +1,4 @@
-"""Cards of National Instruments: the driver with its errors, its tasks, and the device."""
+"""Cards of National Instruments: the driver with its errors, its tasks, and the device.
+
+May import ``realtime.devices`` (base file only) and ``realtime.system``.
+"""
