@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,12 @@ import quell as ql
 # The same examples in every run, and no stop-watch: the machines that test are shared.
 settings.register_profile("quell", deadline=None, derandomize=True)
 settings.load_profile("quell")
+
+
+def pytest_runtest_setup() -> None:
+    """Spare the garbage collector all that was imported: going through it takes half a second."""
+    if not gc.get_freeze_count():  # at the first test, and after a real-time loop
+        gc.freeze()
 
 
 @pytest.fixture
@@ -43,3 +51,15 @@ def bench() -> Iterator[Callable[..., Any]]:
 
     with ExitStack() as stack:
         yield lambda *where, **settings: Bench(stack, *where, **settings)
+
+
+@pytest.fixture
+def quell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Any]:
+    """Run the command in this process, in a folder of its own; return what it did (``Shown``)."""
+    from .commands import in_this_process
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    return lambda *arguments: in_this_process(arguments, monkeypatch, capsys)

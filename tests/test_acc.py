@@ -241,9 +241,14 @@ def test_ours_fail_less_than_the_published_on_drawn_plants_without_and_with_the_
             )
 
 
-def test_the_original_design_cases_are_met() -> None:
+@pytest.fixture(scope="module")
+def cases() -> dict[str, CaseResult]:
+    """The design cases of the original problem; they take seconds."""
+    return study_cases()
+
+
+def test_the_original_design_cases_are_met(cases: dict[str, CaseResult]) -> None:
     """Stable for all 0.5 < k < 2 (MB-ESO from 0.59 only), settled by 15 s at k = 1; the sinusoid fades under the learner."""
-    cases = study_cases()
     for name in (MF, MB, L):
         case = cases[name]
         assert case.stable_from < (0.6 if name == MB else 0.5)
@@ -269,10 +274,14 @@ def test_a_case_that_is_lost_is_called_unstable_and_one_that_does_not_settle_nev
 
 
 def test_the_command_writes_what_programs_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cases: dict[str, CaseResult],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The keys are fixed, rates lie in their intervals; without the baselines, whose loops would be compiled for this alone."""
     monkeypatch.setattr(controllers, "BASELINES", {})
+    monkeypatch.setattr("quell.experiments.acc.study.study_cases", lambda: cases)
     (tmp_path / "few.csv").write_text(HEADER + "1,1,1,0.1,1,0.01\n0.9,1.1,0.95,-0.1,0.9,0.02\n")
     where = ["--json", str(tmp_path / "out.json"), "--no-figures"]
     with pytest.raises(SystemExit, match="0"):

@@ -5,34 +5,28 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-
-def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "quell", *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+from .commands import Shown, in_its_own_process
 
 
 def test_help_and_version_answer(tmp_path: Path) -> None:
     """The commands are listed."""
-    shown = quell("--help", cwd=tmp_path)
-    assert shown.returncode == 0
-    assert "reproduce" in shown.stdout
-    assert "two-mass" in quell("reproduce", "--help", cwd=tmp_path).stdout
-    assert quell("--version", cwd=tmp_path).stdout.strip() == __import__("quell").__version__
+    shown = in_its_own_process("--help", cwd=tmp_path)
+    assert shown.code == 0
+    assert "reproduce" in shown.out
+    assert "two-mass" in in_its_own_process("reproduce", "--help", cwd=tmp_path).out
+    assert (
+        in_its_own_process("--version", cwd=tmp_path).out.strip() == __import__("quell").__version__
+    )
 
 
 def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
     """Tables, JSON in its fixed form, figures as PNG and SVG; without a terminal."""
-    shown = quell(
+    shown = in_its_own_process(
         "reproduce",
         "two-mass",
         "--dt",
@@ -43,9 +37,9 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
         "pictures",
         cwd=tmp_path,
     )
-    assert shown.returncode == 0, shown.stderr
-    assert "Claims of section IV" in shown.stdout
-    assert "nan" not in shown.stdout.lower()
+    assert shown.code == 0, shown.err
+    assert "Claims of section IV" in shown.out
+    assert "nan" not in shown.out.lower()
     result = json.loads((tmp_path / "out.json").read_text())
     assert set(result) >= {"settings", "controllers", "claims"}
     assert list(result["controllers"]) == [
@@ -69,8 +63,9 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.xdist_group("torsional")
-def test_the_torsional_experiment_is_printed_written_and_drawn(tmp_path: Path) -> None:
+def test_the_torsional_experiment_is_printed_written_and_drawn(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """Tables, JSON in the study's form with one entry a pair of bandwidths, figures; without a terminal."""
     shown = quell(
         "reproduce",
@@ -81,11 +76,10 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(tmp_path: Path) -
         "out.json",
         "--figures",
         "pictures",
-        cwd=tmp_path,
     )
-    assert shown.returncode == 0, shown.stderr
-    assert "nan" not in shown.stdout.lower()
-    assert "…" not in shown.stdout, "a column is cut"
+    assert shown.code == 0, shown.err
+    assert "nan" not in shown.out.lower()
+    assert "…" not in shown.out, "a column is cut"
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["settings"]["dt"] == 0.002
     assert [(case["omega_c"], case["omega_o"]) for case in result["cases"]] == [
@@ -111,15 +105,17 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(tmp_path: Path) -
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
         f"{n}.{s}" for n in names for s in ("png", "svg")
     }
-    wrong = quell("reproduce", "torsional", "--dt", "0.01", cwd=tmp_path)
-    assert wrong.returncode == 2
+    wrong = quell("reproduce", "torsional", "--dt", "0.01")
+    assert wrong.code == 2
     assert (
-        wrong.stderr.strip()
+        wrong.err.strip()
         == "quell: dt = 0.01: must be from 0.0001 to 0.002 s, as the loops have up to 90 rad/s"
     )
 
 
-def test_the_guards_trial_is_printed_written_and_drawn(tmp_path: Path) -> None:
+def test_the_guards_trial_is_printed_written_and_drawn(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """A table a line a kind, JSON, and a figure as PNG and SVG; without a terminal."""
     shown = quell(
         "stress",
@@ -133,20 +129,19 @@ def test_the_guards_trial_is_printed_written_and_drawn(tmp_path: Path) -> None:
         "out.json",
         "--figures",
         "pictures",
-        cwd=tmp_path,
     )
-    assert shown.returncode == 0, shown.stderr
+    assert shown.code == 0, shown.err
     assert all(
-        kind in shown.stdout for kind in ("opposite sign", "turncoat", "all adversaries", "honest")
+        kind in shown.out for kind in ("opposite sign", "turncoat", "all adversaries", "honest")
     )
-    assert "…" not in shown.stdout, "a column is cut"
+    assert "…" not in shown.out, "a column is cut"
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["settings"]["seed"] == 4
     assert result["adversarial"]["unstable_where_plain_is_stable"] == 0
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {"stress.png", "stress.svg"}
-    wrong = quell("stress", "--runs", "-3", cwd=tmp_path)
-    assert wrong.returncode == 2
-    assert wrong.stderr.strip() == "quell: runs = -3: must be a whole number from 0 to 1000000"
+    wrong = quell("stress", "--runs", "-3")
+    assert wrong.code == 2
+    assert wrong.err.strip() == "quell: runs = -3: must be a whole number from 0 to 1000000"
 
 
 @pytest.mark.parametrize(
@@ -163,24 +158,26 @@ def test_the_guards_trial_is_printed_written_and_drawn(tmp_path: Path) -> None:
     ],
 )
 def test_a_mistake_gives_one_line_and_exit_code_two(
-    arguments: tuple[str, ...], message: str, tmp_path: Path
+    arguments: tuple[str, ...], message: str, quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
     """No traceback, nothing written."""
-    shown = quell("reproduce", "two-mass", *arguments, cwd=tmp_path)
-    assert shown.returncode == 2
-    assert message in shown.stderr
-    assert shown.stderr.startswith("quell: ")
-    assert len(shown.stderr.strip().splitlines()) == 1
+    shown = quell("reproduce", "two-mass", *arguments)
+    assert shown.code == 2
+    assert message in shown.err
+    assert shown.err.startswith("quell: ")
+    assert len(shown.err.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_old_result_outlives_a_run_that_fails(tmp_path: Path) -> None:
+def test_an_old_result_outlives_a_run_that_fails(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """What can't be written is said before the work is done, and nothing is overwritten until it is."""
     (tmp_path / "keep.json").write_text("old")
     (tmp_path / "file").write_text("")
-    shown = quell("reproduce", "two-mass", "--json", "keep.json", "--figures", "file", cwd=tmp_path)
-    assert shown.returncode == 2
-    assert "figures = 'file': must be a folder that can be made" in shown.stderr
+    shown = quell("reproduce", "two-mass", "--json", "keep.json", "--figures", "file")
+    assert shown.code == 2
+    assert "figures = 'file': must be a folder that can be made" in shown.err
     assert (tmp_path / "keep.json").read_text() == "old"
 
 

@@ -8,18 +8,17 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import pytest
 
 import quell as ql
-from quell.cli import app as cli
 from quell.cli.commands.run_rig import exit_code
 from quell.realtime.loop.modes import Cause
 from quell.setup import EXAMPLES, load
+
+from .commands import Shown
 
 SHORT = """
 title = "A short run"
@@ -42,37 +41,6 @@ stop = 8.0
 [[metrics]]
 start = 8.0
 """
-
-
-class Shown(NamedTuple):
-    """What a command did."""
-
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def quell(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., Shown]:
-    """Run the command in this process, in a folder of its own."""
-
-    def run(*arguments: str) -> Shown:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setenv("COLUMNS", "100")
-        code = 0
-        try:
-            with monkeypatch.context() as quietly:
-                quietly.setattr(
-                    cli, "app", partial(cli.app, list(arguments))
-                )  # told apart from the runner's own arguments
-                cli.main()
-        except SystemExit as ended:
-            code = int(ended.code or 0)
-        return Shown(code, *capsys.readouterr())
-
-    return run
 
 
 def test_a_setup_is_simulated_printed_written_drawn_and_saved(

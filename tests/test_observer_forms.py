@@ -376,7 +376,6 @@ def test_learners_that_must_tell_noise_from_motion_refuse_the_reduced_form(learn
     ql.ADRC(FORMS["reduced"], omega_c=2.0, learner=ql.learners.BatchGradient(), guard=ql.Guard())
 
 
-@pytest.mark.xdist_group("forms")  # most share what is compiled
 @pytest.mark.parametrize("name", ["half gain", "half gain, predictor", "Kalman", "cascade"])
 def test_a_guarded_learner_serves_other_forms(name: str) -> None:
     """The loop ends where it should, and the learner has found the spring."""

@@ -134,7 +134,8 @@ def test_an_observer_runs_the_same_again_and_interpreted(name: str) -> None:
 
 
 # Other features for the same learner: tested below without a loop, which takes long to compile.
-IN_LOOPS = [name for name in LEARNERS if not name.endswith(("radial features", "random features"))]
+OTHER_FEATURES = ("RLS with u", "radial features", "random features")
+IN_LOOPS = [name for name in LEARNERS if not name.endswith(OTHER_FEATURES)]
 
 
 @pytest.mark.parametrize("name", IN_LOOPS)

@@ -75,7 +75,7 @@ def test_a_step_at_a_time_is_the_simulated_run(name: str) -> None:
     controller = copy.deepcopy(CONTROLLERS[name])
     run = ql.simulate(
         PLANTS.get(name, CHAIN),
-        controller,
+        CONTROLLERS[name],  # a copy's arrays can be written to: another type, compiled once more
         ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise),
     )
     u = [controller.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]

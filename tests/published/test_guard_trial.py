@@ -23,7 +23,6 @@ def trial() -> stress.Result:
     return stress.run(120, 240, seed=3, guard=ql.Guard())
 
 
-@pytest.mark.xdist_group("trial")
 def test_no_hostile_learner_harms_a_loop() -> None:
     """None is lost; 99 % of the ratios are at most 1.1, all at most 1.5."""
     found = stress.summary(trial().hostile)
@@ -33,7 +32,6 @@ def test_no_hostile_learner_harms_a_loop() -> None:
     assert found["load_ratio"]["p99"] <= 1.5
 
 
-@pytest.mark.xdist_group("trial")
 def test_one_untuned_learner_serves_all_loops() -> None:
     """Median 0.2 under load, 1.05 and 1.2 at worst; 0.02 late."""
     found = stress.summary(trial().of(stress.HONEST))
@@ -59,7 +57,6 @@ def late_peaks(learners: list[object], guard: ql.Guard | None, scenario: ql.Scen
     return np.array(learned) / plain
 
 
-@pytest.mark.xdist_group("trial")
 @pytest.mark.parametrize("guard", [None, ql.Guard()])
 def test_a_load_of_unknown_frequency_is_rejected_to_a_five_hundredth(
     guard: ql.Guard | None,
@@ -71,7 +68,6 @@ def test_a_load_of_unknown_frequency_is_rejected_to_a_five_hundredth(
     assert np.max(late_peaks(learners, guard, study.scenario(SETTINGS))) <= 1.0 / 500.0
 
 
-@pytest.mark.xdist_group("trial")
 @pytest.mark.parametrize(
     ("slow", "fast", "size"), [(0.1 * np.pi, 0.8, 0.5), (0.3, 1.3, 1.0), (0.27, 0.69, 0.9)]
 )
@@ -85,7 +81,6 @@ def test_two_sinusoids_and_a_step_are_rejected_to_a_fiftieth(
     assert late_peaks([ql.learners.Harmonic(count=2)], None, scenario)[0] <= 1.0 / 50.0
 
 
-@pytest.mark.xdist_group("trial")
 def test_algorithm_1_is_harmless_at_any_rate_behind_the_guard() -> None:
     """Rates from 1e-7 to 1 a sample: RMS error from the step on at most 1.1 times MF-ESO's."""
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=SETTINGS.dt)

@@ -35,7 +35,6 @@ def median(
     ("name", "overshoot", "settling"),
     [(study.MF, 0.0066, 3.84), (study.MB, 0.0001, 2.26), (study.L, 0.0003, 2.26)],
 )
-@pytest.mark.xdist_group("torsional")
 def test_the_reference_figures_of_the_linear_plant_are_met(
     name: str, overshoot: float, settling: float
 ) -> None:
@@ -47,7 +46,6 @@ def test_the_reference_figures_of_the_linear_plant_are_met(
 
 
 @pytest.mark.parametrize("kind", study.PLANTS)
-@pytest.mark.xdist_group("torsional")
 def test_l_eso_beats_both_mf_eso_and_a_model_that_is_ten_percent_off(kind: str) -> None:
     """Overshoot at most 0.1 %, settling at most 2.4 s, both no more than the others', control variation no larger than MF-ESO's."""
     for seed in SEEDS:
@@ -61,7 +59,6 @@ def test_l_eso_beats_both_mf_eso_and_a_model_that_is_ten_percent_off(kind: str) 
         assert found["control_variation"] <= 0.9 * median(study.MF, kind, seed)["control_variation"]
 
 
-@pytest.mark.xdist_group("torsional")
 def test_the_guard_keeps_most_of_it() -> None:
     """Overshoot and settling of the guarded learner lie nearer to L-ESO's than to MF-ESO's."""
     for kind in study.PLANTS:
@@ -71,7 +68,6 @@ def test_the_guard_keeps_most_of_it() -> None:
 
 
 @pytest.mark.parametrize("case", [(90.0, 40.0), (40.0, 90.0)])
-@pytest.mark.xdist_group("torsional")
 def test_the_papers_bandwidths_are_stable_either_way_round(case: tuple[float, float]) -> None:
     """L-ESO arrives within 10 ms of what the design asks for, on the linear plant and with friction."""
     asked = {90.0: 1.995, 40.0: 2.073}[case[0]]

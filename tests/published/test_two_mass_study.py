@@ -27,7 +27,6 @@ def scores(name: str, dt: float, seed: int, reset: bool = True) -> dict[str, flo
 
 
 @pytest.mark.parametrize("dt", DTS)
-@pytest.mark.xdist_group("study")
 def test_mf_eso_overshoots_by_four_and_a_half_per_mille_and_settles_in_16_6_seconds(
     dt: float,
 ) -> None:
@@ -40,7 +39,6 @@ def test_mf_eso_overshoots_by_four_and_a_half_per_mille_and_settles_in_16_6_seco
 
 
 @pytest.mark.parametrize("dt", DTS)
-@pytest.mark.xdist_group("study")
 def test_mb_eso_does_not_overshoot_and_settles_in_12_seconds(dt: float) -> None:
     """Paper: 0 and 12 s."""
     for seed in SEEDS:
@@ -51,7 +49,6 @@ def test_mb_eso_does_not_overshoot_and_settles_in_12_seconds(dt: float) -> None:
 
 @pytest.mark.parametrize("reset", [True, False])
 @pytest.mark.parametrize("dt", DTS)
-@pytest.mark.xdist_group("study")
 def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_bandwidth(
     dt: float, reset: bool
 ) -> None:
@@ -73,7 +70,6 @@ def test_l_eso_steps_like_mb_eso_and_rejects_like_mf_eso_at_three_times_the_band
         (study.L, 0.0000, 11.99, 0.042, 103.0),
     ],
 )
-@pytest.mark.xdist_group("study")
 def test_the_reference_figures_are_met(
     name: str, overshoot: float, settling: float, peak: float, variation: float
 ) -> None:
@@ -85,7 +81,6 @@ def test_the_reference_figures_are_met(
     assert found["control_variation"] == pytest.approx(variation, rel=0.02)
 
 
-@pytest.mark.xdist_group("study")
 def test_without_the_reset_mf_eso_has_the_rms_error_of_the_reference() -> None:
     """docs/theory: 0.178 m over [110, 250] s."""
     assert scores(study.MF, 1e-3, 0, reset=False)["rms_from_step"] == pytest.approx(
@@ -93,7 +88,6 @@ def test_without_the_reset_mf_eso_has_the_rms_error_of_the_reference() -> None:
     )
 
 
-@pytest.mark.xdist_group("study")
 def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_whatever_the_batch() -> (
     None
 ):
@@ -107,7 +101,6 @@ def test_algorithm_1_is_stable_below_a_hundredth_a_second_and_diverges_above_wha
             assert stable or run.ended > study.FORCE_AT
 
 
-@pytest.mark.xdist_group("study")
 def test_what_is_learned_is_the_plant() -> None:
     """θ after training is (0, 0, −2, 0), to 0.06."""
     settings = study.Settings()
