@@ -34,7 +34,8 @@ def advise(
 ) -> list[Finding]:
     """Return the weak points of a design, each with its number, the limit, and what to do.
 
-    They are in the order sampling, margin, lag, noise.
+    They are in the order sampling, margin, lag, noise. Raises ``ValueError`` as ``analyse``
+    does, and without a plant for a controller that assumes none.
 
     Parameters
     ----------
@@ -53,11 +54,6 @@ def advise(
         that the observer assumes.
     at
         instant at which the learner is frozen; see ``analyse``.
-
-    Raises
-    ------
-    ValueError
-        as ``analyse``; without a plant for a controller that assumes none.
     """
     observer = controller.observer if isinstance(controller, ADRC) else None
     known_delay, found = 0.0, []
@@ -122,14 +118,9 @@ def _judge_lag(
     cause = " and ".join(f"{what} of {1e3 * time:.3g} ms" for what, time in parts if time > 0.0)
     before, after = loop.margins, late.margins
     if not late.stable:
+        margin = f"its delay margin is {1e3 * before.delay:.3g} ms"
         what_to_do = "shorten it, or lower omega_o and omega_c together"
-        return [
-            _unstable(
-                late,
-                f"with {cause}",
-                f"its delay margin is {1e3 * before.delay:.3g} ms; {what_to_do}",
-            )
-        ]
+        return [_unstable(late, f"with {cause}", f"{margin}; {what_to_do}")]
     if after.modulus >= _LAG_LEAVES * before.modulus:
         return []
     # Without a crossover the phase margin is infinite, and there is no angle to lose.

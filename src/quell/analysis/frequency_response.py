@@ -49,19 +49,15 @@ class System(NamedTuple):
 def response(system: System, omega: Any, dt: float) -> Complex:
     """Return the response (k,) at the frequencies ``omega`` (k,) [rad/s].
 
-    Raises
-    ------
-    ValueError
-        at the frequency of a pole.
+    Raises ``ValueError`` at the frequency of a pole.
     """
     zeta = np.expm1(1j * np.atleast_1d(omega) * dt)
     if system.N.shape[0] == 0:
         return np.full(zeta.shape, complex(system.D))
     resolvent = zeta[:, None, None] * np.eye(system.N.shape[0]) - system.N
+    inputs = np.broadcast_to(system.B[:, None], (zeta.size, system.B.size, 1))
     try:
-        solved = np.linalg.solve(
-            resolvent, np.broadcast_to(system.B[:, None], (zeta.size, system.B.size, 1))
-        )
+        solved = np.linalg.solve(resolvent, inputs)
     except np.linalg.LinAlgError:
         raise ValueError(
             f"omega = {np.atleast_1d(omega).tolist()!r} rad/s: the response is infinite at one of "

@@ -48,12 +48,9 @@ _USE_STATE = "pass the scenario to loops_over_time, or the final_state of a run 
 class Frozen(NamedTuple):
     """A learner that no longer learns, for a plant of order n, with its authority."""
 
-    gain: Vector
-    """g (n + 1,), for x̂_1 … x̂_n and Δf̂."""
-    before: float
-    """h, for the control signal applied a sample before."""
-    slope: float
-    """s, for the control signal that is about to be applied."""
+    gain: Vector  # g (n + 1,), for x̂_1 … x̂_n and Δf̂
+    before: float  # h, for the control signal applied a sample before
+    slope: float  # s, for the control signal that is about to be applied
 
 
 @predict.register(Frozen)
@@ -74,7 +71,9 @@ for _generic in (adapt, commit, restart, coefficients):
 def frozen(controller: Controller, run: Any = None, t: float | None = None) -> Frozen:
     """Freeze a controller's learner: now, at the end of a run, or at any time of it.
 
-    The gains include the authority that a guard gave it.
+    The gains include the authority that a guard gave it. Raises ``ValueError`` if the record
+    lacks the time or the learner's coefficients, and for a learner that calls a Python model, whose
+    answer is held between calls.
 
     Parameters
     ----------
@@ -87,12 +86,6 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
         time of the run [s]; by default its end. The coefficients at that time come from the record,
         so the learner's features must be states, u, a constant and sinusoids. Freeze any other
         learner at the end of a run that ends at that time.
-
-    Raises
-    ------
-    ValueError
-        if the record does not hold the learner's coefficients, or not the time; for a learner that
-        calls a Python model, whose answer is held between calls.
     """
     if not isinstance(controller, ADRC):
         raise ValueError(f"controller = {controller!r}: must be an ADRC")

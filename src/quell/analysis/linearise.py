@@ -32,6 +32,11 @@ _UNLIMITED = Limits(-math.inf, math.inf, math.inf)
 def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     """Return the linear law of a controller, its learner frozen.
 
+    It equals the controller without limits, except for a constant feedforward of the learner, and
+    the first sample if y is not 0 then: an ADRC takes the measurement as its state.
+    Raises ``ValueError`` for a controller without a linear law, or with one that changes from
+    sample to sample.
+
     Parameters
     ----------
     controller
@@ -39,18 +44,6 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     at
         instant at which the learner is frozen: a ``Frozen``, a run or a state of the controller
         (its end); by default the present state.
-
-    Returns
-    -------
-    LinearLaw
-        equal to the controller without limits, except for a constant feedforward of the learner and
-        for the first sample, at which an ADRC takes the measurement as its state; from ``y = 0`` on
-        they agree.
-
-    Raises
-    ------
-    ValueError
-        for a controller without a linear law, or with one that changes from sample to sample.
     """
     if hasattr(controller, "law"):
         given: LinearLaw = controller.law
@@ -77,11 +70,8 @@ def _measured_law(design: Any, origin: Any) -> LinearLaw:
     """Return the law around a state ``origin`` that no limit and no flag is about to change."""
     fixed_u = [design._replace(limits=Limits(u, u, math.inf)) for u in (0.0, _UNIT)]
     # Entries that are not zero are flags and the like, which do not change any more.
-    places = [
-        (name, at)
-        for name, array in named_arrays(origin).items()
-        for at in np.argwhere(array == 0.0)
-    ]
+    arrays = named_arrays(origin).items()
+    places = [(name, at) for name, array in arrays for at in np.argwhere(array == 0.0)]
 
     def respond(design: Any, place: Any = None, r: float = 0.0, y: float = 0.0) -> Any:
         """Return the next state and u, in units, for one entry of the state, r or y."""

@@ -40,6 +40,9 @@ def analyse(
 ) -> LoopAnalysis:
     """Analyse the loop of a linear plant and a controller, unlimited and with a frozen learner.
 
+    Raises ``ValueError`` for a plant that is not linear or has direct feedthrough, a controller
+    without a linear law, a delay of more than 200 samples.
+
     Parameters
     ----------
     plant
@@ -54,12 +57,6 @@ def analyse(
         additional dead time of the loop [s].
     actuator_lag
         time constant of a first-order lag between u and the plant [s].
-
-    Raises
-    ------
-    ValueError
-        for a plant that is not linear or has direct feedthrough, a controller without a linear law,
-        a delay of more than 200 samples.
     """
     while isinstance(controller, Prefiltered):
         controller = controller.controller
@@ -125,9 +122,8 @@ class LoopAnalysis:
 
     def closed_loop_matrix(self, gain: float = 1.0) -> Matrix:
         """Return ``A − I`` of the closed loop with ``gain`` times the plant's gain."""
-        return closed_loop_matrix(
-            self.plant.N, gain * self.plant.B, self.plant.C, self.law, self._N
-        )
+        plant = self.plant
+        return closed_loop_matrix(plant.N, gain * plant.B, plant.C, self.law, self._N)
 
     def _shifted_poles(self, gain: float = 1.0) -> Complex:
         """Return the closed-loop poles as z − 1, the slowest first."""
@@ -159,10 +155,8 @@ class LoopAnalysis:
     @cached_property
     def omega(self) -> Vector:
         """Frequencies [rad/s] for plots, up to half the sampling rate; dense near poles."""
-        open_loop = [
-            in_s_plane(np.linalg.eigvals(N).astype(np.complex128), self.dt)
-            for N in (self.plant.N, self._N)
-        ]
+        poles = (np.linalg.eigvals(N).astype(np.complex128) for N in (self.plant.N, self._N))
+        open_loop = [in_s_plane(shifted, self.dt) for shifted in poles]
         return frequencies(np.concatenate([self.s_poles, *open_loop]), self.dt)
 
     def response(self, name: str, omega: Any) -> Complex:
@@ -175,11 +169,6 @@ class LoopAnalysis:
             (noise to −u) or ``"closed_loop"`` (r to y).
         omega
             frequencies [rad/s] (k,).
-
-        Raises
-        ------
-        ValueError
-            for another name.
         """
         checks.one_of("name", name, ("P", "C_r", "C_y", "L", "S", "T", "PS", "CS", "closed_loop"))
         if name in self._open:
@@ -251,27 +240,19 @@ class LoopAnalysis:
             (the plant's disturbances).
         target
             ``"y"``, ``"u"`` or ``"e"``, which is r − y.
-
-        Raises
-        ------
-        ValueError
-            for another source or target.
         """
         return closed_loop(self.plant, self.law, source, target)
 
     def system(self, name: str) -> Any:
         """Return a part of the loop, or a closed loop, as a sampled ``control.StateSpace``.
 
+        Raises ``ImportError`` without python-control.
+
         Parameters
         ----------
         name
             as for ``response``, or ``"source → target"`` as for ``closed_loop``, for example
             ``"w2 → y"``.
-
-        Raises
-        ------
-        ImportError
-            without python-control.
         """
         return state_space(subsystem(self.plant, self.law, name), self.dt)
 

@@ -70,18 +70,10 @@ class Margins(NamedTuple):
 def margins(
     loop: Response, omega: Vector, dt: float, stable_with: Callable[[float], bool]
 ) -> Margins:
-    """Return the margins of a loop.
+    """Return the margins of a loop, given as a function from frequencies [rad/s] to L.
 
-    Parameters
-    ----------
-    loop
-        function that returns L at frequencies [rad/s].
-    omega
-        grid of frequencies [rad/s]; extrema and crossings between them are refined.
-    dt
-        sample time [s].
-    stable_with
-        function that returns whether the closed loop is stable with its gain times a factor.
+    Extrema and crossings are refined between the frequencies ``omega``. ``stable_with`` returns
+    whether the closed loop is stable with its gain times a factor.
     """
     nan = math.nan
     if not stable_with(1.0):

@@ -32,11 +32,6 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
         two matplotlib axes; a new figure by default.
     style
         of the lines, for example ``label``.
-
-    Raises
-    ------
-    ValueError
-        for another number of axes.
     """
     new_figure = axes is None
     top, low = axes = _axes(axes, 2, 1)
@@ -75,24 +70,11 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
 def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
     """Plot the gains of S, T, PS (load to y) and CS (noise to u); return these four axes.
 
-    Parameters
-    ----------
-    loop, axes, style
-        as for ``plot_bode``, but with four axes.
-
-    Raises
-    ------
-    ValueError
-        for another number of axes.
+    The parameters are those of ``plot_bode``, but with four axes.
     """
     axes = _axes(axes, 2, 2)
-    meanings = {
-        "S": "",
-        "T": "",
-        "PS": ": load at the plant's input to y",
-        "CS": ": measurement noise to u",
-    }
-    for ax, (name, meaning) in zip(axes, meanings.items(), strict=True):
+    meanings = ("", "", ": load at the plant's input to y", ": measurement noise to u")
+    for ax, name, meaning in zip(axes, ("S", "T", "PS", "CS"), meanings, strict=True):
         gain = np.abs(loop.response(name, loop.omega))
         ax.loglog(loop.omega, gain, **style)
         _limit_ratio(ax, gain)
@@ -118,11 +100,6 @@ def plot_margins_over_time(
         one for each, from ``loops_over_time``.
     axes, style
         as for ``plot_bode``, but with three axes.
-
-    Raises
-    ------
-    ValueError
-        for another number of loops than instants, or of axes.
     """
     axes = _plot_margins(checks.vector("times", times), loops, axes, style)
     axes[-1].set_xlabel("learner frozen at [s]")
@@ -144,11 +121,6 @@ def plot_margins_against_omega_o(
         as for ``loops_over_omega_o``.
     axes
         four matplotlib axes; a new figure by default.
-
-    Raises
-    ------
-    ValueError
-        as ``loops_over_omega_o``; for another number of axes.
     """
     loops = loops_over_omega_o(plant, make_controller, omegas, **lags)
     omegas = checks.vector("omegas", omegas)
@@ -179,9 +151,8 @@ def _plot_margins(
     axes[2].set_yscale("log")
     axes[2].axhline(1.0, **_AID)
     gain = "gain" if any(loop.b_over_b0 is None for loop in loops) else "b/b0"
-    for ax, label in zip(
-        axes, ("margin", "phase margin [°]", f"{gain} for which\nit is stable"), strict=True
-    ):
+    labels = ("margin", "phase margin [°]", f"{gain} for which\nit is stable")
+    for ax, label in zip(axes, labels, strict=True):
         _finish(ax, label)
     axes[0].legend(fontsize="small")
     return axes
@@ -204,10 +175,8 @@ def _limit_ratio(ax: Axes, size: Vector) -> None:
     """Limit the axis to six decades about the median, to leave out undamped poles and zeros."""
     finite = size[np.isfinite(size) & (size > 0.0)]
     middle = float(np.median(finite))
-    ax.set_ylim(
-        max(0.5 * float(np.min(finite)), 1e-6 * middle),
-        min(2.0 * float(np.max(finite)), 1e6 * middle),
-    )
+    low, high = 0.5 * float(np.min(finite)), 2.0 * float(np.max(finite))
+    ax.set_ylim(max(low, 1e-6 * middle), min(high, 1e6 * middle))
 
 
 def _finish(ax: Axes, label: str, loop: LoopAnalysis | None = None) -> None:

@@ -24,39 +24,20 @@ _MOST_SAMPLES = 200
 class SampledPlant(NamedTuple):
     """``x⁺ − x = N x + B u + E w``, ``y = C x``."""
 
-    N: Matrix
-    """A − I (n, n)."""
-    B: Vector
-    """(n,)."""
-    E: Matrix
-    """(n, m)."""
-    C: Vector
-    """(n,)."""
-    b: dict[int, float]
-    """Gain from u to y^(k), by k, for the first derivative that u reaches."""
+    N: Matrix  # A − I (n, n)
+    B: Vector  # (n,)
+    E: Matrix  # (n, m)
+    C: Vector  # (n,)
+    b: dict[int, float]  # gain from u to y^(k), by k, for the first derivative that u reaches
 
 
 def sampled_plant(
     plant: Any, dt: float, delay: float = 0.0, actuator_lag: float = 0.0
 ) -> SampledPlant:
-    """Sample a linear plant exactly.
+    """Sample a linear plant exactly; see ``analyse`` for the parameters.
 
-    Parameters
-    ----------
-    plant
-        anything that ``LinearPlant.of`` takes; a system of python-control or scipy.signal may be
-        sampled already, with the same dt.
-    dt
-        sample time [s].
-    delay
-        dead time before the plant's input [s]; any fraction of a sample.
-    actuator_lag
-        time constant of a first-order lag between u and the plant [s].
-
-    Raises
-    ------
-    ValueError
-        for another object, direct feedthrough, or a dead time of more than 200 samples.
+    A system of python-control or scipy.signal may be sampled already, with the same dt. Raises
+    ``ValueError`` for another object, direct feedthrough, or a dead time of more than 200 samples.
     """
     delay = checks.non_negative("delay", delay, "s")
     actuator_lag = checks.non_negative("actuator_lag", actuator_lag, "s")
@@ -80,9 +61,8 @@ def sampled_plant(
         B = np.vstack([np.zeros_like(B), [[1.0 / actuator_lag]]])
         C, E = np.append(C, 0.0), np.vstack([E, np.zeros((1, E.shape[1]))])
     if delay > _MOST_SAMPLES * dt:
-        raise ValueError(
-            f"delay = {delay!r} s: must be at most {_MOST_SAMPLES} samples of {dt!r} s"
-        )
+        limit = f"{_MOST_SAMPLES} samples of {dt!r} s"
+        raise ValueError(f"delay = {delay!r} s: must be at most {limit}")
     samples = math.floor(delay / dt * (1.0 + 1e-12))
     late = max(delay - samples * dt, 0.0)
     if late < 1e-12 * dt:  # a whole number of samples, to rounding
@@ -96,13 +76,7 @@ def sampled_plant(
 
 
 def _delayed(
-    N: Matrix,
-    now: Matrix,
-    before: Matrix,
-    C: Vector,
-    E: Matrix,
-    samples: int,
-    gains: dict[int, float],
+    N: Matrix, now: Matrix, before: Matrix, C: Vector, E: Matrix, samples: int, b: dict[int, float]
 ) -> SampledPlant:
     """Append the control signals that have not arrived yet as states, the newest last."""
     n, waiting = N.shape[0], samples + bool(np.any(before))
@@ -123,4 +97,4 @@ def _delayed(
     else:
         B[:n] = now[:, 0]
     E = np.vstack([E, np.zeros((waiting, E.shape[1]))])
-    return SampledPlant(A, B, E, np.append(C, np.zeros(waiting)), gains)
+    return SampledPlant(A, B, E, np.append(C, np.zeros(waiting)), b)

@@ -10,14 +10,8 @@ from quell.analysis.sampled_plant import SampledPlant
 from quell.controllers.linear.law import LinearLaw
 from quell.types import Matrix
 
-# Source and target of the closed-loop responses that have a name.
-_CLOSED = {
-    "closed_loop": ("r", "y"),
-    "PS": ("d", "y"),
-    "CS": ("n", "u"),
-    "S": ("n", "y"),
-    "T": ("n", "y"),
-}
+# Source and target, a letter each, of the closed-loop responses that have a name.
+_CLOSED = {"closed_loop": "ry", "PS": "dy", "CS": "nu", "S": "ny", "T": "ny"}
 _OPEN = ("P", "C_r", "C_y", "L")
 
 
@@ -27,12 +21,8 @@ def closed_loop_matrix(A: Matrix, B: Matrix, C: Matrix, law: LinearLaw, inner: M
     ``inner`` is ``law.A + B_u C``, the law with its own output applied. Pass A and ``inner`` both
     as they are, or both less the unit matrix.
     """
-    return np.block(
-        [
-            [A + law.D_y * np.outer(B, C), np.outer(B, law.C)],
-            [np.outer(law.B_y + law.B_u * law.D_y, C), inner],
-        ]
-    )
+    plant_rows = [A + law.D_y * np.outer(B, C), np.outer(B, law.C)]
+    return np.block([plant_rows, [np.outer(law.B_y + law.B_u * law.D_y, C), inner]])
 
 
 def law_matrix(law: LinearLaw) -> Matrix:
@@ -71,9 +61,8 @@ def _open_loop(plant: SampledPlant, law: LinearLaw, name: str) -> System:
 
 def closed_loop(plant: SampledPlant, law: LinearLaw, source: str, target: str) -> System:
     """Return the closed loop from an input to an output; see ``LoopAnalysis.closed_loop``."""
-    checks.one_of(
-        "source", source, ("r", "d", "n", *(f"w{i + 1}" for i in range(plant.E.shape[1])))
-    )
+    disturbances = (f"w{i + 1}" for i in range(plant.E.shape[1]))
+    checks.one_of("source", source, ("r", "d", "n", *disturbances))
     checks.one_of("target", target, ("y", "u", "e"))
     A = closed_loop_matrix(plant.N, plant.B, plant.C, law, law_matrix(law))
     m = law.A.shape[0]

@@ -20,7 +20,9 @@ def loops_over_time(
     """Analyse the loop with its learner frozen at several instants.
 
     Each is the loop that would follow if nothing more were learned. That all of them are stable
-    does not prove that the loop with a learner that learns is stable (docs/analysis).
+    does not prove that the loop with a learner that learns is stable (docs/analysis). Raises
+    ``ValueError`` as ``frozen`` and ``analyse`` do, for a time outside of the run, and for a
+    scenario in which the loop diverges before it.
 
     Parameters
     ----------
@@ -33,12 +35,6 @@ def loops_over_time(
         instants [s].
     lags
         ``delay`` and ``actuator_lag``, as for ``analyse``.
-
-    Raises
-    ------
-    ValueError
-        as ``frozen`` and ``analyse``; for a time outside of the run, or a scenario in which the
-        loop diverges before it.
     """
     instants = checks.vector("times", times).tolist()
     if isinstance(run, Trajectory):
@@ -50,9 +46,8 @@ def loops_over_time(
         if not 0.0 < t <= run.duration:
             raise ValueError(f"times has {t!r}: must lie within (0, duration = {run.duration!r}] s")
         until = replace(run, duration=t, rest_at=tuple(at for at in run.rest_at if at < t))
-        record = simulate(
-            plant, controller, until, record_every=10**9
-        )  # only the final state is used
+        # Only the final state is used.
+        record = simulate(plant, controller, until, record_every=10**9)
         if record.diverged:
             raise ValueError(f"times has {t!r}: the loop diverged at {record.ended:.6g} s")
         loops.append(analyse(plant, controller, at=record, **lags))
@@ -74,11 +69,6 @@ def loops_over_omega_o(
         the bandwidths [rad/s], at least one.
     lags
         ``delay`` and ``actuator_lag``, as for ``analyse``.
-
-    Raises
-    ------
-    ValueError
-        for a bandwidth that is not greater than zero; as ``analyse``.
     """
     bandwidths = checks.positive_vector("omegas", omegas)
     if bandwidths.size == 0:

@@ -29,12 +29,10 @@ _DELAY_LIMIT = 0.5
 class Finding(NamedTuple):
     """A weak point of a design."""
 
-    subject: str
-    """``"sampling"``, ``"noise"``, ``"lag"``, ``"margin"`` or ``"stability"``."""
+    subject: str  # ``"sampling"``, ``"noise"``, ``"lag"``, ``"margin"`` or ``"stability"``
     value: float
     limit: float
-    message: str
-    """The weak point, with both numbers, and what to do."""
+    message: str  # the weak point, with both numbers, and what to do
 
     def __str__(self) -> str:
         return self.message

@@ -18,8 +18,7 @@ class Limits(NamedTuple):
 
     low: float
     high: float
-    most_change: float
-    """Largest change in a sample."""
+    most_change: float  # largest change in a sample
 
 
 def checked_limits(u_min: float, u_max: float, rate_limit: float, dt: float) -> Limits:

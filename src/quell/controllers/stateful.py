@@ -28,8 +28,7 @@ class StatefulController:
     ``_external_snapshots`` and ``_restore_external``.
     """
 
-    parameters: Any
-    """Parameters of the compiled functions, a NamedTuple."""
+    parameters: Any  # parameters of the compiled functions, a NamedTuple
     _state: Any
     _limits: Limits
     _packed: Any
@@ -87,11 +86,6 @@ class StatefulController:
 
         Call it before the next ``step``. Limits that are known beforehand belong in ``u_min``,
         ``u_max`` and ``rate_limit``.
-
-        Raises
-        ------
-        ValueError
-            for a u that is not finite.
         """
         set_applied_control(self.parameters, self._state, checks.finite("u", u))
 
@@ -162,9 +156,8 @@ class StatefulController:
         """Restore what ``_external_snapshots`` returned."""
 
     def _saved(self, state: Any) -> dict[str, NDArray[Any]]:
-        saved: dict[str, NDArray[Any]] = {
-            name: array.copy() for name, array in named_arrays(state).items()
-        }
+        arrays = named_arrays(state).items()
+        saved: dict[str, NDArray[Any]] = {name: array.copy() for name, array in arrays}
         for name, snapshot in self._external_snapshots(state).items():
             saved[name] = np.empty((), dtype=object)
             saved[name][()] = snapshot

@@ -42,13 +42,7 @@ class Features:
     """A block of features; ``one + other`` has the features of both."""
 
     def design(self, order: int) -> Any:
-        """Return the parameters (a NamedTuple) for a plant of order ``order``.
-
-        Raises
-        ------
-        ValueError
-            if the block does not fit a plant of this order.
-        """
+        """Return the parameters (a NamedTuple) for a plant of order ``order``."""
         raise NotImplementedError
 
     def names(self, order: int) -> tuple[str, ...]:
@@ -73,10 +67,7 @@ class Features:
 class Joined(Features):
     """The features of two blocks, one after the other; made by ``first + second``.
 
-    Raises
-    ------
-    ValueError
-        if ``first`` has the control signal, which must be last and only once.
+    Raises ``ValueError`` if ``first`` has the control signal, which must be last and only once.
     """
 
     def __init__(self, first: Features, second: Features) -> None:
@@ -86,9 +77,8 @@ class Joined(Features):
 
     def design(self, order: int) -> JoinedDesign:
         """Return both blocks' parameters."""
-        return JoinedDesign(
-            self.first.design(order), self.second.design(order), len(self.first.names(order))
-        )
+        first, second = self.first.design(order), self.second.design(order)
+        return JoinedDesign(first, second, len(self.first.names(order)))
 
     def names(self, order: int) -> tuple[str, ...]:
         """Return both blocks' names; repeated names are numbered."""
@@ -119,8 +109,7 @@ class JoinedDesign(NamedTuple):
 
     first: Any
     second: Any
-    split: int
-    """Number of features of the first."""
+    split: int  # number of features of the first
 
 
 @write.register(JoinedDesign)
@@ -136,13 +125,7 @@ def _unit(features: JoinedDesign, scale: Vector, out: Vector) -> None:
 
 
 def checked_design(features: Features, order: int) -> Any:
-    """Return ``features.design(order)`` after a test of each user-defined block.
-
-    Raises
-    ------
-    ValueError
-        if a block breaks a rule; the message names its class and the rule.
-    """
+    """Return ``features.design(order)`` after a test of each user-defined block."""
     if isinstance(features, Joined):
         checked_design(features.first, order)
         checked_design(features.second, order)
@@ -157,27 +140,20 @@ def _check_block(block: Features, order: int) -> None:
     what = f"{name}.design({order})"
     parameters = validation.attempt(what, "design takes the plant's order", block.design, order)
     validation.check_named_tuple(what, parameters, "numbers and arrays")
-    names = validation.attempt(
-        f"{name}.names({order})", "names takes the plant's order", block.names, order
-    )
+    what = f"{name}.names({order})"
+    names = validation.attempt(what, "names takes the plant's order", block.names, order)
     if not (isinstance(names, tuple) and names and all(isinstance(label, str) for label in names)):
-        raise ValueError(
-            f"{name}.names({order}) returns {names!r}: must return a tuple with a name for each "
-            "feature"
-        )
+        rule = "must return a tuple with a name for each feature"
+        raise ValueError(f"{what} returns {names!r}: {rule}")
     validation.check_registered(name, parameters, write, unit)
     rule = f"it gets x ({order},), u, and room for {len(names)} features, one for each name"
     ones, marks = np.ones(order + 2), (7e77, -7e77)
     for function, arguments in ((write, (validation.sample_values(order), 0.5)), (unit, (ones,))):
-        written = []
+        what, written = f"{name}: {function.__name__}", []
         for mark in marks:
             out = np.full(len(names), mark)
-            validation.attempt_kernel(
-                f"{name}: {function.__name__}", rule, function, parameters, *arguments, out
-            )
+            validation.attempt_kernel(what, rule, function, parameters, *arguments, out)
             written.append(out != mark)
         if not np.all(written):
             missing = np.flatnonzero(~np.all(written, axis=0)).tolist()
-            raise ValueError(
-                f"{name}: {function.__name__} does not write features {missing}; {rule}"
-            )
+            raise ValueError(f"{what} does not write features {missing}; {rule}")

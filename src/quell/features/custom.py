@@ -26,8 +26,7 @@ _SIGNATURE = nb_types.void(POINTER, nb_types.float64, POINTER)
 class CustomDesign(NamedTuple):
     """Parameters of ``Custom``."""
 
-    address: int
-    """Address of the compiled function; the cache of ``_machine_code`` keeps it alive."""
+    address: int  # address of the compiled function; the cache of ``_machine_code`` keeps it alive
 
 
 class Custom(Features):
@@ -40,12 +39,6 @@ class Custom(Features):
         address.
     names
         name of each of the numbers.
-
-    Raises
-    ------
-    ValueError
-        if there are no names; by ``design`` if the function returns another number of values or
-        can't be compiled.
 
     Examples
     --------

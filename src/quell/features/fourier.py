@@ -19,12 +19,9 @@ class RandomFourierDesign(NamedTuple):
     """Parameters of ``RandomFourier``."""
 
     states: StateIndices
-    waves: Matrix
-    """w (p, k)."""
-    phase: Vector
-    """b (p,)."""
-    size: float
-    """``sqrt(2/p)``."""
+    waves: Matrix  # w (p, k)
+    phase: Vector  # b (p,)
+    size: float  # ``sqrt(2/p)``
 
 
 @dataclass(frozen=True)
@@ -45,11 +42,6 @@ class RandomFourier(Features):
         of w and b.
     states
         numbers of the states, from 1; all by default.
-
-    Raises
-    ------
-    ValueError
-        for arguments out of range.
 
     References
     ----------

@@ -19,8 +19,7 @@ from quell.types import Vector
 class PolynomialDesign(NamedTuple):
     """Parameters of ``Polynomial``."""
 
-    factors: NDArray[np.int64]
-    """(p, degree): indices of the states that are multiplied; −1 for none."""
+    factors: NDArray[np.int64]  # (p, degree): indices of the states to multiply; −1 for none
 
 
 @dataclass(frozen=True)
@@ -36,11 +35,6 @@ class Polynomial(Features):
         the largest total degree.
     states
         numbers of the states, from 1; all by default.
-
-    Raises
-    ------
-    ValueError
-        for a degree below 2, or a state that the plant does not have.
     """
 
     degree: int = 3

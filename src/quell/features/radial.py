@@ -21,10 +21,8 @@ class RadialDesign(NamedTuple):
     """Parameters of ``RBF``."""
 
     states: StateIndices
-    centers: Matrix
-    """(p, k)."""
-    weight: float
-    """``1/(2 width²)``."""
+    centers: Matrix  # (p, k)
+    weight: float  # ``1/(2 width²)``
 
 
 class RBF(Features):
@@ -42,11 +40,6 @@ class RBF(Features):
         numbers of the states, from 1; the first two by default.
     centers
         the centres (p, k), instead of ``count``.
-
-    Raises
-    ------
-    ValueError
-        for arguments out of range, or centres that do not fit the states.
 
     References
     ----------
@@ -81,10 +74,8 @@ class RBF(Features):
         chosen = state_indices(self.states, order, 2)
         if self.centers is None:
             if chosen.size > len(_PRIMES):
-                raise ValueError(
-                    f"states = {self.states!r}: must be at most {len(_PRIMES)}, or centers must be "
-                    "given"
-                )
+                rule = f"must be at most {len(_PRIMES)}, or centers must be given"
+                raise ValueError(f"states = {self.states!r}: {rule}")
             bases, points = _PRIMES[: chosen.size], range(1, self.count + 1)
             halton = np.array([[_radical_inverse(i, base) for base in bases] for i in points])
             centers = 2.0 * halton - 1.0

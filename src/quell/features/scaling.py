@@ -28,10 +28,8 @@ _FLOOR = 1.0 / 8.0
 class Scaling(NamedTuple):
     """Parameters, for a plant of order n."""
 
-    floors: Vector
-    """Least scales (n + 2,) over that of x_1: ω^(i−1)/8 for x_2 … x_n; 0 for x_1, u and f."""
-    fixed: bool
-    """Whether the scales are given and do not change."""
+    floors: Vector  # least scales (n + 2,) over that of x_1: ω^(i−1)/8 for x_2 … x_n, else 0
+    fixed: bool  # whether the scales are given and do not change
 
 
 def scaling(observer: ESO, frequency: float, fixed: bool) -> Scaling:

@@ -17,9 +17,8 @@ def check_states(states: Sequence[int] | None) -> None:
     if states is None:
         return
     if not isinstance(states, tuple | list) or len(states) == 0:
-        raise ValueError(
-            f"states = {states!r}: must be a tuple of the numbers of states, for example (1, 2)"
-        )
+        rule = "must be a tuple of the numbers of states, for example (1, 2)"
+        raise ValueError(f"states = {states!r}: {rule}")
     for i, state in enumerate(states):
         checks.whole(f"states[{i}]", state, 1)
     if len(set(states)) < len(states):
@@ -29,17 +28,10 @@ def check_states(states: Sequence[int] | None) -> None:
 def state_indices(
     states: Sequence[int] | None, order: int, default: int | None = None
 ) -> StateIndices:
-    """Return the indices (k,) of ``states`` in x, from 0; by default the first ``default`` or all.
-
-    Raises
-    ------
-    ValueError
-        if a plant of order ``order`` has no such state.
-    """
+    """Return the indices (k,) of ``states`` in x; by default the first ``default``, or all."""
     if states is None:
         return np.arange(order if default is None else min(order, default))
     if max(states) > order:
-        raise ValueError(
-            f"states = {states!r}: a plant of order {order} has no state {max(states)}"
-        )
+        rule = f"a plant of order {order} has no state {max(states)}"
+        raise ValueError(f"states = {states!r}: {rule}")
     return np.array(states, dtype=np.int64) - 1

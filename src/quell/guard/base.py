@@ -22,8 +22,7 @@ class UnguardedDesign(NamedTuple):
 class UnguardedMemory(NamedTuple):
     """State of a controller without guard."""
 
-    nothing: Vector
-    """(0,)."""
+    nothing: Vector  # (0,)
 
 
 @generic_with_default

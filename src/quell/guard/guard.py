@@ -80,22 +80,14 @@ _TRUSTED, _UNPROVEN, _TOO_LOUD, _OUT_OF_BOUNDS, _TOO_FAST, _EXPLODED, _NOT_FINIT
 class GuardDesign(NamedTuple):
     """Parameters of the guard."""
 
-    lag: Any
-    """Lag filter of the observer."""
-    forget: float
-    """dt/T."""
-    rise: float
-    """Share by which e follows a larger \\|q\\| in a sample."""
-    decay: float
-    """Share by which e decays in a sample."""
-    bound: float
-    """κ."""
-    fastest: float
-    """Largest change of f_L in a sample, in units of e."""
-    least_slope: float
-    """Least ∂f_L/∂u that is used; beyond it the output counts as a constant."""
-    largest_slope: float
-    """Largest ∂f_L/∂u that is used."""
+    lag: Any  # lag filter of the observer
+    forget: float  # dt/T
+    rise: float  # share by which e follows a larger \|q\| in a sample
+    decay: float  # share by which e decays in a sample
+    bound: float  # κ
+    fastest: float  # largest change of f_L in a sample, in units of e
+    least_slope: float  # least ∂f_L/∂u that is used; beyond it the output counts as a constant
+    largest_slope: float  # largest ∂f_L/∂u that is used
 
 
 class GuardAverages(Scalars):
@@ -122,14 +114,10 @@ class GuardSample(Scalars):
 class GuardMemory(NamedTuple):
     """State of the guard."""
 
-    chain: Matrix
-    """Lag filters of f_plain, g and g^F (3, …)."""
-    shown: Vector
-    """Their outputs: f_plain^F, g^F and g^FF (3,)."""
-    averages: NDArray[GuardAverages]
-    """(1,)."""
-    sample: NDArray[GuardSample]
-    """(1,)."""
+    chain: Matrix  # lag filters of f_plain, g and g^F (3, …)
+    shown: Vector  # their outputs: f_plain^F, g^F and g^FF (3,)
+    averages: NDArray[GuardAverages]  # (1,)
+    sample: NDArray[GuardSample]  # (1,)
 
 
 # Rows of GuardMemory.chain and entries of GuardMemory.shown.
@@ -270,11 +258,6 @@ class Guard:
     time
         time T [s] over which a learner's output is averaged; by default 30 lags
         ``(n + 1)/omega_o`` of the observer.
-
-    Raises
-    ------
-    ValueError
-        for a parameter that is not positive.
     """
 
     bound: float = 1.2
@@ -306,6 +289,5 @@ class Guard:
         """Return the state before the first sample, without authority."""
         averages = GuardAverages.zeros()
         _withdraw_authority(averages[0])
-        return GuardMemory(
-            lag_memory(parameters.lag, 3), np.zeros(3), averages, GuardSample.zeros()
-        )
+        chain = lag_memory(parameters.lag, 3)
+        return GuardMemory(chain, np.zeros(3), averages, GuardSample.zeros())

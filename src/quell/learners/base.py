@@ -92,33 +92,24 @@ def checked_design(learner: Learner, observer: ESO, omega_c: float) -> Any:
     """Return ``learner.design(observer, omega_c)``; check a user-defined learner first.
 
     All functions of the contract are called once, interpreted, on a memory that is discarded.
-
-    Raises
-    ------
-    ValueError
-        that names the learner's class and the rule it breaks.
     """
     if not validation.is_user_defined(learner):
         return learner.design(observer, omega_c)
     name, order = type(learner).__name__, observer.order
     what = f"{name}.design(observer, {omega_c:g})"
-    parameters = validation.attempt(
-        what, "design takes (observer, omega_c)", learner.design, observer, omega_c
-    )
+    rule = "design takes (observer, omega_c)"
+    parameters = validation.attempt(what, rule, learner.design, observer, omega_c)
     validation.check_named_tuple(what, parameters, "numbers and arrays")
     validation.check_registered(name, parameters, adapt, predict, commit, restart, coefficients)
-    memory = validation.attempt(
-        f"{name}.memory(...)", "memory takes (parameters)", learner.memory, parameters
-    )
+    what = f"{name}.memory(...)"
+    memory = validation.attempt(what, "memory takes (parameters)", learner.memory, parameters)
     validation.check_arrays(f"{name}.memory", memory, nested=True)
     what = f"{name}.feature_names({order})"
-    names = validation.attempt(
-        what, "feature_names takes the plant's order", learner.feature_names, order
-    )
+    rule = "feature_names takes the plant's order"
+    names = validation.attempt(what, rule, learner.feature_names, order)
     if not isinstance(names, tuple) or not all(isinstance(label, str) for label in names):
-        raise ValueError(
-            f"{what} returns {names!r}: must return a tuple with a name for each coefficient"
-        )
+        rule = "must return a tuple with a name for each coefficient"
+        raise ValueError(f"{what} returns {names!r}: {rule}")
 
     def call(
         function: Any, *arguments: Any, rule: str = "docs/extend describes its arguments"
@@ -131,9 +122,8 @@ def checked_design(learner: Learner, observer: ESO, omega_c: float) -> Any:
     predicted = call(predict, seen, 0.5)
     if predicted is not validation.UNKNOWN:
         if not (isinstance(predicted, tuple) and len(predicted) == 2):
-            raise ValueError(
-                f"{name}: predict returns {predicted!r}: must return (constant, slope), two numbers"
-            )
+            rule = "must return (constant, slope), two numbers"
+            raise ValueError(f"{name}: predict returns {predicted!r}: {rule}")
         for label, value in zip(("constant", "slope"), predicted, strict=True):
             validation.check_number(f"{name}: predict, {label},", value)
     call(commit, seen, 0.5, 0.1)

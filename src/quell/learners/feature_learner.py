@@ -59,11 +59,6 @@ class FeatureLearner:
     bias_bandwidth
         bandwidth λ of a bias that follows what is not learned otherwise [rad/s]; ``omega_o`` of the
         observer by default, 0 for no bias.
-
-    Raises
-    ------
-    ValueError
-        for an argument that is out of range or no block of features.
     """
 
     def __init__(
@@ -81,9 +76,8 @@ class FeatureLearner:
             )
         self.frequency = checks.optional(checks.positive, "frequency", frequency, "rad/s")
         self.scale = checks.optional(checks.positive_vector, "scale", scale)
-        self.bias_bandwidth = checks.optional(
-            checks.non_negative, "bias_bandwidth", bias_bandwidth, "rad/s"
-        )
+        check = checks.non_negative
+        self.bias_bandwidth = checks.optional(check, "bias_bandwidth", bias_bandwidth, "rad/s")
 
     def _inputs(self, observer: ESO, omega_c: float) -> Inputs:
         order, frequency = observer.order, self.frequency or omega_c

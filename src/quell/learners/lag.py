@@ -34,14 +34,10 @@ STARTUP_LAGS = 2.0
 class Lag(NamedTuple):
     """The lag filter of an observer with all poles in one place, N = n + 1 states per input."""
 
-    pole: float
-    """β."""
-    rise: float
-    """1 − β, without cancellation."""
-    taps: Vector
-    """c (N,)."""
-    predictor: bool
-    """Whether the estimate shows the input one sample later: the observer is in predictor form."""
+    pole: float  # β
+    rise: float  # 1 − β, without cancellation
+    taps: Vector  # c (N,)
+    predictor: bool  # whether the observer is in predictor form: its estimate is a sample later
 
     @property
     def width(self) -> int:
@@ -52,14 +48,10 @@ class Lag(NamedTuple):
 class DenseLag(NamedTuple):
     """The lag filter of any linear observer, with m states per input."""
 
-    transition: Matrix
-    """M (m, m)."""
-    input: Vector
-    """g (m,)."""
-    taps: Vector
-    """c (m,): effect of the state on the next estimate."""
-    through: float
-    """d: effect of the input."""
+    transition: Matrix  # M (m, m)
+    input: Vector  # g (m,)
+    taps: Vector  # c (m,): effect of the state on the next estimate
+    through: float  # d: effect of the input
 
     @property
     def width(self) -> int:
@@ -85,12 +77,8 @@ def lag_of(observer: ESO) -> Lag | DenseLag:
     """Return the lag filter of an observer.
 
     It is a ``Lag`` if all poles are in one place, else a ``DenseLag``. A delay of u has no effect:
-    the feedforward is not delayed.
-
-    Raises
-    ------
-    ValueError
-        for a nonlinear observer, which has no lag filter.
+    the feedforward is not delayed. Raises ``ValueError`` for a nonlinear observer, which has no lag
+    filter.
     """
     if observer.has_one_pole:
         return _chain(observer)

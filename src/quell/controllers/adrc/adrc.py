@@ -40,7 +40,8 @@ class ADRC(StatefulController):
     Parameters
     ----------
     observer
-        model-free or model-based; it sets order, b0 and dt.
+        model-free or model-based, of a plant whose zeros lie in the left half plane; it sets order,
+        b0 and dt.
     omega_c
         controller bandwidth [rad/s]: all poles of the ideal loop lie at −omega_c.
     learner
@@ -58,12 +59,6 @@ class ADRC(StatefulController):
         whether to halve the gains k of the law, reference included, but not the cancellation of f.
         The gain from noise in x̂ is halved, and the loop settles to 2 % in 2.0, 1.4, 1.2 and 1.0
         times the time for orders 1 to 4 (Herbst, Hempel, Göhrt & Streif 2020, arXiv 2003.03986).
-
-    Raises
-    ------
-    ValueError
-        for a bandwidth or rate limit that is not positive, limits in the wrong order, and an
-        observer of a plant with zeros outside of the left half plane.
 
     Examples
     --------
@@ -171,13 +166,7 @@ class ADRC(StatefulController):
         call ``applied`` with what was applied.
 
         The first call compiles, or loads from the disk cache; ``prepare`` does that beforehand.
-
-        Raises
-        ------
-        ValueError
-            for more derivatives than are fed forward.
-        TypeError
-            for a value that is not a number.
+        Raises ``ValueError`` for more derivatives than are fed forward.
         """
         if self._packed is None:
             self.prepare()
@@ -212,35 +201,16 @@ class ADRC(StatefulController):
         r
             reference of the next step [y-unit]; ``y`` by default. With another one u still
             continues without a jump, and the move begins with the observer's own dynamics.
-
-        Raises
-        ------
-        ValueError
-            for a value that is not finite.
         """
         y, u = checks.finite("y", y), checks.finite("u", u)
         goal = y if r is None else checks.finite("r", r)
         start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), y, u, goal)
 
     def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
-        """Take one sample in manual operation: ``u`` is applied until the next sample.
+        """Take one sample in manual operation: ``u`` is applied until the next sample, unlimited.
 
-        Parameters
-        ----------
-        r, y, derivatives
-            as for ``step``.
-        u
-            applied control signal [u-unit]; not limited.
-
-        Returns
-        -------
-        float
-            the control signal that the controller would have applied [u-unit].
-
-        Raises
-        ------
-        ValueError
-            as ``step``, and for a u that is not finite.
+        Return the control signal that the controller would have applied [u-unit]; ``r``, ``y`` and
+        ``derivatives`` are as for ``step``.
         """
         with manual_operation(self._state, checks.finite("u", u)):
             self.step(r, y, *derivatives)
@@ -249,10 +219,7 @@ class ADRC(StatefulController):
     def hand_over(self) -> None:
         """End manual operation: the next ``step`` continues from the u of the last ``track``.
 
-        Raises
-        ------
-        ValueError
-            before the first sample.
+        Raises ``ValueError`` before the first sample.
         """
         if self._state.loop[0].started == 0.0:
             raise ValueError("hand_over: there was no sample yet; call track or start before")
@@ -275,7 +242,9 @@ class ADRC(StatefulController):
         The control signal continues from where the old gains would have it, and the difference
         decays with the new ``omega_c``. A faster observer still moves it in the middle of a motion,
         by its own better estimate. What was learned is kept. A call takes some milliseconds,
-        because the designs are sampled again.
+        because the designs are sampled again. Raises ``ValueError`` for an observer of another
+        kind, for a change of b0 or model that a learner's coefficients or the state do not allow;
+        the controller is then unchanged.
 
         Parameters
         ----------
@@ -285,13 +254,6 @@ class ADRC(StatefulController):
             new observer of the same order, form, structure and sample time, with another
             ``omega_o``, ``b0`` or model; unchanged by default. For a plant with zeros, or with a
             separate input for f, only ``omega_o`` may change.
-
-        Raises
-        ------
-        ValueError
-            for an observer of another kind, for a change of b0 or model that a learner's
-            coefficients or the state do not allow, and for a bandwidth that is not positive. The
-            controller is then unchanged.
         """
         omega_c = checks.optional(checks.positive, "omega_c", omega_c, "rad/s") or self.omega_c
         if observer is not None:

@@ -98,14 +98,7 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
 
 
 def check_replacement(old: ESO, new: Any, learns: bool) -> None:
-    """Check that ``new`` can replace ``old`` in a running controller; ``learns`` with a learner.
-
-    Raises
-    ------
-    ValueError
-        for another order, form, sample time or number of states, or a change of b0 or model that
-        the state or the learner's coefficients do not allow.
-    """
+    """Check that ``new`` can replace ``old`` in a running controller; ``learns`` with a learner."""
     if not isinstance(new, ESO):
         raise ValueError(f"observer = {new!r}: must be an ESO")
     for name in ("order", "degree", "f_degree", "dt", "form", "states"):

@@ -72,38 +72,27 @@ class AdrcLoop(Scalars):
 class AdrcDesign(NamedTuple):
     """Parameters of the controller, for a plant of order n; N = n + 1."""
 
-    eso: Any
-    """Parameters of the observer, see ``observers.base``."""
-    law: Vector
-    """k (n,); zero from the relative degree on."""
-    cancel: Vector
-    """a (n,)."""
-    cancel_f: float
-    """1 if f enters where u enters, else 0."""
-    fade: float
-    """Factor of the offset from one sample to the next."""
+    eso: Any  # parameters of the observer, see ``observers.base``
+    law: Vector  # k (n,); zero from the relative degree on
+    cancel: Vector  # a (n,)
+    cancel_f: float  # 1 if f enters where u enters, else 0
+    fade: float  # factor of the offset from one sample to the next
     b0: float
     limits: Limits
     learner: Any
-    lag: Any
-    """Lag filter of f_L; without taps if there is no learner."""
+    lag: Any  # lag filter of f_L; without taps if there is no learner
     guard: Any
 
 
 class AdrcState(NamedTuple):
     """State of the controller."""
 
-    z: Vector
-    """State of the observer."""
-    seen: Vector
-    """Estimates (x̂_1 … x̂_n, Δf̂) of the observer (N,)."""
-    reference: Vector
-    """r', …, r^(m) (m,), zero if they are not given; empty without feedforward."""
-    loop: NDArray[AdrcLoop]
-    """(1,)."""
+    z: Vector  # state of the observer
+    seen: Vector  # estimates (x̂_1 … x̂_n, Δf̂) of the observer (N,)
+    reference: Vector  # r', …, r^(m) (m,), zero if they are not given; empty without feedforward
+    loop: NDArray[AdrcLoop]  # (1,)
     learner: Any
-    shadow: Matrix
-    """Lag filter of f_L (1, …)."""
+    shadow: Matrix  # lag filter of f_L (1, …)
     guard: Any
 
 
@@ -253,18 +242,10 @@ def law_gains(order: int, omega_c: float) -> Vector:
     """Return the gains ``k_i = C(n, i−1) omega_c^(n−i+1)`` (n,) of order n.
 
     All poles of ``s^n + k_n s^(n−1) + … + k_1`` lie at −omega_c.
-
-    Raises
-    ------
-    ValueError
-        if a gain is not finite.
     """
     with np.errstate(over="ignore"):
-        gains = np.array(
-            [math.comb(order, i) * np.float64(omega_c) ** (order - i) for i in range(order)]
-        )
+        powers = [np.float64(omega_c) ** (order - i) for i in range(order)]
+        gains = np.array([math.comb(order, i) * power for i, power in enumerate(powers)])
     if not np.all(np.isfinite(gains)):
-        raise ValueError(
-            f"omega_c = {omega_c!r} rad/s: its power {order} must be finite; lower omega_c"
-        )
+        raise ValueError(f"omega_c = {omega_c!r} rad/s: its power {order} must be finite; lower it")
     return gains

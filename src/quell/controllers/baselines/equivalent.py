@@ -33,17 +33,15 @@ from quell.observers.eso import ESO
 def equivalent_pid(controller: ADRC, **options: Any) -> PID:
     """Return the PID controller that a linear ADRC of order 1 (PI) or 2 is in continuous time.
 
+    Raises ``ValueError`` for an ADRC with another order or observer, a learner or feedforward, or
+    another type.
+
     Parameters
     ----------
     controller
         an ``ADRC`` without learner around a model-free ESO of order 1 or 2.
     **options
         limits and name; by default the limits of ``controller``, except its rate limit.
-
-    Raises
-    ------
-    ValueError
-        for an ADRC with another order or observer, a learner or feedforward, or another type.
     """
     _check_linear(controller)
     observer, gains = controller.observer, controller.parameters.law.tolist()

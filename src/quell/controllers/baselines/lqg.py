@@ -40,6 +40,9 @@ from quell.types import Matrix, Vector
 class LQG(LinearController):
     """Linear-quadratic state feedback with a Kalman filter and a disturbance state.
 
+    Raises ``ValueError`` for a plant that is not stabilisable from u or not detectable from y, or
+    has a zero at s = 0 (a constant disturbance then has no effect on y).
+
     Parameters
     ----------
     plant
@@ -67,12 +70,6 @@ class LQG(LinearController):
         gains of the filter.
     N : float
         gain of the reference.
-
-    Raises
-    ------
-    ValueError
-        for a plant that is not stabilisable from u or not detectable from y, or has a zero at s = 0
-        (a constant disturbance then has no effect on y), and for numbers out of range.
 
     Examples
     --------

@@ -26,12 +26,9 @@ from quell.controllers.baselines.pid import PID
 class Notch(NamedTuple):
     """A notch filter; make it with ``Notch.at``."""
 
-    omega: float
-    """Centre [rad/s]."""
-    zero_damping: float
-    """ζ_z."""
-    pole_damping: float
-    """ζ_p."""
+    omega: float  # centre [rad/s]
+    zero_damping: float  # ζ_z
+    pole_damping: float  # ζ_p
 
     @classmethod
     def at(cls, omega: float, *, depth: float = 0.1, width: float = 1.0) -> Notch:
@@ -47,11 +44,6 @@ class Notch(NamedTuple):
             gain at the centre, from 0 to below 1.
         width
             as a share of ``omega``, greater than zero.
-
-        Raises
-        ------
-        ValueError
-            for a frequency or width that is not positive, or a depth that is not from 0 to below 1.
         """
         omega, width = checks.positive("omega", omega, "rad/s"), checks.positive("width", width)
         depth = checks.non_negative("depth", depth)
@@ -84,11 +76,6 @@ class NotchPID(PID):
         the filter, from ``Notch.at``.
     kp, ki, kd, **options
         as for ``PID``.
-
-    Raises
-    ------
-    ValueError
-        as ``PID``, for a notch above half the sampling rate, and for anything but a notch.
 
     Examples
     --------

@@ -50,12 +50,7 @@ def with_disturbance(A: Matrix, B: Matrix, C: Matrix, E: Matrix, dt: float) -> S
 def check_reachable(A: Matrix, B: Matrix, what: str) -> None:
     """Check the rank of (A − λ, B) for each pole λ that does not decay (Popov, Belevitch, Hautus).
 
-    The error begins with ``what``.
-
-    Raises
-    ------
-    ValueError
-        for a mode that B does not reach.
+    The error, for a mode that B does not reach, begins with ``what``.
     """
     n = A.shape[0]
     for pole in np.linalg.eigvals(A):
@@ -69,12 +64,8 @@ def stationary_gain(model: SampledModel, W: Matrix, V: float) -> Vector:
     """Return the gain L (N,) of the stationary Kalman filter.
 
     The process noise per sample is W (N, N) [state-unit²], the measurement variance V [y-unit²];
-    only their ratio counts.
-
-    Raises
-    ------
-    ValueError
-        if the Riccati equation has no solution with a stable filter.
+    only their ratio counts. Raises ``ValueError`` if the Riccati equation has no solution with a
+    stable filter.
     """
     from scipy.linalg import solve_discrete_are
 

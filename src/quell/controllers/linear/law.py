@@ -25,33 +25,17 @@ class LinearLaw(NamedTuple):
     Without limits, u is u_wished and the law is linear with A + B_u C etc. B_u prevents windup.
     """
 
-    A: Matrix
-    """(m, m)."""
-    B_r: Vector
-    """(m,)."""
-    B_y: Vector
-    """(m,)."""
-    B_u: Vector
-    """(m,)."""
-    C: Vector
-    """(m,)."""
-    D_r: float
-    D_y: float
+    A: Matrix  # (m, m)
+    B_r: Vector  # (m,)
+    B_y: Vector  # (m,)
+    B_u: Vector  # (m,)
+    C: Vector  # (m,)
+    D_r: float  # [u-unit/y-unit]
+    D_y: float  # [u-unit/y-unit]
 
 
 def checked_law(law: Any) -> LinearLaw:
-    """Return the law with contiguous arrays that can't be written to.
-
-    Parameters
-    ----------
-    law
-        a ``LinearLaw``: A (m, m); B_r, B_y, B_u and C (m,); D_r and D_y numbers [u-unit/y-unit].
-
-    Raises
-    ------
-    ValueError
-        for anything but a ``LinearLaw``, shapes that do not fit, or an entry that is not finite.
-    """
+    """Return the law with checked, contiguous arrays that can't be written to."""
     if not isinstance(law, LinearLaw):
         raise ValueError(f"law = {law!r}: must be a quell.controllers.LinearLaw")
     A = checks.matrix("law.A", law.A)
@@ -61,9 +45,8 @@ def checked_law(law: Any) -> LinearLaw:
     B_r, B_y, B_u, C = (checks.vector(f"law.{name}", getattr(law, name), m) for name in names)
     for array in (A, B_r, B_y, B_u, C):
         array.flags.writeable = False
-    return LinearLaw(
-        A, B_r, B_y, B_u, C, checks.finite("law.D_r", law.D_r), checks.finite("law.D_y", law.D_y)
-    )
+    D_r, D_y = checks.finite("law.D_r", law.D_r), checks.finite("law.D_y", law.D_y)
+    return LinearLaw(A, B_r, B_y, B_u, C, D_r, D_y)
 
 
 def rest_state(law: LinearLaw) -> Vector:

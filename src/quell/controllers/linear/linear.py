@@ -27,8 +27,7 @@ class LinearDesign(NamedTuple):
     """Parameters of the controller."""
 
     law: LinearLaw
-    start: Vector
-    """Initial state for y = 1 (m,), see ``rest_state``."""
+    start: Vector  # initial state for y = 1 (m,), see ``rest_state``
     limits: Limits
 
 
@@ -47,12 +46,9 @@ class LinearLoop(Scalars):
 class LinearState(NamedTuple):
     """State of the controller."""
 
-    x: Vector
-    """State of the law (m,)."""
-    next: Vector
-    """Memory for the next state (m,)."""
-    loop: NDArray[LinearLoop]
-    """(1,)."""
+    x: Vector  # state of the law (m,)
+    next: Vector  # memory for the next state (m,)
+    loop: NDArray[LinearLoop]  # (1,)
 
 
 @kernel
@@ -144,12 +140,6 @@ class LinearController(StatefulController):
     name
         label in tables and plots.
 
-    Raises
-    ------
-    ValueError
-        for matrices of unsuitable shape or with entries that are not finite, limits in the wrong
-        order, or a rate limit or sample time that is not positive.
-
     Examples
     --------
     >>> num, den = [2.0, 1.0], [1.0, 0.0]  # 2 + 1/s
@@ -198,7 +188,8 @@ class LinearController(StatefulController):
         """Return the controller ``u = C (r − y)`` or ``u = −C y`` for a transfer function C(s).
 
         C is sampled in scaled, balanced coordinates of its state, not as polynomials in z: their
-        roots are close to 1, where coefficients determine them badly.
+        roots are close to 1, where coefficients determine them badly. Raises ``ValueError`` for a
+        C(s) that is not proper or has several inputs or outputs.
 
         Parameters
         ----------
@@ -220,12 +211,6 @@ class LinearController(StatefulController):
             other than s = 0, or of its slowest pole if it has no such zero.
         u_min, u_max, rate_limit, name
             as for the class.
-
-        Raises
-        ------
-        ValueError
-            for a C(s) that is not proper or has several inputs or outputs, or for arguments out of
-            range.
         """
         dt = checks.positive("dt", dt, "s")
         on_error = checks.one_of("feedback", feedback, ("error", "output")) == "error"

@@ -31,16 +31,14 @@ System = tuple[Matrix, Matrix, Matrix, Matrix]
 def as_state_space(num: Any, den: Any = None) -> System:
     """Return (A, B, C, D) of a transfer function, in balanced coordinates.
 
+    Raises ``ValueError`` for several inputs or outputs, a system that is not proper, or one with a
+    sample time.
+
     Parameters
     ----------
     num, den
         polynomials in s, highest power first; or a ``control.TransferFunction`` or
         ``control.StateSpace`` in continuous time.
-
-    Raises
-    ------
-    ValueError
-        for several inputs or outputs, a system that is not proper, or one with a sample time.
     """
     if den is not None:
         return realised([num], den)
@@ -66,11 +64,6 @@ def realised(numerators: list[Any], den: Any) -> System:
 
     It is the observer canonical form, in time scaled by the geometric mean of the poles other than
     zero. Several inputs need no more states than D has roots.
-
-    Raises
-    ------
-    ValueError
-        for a denominator of zero, or a numerator of higher degree than it.
     """
     D = np.trim_zeros(checks.vector("den", den), "f")
     if D.size == 0:
@@ -115,15 +108,10 @@ def balanced(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> System:
 def tustin(system: System, dt: float, prewarp: float | None = None) -> System:
     """Sample by the trapezoidal rule ``s = (z − 1) / (h (z + 1))``.
 
-    With h = dt/2, or tan(ω dt/2)/ω for prewarping, which is exact at ω:
-    ``A_d = (I − hA)⁻¹ (I + hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``,
-    ``D_d = D + h C (I − hA)⁻¹ B`` (Franklin, Powell & Workman, *Digital Control of Dynamic
-    Systems*, 1998, section 6.1).
-
-    Raises
-    ------
-    ValueError
-        for a prewarping frequency at or above half the sampling rate.
+    With h = dt/2, or tan(ω dt/2)/ω for prewarping, which is exact at ω: ``A_d = (I − hA)⁻¹ (I +
+    hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``, ``D_d = D + h C (I − hA)⁻¹ B``
+    (Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, section 6.1). Raises
+    ``ValueError`` for a prewarping frequency at or above half the sampling rate.
     """
     h = 0.5 * dt
     if prewarp is not None:

@@ -27,19 +27,15 @@ from quell.types import Vector
 class TrackingDesign(NamedTuple):
     """Parameters."""
 
-    acceleration: float
-    """r_0 [y-unit/s²]."""
-    horizon: float
-    """h_0 [s]."""
-    dt: float
-    """h [s]."""
+    acceleration: float  # r_0 [y-unit/s²]
+    horizon: float  # h_0 [s]
+    dt: float  # h [s]
 
 
 class TrackingMemory(NamedTuple):
     """State."""
 
-    v: Vector
-    """v_1 [y-unit] and v_2 [y-unit/s] (2,)."""
+    v: Vector  # v_1 [y-unit] and v_2 [y-unit/s] (2,)
 
 
 @kernel
@@ -81,11 +77,6 @@ class TrackingDifferentiator:
         largest second derivative, r_0 [y-unit/s²].
     horizon
         h_0 [s]: by default the sample time, for the shortest transition; larger is smoother.
-
-    Raises
-    ------
-    ValueError
-        for a parameter that is not positive, and in ``design`` for a horizon shorter than a sample.
 
     Examples
     --------

@@ -87,10 +87,8 @@ class PrefilteredState(NamedTuple):
 
     controller: Any
     prefilter: Any
-    derivatives: Vector
-    """Derivatives of the shaped reference; empty if the controller uses none."""
-    loop: NDArray[PrefilteredLoop]
-    """(1,)."""
+    derivatives: Vector  # derivatives of the shaped reference; empty if the controller uses none
+    loop: NDArray[PrefilteredLoop]  # (1,)
 
 
 @control.register(PrefilteredDesign)
@@ -155,13 +153,8 @@ class Prefiltered(StatefulController):
     controller
         any controller: ``ADRC``, ``LinearController``, another ``Prefiltered``.
     prefilter
-        for example ``quell.baselines.ZV(omega, zeta)``.
-
-    Raises
-    ------
-    ValueError
-        for an object that is no controller or no prefilter, and for a controller with feedforward
-        behind a prefilter without derivatives.
+        for example ``quell.baselines.ZV(omega, zeta)``; for a controller with feedforward one with
+        derivatives, such as ``ReferenceModel``.
 
     Examples
     --------
@@ -173,13 +166,10 @@ class Prefiltered(StatefulController):
 
     def __init__(self, controller: Controller, prefilter: Prefilter) -> None:
         check_controller(controller)
-        if isinstance(prefilter, type) or not all(
-            hasattr(prefilter, name) for name in ("design", "memory")
-        ):
-            raise ValueError(
-                f"prefilter = {prefilter!r}: must be a prefilter, "
-                "for example quell.baselines.ZV(omega=1.4)"
-            )
+        complete = hasattr(prefilter, "design") and hasattr(prefilter, "memory")
+        if isinstance(prefilter, type) or not complete:
+            rule = "must be a prefilter, for example quell.baselines.ZV(omega=1.4)"
+            raise ValueError(f"prefilter = {prefilter!r}: {rule}")
         if getattr(controller, "derivatives", 0) and not getattr(prefilter, "derivatives", 0):
             raise ValueError(
                 f"controller has feedforward, and {type(prefilter).__name__} provides no "
@@ -243,9 +233,8 @@ class Prefiltered(StatefulController):
         self._pack_again()
 
     def _update_parameters(self) -> None:
-        self.parameters = PrefilteredDesign(
-            self.controller.parameters, self.prefilter.design(self.dt)
-        )
+        design = self.prefilter.design(self.dt)
+        self.parameters = PrefilteredDesign(self.controller.parameters, design)
 
     @property
     def dt(self) -> float:
@@ -271,12 +260,9 @@ class Prefiltered(StatefulController):
         """Return a state before the first sample, with nothing learned."""
         used = getattr(self.controller, "derivatives", 0) > 0
         count = getattr(self.prefilter, "derivatives", 0) if used else 0
-        return PrefilteredState(
-            self.controller.initial_state(),
-            self.prefilter.memory(self.parameters.prefilter),
-            np.zeros(count),
-            PrefilteredLoop.zeros(),
-        )
+        inner = self.controller.initial_state()
+        memory = self.prefilter.memory(self.parameters.prefilter)
+        return PrefilteredState(inner, memory, np.zeros(count), PrefilteredLoop.zeros())
 
     @property
     def status(self) -> Status:
@@ -294,9 +280,8 @@ class Prefiltered(StatefulController):
 
     @property
     def _external_fields(self) -> tuple[str, ...]:
-        return tuple(
-            f"controller.{name}" for name in getattr(self.controller, "_external_fields", ())
-        )
+        inner = getattr(self.controller, "_external_fields", ())
+        return tuple(f"controller.{name}" for name in inner)
 
     def _external_snapshots(self, state: PrefilteredState) -> dict[str, Any]:
         if not self._external_fields:
@@ -305,7 +290,5 @@ class Prefiltered(StatefulController):
         return {name: saved[name.removeprefix("controller.")][()] for name in self._external_fields}
 
     def _restore_external(self, state: PrefilteredState, snapshots: Mapping[str, Any]) -> None:
-        self.controller._restore_external(
-            state.controller,
-            {name.removeprefix("controller."): value for name, value in snapshots.items()},
-        )
+        inner = {name.removeprefix("controller."): value for name, value in snapshots.items()}
+        self.controller._restore_external(state.controller, inner)

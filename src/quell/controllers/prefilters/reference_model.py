@@ -24,22 +24,17 @@ from quell.types import Matrix, Vector
 class ReferenceModelDesign(NamedTuple):
     """Parameters, of order m; the coordinates are ``r_f^(i) dt^i``."""
 
-    transition: Matrix
-    """(m, m)."""
-    input: Vector
-    """(m,)."""
-    rates: Vector
-    """Coefficients of the state and of r in r_f^(m) (m + 1,)."""
+    transition: Matrix  # (m, m)
+    input: Vector  # (m,)
+    rates: Vector  # coefficients of the state and of r in r_f^(m) (m + 1,)
     dt: float
 
 
 class ReferenceModelMemory(NamedTuple):
     """State."""
 
-    x: Vector
-    """(2 m,): the state, and scratch for the next one."""
-    r: Vector
-    """(1,): the reference of the last sample."""
+    x: Vector  # (2 m,): the state, and scratch for the next one
+    r: Vector  # (1,): the reference of the last sample
 
 
 @prefilter.register(ReferenceModelDesign)
@@ -84,14 +79,9 @@ class ReferenceModel:
     Parameters
     ----------
     omega
-        bandwidth [rad/s].
+        bandwidth [rad/s], at most 1/dt.
     order
         order m, 1 to 8: with feedforward in the controller, the plant's order (relative degree).
-
-    Raises
-    ------
-    ValueError
-        for a bandwidth that is not positive, or in ``design`` too high for the sample time.
     """
 
     omega: float

@@ -34,8 +34,7 @@ _MOST_SAMPLES = 10_000_000
 class ShaperDesign(NamedTuple):
     """Impulses on samples; the buffer is one sample longer than the longest delay."""
 
-    delays: NDArray[np.int64]
-    """In samples."""
+    delays: NDArray[np.int64]  # in samples
     weights: Vector
     length: int
 
@@ -44,8 +43,7 @@ class ShaperMemory(NamedTuple):
     """The references of the last samples, as a ring."""
 
     past: Vector
-    at: Vector
-    """(1,): index of the newest."""
+    at: Vector  # (1,): index of the newest
 
 
 @prefilter.register(ShaperDesign)
@@ -80,11 +78,6 @@ class Shaper:
         times of the impulses [s], from 0 on, increasing.
     amplitudes
         their amplitudes, with the sum 1.
-
-    Raises
-    ------
-    ValueError
-        for different numbers of both, times that do not increase from 0, and another sum than 1.
     """
 
     times: tuple[float, ...]
@@ -113,10 +106,8 @@ class Shaper:
     def design(self, dt: float) -> ShaperDesign:
         """Return the impulses on samples of ``dt`` [s].
 
-        Raises
-        ------
-        ValueError
-            for a dt that is not positive, or a shaper of more than ten million samples.
+        Raises ``ValueError`` for a dt that is not positive, or a shaper of more than ten million
+        samples.
         """
         if self.times[-1] / checks.positive("dt", dt, "s") > _MOST_SAMPLES:
             rule = f"the shaper's {self.times[-1]:.3g} s must be at most {_MOST_SAMPLES} samples"
@@ -125,10 +116,8 @@ class Shaper:
         for time, amplitude in zip(self.times, self.amplitudes, strict=True):
             before = math.floor(time / dt + 1e-9)
             share = max(time / dt - before, 0.0)
-            for place, weight in (
-                (before, (1.0 - share) * amplitude),
-                (before + 1, share * amplitude),
-            ):
+            parts = (before, (1.0 - share) * amplitude), (before + 1, share * amplitude)
+            for place, weight in parts:
                 if abs(weight) > 1e-12:  # the rest of a rounded time
                     weights[place] = weights.get(place, 0.0) + weight
         delays = np.array(list(weights), dtype=np.int64)
@@ -148,11 +137,6 @@ def ZV(omega: float, zeta: float = 0.0) -> Shaper:  # noqa: N802 - the field's n
         undamped frequency of the mode [rad/s].
     zeta
         its damping ratio, 0 to below 1.
-
-    Raises
-    ------
-    ValueError
-        for a frequency or damping out of range.
     """
     half, K = _half_period(omega, zeta)
     return Shaper((0.0, half), (1.0 / (1.0 + K), K / (1.0 + K)))

@@ -133,13 +133,7 @@ class Instance:
 
 
 def finite_number(value: Any) -> float:
-    """Return a prediction as a float.
-
-    Raises
-    ------
-    ValueError
-        if it is not one finite number.
-    """
+    """Return a prediction as a float."""
     if not isinstance(value, float):
         array = np.asarray(value)
         if array.size != 1 or array.dtype.kind not in "iuf":

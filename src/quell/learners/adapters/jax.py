@@ -8,7 +8,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from quell import checks
-from quell.learners.adapters.python import Options, PythonModel
+from quell.learners.adapters.python import Options, PythonModel, check_methods
 from quell.optional import import_extra
 from quell.types import Matrix, Vector
 
@@ -30,13 +30,6 @@ class JaxModel(PythonModel):
         gradient steps on each batch.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
-
-    Raises
-    ------
-    ImportError
-        if JAX, Equinox or optax is missing.
-    ValueError
-        for an object that is no module or no optimiser, and as ``PythonModel``.
     """
 
     def __init__(
@@ -45,14 +38,11 @@ class JaxModel(PythonModel):
         _needed("jax")
         equinox, optax = _needed("equinox"), _needed("optax")
         if not (isinstance(module, equinox.Module) and callable(module)):
-            raise ValueError(
-                f"module = {module!r}: must be an equinox.Module that takes an array (p,)"
-            )
+            rule = "must be an equinox.Module that takes an array (p,)"
+            raise ValueError(f"module = {module!r}: {rule}")
         optimizer = optax.sgd(0.1) if optimizer is None else optimizer
-        if not all(callable(getattr(optimizer, name, None)) for name in ("init", "update")):
-            raise ValueError(
-                f"optimizer = {optimizer!r}: must be an optax optimiser, for example optax.sgd(0.1)"
-            )
+        rule = "must be an optax optimiser, for example optax.sgd(0.1)"
+        check_methods("optimizer", optimizer, ("init", "update"), rule)
         model = _Module(module, optimizer, checks.whole("steps", steps, 1))
         self._set_up(type(module).__name__, model, **options)
 
@@ -108,9 +98,8 @@ def _compiled() -> tuple[Any, Any]:
         module: Any, moments: Any, optimizer: Any, rows: Any, wanted: Any, weights: Any
     ) -> Any:
         gradient = equinox.filter_grad(loss)(module, rows, wanted, weights)
-        updates, moments = optimizer.update(
-            gradient, moments, equinox.filter(module, equinox.is_inexact_array)
-        )
+        trained = equinox.filter(module, equinox.is_inexact_array)
+        updates, moments = optimizer.update(gradient, moments, trained)
         return equinox.apply_updates(module, updates), moments
 
     return equinox.filter_jit(step), equinox.filter_jit(lambda module, features: module(features))

@@ -64,9 +64,8 @@ class Pairs:
 
     def memory(self, parameters: PairsDesign) -> PairsMemory:
         """Return an empty batch."""
-        return PairsMemory(
-            np.zeros((parameters.size, parameters.width)), np.zeros(parameters.size), np.zeros(1)
-        )
+        size = parameters.size
+        return PairsMemory(np.zeros((size, parameters.width)), np.zeros(size), np.zeros(1))
 
 
 @infer.register(PairsDesign)
@@ -117,17 +116,8 @@ def _adapt(
     now, batch = online.features, online.model
     write_features(learner.online.inputs, online, seen, u_before, now)
     if batch.filled[0] > 0.0 and _finite(now):
-        filled = int(batch.filled[0])
-        call(
-            learner.address,
-            memory.model,
-            batch.features,
-            batch.targets,
-            filled,
-            now.size,
-            now,
-            answer,
-        )
+        address, filled = learner.address, int(batch.filled[0])
+        call(address, memory.model, batch.features, batch.targets, filled, now.size, now, answer)
         batch.filled[0] = 0.0
         answer[COUNTDOWN] = learner.period
 

@@ -34,6 +34,13 @@ class Options(TypedDict, total=False):
     scale: Any
 
 
+def check_methods(name: str, value: Any, methods: tuple[str, ...], rule: str) -> None:
+    """Raise a ``ValueError`` with ``rule`` unless the argument ``name`` has these methods."""
+    found = all(callable(getattr(value, method, None)) for method in methods)
+    if isinstance(value, type) or not found:
+        raise ValueError(f"{name} = {value!r}: {rule}")
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """A copy of a model that learns, for a controller's ``state``."""
@@ -57,7 +64,8 @@ class PythonModel:
     If a model raises, or predicts something other than a finite number, its answer is dropped: the
     step reports ``Status.LEARNER_FAILED``, a ``RuntimeWarning`` and ``last_problem`` describe the
     problem, and a fresh copy continues. After three failures in a row the model is disabled, with a
-    prediction of zero, until the controller is reset.
+    prediction of zero, until the controller is reset. ``design`` raises ``ValueError`` if a copy
+    of the model fails to learn and predict in a trial with a few pairs.
 
     Parameters
     ----------
@@ -80,25 +88,13 @@ class PythonModel:
         by default.
     scale : array, optional
         what x_1 … x_n, u and f are divided by, (n + 2,); found automatically by default.
-
-    Raises
-    ------
-    ValueError
-        for an argument out of range; in ``design``, if a copy of the model fails to learn and
-        predict in a trial with a few pairs.
     """
 
-    external_fields = ("model",)
-    """The field of the memory that refers to the model."""
+    external_fields = ("model",)  # the field of the memory that refers to the model
 
     def __init__(self, model: Any, **options: Unpack[Options]) -> None:
-        if isinstance(model, type) or not all(
-            callable(getattr(model, name, None)) for name in ("learn", "predict")
-        ):
-            raise ValueError(
-                f"model = {model!r}: must be an object with learn(features, targets) and "
-                "predict(features)"
-            )
+        rule = "must be an object with learn(features, targets) and predict(features)"
+        check_methods("model", model, ("learn", "predict"), rule)
         self._set_up(type(model).__name__, model, **options)
 
     def _set_up(

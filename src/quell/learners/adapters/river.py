@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Unpack
 
-from quell.learners.adapters.python import Options, PythonModel
+from quell.learners.adapters.python import Options, PythonModel, check_methods
 from quell.types import Matrix, Vector
 
 
@@ -21,21 +21,11 @@ class RiverModel(PythonModel):
         river.linear_model.LinearRegression()``.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
-
-    Raises
-    ------
-    ValueError
-        for a regressor without these methods, and as ``PythonModel``.
     """
 
     def __init__(self, regressor: Any, **options: Unpack[Options]) -> None:
-        if isinstance(regressor, type) or not all(
-            callable(getattr(regressor, name, None)) for name in ("learn_one", "predict_one")
-        ):
-            raise ValueError(
-                f"regressor = {regressor!r}: must have learn_one and predict_one, "
-                "as river's regressors have"
-            )
+        rule = "must have learn_one and predict_one, as river's regressors have"
+        check_methods("regressor", regressor, ("learn_one", "predict_one"), rule)
         self._set_up(type(regressor).__name__, _Regressor(regressor), **options)
 
     def _unwrapped(self, model: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from typing import Any, Unpack
 
-from quell.learners.adapters.python import Options, PythonModel
+from quell.learners.adapters.python import Options, PythonModel, check_methods
 from quell.types import Matrix, Vector
 
 
@@ -23,21 +23,14 @@ class SklearnModel(PythonModel):
         ``sklearn.neural_network.MLPRegressor()``.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
-
-    Raises
-    ------
-    ValueError
-        for an estimator that cannot learn incrementally, and as ``PythonModel``.
     """
 
     def __init__(self, estimator: Any, **options: Unpack[Options]) -> None:
-        if isinstance(estimator, type) or not all(
-            callable(getattr(estimator, name, None)) for name in ("partial_fit", "predict")
-        ):
-            raise ValueError(
-                f"estimator = {estimator!r}: must have partial_fit and predict, as SGDRegressor "
-                "and MLPRegressor have; pass the last step of a pipeline: features come scaled"
-            )
+        rule = (
+            "must have partial_fit and predict, as SGDRegressor and MLPRegressor have; pass the "
+            "last step of a pipeline: features come scaled"
+        )
+        check_methods("estimator", estimator, ("partial_fit", "predict"), rule)
         self._set_up(type(estimator).__name__, _Estimator(estimator), **options)
 
     def _unwrapped(self, model: Any) -> Any:

@@ -29,13 +29,6 @@ class TorchModel(PythonModel):
         gradient steps on each batch.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
-
-    Raises
-    ------
-    ImportError
-        if PyTorch is missing.
-    ValueError
-        for an object that is no module or no optimiser, and as ``PythonModel``.
     """
 
     def __init__(
@@ -64,7 +57,7 @@ class TorchModel(PythonModel):
         own = {id(parameter) for parameter in parameters}
         if not own.issuperset(id(p) for group in optimizer.param_groups for p in group["params"]):
             raise ValueError(
-                "optimizer: must be on the parameters of the module; use module.parameters()"
+                "optimizer: must be on the parameters of the module; use its parameters()"
             )
         model = _Module(module, optimizer, checks.whole("steps", steps, 1))
         self._set_up(type(module).__name__, model, **options)

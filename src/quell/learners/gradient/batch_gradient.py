@@ -86,11 +86,6 @@ class BatchGradient:
     features
         other features, which are scaled to O(1), as is Δf̂ (``scaled_features.py``); those of the
         paper, unscaled, by default.
-
-    Raises
-    ------
-    ValueError
-        for a negative rate, a batch below 1, or something that is no block of features.
     """
 
     rate: float = 1e-6
@@ -101,9 +96,7 @@ class BatchGradient:
         checks.non_negative("rate", self.rate)
         checks.whole("batch", self.batch, 1)
         if not isinstance(self.features, Features | None):
-            raise ValueError(
-                f"features = {self.features!r}: must be made of blocks from quell.features, or None"
-            )
+            raise ValueError(f"features = {self.features!r}: must be made of blocks, or None")
 
     def design(self, observer: ESO, omega_c: float) -> BatchDesign | ScaledDesign:
         """Return the parameters for an observer.

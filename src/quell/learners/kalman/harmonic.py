@@ -34,8 +34,8 @@ class Harmonic(Kalman):
     count
         number of sinusoids, 1 to 8.
     omegas
-        initial frequencies [rad/s], one for each sinusoid; by default ``omega_c`` of the
-        controller, 0.3 omega_c, 0.09 omega_c …
+        initial frequencies [rad/s] within ``limits``, one for each sinusoid; by default ``omega_c``
+        of the controller, 0.3 omega_c, 0.09 omega_c …
     limits
         least and largest frequency [rad/s]; ``0.02 omega_c`` and ``0.5 omega_o`` by default.
     pair_bandwidth
@@ -43,11 +43,6 @@ class Harmonic(Kalman):
         An oscillator at ω learns at about the rate ``ω · pair_bandwidth / bias_bandwidth``.
 
     All other parameters are those of ``Kalman``.
-
-    Raises
-    ------
-    ValueError
-        for a parameter out of range.
     """
 
     count: int = 1
@@ -64,20 +59,13 @@ class Harmonic(Kalman):
         if self.limits is not None:
             low, high = checks.vector("limits", self.limits, 2).tolist()
             if not 0.0 < low < high:
-                raise ValueError(
-                    f"limits = {self.limits!r}: must be (low, high) with 0 < low < high [rad/s]"
-                )
+                rule = "must be (low, high) with 0 < low < high [rad/s]"
+                raise ValueError(f"limits = {self.limits!r}: {rule}")
         if self.pair_bandwidth is not None:
             checks.positive("pair_bandwidth", self.pair_bandwidth, "rad/s")
 
     def oscillators(self, observer: ESO, omega_c: float) -> tuple[Oscillators, float]:
-        """Return the parameters of the oscillators, and the bandwidth of their pairs [rad/s].
-
-        Raises
-        ------
-        ValueError
-            for an initial frequency outside of the limits.
-        """
+        """Return the parameters of the oscillators, and the bandwidth of their pairs [rad/s]."""
         low, high = _LOWEST * omega_c, _HIGHEST * observer.omega_o
         if self.limits is not None:
             low, high = self.limits
@@ -86,10 +74,8 @@ class Harmonic(Kalman):
         else:
             start = checks.vector("omegas", self.omegas)
         if not np.all((low <= start) & (start <= high)):
-            raise ValueError(
-                f"omegas = {self.omegas!r} rad/s: must lie within limits = ({low:g}, {high:g}) "
-                "rad/s"
-            )
+            rule = f"must lie within limits = ({low:g}, {high:g}) rad/s"
+            raise ValueError(f"omegas = {self.omegas!r} rad/s: {rule}")
         first = observer.order * self.state + self.bias
         bandwidth = self.pair_bandwidth
         if bandwidth is None:

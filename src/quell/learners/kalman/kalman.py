@@ -45,11 +45,6 @@ class Kalman:
     gain_interval
         interval of the effective gain ``(b0 + θ_u)/b0`` when ``u`` is a feature.
 
-    Raises
-    ------
-    ValueError
-        for a parameter out of range, or if no feature is left.
-
     References
     ----------
     docs/theory: Algorithm 1 of the paper, its weaknesses and their remedies.
@@ -79,13 +74,7 @@ class Kalman:
         checks.around_one("gain_interval", self.gain_interval)
 
     def design(self, observer: ESO, omega_c: float) -> KalmanDesign:
-        """Return the parameters for ``observer`` and a controller of bandwidth ``omega_c`` [rad/s].
-
-        Raises
-        ------
-        ValueError
-            if ``state_bandwidth`` is neither one number nor one for each state.
-        """
+        """Return the parameters for an observer and the controller's bandwidth [rad/s]."""
         n, lag_time = observer.order, observer.lag_time
         slow = checks.vector("state_bandwidth", self.state_bandwidth)
         slow = np.full(n, slow[0]) if slow.size == 1 else checks.vector("state_bandwidth", slow, n)
@@ -146,8 +135,5 @@ class Kalman:
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return those of ``("x1", …, "bias", "u")`` that are features."""
-        return (
-            *(f"x{i + 1}" for i in range(order * self.state)),
-            *["bias"] * self.bias,
-            *["u"] * self.u,
-        )
+        states = (f"x{i + 1}" for i in range(order * self.state))
+        return (*states, *["bias"] * self.bias, *["u"] * self.u)

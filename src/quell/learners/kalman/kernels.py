@@ -24,12 +24,9 @@ with the time constant 1/λ in any unit. For a feature of variance φ² it is ``
 together learn at most at the rate λ_m, the larger of omega_o and the bandwidth of the bias, because
 the observer cannot verify anything faster.
 
-**Excitation.** At rest the estimated derivatives are only noise, and a regression on noise slowly
-finds coefficients that mean nothing. So a feature is used only while its variance exceeds
-``SIGNAL_TO_NOISE²`` times the variance that measurement noise, estimated from y − x̂_1, causes in
-it; otherwise its entry of φ̃ is zero. Rounding counts as noise. With a bias, φ̃ contains the
-feature less its running mean, and a change of a coefficient is compensated in the bias at that
-mean.
+**Excitation.** A feature that does not move (``noise_gate.py``) has a zero in φ̃. With a bias, φ̃
+contains the feature less its running mean, and a change of a coefficient is compensated in the
+bias at that mean.
 
 **Start.** After a start from rest Δf̂ contains the observer's initial error, which is no
 disturbance: the learner does not learn for 2 τ.
@@ -60,38 +57,25 @@ class KalmanDesign(NamedTuple):
     """Parameters for an observer of order n and p features: state, bias, pairs of sinusoids, u."""
 
     lag: Any
-    scale: Vector
-    """Factor of each feature's signal (p,)."""
-    walk: Vector
-    """λ² of each feature [1/s²] (p,)."""
+    scale: Vector  # factor of each feature's signal (p,)
+    walk: Vector  # λ² of each feature [1/s²] (p,)
+    # Least variance of a feature that is used, in units of that of y − x̂_1 (p,); 0 for bias and
+    # sinusoids, which are always used.
     threshold: Vector
-    """Least variance of a feature that is used, in units of that of y − x̂_1 (p,).
-
-    0 for bias and sinusoids, which are always used.
-    """
+    # Initial standard deviation of θ in scaled units (p,); 0 for bias and sinusoids, because their
+    # walk makes P grow by itself.
     prior: Vector
-    """Initial standard deviation of θ in scaled units (p,).
-
-    0 for bias and sinusoids, because their walk makes P grow by itself.
-    """
-    fastest: float
-    """λ_m [rad/s]."""
-    f_noise: float
-    """Variance that white noise of unit variance in y causes in f̂."""
-    states: int
-    """n, or 0 without state features."""
+    fastest: float  # λ_m [rad/s]
+    f_noise: float  # variance that white noise of unit variance in y causes in f̂
+    states: int  # n, or 0 without state features
     bias: bool
     oscillators: Oscillators
     with_u: bool
-    slope_low: float
-    """Least θ_u in scaled units."""
-    slope_high: float
-    """Largest θ_u in scaled units."""
+    slope_low: float  # least θ_u in scaled units
+    slope_high: float  # largest θ_u in scaled units
     dt: float
-    forget: float
-    """dt over the averaging time of mean squares."""
-    lag_time: float
-    """τ [s]."""
+    forget: float  # dt over the averaging time of mean squares
+    lag_time: float  # τ [s]
 
 
 class KalmanAverages(Scalars):
@@ -106,28 +90,17 @@ class KalmanAverages(Scalars):
 class KalmanMemory(NamedTuple):
     """State of the learner, with p features and m oscillators."""
 
-    theta: Vector
-    """θ in scaled units (p,)."""
-    covariance: Matrix
-    """P (p, p); for the bias in units of R."""
-    chain: Matrix
-    """Lag filters of the features (p, …)."""
-    filtered: Vector
-    """φ^F (p,)."""
-    mean: Vector
-    """Running means of φ^F (p,)."""
-    variance: Vector
-    """Running variances of φ^F (p,)."""
-    regressor: Vector
-    """φ̃ of the newest sample (p,)."""
-    gain: Vector
-    """P φ̃ (p,)."""
-    phase: Vector
-    """ψ of each oscillator [rad] (m,)."""
-    omega: Vector
-    """ω̂ of each oscillator [rad/s] (m,)."""
-    averages: NDArray[KalmanAverages]
-    """(1,)."""
+    theta: Vector  # θ in scaled units (p,)
+    covariance: Matrix  # P (p, p); for the bias in units of R
+    chain: Matrix  # lag filters of the features (p, …)
+    filtered: Vector  # φ^F (p,)
+    mean: Vector  # running means of φ^F (p,)
+    variance: Vector  # running variances of φ^F (p,)
+    regressor: Vector  # φ̃ of the newest sample (p,)
+    gain: Vector  # P φ̃ (p,)
+    phase: Vector  # ψ of each oscillator [rad] (m,)
+    omega: Vector  # ω̂ of each oscillator [rad/s] (m,)
+    averages: NDArray[KalmanAverages]  # (1,)
 
 
 @adapt.register(KalmanDesign)
@@ -189,9 +162,8 @@ def _adapt(
     for j in range(memory.omega.size):
         at = learner.oscillators.first + 2 * j
         change_s, change_c = step * gain[at], step * gain[at + 1]
-        retune(
-            learner.oscillators, memory.omega, j, theta, change_s, change_c, averages.unexplained
-        )
+        unexplained = averages.unexplained
+        retune(learner.oscillators, memory.omega, j, theta, change_s, change_c, unexplained)
 
 
 @kernel
@@ -206,9 +178,8 @@ def _update_averages(
     """Update the averages; return the mean square of y − x̂_1, and √R."""
     rounding, doubt = RESOLUTION * y, _UNEXPLAINED_SHARE * target
     averages.noise += learner.forget * (error * error + rounding * rounding - averages.noise)
-    averages.unexplained += learner.forget * (
-        innovation * innovation + doubt * doubt - averages.unexplained
-    )
+    square = innovation * innovation + doubt * doubt
+    averages.unexplained += learner.forget * (square - averages.unexplained)
     averages.weight += learner.forget * (1.0 - averages.weight)
     averages.time += learner.dt
     unexplained = averages.unexplained + learner.f_noise * averages.noise

@@ -52,9 +52,8 @@ def retune(
     size = theta[at] * theta[at] + theta[at + 1] * theta[at + 1] + _UNEXPLAINED_WEIGHT * unexplained
     if size > 0.0:
         turn = (theta[at] * change_c - theta[at + 1] * change_s) / size
-        omega[j] = min(
-            max(omega[j] * (1.0 + _FREQUENCY_GAIN * turn), oscillators.low), oscillators.high
-        )
+        turned = omega[j] * (1.0 + _FREQUENCY_GAIN * turn)
+        omega[j] = min(max(turned, oscillators.low), oscillators.high)
 
 
 @kernel

@@ -7,9 +7,8 @@ stores at most M points c_i, with the mean μ and the covariance Σ of f at thes
     q = Q k,   γ² = 1 − k·q,   h = Σ q,   s = γ² + q·h + σ²,   e = y − q·μ
 
 * if γ² is small, the stored points determine f at φ: ``μ += h e/s``, ``Σ −= h hᵀ/s``;
-* else φ becomes a point. If there are more than M then, the point is removed whose loss changes the
-mean
-  least: ``min (Qμ)_i²/Q_ii``.
+* else φ becomes a point. If there are then more than M, the point is removed whose loss changes the
+  mean least: ``min (Qμ)_i²/Q_ii``.
 
 Before that, the state is moved back towards the prior, ``Σ ← λΣ + (1−λ)K``, ``μ ← √λ μ``. All of it
 is O(M²) and in place.
@@ -31,8 +30,7 @@ from quell.learners.online.model import infer, learn
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
-# Least γ² of a new point; it also bounds the effect of rounding on Q. Chosen by hand, not tuned
-# further.
+# Least γ² of a new point; also bounds rounding errors of Q. Chosen by hand, not tuned further.
 _LEAST_NOVELTY = 1e-2
 # Default of memory_time in units of 1/omega_c; chosen by hand, not tuned further.
 _MEMORY = 1000.0
@@ -144,9 +142,8 @@ def _forget(model: ProcessDesign, memory: ProcessMemory, count: int) -> None:
     for i in range(count):
         memory.mean[i] *= root
         for j in range(count):
-            memory.covariance[i, j] = (
-                keep * memory.covariance[i, j] + model.forget * memory.kernel[i, j]
-            )
+            prior = model.forget * memory.kernel[i, j]
+            memory.covariance[i, j] = keep * memory.covariance[i, j] + prior
 
 
 @kernel
@@ -245,18 +242,11 @@ class GaussianProcessModel:
     def memory(self, parameters: ProcessDesign) -> ProcessMemory:
         """Return a process without points."""
         size = parameters.budget + 1
-        return ProcessMemory(
-            points=np.zeros((size, parameters.inputs)),
-            kernel=np.zeros((size, size)),
-            inverse=np.zeros((size, size)),
-            covariance=np.zeros((size, size)),
-            mean=np.zeros(size),
-            weights=np.zeros(size),
-            k=np.zeros(size),
-            q=np.zeros(size),
-            h=np.zeros(size),
-            counters=np.zeros(2),
-        )
+        points = np.zeros((size, parameters.inputs))
+        kernel, inverse, covariance = np.zeros((3, size, size))
+        mean, weights, k, q, h = np.zeros((5, size))
+        matrices = (points, kernel, inverse, covariance)
+        return ProcessMemory(*matrices, mean, weights, k, q, h, np.zeros(2))
 
 
 class GaussianProcess(Online):
@@ -281,15 +271,11 @@ class GaussianProcess(Online):
 
     The other parameters are described in the base class ``FeatureLearner``.
 
-    Raises
-    ------
-    ValueError
-        for an argument out of range.
-
-    References ---------- Van Vaerenbergh, Lázaro-Gredilla & Santamaría, *Kernel recursive
-    least-squares tracker for time-varying regression*, IEEE Trans. Neural Networks and Learning
-    Systems 23 (2012); Csató & Opper, *Sparse on-line Gaussian processes*, Neural Computation 14
-    (2002).
+    References
+    ----------
+    Van Vaerenbergh, Lázaro-Gredilla & Santamaría, *Kernel recursive least-squares tracker for
+    time-varying regression*, IEEE Trans. Neural Networks and Learning Systems 23 (2012); Csató &
+    Opper, *Sparse on-line Gaussian processes*, Neural Computation 14 (2002).
     """
 
     def __init__(

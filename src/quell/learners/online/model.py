@@ -43,35 +43,25 @@ def checked_design(model: Model, features: int, dt: float) -> Any:
     """Return ``model.design(features, dt)``; check a user-defined model first.
 
     The model has to infer and learn, interpreted, on a memory that is discarded.
-
-    Raises
-    ------
-    ValueError
-        that names the model's class and the rule it breaks.
     """
     if not validation.is_user_defined(model):
         return model.design(features, dt)
     name = type(model).__name__
-    rule = (
-        f"it is shown {features} features, of shape ({features},), "
-        "and learns and predicts one number"
-    )
+    rule = f"it is shown {features} features, of shape ({features},), and predicts one number"
     what = f"{name}.design({features}, {dt:g})"
     parameters = validation.attempt(what, "design takes (features, dt)", model.design, features, dt)
     validation.check_named_tuple(what, parameters, "numbers and arrays")
     validation.check_registered(name, parameters, infer, learn)
-    memory = validation.attempt(
-        f"{name}.memory(...)", "memory takes (parameters)", model.memory, parameters
-    )
+    what = f"{name}.memory(...)"
+    memory = validation.attempt(what, "memory takes (parameters)", model.memory, parameters)
     validation.check_arrays(f"{name}.memory", memory, nested=False)
     memory = packed(memory)[0]
     for i in range(3):
         shown = validation.sample_values(features, 1.0 + i)
-        predicted = validation.attempt_kernel(
-            f"{name}: infer", rule, infer, parameters, memory, shown
-        )
+        what = f"{name}: infer"
+        predicted = validation.attempt_kernel(what, rule, infer, parameters, memory, shown)
         if predicted is not validation.UNKNOWN:
-            validation.check_number(f"{name}: infer", predicted)
+            validation.check_number(what, predicted)
         validation.attempt_kernel(f"{name}: learn", rule, learn, parameters, memory, shown, 0.5)
     return parameters
 
@@ -81,8 +71,6 @@ def packed(memory: Any) -> tuple[Any, Vector]:
     arrays = [np.asarray(array, dtype=np.float64) for array in memory]
     flat = np.concatenate([array.ravel() for array in arrays]) if arrays else np.zeros(0)
     ends = np.cumsum([array.size for array in arrays])
-    views = [
-        flat[end - array.size : end].reshape(array.shape)
-        for end, array in zip(ends, arrays, strict=True)
-    ]
+    places = zip(ends, arrays, strict=True)
+    views = [flat[end - array.size : end].reshape(array.shape) for end, array in places]
     return type(memory)(*views), flat

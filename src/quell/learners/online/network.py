@@ -103,9 +103,8 @@ def _learn(model: NetworkDesign, memory: NetworkMemory, features: Vector, target
     if not is_finite(error):
         return
     error = min(max(error, -_LARGEST_ERROR), _LARGEST_ERROR)
-    step = error * least_squares_gain(
-        model.rule, memory.covariance, gain, memory.gradient, model.rule.noise
-    )
+    rule, gradient = model.rule, memory.gradient
+    step = error * least_squares_gain(rule, memory.covariance, gain, gradient, rule.noise)
     for i in range(theta.size):
         theta[i] = min(max(theta[i] + step * gain[i], -_LARGEST), _LARGEST)
 
@@ -149,10 +148,9 @@ class Network:
         centres = rng.uniform(-1.0, 1.0, (hidden, inputs))
         weights[:, 1] = -np.sum(weights[:, 2:] * centres, axis=1)
         theta = np.append(weights.ravel(), 0.0)
-        p = theta.size
-        return NetworkMemory(
-            theta, parameters.rule.prior * np.eye(p), np.zeros(p), np.zeros(p), np.zeros(1)
-        )
+        covariance = parameters.rule.prior * np.eye(theta.size)
+        gradient, gain = np.zeros((2, theta.size))
+        return NetworkMemory(theta, covariance, gradient, gain, np.zeros(1))
 
 
 class MLP(Online):
@@ -178,11 +176,6 @@ class MLP(Online):
         of the initial weights.
 
     The other parameters are described in the base class ``FeatureLearner``.
-
-    Raises
-    ------
-    ValueError
-        for an argument out of range.
 
     References
     ----------

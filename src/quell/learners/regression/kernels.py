@@ -123,16 +123,15 @@ def _adapt(
     if not is_finite(error):
         return
     loop.bias += inputs.bias_gain * (error * scale[scale.size - 1] - loop.bias)
-    sure = confidence(inputs.gate, memory.gate, scale[0])
-    if not moves or sure < _LEAST_CONFIDENCE or loop.samples <= loop.learn_after:
+    share = confidence(inputs.gate, memory.gate, scale[0])
+    if not moves or share < _LEAST_CONFIDENCE or loop.samples <= loop.learn_after:
         return
-    update_theta(learner.rule, memory.rule, theta, memory.filtered, error, sure)
+    update_theta(learner.rule, memory.rule, theta, memory.filtered, error, share)
     if learner.with_u:
         last = theta.size - 1
         in_plant = scale[scale.size - 1] / scale[scale.size - 2]
-        theta[last] = min(
-            max(theta[last], learner.slope_low / in_plant), learner.slope_high / in_plant
-        )
+        low, high = learner.slope_low / in_plant, learner.slope_high / in_plant
+        theta[last] = min(max(theta[last], low), high)
 
 
 @kernel
