@@ -67,34 +67,11 @@ _HOME = {
 _MODULES = {"baselines": "quell.controllers.baselines", "metrics": "quell.records.metrics"}
 
 __all__ = [
-    "ADRC",
-    "ESO",
-    "BatchTrajectory",
-    "DesignWarning",
-    "Estimate",
-    "Guard",
-    "Reason",
-    "Scenario",
-    "Status",
-    "Trajectory",
-    "analysis",
-    "baselines",
-    "canonical",
-    "controllers",
-    "experiments",
-    "features",
-    "identification",
-    "identify",
-    "learners",
-    "metrics",
-    "observers",
-    "omega_c_for",
-    "plants",
-    "realtime",
-    "setup",
-    "signals",
-    "simulate",
-]
+    "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Guard", "Reason", "Scenario",
+    "Status", "Trajectory", "analysis", "baselines", "canonical", "controllers", "experiments",
+    "features", "identification", "identify", "learners", "metrics", "observers", "omega_c_for",
+    "plants", "realtime", "setup", "signals", "simulate",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -78,10 +78,8 @@ def interval(low_name: str, low: Any, high_name: str, high: Any) -> tuple[float,
     """Return two limits in order; either may be infinite, neither NaN."""
     low_value, high_value = _number(low_name, low), _number(high_name, high)
     if not low_value < high_value:
-        raise ValueError(
-            f"{low_name} = {low!r}, {high_name} = {high!r}: "
-            f"{low_name} must be less than {high_name}"
-        )
+        limits = f"{low_name} = {low!r}, {high_name} = {high!r}"
+        raise ValueError(f"{limits}: {low_name} must be less than {high_name}")
     return low_value, high_value
 
 
@@ -129,9 +127,7 @@ def matrix(name: str, value: Any, rows: int | None = None, columns: int | None =
     """Return ``value`` as a finite, contiguous float matrix, with so many rows and columns."""
     array = _array(name, value)
     wanted = (rows, columns)
-    if array.ndim != 2 or any(
-        w is not None and size != w for size, w in zip(array.shape, wanted, strict=True)
-    ):
+    if array.ndim != 2 or any(w not in (None, n) for n, w in zip(array.shape, wanted, strict=True)):
         shape = ", ".join("any" if w is None else str(w) for w in wanted)
         raise ValueError(f"{name} has shape {array.shape}: must be a matrix of shape ({shape})")
     return array

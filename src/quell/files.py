@@ -14,24 +14,12 @@ from typing import Any
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check that ``written_atomically`` can write ``path``; a file there is not changed.
-
-    Raises
-    ------
-    ValueError
-        if the folder of ``path`` does not exist or can't be written to, or ``path`` is a folder.
-    """
+    """Check that ``written_atomically`` can write ``path``; a file there is not changed."""
     _new_file_beside(Path(path)).unlink()
 
 
 def check_new_file(path: Path) -> None:
-    """Check that a recording can be written to ``path``.
-
-    Raises
-    ------
-    ValueError
-        if the file exists, or can't be written.
-    """
+    """Check that a recording can be written to ``path``."""
     if path.exists() and not path.is_dir():
         raise ValueError(
             f"path = {str(path)!r}: the file exists; recordings are not overwritten: "
@@ -42,13 +30,7 @@ def check_new_file(path: Path) -> None:
 
 @contextmanager
 def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a path to write to; at the end it replaces ``path``, or is removed after an error.
-
-    Raises
-    ------
-    ValueError
-        as ``check_writable``.
-    """
+    """Yield a path to write to; at the end it replaces ``path``, or is removed after an error."""
     target = Path(path)
     part = _new_file_beside(target)
     try:
@@ -59,26 +41,14 @@ def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
-    """Write dictionaries, lists, strings and finite numbers to a JSON file, whole or not at all.
-
-    Raises
-    ------
-    ValueError
-        as ``check_writable``, and for a number that is not finite.
-    """
+    """Write dictionaries, lists, strings and finite numbers to a JSON file, whole or not at all."""
     with written_atomically(path) as part:
         text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
         part.write_text(text + "\n", encoding="utf-8")
 
 
 def read_text(path: str | os.PathLike[str], where: str) -> str:
-    """Return a text file's content.
-
-    Raises
-    ------
-    ValueError
-        if it can't be read; the message begins with ``where``.
-    """
+    """Return a text file's content; messages of errors begin with ``where``."""
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -87,13 +57,7 @@ def read_text(path: str | os.PathLike[str], where: str) -> str:
 
 
 def csv_rows(text: str, where: str, delimiter: str = ",") -> list[tuple[int, list[str]]]:
-    """Return number and stripped cells of each line that is not empty.
-
-    Raises
-    ------
-    ValueError
-        if it is no CSV; the message begins with ``where``.
-    """
+    """Return number and stripped cells of each line that is not empty; errors name ``where``."""
     lines = csv.reader(text.splitlines(), delimiter=delimiter)
     try:
         rows = [(number, [cell.strip() for cell in row]) for number, row in enumerate(lines, 1)]

@@ -7,13 +7,7 @@ from typing import Any
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Import a third-party module for a ``purpose``; return it.
-
-    Raises
-    ------
-    ImportError
-        if it can't be imported; the message names the extra that installs it.
-    """
+    """Return a third-party module; an ``ImportError`` names the ``extra`` that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

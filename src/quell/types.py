@@ -9,11 +9,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Vector: TypeAlias = NDArray[np.float64]
-"""One-dimensional, contiguous, float64."""
+Vector: TypeAlias = NDArray[np.float64]  # one-dimensional, contiguous, float64
 
-Matrix: TypeAlias = NDArray[np.float64]
-"""Two-dimensional, C-contiguous, float64."""
+Matrix: TypeAlias = NDArray[np.float64]  # two-dimensional, C-contiguous, float64
 
 Channels: TypeAlias = tuple[tuple[str, int], ...]
 """Name and width of the channels that are side by side in a log, in order."""

@@ -91,10 +91,7 @@ class NotCompilableError(Exception):
 def jit_user_function(function: Callable[..., Any]) -> Any:
     """Return a user's function for calls from a function that is passed to ``compile_cfunc``.
 
-    Raises
-    ------
-    NotCompilableError
-        if it is not a plain function but, for example, a bound method or a callable object.
+    Bound methods and callable objects raise a ``NotCompilableError``.
     """
     try:
         # Division by zero gives inf, as in numpy: an exception can't leave compiled code from here.
@@ -104,13 +101,7 @@ def jit_user_function(function: Callable[..., Any]) -> Any:
 
 
 def compile_cfunc(signature: Any, function: Callable[..., Any]) -> Any:
-    """Return a compiled function with an ``address``.
-
-    Raises
-    ------
-    NotCompilableError
-        if Numba can't compile it.
-    """
+    """Return a function with an ``address``; raise a ``NotCompilableError`` if Numba can't."""
     try:
         return numba.cfunc(signature)(function)
     except Exception as error:  # compilation can raise anything

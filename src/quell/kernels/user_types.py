@@ -41,13 +41,7 @@ def uses_user_types(value: Any) -> bool:
 
 @contextmanager
 def explain_compile_errors(*arguments: Any) -> Iterator[None]:
-    """Replace Numba's error about a user's function by one line, during calls with ``arguments``.
-
-    Raises
-    ------
-    ValueError
-        if a user's function can't be compiled, or allocates memory.
-    """
+    """Replace Numba's error about a user's function by a ``ValueError`` with one line."""
     try:
         yield
     except NumbaError as error:

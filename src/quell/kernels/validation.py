@@ -1,7 +1,6 @@
 """Trial of user-defined functions, interpreted, so that mistakes are reported before compilation.
 
-Each error names the user's class and the rule. Classes of this package are not tried: they have
-tests.
+Each error names the user's class and the rule. Classes of this package are not tried.
 """
 
 from __future__ import annotations
@@ -15,8 +14,7 @@ from quell.kernels.dispatch import Generic
 from quell.kernels.user_types import set_display_name
 from quell.types import Vector
 
-UNKNOWN = object()
-"""A function's result is not known, because it fails for the numbers of the trial."""
+UNKNOWN = object()  # the result of a function that fails for the numbers of the trial
 
 
 def is_user_defined(thing: Any) -> bool:

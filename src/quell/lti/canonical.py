@@ -45,26 +45,16 @@ class Canonical(NamedTuple):
     Without zeros it is ``y^(n) = −a_0 y − … − a_{n−1} y^(n−1) + b u + f``.
     """
 
-    a: Vector
-    """(n,) [1/s^(n−i)]."""
-    b: float
-    """Gain from u to y^(degree) [y-unit / u-unit / s^degree]."""
-    S: Matrix
-    """(n, n), from the user's states to z; the identity for a plant given without states."""
-    B: Vector
-    """S B (n,): zero before entry ``degree``, which is b."""
-    E: Vector
-    """S E / f_gain (n,): zero before entry ``f_degree``, which is 1."""
-    degree: int
-    """Relative degree r from u to y."""
-    f_degree: int
-    """Relative degree from f to y; f is measured in y-unit/s^f_degree."""
-    f_gain: float
-    """f divided by the disturbance that enters through E (through B, in units of u, without E)."""
-    zeros: Vector
-    """The n − degree zeros from u to y [rad/s], complex."""
-    condition: float
-    """Condition number of S with rows of length 1; from 1e10 on the plant is unobservable."""
+    a: Vector  #: (n,) [1/s^(n−i)]
+    b: float  #: gain from u to y^(degree) [y-unit / u-unit / s^degree]
+    S: Matrix  #: (n, n), from the user's states to z; the identity for a plant given without states
+    B: Vector  #: S B (n,): zero before entry ``degree``, which is b
+    E: Vector  #: S E / f_gain (n,): zero before entry ``f_degree``, which is 1
+    degree: int  #: relative degree r from u to y
+    f_degree: int  #: relative degree from f to y; f is measured in y-unit/s^f_degree
+    f_gain: float  #: f over the disturbance that enters through E (without E: through B, as u)
+    zeros: Vector  #: the n − degree zeros from u to y [rad/s], complex
+    condition: float  #: condition number of S with rows of length 1; unobservable from 1e10 on
 
     @property
     def matched(self) -> bool:
@@ -168,8 +158,7 @@ def _assemble(a: Vector, B: Vector, E: Vector | None, S: Matrix, condition: floa
     E = B if E is None or _parallel(E, B) else E
     if not np.any(E):
         raise ValueError(
-            f"E: the disturbance does not reach y through any of the {n} states; it can not be "
-            "estimated and does not matter"
+            f"E: the disturbance does not reach y through any of the {n} states: leave E out"
         )
     f_degree = int(np.flatnonzero(E)[0]) + 1
     if E is not B and f_degree < n:

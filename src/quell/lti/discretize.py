@@ -11,25 +11,12 @@ from quell.types import Matrix
 
 
 def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Matrix, list[Matrix]]:
-    """Sample ``x' = A x + Σ B_i u_i`` exactly, with every ``u_i`` held over a sample.
+    """Sample ``x' = A x + Σ B_i u_i`` exactly, with every ``u_i`` held over a sample of ``dt`` [s].
 
-    One matrix exponential gives all (Van Loan, *IEEE Trans. Automatic Control* 23, 1978)::
+    Return Φ (n, n) and the list of Γ_i (n, m_i). One matrix exponential gives all (Van Loan, *IEEE
+    Trans. Automatic Control* 23, 1978)::
 
         exp([[A, B], [0, 0]] dt) = [[Φ, Γ], [0, I]]
-
-    Parameters
-    ----------
-    A
-        (n, n), in 1/s.
-    inputs
-        each (n, m_i).
-    dt
-        sample time [s].
-
-    Returns
-    -------
-    tuple
-        Φ (n, n), and the list of Γ_i (n, m_i).
     """
     from scipy.linalg import expm
 
@@ -44,28 +31,14 @@ def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Mat
 
 
 def gramian(A: Matrix, Q: Matrix, dt: float) -> Matrix:
-    """Return ``∫ exp(A s) Q exp(Aᵀ s) ds`` over a sample, from one exponential (Van Loan 1978).
+    """Return ``∫ exp(A s) Q exp(Aᵀ s) ds`` over a sample, in the unit of Q times s (Van Loan 1978).
 
     ::
 
         exp([[−A, Q], [0, Aᵀ]] dt) = [[·, G], [0, Φᵀ]],      ∫ = Φ G
 
-    For white noise of density Q on x' it is the covariance added in a sample. With Aᵀ in place of A
-    it is the weight of x(0) in the cost ``∫ xᵀ Q x dt`` of a sample.
-
-    Parameters
-    ----------
-    A
-        (n, n), in 1/s.
-    Q
-        (n, n), symmetric.
-    dt
-        sample time [s].
-
-    Returns
-    -------
-    (n, n) array
-        symmetric, in the unit of Q times s.
+    Q (n, n) is symmetric. For white noise of density Q on x' the result is the covariance added in
+    a sample. With Aᵀ for A it is the weight of x(0) in the cost ``∫ xᵀ Q x dt`` of a sample.
     """
     from scipy.linalg import expm
 

@@ -25,14 +25,10 @@ ZERO_TOLERANCE = 1e-9
 class StateSpace(NamedTuple):
     """``x' = A x + B u + E w``, ``y = C x``."""
 
-    A: Matrix
-    """(n, n)."""
-    B: Vector
-    """(n,)."""
-    C: Vector
-    """(n,)."""
-    E: Vector | None
-    """(n,), the input of the disturbance; None if it enters where u does."""
+    A: Matrix  # (n, n)
+    B: Vector  # (n,)
+    C: Vector  # (n,)
+    E: Vector | None  # (n,), the input of the disturbance; None if it enters where u does
 
 
 class TransferFunction(NamedTuple):
@@ -41,28 +37,15 @@ class TransferFunction(NamedTuple):
     For a sampled model, shifts replace derivatives.
     """
 
-    a: Vector
-    """(n,)."""
-    c: Vector
-    """(n,)."""
+    a: Vector  # (n,)
+    c: Vector  # (n,)
 
 
 def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace | TransferFunction:
-    """Return ``plant`` as a checked model.
+    """Return ``plant`` as a checked model; ``LinearPlant.of`` lists the accepted kinds.
 
-    Parameters
-    ----------
-    plant
-        see ``LinearPlant.of`` for the accepted kinds.
-    E
-        input of the disturbance, if it does not enter where u does; see ``canonical``.
-    dt
-        sample time [s]; if given, a discrete-time model with this sample time is accepted too.
-
-    Raises
-    ------
-    ValueError
-        if the model is of no known kind or its parts do not fit.
+    ``E`` is the input of the disturbance, see ``canonical``. With a sample time ``dt`` [s], a
+    discrete-time model that has the same is accepted too.
     """
     if isinstance(plant, list):
         plant = tuple(plant)
@@ -78,8 +61,7 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
         return _state_space(plant.A, plant.B, plant.C, _column(E, getattr(plant, "E", None)))
     if E is not None:
         raise ValueError(
-            "E: only a plant with states, given by matrices, has an input for the disturbance; "
-            "leave E out"
+            "E: only a plant given by matrices has an input for the disturbance; leave E out"
         )
     if isinstance(plant, tuple) and len(plant) == 2:
         if np.ndim(plant[1]) != 0:
@@ -128,9 +110,8 @@ def to_state_space(model: TransferFunction) -> StateSpace:
 def is_linear_model(value: Any) -> bool:
     """Return whether ``value`` looks like a model for ``read_model``: by attributes or numbers."""
     if isinstance(value, tuple | list):
-        return len(value) > 0 and isinstance(
-            value[0], int | float | np.number | np.ndarray | tuple | list
-        )
+        first = value[0] if value else None
+        return isinstance(first, int | float | np.number | np.ndarray | tuple | list)
     kinds = (("A", "B", "C"), ("num", "den"), ("zeros", "poles", "gain"))
     return not isinstance(value, type) and any(
         all(hasattr(value, name) for name in names) for names in kinds
@@ -138,22 +119,10 @@ def is_linear_model(value: Any) -> bool:
 
 
 def leading_gain(A: Matrix, column: Matrix, C: Matrix) -> tuple[float, int] | None:
-    """Return the first nonzero Markov parameter, ``b = C A^(ν−1) column``, and its ν.
+    """Return the first nonzero Markov parameter, ``b = C A^(ν−1) column``, and its ν from 1 to n.
 
-    Parameters
-    ----------
-    A
-        (n, n), in 1/s.
-    column
-        (n, 1), the input: B, or a column of E.
-    C
-        (1, n).
-
-    Returns
-    -------
-    tuple or None
-        b in y-unit / input-unit / s^ν, and the relative degree ν from 1 to n; None if the input
-        does not reach y. Values below 1e-9 of ``|C| |A|^(ν−1) |column|`` are rounding errors.
+    ``column`` (n, 1) is the input: B, or a column of E. b is in y-unit / input-unit / s^ν. None if
+    the input does not reach y. Values below 1e-9 of ``|C| |A|^(ν−1) |column|`` are rounding errors.
     """
     row, bound = C[0], np.abs(C[0])
     for degree in range(1, A.shape[0] + 1):
@@ -208,8 +177,7 @@ def _column(E: Any, columns: Any) -> Any:
     if isinstance(E, int | np.integer) and not isinstance(E, bool):
         if columns is None:
             raise ValueError(
-                f"E = {E!r}: this plant has no disturbance inputs of its own to count; give the "
-                "column (n,)"
+                f"E = {E!r}: this plant has no disturbance inputs of its own; give a column (n,)"
             )
         return np.asarray(columns)[:, [checks.whole("E", E, 0, np.shape(columns)[1] - 1)]]
     return np.reshape(E, (-1, 1)) if np.ndim(E) == 1 else E
@@ -223,8 +191,7 @@ def _transfer_function(numerator: Any, denominator: Any) -> TransferFunction:
         raise ValueError("numerator is zero: the input must reach the output")
     if den.size < 2:
         raise ValueError(
-            f"denominator has degree {max(den.size - 1, 0)}: must be at least 1, or the plant has "
-            "no state"
+            f"denominator has degree {max(den.size - 1, 0)}: must be at least 1, for a state"
         )
     num = _without_rounding(num, den)
     if num.size > den.size:

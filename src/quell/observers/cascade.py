@@ -34,14 +34,10 @@ from quell.types import Matrix, Vector
 class CascadeModel(NamedTuple):
     """Parameters of p levels with N = n + 1 states each; the state of the first level is first."""
 
-    transition: Matrix
-    """Φ (N, N)."""
-    input: Vector
-    """Γ_u (N,)."""
-    feed: Vector
-    """Γ_f (N,)."""
-    gains: Matrix
-    """L_i (p, N)."""
+    transition: Matrix  # Φ (N, N)
+    input: Vector  # Γ_u (N,)
+    feed: Vector  # Γ_f (N,)
+    gains: Matrix  # L_i (p, N)
 
     @property
     def states(self) -> int:

@@ -24,12 +24,9 @@ _MOST_SAMPLES = 10_000
 class DelayedModel(NamedTuple):
     """Parameters of an observer with a delay of u."""
 
-    inner: Any
-    """Parameters of the observer without delay."""
-    size: int
-    """Length of the running state of ``inner``."""
-    samples: int
-    """d, at least 1."""
+    inner: Any  # parameters of the observer without delay
+    size: int  # length of the running state of ``inner``
+    samples: int  # d, at least 1
 
     @property
     def states(self) -> int:
@@ -67,18 +64,11 @@ def _acting_control(model: DelayedModel, z: Vector, u: float) -> float:
 
 
 def delayed_model(model: Any, delay: float, dt: float) -> Any:
-    """Return ``model`` with a delay [s] of u; ``model`` itself if the delay is zero.
-
-    Raises
-    ------
-    ValueError
-        if the delay is negative, no whole number of samples, or longer than 10 000 samples.
-    """
+    """Return ``model`` with a delay [s] of u; ``model`` itself if the delay is zero."""
     samples = checks.samples("delay", delay, dt)
     if samples > _MOST_SAMPLES:
         raise ValueError(
-            f"delay = {delay!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES} samples; "
-            "is it in seconds?"
+            f"delay = {delay!r} s with dt = {dt!r} s: must be at most {_MOST_SAMPLES} samples"
         )
     return model if samples == 0 else DelayedModel(model, model.states, samples)
 

@@ -46,14 +46,7 @@ def design_model(
     half_gain: bool,
     keep_zeros: bool,
 ) -> EsoModel:
-    """Return the update of the observer of ``plant`` with the bandwidth ``omega_o``.
-
-    Raises
-    ------
-    ValueError
-        for a ``form`` that does not exist or does not go with ``half_gain``, and for a bandwidth
-        that ``dt`` does not allow.
-    """
+    """Return the update of the observer of ``plant`` with the bandwidth ``omega_o``."""
     checks.one_of("form", form, FORMS)
     if omega_o * dt >= math.pi:
         raise ValueError(
@@ -62,8 +55,7 @@ def design_model(
         )
     if checks.flag("half_gain", half_gain) and form == "reduced":
         raise ValueError(
-            "half_gain = True with form = 'reduced': half the gain is not of reduced order; "
-            "use form='current'"
+            "half_gain = True with form = 'reduced': they exclude each other; use form='current'"
         )
     kept = np.zeros(0)
     if keep_zeros and plant.matched:

@@ -27,11 +27,6 @@ def kalman_gain(
 
     L is in the coordinates of ``A`` (N, N), whose last state is f. The equation is solved in the
     time unit of the Butterworth pattern, where the entries of Φ, Q and P have similar sizes.
-
-    Raises
-    ------
-    ValueError
-        if the variances are so far apart that no solution is found.
     """
     from scipy.linalg import solve_discrete_are
 

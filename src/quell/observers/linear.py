@@ -20,16 +20,11 @@ from quell.types import Matrix, Vector
 class EsoModel(NamedTuple):
     """Parameters of the update for order n, with N = n + 1 states."""
 
-    transition: Matrix
-    """Φ (N, N)."""
-    input: Vector
-    """Γ_u (N,)."""
-    feed: Vector
-    """Γ_f (N,)."""
-    gain: Vector
-    """L (N,)."""
-    predictor: bool
-    """Whether the controller gets z⁻ instead of z."""
+    transition: Matrix  # Φ (N, N)
+    input: Vector  # Γ_u (N,)
+    feed: Vector  # Γ_f (N,)
+    gain: Vector  # L (N,)
+    predictor: bool  # whether the controller gets z⁻ instead of z
 
     @property
     def states(self) -> int:

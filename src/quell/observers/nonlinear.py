@@ -33,18 +33,12 @@ from quell.types import Matrix, Vector
 class NonlinearModel(NamedTuple):
     """Parameters of the nonlinear observer, with N = n + 1 states."""
 
-    transition: Matrix
-    """Φ (N, N)."""
-    input: Vector
-    """Γ_u (N,)."""
-    feed: Vector
-    """Γ_f (N,)."""
-    gain: Vector
-    """L (N,), as for the linear observer."""
-    alpha: Vector
-    """α (N,), above 0 and at most 1."""
-    delta: float
-    """δ [y-unit]."""
+    transition: Matrix  # Φ (N, N)
+    input: Vector  # Γ_u (N,)
+    feed: Vector  # Γ_f (N,)
+    gain: Vector  # L (N,), as for the linear observer
+    alpha: Vector  # α (N,), above 0 and at most 1
+    delta: float  # δ [y-unit]
 
     @property
     def states(self) -> int:

@@ -10,23 +10,14 @@ from quell.types import Matrix, Vector
 def place_poles(difference: Matrix, offsets: Vector) -> Vector:
     """Return L that puts the eigenvalues of ``(I − L C) Φ``, C = (1, 0, …), at ``1 − offsets``.
 
+    ``difference`` is ``Φ − I`` (N, N), in coordinates in which it is O(1) after division by the
+    largest offset; complex offsets (N,) come in conjugate pairs. L (N,) is NaN if Φ can't be
+    observed through C.
+
     Ackermann's formula: ``L = Π (Φ − β_i I) O⁻¹ e_N`` with the rows ``C Φ (Φ − I)^i`` for O.
     Differences instead of powers do not change ``O⁻¹ e_N`` and make O triangular for a chain of
     integrators, where powers would be nearly parallel. Dividing by the largest offset makes them
     O(1).
-
-    Parameters
-    ----------
-    difference
-        ``Φ − I`` (N, N), in the coordinates of the observer's own time, so that it is O(1) after
-        division by the largest offset.
-    offsets
-        ``1 − β_i`` (N,), complex ones in conjugate pairs.
-
-    Returns
-    -------
-    array
-        L (N,); NaN if Φ can't be observed through C.
     """
     size = difference.shape[0]
     unit = np.max(np.abs(offsets))
@@ -49,23 +40,9 @@ def place_poles(difference: Matrix, offsets: Vector) -> Vector:
 def sampled_zeros(difference: Matrix, zeros: Vector, dt: float) -> Vector:
     """Return ``1 − ζ`` for the z-plane zeros ζ from f to y that belong to the plant's ``zeros``.
 
-    They are close to ``exp(zeros dt)`` among the finite eigenvalues of the pencil
-    ``[[Φ − I − λ I, Γ], [C, 0]]`` with ``λ = ζ − 1``; the others are due to sampling. Γ, the
-    response to a held f, is the last column of Φ.
-
-    Parameters
-    ----------
-    difference
-        ``Φ − I`` of the extended model (N, N), as for ``place_poles``; its last state is f.
-    zeros
-        some of the plant's zeros from f [rad/s], complex ones in conjugate pairs.
-    dt
-        sample time [s].
-
-    Returns
-    -------
-    array
-        of the same size, for the ``offsets`` of ``place_poles``.
+    The plant's zeros [rad/s] come in conjugate pairs. ζ are close to ``exp(zeros dt)`` among the
+    finite eigenvalues of the pencil ``[[Φ − I − λ I, Γ], [C, 0]]`` with ``λ = ζ − 1``; the others
+    are due to sampling. Γ, the response to a held f, is the last column of Φ.
     """
     from scipy.linalg import eigvals
 

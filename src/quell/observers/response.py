@@ -18,28 +18,17 @@ class Response(NamedTuple):
     There are m states and N = n + 1 estimates, ``x̂_1 … x̂_n, Δf̂``.
     """
 
-    transition: Matrix
-    """M (m, m)."""
-    input: Matrix
-    """G (m, 3)."""
-    output: Matrix
-    """C (N, m)."""
-    feedthrough: Matrix
-    """D (N, 3)."""
+    transition: Matrix  #: M (m, m)
+    input: Matrix  #: G (m, 3)
+    output: Matrix  #: C (N, m)
+    feedthrough: Matrix  #: D (N, 3)
 
 
 def response(model: Any, estimates: int) -> Response:
-    """Return the matrices of the update with the parameters ``model``, for N ``estimates``.
-
-    Raises
-    ------
-    ValueError
-        for a nonlinear observer, which has none.
-    """
+    """Return the matrices of the update of a linear observer's ``model``, for N ``estimates``."""
     if isinstance(without_delay(model), NonlinearModel):
         raise ValueError(
-            "observer is nonlinear (ESO.nonlinear): it has no exact lag, which learners and guards "
-            "need; use a linear observer"
+            "observer is nonlinear: it has no exact lag for learners and guards; use a linear one"
         )
     m = model.states
     state, estimated = np.zeros((m, m + 3)), np.zeros((estimates, m + 3))
@@ -47,19 +36,14 @@ def response(model: Any, estimates: int) -> Response:
         z, estimate = one[:m].copy(), np.zeros(estimates)
         observe(model, z, estimate, *one[m:].tolist())
         state[:, i], estimated[:, i] = z, estimate
-    return Response(
-        state[:, :m].copy(), state[:, m:].copy(), estimated[:, :m].copy(), estimated[:, m:].copy()
-    )
+    parts = state[:, :m], state[:, m:], estimated[:, :m], estimated[:, m:]
+    return Response(*(part.copy() for part in parts))
 
 
 def f_learned_response(found: Response) -> tuple[Matrix, Vector, Vector, float]:
     """Return ``(M, g, c, d)`` of ``s⁺ = M s + g f_L``, ``−Δf̂ = c·s + d f_L``, for y = u = 0."""
-    return (
-        found.transition,
-        found.input[:, 2],
-        -found.output[-1],
-        -float(found.feedthrough[-1, 2]),
-    )
+    feedthrough = float(found.feedthrough[-1, 2])
+    return found.transition, found.input[:, 2], -found.output[-1], -feedthrough
 
 
 def scaled_response(model: Any, units: Vector) -> Response:

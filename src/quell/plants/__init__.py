@@ -15,17 +15,7 @@ from quell.plants.torsional import TorsionalPlant, torsional, torsional_identifi
 from quell.plants.two_mass_spring import two_mass_spring
 
 __all__ = [
-    "CubicSpringPlant",
-    "LinearPlant",
-    "NonlinearPlant",
-    "Plant",
-    "PlantBatch",
-    "TorsionalPlant",
-    "batch",
-    "delayed",
-    "encoded",
-    "lagged_two_mass_spring",
-    "torsional",
-    "torsional_identified",
+    "CubicSpringPlant", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch", "TorsionalPlant",
+    "batch", "delayed", "encoded", "lagged_two_mass_spring", "torsional", "torsional_identified",
     "two_mass_spring",
-]
+]  # fmt: skip

@@ -28,8 +28,7 @@ class PlantBatch(Sequence[Plant]):
     Raises
     ------
     ValueError
-        if an entry is no plant, or is of another kind, order or number of disturbances than the
-        first.
+        if an entry is no plant, or of another kind, order or number of disturbances.
     """
 
     def __init__(
@@ -47,8 +46,7 @@ class PlantBatch(Sequence[Plant]):
             ):
                 if own != common:
                     raise ValueError(
-                        f"plant[{i}] has {what} {own}, plant[0] {common}: must be the same; run "
-                        "them as two batches"
+                        f"plant[{i}] has {what} {own}, plant[0] {common}: make two batches"
                     )
         arrays = {name: np.array(values) for name, values in (parameters or {}).items()}
         for name, array in arrays.items():
@@ -105,8 +103,7 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
     Raises
     ------
     ValueError
-        for vectors of different lengths, a parameter that the factory does not have, and a plant
-        that it refuses; the message names the run.
+        for vectors of different lengths, and if the factory raises one; it names the run.
 
     Examples
     --------
@@ -123,8 +120,7 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
         if length not in (1, runs) or length == 0:
             longest = max(lengths, key=lambda name: lengths[name])
             raise ValueError(
-                f"{name} has {length} entries, {longest} {runs}: must be numbers or vectors of one "
-                "length, at least 1"
+                f"{name} has {length} entries, {longest} {runs}: must be numbers, or of one length"
             )
     whole = {name: np.broadcast_to(array, (runs,)) for name, array in arrays.items()}
     columns = {name: values.tolist() for name, values in whole.items()}
@@ -132,8 +128,7 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
         inspect.signature(factory).bind(**columns)
     except TypeError as error:
         raise ValueError(
-            f"parameters = {', '.join(parameters) or 'none'}: the factory can't be called with "
-            f"them: {error}"
+            f"parameters = {', '.join(parameters) or 'none'}: don't fit the factory: {error}"
         ) from None
     plants = []
     for i in range(runs):

@@ -28,10 +28,8 @@ class CubicSpringModel(NamedTuple):
     """The sampled plant: its linear part and the impulses of the cubic spring."""
 
     linear: LinearModel
-    impulse1: float
-    """Velocity that m1 gains in half a sample at a spring length of 1 m, ``−k_cubic dt / 2 m1``."""
-    impulse2: float
-    """The same for m2, ``k_cubic dt / 2 m2``."""
+    impulse1: float  # velocity that m1 gains in half a sample at 1 m, ``−k_cubic dt / 2 m1``
+    impulse2: float  # the same for m2, ``k_cubic dt / 2 m2``
 
 
 @measure.register(CubicSpringModel)
@@ -119,12 +117,6 @@ def lagged_two_mass_spring(
         share λ of the actuator's force that reaches m1.
     lag
         its time constant τ [s].
-
-    Raises
-    ------
-    ValueError
-        for a mass, stiffness, effectiveness or lag that is not positive, or a ``k_cubic`` that is
-        not finite.
     """
     masses, forces = two_mass_matrices(m1, m2, k)
     effectiveness = checks.positive("effectiveness", effectiveness)

@@ -17,10 +17,8 @@ from quell.types import Vector
 class DelayedPlantModel(NamedTuple):
     """A sampled plant with a delay of at least one sample."""
 
-    inner: Any
-    """Parameters of the plant without delay."""
-    size: int
-    """Number of its states."""
+    inner: Any  # parameters of the plant without delay
+    size: int  # number of its states
 
 
 @measure.register(DelayedPlantModel)
@@ -65,8 +63,7 @@ class DelayedPlant(PlantWrapper):
         """Return the parameters for the sample time ``dt`` [s] of the delay."""
         if abs(dt - self.dt) > 1e-9 * self.dt:
             raise ValueError(
-                f"dt = {dt!r} s: this delayed plant has the states of {self.dt!r} s; make it with "
-                f"dt={dt!r}"
+                f"dt = {dt!r} s: this delayed plant was made for {self.dt!r} s; make another one"
             )
         return DelayedPlantModel(self.plant.sampled(dt, interpret), self.plant.order)
 
@@ -82,12 +79,6 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
         [s], at least one sample and a whole number of samples.
     dt
         sample time of the later runs [s]; it decides how many values of u are stored.
-
-    Raises
-    ------
-    ValueError
-        if the delay is shorter than a sample or no whole number of samples, or ``plant`` is not a
-        plant.
 
     Examples
     --------

@@ -21,10 +21,8 @@ from quell.types import Vector
 class EncodedPlantModel(NamedTuple):
     """A sampled plant with an encoder."""
 
-    inner: Any
-    """Parameters of the plant without encoder."""
-    resolution: float
-    """q [y-unit]."""
+    inner: Any  # parameters of the plant without encoder
+    resolution: float  # q [y-unit]
 
 
 @kernel
@@ -79,11 +77,6 @@ def encoded(plant: Plant, counts: int) -> EncodedPlant:
         any plant.
     counts
         counts of the encoder a turn, with all four edges of its two channels.
-
-    Raises
-    ------
-    ValueError
-        if ``counts`` is no whole number above zero, or ``plant`` is not a plant.
 
     Examples
     --------

@@ -15,14 +15,10 @@ from quell.types import Matrix, Vector
 class LinearModel(NamedTuple):
     """A sampled linear plant: ``x⁺ = Φ x + Γ u + Γ_w w``, ``y = C x``."""
 
-    transition: Matrix
-    """Φ (n, n)."""
-    input: Vector
-    """Γ (n,)."""
-    disturbance: Matrix
-    """Γ_w (n, m)."""
-    output: Vector
-    """C (n,)."""
+    transition: Matrix  # Φ (n, n)
+    input: Vector  # Γ (n,)
+    disturbance: Matrix  # Γ_w (n, m)
+    output: Vector  # C (n,)
 
 
 @measure.register(LinearModel)
@@ -63,11 +59,6 @@ class LinearPlant:
         (n, m), m ≥ 0 disturbance inputs; by default the disturbance enters as u does.
     name
         for tables and plots.
-
-    Raises
-    ------
-    ValueError
-        if shapes do not fit or an entry is not finite.
     """
 
     A: Any

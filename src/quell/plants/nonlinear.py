@@ -31,8 +31,7 @@ class CompiledNonlinear(NamedTuple):
 
     rate: int
     output: int
-    step: float
-    """Length of a sub-step [s]."""
+    step: float  # length of a sub-step [s]
     substeps: int
 
 
@@ -136,12 +135,6 @@ class NonlinearPlant:
     name
         for tables and plots.
 
-    Raises
-    ------
-    ValueError
-        if ``f`` does not return n numbers, or ``output`` is neither a row nor a function that
-        returns a number.
-
     Examples
     --------
     >>> import math
@@ -167,8 +160,7 @@ class NonlinearPlant:
         )
         if returned is not validation.UNKNOWN and np.shape(returned) != (n,):
             raise ValueError(
-                f"f returns shape {np.shape(returned)}: must return the {n} derivatives of the "
-                "state"
+                f"f returns shape {np.shape(returned)}: must return the {n} derivatives of x"
             )
         if not callable(self.output):
             checks.vector("output", self._row, n)
@@ -210,10 +202,8 @@ class NonlinearPlant:
         try:
             f = function_pointers.jit_user_function(self.f)
             h = function_pointers.jit_user_function(self._output_function)
-            return (
-                function_pointers.compile_cfunc(_RATE_SIGNATURE, rate),
-                function_pointers.compile_cfunc(_OUTPUT_SIGNATURE, output),
-            )
+            compile_cfunc = function_pointers.compile_cfunc
+            return compile_cfunc(_RATE_SIGNATURE, rate), compile_cfunc(_OUTPUT_SIGNATURE, output)
         except function_pointers.NotCompilableError as error:
             warnings.warn(
                 f"{self.name}: f or output can't be compiled and runs as Python, which is slow "

@@ -31,11 +31,6 @@ def linear(
         in place of num and den, matrices as lists of rows; B and C may be lists of numbers.
     E
         how disturbances enter, with a column for each; as u does by default.
-
-    Raises
-    ------
-    ValueError
-        if only some of num and den, or of A, B and C, are given, or some of both groups.
     """
     values = {"num": num, "den": den, "A": A, "B": B, "C": C}
     given = [name for name, value in values.items() if value is not None]
@@ -64,11 +59,5 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
 
 
 def named_plant(name: str, argument: str = "plant") -> Plant:
-    """Return the plant of ``TESTBEDS`` with this name; errors call the name ``argument``.
-
-    Raises
-    ------
-    ValueError
-        for an unknown name.
-    """
+    """Return the plant of ``TESTBEDS`` with this name; errors call the name ``argument``."""
     return TESTBEDS[checks.one_of(argument, name, tuple(TESTBEDS))]()

@@ -50,15 +50,11 @@ _RANGE = 10.0
 class TorsionalModel(NamedTuple):
     """The disks and their drive, sampled at a sub-step."""
 
-    disks: LinearModel
-    """The disks without Coulomb friction; the disturbances are torques on them [N m]."""
+    disks: LinearModel  # disks without Coulomb friction; disturbances are torques on them [N m]
     substeps: int
-    coulomb: Vector
-    """C of the lower and the upper disk [N m] (2,)."""
-    u_max: float
-    """Limit of u by the converter or the current limit [V]."""
-    step: float
-    """Step of the converter [V]; 0.0 for no rounding."""
+    coulomb: Vector  # C of the lower and the upper disk [N m] (2,)
+    u_max: float  # limit of u by the converter or the current limit [V]
+    step: float  # step of the converter [V]; 0.0 for no rounding
 
 
 @measure.register(TorsionalModel)
@@ -102,17 +98,12 @@ class TorsionalPlant:
     Its states are those of ``linear``, followed by the delayed values of u.
     """
 
-    linear: LinearPlant
-    """The disks with viscous friction alone, from u [V] to the angle: for analysis and design."""
-    coulomb: tuple[float, float]
-    """Coulomb friction of the lower and the upper disk [N m]."""
-    u_max: float
-    """Limit of u [V]."""
-    step: float
-    """Rounding of u [V]; 0.0 for none."""
+    linear: LinearPlant  #: disks with viscous friction alone, from u [V] to the angle: for design
+    coulomb: tuple[float, float]  # Coulomb friction of the lower and the upper disk [N m]
+    u_max: float  # limit of u [V]
+    step: float  # rounding of u [V]; 0.0 for none
     counts: int | None
-    late: int
-    """Delay of u in samples."""
+    late: int  # delay of u in samples
     name: str = "torsional plant"
 
     @property
@@ -219,12 +210,6 @@ def torsional(
         of the encoder a turn: 16000 [1]_; None for the angle itself.
     late
         delay of u in samples: assumed 0, as if the computer answers within the sample.
-
-    Raises
-    ------
-    ValueError
-        for an inertia, stiffness, belt, torque constant, amplifier or current limit that is not
-        positive, a friction or damping below zero, or bits, counts or samples out of range.
 
     References
     ----------

@@ -47,19 +47,9 @@ _HOME = {
 }
 
 __all__ = [
-    "CsvSink",
-    "Device",
-    "LiveSink",
-    "McapSink",
-    "Rig",
-    "RigRun",
-    "Safety",
-    "TwinDevice",
-    "load",
-    "open_device",
-    "replay",
-    "run_rig",
-]
+    "CsvSink", "Device", "LiveSink", "McapSink", "Rig", "RigRun", "Safety", "TwinDevice",
+    "load", "open_device", "replay", "run_rig",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -30,8 +30,7 @@ class Signal:
         values = np.asarray(self.evaluate(times), dtype=np.float64)
         if values.shape != times.shape:
             raise ValueError(
-                f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape "
-                f"{times.shape}"
+                f"{type(self).__name__}.evaluate: shape {values.shape} for times of {times.shape}"
             )
         return values
 
@@ -42,10 +41,7 @@ class Signal:
     def derivative(self) -> Signal:
         """Return the derivative in time, without the impulses of jumps.
 
-        Raises
-        ------
-        ValueError
-            for a signal whose derivative is not known in closed form.
+        Raise a ``ValueError`` if it is not known in closed form.
         """
         raise ValueError(
             f"reference has no derivative known in closed form, {type(self).__name__} has none: "
@@ -153,8 +149,7 @@ class Switched(Signal):
         times = checks.vector("times", self.times)
         if len(self.pieces) != times.size + 1:
             raise ValueError(
-                f"pieces has {len(self.pieces)} entries, times {times.size}: there must be one "
-                "piece more than times"
+                f"pieces has {len(self.pieces)} entries, times {times.size}: must be one more"
             )
         if np.any(np.diff(times) <= 0.0):
             raise ValueError(f"times = {self.times!r}: must increase")

@@ -48,10 +48,8 @@ class BandLimitedNoise(Signal):
         """Return the draws that are held at ``t``; zero for negative times."""
         count = t * (1.0 / self.sample_time) + (1.0 + 1e-6)
         if t.size and not float(np.max(np.abs(count))) < 2.0**52:
-            raise ValueError(
-                f"sample_time = {self.sample_time!r}: too short to be counted in times of "
-                f"{float(np.max(np.abs(t))):g} s"
-            )
+            most = float(np.max(np.abs(t)))
+            raise ValueError(f"sample_time = {self.sample_time!r}: too short to count {most:g} s")
         index = count.astype(np.int64) - 1  # floor, for times from 0 on
         if t.size and np.ptp(index) < _BLOCKS_AT_ONCE * _BLOCK:
             blocks = np.arange(index.min() // _BLOCK, index.max() // _BLOCK + 1)

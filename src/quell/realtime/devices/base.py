@@ -2,8 +2,7 @@
 
 A device is an object with ``read() -> y``, ``write(u)`` and ``close()``. A device that can be used
 from compiled code also has a ``handle``: a NamedTuple for whose type ``read_measurement`` and
-``write_command`` are registered. Any other device gets a ``PythonHandle``, and the loop around it
-runs as Python.
+``write_command`` are registered. Any other device gets a ``PythonHandle``; its loop runs as Python.
 
 A device with its own clock sends a measurement at each of its ticks; its attribute ``paced`` is
 True, and ``read_measurement`` waits for the next tick. Other devices answer at any time.
@@ -41,8 +40,7 @@ class Listener(Protocol):
     """
 
     url: str
-    transport: Any
-    """The functions of ``quell.realtime.wire.transport`` are registered for its type."""
+    transport: Any  # its type has the functions of ``quell.realtime.wire.transport``
 
     def close(self) -> None:
         """Release the wire."""
@@ -68,20 +66,12 @@ class PythonHandle(NamedTuple):
     """A device that only Python can use."""
 
     device: Device
-    errors: list[Exception]
-    """The exception that it raised last, if any."""
-    faults: NDArray[np.int64]
-    """Number of exceptions that it raised (1,)."""
+    errors: list[Exception]  #: the exception that it raised last, if any
+    faults: NDArray[np.int64]  #: number of exceptions that it raised (1,)
 
 
 def handle_of(device: Device) -> Any:
-    """Return the handle of a device, a ``PythonHandle`` if it has none.
-
-    Raises
-    ------
-    ValueError
-        for an object that is not a device.
-    """
+    """Return the handle of a device, a ``PythonHandle`` if it has none."""
     if isinstance(device, type) or not isinstance(device, Device):
         raise ValueError(
             f"device = {device!r}: must have read(), write(u) and close(), "

@@ -18,12 +18,9 @@ class Scheme(NamedTuple):
 
     example: str
     description: str
-    module: str
-    """Module below ``quell.realtime``."""
-    device: str
-    """Name there of the loop's end, which is called with URL and sample time."""
-    listener: str = ""
-    """Name there of the device's end, which is called with the URL; empty if there is none."""
+    module: str  # module below ``quell.realtime``
+    device: str  # name there of the loop's end, which is called with URL and sample time
+    listener: str = ""  # name there of the device's end, called with the URL; empty if none
 
 
 # fmt: off
@@ -74,13 +71,7 @@ def open_device(device: str | Device, dt: float) -> Any:
 
 
 def listen(url: str) -> Listener:
-    """Return the device's end of the wire with this URL, for a ``Rig``.
-
-    Raises
-    ------
-    ValueError
-        for a URL at which nothing can listen.
-    """
+    """Return the device's end of the wire with this URL, for a ``Rig``."""
     found: Listener = _end(url, listening=True)(url)
     return found
 

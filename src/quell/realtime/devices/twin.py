@@ -19,13 +19,10 @@ class TwinHandle(NamedTuple):
     """A sampled plant and its state."""
 
     plant: Any
-    x: Vector
-    """State of the plant (n,)."""
+    x: Vector  # state of the plant (n,)
     scratch: Vector
-    w: Vector
-    """Disturbances: zero (m,)."""
-    t: Vector
-    """Samples since the start, and the sample time [s] (2,)."""
+    w: Vector  # disturbances: zero (m,)
+    t: Vector  # samples since the start, and the sample time [s] (2,)
 
 
 @read_measurement.register(TwinHandle)
@@ -51,24 +48,10 @@ def _write(handle: TwinHandle, u: float) -> None:
 
 
 class TwinDevice:
-    """A simulated plant: ``read`` measures it, ``write(u)`` advances it by a sample.
+    """A simulated plant: ``read`` measures it, ``write(u)`` advances it by a sample ``dt`` [s].
 
-    u acts at once. Over a wire it acts a sample later; ``quell.plants.delayed(plant, dt, dt)`` adds
-    the same delay to this device.
-
-    Parameters
-    ----------
-    plant
-        any plant.
-    dt
-        sample time [s].
-    x0
-        state at the start (n,); zero by default.
-
-    Raises
-    ------
-    ValueError
-        if ``plant`` is not a plant, dt is not positive, or x0 has the wrong size.
+    It starts from the state ``x0`` (n,), zero by default. u acts at once. Over a wire it acts a
+    sample later; ``quell.plants.delayed(plant, dt, dt)`` adds the same delay to this device.
 
     Examples
     --------

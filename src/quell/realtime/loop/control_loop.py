@@ -103,9 +103,8 @@ class ControlLoop:
         """Compile by a run that is finished before it begins, or by a step after its end."""
         finished = copy.deepcopy(self.controller.supervisor)
         finished.memory[0].mode, finished.memory[0].samples = Mode.STOPPED, FLUSH + 1
-        over = self.controller._replace(
-            supervisor=finished, state=copy.deepcopy(self.controller.state)
-        )
+        state = copy.deepcopy(self.controller.state)
+        over = self.controller._replace(supervisor=finished, state=state)
         with explain_compile_errors(self.handle, self.controller.design):
             ControlLoop(self.handle, self.clock, self.times, over, self.interpret).run()
             if self.interpreted and not self.interpret:

@@ -71,41 +71,29 @@ _MISSED, _OVERRAN, _CLIPPED, _UNSENT, _CHANGED = (
 class CycleTimes(NamedTuple):
     """Times of a cycle [ns]."""
 
-    period: float
-    """Sample time."""
-    timeout: int
-    """Wait for the measurement of a paced device, counted from the deadline."""
-    recheck: int
-    """Wait for a newer measurement if the one found may be old, counted from the deadline."""
-    later: int
-    """Largest shift of the grid towards later per cycle; 0 for a device that is not paced."""
-    earlier: int
-    """Shift of the grid towards earlier per cycle."""
+    period: float  #: sample time
+    timeout: int  #: wait for the measurement of a paced device, counted from the deadline
+    recheck: int  #: wait for a newer measurement if the one found may be old, from the deadline
+    later: int  #: largest shift of the grid towards later per cycle; 0 if the device is not paced
+    earlier: int  #: shift of the grid towards earlier per cycle
 
 
 class CycleLog(NamedTuple):
     """Outputs of the loop for other threads."""
 
     ring: Ring
-    row: Vector
-    """Work array: one row."""
-    f_learned: int
-    """Index of the learned part of f̂ in a row; −1 if the controller reports none."""
-    f_residual: int
-    """Index of the observer's part of f̂."""
-    lateness: NDArray[np.int64]
-    """Histogram, see ``count_duration``."""
-    step_time: NDArray[np.int64]
-    """Histogram."""
+    row: Vector  #: work array: one row
+    f_learned: int  #: index of the learned part of f̂ in a row; −1 if the controller reports none
+    f_residual: int  #: index of the observer's part of f̂
+    lateness: NDArray[np.int64]  #: histogram, see ``count_duration``
+    step_time: NDArray[np.int64]  #: histogram
 
 
 class SupervisedController(NamedTuple):
     """A controller, its supervisor, its reference and its log: the arguments of a control step."""
 
-    design: Any
-    """Parameters of the controller."""
-    state: Any
-    """State of the controller."""
+    design: Any  #: parameters of the controller
+    state: Any  #: state of the controller
     rules: Rules
     supervisor: SupervisorState
     reference: ReferenceSamples

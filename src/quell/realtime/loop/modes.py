@@ -19,32 +19,24 @@ class Request(IntEnum):
     """A request of another thread to the loop; a higher one prevails."""
 
     NONE = 0
-    RAMP = 1
-    """Ramp u to zero."""
-    ZERO = 2
-    """Set u to zero at once."""
+    RAMP = 1  #: ramp u to zero
+    ZERO = 2  #: set u to zero at once
 
 
 class Ending(IntEnum):
     """The way in which a cause ends the run."""
 
-    NO = 0
-    """It does not: the run goes on, or had ended already."""
-    COMPLETED = 1
-    """The scenario was run to its end."""
-    REQUESTED = 2
-    """The run was asked to stop."""
-    FAULT = 3
-    """A limit or a fault stopped it."""
+    NO = 0  #: it does not: the run goes on, or had ended already
+    COMPLETED = 1  #: the scenario was run to its end
+    REQUESTED = 2  #: the run was asked to stop
+    FAULT = 3  #: a limit or a fault stopped it
 
 
 class Cause(IntEnum):
     """Why the mode changed."""
 
-    text: str
-    """The cause as a clause."""
-    ending: Ending
-    """How it ends the run."""
+    text: str  #: the cause as a clause
+    ending: Ending  #: how it ends the run
 
     def __new__(cls, number: int, text: str = "", ending: Ending = Ending.FAULT) -> Cause:
         """Return the member with this number."""

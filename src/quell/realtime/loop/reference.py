@@ -15,38 +15,24 @@ from quell.types import Matrix, Vector
 
 # A record of so many samples with twenty channels takes 1.6 GB.
 _MOST_SAMPLES = 10_000_000
-# s(τ) of the least jerk from 0 to 1, at rest at both ends (Flash & Hogan, J. Neuroscience 5, 1985,
-# eq. (3)).
+# s(τ) of the least jerk from rest at 0 to rest at 1 (Flash & Hogan, J. Neuroscience 5, 1985, (3)).
 _LEAST_JERK = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
 
 
 class ReferenceSamples(NamedTuple):
     """The reference for all samples of a run."""
 
-    r: Vector
-    """(samples,) [y-unit]."""
-    derivatives: Matrix
-    """(samples, d): r', r'', …, as many as the controller uses."""
-    approach: Matrix
-    """(·, 1 + d): approach and its derivatives for a distance of 1, see ``approach_curve``."""
-    current: Vector
-    """Work array: derivatives of one sample (d,)."""
+    r: Vector  # (samples,) [y-unit]
+    derivatives: Matrix  # (samples, d): r', r'', …, as many as the controller uses
+    approach: Matrix  # (·, 1 + d): ``approach_curve`` and its derivatives for a distance of 1
+    current: Vector  # work array: derivatives of one sample (d,)
 
 
 def as_scenario(value: Scenario | Signal | float, duration: float | None) -> Scenario:
-    """Return a scenario, or make one of a reference that takes ``duration`` [s].
-
-    Raises
-    ------
-    ValueError
-        for a reference without duration, and for a scenario with ``rest_at``.
-    """
+    """Return a scenario, or make one of a reference that takes ``duration`` [s]."""
     if not isinstance(value, Scenario):
         if duration is None:
-            raise ValueError(
-                "duration = None: give the duration [s] with a reference, or a quell.Scenario, "
-                "which has one"
-            )
+            raise ValueError("duration = None: give the duration [s], or a quell.Scenario")
         return Scenario(as_signal(value, "scenario"), duration)
     if value.rest_at:
         raise ValueError(
@@ -58,19 +44,10 @@ def as_scenario(value: Scenario | Signal | float, duration: float | None) -> Sce
 def reference_samples(
     scenario: Scenario, dt: float, derivatives: int, approach: float
 ) -> ReferenceSamples:
-    """Return the reference for every sample, and its approach within ``approach`` [s].
-
-    Raises
-    ------
-    ValueError
-        for a run of more than ten million samples, and a reference that is not finite or has no
-        derivatives.
-    """
+    """Return the reference for every sample, and its approach within ``approach`` [s]."""
     if scenario.duration / dt > _MOST_SAMPLES:
-        raise ValueError(
-            f"duration = {scenario.duration!r} s with dt = {dt!r} s: must be at most "
-            f"{_MOST_SAMPLES:.0e} samples"
-        )
+        times = f"duration = {scenario.duration!r} s with dt = {dt!r} s"
+        raise ValueError(f"{times}: must be at most {_MOST_SAMPLES:.0e} samples")
     t = np.arange(math.floor(in_steps(scenario.duration, dt)) + 1) * dt
     signals = [scenario.seeded_signals(len(scenario.disturbances))[0]]
     for _ in range(derivatives):

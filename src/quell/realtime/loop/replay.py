@@ -2,8 +2,7 @@
 
 The controller gets the recorded reference and measurements, sample by sample, and the recorded u as
 the applied one. So its observer and its learner run on what really happened. Its own u is recorded
-as ``u_wished`` but never acts: how
-*the loop* would have behaved is a question for ``simulate``.
+as ``u_wished`` but never acts: how *the loop* would have behaved is a question for ``simulate``.
 """
 
 from __future__ import annotations
@@ -59,15 +58,13 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     Returns
     -------
     Trajectory
-        ``r``, ``y``, ``y_measured`` and ``u`` of the run, ``u_wished``, and the controller's
-        channels.
+        ``r``, ``y``, ``y_measured``, ``u`` of the run; ``u_wished``; the controller's channels.
 
     Raises
     ------
     ValueError
-        for anything else than a Trajectory; for a run that lacks r, y, y_measured, u or some
-        samples, or has no measurement; for another sample time; and for ``u_before`` with a
-        controller other than an ADRC.
+        for a run without r, y, y_measured or u, with samples left out, without measurements, or
+        with another sample time; for ``u_before`` with a controller other than an ADRC.
     """
     check_controller(controller)
     if not isinstance(run, Trajectory):
@@ -78,8 +75,7 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     u = recorded[:, 3]
     if run.every != 1:
         raise ValueError(
-            f"run has every {run.every}th sample: a replay needs all of them; record with "
-            "record_every=1"
+            f"run has every {run.every}th sample: a replay needs all; record with record_every=1"
         )
     if run.dt != controller.dt:
         raise ValueError(
@@ -116,10 +112,8 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
 def _started(controller: Any, y: float, u: float, r: float) -> tuple[Any, Any]:
     """Return parameters and initial state for a plant that rests at ``y`` under ``u``."""
     if not hasattr(controller, "start"):
-        raise ValueError(
-            f"u_before = {u!r}: only an ADRC starts under load; leave it out for a "
-            f"{type(controller).__name__}"
-        )
+        kind = type(controller).__name__
+        raise ValueError(f"u_before = {u!r}: only an ADRC starts under load; leave it out ({kind})")
     follower = copy.copy(controller)
     follower.reset()
     follower.start(y, u, r if math.isfinite(r) else None)

@@ -18,8 +18,7 @@ from quell.records.trajectory import Trajectory
 class ModeChange(NamedTuple):
     """A change of the supervisor's mode."""
 
-    t: float
-    """Time since the loop's first cycle [s]."""
+    t: float  # time since the loop's first cycle [s]
     mode: Mode
     cause: Cause
 
@@ -32,18 +31,12 @@ class Tally(NamedTuple):
     """Numbers of cycles and of events in them."""
 
     cycles: int
-    overruns: int
-    """Cycles that woke, or ended, after the next deadline."""
-    skipped: int
-    """Deadlines that were skipped because of that."""
-    missed: int
-    """Cycles without a good measurement."""
-    clipped: int
-    """Cycles in which the supervisor's limits changed the controller's u."""
-    unsent: int
-    """Commands that could not be sent."""
-    rows_lost: int
-    """Rows that found the telemetry's ring full."""
+    overruns: int  # cycles that woke, or ended, after the next deadline
+    skipped: int  # deadlines that were skipped because of that
+    missed: int  # cycles without a good measurement
+    clipped: int  # cycles in which the supervisor's limits changed the controller's u
+    unsent: int  # commands that could not be sent
+    rows_lost: int  # rows that found the telemetry's ring full
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +49,7 @@ class RigRun:
         from the scenario's first sample to its last, or to the end of the run; ``ended`` is zero if
         it did not begin.
     record : Trajectory
-        all cycles, also those before, in which the controller observes, and after, in which u goes
-        to zero.
+        all cycles, also those before the scenario (START) and after it (RAMP, STOPPED).
     timing : Timing
         histograms of lateness and step time.
     changes : tuple of ModeChange

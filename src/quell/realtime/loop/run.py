@@ -101,10 +101,6 @@ def run_rig(
     on_change
         called with each change of the supervisor's mode, soon after it, in this thread.
 
-    Returns
-    -------
-    RigRun
-
     Raises
     ------
     ValueError

@@ -39,11 +39,6 @@ class Safety:
         number of samples in which u goes to zero.
     settle
         number of samples for which the controller observes, with u at zero, before it takes over.
-
-    Raises
-    ------
-    ValueError
-        for limits without zero between them, or numbers out of range.
     """
 
     u_min: float = -math.inf
@@ -70,13 +65,7 @@ class Safety:
             checks.whole(name, getattr(self, name), least)
 
     def rules(self, controller: Controller) -> Rules:
-        """Return the supervisor's rules for a controller.
-
-        Raises
-        ------
-        ValueError
-            if u has no finite limits, or zero is not between them.
-        """
+        """Return the supervisor's rules for a controller, with the narrower limits of both."""
         own = getattr(controller, "limits", None)
         low = max(float(self.u_min), -math.inf if own is None else own.low)
         high = min(float(self.u_max), math.inf if own is None else own.high)

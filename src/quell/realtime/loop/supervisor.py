@@ -9,14 +9,12 @@
 * START: u is zero and the controller observes, with y as its reference, until ``settle`` samples
   in a row were good.
 * RUN: u is the controller's, within limits.
-* HOLD: there was no good sample, and u stays as it is. After ``hold`` such samples in a row the
-  mode is RAMP.
+* HOLD: there was no good sample, and u stays as it is; RAMP after ``hold`` such samples in a row.
 * RAMP: u goes to zero in a straight line within ``ramp`` samples, whatever happens meanwhile;
   there is no way back to RUN.
 * STOPPED: u is zero; it is written some more times, in case a frame is lost.
 
-All of it is arithmetic on arrays, so that tests can run it sample by sample without a clock or a
-device.
+All of it is arithmetic on arrays, so that tests can run it without a clock or a device.
 """
 
 from __future__ import annotations
@@ -44,14 +42,10 @@ _KEPT, RESERVED = 4096, 4
 class Rules(NamedTuple):
     """The supervisor's rules; ``Safety.rules`` makes them."""
 
-    low: float
-    """Lower limit of u [u-unit], ≤ 0."""
-    high: float
-    """Upper limit, ≥ 0."""
-    most_error: float
-    """Largest ``|r − y|`` [y-unit]."""
-    most_f: float
-    """Largest ``|f̂|`` [y-unit/s^n]."""
+    low: float  #: lower limit of u [u-unit], ≤ 0
+    high: float  #: upper limit, ≥ 0
+    most_error: float  #: largest ``|r − y|`` [y-unit]
+    most_f: float  #: largest ``|f̂|`` [y-unit/s^n]
     hold: int
     ramp: int
     settle: int
@@ -63,29 +57,19 @@ class Memory(Scalars):
     """State of the supervisor from one cycle to the next."""
 
     mode: int
-    samples: int
-    """Good samples in a row in START, cycles so far in RAMP and STOPPED."""
-    began: int
-    """Index k of the scenario's first sample; −1 before it."""
-    missed_in_row: int
-    """Deadlines without a good sample, those that were skipped included."""
+    samples: int  #: good samples in a row in START, cycles so far in RAMP and STOPPED
+    began: int  #: index k of the scenario's first sample; −1 before it
+    missed_in_row: int  #: deadlines without a good sample, those that were skipped included
     skipped_in_row: int
-    at_limit_in_row: int
-    """Samples with u at a limit."""
+    at_limit_in_row: int  #: samples with u at a limit
     overruns_in_row: int
     unsent_in_row: int
-    maybe_stale: int
-    """Not zero if the next measurement may be an old one."""
-    tripped: int
-    """Not zero if the device has set u to zero for good."""
-    u: float
-    """As applied [u-unit]."""
-    ramp_start: float
-    """u at the beginning of the ramp [u-unit]."""
-    y: float
-    """Last good measurement [y-unit]; NaN before the first."""
-    offset: float
-    """Distance from the reference to y at the scenario's first sample [y-unit]."""
+    maybe_stale: int  #: not zero if the next measurement may be an old one
+    tripped: int  #: not zero if the device has set u to zero for good
+    u: float  #: as applied [u-unit]
+    ramp_start: float  #: u at the beginning of the ramp [u-unit]
+    y: float  #: last good measurement [y-unit]; NaN before the first
+    offset: float  #: distance from the reference to y at the scenario's first sample [y-unit]
 
 
 class Counters(Scalars):
@@ -104,12 +88,9 @@ class SupervisorState(NamedTuple):
 
     memory: NDArray[Memory]
     counters: NDArray[Counters]
-    changes: NDArray[np.int64]
-    """k, mode and cause of each change of mode (·, 3)."""
-    changed: NDArray[np.int64]
-    """Number of changes of mode that are kept (1,), an atomic word."""
-    requests: NDArray[np.int64]
-    """A ``Request`` (1,), an atomic word that another thread writes."""
+    changes: NDArray[np.int64]  #: k, mode and cause of each change of mode (·, 3)
+    changed: NDArray[np.int64]  #: number of changes of mode that are kept (1,), an atomic word
+    requests: NDArray[np.int64]  #: a ``Request`` (1,), an atomic word that another thread writes
 
 
 def initial_state() -> SupervisorState:

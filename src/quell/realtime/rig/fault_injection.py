@@ -53,11 +53,6 @@ class Fault:
         number of the first frame, from 0, and number of frames.
     late
         frames, for ``delay``.
-
-    Raises
-    ------
-    ValueError
-        for an unknown kind or direction, or numbers out of range.
     """
 
     kind: str
@@ -75,13 +70,7 @@ class Fault:
 
 
 def random_faults(number: int, frames: int, seed: int = 0, longest: int = 50) -> list[Fault]:
-    """Return random faults, 1 to ``longest`` of the first ``frames`` long, in both directions.
-
-    Raises
-    ------
-    ValueError
-        for numbers below one.
-    """
+    """Return random faults, 1 to ``longest`` of the first ``frames`` long, in both directions."""
     checks.whole("number", number, 1)
     last = checks.whole("frames", frames, 1) - 1
     most = checks.whole("longest", longest, 1)
@@ -157,11 +146,6 @@ class Relay:
         the plan.
     seed
         seed of what is random in it, such as which bit is wrong.
-
-    Raises
-    ------
-    ValueError
-        for a URL that is not ``udp://HOST:PORT``, or a port that is in use.
     """
 
     def __init__(self, url: str, rig: str, faults: Sequence[Fault] = (), seed: int = 0) -> None:

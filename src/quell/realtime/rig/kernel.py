@@ -19,8 +19,8 @@ live     u is the last command
 tripped  no fresh, finite command for ``watchdog`` ticks in a row: u = 0 until a new session
 =======  ========================================================================================
 
-A hello begins a session, unless one is live or has been waiting for less than ``patience`` ticks. A
-goodbye ends it.
+A hello begins a session, unless one is live or waits for less than ``patience`` ticks. A goodbye
+ends it.
 """
 
 from __future__ import annotations
@@ -66,16 +66,11 @@ class RigModel(NamedTuple):
     endpoint: Endpoint
     inbox: Buffer
     outbox: Buffer
-    dt: float
-    """Time between ticks [s]."""
-    u_max: float
-    """Largest |u| that is applied [u-unit]."""
-    watchdog: int
-    """Ticks without a fresh command before u is set to zero."""
-    patience: int
-    """Ticks that a session has for its first command before another may replace it."""
-    rest: bool
-    """Whether each session starts from ``x0``."""
+    dt: float  # time between ticks [s]
+    u_max: float  # largest |u| that is applied [u-unit]
+    watchdog: int  # ticks without a fresh command before u is set to zero
+    patience: int  # ticks that a session has for its first command before another may replace it
+    rest: bool  # whether each session starts from ``x0``
     x: Vector
     x0: Vector
     scratch: Vector
@@ -85,10 +80,8 @@ class RigModel(NamedTuple):
     row: Vector
     log: Ring
     logged: bool
-    lateness: NDArray[np.int64]
-    """Histogram of how late ticks were, see ``system.histogram``."""
-    stop: NDArray[np.int64]
-    """``serve`` ends if this is not zero (1,)."""
+    lateness: NDArray[np.int64]  # histogram of how late ticks were, see ``system.histogram``
+    stop: NDArray[np.int64]  # ``serve`` ends if this is not zero (1,)
 
 
 @kernel

@@ -67,11 +67,6 @@ class Rig:
     log
         CSV file for y, u, command and state of each tick (``quell.realtime.rig.kernel.LOG``); an
         existing file is overwritten.
-
-    Raises
-    ------
-    ValueError
-        for a plant that is not compiled, numbers out of range, or a log that can't be written.
     """
 
     def __init__(
@@ -183,6 +178,7 @@ class Rig:
         """Tick in real time for ``seconds``, or until a signal or another thread calls ``stop``.
 
         The ticks run on their own thread, which needs no Python; the calling thread writes the log.
+        Return sentences about which requests the system has granted.
 
         Parameters
         ----------
@@ -192,16 +188,6 @@ class Rig:
             SCHED_FIFO priority of the ticks, 1 to 99, together with locked memory; 0 for neither.
         cpu
             number of the processor for the ticks; any by default.
-
-        Returns
-        -------
-        list of str
-            sentences about which of these requests the system has granted.
-
-        Raises
-        ------
-        ValueError
-            for arguments out of range.
         """
         most = -1
         if seconds is not None:
@@ -287,10 +273,7 @@ class Rig:
 def checked_seconds(name: str, seconds: float) -> float:
     """Return the duration of a run [s], at most thirty years."""
     if checks.positive(name, seconds, "s") > _LONGEST_RUN:
-        raise ValueError(
-            f"{name} = {seconds!r}: must be at most {_LONGEST_RUN:g} s; "
-            "leave it out to run until interrupted"
-        )
+        raise ValueError(f"{name} = {seconds!r}: must be at most {_LONGEST_RUN:g} s, or left out")
     return seconds
 
 

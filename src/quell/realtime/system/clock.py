@@ -44,22 +44,13 @@ def wait_until(clock: Any, deadline: int) -> int:
 class SystemClock(NamedTuple):
     """The operating system's monotonic clock; ``system_clock`` makes it."""
 
-    spin: int
-    """Time before a deadline from which on it polls the time instead of sleeping [ns]."""
-    timespec: NDArray[np.int64]
-    """Work array: seconds and nanoseconds (2,)."""
-    address: int
-    """Address of ``timespec``."""
+    spin: int  #: time before a deadline from which on it polls the time instead of sleeping [ns]
+    timespec: NDArray[np.int64]  #: work array: seconds and nanoseconds (2,)
+    address: int  #: address of ``timespec``
 
 
 def system_clock(spin: float = 0.0) -> SystemClock:
-    """Return the system's clock, which polls the time for the last ``spin`` [s] before a deadline.
-
-    Raises
-    ------
-    ValueError
-        for a negative ``spin``.
-    """
+    """Return the system's clock, which polls for the last ``spin`` [s] before a deadline."""
     timespec = np.zeros(2, dtype=np.int64)
     nanoseconds = round(checks.non_negative("spin", spin, "s") * 1e9)
     return SystemClock(nanoseconds, timespec, timespec.ctypes.data)
@@ -118,10 +109,8 @@ def _wait_until(clock: SystemClock, deadline: int) -> int:
 class VirtualClock(NamedTuple):
     """A clock for tests: time passes only while it waits, and each wait is as late as scripted."""
 
-    time: NDArray[np.int64]
-    """The time [ns], and the number of waits so far (2,)."""
-    late: NDArray[np.int64]
-    """Lateness of each wait [ns]; the last entry holds for all later ones."""
+    time: NDArray[np.int64]  #: the time [ns], and the number of waits so far (2,)
+    late: NDArray[np.int64]  #: lateness of each wait [ns]; the last entry holds for all later ones
 
 
 def virtual_clock(late: ArrayLike = (0,)) -> VirtualClock:

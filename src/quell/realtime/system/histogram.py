@@ -18,8 +18,7 @@ from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.types import Vector
 
-# Bins per power of two; a percentile is rounded by at most 1/32 = 3.1 %. Chosen by hand; not tuned
-# further.
+# Bins per power of two; a percentile is rounded by at most 1/32 = 3.1 %. Chosen by hand.
 _PARTS = 32
 # Below this duration [ns] a bin is 1 ns wide.
 _LINEAR = 2 * _PARTS
@@ -53,29 +52,18 @@ def count_duration(counts: NDArray[np.int64], nanoseconds: int) -> None:
 def _edges() -> Vector:
     """Return the upper edges of the bins [s]."""
     first = np.arange(1, _LINEAR + 1, dtype=np.float64)
-    rest = [
-        (np.arange(_PARTS, 2 * _PARTS) + 1.0) * 2.0**octave for octave in range(1, _OCTAVES + 1)
-    ]
+    upper = np.arange(_PARTS, 2 * _PARTS) + 1.0
+    rest = [upper * 2.0**octave for octave in range(1, _OCTAVES + 1)]
     return np.concatenate([first, *rest]) * 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """Durations of many cycles.
+    """Durations of many cycles."""
 
-    Attributes
-    ----------
-    counts : (bins,) array
-        number of durations in each bin.
-    edges : (bins,) array
-        upper edge of each bin [s].
-    max : float
-        longest duration [s]; NaN for an empty histogram.
-    """
-
-    counts: NDArray[np.int64]
-    edges: Vector
-    max: float
+    counts: NDArray[np.int64]  #: number of durations in each bin (bins,)
+    edges: Vector  #: upper edge of each bin [s] (bins,)
+    max: float  #: longest duration [s]; NaN for an empty histogram
 
     @classmethod
     def of(cls, counts: NDArray[np.int64]) -> Histogram:
@@ -88,13 +76,7 @@ class Histogram:
         return int(self.counts.sum())
 
     def percentile(self, percent: float) -> float:
-        """Return a percentile [s], rounded up by at most 3.1 %; NaN for an empty histogram.
-
-        Raises
-        ------
-        ValueError
-            for a percentage outside (0, 100].
-        """
+        """Return a percentile [s], rounded up by at most 3.1 %; NaN for an empty histogram."""
         if not 0.0 < checks.finite("percent", percent) <= 100.0:
             raise ValueError(f"percent = {percent!r}: must be above 0 and at most 100")
         if not len(self):
@@ -138,16 +120,7 @@ class Histogram:
     def plot(self, ax: Any = None, label: str | None = None) -> Any:
         """Plot the share of cycles that took longer than a duration, both logarithmic.
 
-        Parameters
-        ----------
-        ax
-            matplotlib axes; a new figure by default.
-        label
-            for the legend.
-
-        Returns
-        -------
-        matplotlib.axes.Axes
+        Return the matplotlib axes, by default of a new figure; ``label`` is for the legend.
         """
         if ax is None:
             import matplotlib.pyplot as plt
@@ -165,19 +138,10 @@ class Histogram:
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """Punctuality of a run.
+    """Punctuality of a run."""
 
-    Attributes
-    ----------
-    lateness : Histogram
-        time from a deadline until the loop woke.
-    step : Histogram
-        time from then until u was written, without waiting for the device: measurement, supervisor,
-        controller, command.
-    """
-
-    lateness: Histogram
-    step: Histogram
+    lateness: Histogram  #: time from a deadline until the loop woke
+    step: Histogram  #: time from then until u was written, without waiting for the device
 
     def text(self) -> str:
         """Return both histograms as text."""

@@ -23,14 +23,9 @@ _KINDS = {
 
 
 def external(name: str, returns: str, *arguments: str) -> Callable[..., int]:
-    """Return the C library's function ``name``.
+    """Return the C library's function ``name``; a call raises an ``OSError`` if there is none.
 
     The types of the arguments and of the result are ``"int"``, ``"long"`` or ``"address"``.
-
-    Raises
-    ------
-    OSError
-        on a call from Python if the library has no such function.
     """
 
     @cache

@@ -47,8 +47,7 @@ def checked_cpu(cpu: int | None) -> int | None:
 def real_time_process(priority: int, interpreted: bool) -> Iterator[list[str]]:
     """Lock the memory, keep processors awake and the garbage collector off; for the main thread.
 
-    Yields a list of notes on what the system permitted. With a priority of 0 only the collector is
-    touched.
+    Yield notes on what the system permitted. A priority of 0 touches only the collector.
     """
     notes: list[str] = []
     collecting, interval = gc.isenabled(), sys.getswitchinterval()

@@ -26,18 +26,12 @@ LOOP_WIDTH = len(LOOP_CHANNELS)
 class Event(IntFlag):
     """Events of a cycle; flags add up. The low sixteen bits are the loop's."""
 
-    MISSED = 1
-    """No finite measurement came in time."""
-    OVERRUN = 2
-    """The loop woke, or ended its cycle, after the next deadline: deadlines were skipped."""
-    CLIPPED = 4
-    """The supervisor's limits changed the controller's u."""
-    UNSENT = 8
-    """The command could not be sent."""
-    CHANGED = 16
-    """The mode changed."""
-    GAP = 1 << 16
-    """No recorded cycle: its deadline was skipped, or its row lost; ``load`` filled it in."""
+    MISSED = 1  #: no finite measurement came in time
+    OVERRUN = 2  #: the loop woke, or ended its cycle, after the next deadline and skipped it
+    CLIPPED = 4  #: the supervisor's limits changed the controller's u
+    UNSENT = 8  #: the command could not be sent
+    CHANGED = 16  #: the mode changed
+    GAP = 1 << 16  #: no recorded cycle: deadline skipped, or row lost; ``load`` filled it in
 
 
 def row_channels(controller_channels: Channels) -> Channels:

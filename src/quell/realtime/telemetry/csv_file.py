@@ -1,8 +1,7 @@
 """Recordings as CSV: a line of names, then a line for each row; the header is in ``<name>.json``.
 
 The first column is ``time`` [s]; the others are those of the row, ``x_hat[0]`` the first entry of a
-vector channel. Numbers have as many digits as it takes to read the same bits back, and NaN is
-``nan``.
+vector channel. Numbers have as many digits as it takes to read the same bits back.
 """
 
 from __future__ import annotations
@@ -21,13 +20,7 @@ from quell.types import Channels, Matrix, Vector
 
 
 class CsvSink:
-    """Write rows to a CSV file, which grows as they come.
-
-    Parameters
-    ----------
-    path
-        file to create; an existing one is not overwritten.
-    """
+    """Write rows to a new CSV file ``path``, which grows as they come."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -82,13 +75,7 @@ def header_path(path: Path) -> Path:
 def read_csv(path: Path) -> tuple[Header, Matrix]:
     """Return header and rows of a ``CsvSink``'s file, without a last line that was cut short.
 
-    Without the header beside it, dt is taken from the column ``time``, and the factors of ``theta``
-    are unknown.
-
-    Raises
-    ------
-    ValueError
-        if the file is not a recording.
+    Without the header beside it, dt comes from the column ``time``; ``features`` are unknown.
     """
     text = path.read_bytes()
     first, _, body = text[: text.rfind(b"\n") + 1].partition(b"\n")
@@ -96,11 +83,9 @@ def read_csv(path: Path) -> tuple[Header, Matrix]:
     if names[:2] != ["time", "k"]:
         raise ValueError("its first line is not the names of a recording's columns: time, k, …")
     try:
-        table = (
-            np.loadtxt(io.BytesIO(body), delimiter=",", ndmin=2, comments=None)
-            if body
-            else np.empty((0, len(names)))
-        )
+        table = np.empty((0, len(names)))
+        if body:
+            table = np.loadtxt(io.BytesIO(body), delimiter=",", ndmin=2, comments=None)
     except ValueError as error:
         raise ValueError(f"a line is not {len(names)} numbers ({error})") from None
     if table.shape[1] != len(names):

@@ -13,8 +13,7 @@ from quell.realtime.telemetry.channels import LOOP_CHANNELS
 from quell.records.channels import is_vector
 from quell.types import Channels
 
-VERSION = 1
-"""Version of the recording's layout; a reader refuses others."""
+VERSION = 1  # version of the recording's layout; a reader refuses others
 
 
 @dataclass(frozen=True)
@@ -38,11 +37,6 @@ class Header:
         anything else that JSON can represent.
     started
         deadline of the row with k = 0, in nanoseconds since 1970, UTC.
-
-    Raises
-    ------
-    ValueError
-        for a dt that is not positive, and for channels that do not begin with those of a loop.
     """
 
     channels: Channels
@@ -80,13 +74,7 @@ class Header:
 
     @classmethod
     def from_json(cls, text: str) -> Header:
-        """Return the header that ``to_json`` wrote.
-
-        Raises
-        ------
-        ValueError
-            for any other text, and for another version of the layout.
-        """
+        """Return the header that ``to_json`` wrote."""
         try:
             fields = json.loads(text)
             version = fields.pop("quell_recording")

@@ -1,8 +1,7 @@
 """Rows over a Foxglove WebSocket, for Foxglove and for PlotJuggler's Foxglove bridge.
 
-A viewer is no recorder: of a fast loop only a limited number of rows per second is sent, and a slow
-viewer loses the oldest. A row that is sent has the events of all rows since the one before, so that
-none is lost.
+Only a limited number of rows per second is sent, and a slow viewer loses the oldest. A row that is
+sent has the events of all rows since the one before, so that none is lost.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.ros_message import log_rows, open_topic
 from quell.types import Matrix
 
-PORT = 8765
-"""Default port of Foxglove's viewers."""
+PORT = 8765  # default port of Foxglove's viewers
 
 
 class LiveSink:
@@ -40,11 +38,6 @@ class LiveSink:
     ----------
     url : str
         address for viewers, once the sink is open.
-
-    Raises
-    ------
-    ValueError
-        for a port out of range or a rate that is not positive.
     """
 
     def __init__(self, port: int = PORT, host: str = "127.0.0.1", rate: float = 100.0) -> None:

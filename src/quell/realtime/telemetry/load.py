@@ -15,8 +15,7 @@ from quell.records.channels import columns_of
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix, Status
 
-# A larger jump of k means a damaged file: 28 hours at 1 kHz, which with 20 channels would fill 16
-# GB.
+# A larger jump of k means a damaged file: 28 hours at 1 kHz; 20 channels would fill 16 GB.
 _MOST_ROWS = 100_000_000
 
 
@@ -49,13 +48,7 @@ def load(path: str | os.PathLike[str]) -> Trajectory:
 
 
 def trajectory_of(header: Header, rows: Matrix) -> Trajectory:
-    """Return rows (rows, width) as a trajectory with gaps filled in, see ``load``.
-
-    Raises
-    ------
-    ValueError
-        if there is no row, or k does not increase in whole numbers.
-    """
+    """Return rows (rows, width) as a trajectory with gaps filled in, see ``load``."""
     if rows.shape[0] == 0:
         raise ValueError("it has no row")
     log, status = _filled(rows), 0

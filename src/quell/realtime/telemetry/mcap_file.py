@@ -24,11 +24,9 @@ from quell.realtime.telemetry.ros_message import MARK, SCHEMA, TOPIC, log_rows, 
 from quell.types import Matrix
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD = "quell"
-"""Name of the metadata record with the header."""
+RECORD = "quell"  # name of the metadata record with the header
 
-# Time between two chunks [s]: with the writer's period of at most 0.25 s, a killed process loses
-# less than 1 s.
+# Time between two chunks [s]: with the writer's 0.25 s a killed process loses less than 1 s.
 _CHUNK_TIME = 0.5
 # Messages that are converted to an array at once when reading; chosen by hand, not tuned further.
 _BLOCK = 4096
@@ -74,13 +72,7 @@ class _File:
 
 
 class McapSink:
-    """Write rows to an MCAP file, which grows as they come.
-
-    Parameters
-    ----------
-    path
-        file to create; an existing one is not overwritten.
-    """
+    """Write rows to a new MCAP file ``path``, which grows as they come."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -131,15 +123,7 @@ class McapSink:
 
 
 def read_mcap(path: Path) -> tuple[Header, Matrix]:
-    """Return header and rows of a ``McapSink``'s file, up to its last complete chunk.
-
-    Raises
-    ------
-    ValueError
-        if the file is not a recording.
-    ImportError
-        if the package mcap is missing.
-    """
+    """Return header and rows of a ``McapSink``'s file, up to its last complete chunk."""
     import_extra("mcap", "telemetry", "reading an MCAP file")
     header: Header | None = None
     schemas: dict[int, str] = {}

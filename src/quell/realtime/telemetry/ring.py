@@ -28,21 +28,14 @@ _WORDS = 48
 class Ring(NamedTuple):
     """Rows on their way from one thread to another."""
 
-    rows: Matrix
-    """(capacity, width); row number k is stored at k modulo capacity."""
-    ends: NDArray[np.int64]
-    """Numbers of rows written (at ``HEAD``), read (``TAIL``) and dropped (``DROPPED``)."""
+    rows: Matrix  #: (capacity, width); row number k is stored at k modulo capacity
+    ends: NDArray[np.int64]  #: rows written (at ``HEAD``), read (``TAIL``), dropped (``DROPPED``)
 
 
 def ring(capacity: int, width: int) -> Ring:
     """Return an empty ring for ``capacity`` rows of ``width`` values.
 
     All its memory is written once, so that no page is missing when the loop first uses it.
-
-    Raises
-    ------
-    ValueError
-        for a capacity or a width below one.
     """
     size = checks.whole("capacity", capacity, 1), checks.whole("width", width, 1)
     return Ring(np.full(size, np.nan), np.zeros(_WORDS, dtype=np.int64))

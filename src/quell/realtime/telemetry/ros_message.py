@@ -16,8 +16,7 @@ from quell.types import Matrix
 
 SCHEMA = "quell/msg/Cycle"
 TOPIC = "/loop"
-MARK = b"\x00\x01\x00\x00"
-"""First bytes of a message: plain CDR, little endian, no options."""
+MARK = b"\x00\x01\x00\x00"  # first bytes of a message: plain CDR, little endian, no options
 
 
 def definition(header: Header) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -20,8 +19,7 @@ from quell.types import Matrix
 class Sink(Protocol):
     """A receiver of rows; all methods except ``open`` are called on the writer's thread."""
 
-    name: str
-    """Name in messages."""
+    name: str  #: name in messages
 
     def open(self, header: Header) -> None:
         """Begin a recording; raise a ``ValueError`` with the reason if that is impossible."""
@@ -68,17 +66,8 @@ class MemorySink:
 
 
 def file_sink(path: str | os.PathLike[str]) -> Sink:
-    """Return the sink for a file by its suffix, ``.csv`` or ``.mcap``.
-
-    Raises
-    ------
-    ValueError
-        for another suffix.
-    """
-    kinds: dict[str, Callable[[str | os.PathLike[str]], Sink]] = {
-        ".csv": CsvSink,
-        ".mcap": McapSink,
-    }
+    """Return the sink for a file by its suffix, ``.csv`` or ``.mcap``."""
+    kinds: dict[str, type[CsvSink | McapSink]] = {".csv": CsvSink, ".mcap": McapSink}
     suffix = Path(path).suffix.lower()
     if suffix not in kinds:
         raise ValueError(f"path = {os.fspath(path)!r}: must end in {' or '.join(kinds)}")

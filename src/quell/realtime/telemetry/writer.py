@@ -49,7 +49,8 @@ class TelemetryWriter:
     sinks
         receivers of the rows.
     period
-        time between two rounds of emptying the ring [s].
+        time between two rounds of emptying the ring [s], at most 0.25: a killed process must lose
+        less than one second.
     urgent
         True if the loop is interpreted and has a real-time priority above 1: the writer then takes
         priority 1 if permitted. Otherwise it takes an ordinary one, even if it would inherit
@@ -63,12 +64,6 @@ class TelemetryWriter:
         number of rows taken out so far.
     problems : list of str
         which sinks failed, when and why.
-
-    Raises
-    ------
-    ValueError
-        for a period that is not positive, or above 0.25 s: a killed process must lose less than one
-        second.
     """
 
     def __init__(
@@ -80,12 +75,10 @@ class TelemetryWriter:
         urgent: bool = False,
     ) -> None:
         self.header, self.period = header, checks.positive("period", period, "s")
-        if (
-            period > 0.25
-        ):  # half a second of an MCAP chunk and a quarter here leave a margin of a quarter
+        # Half a second of an MCAP chunk and a quarter here leave a margin of a quarter.
+        if period > 0.25:
             raise ValueError(
-                f"period = {period!r} s: must be at most 0.25 s, or a killed process may lose more "
-                "than a second"
+                f"period = {period!r} s: must be at most 0.25 s, or a killed process may lose 1 s"
             )
         self.ring: Ring = ring(max(_LEAST_ROWS, math.ceil(_CAPACITY / header.dt)), header.width)
         self.urgent = urgent

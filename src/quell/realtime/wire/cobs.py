@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import kernel
 
-INVALID = -1
-"""Returned by ``decode`` for bytes that are not a packet."""
+INVALID = -1  # returned by ``decode`` for bytes that are not a packet
 # The largest code; its block has no zero after it (section III of the source).
 _LONGEST = 255
 

@@ -24,10 +24,8 @@ class Descriptor(NamedTuple):
     """A file descriptor to wait for; make it with ``descriptor``."""
 
     fd: int
-    words: NDArray[np.int64]
-    """A pollfd, seconds and nanoseconds (3,)."""
-    address: int
-    """Address of ``words``."""
+    words: NDArray[np.int64]  # A pollfd, seconds and nanoseconds (3,)
+    address: int  # address of ``words``
 
 
 def descriptor(fd: int) -> Descriptor:

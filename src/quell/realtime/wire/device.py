@@ -43,8 +43,7 @@ def _write(handle: WireHandle, u: float) -> int:
 class WireDevice:
     """A device at the other end of a wire; a subclass opens the wire and releases it.
 
-    Its attribute ``paced`` is True: the device has its own clock, and ``read`` waits for its next
-    measurement.
+    ``paced`` is True: the device has its own clock, and ``read`` waits for the next measurement.
 
     Parameters
     ----------
@@ -64,8 +63,7 @@ class WireDevice:
     """
 
     paced = True
-    _hint = "start one with: quell rig --device {url}"
-    """Advice if no device answers."""
+    _hint = "start one with: quell rig --device {url}"  # advice if no device answers
 
     def __init__(self, url: str, dt: float, timeout: float = 3.0) -> None:
         self.url = url
@@ -122,13 +120,7 @@ class WireDevice:
             raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
 
     def restart_session(self) -> None:
-        """Replace this session by a new one: a device waits only so long for the first command.
-
-        Raises
-        ------
-        ConnectionError
-            if no device answers.
-        """
+        """Replace this session by a new one: a device waits only so long for the first command."""
         self._check_open()
         former = self._session
         self._send(frames.GOODBYE, 0.0, former)
@@ -140,10 +132,7 @@ class WireDevice:
     def tick(self, timeout: float = 1.0) -> int:
         """Wait for the next measurement; return the monotonic time of its arrival [ns].
 
-        Raises
-        ------
-        ConnectionError
-            if none has come for ``timeout`` [s].
+        Raise a ``ConnectionError`` if none has come for ``timeout`` [s].
         """
         counters = self.handle.endpoint.counters
         self._read_within(0.0)
@@ -207,8 +196,7 @@ class WireDevice:
                 state, dt = int(frame.words[8]), float(frame.doubles[3])
                 if state & frames.OTHER_DT:
                     raise ValueError(
-                        f"dt = {self.dt!r} s: the device at {self.url} ticks every {dt!r} s; "
-                        "both must be the same"
+                        f"dt = {self.dt!r} s: must be {dt!r} s, as for the device at {self.url}"
                     )
                 yield state
 

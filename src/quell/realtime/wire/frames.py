@@ -66,14 +66,12 @@ _CRC = _crc_table()
 class Buffer(NamedTuple):
     """Memory for a frame as bytes and as numbers; all arrays share it."""
 
-    bytes: NDArray[np.uint8]
-    """(48,): longer than a frame, so that a datagram that is too long is noticed."""
+    bytes: NDArray[np.uint8]  # (48,): longer than a frame, to notice a datagram that is too long
     shorts: NDArray[np.uint16]
     words: NDArray[np.uint32]
     longs: NDArray[np.int64]
     doubles: NDArray[np.float64]
-    address: int
-    """Address of the first byte."""
+    address: int  # address of the first byte
 
 
 def buffer() -> Buffer:
@@ -86,15 +84,12 @@ def buffer() -> Buffer:
 class Endpoint(NamedTuple):
     """The session as one side sees it; make it with ``endpoint``."""
 
-    expects: int
-    """The kind it accepts: MEASUREMENT or COMMAND."""
-    most_age: int
-    """A frame is stale if it answers one that was sent more than this number of frames ago."""
+    expects: int  # the kind it accepts: MEASUREMENT or COMMAND
+    most_age: int  # a frame is stale if it answers one sent more than this number of frames ago
     numbers: NDArray[np.int64]
     """Session, number of the last frame sent, number of the last one accepted, the number that this
     one answered, and its state flags (5,)."""
-    counters: NDArray[np.int64]
-    """Number of frames for each name in ``COUNTERS`` (11,)."""
+    counters: NDArray[np.int64]  # number of frames for each name in ``COUNTERS`` (11,)
 
 
 SESSION, SENT, RECEIVED, ANSWERED, STATE = range(5)

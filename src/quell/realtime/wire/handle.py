@@ -29,8 +29,7 @@ class WireHandle(NamedTuple):
     endpoint: Endpoint
     inbox: Buffer
     outbox: Buffer
-    watch: SystemClock
-    """Limits waiting: a wire takes real time even if the loop's clock is virtual."""
+    watch: SystemClock  # limits waiting: a wire takes real time even if the loop's clock is virtual
 
 
 @read_measurement.register(WireHandle)

@@ -50,12 +50,9 @@ class SerialTransport(NamedTuple):
     """One end of a serial line; make it with ``serial_transport``."""
 
     port: Descriptor
-    raw: NDArray[np.uint8]
-    """Bytes read from the system."""
-    packet: NDArray[np.uint8]
-    """Bytes since the last zero."""
-    coded: NDArray[np.uint8]
-    """The packet to send; the byte before it in memory is a zero."""
+    raw: NDArray[np.uint8]  # bytes read from the system
+    packet: NDArray[np.uint8]  # bytes since the last zero
+    coded: NDArray[np.uint8]  # the packet to send; the byte before it in memory is a zero
     state: NDArray[np.int64]
     """Next byte of ``raw`` and their end, bytes since the last zero, whether the other side may
     have received a part of a packet (4,)."""
@@ -214,8 +211,7 @@ def _opened(url: str, path: str, baud: int) -> Any:
     """Return the open port: raw, 8N1, exclusive, in low-latency mode if its driver has one."""
     if sys.platform != "linux":
         raise ValueError(
-            f"device = {url!r}: serial lines need Linux; elsewhere give run_rig a device of your "
-            "own that uses pyserial"
+            f"device = {url!r}: needs Linux; elsewhere give run_rig a device that uses pyserial"
         )
     serial = import_extra("serial", "serial", "a serial line")
     try:

@@ -45,12 +45,9 @@ _ATTEMPTS = 1000
 class SharedMemoryTransport(NamedTuple):
     """One end of a wire through shared memory."""
 
-    own: NDArray[np.int64]
-    """The mailbox to write to (12,)."""
-    others: NDArray[np.int64]
-    """The mailbox to read from (12,)."""
-    seen: NDArray[np.int64]
-    """Counters of the frames read last (2,)."""
+    own: NDArray[np.int64]  # the mailbox to write to (12,)
+    others: NDArray[np.int64]  # the mailbox to read from (12,)
+    seen: NDArray[np.int64]  # counters of the frames read last (2,)
     clock: SystemClock
 
 

@@ -35,8 +35,7 @@ class UdpTransport(NamedTuple):
     socket: Descriptor
     other: NDArray[np.int32]
     """Address of the other side and its length; the length is 0 if the socket is connected."""
-    sender: NDArray[np.int32]
-    """Address and length of the sender of the last datagram."""
+    sender: NDArray[np.int32]  # address and length of the sender of the last datagram
     other_at: int
     sender_at: int
 

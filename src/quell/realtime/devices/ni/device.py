@@ -7,8 +7,7 @@ known. With the counter's c_k the position is::
     y_k = ratio · 2π · (n_k − n_0) / counts
 
 which holds across roll-overs in both directions if the shaft turns by less than 2^(bits−1) counts
-per sample. The index pulse is not used: if it reset the counter, y would have a step in a running
-loop.
+per sample. The index pulse is not used: it would reset the counter and give y a step.
 """
 
 from __future__ import annotations
@@ -118,13 +117,7 @@ class NiDevice:
             raise
 
     def read(self) -> float:
-        """Return the position [y-unit], zero where the device was opened.
-
-        Raises
-        ------
-        OSError
-            if the card does not answer, or the device is closed.
-        """
+        """Return the position [y-unit], zero where the device was opened."""
         self._check_open()
         with translated_errors("the counter can't be read"):
             ahead = self._read_count() - self._count
@@ -134,12 +127,7 @@ class NiDevice:
     def write(self, u: float) -> None:
         """Set the output to ``u`` [u-unit], cut to its limits.
 
-        Raises
-        ------
-        ValueError
-            for a value that is not finite; the output is set to zero.
-        OSError
-            if the card does not answer, or the device is closed.
+        A value that is not finite sets the output to zero and raises a ``ValueError``.
         """
         self._check_open()
         finite = math.isfinite(u)
@@ -178,19 +166,13 @@ def ni_device(url: str, dt: float) -> NiDevice:
 
     For example ``ni://Dev1/ctr0+Dev2/ao0?counts=16000&enable=Dev2/port0/line0``. The names are the
     parameters of ``NiDevice``. The cards have no sample time of their own; dt is the loop's [s].
-
-    Raises
-    ------
-    ValueError
-        for a URL of another form, and all errors of ``NiDevice``.
     """
     checks.positive("dt", dt, "s")
     parts = urlsplit(url)
     channels = (parts.netloc + parts.path).split("+")
     if parts.scheme != "ni" or len(channels) != 2 or not all(channels):
         raise ValueError(
-            f"device = {url!r}: must be ni://COUNTER+OUTPUT, "
-            "such as ni://Dev1/ctr0+Dev2/ao0?counts=16000"
+            f"device = {url!r}: must be ni://COUNTER+OUTPUT, such as ni://Dev1/ctr0+Dev2/ao0"
         )
     given: dict[str, Any] = {}
     for key, text in parse_qsl(parts.query, keep_blank_values=True):

@@ -27,13 +27,7 @@ _HARDWARE = {
 
 
 def driver() -> Any:
-    """Return the package ``nidaqmx`` with the modules that are used here.
-
-    Raises
-    ------
-    ImportError
-        if it is not installed.
-    """
+    """Return the package ``nidaqmx`` with the modules that are used here."""
     for module in ("constants", "stream_readers", "stream_writers", "system.watchdog", "types"):
         import_extra(f"nidaqmx.{module}", "ni", "a card of NI")
     return import_extra("nidaqmx", "ni", "a card of NI")
@@ -43,12 +37,7 @@ def driver() -> Any:
 def translated_errors(context: str) -> Iterator[None]:
     """Turn an error of the driver into an error with one line, which begins with ``context``.
 
-    Raises
-    ------
-    ValueError
-        if an argument is wrong for these cards.
-    OSError
-        if there is no driver, or a card fails.
+    It is a ``ValueError`` for arguments that are wrong for these cards, else an ``OSError``.
     """
     from nidaqmx import errors
 
