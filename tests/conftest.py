@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import gc
 import math
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+
+# Two workers share two cores, and in small matrices the threads of BLAS mostly wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
@@ -18,6 +22,9 @@ import quell as ql
 # The same examples in every run, and no stop-watch: the machines that test are shared.
 settings.register_profile("quell", deadline=None, derandomize=True)
 settings.load_profile("quell")
+
+# Numba makes millions of objects that live long: look for garbage among them less often.
+gc.set_threshold(50_000, 20, 20)
 
 
 def pytest_runtest_setup() -> None:

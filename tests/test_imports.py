@@ -71,7 +71,10 @@ def imports_of(module: str) -> set[str]:
     return found - {module}
 
 
-IMPORTS = {module: imports_of(module) for module in MODULES}
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    """What each module imports."""
+    return {module: imports_of(module) for module in MODULES}
 
 
 def place(module: str) -> int:
@@ -83,21 +86,21 @@ def place(module: str) -> int:
     return ORDER.index(max(folders, key=len))
 
 
-def test_a_file_imports_only_what_stands_before_it() -> None:
+def test_a_file_imports_only_what_stands_before_it(imports: dict[str, set[str]]) -> None:
     """Its own folder, and folders that come earlier in the table."""
     wrong = [
         f"{module} imports {other}"
-        for module, others in IMPORTS.items()
+        for module, others in imports.items()
         for other in sorted(others)
         if place(other) > place(module)
     ]
     assert not wrong, "against ORDER: " + "; ".join(wrong)
 
 
-def test_no_files_import_each_other_in_a_circle() -> None:
+def test_no_files_import_each_other_in_a_circle(imports: dict[str, set[str]]) -> None:
     """Imports that are there for types only, or inside functions, count too."""
     try:
-        tuple(TopologicalSorter(IMPORTS).static_order())
+        tuple(TopologicalSorter(imports).static_order())
     except CycleError as error:
         pytest.fail(" imports ".join(reversed(error.args[1])))
 
