@@ -7,8 +7,7 @@ and arrays) and explicit state (a NamedTuple of arrays), under one of these deco
     a plain helper; interpreted when called from Python, inlined when called from compiled code.
 ``generic``
     a function with one implementation for each NamedTuple type of its first argument. Compiled code
-    selects it by Numba's overload resolution, which costs nothing at run time; interpreted code by
-    a dictionary.
+    selects it by Numba's overload resolution, at no cost at run time; interpreted code by a table.
 ``compiled``
     an entry point, compiled once for each combination of types and cached on disk (``cache``).
 """

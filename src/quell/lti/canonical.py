@@ -83,8 +83,7 @@ def canonical(plant: Any, E: Any = None) -> Canonical:
     ValueError
         if the plant is not observable from y (assumption 1 of the paper), u or the disturbance does
         not reach y, a disturbance with an input of its own has invariant zeros to y (assumption 3),
-        a transfer function is improper or biproper, the model is of discrete time, or shapes do not
-        fit.
+        or the transfer function is improper or biproper.
 
     Examples
     --------

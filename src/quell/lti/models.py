@@ -61,7 +61,7 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
         return _state_space(plant.A, plant.B, plant.C, _column(E, getattr(plant, "E", None)))
     if E is not None:
         raise ValueError(
-            "E: only a plant given by matrices has an input for the disturbance; leave E out"
+            "E: only a plant with states has an input for the disturbance; leave E out"
         )
     if isinstance(plant, tuple) and len(plant) == 2:
         if np.ndim(plant[1]) != 0:

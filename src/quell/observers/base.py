@@ -50,7 +50,7 @@ def acting_control(model: Any, z: Vector, u: float) -> float:
 
 @kernel
 def predict_state(model: Any, z: Vector, predicted: Vector, u: float, f: float) -> None:
-    """Write ``Φ z + Γ_u u + Γ_f f`` into ``predicted``, both (N,)."""
+    """Write ``Φ z + Γ_u u + Γ_f f`` into ``predicted`` (N,)."""
     for i in range(z.size):
         total = model.input[i] * u + model.feed[i] * f
         for j in range(z.size):

@@ -133,8 +133,7 @@ class ESO:
         Raises
         ------
         ValueError
-            as for ``model_free`` and ``canonical``, for a plant of more than 8 states, and if a
-            zero at s = 0 hides a constant f.
+            as for ``canonical``, for more than 8 states, and if a zero at s = 0 hides a constant f.
         """
         found = canonical(plant, E)
         checks.whole("order of the plant", found.a.size, 1, 8)
@@ -202,8 +201,7 @@ class ESO:
         delta
             largest error for which it is linear, δ [y-unit].
         alpha
-            the powers α (n + 1,) beyond δ, above 0 and at most 1; 1, 1/2, 1/4, … by default, as in
-            Han's paper.
+            the powers α (n + 1,) beyond δ, above 0 and at most 1; by default Han's 1, 1/2, 1/4, …
         """
         linear = cls.model_free(order, b0, omega_o, dt)
         return linear._with_model(nonlinear_model(linear.model, delta, alpha), delay)

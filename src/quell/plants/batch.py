@@ -46,7 +46,7 @@ class PlantBatch(Sequence[Plant]):
             ):
                 if own != common:
                     raise ValueError(
-                        f"plant[{i}] has {what} {own}, plant[0] {common}: make two batches"
+                        f"plant[{i}] has {what} {own}, plant[0] {common}: must be the same"
                     )
         arrays = {name: np.array(values) for name, values in (parameters or {}).items()}
         for name, array in arrays.items():
@@ -119,16 +119,16 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
     for name, length in lengths.items():
         if length not in (1, runs) or length == 0:
             longest = max(lengths, key=lambda name: lengths[name])
-            raise ValueError(
-                f"{name} has {length} entries, {longest} {runs}: must be numbers, or of one length"
-            )
+            sizes = f"{name} has {length} entries, {longest} {runs}"
+            raise ValueError(f"{sizes}: must be numbers or vectors of one length, at least 1")
     whole = {name: np.broadcast_to(array, (runs,)) for name, array in arrays.items()}
     columns = {name: values.tolist() for name, values in whole.items()}
     try:
         inspect.signature(factory).bind(**columns)
     except TypeError as error:
         raise ValueError(
-            f"parameters = {', '.join(parameters) or 'none'}: don't fit the factory: {error}"
+            f"parameters = {', '.join(parameters) or 'none'}: the factory can't be called with "
+            f"them: {error}"
         ) from None
     plants = []
     for i in range(runs):

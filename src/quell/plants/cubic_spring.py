@@ -67,6 +67,7 @@ class CubicSpringPlant:
     m2: float
     k_cubic: float
     name: str = "two-mass-spring with cubic spring"
+    compiled = True
 
     @property
     def order(self) -> int:
@@ -77,11 +78,6 @@ class CubicSpringPlant:
     def disturbances(self) -> int:
         """Number of disturbance inputs."""
         return self.linear.disturbances
-
-    @property
-    def compiled(self) -> bool:
-        """Whether the driver can run it compiled: always."""
-        return True
 
     def sampled(self, dt: float, interpret: bool = False) -> CubicSpringModel:
         """Return the parameters for a sample time ``dt`` [s]."""

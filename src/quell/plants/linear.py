@@ -66,6 +66,7 @@ class LinearPlant:
     C: Any
     E: Any = None
     name: str = "linear plant"
+    compiled = True
 
     def __post_init__(self) -> None:
         A, B, C = check_matrices(self.A, self.B, self.C)
@@ -135,11 +136,6 @@ class LinearPlant:
     def disturbances(self) -> int:
         """Number of disturbance inputs."""
         return int(self.E.shape[1])
-
-    @property
-    def compiled(self) -> bool:
-        """Whether the driver can run it compiled: always."""
-        return True
 
     def sampled(self, dt: float, interpret: bool = False) -> LinearModel:
         """Return the plant sampled at ``dt`` [s] with zero-order hold on u and w."""

@@ -1,7 +1,4 @@
-"""The plants that setup files, rigs and twins know by name.
-
-A new plant needs its own file and one line here.
-"""
+"""The plants that setup files, rigs and twins know by name."""
 
 from __future__ import annotations
 

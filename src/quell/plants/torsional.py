@@ -105,6 +105,7 @@ class TorsionalPlant:
     counts: int | None
     late: int  # delay of u in samples
     name: str = "torsional plant"
+    compiled = True
 
     @property
     def order(self) -> int:
@@ -115,11 +116,6 @@ class TorsionalPlant:
     def disturbances(self) -> int:
         """Number of disturbance inputs: torques on the lower and the upper disk [N m]."""
         return self.linear.disturbances
-
-    @property
-    def compiled(self) -> bool:
-        """Whether the driver can run it compiled: always."""
-        return True
 
     @property
     def resolution(self) -> float:
@@ -163,8 +159,7 @@ def torsional(
 
     States: angles of the lower and the upper disk [rad], their speeds [rad/s], then the delayed
     values of u [V]. The control signal u [V] is the amplifier's input; the disturbances are torques
-    on the lower and the upper disk [N m]. Output: the upper disk's angle [rad] as counted by the
-    encoder.
+    on the lower and the upper disk [N m]. Output: the encoder's angle of the upper disk [rad].
 
     Defaults are published values if there are any. The free ones are chosen so that the plant
     without Coulomb friction has the transfer function that the paper identified, except for its
@@ -214,8 +209,7 @@ def torsional(
     References
     ----------
     .. [1] *Torsional Pendulum*, laboratory manual for the ECP Model 205a in a public repository:
-       weights, inertia of the drive, "hardware gains" as in the maker's manual, range of
-       amplitudes.
+       weights, inertia of the drive, "hardware gains", range of amplitudes.
     .. [2] Course work on the Model 205a (ELEC 481, tasks 1 to 3) in a public repository: J, c and k
        of two disks with two weights each.
 

@@ -30,7 +30,8 @@ class Signal:
         values = np.asarray(self.evaluate(times), dtype=np.float64)
         if values.shape != times.shape:
             raise ValueError(
-                f"{type(self).__name__}.evaluate: shape {values.shape} for times of {times.shape}"
+                f"{type(self).__name__}.evaluate returned shape {values.shape} for times of shape "
+                f"{times.shape}"
             )
         return values
 
@@ -148,9 +149,8 @@ class Switched(Signal):
     def __post_init__(self) -> None:
         times = checks.vector("times", self.times)
         if len(self.pieces) != times.size + 1:
-            raise ValueError(
-                f"pieces has {len(self.pieces)} entries, times {times.size}: must be one more"
-            )
+            sizes = f"pieces has {len(self.pieces)} entries, times {times.size}"
+            raise ValueError(f"{sizes}: there must be one piece more than times")
         if np.any(np.diff(times) <= 0.0):
             raise ValueError(f"times = {self.times!r}: must increase")
 

@@ -42,8 +42,7 @@ class PRBS(Signal):
     start
         time of its start [s]; it is zero before.
     seed
-        index of its first value in the sequence. It is no noise: the seed of a scenario does not
-        change it.
+        index of its first value in the sequence; the seed of a scenario does not change it.
     """
 
     amplitude: float = 1.0

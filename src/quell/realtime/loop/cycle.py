@@ -2,9 +2,9 @@
 
 Cycle k has the deadline ``origin + k dt``. The loop sleeps until this time, takes the measurement,
 calls supervisor and controller, writes u, and pushes a row to the telemetry. A cycle that ends
-after the next deadline has overrun: the deadlines that have passed are skipped (k jumps), never
-made up for in a burst. The controller is told of them as of samples without a measurement in which
-u stayed the same. So its observer follows the plant, and a short stall does not disturb it.
+after the next deadline has overrun: the deadlines that have passed are skipped (k jumps). For the
+controller they are samples without a measurement in which u stayed the same, so its observer
+follows the plant.
 
 A device with a clock of its own (``paced``) sends a measurement at each of its ticks, and the loop
 should wake when one comes. Therefore the grid of deadlines follows the device: if the loop had to
@@ -237,8 +237,8 @@ def _measure(
 def control_step(controller: Any, k: int, left_out: int, y: float) -> float:
     """Take a sample of supervisor and controller; return the u to apply.
 
-    First the controller is told of the ``left_out`` deadlines before k, except those that end the
-    run anyway. Reference and channels of the controller are written into the row.
+    First the controller takes the ``left_out`` deadlines before k as samples without measurement.
+    Reference and channels of the controller are written into the row.
     """
     raise TypeError
 

@@ -104,8 +104,7 @@ def run_rig(
     Raises
     ------
     ValueError
-        for arguments out of range, u without finite limits, a device of another sample time, a
-        reference that is not finite.
+        for u without finite limits, a device of another sample time, an infinite reference.
     ConnectionError
         if a call of the device's driver does not return.
     """
@@ -113,7 +112,11 @@ def run_rig(
     with closing(device):
         check_controller(controller)
         dt = controller.dt
-        _check_sample_time(device, dt)
+        own = getattr(device, "dt", dt)
+        if abs(own - dt) > 1e-9 * dt:  # allows for the rounding of 1 / rate
+            raise ValueError(
+                f"device has dt = {own!r} s, the controller {dt!r} s: must be the same"
+            )
         rules = (Safety() if safety is None else safety).rules(controller)
         scenario = as_scenario(scenario, duration)
         derivatives = getattr(controller, "derivatives", 0)
@@ -151,12 +154,6 @@ def run_rig(
         counters=dict(getattr(device, "counters", {})),
         notes=tuple(notes),
     )
-
-
-def _check_sample_time(device: Device, dt: float) -> None:
-    own = getattr(device, "dt", dt)
-    if abs(own - dt) > 1e-9 * dt:  # allows for the rounding of 1 / rate
-        raise ValueError(f"device has dt = {own!r} s, the controller {dt!r} s: must be the same")
 
 
 def _header(device: Device, controller: Controller) -> Header:

@@ -26,8 +26,7 @@ class Safety:
     most_error
         largest ``|r − y|`` [y-unit]; beyond it u is ramped to zero.
     most_f
-        largest ``|f̂|`` [y-unit/s^n] of a controller that reports one; beyond it u is ramped to
-        zero.
+        largest ``|f̂|`` [y-unit/s^n], if the controller reports one; beyond it u is ramped to zero.
     most_saturated
         number of samples in a row for which u may lie at one of its limits; any by default.
     hold

@@ -45,8 +45,7 @@ class Fault:
         ``drop``; ``burst``: the frames are held and sent together with the next one; ``duplicate``;
         ``delay``: each is sent ``late`` frames later, after newer ones; ``nan``: the value is NaN
         or infinite, with a correct CRC; ``flip``: a bit is wrong; ``short``, ``long``: bytes are
-        missing or added; ``foreign``: another session; ``version``: another version of the
-        protocol.
+        missing or added; ``foreign``: another session; ``version``: of the protocol.
     towards
         ``loop`` for measurements, ``rig`` for commands.
     first, count

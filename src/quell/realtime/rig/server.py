@@ -56,8 +56,7 @@ class Rig:
     listener
         its end of the wire; ``close`` closes it.
     watchdog
-        number of ticks in a row without a fresh, finite command after which u is zero until a new
-        session.
+        ticks in a row without a fresh, finite command after which u is zero until a new session.
     u_max
         larger commands are cut to it [u-unit].
     rest

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -47,7 +48,8 @@ class CsvSink:
             numbers = [row[K] * self._dt, *row]
             # Some readers (PlotJuggler 3.15) take the type of a column from the first line, and
             # 1e-05 for text.
-            lines.append(",".join(map(_positional if self._first else repr, numbers)))
+            text = partial(np.format_float_positional, trim="0") if self._first else repr
+            lines.append(",".join(map(text, numbers)))
             self._first = False
         self._file.write(("\n".join(lines) + "\n").encode())
 
@@ -61,10 +63,6 @@ class CsvSink:
         if self._file is not None:
             file, self._file = self._file, None
             file.close()
-
-
-def _positional(number: float) -> str:
-    return np.format_float_positional(number, trim="0")
 
 
 def header_path(path: Path) -> Path:

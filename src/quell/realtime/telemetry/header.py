@@ -31,8 +31,7 @@ class Header:
     device, controller
         names of the device and the controller.
     units
-        of ``y`` and ``u``, for example ``{"y": "rad", "u": "A"}``; ``y-unit`` and ``u-unit`` by
-        default.
+        of ``y`` and ``u``, such as ``{"y": "rad", "u": "A"}``; by default ``y-unit``, ``u-unit``.
     notes
         anything else that JSON can represent.
     started

@@ -53,8 +53,7 @@ class TelemetryWriter:
         less than one second.
     urgent
         True if the loop is interpreted and has a real-time priority above 1: the writer then takes
-        priority 1 if permitted. Otherwise it takes an ordinary one, even if it would inherit
-        another.
+        priority 1 if permitted, otherwise an ordinary one.
 
     Attributes
     ----------

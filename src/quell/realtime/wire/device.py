@@ -196,7 +196,8 @@ class WireDevice:
                 state, dt = int(frame.words[8]), float(frame.doubles[3])
                 if state & frames.OTHER_DT:
                     raise ValueError(
-                        f"dt = {self.dt!r} s: must be {dt!r} s, as for the device at {self.url}"
+                        f"dt = {self.dt!r} s: the device at {self.url} ticks every {dt!r} s; "
+                        "both must be the same"
                     )
                 yield state
 

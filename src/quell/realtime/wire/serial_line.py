@@ -211,7 +211,8 @@ def _opened(url: str, path: str, baud: int) -> Any:
     """Return the open port: raw, 8N1, exclusive, in low-latency mode if its driver has one."""
     if sys.platform != "linux":
         raise ValueError(
-            f"device = {url!r}: needs Linux; elsewhere give run_rig a device that uses pyserial"
+            f"device = {url!r}: serial lines need Linux; elsewhere give run_rig a device of your "
+            "own that uses pyserial"
         )
     serial = import_extra("serial", "serial", "a serial line")
     try:
