@@ -41,34 +41,15 @@ class Tally(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RigRun:
-    """The record of one run at a rig.
+    """The record of one run at a rig."""
 
-    Attributes
-    ----------
-    trajectory : Trajectory
-        from the scenario's first sample to its last, or to the end of the run; ``ended`` is zero if
-        it did not begin.
-    record : Trajectory
-        all cycles, also those before the scenario (START) and after it (RAMP, STOPPED).
-    timing : Timing
-        histograms of lateness and step time.
-    changes : tuple of ModeChange
-        changes of the supervisor's mode and their causes.
-    tally : Tally
-        numbers of cycles, overruns, missed samples and so on.
-    counters : dict
-        the device's counters, of frames for instance.
-    notes : tuple of str
-        what the system permitted of real-time scheduling, and other remarks.
-    """
-
-    trajectory: Trajectory
-    record: Trajectory
-    timing: Timing
-    changes: tuple[ModeChange, ...]
-    tally: Tally
-    counters: dict[str, int]
-    notes: tuple[str, ...]
+    trajectory: Trajectory  #: the samples of the scenario; ``ended`` is zero if it did not begin
+    record: Trajectory  #: all cycles, also before the scenario (START) and after it (RAMP, STOPPED)
+    timing: Timing  #: histograms of lateness and step time
+    changes: tuple[ModeChange, ...]  #: changes of the supervisor's mode and their causes
+    tally: Tally  #: numbers of cycles, overruns, missed samples and so on
+    counters: dict[str, int]  #: the device's counters, of frames for instance
+    notes: tuple[str, ...]  #: remarks, for example on permitted real-time scheduling
 
     @property
     def overruns(self) -> int:

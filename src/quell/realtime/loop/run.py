@@ -104,7 +104,7 @@ def run_rig(
     Raises
     ------
     ValueError
-        for u without finite limits, a device of another sample time, an infinite reference.
+        for u without finite limits, a device of another dt, a reference that is not finite.
     ConnectionError
         if a call of the device's driver does not return.
     """

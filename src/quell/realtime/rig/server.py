@@ -37,7 +37,7 @@ _BUFFERED, _LEAST_ROWS = 5.0, 100
 # Time that a new session is protected while its first command is missing [s]: its loop may have to
 # be compiled first. Chosen by hand; not tuned further.
 _PATIENCE = 60.0
-# Range of dt [s] and largest watchdog [ticks]; far beyond any use, against slips of the pen.
+# Range of dt [s] and largest watchdog [ticks]: far beyond any use; they catch typing errors.
 _SHORTEST, _LONGEST = 1e-6, 100.0
 _MOST_TICKS = 1_000_000
 # Longest run [s]: thirty years, so that the number of ticks fits into an integer.

@@ -1,7 +1,7 @@
 """Recordings as CSV: a line of names, then a line for each row; the header is in ``<name>.json``.
 
 The first column is ``time`` [s]; the others are those of the row, ``x_hat[0]`` the first entry of a
-vector channel. Numbers have as many digits as it takes to read the same bits back.
+vector channel. Numbers have the digits that it takes to read the same bits back; NaN is ``nan``.
 """
 
 from __future__ import annotations
