@@ -33,7 +33,7 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     """Return the linear law of a controller, its learner frozen.
 
     It equals the controller without limits, except for a constant feedforward of the learner, and
-    the first sample if y is not 0 then: an ADRC takes the measurement as its state.
+    except for a first sample with y ≠ 0, at which an ADRC takes the measurement as its state.
     Raises ``ValueError`` for a controller without a linear law, or with one that changes from
     sample to sample.
 

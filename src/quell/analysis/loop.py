@@ -147,7 +147,7 @@ class LoopAnalysis:
 
     @cached_property
     def stable(self) -> bool:
-        """Whether all poles lie inside of the unit circle."""
+        """True if all poles lie inside of the unit circle."""
         return self._stable_with(1.0)
 
     # ---- frequency responses

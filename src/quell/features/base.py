@@ -51,7 +51,7 @@ class Features:
 
     @property
     def has_input(self) -> bool:
-        """Whether the last feature is u itself."""
+        """True if the last feature is u itself."""
         return False
 
     def constant(self, order: int) -> int:
@@ -92,7 +92,7 @@ class Joined(Features):
 
     @property
     def has_input(self) -> bool:
-        """Whether the last feature is u itself."""
+        """True if the last feature is u itself."""
         return self.second.has_input
 
     def constant(self, order: int) -> int:

@@ -82,7 +82,7 @@ class GuardDesign(NamedTuple):
 
     lag: Any  # lag filter of the observer
     forget: float  # dt/T
-    rise: float  # share by which e follows a larger \|q\| in a sample
+    rise: float  # share by which e follows a larger |q| in a sample
     decay: float  # share by which e decays in a sample
     bound: float  # κ
     fastest: float  # largest change of f_L in a sample, in units of e

@@ -24,7 +24,7 @@ from quell.observers.noise import noise_gains
 from quell.types import Vector
 
 # Least ratio of a moving signal's standard deviation to that of its noise. White noise has ratio 1,
-# noise that is held for ten samples 3; with a margin of two above that, not tuned further.
+# noise that is constant for ten samples 3; with a margin of two above that, not tuned further.
 SIGNAL_TO_NOISE = 6.0
 # Standard deviations of noise in f that ``confidence`` counts: a three-sigma bound.
 _NOISE_DEVIATIONS = 3.0

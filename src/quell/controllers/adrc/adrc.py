@@ -207,7 +207,7 @@ class ADRC(StatefulController):
         start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), y, u, goal)
 
     def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
-        """Take one sample in manual operation: ``u`` is applied until the next sample, unlimited.
+        """Take one sample in manual operation: ``u`` is applied, unlimited, until the next sample.
 
         Return the control signal that the controller would have applied [u-unit]; ``r``, ``y`` and
         ``derivatives`` are as for ``step``.

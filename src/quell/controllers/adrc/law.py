@@ -113,8 +113,8 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     else:
         _finish_sample(design, state, u_acting)
         if status & _MEASUREMENT_HELD != 0:
-            # A held y looks like a disturbance while the plant moves; the expected y does not
-            # change the estimates.
+            # The last y would look like a disturbance while the plant moves; the expected y does
+            # not change the estimates.
             y = expected_measurement(design.eso, state.z, loop.u, loop.f_learned)
             if is_finite(y):
                 loop.y = y

@@ -58,11 +58,8 @@ class Notch(NamedTuple):
 
     def polynomials(self) -> tuple[list[float], list[float]]:
         """Return numerator and denominator in s, highest power first."""
-        zeros, poles = (
-            [1.0, 2.0 * damping * self.omega, self.omega**2]
-            for damping in (self.zero_damping, self.pole_damping)
-        )
-        return zeros, poles
+        w = self.omega
+        return [1.0, 2.0 * self.zero_damping * w, w**2], [1.0, 2.0 * self.pole_damping * w, w**2]
 
 
 class NotchPID(PID):

@@ -108,10 +108,10 @@ def balanced(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> System:
 def tustin(system: System, dt: float, prewarp: float | None = None) -> System:
     """Sample by the trapezoidal rule ``s = (z − 1) / (h (z + 1))``.
 
-    With h = dt/2, or tan(ω dt/2)/ω for prewarping, which is exact at ω: ``A_d = (I − hA)⁻¹ (I +
-    hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``, ``D_d = D + h C (I − hA)⁻¹ B``
-    (Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, 1998, section 6.1). Raises
-    ``ValueError`` for a prewarping frequency at or above half the sampling rate.
+    With h = dt/2, or tan(ω dt/2)/ω for prewarping at ω < π/dt, which is exact there:
+    ``A_d = (I − hA)⁻¹ (I + hA)``, ``B_d = 2h (I − hA)⁻¹ B``, ``C_d = C (I − hA)⁻¹``,
+    ``D_d = D + h C (I − hA)⁻¹ B`` (Franklin, Powell & Workman, *Digital Control of Dynamic
+    Systems*, 1998, section 6.1).
     """
     h = 0.5 * dt
     if prewarp is not None:

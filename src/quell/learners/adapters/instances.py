@@ -90,7 +90,7 @@ class Instance:
 
     @property
     def disabled(self) -> bool:
-        """Whether the model has failed too often to be called again."""
+        """True if the model has failed too often to be called again."""
         return self.failures >= _MAX_FAILURES
 
     def _call(self, features: Matrix, targets: Vector, now: Vector) -> tuple[float, str]:
@@ -133,7 +133,7 @@ class Instance:
 
 
 def finite_number(value: Any) -> float:
-    """Return a prediction as a float."""
+    """Return a prediction as a float, or raise a ``ValueError`` if it is not one finite number."""
     if not isinstance(value, float):
         array = np.asarray(value)
         if array.size != 1 or array.dtype.kind not in "iuf":

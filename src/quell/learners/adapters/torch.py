@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Unpack
 
 from quell import checks
@@ -32,12 +31,7 @@ class TorchModel(PythonModel):
     """
 
     def __init__(
-        self,
-        module: Any,
-        optimizer: Callable[[Any], Any] | Any = None,
-        *,
-        steps: int = 1,
-        **options: Unpack[Options],
+        self, module: Any, optimizer: Any = None, *, steps: int = 1, **options: Unpack[Options]
     ) -> None:
         torch = import_extra("torch", "torch", "a PyTorch learner")
         if not isinstance(module, torch.nn.Module):

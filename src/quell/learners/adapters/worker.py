@@ -12,8 +12,7 @@ class Worker:
     """A thread that runs one job at a time. It starts with the first job."""
 
     def __init__(self) -> None:
-        self.busy = False
-        """Whether there is a job whose result was not taken."""
+        self.busy = False  # true while there is a job whose result was not taken
         self._jobs: queue.SimpleQueue[Callable[[], Any] | None] = queue.SimpleQueue()
         self._done = threading.Event()
         self._results: list[Any] = []

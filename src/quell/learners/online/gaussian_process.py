@@ -243,10 +243,9 @@ class GaussianProcessModel:
         """Return a process without points."""
         size = parameters.budget + 1
         points = np.zeros((size, parameters.inputs))
-        kernel, inverse, covariance = np.zeros((3, size, size))
+        K, Q, covariance = np.zeros((3, size, size))
         mean, weights, k, q, h = np.zeros((5, size))
-        matrices = (points, kernel, inverse, covariance)
-        return ProcessMemory(*matrices, mean, weights, k, q, h, np.zeros(2))
+        return ProcessMemory(points, K, Q, covariance, mean, weights, k, q, h, np.zeros(2))
 
 
 class GaussianProcess(Online):

@@ -40,8 +40,8 @@ from quell.learners.lag import lag_push
 from quell.learners.noise_gate import NoiseGateMemory, confidence, reset_gate, update_gate
 from quell.types import Matrix, Vector
 
-# Below this confidence nothing is learned: noise that is held for several samples is stronger than
-# the gate's model of white noise says. Chosen by hand; not tuned further.
+# Below this confidence nothing is learned: noise that stays constant for several samples has more
+# effect than the white noise that the gate assumes. Chosen by hand; not tuned further.
 _LEAST_CONFIDENCE = 0.1
 
 
