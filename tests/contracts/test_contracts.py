@@ -213,7 +213,7 @@ def drive(design: Any, memory: Any, seen: Any, y: Any, u: Any, f: Any, said: Any
 def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.Generator) -> None:
     """1e5 finite samples of very different size: state and output stay finite and repeatable."""
     # Models that are Python objects take their time.
-    learner, samples = LEARNERS[name], 20_000 if name in PYTHON_LEARNERS else 100_000
+    learner, samples = LEARNERS[name], 10_000 if name in PYTHON_LEARNERS else 100_000
     design = learner.design(OBSERVERS["model-free, order 2, current"], 1.0)
     # From rest to wild and back, in blocks, with spikes.
     size = np.repeat(10.0 ** rng.uniform(-6.0, 3.0, 100), samples // 100) * np.where(
