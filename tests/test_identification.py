@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from quell.identification import Identified, excitation, excited, frequency_resp
 from quell.identification.roots import root_covariance
 from quell.identification.structure import Structure, gradient, output
 
-from .test_cli import quell
+from .commands import Shown
 
 DT = 1e-3
 TESTBED = ([4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032])
@@ -437,7 +438,7 @@ def test_a_wrong_argument_is_named(change: dict[str, Any], message: str) -> None
     assert message in str(caught.value)
 
 
-def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
+def test_the_command_prints_writes_and_draws(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """Tables, JSON and a figure from a file; the same numbers as the function."""
     u = excitation("prbs", (0.5, 30.0), 20.0, 0.01).u
     y = answer(([2.0], [1.0, 0.6, 9.0]), u, 0.01)
@@ -457,10 +458,9 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
         "out.json",
         "--figures",
         "pictures",
-        cwd=tmp_path,
     )
-    assert shown.returncode == 0, shown.stderr
-    assert all(part in shown.stdout for part in ("Poles and zeros", "Fit (NRMSE)", "white:"))
+    assert shown.code == 0, shown.err
+    assert all(part in shown.out for part in ("Poles and zeros", "Fit (NRMSE)", "white:"))
     told = json.loads((tmp_path / "out.json").read_text())
     assert told["den"] == pytest.approx([1.0, 0.6, 9.0], rel=1e-6)
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {
