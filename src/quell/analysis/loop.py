@@ -169,6 +169,11 @@ class LoopAnalysis:
             (noise to −u) or ``"closed_loop"`` (r to y).
         omega
             frequencies [rad/s] (k,).
+
+        Raises
+        ------
+        ValueError
+            for another name.
         """
         checks.one_of("name", name, ("P", "C_r", "C_y", "L", "S", "T", "PS", "CS", "closed_loop"))
         if name in self._open:
@@ -240,6 +245,11 @@ class LoopAnalysis:
             (the plant's disturbances).
         target
             ``"y"``, ``"u"`` or ``"e"``, which is r − y.
+
+        Raises
+        ------
+        ValueError
+            for another source or target.
         """
         return closed_loop(self.plant, self.law, source, target)
 

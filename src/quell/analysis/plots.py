@@ -32,6 +32,11 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
         two matplotlib axes; a new figure by default.
     style
         of the lines, for example ``label``.
+
+    Raises
+    ------
+    ValueError
+        for another number of axes.
     """
     new_figure = axes is None
     top, low = axes = _axes(axes, 2, 1)
@@ -71,6 +76,11 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> lis
     """Plot the gains of S, T, PS (load to y) and CS (noise to u); return these four axes.
 
     The parameters are those of ``plot_bode``, but with four axes.
+
+    Raises
+    ------
+    ValueError
+        for another number of axes.
     """
     axes = _axes(axes, 2, 2)
     meanings = ("", "", ": load at the plant's input to y", ": measurement noise to u")
@@ -100,6 +110,11 @@ def plot_margins_over_time(
         one for each, from ``loops_over_time``.
     axes, style
         as for ``plot_bode``, but with three axes.
+
+    Raises
+    ------
+    ValueError
+        for another number of loops than instants, or of axes.
     """
     axes = _plot_margins(checks.vector("times", times), loops, axes, style)
     axes[-1].set_xlabel("learner frozen at [s]")
@@ -121,6 +136,11 @@ def plot_margins_against_omega_o(
         as for ``loops_over_omega_o``.
     axes
         four matplotlib axes; a new figure by default.
+
+    Raises
+    ------
+    ValueError
+        as ``loops_over_omega_o``; for another number of axes.
     """
     loops = loops_over_omega_o(plant, make_controller, omegas, **lags)
     omegas = checks.vector("omegas", omegas)

@@ -69,6 +69,11 @@ def loops_over_omega_o(
         the bandwidths [rad/s], at least one.
     lags
         ``delay`` and ``actuator_lag``, as for ``analyse``.
+
+    Raises
+    ------
+    ValueError
+        for a bandwidth that is not greater than zero; as ``analyse``.
     """
     bandwidths = checks.positive_vector("omegas", omegas)
     if bandwidths.size == 0:

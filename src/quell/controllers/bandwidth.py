@@ -23,6 +23,11 @@ def omega_c_for(settling_time: float, order: int, band: float = 0.02) -> float:
     band
         half width of the band, as a fraction of the step.
 
+    Raises
+    ------
+    ValueError
+        for a time that is not positive, an order below 1, or a band outside of (0, 1).
+
     Examples
     --------
     >>> round(omega_c_for(settling_time=2.0, order=2), 3)

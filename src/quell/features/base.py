@@ -42,7 +42,13 @@ class Features:
     """A block of features; ``one + other`` has the features of both."""
 
     def design(self, order: int) -> Any:
-        """Return the parameters (a NamedTuple) for a plant of order ``order``."""
+        """Return the parameters (a NamedTuple) for a plant of order ``order``.
+
+        Raises
+        ------
+        ValueError
+            if the block does not fit a plant of this order.
+        """
         raise NotImplementedError
 
     def names(self, order: int) -> tuple[str, ...]:

@@ -40,6 +40,12 @@ class Custom(Features):
     names
         name of each of the numbers.
 
+    Raises
+    ------
+    ValueError
+        if there are no names; by ``design`` if the function returns another number of values or
+        can't be compiled.
+
     Examples
     --------
     >>> import math

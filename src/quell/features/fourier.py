@@ -43,6 +43,11 @@ class RandomFourier(Features):
     states
         numbers of the states, from 1; all by default.
 
+    Raises
+    ------
+    ValueError
+        for arguments out of range.
+
     References
     ----------
     Rahimi & Recht, *Random features for large-scale kernel machines*, NIPS 2007, algorithm 1.

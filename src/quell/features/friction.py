@@ -36,6 +36,11 @@ class Friction(Features):
     states
         numbers of the velocities among the states, from 1; x_2 by default.
 
+    Raises
+    ------
+    ValueError
+        for a width that is not positive, or a plant without a velocity.
+
     References
     ----------
     Armstrong-Hélouvry, Dupont & Canudas de Wit, *A survey of models, analysis tools and

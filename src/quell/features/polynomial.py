@@ -35,6 +35,11 @@ class Polynomial(Features):
         the largest total degree.
     states
         numbers of the states, from 1; all by default.
+
+    Raises
+    ------
+    ValueError
+        for a degree below 2, or a state that the plant does not have.
     """
 
     degree: int = 3

@@ -41,6 +41,11 @@ class RBF(Features):
     centers
         the centres (p, k), instead of ``count``.
 
+    Raises
+    ------
+    ValueError
+        for arguments out of range, or centres that do not fit the states.
+
     References
     ----------
     Broomhead & Lowe, *Multivariable functional interpolation and adaptive networks*, Complex

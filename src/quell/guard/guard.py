@@ -258,6 +258,11 @@ class Guard:
     time
         time T [s] over which a learner's output is averaged; by default 30 lags
         ``(n + 1)/omega_o`` of the observer.
+
+    Raises
+    ------
+    ValueError
+        for a parameter that is not positive.
     """
 
     bound: float = 1.2

@@ -91,6 +91,11 @@ class ESO:
             at order 1, by 20 % at order 3, and not at all from order 5 on.
         delay
             time after which u reaches the plant [s], a whole number of samples.
+
+        Raises
+        ------
+        ValueError
+            naming the argument, its value and the rule.
         """
         chain = canonical((np.zeros(checks.whole("order", order, 1, 8)), 1.0))
         return cls._design(chain, b0, omega_o, dt, form, half_gain, False, delay)
@@ -355,6 +360,11 @@ class ESO:
         array
             of the same shape. For a plant given without states it is x̂ itself: y and its
             derivatives, less the feedthrough of u and f.
+
+        Raises
+        ------
+        ValueError
+            if the last axis is not n long.
         """
         x = np.asarray(x_hat, dtype=np.float64)
         if x.ndim == 0 or x.shape[-1] != self.order:

@@ -113,6 +113,12 @@ def lagged_two_mass_spring(
         share λ of the actuator's force that reaches m1.
     lag
         its time constant τ [s].
+
+    Raises
+    ------
+    ValueError
+        for a mass, stiffness, effectiveness or lag that is not positive, or a ``k_cubic`` that is
+        not finite.
     """
     masses, forces = two_mass_matrices(m1, m2, k)
     effectiveness = checks.positive("effectiveness", effectiveness)

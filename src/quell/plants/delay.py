@@ -80,6 +80,12 @@ def delayed(plant: Plant, delay: float, dt: float) -> DelayedPlant:
     dt
         sample time of the later runs [s]; it decides how many values of u are stored.
 
+    Raises
+    ------
+    ValueError
+        if the delay is shorter than a sample or no whole number of samples, or ``plant`` is not a
+        plant.
+
     Examples
     --------
     >>> import quell as ql

@@ -78,6 +78,11 @@ def encoded(plant: Plant, counts: int) -> EncodedPlant:
     counts
         counts of the encoder a turn, with all four edges of its two channels.
 
+    Raises
+    ------
+    ValueError
+        if ``counts`` is no whole number above zero, or ``plant`` is not a plant.
+
     Examples
     --------
     >>> import quell as ql

@@ -59,6 +59,11 @@ class LinearPlant:
         (n, m), m ≥ 0 disturbance inputs; by default the disturbance enters as u does.
     name
         for tables and plots.
+
+    Raises
+    ------
+    ValueError
+        if shapes do not fit or an entry is not finite.
     """
 
     A: Any

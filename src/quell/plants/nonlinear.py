@@ -135,6 +135,12 @@ class NonlinearPlant:
     name
         for tables and plots.
 
+    Raises
+    ------
+    ValueError
+        if ``f`` does not return n numbers, or ``output`` is neither a row nor a function that
+        returns a number.
+
     Examples
     --------
     >>> import math

@@ -206,6 +206,12 @@ def torsional(
     late
         delay of u in samples: assumed 0, as if the computer answers within the sample.
 
+    Raises
+    ------
+    ValueError
+        for an inertia, stiffness, belt, torque constant, amplifier or current limit that is not
+        positive, a friction or damping below zero, or bits, counts or samples out of range.
+
     References
     ----------
     .. [1] *Torsional Pendulum*, laboratory manual for the ECP Model 205a in a public repository:

@@ -41,6 +41,11 @@ def two_mass_spring(
         stiffness of the spring [N/m].
     c1, c2
         weights of the positions in y.
+
+    Raises
+    ------
+    ValueError
+        for a mass or stiffness that is not positive, or if c1 and c2 are both zero.
     """
     A, E = two_mass_matrices(m1, m2, k)
     c1, c2 = checks.finite("c1", c1), checks.finite("c2", c2)

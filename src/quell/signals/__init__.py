@@ -45,7 +45,13 @@ KINDS: Mapping[str, type[Signal]] = {
 
 
 def make(kind: str, **parameters: Any) -> Signal:
-    """Return a signal from the name of its kind and its parameters."""
+    """Return a signal from the name of its kind and its parameters.
+
+    Raises
+    ------
+    ValueError
+        for an unknown kind or parameter; the message lists the known ones.
+    """
     cls = KINDS[checks.one_of("signal", kind, tuple(KINDS))]
     known = tuple(f.name for f in fields(cls))
     for name in parameters:

@@ -60,6 +60,12 @@ class ADRC(StatefulController):
         The gain from noise in x̂ is halved, and the loop settles to 2 % in 2.0, 1.4, 1.2 and 1.0
         times the time for orders 1 to 4 (Herbst, Hempel, Göhrt & Streif 2020, arXiv 2003.03986).
 
+    Raises
+    ------
+    ValueError
+        for a bandwidth or rate limit that is not positive, limits in the wrong order, and an
+        observer of a plant with zeros outside of the left half plane.
+
     Examples
     --------
     >>> from quell.observers import ESO

@@ -44,6 +44,11 @@ class Notch(NamedTuple):
             gain at the centre, from 0 to below 1.
         width
             as a share of ``omega``, greater than zero.
+
+        Raises
+        ------
+        ValueError
+            for a frequency or width that is not positive, or a depth that is not from 0 to below 1.
         """
         omega, width = checks.positive("omega", omega, "rad/s"), checks.positive("width", width)
         depth = checks.non_negative("depth", depth)
@@ -73,6 +78,11 @@ class NotchPID(PID):
         the filter, from ``Notch.at``.
     kp, ki, kd, **options
         as for ``PID``.
+
+    Raises
+    ------
+    ValueError
+        as ``PID``, for a notch above half the sampling rate, and for anything but a notch.
 
     Examples
     --------

@@ -48,6 +48,11 @@ class PID(LinearController):
     u_min, u_max, rate_limit, name
         as for ``LinearController``.
 
+    Raises
+    ------
+    ValueError
+        for a number out of range, or a derivative without filter.
+
     Examples
     --------
     >>> controller = PID.simc(gain=2.0, tau1=1.0, theta=0.1, dt=0.01)
@@ -131,6 +136,11 @@ class PID(LinearController):
             sample time [s].
         **options
             passed on to ``PID``. With τ2 the filter time is τ2/10 by default.
+
+        Raises
+        ------
+        ValueError
+            for a gain of zero, a time out of range, θ = 0 without ``tau_c``, and as ``PID``.
         """
         gain = checks.nonzero("gain", gain, "or u does not reach y")
         tau1, theta = checks.positive("tau1", tau1, "s"), checks.non_negative("theta", theta, "s")

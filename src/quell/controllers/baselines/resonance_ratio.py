@@ -68,6 +68,11 @@ class ResonanceRatio(LinearController):
     L : (5,) array
         gains of the filter.
 
+    Raises
+    ------
+    ValueError
+        for a number out of range.
+
     Examples
     --------
     >>> controller = ResonanceRatio(omega_o=10.0, dt=1e-2)

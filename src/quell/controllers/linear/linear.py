@@ -140,6 +140,12 @@ class LinearController(StatefulController):
     name
         label in tables and plots.
 
+    Raises
+    ------
+    ValueError
+        for matrices of unsuitable shape or with entries that are not finite, limits in the wrong
+        order, or a rate limit or sample time that is not positive.
+
     Examples
     --------
     >>> num, den = [2.0, 1.0], [1.0, 0.0]  # 2 + 1/s

@@ -78,6 +78,11 @@ class TrackingDifferentiator:
     horizon
         h_0 [s]: by default the sample time, for the shortest transition; larger is smoother.
 
+    Raises
+    ------
+    ValueError
+        for a parameter that is not positive, and in ``design`` for a horizon shorter than a sample.
+
     Examples
     --------
     >>> profile = TrackingDifferentiator(acceleration=2.0)

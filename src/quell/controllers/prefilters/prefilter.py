@@ -156,6 +156,12 @@ class Prefiltered(StatefulController):
         for example ``quell.baselines.ZV(omega, zeta)``; for a controller with feedforward one with
         derivatives, such as ``ReferenceModel``.
 
+    Raises
+    ------
+    ValueError
+        for an object that is no controller or no prefilter, and for a controller with feedforward
+        behind a prefilter without derivatives.
+
     Examples
     --------
     >>> from quell.controllers.baselines import PID, ZV

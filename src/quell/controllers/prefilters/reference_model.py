@@ -82,6 +82,11 @@ class ReferenceModel:
         bandwidth [rad/s], at most 1/dt.
     order
         order m, 1 to 8: with feedforward in the controller, the plant's order (relative degree).
+
+    Raises
+    ------
+    ValueError
+        for a bandwidth that is not positive, or in ``design`` too high for the sample time.
     """
 
     omega: float

@@ -78,6 +78,11 @@ class Shaper:
         times of the impulses [s], from 0 on, increasing.
     amplitudes
         their amplitudes, with the sum 1.
+
+    Raises
+    ------
+    ValueError
+        for different numbers of both, times that do not increase from 0, and another sum than 1.
     """
 
     times: tuple[float, ...]
@@ -137,6 +142,11 @@ def ZV(omega: float, zeta: float = 0.0) -> Shaper:  # noqa: N802 - the field's n
         undamped frequency of the mode [rad/s].
     zeta
         its damping ratio, 0 to below 1.
+
+    Raises
+    ------
+    ValueError
+        for a frequency or damping out of range.
     """
     half, K = _half_period(omega, zeta)
     return Shaper((0.0, half), (1.0 / (1.0 + K), K / (1.0 + K)))

@@ -30,6 +30,13 @@ class JaxModel(PythonModel):
         gradient steps on each batch.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
+
+    Raises
+    ------
+    ImportError
+        if JAX, Equinox or optax is missing.
+    ValueError
+        for an object that is no module or no optimiser, and as ``PythonModel``.
     """
 
     def __init__(

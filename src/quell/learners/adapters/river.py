@@ -21,6 +21,11 @@ class RiverModel(PythonModel):
         river.linear_model.LinearRegression()``.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
+
+    Raises
+    ------
+    ValueError
+        for a regressor without these methods, and as ``PythonModel``.
     """
 
     def __init__(self, regressor: Any, **options: Unpack[Options]) -> None:

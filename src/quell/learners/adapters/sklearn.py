@@ -23,6 +23,11 @@ class SklearnModel(PythonModel):
         ``sklearn.neural_network.MLPRegressor()``.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
+
+    Raises
+    ------
+    ValueError
+        for an estimator that cannot learn incrementally, and as ``PythonModel``.
     """
 
     def __init__(self, estimator: Any, **options: Unpack[Options]) -> None:

@@ -28,6 +28,13 @@ class TorchModel(PythonModel):
         gradient steps on each batch.
     **options
         ``features``, ``period``, ``budget``, ``frequency``, ``scale``: see ``PythonModel``.
+
+    Raises
+    ------
+    ImportError
+        if PyTorch is missing.
+    ValueError
+        for an object that is no module or no optimiser, and as ``PythonModel``.
     """
 
     def __init__(

@@ -86,6 +86,11 @@ class BatchGradient:
     features
         other features, which are scaled to O(1), as is Δf̂ (``scaled_features.py``); those of the
         paper, unscaled, by default.
+
+    Raises
+    ------
+    ValueError
+        for a negative rate, a batch below 1, or something that is no block of features.
     """
 
     rate: float = 1e-6

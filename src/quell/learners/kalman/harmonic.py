@@ -43,6 +43,11 @@ class Harmonic(Kalman):
         An oscillator at ω learns at about the rate ``ω · pair_bandwidth / bias_bandwidth``.
 
     All other parameters are those of ``Kalman``.
+
+    Raises
+    ------
+    ValueError
+        for a parameter out of range.
     """
 
     count: int = 1
@@ -65,7 +70,13 @@ class Harmonic(Kalman):
             checks.positive("pair_bandwidth", self.pair_bandwidth, "rad/s")
 
     def oscillators(self, observer: ESO, omega_c: float) -> tuple[Oscillators, float]:
-        """Return the parameters of the oscillators, and the bandwidth of their pairs [rad/s]."""
+        """Return the parameters of the oscillators, and the bandwidth of their pairs [rad/s].
+
+        Raises
+        ------
+        ValueError
+            for an initial frequency outside of the limits.
+        """
         low, high = _LOWEST * omega_c, _HIGHEST * observer.omega_o
         if self.limits is not None:
             low, high = self.limits

@@ -45,6 +45,11 @@ class Kalman:
     gain_interval
         interval of the effective gain ``(b0 + θ_u)/b0`` when ``u`` is a feature.
 
+    Raises
+    ------
+    ValueError
+        for a parameter out of range, or if no feature is left.
+
     References
     ----------
     docs/theory: Algorithm 1 of the paper, its weaknesses and their remedies.
@@ -74,7 +79,13 @@ class Kalman:
         checks.around_one("gain_interval", self.gain_interval)
 
     def design(self, observer: ESO, omega_c: float) -> KalmanDesign:
-        """Return the parameters for an observer and the controller's bandwidth [rad/s]."""
+        """Return the parameters for an observer and the controller's bandwidth [rad/s].
+
+        Raises
+        ------
+        ValueError
+            if ``state_bandwidth`` is neither one number nor one for each state.
+        """
         n, lag_time = observer.order, observer.lag_time
         slow = checks.vector("state_bandwidth", self.state_bandwidth)
         slow = np.full(n, slow[0]) if slow.size == 1 else checks.vector("state_bandwidth", slow, n)

@@ -160,6 +160,11 @@ class Online(FeatureLearner):
         a description with ``design(features, dt)`` and ``memory(parameters)`` (``model.py``).
 
     The other parameters are described in the base class ``FeatureLearner``.
+
+    Raises
+    ------
+    ValueError
+        for an argument that is out of range, or is no model or no block of features.
     """
 
     def __init__(

@@ -177,6 +177,11 @@ class MLP(Online):
 
     The other parameters are described in the base class ``FeatureLearner``.
 
+    Raises
+    ------
+    ValueError
+        for an argument out of range.
+
     References
     ----------
     Singhal & Wu, *Training multilayer perceptrons with the extended Kalman algorithm*, NIPS 1988;

@@ -61,6 +61,11 @@ class NLMS(Linear):
 
     The other parameters are described in the base classes ``Linear`` and ``FeatureLearner``.
 
+    Raises
+    ------
+    ValueError
+        for an argument out of range.
+
     References
     ----------
     Nagumo & Noda, *A learning method for system identification*, IEEE Trans. Automatic Control 12

@@ -66,6 +66,15 @@ class RLS(Linear):
 
     The other parameters are described in the base classes ``Linear`` and ``FeatureLearner``.
 
+    Raises
+    ------
+    ValueError
+        for an argument out of range.
+
+    References ---------- Kulhavý & Kárný, *Tracking of slowly varying parameters by directional
+    forgetting*, IFAC World Congress 1984; Ljung & Söderström, *Theory and Practice of Recursive
+    Identification*, MIT Press 1983.
+
     References
     ----------
     Kulhavý & Kárný, *Tracking of slowly varying parameters by directional forgetting*, IFAC World

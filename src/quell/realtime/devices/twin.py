@@ -53,6 +53,11 @@ class TwinDevice:
     It starts from the state ``x0`` (n,), zero by default. u acts at once. Over a wire it acts a
     sample later; ``quell.plants.delayed(plant, dt, dt)`` adds the same delay to this device.
 
+    Raises
+    ------
+    ValueError
+        if ``plant`` is not a plant, dt is not positive, or x0 has the wrong size.
+
     Examples
     --------
     >>> import quell as ql

@@ -38,6 +38,11 @@ class Safety:
         number of samples in which u goes to zero.
     settle
         number of samples for which the controller observes, with u at zero, before it takes over.
+
+    Raises
+    ------
+    ValueError
+        for limits without zero between them, or numbers out of range.
     """
 
     u_min: float = -math.inf
@@ -64,7 +69,13 @@ class Safety:
             checks.whole(name, getattr(self, name), least)
 
     def rules(self, controller: Controller) -> Rules:
-        """Return the supervisor's rules for a controller, with the narrower limits of both."""
+        """Return the supervisor's rules for a controller, with the narrower limits of both.
+
+        Raises
+        ------
+        ValueError
+            if u has no finite limits, or zero is not between them.
+        """
         own = getattr(controller, "limits", None)
         low = max(float(self.u_min), -math.inf if own is None else own.low)
         high = min(float(self.u_max), math.inf if own is None else own.high)

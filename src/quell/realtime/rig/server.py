@@ -66,6 +66,11 @@ class Rig:
     log
         CSV file for y, u, command and state of each tick (``quell.realtime.rig.kernel.LOG``); an
         existing file is overwritten.
+
+    Raises
+    ------
+    ValueError
+        for a plant that is not compiled, numbers out of range, or a log that can't be written.
     """
 
     def __init__(
@@ -187,6 +192,11 @@ class Rig:
             SCHED_FIFO priority of the ticks, 1 to 99, together with locked memory; 0 for neither.
         cpu
             number of the processor for the ticks; any by default.
+
+        Raises
+        ------
+        ValueError
+            for arguments out of range.
         """
         most = -1
         if seconds is not None:

@@ -38,6 +38,11 @@ class LiveSink:
     ----------
     url : str
         address for viewers, once the sink is open.
+
+    Raises
+    ------
+    ValueError
+        for a port out of range or a rate that is not positive.
     """
 
     def __init__(self, port: int = PORT, host: str = "127.0.0.1", rate: float = 100.0) -> None:
