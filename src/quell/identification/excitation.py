@@ -35,20 +35,13 @@ class Excitation:
     kind: str
     signal: Signal
     """The excitation for a scenario or a rig; equals ``u`` if it is sampled at ``dt`` and held."""
-    dt: float
-    """[s]."""
-    u: Vector
-    """Samples (N,) [u-unit]."""
-    period: float
-    """Period [s]; infinite for a chirp."""
-    band: tuple[float, float]
-    """Lowest and highest frequency that is really excited [rad/s]."""
-    crest: float
-    """Peak of ``u − mean`` over its RMS: 1 at least, 1.41 for a sinusoid."""
-    rms: float
-    """RMS of ``u − mean`` [u-unit]."""
-    details: str
-    """The design in a sentence."""
+    dt: float  #: [s]
+    u: Vector  #: samples (N,) [u-unit]
+    period: float  #: period [s]; infinite for a chirp
+    band: tuple[float, float]  #: lowest and highest frequency that is really excited [rad/s]
+    crest: float  #: peak of ``u − mean`` over its RMS: 1 at least, 1.41 for a sinusoid
+    rms: float  #: RMS of ``u − mean`` [u-unit]
+    details: str  #: the design in a sentence
     shortcomings: tuple[str, ...]
     """Requirements that limits and duration do not allow; each with a remedy."""
 

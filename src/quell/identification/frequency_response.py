@@ -14,14 +14,11 @@ from quell.types import Vector
 class FrequencyResponse(NamedTuple):
     """An empirical frequency response."""
 
-    omega: Vector
-    """[rad/s] (points,)."""
-    response: NDArray[np.complex128]
-    """Complex [y-unit/u-unit] (points,)."""
+    omega: Vector  #: [rad/s] (points,)
+    response: NDArray[np.complex128]  #: complex [y-unit/u-unit] (points,)
     coherence: Vector
     """Share of the power of y that u (or ``reference``, if given) explains, 0 to 1 (points,)."""
-    deviation: Vector
-    """Relative standard deviation of ``response`` (points,)."""
+    deviation: Vector  #: relative standard deviation of ``response`` (points,)
 
 
 def frequency_response(

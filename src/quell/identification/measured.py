@@ -25,8 +25,7 @@ _JITTER = 0.2
 # Least number of samples: chosen by hand, ``identify`` asks for more.
 _FEWEST = 8
 
-_Row = tuple[int, list[str]]
-"""Line number and cells."""
+_Row = tuple[int, list[str]]  # line number and cells
 
 
 class Measured(NamedTuple):
@@ -34,8 +33,7 @@ class Measured(NamedTuple):
 
     u: Vector
     y: Vector
-    dt: float
-    """[s]."""
+    dt: float  #: [s]
     reference: Vector | None
 
 

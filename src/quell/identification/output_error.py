@@ -44,10 +44,8 @@ class ParameterEstimate(NamedTuple):
     """The result of a search."""
 
     theta: Vector
-    covariance: Matrix
-    """(size, size)."""
-    cost: float
-    """Mean square of the output error [y-unit²]."""
+    covariance: Matrix  # (size, size)
+    cost: float  # mean square of the output error [y-unit²]
     converged: bool
 
 
@@ -101,17 +99,12 @@ def block_sums(columns: Matrix, error: Vector, blocks: int) -> Matrix:
 class _Linearisation(NamedTuple):
     """The output error near a θ, with the columns of the gradient scaled to length 1."""
 
-    size: Vector
-    """Lengths of the columns."""
+    size: Vector  # lengths of the columns
     hessian: Matrix
-    right: Vector
-    """Σ ψ e."""
-    scores: Matrix
-    """Its sums over blocks."""
-    error: float
-    """Σ e²."""
-    finite: bool
-    """False for a model whose output is not finite."""
+    right: Vector  # Σ ψ e
+    scores: Matrix  # its sums over blocks
+    error: float  # Σ e²
+    finite: bool  # false for a model whose output is not finite
 
 
 def _linearise(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Linearisation:

@@ -29,39 +29,29 @@ class Identified:
     functions.
     """
 
-    num: Vector
-    """Numerator, descending powers of s."""
-    den: Vector
-    """Denominator, descending powers of s; the first is 1."""
+    num: Vector  #: numerator, descending powers of s
+    den: Vector  #: denominator, descending powers of s; the first is 1
     covariance: Matrix
     """Covariance of the fitted coefficients, ``den`` before ``num``, in ascending powers."""
     poles: tuple[Root, ...]
     zeros: tuple[Root, ...]
-    integrators: int
-    """Number of poles that were set to s = 0."""
-    delay: float
-    """Delay of u [s]."""
+    integrators: int  #: number of poles that were set to s = 0
+    delay: float  #: delay of u [s]
     bias: float
     """Constant force on the plant [u-unit]; NaN if a constant u has no effect on the plant."""
     friction: float | None
     """Coulomb friction: the |u| needed for slow motion [u-unit]; None if it was not fitted."""
-    dt: float
-    """Sample time of the record [s]."""
-    horizon: int
-    """Number of samples that the predictions in ``fits`` look ahead."""
+    dt: float  #: sample time of the record [s]
+    horizon: int  #: number of samples that the predictions in ``fits`` look ahead
     fits: dict[str, float]
     """NRMSE in %, of the simulation: ``"estimation"`` and ``"held out"``; of the prediction:
     ``"estimation, predicted"`` and ``"held out, predicted"``."""
-    residuals: Residuals
-    """Tests of the error, on the held-out samples if there are any."""
-    resolution: float
-    """Step that y is rounded to, 0.0 if it is not rounded [y-unit]."""
-    held_from: int
-    """Index of the first held-out sample; N if none was held out."""
+    residuals: Residuals  #: tests of the error, on the held-out samples if there are any
+    resolution: float  #: step that y is rounded to, 0.0 if it is not rounded [y-unit]
+    held_from: int  #: index of the first held-out sample; N if none was held out
     u: Vector
     y: Vector
-    simulated: Vector
-    """The model's output (N,) [y-unit]; it starts again at the held-out samples."""
+    simulated: Vector  #: the model's output (N,) [y-unit]; it starts again at the held-out samples
     reference: Vector | None
     converged: bool
     method: str

@@ -14,12 +14,9 @@ from quell.types import Matrix, Vector
 class Root(NamedTuple):
     """A pole or a zero; of a conjugate pair both are listed."""
 
-    value: complex
-    """[rad/s]."""
-    real_std: float
-    """Standard deviation of the real part [rad/s]; 0 for a root that was set."""
-    imag_std: float
-    """Standard deviation of the imaginary part [rad/s]."""
+    value: complex  #: [rad/s]
+    real_std: float  #: standard deviation of the real part [rad/s]; 0 for a root that was set
+    imag_std: float  #: standard deviation of the imaginary part [rad/s]
 
     @property
     def omega(self) -> float:

@@ -21,19 +21,15 @@ from quell.types import Matrix, Vector
 # (1e-308) that processors are slow with.
 _TINY = 1e-140
 
-Bank = NDArray[np.float64]
-"""States of a chain for several inputs (N, n, m)."""
+Bank = NDArray[np.float64]  # states of a chain for several inputs (N, n, m)
 
 
 class Sampled(NamedTuple):
     """A sampled system ``x⁺ = Φ x + Γ v + Γ₁ (v⁺ − v)``, with held or linear inputs."""
 
-    phi: Matrix
-    """Φ (n, n)."""
-    gamma: Matrix
-    """Γ (n, m)."""
-    slope: Matrix
-    """Γ₁ (n, m); zero for held inputs."""
+    phi: Matrix  # Φ (n, n)
+    gamma: Matrix  # Γ (n, m)
+    slope: Matrix  # Γ₁ (n, m); zero for held inputs
 
 
 @compiled

@@ -42,8 +42,7 @@ class Fit(NamedTuple):
 
     structure: Structure
     estimate: ParameterEstimate
-    delay: int
-    """Delay of u [samples]."""
+    delay: int  # delay of u [samples]
     bias: bool
 
     def inputs(self, u: Vector) -> Matrix:

@@ -44,12 +44,9 @@ from quell.types import Matrix, Vector
 class Structure(NamedTuple):
     """The parameters θ, in this order: a_q … a_{n−1}; the numerator of each input; D."""
 
-    order: int
-    """n."""
-    integrators: int
-    """q, the number of poles that are set to s = 0."""
-    degrees: tuple[int, ...]
-    """Degree of the numerator of each input, u first."""
+    order: int  #: n
+    integrators: int  #: q, the number of poles that are set to s = 0
+    degrees: tuple[int, ...]  #: degree of the numerator of each input, u first
     friction: tuple[float, ...] = ()
     """1/ω_a² [samples²] of each friction input, the last ones; 0.0 on the measured side."""
 

@@ -34,20 +34,14 @@ _RANK = 1e-12
 class Residuals(NamedTuple):
     """Tests of the error ε of a simulation."""
 
-    rms: float
-    """Root mean square [y-unit]."""
-    lags: int
-    """M, the number of lags in the tests."""
-    autocorrelation: Vector
-    """R_ε(τ)/R_ε(0) for τ = 0 … M (M + 1,)."""
-    whiteness: float
-    """ζ."""
-    whiteness_limit: float
-    """Limit that ζ of a white sequence exceeds with 1 % probability."""
+    rms: float  #: root mean square [y-unit]
+    lags: int  #: M, the number of lags in the tests
+    autocorrelation: Vector  #: R_ε(τ)/R_ε(0) for τ = 0 … M (M + 1,)
+    whiteness: float  #: ζ
+    whiteness_limit: float  #: limit that ζ of a white sequence exceeds with 1 % probability
     cross_correlation: Vector
     """Correlation of ε and u, of variance 1, for ε later by τ = −M … M samples (2 M + 1,)."""
-    cross_limit: float
-    """Limit that 1 % of them exceed if ε does not depend on u."""
+    cross_limit: float  #: limit that 1 % of them exceed if ε does not depend on u
 
     @property
     def white(self) -> bool:

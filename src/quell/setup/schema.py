@@ -55,12 +55,9 @@ class Table(BaseModel):
 class CallTable(Table):
     """A table that is a call of a function."""
 
-    function: ClassVar[Callable[..., Any]]
-    """The function."""
-    kind_name: ClassVar[str]
-    """The value of its key ``kind``."""
-    context: ClassVar[tuple[str, ...]]
-    """The parameters that other tables of the file give."""
+    function: ClassVar[Callable[..., Any]]  # the function
+    kind_name: ClassVar[str]  # the value of its key ``kind``
+    context: ClassVar[tuple[str, ...]]  # the parameters that other tables of the file give
 
 
 def call_table(

@@ -30,8 +30,7 @@ class Segment(NamedTuple):
 
     first: int
     dt: float
-    from_rest: bool
-    """True if the loop starts from rest at the first of them."""
+    from_rest: bool  # true if the loop starts from rest at the first of them
     r: Vector
     derivatives: Matrix
     w: Matrix
@@ -43,8 +42,7 @@ class SampledScenario:
     """A scenario for a plant and a controller."""
 
     signals: tuple[Signal, tuple[Signal, ...], Signal]
-    derivatives: tuple[Signal, ...]
-    """Those of the reference that the controller uses."""
+    derivatives: tuple[Signal, ...]  # those of the reference that the controller uses
     samples: int
     dt: float
     x0: Vector

@@ -35,8 +35,7 @@ from quell.simulation import Scenario, simulate
 
 STIFFNESSES = np.linspace(0.5, 2.0, 13)
 """Stiffnesses of cases 1 and 3 [N/m]: the problem's range, in steps chosen by hand."""
-LOAD = 0.5
-"""Frequency of the load in case 3 [rad/s]."""
+LOAD = 0.5  # frequency of the load in case 3 [rad/s]
 # Phases of the load [rad]: a start with no force, and with the full one.
 _PHASES = (0.0, 0.5 * np.pi)
 # Duration of the runs [s]: for the impulse four times, for the load four times the time that the
@@ -48,22 +47,17 @@ _IMPULSE_TIME, _LOAD_TIME = 60.0, 80.0
 class CaseResult:
     """Results of a controller in the three cases."""
 
-    margins: Margins
-    """Margins of the nominal loop."""
+    margins: Margins  #: margins of the nominal loop
     settled_at: float
     """Time after which ``|y|`` stays below 0.1 m, at k = 1 [s]; infinite beyond 60 s."""
-    settled_at_worst: float
-    """That time at the worst k [s]."""
-    stable_from: float
-    """Least k of the interval around k = 1 in which the loop is stable [N/m]."""
-    stable_to: float
-    """Largest k of that interval."""
+    settled_at_worst: float  #: that time at the worst k [s]
+    stable_from: float  #: least k of the interval around k = 1 in which the loop is stable [N/m]
+    stable_to: float  #: largest k of that interval
     parameter_bound: float
     """Largest p such that the loop is stable for every m1, m2, k in [1 − p, 1 + p]."""
     load_peak: float
     """Largest ``|y|`` from 20 s on, at the worst k and phase [m]; infinite if unstable."""
-    load_remains: float
-    """Largest ``|y|`` over the last period of 80 s [m]."""
+    load_remains: float  #: largest ``|y|`` over the last period of 80 s [m]
 
     def to_json(self) -> dict[str, Any]:
         """Return numbers for ``json.dump``; None for infinite ones."""

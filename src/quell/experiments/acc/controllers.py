@@ -23,10 +23,8 @@ from quell.plants import two_mass_spring
 
 MF, MB, L = OURS = "MF-ESO", "MB-ESO", "L-ESO"
 OMEGA_C, OMEGA_O, B0 = 1.0, 10.0, 1.5
-MOST_U = 0.5
-"""Limit of ``|u|`` [N], of Rocchetta, Crespo & Kenny (DSCC 2019)."""
-DT = 0.01
-"""Sample time [s]: chosen by hand, omega_o dt = 0.1."""
+MOST_U = 0.5  # limit of ``|u|`` [N], of Rocchetta, Crespo & Kenny (DSCC 2019)
+DT = 0.01  # sample time [s]: chosen by hand, omega_o dt = 0.1
 
 BASELINES = {
     "PID": "pid",

@@ -21,10 +21,8 @@ _ROUNDING = 1e-9
 class Judged(NamedTuple):
     """Runs of one controller on a sample of plants; each array (count,)."""
 
-    late_peak: Vector
-    """Largest ``|y|`` from 15 s on [m]; infinite for an unstable loop."""
-    most_u: Vector
-    """Largest ``|u|`` [N]."""
+    late_peak: Vector  #: largest ``|y|`` from 15 s on [m]; infinite for an unstable loop
+    most_u: Vector  #: largest ``|u|`` [N]
 
     @property
     def fails(self) -> NDArray[np.bool_]:

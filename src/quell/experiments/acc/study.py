@@ -38,13 +38,10 @@ class Result:
     """The results, by spring and controller."""
 
     samples: Matrix
-    source: str
-    """Origin of the samples."""
+    source: str  #: origin of the samples
     judged: Mapping[str, Mapping[str, Judged]]
-    cases: Mapping[str, CaseResult]
-    """Design cases of the original problem, by controller."""
-    runs_per_second: float
-    """Judged runs of 30 s, of all sampled controllers, on all cores."""
+    cases: Mapping[str, CaseResult]  #: design cases of the original problem, by controller
+    runs_per_second: float  #: judged runs of 30 s, of all sampled controllers, on all cores
     runs_per_second_one_core: float
 
     def to_json(self) -> dict[str, Any]:

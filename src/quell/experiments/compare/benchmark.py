@@ -31,10 +31,8 @@ OMEGA_C, OMEGA_O = 1.0, 10.0
 """Bandwidths of all controllers that have them [rad/s]: those of the paper's simulation study."""
 RESONANCE = math.sqrt(2.0)
 """Resonance of the nominal plant, free at both ends [rad/s]: √(k/m1 + k/m2)."""
-FORCE_AT, END = 40.0, 100.0
-"""Start of the constant force, end of the scenario [s]: chosen by hand."""
-FORCE = 0.1
-"""Force on the load [N]: a tenth of the force that moves it by the step within a second."""
+FORCE_AT, END = 40.0, 100.0  # start of the constant force, end of the scenario [s]: chosen by hand
+FORCE = 0.1  # force on the load [N]: a tenth of the force that moves it by the step within a second
 # Longest sample time [s]: omega_o dt = 1 with the bandwidth above.
 _LONGEST_DT = 0.1
 # About 1 GB of records for each controller.
@@ -171,5 +169,4 @@ _DESIGNS: Mapping[str, Callable[[float, dict[str, Any]], Controller]] = {
     "resonance-ratio": lambda dt, limits: ResonanceRatio(omega_o=OMEGA_O, dt=dt, **limits),
 }
 _SHAPERS = {"zv": ZV, "zvd": ZVD}
-NAMES = tuple(_DESIGNS)
-"""The benchmark's controllers."""
+NAMES = tuple(_DESIGNS)  # the benchmark's controllers

@@ -17,8 +17,7 @@ from quell.records import metrics
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
 
-BAND = 0.02
-"""Half width of the settling band, as a fraction of the step: the usual 2 %."""
+BAND = 0.02  # half width of the settling band, as a fraction of the step: the usual 2 %
 
 
 @dataclass(frozen=True)

@@ -32,25 +32,19 @@ class AdversaryDesign(NamedTuple):
     """Parameters of an adversary."""
 
     kind: int
-    size: float
-    """A factor, a standard deviation or an amplitude."""
-    time: float
-    """A time constant or mean time between events [samples]."""
-    weights: Vector
-    """Factors of (x̂_1 … x̂_n, u, 1) (n + 2,)."""
-    delay: int
-    """[samples]."""
+    size: float  # a factor, a standard deviation or an amplitude
+    time: float  # a time constant or mean time between events [samples]
+    weights: Vector  # factors of (x̂_1 … x̂_n, u, 1) (n + 2,)
+    delay: int  # [samples]
 
 
 class AdversaryMemory(NamedTuple):
     """State of an adversary."""
 
-    past: Vector
-    """Ring buffer of the last estimates f̂ (delay + 1,)."""
+    past: Vector  # ring buffer of the last estimates f̂ (delay + 1,)
     now: Vector
     """(5,): place in ``past``, number of samples, f_L, f̂ of an ESO without learner, sign."""
-    seed: Vector
-    """(1,): state of the random numbers."""
+    seed: Vector  # (1,): state of the random numbers
 
 
 _AT, _COUNT, _F_L, _F_PLAIN, _SIGN = range(5)

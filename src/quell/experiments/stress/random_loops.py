@@ -32,15 +32,11 @@ class Loop:
     m1: float
     m2: float
     k: float
-    gain_error: float
-    """b0 / b."""
+    gain_error: float  #: b0 / b
     dt: float
-    omega: float
-    """Frequency of the load [rad/s]."""
-    amplitude: float
-    """Amplitude of the load [N]."""
-    seed: int
-    """Seed of the noise."""
+    omega: float  #: frequency of the load [rad/s]
+    amplitude: float  #: amplitude of the load [N]
+    seed: int  #: seed of the noise
 
     @property
     def plant(self) -> LinearPlant:

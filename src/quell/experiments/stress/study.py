@@ -45,12 +45,9 @@ class Outcome:
     learner: str
     plain_unstable: bool
     unstable: bool
-    ratio: float
-    """Ratio over the whole run."""
-    load_ratio: float
-    """Ratio over the 60 s of load."""
-    late_ratio: float
-    """Ratio from 50 s after the start of the load."""
+    ratio: float  #: ratio over the whole run
+    load_ratio: float  #: ratio over the 60 s of load
+    late_ratio: float  #: ratio from 50 s after the start of the load
 
 
 @dataclass(frozen=True)

@@ -17,18 +17,15 @@ class TurncoatDesign(NamedTuple):
     """Parameters of ``Turncoat``."""
 
     honest: Any
-    turns: float
-    """Number of honest samples."""
-    size: float
-    """Factor of its prediction afterwards."""
+    turns: float  # number of honest samples
+    size: float  # factor of its prediction afterwards
 
 
 class TurncoatMemory(NamedTuple):
     """State of ``Turncoat``."""
 
     honest: Any
-    samples: Vector
-    """Samples so far (1,)."""
+    samples: Vector  # samples so far (1,)
 
 
 @adapt.register(TurncoatDesign)

@@ -32,17 +32,12 @@ from quell.records.trajectory import Trajectory
 from quell.signals import Sinusoid, Trapezoid
 from quell.simulation.scenario import Scenario
 
-PROFILE_AT, END = 40.0, 50.0
-"""Start of the profile, end of the experiment [s]; see above."""
+PROFILE_AT, END = 40.0, 50.0  # start of the profile, end of the experiment [s]; see above
 TARGET, MOVE_TIME, RAMP_TIME = math.pi, 2.0, 0.5
-BAND = 0.002
-"""Half width of the settling band, as a fraction of the move; see above."""
-COUNTS = 16_000
-"""Counts per turn of the encoder, of the paper."""
-B0 = 5.5e4
-"""The paper's b0 of MF-ESO and L-ESO [rad/(V s⁴)]; the identified plant has 4.6e4."""
-STARTS = 5
-"""Number of starts: chosen by hand, an odd number for medians."""
+BAND = 0.002  # half width of the settling band, as a fraction of the move; see above
+COUNTS = 16_000  # counts per turn of the encoder, of the paper
+B0 = 5.5e4  # the paper's b0 of MF-ESO and L-ESO [rad/(V s⁴)]; the identified plant has 4.6e4
+STARTS = 5  # number of starts: chosen by hand, an odd number for medians
 CASES = ((90.0, 40.0), (40.0, 90.0), (20.0, 90.0))
 """omega_c and omega_o [rad/s]: the paper's, exchanged, and where the claims hold best."""
 

@@ -46,10 +46,8 @@ _COUNT = 2.0 / COUNTS * (1.0 + 1e-6)
 class Outcome:
     """The results on one plant."""
 
-    records: Mapping[str, Trajectory]
-    """Records of the first start."""
-    scores: Mapping[str, Scores]
-    """Medians over the starts, by controller."""
+    records: Mapping[str, Trajectory]  #: records of the first start
+    scores: Mapping[str, Scores]  #: medians over the starts, by controller
     spread: Mapping[str, Mapping[str, tuple[float, float] | None]]
     """Least and largest score over the starts."""
     claims: tuple[Claim, ...]

@@ -19,8 +19,7 @@ BATCHES = (1, 10, 1000)
 """Samples in a batch: chosen by hand, to show that the limit does not depend on it."""
 RATES = tuple(float(rate) for rate in np.geomspace(1e-3, 1.0, 13))
 """rate · batch / dt [1/s], the speed of θ: a range around the limit of 0.015/s."""
-HORIZON = 2500.0
-"""Duration of a run that does not diverge [s]: ten times that of the study."""
+HORIZON = 2500.0  # duration of a run that does not diverge [s]: ten times that of the study
 
 
 @dataclass(frozen=True)
@@ -28,12 +27,9 @@ class Trial:
     """One run of Algorithm 1."""
 
     batch: int
-    rate: float
-    """rate · batch / dt [1/s]."""
-    ended: float
-    """End of the run [s]: ``HORIZON``, or the time of divergence."""
-    stable: bool
-    """True if the run did not diverge within the study's duration."""
+    rate: float  #: rate · batch / dt [1/s]
+    ended: float  #: end of the run [s]: ``HORIZON``, or the time of divergence
+    stable: bool  #: true if the run did not diverge within the study's duration
     disturbance_peak: float | None
 
 
