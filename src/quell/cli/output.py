@@ -28,24 +28,12 @@ COMPILING = "simulating (the first run compiles for some seconds)"
 
 
 class Column(NamedTuple):
-    """A column of a table of scores.
+    """A column of a table of scores."""
 
-    Attributes
-    ----------
-    key : str
-        key of the score.
-    heading : str
-        heading of the column, with the unit.
-    factor : float
-        factor from the score's unit to the column's.
-    form : str
-        format of the number.
-    """
-
-    key: str
-    heading: str
-    factor: float
-    form: str
+    key: str  # key of the score
+    heading: str  # heading of the column, with the unit
+    factor: float  # factor from the score's unit to the column's
+    form: str  # format of the number
 
     def cell(self, scores: Mapping[str, Any]) -> str:
         """Return the score as text, a dash where it is missing."""
@@ -85,10 +73,7 @@ def print_line(console: Console, text: str) -> None:
 def check_outputs(outputs: Outputs) -> None:
     """Check, before the work is done, that the results can be written; create the figures' folder.
 
-    Raises
-    ------
-    ValueError
-        for a file that cannot be written, or a folder that cannot be created.
+    Raises a ``ValueError`` for a file that cannot be written, or a folder that cannot be created.
     """
     from quell.experiments.common.figures import make_folder
     from quell.files import check_writable
@@ -122,16 +107,8 @@ def progress_bar(
 ) -> Iterator[ProgressCallback]:
     """Show a progress bar while the work goes on, and return the callback that moves it.
 
-    Parameters
-    ----------
-    console
-        where to print.
-    first
-        label of the bar until the first call.
-    more
-        further columns of the bar.
-    width
-        least width of the label.
+    ``first`` is the label until the first call, of at least ``width`` characters; ``more`` are
+    further columns of the bar.
     """
     from rich.progress import BarColumn, Progress, TextColumn
 

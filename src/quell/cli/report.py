@@ -29,9 +29,8 @@ COLUMNS = (
 def windowed_metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
     """Return the metrics of each window of a setup; by default after the last start from rest.
 
-    Each has ``start`` and ``stop`` [s], too, and nothing else where the run ended before the
-    window. A metric that does not exist is None. Windows after the end of the scenario are left
-    out.
+    Each also has ``start`` and ``stop`` [s], and nothing else if the run ended before the window.
+    A metric that does not exist is None. Windows after the end of the scenario are left out.
     """
     end = run.ended if setup.scenario is None else setup.scenario.duration
     rests = () if setup.scenario is None else setup.scenario.rest_at
@@ -57,7 +56,7 @@ def print_metrics(console: Console, title: str, windows: list[dict[str, Any]]) -
 
 
 def print_outcome(console: Console, run: Trajectory) -> dict[str, float]:
-    """Print and return the learned coefficients; print the run's status where it is not OK."""
+    """Print and return the learned coefficients; print the run's status if it is not OK."""
     theta = run["theta"][-1] if "theta" in run.names and len(run) else ()
     learned = {name: float(value) for name, value in zip(run.features, theta, strict=False)}
     if learned:

@@ -17,6 +17,8 @@ response, the smaller the variance. The estimate has no bias with any Z.
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from quell.identification.initial_estimate import equation, stable
@@ -27,13 +29,11 @@ from quell.types import Matrix, Vector
 
 # Most rounds, and the relative change of θ that ends them: chosen by hand; not tuned further.
 _ROUNDS, _CONVERGED = 30, 1e-4
-# Number of Laguerre filters at each rate, and the rates relative to the fastest pole: chosen by
-# hand; any are free of bias.
+# Laguerre filters at each rate, rates relative to the fastest pole: by hand; none causes a bias.
 _LAGUERRE, _LAGUERRE_RATES = 8, (1.0, 0.2)
 # Least number of blocks for the covariance, as in ``output_error``.
 _BLOCKS = 60
-# Relative singular value that counts as zero: above the rounding of products of nearly dependent
-# signals.
+# Relative singular value that counts as zero: above rounding, for nearly dependent signals.
 _RANK = 1e-12
 
 
@@ -75,11 +75,8 @@ def _instruments(a: Vector, r: Vector) -> Matrix:
     poles = np.abs(np.roots(np.append(1.0, a[::-1])))
     fast = float(np.clip(np.max(poles), 1e-4, 1.0))
     bank = chain(a, r)
-    laguerre = [
-        _laguerre(rate, signal)
-        for rate in (factor * fast for factor in _LAGUERRE_RATES)
-        for signal in (r, bank[:, -1])
-    ]
+    cases = product((factor * fast for factor in _LAGUERRE_RATES), (r, bank[:, -1]))
+    laguerre = [_laguerre(rate, signal) for rate, signal in cases]
     return np.column_stack([r, bank, *laguerre])
 
 

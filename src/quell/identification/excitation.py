@@ -33,8 +33,7 @@ class Excitation:
     """A designed excitation."""
 
     kind: str
-    signal: Signal
-    """The excitation for a scenario or a rig; equals ``u`` if it is sampled at ``dt`` and held."""
+    signal: Signal  #: the excitation for a scenario or a rig; equals ``u`` if sampled and held
     dt: float  #: [s]
     u: Vector  #: samples (N,) [u-unit]
     period: float  #: period [s]; infinite for a chirp
@@ -42,8 +41,7 @@ class Excitation:
     crest: float  #: peak of ``u − mean`` over its RMS: 1 at least, 1.41 for a sinusoid
     rms: float  #: RMS of ``u − mean`` [u-unit]
     details: str  #: the design in a sentence
-    shortcomings: tuple[str, ...]
-    """Requirements that limits and duration do not allow; each with a remedy."""
+    shortcomings: tuple[str, ...]  #: requirements that cannot be met; each with a remedy
 
     @property
     def t(self) -> Vector:
@@ -63,13 +61,7 @@ class Excitation:
     __str__ = describe
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``t,u`` as CSV, completely or not at all.
-
-        Raises
-        ------
-        ValueError
-            if the file can't be written.
-        """
+        """Write ``t,u`` as CSV, completely or not at all."""
         samples = zip(self.t.tolist(), self.u.tolist(), strict=True)
         rows = "".join(f"{t:.9g},{u:.9g}\n" for t, u in samples)
         with written_atomically(path) as part:
@@ -153,23 +145,10 @@ def excitation(
     away = u - np.mean(u)
     rms = float(np.sqrt(np.mean(away**2)))
     if count * dt * low < 2.0 * math.pi:
-        shortcomings = (
-            *shortcomings,
-            f"{duration:g} s is less than one period of {low:.4g} rad/s; "
-            "take longer, or begin the band higher",
-        )
-    return Excitation(
-        kind=kind,
-        signal=scale * signal + (u_min - scale * bottom),
-        dt=dt,
-        u=u,
-        period=period,
-        band=reached,
-        crest=float(np.max(np.abs(away))) / rms,
-        rms=rms,
-        details=details,
-        shortcomings=shortcomings,
-    )
+        short = f"{duration:g} s is less than one period of {low:.4g} rad/s"
+        shortcomings = (*shortcomings, f"{short}; take longer, or begin the band higher")
+    crest, signal = float(np.max(np.abs(away))) / rms, scale * signal + (u_min - scale * bottom)
+    return Excitation(kind, signal, dt, u, period, reached, crest, rms, details, shortcomings)
 
 
 _Design = tuple[Signal, float, tuple[float, float], str, tuple[str, ...]]
@@ -184,10 +163,8 @@ def _chirp(low: float, high: float, count: int, dt: float, seed: int) -> _Design
     )
     # A resonance is excited for only as many periods as the sweep stays near it.
     periods = low * count * dt / octaves / (2.0 * math.pi)
-    short = (
-        f"the lowest octave gets {periods:.2g} periods of its lowest frequency; "
-        "take longer, or a multisine"
-    )
+    few = f"the lowest octave gets {periods:.2g} periods of its lowest frequency"
+    short = f"{few}; take longer, or a multisine"
     return sweep, math.inf, (low, high), details, () if periods >= 1.0 else (short,)
 
 
@@ -207,19 +184,13 @@ def _prbs(low: float, high: float, count: int, dt: float, seed: int) -> _Design:
             "take longer, or begin the band higher"
         )
     if reached[1] < high:
-        short.append(
-            f"at {high:.4g} rad/s it is more than 3 dB down, from {reached[1]:.4g} on; "
-            "sample faster, or end the band lower"
-        )
+        down = f"at {high:.4g} rad/s it is more than 3 dB down, from {reached[1]:.4g} on"
+        short.append(f"{down}; sample faster, or end the band lower")
     if signal.period > count * dt + 1e-9:
-        short.append(
-            f"not one whole period of {signal.period:.4g} s fits into {count * dt:.4g} s; "
-            "take longer"
-        )
-    details = (
-        f"PRBS of {bits} bits, each held for {samples} samples ({step:.4g} s), "
-        f"period {signal.period:.4g} s"
-    )
+        times = f"{signal.period:.4g} s fits into {count * dt:.4g} s"
+        short.append(f"not one whole period of {times}; take longer")
+    hold = f"each held for {samples} samples ({step:.4g} s)"
+    details = f"PRBS of {bits} bits, {hold}, period {signal.period:.4g} s"
     return signal, signal.period, reached, details, tuple(short)
 
 

@@ -16,8 +16,7 @@ class FrequencyResponse(NamedTuple):
 
     omega: Vector  #: [rad/s] (points,)
     response: NDArray[np.complex128]  #: complex [y-unit/u-unit] (points,)
-    coherence: Vector
-    """Share of the power of y that u (or ``reference``, if given) explains, 0 to 1 (points,)."""
+    coherence: Vector  #: share of y's power that u or ``reference`` explains, 0 to 1 (points,)
     deviation: Vector  #: relative standard deviation of ``response`` (points,)
 
 
@@ -50,11 +49,6 @@ def frequency_response(
     -------
     FrequencyResponse
         at frequencies up to half the sampling rate, without zero.
-
-    Raises
-    ------
-    ValueError
-        for records that differ in length, or are too short for the number of segments.
     """
     from scipy.signal import csd, welch
 

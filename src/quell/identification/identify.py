@@ -65,10 +65,8 @@ def identify(
         encoder's steps are taken as white.
     dt
         sample time [s].
-    order
-        number of poles n, 1 to 8.
-    zeros
-        number of zeros, less than n.
+    order, zeros
+        number of poles n, 1 to 8, and of zeros, less than n.
     integrators
         number of poles at s = 0. By default a pole is set there if it can't be distinguished from s
         = 0: if it is within three of its standard deviations, or slower than ten times the record;
@@ -89,16 +87,10 @@ def identify(
         external signal of a closed loop (N,), if it is known: the model is then fitted to the part
         of u and y that follows it (see Notes).
 
-    Returns
-    -------
-    Identified
-
     Raises
     ------
     ValueError
-        for records that differ in length, are not finite, are too short for the number of
-        parameters or constant; and for an order, a number of zeros, a delay or a share that is out
-        of range.
+        also for records that are too short for the number of parameters, or constant.
 
     Notes
     -----
@@ -147,21 +139,14 @@ def identify(
         if reference is not None:
             structure, theta = fitted.structure, fitted.estimate.theta
             v = free_run(structure, theta, fitted.inputs(u[:held_from]), own_friction=True)[1]
-            estimate = instrumental_variables(
-                structure, theta, v, y[:held_from], reference[:held_from]
-            )
+            y_fit, r_fit = y[:held_from], reference[:held_from]
+            estimate = instrumental_variables(structure, theta, v, y_fit, r_fit)
             fitted = fitted._replace(estimate=estimate)
         return _validated(fitted, u, y, reference, dt, held_from, horizon)
 
 
 def _validated(
-    fitted: Fit,
-    u: Vector,
-    y: Vector,
-    reference: Vector | None,
-    dt: float,
-    held_from: int,
-    horizon: int,
+    fitted: Fit, u: Vector, y: Vector, r: Vector | None, dt: float, held_from: int, horizon: int
 ) -> Identified:
     """Return the result in seconds, with fits and tests."""
     structure, v = fitted.structure, fitted.inputs(u)
@@ -207,9 +192,9 @@ def _validated(
         u=u,
         y=y,
         simulated=model,
-        reference=reference,
+        reference=r,
         converged=fitted.estimate.converged,
-        method=_METHODS[reference is not None],
+        method=_METHODS[r is not None],
     )
 
 
@@ -233,9 +218,8 @@ def _delays(delay: Any, dt: float) -> tuple[int, int]:
     if np.ndim(delay) == 0:
         samples = checks.samples("delay", delay, dt)
         return samples, samples
-    low, high = (
-        checks.samples("delay", value, dt) for value in checks.vector("delay", delay, 2).tolist()
-    )
+    ends = checks.vector("delay", delay, 2).tolist()
+    low, high = (checks.samples("delay", value, dt) for value in ends)
     if low > high:
         raise ValueError(f"delay = {delay!r}: the smallest comes first")
     return low, high
@@ -249,8 +233,8 @@ def _split(u: Vector, y: Vector, order: int, held_out: float, least: int, least_
             f"held_out = {held_out!r}: must be from 0 to 0.9, "
             "the share of the record that is not used for the fit"
         )
-    held_from = u.size - int(share * u.size)
-    held = u.size - held_from
+    held = int(share * u.size)
+    held_from = u.size - held
     if held_from < least:
         raise ValueError(
             f"u has {u.size} samples, {held_from} of them for the fit: "
@@ -263,14 +247,11 @@ def _split(u: Vector, y: Vector, order: int, held_out: float, least: int, least_
         )
     for name, value in (("u", u), ("y", y)):
         if np.ptp(value[:held_from]) == 0.0:
-            raise ValueError(
-                f"{name} is {value[0]:g} all through the samples for the fit: "
-                "must move, or nothing can be learned from it"
-            )
+            place = "all through the samples for the fit"
+            raise ValueError(f"{name} is {value[0]:g} {place}: must move")
         if held and np.ptp(value[held_from:]) == 0.0:
             raise ValueError(
-                f"held_out = {held_out!r}: {name} is {value[-1]:g} all through these samples, "
-                "must move to be judged on; hold fewer out, or none, "
-                "or cut the record where it rests"
+                f"held_out = {held_out!r}: {name} is {value[-1]:g} all through these samples, must "
+                "move; hold fewer out, or none, or cut the record where it rests"
             )
     return held_from

@@ -36,14 +36,11 @@ from quell.types import Matrix, Vector
 # Number of λ, log-spaced from 10 per length of the record (at most 0.01 per sample) to 0.5 per
 # sample: chosen by hand.
 _RATES = 7
-# Share of the output's power that may stay unexplained before lower orders are tried: chosen by
-# hand.
+# Share of the output's power that may stay unexplained before lower orders are tried (by hand).
 _POOR = 1e-3
-# Fast pole that is added to a model of lower order [1/sample]: beyond the π per sample that samples
-# show.
+# Fast pole that is added to a model of lower order: beyond the π per sample that samples show.
 _FAST_POLE = 10.0
-# Rounds of refined instrumental variables, and the least relative gain of one: chosen by hand; not
-# tuned further.
+# Rounds of refined instrumental variables, least relative gain of one: chosen by hand, not tuned.
 _ROUNDS, _GAIN = 8, 1e-3
 # For slow λ, samples are averaged: over this share of the filter's time constant at most, with this
 # number of averages for each parameter at least. Chosen by hand; the result is only a start.
@@ -55,13 +52,10 @@ def initial_estimates(structure: Structure, v: Matrix, y: Vector) -> tuple[Vecto
 
     If the first leaves much unexplained, those of lower orders with added fast poles follow.
     """
-    tried = [
-        _filtered(structure, v, y, rate)
-        for rate in np.geomspace(min(10.0 / y.size, 1e-2), 0.5, _RATES).tolist()
-    ]
-    best, theta = min(
-        ((cost(structure, theta, v, y), theta) for theta in tried), key=lambda pair: pair[0]
-    )
+    rates = np.geomspace(min(10.0 / y.size, 1e-2), 0.5, _RATES).tolist()
+    tried = [_filtered(structure, v, y, rate) for rate in rates]
+    costs = ((cost(structure, theta, v, y), theta) for theta in tried)
+    best, theta = min(costs, key=lambda pair: pair[0])
     for _ in range(_ROUNDS):
         refined = stable(structure, _refined(structure, theta, v, y))
         value = cost(structure, refined, v, y)

@@ -17,7 +17,7 @@ from quell.files import csv_rows, read_text
 from quell.identification.excitation import Excitation
 from quell.plants import Plant
 from quell.simulation import Scenario, simulate
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 # Times may be off the grid by this share of a sample: chosen by hand, so that rounded times pass
 # and a gap does not.
@@ -38,13 +38,7 @@ class Measured(NamedTuple):
 
 
 def excited(plant: Plant, design: Excitation) -> Measured:
-    """Return the simulated record of a plant at rest that gets a designed excitation as u.
-
-    Raises
-    ------
-    ValueError
-        as ``simulate``.
-    """
+    """Return the simulated record of a plant at rest that gets a designed excitation as u."""
     none = np.zeros(0)
     law = LinearLaw(np.zeros((0, 0)), none, none, none, none, 1.0, 0.0)  # u = r
     scenario = Scenario(reference=design.signal, duration=(design.u.size - 1) * design.dt)
@@ -72,17 +66,14 @@ def read_record(
     Raises
     ------
     ValueError
-        if the file can't be read, a column is missing, a value is not a number, or the times are
-        not even; it names line and column.
+        names line and column of a fault in the file.
     """
     if dt is not None:
         checks.positive("dt", dt, "s")
     where = f"data = {os.fspath(path)!r}"
     if len(set(columns)) != len(columns) or len(columns) not in ((3, 4) if dt is None else (2, 3)):
         rule = "t,u,y or t,u,y,r" if dt is None else "u,y or u,y,r, as dt is given"
-        raise ValueError(
-            f"columns = {','.join(columns)!r}: must be {rule}, by their names or numbers"
-        )
+        raise ValueError(f"columns = {','.join(columns)!r}: must be {rule}, by names or numbers")
     rows = _rows(Path(path), where)
     header = None if all(_is_number(cell) for cell in rows[0][1]) else rows[0][1]
     if header is not None:
@@ -90,9 +81,8 @@ def read_record(
     if len(rows) < _FEWEST:
         raise ValueError(f"{where}: has {len(rows)} samples; must have at least {_FEWEST}")
     width = len(rows[0][1] if header is None else header)
-    places = [
-        _place(where, header, width, name, i + (dt is not None)) for i, name in enumerate(columns)
-    ]
+    roles = enumerate(columns, start=int(dt is not None))
+    places = [_place(where, header, width, name, role) for role, name in roles]
     values = _values(where, rows, places, columns)
     if dt is None:
         dt = _sample_time(where, values[:, 0], [number for number, _ in rows])
@@ -127,19 +117,16 @@ def _place(where: str, header: list[str] | None, width: int, name: str, role: in
         return header.index(name)
     if name.isdecimal():
         if not 1 <= int(name) <= width:
-            raise ValueError(
-                f"{where}: column {name} is missing; there are {width}, counted from 1"
-            )
+            rule = f"there are {width}, counted from 1"
+            raise ValueError(f"{where}: column {name} is missing; {rule}")
         return int(name) - 1
     if header is None and name == ("t", "u", "y", "r")[role]:
         place = role - (role > 0 and width < 3)
         if place < width:
             return place
-    has = (
-        f"no line names columns, there are {width}"
-        if header is None
-        else f"the first line names {', '.join(header)}"
-    )
+    has = f"no line names columns, there are {width}"
+    if header is not None:
+        has = f"the first line names {', '.join(header)}"
     raise ValueError(f"{where}: column {name} is missing; {has}; say which with --columns")
 
 
@@ -151,9 +138,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _values(
-    where: str, rows: Sequence[_Row], places: Sequence[int], names: Sequence[str]
-) -> Vector:
+def _values(where: str, rows: list[_Row], places: list[int], names: Sequence[str]) -> Matrix:
     """Return the values (samples, columns)."""
     try:
         cells = [[row[place] for place in places] for _, row in rows]
@@ -176,10 +161,8 @@ def _value(where: str, number: int, row: list[str], place: int, name: str) -> fl
         raise ValueError(f"{where}, line {number}: {name} = {text!r}: must be a number")
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(
-            f"{where}, line {number}: {name} = {text}: must be finite; "
-            "mend the record or cut it there"
-        )
+        rule = "must be finite; mend the record or cut it there"
+        raise ValueError(f"{where}, line {number}: {name} = {text}: {rule}")
     return value
 
 

@@ -27,13 +27,12 @@ from quell.types import Matrix, Vector
 
 # Convergence: relative gain of a step, chosen by hand; not tuned further.
 _CONVERGED = 1e-7
-# First μ, least μ after a failed step, and the μ at which the search ends: chosen by hand; not
-# tuned further. The factor of 10 for each step is Marquardt's.
+# First μ, least μ after a failed step, μ at which the search ends: chosen by hand, not tuned. The
+# factor of 10 for each step is Marquardt's.
 _MU, _LEAST_MU, _MOST_MU = 1e-4, 1e-8, 1e8
 # Relative singular value of H that counts as zero: some 50 units of rounding.
 _RANK = 1e-14
-# Relative mean square that counts as zero: errors of 1e-12, which rounding in long simulations adds
-# up to.
+# Relative mean square that counts as zero: rounding in long simulations adds up to errors of 1e-12.
 _ROUNDING = 1e-24
 # Least number of blocks: longer ones hold more correlation, fewer make the covariance uncertain;
 # chosen by hand.
@@ -54,8 +53,7 @@ def refine(
 ) -> ParameterEstimate:
     """Return θ of least output error near ``theta``, for inputs ``v`` and output ``y``."""
     best, mu = cost(structure, theta, v, y), _MU
-    # Without noise the error is reduced to its own rounding, where no step is sure to reduce it
-    # further.
+    # Without noise the error falls to its own rounding, where a step may not reduce it further.
     rounding = _ROUNDING * float(np.mean(y**2))
     converged = best <= rounding
     near = _linearise(structure, theta, v, y)

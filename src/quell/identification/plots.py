@@ -13,34 +13,22 @@ from quell.identification.validation import Residuals
 from quell.records.plotting import draw_line
 from quell.types import Vector
 
-_MOSAIC: Any = [
-    ["gain", "output"],
-    ["gain", "output"],
-    ["phase", "error"],
-    ["phase", "auto"],
-    ["coherence", "cross"],
-]
+_ROWS = ("gain output", "gain output", "phase error", "phase auto", "coherence cross")
 _NAMES = ("gain", "phase", "coherence", "output", "error", "auto", "cross")
-# Least coherence of the empirical points that are drawn; below it, noise is larger than the
-# response.
+# Least coherence of the empirical points that are drawn; below it, noise exceeds the response.
 _COHERENT = 0.5
 # Quantile of the normal distribution: 99 % of values lie within this many standard deviations.
 _WITHIN_99 = 2.576
 
 
 def seven_axes(axes: Any) -> list[Any]:
-    """Return seven matplotlib axes, those of a new figure by default.
-
-    Raises
-    ------
-    ValueError
-        for another number of axes.
-    """
+    """Return seven matplotlib axes, those of a new figure by default."""
     if axes is None:
         import matplotlib.pyplot as plt
 
         figure = plt.figure(figsize=(10.0, 7.5), layout="constrained")
-        mosaic = figure.subplot_mosaic(_MOSAIC)
+        rows: list[Any] = [row.split() for row in _ROWS]
+        mosaic = figure.subplot_mosaic(rows)
         axes = [mosaic[name] for name in _NAMES]
     axes = list(np.ravel(axes))
     if len(axes) != len(_NAMES):

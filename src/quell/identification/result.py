@@ -25,27 +25,22 @@ _DEVIATIONS = 3.0
 class Identified:
     """A transfer function found in a record, with measures of its quality.
 
-    ``str()`` gives the whole report; ``plant`` is the model for ``ESO.model_based`` and other
-    functions.
+    ``str()`` gives the whole report; ``plant`` is the model for ``ESO.model_based``.
     """
 
     num: Vector  #: numerator, descending powers of s
     den: Vector  #: denominator, descending powers of s; the first is 1
-    covariance: Matrix
-    """Covariance of the fitted coefficients, ``den`` before ``num``, in ascending powers."""
+    covariance: Matrix  #: of the fitted coefficients, ``den`` before ``num``, ascending powers
     poles: tuple[Root, ...]
     zeros: tuple[Root, ...]
     integrators: int  #: number of poles that were set to s = 0
     delay: float  #: delay of u [s]
-    bias: float
-    """Constant force on the plant [u-unit]; NaN if a constant u has no effect on the plant."""
-    friction: float | None
-    """Coulomb friction: the |u| needed for slow motion [u-unit]; None if it was not fitted."""
+    bias: float  #: constant force on the plant [u-unit]; NaN if a constant u has no effect on it
+    friction: float | None  #: Coulomb friction, the |u| for slow motion [u-unit]; None: not fitted
     dt: float  #: sample time of the record [s]
     horizon: int  #: number of samples that the predictions in ``fits`` look ahead
+    #: NRMSE in %: ``"estimation"`` and ``"held out"``, also with ``", predicted"``
     fits: dict[str, float]
-    """NRMSE in %, of the simulation: ``"estimation"`` and ``"held out"``; of the prediction:
-    ``"estimation, predicted"`` and ``"held out, predicted"``."""
     residuals: Residuals  #: tests of the error, on the held-out samples if there are any
     resolution: float  #: step that y is rounded to, 0.0 if it is not rounded [y-unit]
     held_from: int  #: index of the first held-out sample; N if none was held out
@@ -68,19 +63,13 @@ class Identified:
         poles, zeros = (
             [root for root in roots if root.value.imag >= 0.0] for roots in (self.poles, self.zeros)
         )
-        found = [
-            f"the pole at {_format(pole)} is unstable; if the plant is stable, use a lower order "
-            "or set integrators"
-            for pole in poles
-            if pole.value.real > 0.0
-        ]
+        remedy = "if the plant is stable, use a lower order or set integrators"
+        unstable = (pole for pole in poles if pole.value.real > 0.0)
+        found = [f"the pole at {_format(pole)} is unstable; {remedy}" for pole in unstable]
         for kind, roots in (("pole", poles), ("zero", zeros)):
-            found += [
-                f"the {kind} at {_format(root)} is faster than samples show, {fastest:.4g} rad/s; "
-                f"use fewer {kind}s"
-                for root in roots
-                if root.omega > fastest
-            ]
+            limit = f"faster than samples show, {fastest:.4g} rad/s; use fewer {kind}s"
+            fast = (root for root in roots if root.omega > fastest)
+            found += [f"the {kind} at {_format(root)} is {limit}" for root in fast]
         for zero in zeros:
             cancelled = [
                 f"the pole at {_format(pole)} nearly equals a zero; use one pole and one zero less"

@@ -22,6 +22,7 @@ from quell.types import Matrix, Vector
 _TINY = 1e-140
 
 Bank = NDArray[np.float64]  # states of a chain for several inputs (N, n, m)
+Indices = NDArray[np.int64]
 
 
 class Sampled(NamedTuple):
@@ -71,7 +72,7 @@ def _chains(phi: Matrix, gamma: Vector, v: Matrix, x: Matrix, out: Bank) -> None
 def _gradient(
     one: Sampled,
     bank: Matrix,
-    columns: NDArray[np.int64],
+    columns: Indices,
     both: Sampled,
     x: Vector,
     skipped: int,
@@ -200,13 +201,7 @@ def chains(a: Vector, v: Matrix) -> Bank:
 
 
 def gradient(
-    a: Vector,
-    B: Matrix,
-    start: Vector,
-    columns: NDArray[np.int64],
-    skipped: int,
-    v: Matrix,
-    size: int,
+    a: Vector, B: Matrix, start: Vector, columns: Indices, skipped: int, v: Matrix, size: int
 ) -> tuple[Vector, Matrix]:
     """Return y (N,) of a model in observable companion form, and its derivatives (N, size).
 

@@ -21,8 +21,7 @@ _PASSES, _SETTLED = 12, 5e-4
 # Range of ω_a²/ω_r² and most trials for the driven side. The ratio is J₁'s share of both inertias;
 # a driven side of less than a tenth of them is rare. The number of trials is chosen by hand.
 _SHARES, _TRIALS = (0.1, 1.0), 10
-# Steps of the refinement on the way, and most of them at the end: chosen by hand; not tuned
-# further.
+# Steps of the refinement on the way, and most of them at the end: chosen by hand, not tuned.
 _FEW_STEPS, _STEPS = 2, 30
 # A pole is set to s = 0 within three standard deviations of it (99.7 %), or if its time constant is
 # more than ten times the record (chosen by hand). For two poles, χ² with two degrees of freedom
@@ -76,14 +75,11 @@ def fit(
     v = _columns(u, delays[0], bias, [measured_sign(y, _HALF_WIDTH)] if friction else [])
     starts = initial_estimates(structure, v, y)
     steps = _FEW_STEPS if len(starts) == 1 else _STEPS
-    estimate = min(
-        (refine(structure, theta, v, y, steps) for theta in starts), key=lambda one: one.cost
-    )
+    refined = (refine(structure, theta, v, y, steps) for theta in starts)
+    estimate = min(refined, key=lambda one: one.cost)
     if not np.isfinite(estimate.cost):
-        raise ValueError(
-            f"order = {order}, zeros = {zeros}: no model was found whose output is finite; "
-            "lower the order, or scale u and y"
-        )
+        none = "no model was found whose output is finite; lower the order, or scale u and y"
+        raise ValueError(f"order = {order}, zeros = {zeros}: {none}")
     delay, estimate, v = _best_delay(structure, estimate, u, v, y, delays, delays[0])
     if integrators is None:
         structure, estimate = _set_integrators(structure, estimate, v, y)

@@ -24,8 +24,7 @@ from quell.identification.search import Fit
 from quell.identification.structure import free_run, lengths
 from quell.types import Matrix, Vector
 
-# Rounds in which the start and the signs of friction are adapted to each other: chosen by hand; not
-# tuned further.
+# Rounds that adapt the start and the signs of friction to each other: chosen by hand, not tuned.
 _ROUNDS = 6
 # Relative singular value that counts as zero.
 _RANK = 1e-12
@@ -39,8 +38,8 @@ class Residuals(NamedTuple):
     autocorrelation: Vector  #: R_ε(τ)/R_ε(0) for τ = 0 … M (M + 1,)
     whiteness: float  #: ζ
     whiteness_limit: float  #: limit that ζ of a white sequence exceeds with 1 % probability
+    #: correlation of ε and u, of variance 1, for ε later by τ = −M … M samples (2 M + 1,)
     cross_correlation: Vector
-    """Correlation of ε and u, of variance 1, for ε later by τ = −M … M samples (2 M + 1,)."""
     cross_limit: float  #: limit that 1 % of them exceed if ε does not depend on u
 
     @property
@@ -85,10 +84,7 @@ def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
 def _finite(predicted: Vector) -> Vector:
     """Return a simulated output if it is finite."""
     if not np.all(np.isfinite(predicted)):
-        raise ValueError(
-            "order: the simulation of the fitted model is unstable; "
-            "lower the order, or give integrators"
-        )
+        raise ValueError("order: the fitted model is unstable; lower the order, or set integrators")
     return predicted
 
 

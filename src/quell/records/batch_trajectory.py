@@ -35,44 +35,23 @@ class BatchTrajectory(Record):
     ``x_hat`` and ``theta``; ``runs.t`` are their times [s]. After the end of a run that diverged,
     its samples are NaN. ``runs.run(i)`` is the i-th run as a ``Trajectory``.
 
-    Attributes
-    ----------
-    log : (runs, samples, columns) array
-        the recorded channels side by side.
-    channels : tuple of (name, width)
-        the columns, in order.
-    dt : float
-        sample time of the runs [s]; every ``every``-th sample was recorded.
-    lengths : (runs,) array
-        number of recorded samples of each run.
-    status : (runs,) array
-        all ``Status`` flags that any step of a run reported, and ``DIVERGED`` if it ended early;
-        ``message`` is their summary.
-    ended : (runs,) array
-        time at which each run ended [s].
-    limit : (runs,) array
-        the ``|y|`` beyond which a run would have been ended [y-unit].
-    plant : str
-        name of the plants.
-    parameters : dict of (runs,) arrays
-        the parameters in which the plants differ.
-    features : tuple of str
-        names of the features that the entries of ``theta`` multiply.
-    final_states : tuple
-        the controllers' states at the end; ``controller.read(runs.final_states[i])`` explains one.
+    ``status`` has all ``Status`` flags that any step of a run reported, and ``DIVERGED`` if it
+    ended early; ``message`` is their summary. ``controller.read(runs.final_states[i])`` explains
+    the state of a controller at the end.
     """
 
-    log: Matrix
-    channels: Channels
-    dt: float
-    every: int
-    lengths: NDArray[np.int64]
-    status: NDArray[np.int64]
-    ended: Vector
-    limit: Vector
-    plant: str = ""
+    log: Matrix  #: the recorded channels side by side (runs, samples, columns)
+    channels: Channels  #: name and width of the channels, in the order of the columns
+    dt: float  #: sample time of the runs [s]
+    every: int  #: every ``every``-th sample was recorded
+    lengths: NDArray[np.int64]  #: number of recorded samples of each run (runs,)
+    status: NDArray[np.int64]  #: flags of each run (runs,)
+    ended: Vector  #: time at which each run ended [s] (runs,)
+    limit: Vector  #: the ``|y|`` beyond which a run would have been ended [y-unit] (runs,)
+    plant: str = ""  #: name of the plants
+    #: the parameters in which the plants differ, by name (runs,)
     parameters: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    features: tuple[str, ...] = ()
+    features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
     final_states: tuple[Any, ...] = ()
 
     @property
@@ -84,9 +63,8 @@ class BatchTrajectory(Record):
     def message(self) -> str:
         """The number of runs that reported each flag, and the time at which the first diverged."""
         counts = [(np.count_nonzero(self.status & int(flag)), flag.message) for flag in Status]
-        sentences = [
-            f"{count} of {len(self)} runs: {message}" for count, message in counts if count
-        ]
+        runs = len(self)
+        sentences = [f"{count} of {runs} runs: {message}" for count, message in counts if count]
         if np.any(self.diverged):
             first = int(np.argmin(np.where(self.diverged, self.ended, np.inf)))
             sentences.append(f"The first to diverge was run {first}, at {self.ended[first]:.6g} s.")
@@ -183,13 +161,7 @@ class BatchTrajectory(Record):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> BatchTrajectory:
-        """Return the record that ``save`` wrote, without ``final_states``.
-
-        Raises
-        ------
-        ValueError
-            if the file is not such a record.
-        """
+        """Return the record that ``save`` wrote, without ``final_states``."""
         required = {"dt", "every", "plant", *_PER_RUN}
         data = read_dataset(path, "BatchTrajectory.save", ("run", "time"), required)
         return cls(

@@ -28,9 +28,8 @@ def settling_time(
     outside at the end.
     """
     t, y = _pair(t, y)
-    width = checks.positive("band", band) * abs(
-        checks.nonzero("target - initial", target - initial, "there is no move to settle")
-    )
+    move = checks.nonzero("target - initial", target - initial, "there is no move to settle")
+    width = checks.positive("band", band) * abs(move)
     outside = np.flatnonzero(np.abs(y - target) > width)
     if outside.size == 0:
         return 0.0
@@ -42,9 +41,8 @@ def settling_time(
 def rise_time(t: Vector, y: Vector, target: float, initial: float = 0.0) -> float:
     """Return the time from 10 % to 90 % of the step, interpolated [s]; NaN if y stays below."""
     t, y = _pair(t, y)
-    done = (y - initial) / checks.nonzero(
-        "target - initial", target - initial, "there is no move to rise"
-    )
+    move = checks.nonzero("target - initial", target - initial, "there is no move to rise")
+    done = (y - initial) / move
     return _first_crossing(t, done, 0.9) - _first_crossing(t, done, 0.1)
 
 
@@ -95,15 +93,12 @@ def _first_crossing(t: Vector, done: Vector, level: float) -> float:
 def _record(values: ArrayLike) -> Vector:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1 or array.size == 0:
-        raise ValueError(
-            f"record has shape {array.shape}: must be a vector of at least one sample; "
-            "widen the window of time"
-        )
+        rule = "must be a vector of at least one sample; widen the window of time"
+        raise ValueError(f"record has shape {array.shape}: {rule}")
     if not np.all(np.isfinite(array)):
         sample = int(np.argmin(np.isfinite(array)))
-        raise ValueError(
-            f"record has a value that is not finite at sample {sample}: take only what is before it"
-        )
+        fault = f"a value that is not finite at sample {sample}"
+        raise ValueError(f"record has {fault}: take only what is before it")
     return array
 
 

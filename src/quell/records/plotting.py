@@ -52,11 +52,9 @@ def plot_run(run: Record, diverged_at: float | None, axes: Any = None) -> Any:
     guarded = "authority" in run.names
     if axes is None:
         axes = _new_axes(4 if guarded else 3, 2.3)
-    if np.size(axes) not in (3, 4) or (np.size(axes) == 4 and not guarded):
-        raise ValueError(
-            "axes: must be three matplotlib axes, or four for a run with a guard, "
-            f"got {np.size(axes)}"
-        )
+    if np.size(axes) not in ((3, 4) if guarded else (3,)):
+        rule = "must be three matplotlib axes, or four for a run with a guard"
+        raise ValueError(f"axes: {rule}, got {np.size(axes)}")
     t = run.t
     draw_line(axes[0], t, run["y"], label="y", color="C0")
     draw_line(axes[0], t, run["r"], label="r", color="0.3", linestyle="--", linewidth=1.0)
@@ -147,9 +145,7 @@ def _draw_guard(run: Record, ax: Any) -> None:
         at = t[run["reason"] == reason]
         if at.size:
             at = at[:: max(at.size // 500, 1)]
-            heights, label = (
-                np.full(at.size, -0.08 - 0.06 * i),
-                reason.name.lower().replace("_", " "),
-            )
+            heights = np.full(at.size, -0.08 - 0.06 * i)
+            label = reason.name.lower().replace("_", " ")
             ax.plot(at, heights, "|", markersize=4.0, color=f"C{5 + i}", label=label)
     ax.set_ylim(-0.45, 2.1)  # room for the legend

@@ -86,11 +86,6 @@ def read_dataset(
     """Return the dataset that ``writer`` wrote to a NetCDF file.
 
     It must have channels over ``axes``, and the ``required`` attributes or variables.
-
-    Raises
-    ------
-    ValueError
-        if the file is not such a record.
     """
     import xarray
 
@@ -103,17 +98,12 @@ def read_dataset(
     except (OSError, ValueError) as error:
         raise ValueError(f"{where}: must be a NetCDF file written by {writer} ({error})") from None
     missing = required - set(data.attrs) - set(map(str, data.variables))
-    if missing:
-        raise ValueError(
-            f"{where}: has no {', '.join(sorted(missing))}: it was not written by {writer}"
-        )
-    if "time" not in data.sizes or any(
-        data[name].dims[: len(axes)] != axes for name in data.data_vars
-    ):
-        raise ValueError(
-            f"{where}: has channels that are not over {' and '.join(axes)}: "
-            f"it was not written by {writer}"
-        )
+    fault = f"has no {', '.join(sorted(missing))}" if missing else ""
+    over = all(data[name].dims[: len(axes)] == axes for name in data.data_vars)
+    if not fault and not ("time" in data.sizes and over):
+        fault = f"has channels that are not over {' and '.join(axes)}"
+    if fault:
+        raise ValueError(f"{where}: {fault}: it was not written by {writer}")
     return data
 
 

@@ -1,4 +1,4 @@
-"""Conversion of times to sample numbers, exact in spite of rounding."""
+"""Conversion of times to sample numbers, unaffected by rounding."""
 
 from __future__ import annotations
 

@@ -25,39 +25,20 @@ class Trajectory(Record):
     ``run["y"]`` is a channel: (samples,), or (samples, width) for ``w``, ``x``, ``x_hat`` and
     ``theta``; ``run.t`` are its times [s]. ``f_hat = f_learned + f_residual`` is computed.
 
-    Attributes
-    ----------
-    log : (samples, columns) array
-        all channels side by side.
-    channels : tuple of (name, width)
-        the columns, in order.
-    dt : float
-        sample time of the run [s]; every ``every``-th sample was recorded.
-    status : Status
-        all flags that any step reported, and ``DIVERGED`` if the run ended early; ``message``
-        explains them.
-    ended : float
-        time at which the run ended [s].
-    limit : float
-        the ``|y|`` beyond which the run would have been ended [y-unit].
-    plant : str
-        name of the plant.
-    features : tuple of str
-        names of the features that the entries of ``theta`` multiply.
-    final_state
-        the controller's state at the end, a NamedTuple; ``controller.read(run.final_state)``
-        explains it.
+    ``status`` has all flags that any step reported, and ``DIVERGED`` if the run ended early;
+    ``message`` explains them. ``controller.read(run.final_state)`` explains the controller's state
+    at the end.
     """
 
-    log: Matrix
-    channels: Channels
-    dt: float
-    every: int = 1
+    log: Matrix  #: all channels side by side (samples, columns)
+    channels: Channels  #: name and width of the channels, in the order of the columns
+    dt: float  #: sample time of the run [s]
+    every: int = 1  #: every ``every``-th sample was recorded
     status: Status = Status.OK
-    ended: float = 0.0
-    limit: float = math.inf
-    plant: str = ""
-    features: tuple[str, ...] = ()
+    ended: float = 0.0  #: time at which the run ended [s]
+    limit: float = math.inf  #: the ``|y|`` beyond which the run would have been ended [y-unit]
+    plant: str = ""  #: name of the plant
+    features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
     final_state: Any = None
 
     @property
@@ -173,13 +154,7 @@ class Trajectory(Record):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trajectory:
-        """Return the record that ``save`` wrote, without ``final_state``.
-
-        Raises
-        ------
-        ValueError
-            if the file is not such a record.
-        """
+        """Return the record that ``save`` wrote, without ``final_state``."""
         required = {"dt", "every", "status", "ended", "plant"}
         data = read_dataset(path, "Trajectory.save", ("time",), required)
         return cls(

@@ -29,22 +29,10 @@ class Builder:
         self.name = name
 
     def build(self, table: CallTable, path: str, **context: Any) -> Any:
-        """Return the object that a table describes.
+        """Return the object that a table describes; ``path`` is its place in the file.
 
-        Parameters
-        ----------
-        table
-            the table.
-        path
-            its path in the file.
-        **context
-            objects of other tables. Those that the table's function takes, and that the table does
-            not have itself, become arguments; None stands for a missing one.
-
-        Raises
-        ------
-        SetupError
-            for a value that the function refuses, and for an argument that is missing.
+        ``context`` has objects of other tables, None for a missing one. Those that the table's
+        function takes, and that the table does not have itself, become arguments.
         """
         takes = inspect.signature(table.function).parameters
         arguments = {
@@ -54,25 +42,15 @@ class Builder:
         for key, value in table.written().items():
             arguments[key] = self._value(value, f"{path}.{key}", key != "disturbances", inner)
         for key, parameter in takes.items():
-            optional = parameter.default is not parameter.empty
-            if (
-                key not in arguments
-                and not optional
-                and parameter.kind is not parameter.VAR_KEYWORD
-            ):
+            needed = parameter.default is parameter.empty
+            if needed and key not in arguments and parameter.kind is not parameter.VAR_KEYWORD:
                 raise SetupError([f"{self.name}: {path}: {key} is missing; give a table [{key}]"])
         return self.attempt(path, [*arguments], partial(table.function, **arguments))
 
     def attempt(
         self, path: str, keys: Sequence[str], action: Callable[..., Any], *arguments: Any
     ) -> Any:
-        """Return ``action(*arguments)``; an error names the path and, if possible, the key.
-
-        Raises
-        ------
-        SetupError
-            in place of a ``ValueError``.
-        """
+        """Return ``action(*arguments)``; an error names the path and, if possible, the key."""
         try:
             return action(*arguments)
         except ValueError as error:
@@ -85,9 +63,8 @@ class Builder:
             return linear_part(built) if path in _MODELS else built
         if not isinstance(value, tuple):
             return value
-        parts = tuple(
-            self._value(part, f"{path}[{i}]", True, context) for i, part in enumerate(value)
-        )
+        entries = enumerate(value)
+        parts = tuple(self._value(part, f"{path}[{i}]", True, context) for i, part in entries)
         if add_up and any(isinstance(part, Features | Signal) for part in parts):
             return self.attempt(path, (), reduce, add, parts)
         return parts

@@ -60,13 +60,7 @@ class Description(Table):
 
 
 def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
-    """Return the name of a TOML file, for messages, and its content.
-
-    Raises
-    ------
-    SetupError
-        for a file that cannot be read, or is not TOML.
-    """
+    """Return the name of a TOML file, for messages, and its content."""
     name = Path(path).name
     try:
         return name, tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -81,13 +75,7 @@ def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
 
 
 def describe(name: str, data: Mapping[str, Any]) -> Description:
-    """Return the tables of ``data``, the content of the file ``name``.
-
-    Raises
-    ------
-    SetupError
-        with a line for each error.
-    """
+    """Return the tables of ``data``, the content of the file ``name``."""
     values = _immutable(data)
     try:
         return Description.model_validate(values)

@@ -12,12 +12,8 @@ from quell.setup.schema import CONTEXT
 
 # Pydantic's names of type errors, and the type that is expected.
 _TYPES = {
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "bool_type": "true or false",
-    "string_type": "a text",
-    "tuple_type": "a list",
-    "model_type": "a table",
+    **{"float_type": "a number", "int_type": "a whole number", "bool_type": "true or false"},
+    **{"string_type": "a text", "tuple_type": "a list", "model_type": "a table"},
 }
 
 
@@ -48,30 +44,23 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
         path = _path(found["loc"], data, absent=kind == "missing")
         if kind in _TYPES:
             one_of_many = kind == "tuple_type" and isinstance(value, Mapping)
-            expected.setdefault(f"{path} = {_short(value)}: must be", []).append(
-                f"[[{path}]]" if one_of_many else _TYPES[kind]
-            )
+            types = expected.setdefault(f"{path} = {_short(value)}: must be", [])
+            types.append(f"[[{path}]]" if one_of_many else _TYPES[kind])
         elif kind == "unknown":
-            lines += [
-                f"{path}{'.' if path else ''}{key}: unknown; {_hint(key, context['known'])}"
-                for key in context["keys"]
-            ]
+            start, known = f"{path}." if path else "", context["known"]
+            lines += [f"{start}{key}: unknown; {_hint(key, known)}" for key in context["keys"]]
         elif kind == "missing":
             lines.append(f"{path}: missing")
         elif kind == "union_tag_invalid" and isinstance(value, Mapping):
-            lines.append(
-                f"{path}.kind = {_short(value['kind'])}: unknown; "
-                f"{nearest(str(value['kind']), _tags(context))}"
-            )
+            hint = nearest(str(value["kind"]), _tags(context))
+            lines.append(f"{path}.kind = {_short(value['kind'])}: unknown; {hint}")
+        elif kind == "union_tag_not_found" and isinstance(value, Mapping):
+            lines.append(f"{path}.kind: missing")
         elif kind in ("union_tag_not_found", "union_tag_invalid"):
-            lines.append(
-                f"{path}.kind: missing"
-                if isinstance(value, Mapping)
-                else f"{path} = {_short(value)}: must be a table"
-            )
+            lines.append(f"{path} = {_short(value)}: must be a table")
         else:
             lines.append(f"{path} = {_short(value)}: {found['msg']}")
-    lines += [f"{line} {' or '.join(dict.fromkeys(types))}" for line, types in expected.items()]
+    lines += [f"{line} {' or '.join(dict.fromkeys(names))}" for line, names in expected.items()]
     return SetupError([f"{name}: {line}" for line in lines])
 
 

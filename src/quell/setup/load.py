@@ -27,34 +27,17 @@ EXAMPLES = Path(__file__).parent / "examples"
 class Setup:
     """The objects that a setup file describes.
 
-    Attributes
-    ----------
-    file : str
-        name of the file.
-    title : str
-        title of tables and figures.
-    controller
-        the controller, behind its prefilter if it has one; its ``dt`` is the loop's.
-    plant
-        the plant, or None.
-    scenario : Scenario
-        the scenario, or None.
-    rig : dict
-        the arguments of ``run_rig`` and ``live``, or None.
-    windows : tuple of dict
-        for each window in which the response is judged the arguments of ``Trajectory.metrics``.
-    description : Description
-        the file's own tables.
+    Optional parts that the file does not have are None.
     """
 
-    file: str
-    title: str
-    controller: Controller
-    plant: Plant | None
-    scenario: Scenario | None
-    rig: dict[str, Any] | None
-    windows: tuple[dict[str, Any], ...]
-    description: Description
+    file: str  #: name of the file
+    title: str  #: title of tables and figures
+    controller: Controller  #: behind its prefilter if it has one; its ``dt`` is the loop's
+    plant: Plant | None  #: the plant
+    scenario: Scenario | None  #: the scenario
+    rig: dict[str, Any] | None  #: arguments of ``run_rig``, and ``live``
+    windows: tuple[dict[str, Any], ...]  #: arguments of ``Trajectory.metrics`` for each window
+    description: Description  #: the file's own tables
 
     def as_json(self) -> dict[str, Any]:
         """Return the file's tables for ``quell.files.write_json``; infinite numbers become None."""
@@ -62,13 +45,7 @@ class Setup:
         return tables
 
     def needed(self, table: str) -> Any:
-        """Return the object of an optional table.
-
-        Raises
-        ------
-        SetupError
-            where the file does not have the table.
-        """
+        """Return the object of an optional table; raise a ``SetupError`` if it is missing."""
         if getattr(self, table) is None:
             raise SetupError([f"{self.file}: {table}: missing; give a table [{table}]"])
         return getattr(self, table)
@@ -77,11 +54,8 @@ class Setup:
 def load(path: str | os.PathLike[str]) -> Setup:
     r"""Read a TOML file and build the objects that it describes.
 
-    Raises
-    ------
-    SetupError
-        with a line for each error: the file, the key's path, the value and the rule, or the nearest
-        known name.
+    A ``SetupError`` has a line for each error: file, path of the key, value and rule, or the
+    nearest known name.
 
     Examples
     --------
@@ -101,13 +75,7 @@ def load(path: str | os.PathLike[str]) -> Setup:
 
 
 def made(name: str, data: Mapping[str, Any]) -> Setup:
-    """Build the objects that ``data`` describes: the content of a TOML file called ``name``.
-
-    Raises
-    ------
-    SetupError
-        as ``load``.
-    """
+    """Build the objects that ``data`` describes: the content of a TOML file called ``name``."""
     tables, builder = describe(name, data), Builder(name)
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
 
@@ -121,10 +89,8 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
     kind, used = tables.controller.kind_name, tables.controller.context
     unused = [key for key, part in parts.items() if part is not None and key not in used]
     if unused:
-        lines = [
-            f"{name}: {key}: a controller of the kind {kind} does not use it" for key in unused
-        ]
-        raise SetupError(lines)
+        rule = f"a controller of the kind {kind} does not use it"
+        raise SetupError([f"{name}: {key}: {rule}" for key in unused])
     controller = build("controller", plant=model, **parts)
     prefilter, scenario, rig = build("prefilter"), build("scenario"), build("rig")
     if prefilter is not None:

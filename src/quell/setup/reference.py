@@ -29,9 +29,8 @@ def table(of: type[Table]) -> str:
         f"| `{key}` | {kind} | {default} | {text.replace('|', bar)} |"
         for key, kind, default, text in keys(of)
     ]
-    return "\n".join(
-        ["| key | type | default | |", "|---|---|---|---|", *rows] if rows else []
-    ).replace("``", "`")
+    heading = ["| key | type | default | |", "|---|---|---|---|"]
+    return "\n".join(heading + rows if rows else []).replace("``", "`")
 
 
 def markdown(kinds: Mapping[str, type[CallTable]]) -> str:
@@ -55,10 +54,8 @@ def _type(annotation: Any) -> str:
     """Return the name of a type in TOML."""
     if annotation in _TYPES:
         return _TYPES[annotation]
-    origin, inside = (
-        get_origin(annotation),
-        [part for part in get_args(annotation) if part is not types.NoneType],
-    )
+    origin = get_origin(annotation)
+    inside = [part for part in get_args(annotation) if part is not types.NoneType]
     if origin is tuple:
         return "list"
     if origin in (Union, types.UnionType):

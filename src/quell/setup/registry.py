@@ -72,17 +72,13 @@ def _switchable(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
         if until is None and then is None:
             return signal
         if until is None or then is None:
-            raise ValueError(
-                "only one of until and then: must be both, "
-                "the time [s] and the signal or number that holds from it on"
-            )
+            rule = "must be both, the time [s] and the signal or number that holds from it on"
+            raise ValueError(f"only one of until and then: {rule}")
         return signal.until(until, then)
 
     own, more = inspect.signature(cls, eval_str=True), inspect.signature(make, eval_str=True)
-    added = [
-        more.parameters[key].replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        for key in ("until", "then")
-    ]
+    only, keys = inspect.Parameter.KEYWORD_ONLY, ("until", "then")
+    added = [more.parameters[key].replace(kind=only) for key in keys]
     make.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
     make.__doc__ = cls.__doc__
     return make
@@ -94,14 +90,10 @@ _SWITCHING = {
     "until": "time at which `then` takes over [s].",
     "then": "signal or number from `until` on.",
 }
-SIGNALS = {
-    kind: call_table(
-        kind, _switchable(cls), types={"then": "Signal | None"}, descriptions=_SWITCHING
-    )
-    for kind, cls in signals.KINDS.items()
-}
+_SWITCHABLE = {kind: _switchable(cls) for kind, cls in signals.KINDS.items()}
+SIGNALS = _call_tables(_SWITCHABLE, {"then": "Signal | None"}, _SWITCHING)
 Plant: Any = one_of(PLANTS)
-Signal: Any = one_of(SIGNALS, number=True, several=one_of(SIGNALS, number=True))
+Signal: Any = one_of(SIGNALS, number=True, many=one_of(SIGNALS, number=True))
 for _model in (*PLANTS.values(), *SIGNALS.values()):
     _model.model_rebuild(_types_namespace={"Plant": Plant, "Signal": Signal})
 
@@ -126,54 +118,29 @@ LEARNERS = _call_tables(
     _public_classes(learners, "design", "memory"), {"features": list_of(one_of(FEATURES)) | None}
 )
 Notch = call_table("notch", notch.Notch.at, only=True)
-CONTROLLERS = {
-    "adrc": call_table("adrc", ADRC),
-    "pid": call_table("pid", PID, forwards_to=(LinearController,)),
-    "pid-simc": call_table("pid-simc", PID.simc, forwards_to=(PID, LinearController)),
-    "pid-simc-double-integrator": call_table(
-        "pid-simc-double-integrator",
-        PID.simc_double_integrator,
-        forwards_to=(PID, LinearController),
-    ),
-    "notch-pid": call_table(
-        "notch-pid", NotchPID, forwards_to=(PID, LinearController), types={"notch": Notch}
-    ),
-    "lqg": call_table(
-        "lqg",
-        LQG,
-        forwards_to=(LinearController,),
-        types={"plant": Plant | None},
-        descriptions=_MODEL,
-    ),
-    "resonance-ratio": call_table(
-        "resonance-ratio", ResonanceRatio, forwards_to=(LinearController,)
-    ),
-}
+_DOUBLE_INTEGRATOR = "pid-simc-double-integrator"
+_PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, LinearController)
+_CONTROLLERS = (
+    call_table("adrc", ADRC),
+    call_table("pid", PID, forwards_to=_LINEAR),
+    call_table("pid-simc", PID.simc, forwards_to=_PID),
+    call_table(_DOUBLE_INTEGRATOR, PID.simc_double_integrator, forwards_to=_PID),
+    call_table("notch-pid", NotchPID, forwards_to=_PID, types={"notch": Notch}),
+    call_table("lqg", LQG, forwards_to=_LINEAR, types=_PLANT, descriptions=_MODEL),
+    call_table("resonance-ratio", ResonanceRatio, forwards_to=_LINEAR),
+)
+CONTROLLERS = {table.kind_name: table for table in _CONTROLLERS}
 PREFILTERS = _call_tables(
-    {
-        "reference-model": ReferenceModel,
-        "tracking-differentiator": TrackingDifferentiator,
-        "zv": ZV,
-        "zvd": ZVD,
-        "shaper": Shaper,
-    }
+    {"reference-model": ReferenceModel, "tracking-differentiator": TrackingDifferentiator}
+    | {"zv": ZV, "zvd": ZVD, "shaper": Shaper}
 )
 Observer, Learner, Prefilter = one_of(OBSERVERS), one_of(LEARNERS), one_of(PREFILTERS)
 Controller = one_of(CONTROLLERS, default="adrc")
 Guard = call_table("guard", guard.Guard, only=True)
-Scenario = call_table(
-    "scenario",
-    SimulationScenario,
-    only=True,
-    types={"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)},
-)
+_SIGNALS = {"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)}
+Scenario = call_table("scenario", SimulationScenario, only=True, types=_SIGNALS)
 Metrics = call_table("metrics", Trajectory.metrics, only=True)
 Safety = call_table("safety", RigSafety, only=True)
-Rig = call_table(
-    "rig",
-    rig,
-    only=True,
-    forwards_to=(run_rig,),
-    types={"safety": Safety | None, "telemetry": list_of(str)},
-    without=("duration", "on_change"),
-)
+_RIG = {"safety": Safety | None, "telemetry": list_of(str)}
+_NO_KEYS = ("duration", "on_change")
+Rig = call_table("rig", rig, only=True, forwards_to=(run_rig,), types=_RIG, without=_NO_KEYS)

@@ -55,7 +55,7 @@ class Table(BaseModel):
 class CallTable(Table):
     """A table that is a call of a function."""
 
-    function: ClassVar[Callable[..., Any]]  # the function
+    function: ClassVar[Callable[..., Any]]
     kind_name: ClassVar[str]  # the value of its key ``kind``
     context: ClassVar[tuple[str, ...]]  # the parameters that other tables of the file give
 
@@ -74,19 +74,13 @@ def call_table(
 
     Parameters
     ----------
-    kind
-        the name of the kind.
-    function
-        the function.
     only
         the table has no other kinds, and no key ``kind``.
     forwards_to
         functions that ``function`` forwards its ``**options`` to: their keyword-only parameters are
         keys, too.
-    types
-        types of keys that are tables, by name.
-    descriptions
-        descriptions that are not in the docstring, by name.
+    types, descriptions
+        types of keys that are tables, and descriptions that are not in the docstring, by name.
     without
         parameters that are no keys.
     """
@@ -95,10 +89,9 @@ def call_table(
         fields["kind"] = (Literal[kind], Field(kind, description="which one."))
     known: dict[str, str] = {}
     for called in (*reversed(forwards_to), function):
-        described = parameter_descriptions(called).items()
-        known |= {
-            key: text for key, text in described if not is_reference(text) or key not in known
-        }
+        for key, text in parameter_descriptions(called).items():
+            if key not in known or not is_reference(text):
+                known[key] = text
     known |= descriptions or {}
     context = []
     for called in (function, *forwards_to):
@@ -119,24 +112,12 @@ def call_table(
 
 
 def one_of(
-    tables: Mapping[str, Any],
-    default: str | None = None,
-    *,
-    number: bool = False,
-    several: Any = None,
+    tables: Mapping[str, Any], default: str | None = None, *, number: bool = False, many: Any = None
 ) -> Any:
     """Return the type of a table of one of several kinds; a text in its place is its kind.
 
-    Parameters
-    ----------
-    tables
-        the tables, by kind.
-    default
-        the kind of a table without the key ``kind``.
-    number
-        allow a number in place of the table.
-    several
-        type of the entries of a list in place of the table; no list by default.
+    ``default`` is the kind of a table without the key ``kind``. In place of the table there may be
+    a number if ``number``, and a list of ``many``, if it is given.
     """
 
     def tag(value: Any) -> str | None:
@@ -144,13 +125,13 @@ def one_of(
             return value.kind_name
         if isinstance(value, Mapping):
             return value.get("kind", default)
-        if isinstance(value, tuple) and several is not None:
+        if isinstance(value, tuple) and many is not None:
             return "list"
         return "number" if number else None
 
     choices: list[Any] = [Annotated[model, Tag(kind)] for kind, model in tables.items()]
     choices += [Annotated[float, Tag("number")]] if number else []
-    choices += [Annotated[list_of(several), Tag("list")]] if several is not None else []
+    choices += [Annotated[list_of(many), Tag("list")]] if many is not None else []
     return Annotated[_union(choices), Discriminator(tag), BeforeValidator(_text_to_table)]
 
 

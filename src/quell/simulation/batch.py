@@ -124,11 +124,8 @@ def _members(
         else:
             for i in range(runs):
                 check[name](value[i], f"{name}[{i}]")
-    plants, controllers, scenarios = (
-        given["plant"],
-        list(given["controller"]),
-        list(given["scenario"]),
-    )
+    plants = given["plant"]
+    controllers, scenarios = list(given["controller"]), list(given["scenario"])
     if "plant" in lengths and not isinstance(plants, PlantBatch):
         plants = PlantBatch(plants)
     for i, other in enumerate(controllers):
@@ -143,10 +140,7 @@ def _members(
 
 
 def _sampled(
-    scenarios: Sequence[Scenario],
-    plant: Plant,
-    controllers: Sequence[Controller],
-    limit: float | None,
+    scenarios: Sequence[Scenario], plant: Plant, controllers: Sequence[Controller], limit: Any
 ) -> list[SampledScenario]:
     """Return the sampled scenario of each run; runs of one scenario share theirs."""
     found: dict[tuple[int, int], SampledScenario] = {}

@@ -61,9 +61,8 @@ class SampledScenario:
                 f"{_MOST_SAMPLES:.0e} samples"
             )
         samples = math.floor(in_steps(duration, dt)) + 1
-        x0 = np.zeros(plant.order)
-        if scenario.x0 is not None:
-            x0 = checks.vector("x0", scenario.x0, plant.order)
+        given = scenario.x0
+        x0 = np.zeros(plant.order) if given is None else checks.vector("x0", given, plant.order)
         signals = scenario.seeded_signals(plant.disturbances)
         if limit is None:
             limit = _default_limit(signals[0], x0, samples, dt)

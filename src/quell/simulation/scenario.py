@@ -35,12 +35,6 @@ class Scenario:
         keeps what it has learned.
     seed
         seed of all random signals; the same seed gives the same bits.
-
-    Raises
-    ------
-    ValueError
-        if the duration is not positive, the seed is negative, a signal is none, or the times in
-        ``rest_at`` do not increase within the duration.
     """
 
     reference: Signal | float = 0.0
@@ -58,27 +52,20 @@ class Scenario:
         as_signal(self.noise, "noise")
         if not isinstance(self.disturbances, Sequence):
             raise ValueError(
-                f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers, "
-                "one for each input"
+                f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers"
             )
         for i, disturbance in enumerate(self.disturbances):
             as_signal(disturbance, f"disturbances[{i}]")
-        times = checks.vector("rest_at", self.rest_at)
-        if times.size and (
-            np.any(np.diff(times) <= 0.0) or times[0] <= 0.0 or times[-1] >= self.duration
-        ):
-            raise ValueError(
-                f"rest_at = {self.rest_at!r}: must increase and lie within "
-                f"(0, duration = {self.duration!r})"
-            )
+        times = np.array([0.0, *checks.vector("rest_at", self.rest_at), self.duration])
+        if np.any(np.diff(times) <= 0.0):
+            rule = f"must increase and lie within (0, duration = {self.duration!r})"
+            raise ValueError(f"rest_at = {self.rest_at!r}: {rule}")
 
     def seeded_signals(self, inputs: int) -> tuple[Signal, tuple[Signal, ...], Signal]:
         """Return the reference, ``inputs`` disturbances and the noise, seeded."""
         if len(self.disturbances) > inputs:
-            raise ValueError(
-                f"disturbances has {len(self.disturbances)} signals: the plant has {inputs} "
-                "disturbance inputs"
-            )
+            plant = f"the plant has {inputs} disturbance inputs"
+            raise ValueError(f"disturbances has {len(self.disturbances)} signals: {plant}")
         given = (as_signal(self.reference), *map(as_signal, self.disturbances))
         noise = as_signal(self.noise).seeded(self.seed)
         # The noise has the seed itself: its bits must not depend on the number of disturbances.

@@ -94,12 +94,6 @@ def simulate(
     -------
     Trajectory or BatchTrajectory
         the recorded samples, up to the end of the run.
-
-    Raises
-    ------
-    ValueError
-        for arguments out of range, a plant that ``LinearPlant.of`` refuses, an x0 of the wrong
-        size, more disturbances than the plant has inputs, or runs that do not fit into one batch.
     """
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
@@ -109,10 +103,8 @@ def simulate(
         )
     for name, value in (("record", record), ("workers", workers)):
         if value is not None:
-            raise ValueError(
-                f"{name} = {value!r}: is for a batch; a single run records all channels, "
-                "in this thread"
-            )
+            rule = "is for a batch; a single run records all channels, in this thread"
+            raise ValueError(f"{name} = {value!r}: {rule}")
     check_plant(plant)
     check_controller(controller)
     check_scenario(scenario)

@@ -50,10 +50,7 @@ def acc(
         plants = plant_samples.generated(1000 if count is None else count, spread, seed)
         source = f"generated, spread {spread:g}, seed {seed}"
     elif not (count is None and spread is None and seed is None):
-        raise ValueError(
-            "--samples reads plants, --count, --spread and --seed are for drawing them: give one "
-            "or the other"
-        )
+        raise ValueError("--samples: must be without --count, --spread, --seed, which draw plants")
     else:
         plants, source = plant_samples.read(samples), samples.name
     check_outputs(outputs)
@@ -71,12 +68,10 @@ def acc(
 
 
 def _print_rates(console: Console, result: Result, dt: float) -> None:
-    headings = [
-        f"{spring}\n{what}" for spring in result.judged for what in ("[%]", "95 % interval [%]")
-    ]
-    rows = table(
-        f"Plants that fail, of {len(result.samples)} ({result.source})", "controller", *headings
-    )
+    units = ("[%]", "95 % interval [%]")
+    headings = [f"{spring}\n{unit}" for spring in result.judged for unit in units]
+    title = f"Plants that fail, of {len(result.samples)} ({result.source})"
+    rows = table(title, "controller", *headings)
     for name in next(iter(result.judged.values())):
         cells = []
         for judged in result.judged.values():
@@ -87,38 +82,25 @@ def _print_rates(console: Console, result: Result, dt: float) -> None:
     console.print(rows)
     console.print(
         "A plant fails where the loop is unstable, |y| > 0.1 m at any time from 15 s on, or |u| > "
-        "0.5 N at any time; "
-        "30 s after a unit impulse on m2.\n"
+        "0.5 N at any time; 30 s after a unit impulse on m2.\n"
         f"Ours are sampled at {1e3 * dt:g} ms and limited to 0.5 N; the published are in "
-        "continuous time, without limit. "
-        f"{result.runs_per_second:.0f} runs of 30 s a second on all cores, "
-        f"{result.runs_per_second_one_core:.0f} on one.\n"
+        f"continuous time, without limit. {result.runs_per_second:.0f} runs of 30 s a second on "
+        f"all cores, {result.runs_per_second_one_core:.0f} on one.\n"
     )
 
 
 def _print_cases(console: Console, result: Result) -> None:
+    lost = "unstable"
     lines: tuple[tuple[str, Callable[[CaseResult], str]], ...] = (
-        ("gain margin", lambda case: "{:.2f}–{:.2f}".format(*case.margins.gain)),
-        ("phase margin [°]", lambda case: f"{case.margins.phase:.0f}"),
-        ("modulus margin", lambda case: f"{case.margins.modulus:.2f}"),
-        ("1: stable for k [N/m]", lambda case: f"{case.stable_from:.2f}–{case.stable_to:.2f}"),
-        ("1: settled after impulse, k = 1 [s]", lambda case: _number(case.settled_at, ".1f")),
-        (
-            "1: the same, worst k from 0.5 to 2 [s]",
-            lambda case: _number(case.settled_at_worst, ".1f"),
-        ),
-        (
-            "2: stable for m1, m2, k, all within [%]",
-            lambda case: f"±{100.0 * case.parameter_bound:.1f}",
-        ),
-        (
-            "3: |y| under the load, from 20 s on [m]",
-            lambda case: _number(case.load_peak, ".4f", "unstable"),
-        ),
-        (
-            "3: the same, last period of 80 s [m]",
-            lambda case: _number(case.load_remains, ".5f", "unstable"),
-        ),
+        ("gain margin", lambda c: "{:.2f}–{:.2f}".format(*c.margins.gain)),
+        ("phase margin [°]", lambda c: f"{c.margins.phase:.0f}"),
+        ("modulus margin", lambda c: f"{c.margins.modulus:.2f}"),
+        ("1: stable for k [N/m]", lambda c: f"{c.stable_from:.2f}–{c.stable_to:.2f}"),
+        ("1: settled after impulse, k = 1 [s]", lambda c: _number(c.settled_at, ".1f")),
+        ("1: the same, worst k from 0.5 to 2 [s]", lambda c: _number(c.settled_at_worst, ".1f")),
+        ("2: stable for m1, m2, k, all within [%]", lambda c: f"±{100.0 * c.parameter_bound:.1f}"),
+        ("3: |y| under the load, from 20 s on [m]", lambda c: _number(c.load_peak, ".4f", lost)),
+        ("3: the same, last period of 80 s [m]", lambda c: _number(c.load_remains, ".5f", lost)),
     )
     title = "The original problem's design cases (m1 = m2 = 1 kg, no lag)"
     rows = table(title, "", *result.cases)

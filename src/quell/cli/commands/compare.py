@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from quell.controllers import Controller
     from quell.experiments.compare import Benchmark, Comparison
 
+# Key, heading, factor and most decimals.
 _COLUMNS = (
     ("overshoot", "over-\nshoot\n[%]", 100.0, 2),
     ("settling_time", "settling\n[s]", 1.0, 2),
@@ -64,10 +65,8 @@ def compare(
     settings = benchmark.Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
     names = list(dict.fromkeys(name.strip() for name in controllers.split(",") if name.strip()))
     if not names:
-        raise ValueError(
-            f"controllers = {controllers!r}: must be names with commas between, of "
-            f"{', '.join(benchmark.NAMES)}"
-        )
+        known = ", ".join(benchmark.NAMES)
+        raise ValueError(f"controllers = {controllers!r}: must be names with commas, of {known}")
     stable = {name: _is_stable(benchmark.controller(name, dt, u_max), settings) for name in names}
     check_outputs(outputs)
     console = Console()
@@ -104,10 +103,9 @@ def _print(
     rows = table(title, "controller", *headings, padding=(0, 1, 0, 0), pad_edge=False)
     rows.add_column("status")
     for name, score in result.scores.items():
-        values = [(score[key], factor, decimals) for key, _, factor, decimals in _COLUMNS]
         cells = [
-            "–" if value is None else _short(factor * value, decimals)
-            for value, factor, decimals in values
+            "–" if (value := score[key]) is None else _short(factor * value, decimals)
+            for key, _, factor, decimals in _COLUMNS
         ]
         run = result.runs[name]
         status = (run.status.name or "OK").lower().replace("_", " ").replace("|", ", ")

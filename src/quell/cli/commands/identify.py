@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -42,8 +42,8 @@ def identify(
     zeros
         Number of zeros.
     integrators
-        Number of poles at s = 0; by default one if the slowest pole cannot be distinguished from
-        it.
+        Number of poles at s = 0; by default one if the slowest pole cannot be
+        distinguished from it.
     columns
         Names or numbers (from 1 on) of the columns: t,u,y by default, or t,u,y,r with the external
         input of a closed loop.
@@ -66,22 +66,13 @@ def identify(
     if dt is not None and not columns:
         names = ("u", "y")
     record = read_record(data, names, dt)
+    delays = delay if max_delay is None else (delay, max_delay)
+    options: dict[str, Any] = {"friction": friction, "held_out": held_out, "horizon": horizon}
+    options |= {"delay": delays, "integrators": integrators, "reference": record.reference}
     check_outputs(outputs)
     console = Console()
     with console.status("Searching; the first time, code is compiled for some seconds."):
-        model = identify(
-            record.u,
-            record.y,
-            record.dt,
-            order,
-            zeros,
-            integrators=integrators,
-            delay=delay if max_delay is None else (delay, max_delay),
-            friction=friction,
-            held_out=held_out,
-            horizon=horizon,
-            reference=record.reference,
-        )
+        model = identify(record.u, record.y, record.dt, order, zeros, **options)
     _print(console, model, data.name)
     paths = _save_figure(model, outputs.figures) if outputs.figures else []
     write_results(console, model.to_json(), outputs, paths)

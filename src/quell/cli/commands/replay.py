@@ -109,12 +109,10 @@ def _print_gaps(console: Console, recorded: Trajectory) -> None:
         return
     gaps = (recorded["events"].astype(int) & Event.GAP).nonzero()[0]
     if gaps.size:
-        print_line(
-            console,
-            f"{gaps.size} of {len(recorded)} samples were skipped by the loop, the first at "
-            f"{recorded.t[gaps[0]]:.3f} s: "
-            "to the replay, as to the loop, they are samples without a measurement.",
-        )
+        first = f"the first at {recorded.t[gaps[0]]:.3f} s"
+        skipped = f"{gaps.size} of {len(recorded)} samples were skipped by the loop, {first}"
+        meaning = "to the replay, as to the loop, they are samples without a measurement."
+        print_line(console, f"{skipped}: {meaning}")
 
 
 def _draw_wished(run: Trajectory, axes: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -73,22 +73,15 @@ def rig(
         checked_seconds("--seconds", seconds)
     checked_priority(priority)
     checked_cpu(cpu)
-    with (
-        closing(listen(device)) as listener,
-        Rig(
-            model, dt, listener=listener, watchdog=watchdog, u_max=u_max, rest=rest, log=log
-        ) as server,
-    ):
+    limits: dict[str, Any] = {"watchdog": watchdog, "u_max": u_max, "rest": rest, "log": log}
+    with closing(listen(device)) as listener, Rig(model, dt, listener=listener, **limits) as server:
         with exit_on_signal(listener.close):  # compiling may take a minute the first time
             server.prepare()
         with termination_handler(lambda *_: server.stop()):
             limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
-            print(
-                f"{plant} at {listener.url}: a tick every {dt:g} s, "
-                f"u = 0 after {watchdog} ticks without a "
-                f"command{limit}{', from rest' if rest else ''}",
-                flush=True,
-            )
+            rules = f"u = 0 after {watchdog} ticks without a command{limit}"
+            start = ", from rest" if rest else ""
+            print(f"{plant} at {listener.url}: a tick every {dt:g} s, {rules}{start}", flush=True)
             notes = server.run(seconds, priority=priority, cpu=cpu)
     _print_counters(server)
     for note in notes:

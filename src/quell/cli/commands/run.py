@@ -45,18 +45,17 @@ def run(
     check_outputs(outputs)
     console = Console()
     with progress_bar(console, COMPILING) as report:
+        progress = partial(report, COMPILING)
         try:
-            result = simulate(
-                plant, given.controller, scenario, progress=partial(report, COMPILING)
-            )
+            result = simulate(plant, given.controller, scenario, progress=progress)
         except ValueError as error:
             raise SetupError([f"{given.file}: {error}"]) from None
     scores = windowed_metrics(result, given)
     print_metrics(console, f"{given.title}: {result.plant}, dt = {result.dt:g} s", scores)
     learned = print_outcome(console, result)
-    paths = (
-        save_run_figure(result, given.title, outputs.figures, setup.stem) if outputs.figures else []
-    )
+    paths = []
+    if outputs.figures:
+        paths = save_run_figure(result, given.title, outputs.figures, setup.stem)
     write_record(console, result, outputs.save, "Record")
     results = {
         "title": given.title,

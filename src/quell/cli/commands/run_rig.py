@@ -17,7 +17,7 @@ from quell.cli.report import print_metrics, print_outcome, save_run_figure, wind
 from quell.realtime.devices.registry import examples
 
 if TYPE_CHECKING:
-    from quell.realtime import LiveSink, RigRun
+    from quell.realtime import RigRun
     from quell.realtime.loop.result import ModeChange
     from quell.setup import Setup
 
@@ -112,13 +112,11 @@ def _run(
     port = live if port is None else port
     url, dt = options.pop("device"), setup.controller.dt
     console = Console()
-    print_line(
-        console,
-        f"{setup.title}: {url}, dt = {dt:g} s, for {scenario.duration:g} s. Ctrl-C ramps u to "
-        "zero.",
-    )
-    sink = None if port is None else LiveSink(port)
-    run = _close_loop(console, setup, url, options, files, sink)
+    what = f"{setup.title}: {url}, dt = {dt:g} s, for {scenario.duration:g} s"
+    print_line(console, f"{what}. Ctrl-C ramps u to zero.")
+    # The port first: if it is in use no file is created.
+    sinks = files if port is None else [LiveSink(port), *files]
+    run = _close_loop(console, setup, url, options, sinks)
     if run is None:
         return TRIPPED
     record = run.trajectory
@@ -148,39 +146,27 @@ def _run(
 
 
 def _close_loop(
-    console: Console,
-    setup: Setup,
-    url: str,
-    options: dict[str, Any],
-    files: list[Path],
-    live: LiveSink | None,
+    console: Console, setup: Setup, url: str, options: dict[str, Any], sinks: list[Any]
 ) -> RigRun | None:
-    """Run the loop and print each change of mode; return None where the device failed."""
-    from quell.realtime import open_device, run_rig
+    """Run the loop and print each change of mode; return None if the device failed."""
+    from quell.realtime import LiveSink, open_device, run_rig
     from quell.setup.errors import with_path
 
     began = False
 
     def print_change(change: ModeChange) -> None:
         nonlocal began
-        if live is not None and not began:
-            console.print(f"Live: {live.url}")
+        live = () if began else [sink for sink in sinks if isinstance(sink, LiveSink)]
+        for sink in live:
+            console.print(f"Live: {sink.url}")
         began = True
         print_line(console, str(change))
 
-    # The port first: where it is in use no file is created.
-    sinks: list[Any] = [*([] if live is None else [live]), *files]
+    settings = {"telemetry": sinks, "on_change": print_change, **options}
     try:
         device = open_device(url, setup.controller.dt)
         with exit_on_signal(device.close):
-            return run_rig(
-                device,
-                setup.controller,
-                setup.needed("scenario"),
-                telemetry=sinks,
-                on_change=print_change,
-                **options,
-            )
+            return run_rig(device, setup.controller, setup.needed("scenario"), **settings)
     except ValueError as error:
         raise with_path(setup.file, "rig", error, ["device", *options]) from None
     except ConnectionError as error:
@@ -192,9 +178,7 @@ def _close_loop(
 
 def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
     """Return a file's tables with other values for some keys; None changes nothing."""
-    tables = {
-        key: dict(value) if isinstance(value, Mapping) else value for key, value in data.items()
-    }
+    tables = {k: dict(v) if isinstance(v, Mapping) else v for k, v in data.items()}
     for (table_name, key), value in changes.items():
         if value is not None and isinstance(tables.setdefault(table_name, {}), dict):
             tables[table_name][key] = value
@@ -202,14 +186,7 @@ def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) ->
 
 
 def check_recording(file: Path) -> None:
-    """Check that a recording can be written, before the device is opened.
-
-    Raises
-    ------
-    ValueError
-        for another suffix than ``.mcap`` and ``.csv``, an existing file, and a place that cannot be
-        written to.
-    """
+    """Check suffix and place of a recording, before the device is opened."""
     from quell.files import check_new_file
     from quell.realtime.telemetry.sinks import file_sink
 
@@ -268,19 +245,13 @@ def _save_timing_figure(run: RigRun, setup: Setup, folder: Path) -> list[Path]:
 def _as_json(run: RigRun) -> dict[str, Any]:
     from quell.files import nonfinite_to_none
 
-    changes = [
-        {"t": change.t, "mode": change.mode.name, "cause": change.cause.text}
-        for change in run.changes
-    ]
     timing = {"lateness": run.timing.lateness.summary(), "step": run.timing.step.summary()}
-    results: dict[str, Any] = nonfinite_to_none(
-        {
-            "completed": run.completed,
-            "timing": timing,
-            "tally": run.tally._asdict(),
-            "counters": run.counters,
-            "changes": changes,
-            "notes": list(run.notes),
-        }
-    )
-    return results
+    results = {
+        "completed": run.completed,
+        "timing": timing,
+        "tally": run.tally._asdict(),
+        "counters": run.counters,
+        "changes": [{"t": c.t, "mode": c.mode.name, "cause": c.cause.text} for c in run.changes],
+        "notes": list(run.notes),
+    }
+    return dict(nonfinite_to_none(results))

@@ -52,13 +52,8 @@ def stress(
     first = "simulating (the first run compiles for half a minute)"
     columns = (TextColumn("{task.percentage:>3.0f} %"), TimeRemainingColumn())
     with progress_bar(console, first, *columns) as report:
-        result = study.run(
-            runs,
-            honest,
-            seed,
-            guard=Guard() if guard else None,
-            progress=partial(report, "simulating"),
-        )
+        used, progress = Guard() if guard else None, partial(report, "simulating")
+        result = study.run(runs, honest, seed, guard=used, progress=progress)
     _print(console, result, guard)
     paths = figures.save(result, outputs.figures) if outputs.figures else []
     write_results(console, result.to_json(), outputs, paths)
@@ -78,14 +73,12 @@ def _print(console: Console, result: Result, guarded: bool) -> None:
         if label == totals[0][0]:
             rows.add_section()
         found = summary(outcomes)
-        ratios = [
-            found[name][key] for name in ("ratio", "load_ratio") for key in ("median", "p99", "max")
-        ]
+        keys = ("median", "p99", "max")
+        ratios = [found[name][key] for name in ("ratio", "load_ratio") for key in keys]
+        cells = [number(ratio, ".3f") for ratio in (*ratios, found["late_ratio"]["median"])]
         lost = found["unstable_where_plain_is_stable"]
-        rows.add_row(
-            *(escape(label), str(found["runs"]), f"[red]{lost}[/]" if lost else "0"),
-            *(number(ratio, ".3f") for ratio in (*ratios, found["late_ratio"]["median"])),
-        )
+        lost_cell = f"[red]{lost}[/]" if lost else "0"
+        rows.add_row(escape(label), str(found["runs"]), lost_cell, *cells)
     console.print(rows)
     found = summary(result.outcomes)
     console.print(

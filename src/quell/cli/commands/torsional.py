@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -45,9 +46,8 @@ def torsional(*, dt: float = 1e-3, seed: Whole = 0, outputs: Outputs = OUTPUTS) 
     check_outputs(outputs)
     console = Console()
     controllers = setup.controllers(settings, *setup.CASES[0]).values()
-    compile_loops(
-        console, [(setup.plant(kind), each) for kind in setup.PLANTS for each in controllers]
-    )
+    plants = [setup.plant(kind) for kind in setup.PLANTS]
+    compile_loops(console, list(product(plants, controllers)))
     with progress_bar(console, width=15) as report:
         result = study.run(settings, report)
         paths = figures.save(result, outputs.figures, report) if outputs.figures else []
@@ -68,13 +68,8 @@ def torsional(*, dt: float = 1e-3, seed: Whole = 0, outputs: Outputs = OUTPUTS) 
 
 
 def _print_scores(console: Console, case: Case, about: str) -> None:
-    rows = table(
-        f"omega_c/omega_o = {case.label} rad/s ({about})",
-        "plant",
-        "controller",
-        *(column.heading for column in _COLUMNS),
-        left=2,
-    )
+    headings = ("plant", "controller", *(column.heading for column in _COLUMNS))
+    rows = table(f"omega_c/omega_o = {case.label} rad/s ({about})", *headings, left=2)
     for kind, outcome in case.outcomes.items():
         for name, scores in outcome.scores.items():
             rows.add_row(kind, name, *(column.cell(scores) for column in _COLUMNS))
@@ -94,6 +89,5 @@ def _print_claims(console: Console, result: Result) -> None:
     console.print(rows)
     console.print(
         "Overshoots that differ by a count, and settling times that differ by a sample, are "
-        "different. "
-        "docs/theory explains each no.\n"
+        "different. docs/theory explains each no.\n"
     )

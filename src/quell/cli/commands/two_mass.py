@@ -86,11 +86,8 @@ def _print_scores(console: Console, result: Result) -> None:
     settings = result.settings
     reset = "with" if settings.reset else "without"
     about = f"dt = {settings.dt:g} s, seed {settings.seed}, omega_o = {settings.omega_o:g} rad/s"
-    scores = table(
-        f"All controllers ({about}, {reset} reset)",
-        "controller",
-        *(column.heading for column in _COLUMNS),
-    )
+    headings = ("controller", *(column.heading for column in _COLUMNS))
+    scores = table(f"All controllers ({about}, {reset} reset)", *headings)
     for name, score in result.scores.items():
         scores.add_row(name, *(column.cell(score) for column in _COLUMNS))
     console.print(scores)

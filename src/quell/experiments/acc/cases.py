@@ -38,8 +38,7 @@ STIFFNESSES = np.linspace(0.5, 2.0, 13)
 LOAD = 0.5  # frequency of the load in case 3 [rad/s]
 # Phases of the load [rad]: a start with no force, and with the full one.
 _PHASES = (0.0, 0.5 * np.pi)
-# Duration of the runs [s]: for the impulse four times, for the load four times the time that the
-# problem gives.
+# Duration of the runs [s]: four times those that the problem gives for the impulse and the load.
 _IMPULSE_TIME, _LOAD_TIME = 60.0, 80.0
 
 
@@ -48,15 +47,12 @@ class CaseResult:
     """Results of a controller in the three cases."""
 
     margins: Margins  #: margins of the nominal loop
-    settled_at: float
-    """Time after which ``|y|`` stays below 0.1 m, at k = 1 [s]; infinite beyond 60 s."""
+    settled_at: float  #: time after which ``|y| < 0.1`` m, at k = 1 [s]; infinite beyond 60 s
     settled_at_worst: float  #: that time at the worst k [s]
     stable_from: float  #: least k of the interval around k = 1 in which the loop is stable [N/m]
     stable_to: float  #: largest k of that interval
-    parameter_bound: float
-    """Largest p such that the loop is stable for every m1, m2, k in [1 − p, 1 + p]."""
-    load_peak: float
-    """Largest ``|y|`` from 20 s on, at the worst k and phase [m]; infinite if unstable."""
+    parameter_bound: float  #: largest p with a stable loop for all m1, m2, k in [1 − p, 1 + p]
+    load_peak: float  #: largest ``|y|`` from 20 s on, worst k and phase [m]; infinite if unstable
     load_remains: float  #: largest ``|y|`` over the last period of 80 s [m]
 
     def to_json(self) -> dict[str, Any]:
@@ -78,9 +74,8 @@ def study_cases() -> dict[str, CaseResult]:
 def _study(controller: Controller, loaded: Controller) -> CaseResult:
     impulses = in_parallel([partial(_impulse, controller, k) for k in (1.0, *STIFFNESSES)])
     settled = [_settled_at(run) for run in impulses]
-    loads = in_parallel(
-        [partial(_load, loaded, k, phase) for k, phase in product(STIFFNESSES, _PHASES)]
-    )
+    cases = product(STIFFNESSES, _PHASES)
+    loads = in_parallel([partial(_load, loaded, k, phase) for k, phase in cases])
     lost = any(unstable([two_mass_spring(k=k) for k in STIFFNESSES], loaded))
     period = 2.0 * np.pi / LOAD
     return CaseResult(
@@ -101,8 +96,7 @@ def _impulse(controller: Controller, k: float) -> Trajectory:
 
 
 def _load(controller: Controller, k: float, phase: float) -> Trajectory:
-    load = Sinusoid(1.0, LOAD, phase)
-    scenario = Scenario(duration=_LOAD_TIME, disturbances=(0.0, load))
+    scenario = Scenario(duration=_LOAD_TIME, disturbances=(0.0, Sinusoid(1.0, LOAD, phase)))
     return simulate(two_mass_spring(k=k), controller, scenario)
 
 

@@ -27,10 +27,8 @@ MOST_U = 0.5  # limit of ``|u|`` [N], of Rocchetta, Crespo & Kenny (DSCC 2019)
 DT = 0.01  # sample time [s]: chosen by hand, omega_o dt = 0.1
 
 BASELINES = {
-    "PID": "pid",
-    "PI with notch": "pi-notch",
-    "LQG": "lqg",
-    "resonance ratio": "resonance-ratio",
+    **{"PID": "pid", "PI with notch": "pi-notch"},
+    **{"LQG": "lqg", "resonance ratio": "resonance-ratio"},
 }
 """Controllers of ``quell compare``, for the nominal plant; not tuned for this benchmark."""
 
@@ -80,9 +78,7 @@ def designs(
     learner = Kalman() if load is None else Harmonic(omegas=(load,), bias_bandwidth=2.0)
     guard = Guard() if load is None else None
     limits: dict[str, Any] = {"u_min": -most_u, "u_max": most_u}
-    baselines: dict[str, Controller] = {
-        name: controller(key, dt, most_u) for name, key in BASELINES.items()
-    }
+    baselines = {name: controller(key, dt, most_u) for name, key in BASELINES.items()}
     return baselines | {
         MF: ADRC(model_free, omega_c, **limits),
         MB: ADRC(model_based, omega_c, **limits),

@@ -47,10 +47,8 @@ def judge(t: Vector, y: Matrix, u: Matrix, unstable: NDArray[np.bool_]) -> Judge
     records.
     """
     late = np.max(np.abs(y[:, t >= SETTLED_AT - 1e-9]), axis=1)
-    return Judged(
-        np.where(np.isnan(late) | unstable, np.inf, late),
-        np.max(np.abs(np.nan_to_num(u, nan=0.0)), axis=1),
-    )
+    most_u = np.max(np.abs(np.nan_to_num(u, nan=0.0)), axis=1)
+    return Judged(np.where(np.isnan(late) | unstable, np.inf, late), most_u)
 
 
 def interval(failures: int, count: int) -> tuple[float, float]:

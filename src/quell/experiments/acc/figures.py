@@ -26,7 +26,7 @@ Rates = Mapping[str, Mapping[str, Sequence[tuple[float, float, float]]]]
 
 
 def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
-    """Draw the figures into ``folder``, which is created if need be; return the paths."""
+    """Draw the figures into ``folder``, created if missing; return the paths."""
     drawings: dict[str, Callable[[], Any]] = {
         "acc-failures": partial(_failures, result),
         "acc-responses": partial(_responses, result.samples[:_RESPONSES]),

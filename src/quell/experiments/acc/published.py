@@ -47,10 +47,8 @@ def _judged(design: TransferFunction, samples: Matrix, cubic: bool, duration: fl
             if cubic:
                 _push(x, push1, push2)
     unstable = np.max(np.linalg.eigvals(loops).real, axis=1) >= 0.0
-    return Judged(
-        np.where(unstable | np.isnan(late_peak), np.inf, late_peak),
-        np.nan_to_num(most_u, nan=np.inf),
-    )
+    late_peak = np.where(unstable | np.isnan(late_peak), np.inf, late_peak)
+    return Judged(late_peak, np.nan_to_num(most_u, nan=np.inf))
 
 
 def _push(x: Matrix, push1: Vector, push2: Vector) -> None:

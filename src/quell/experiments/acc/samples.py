@@ -46,25 +46,9 @@ _LEAST_DRAWN_LAG = 1e-3
 
 
 def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
-    """Draw samples; the same seed gives the same samples.
+    """Draw samples (count, 6); the same ``seed`` gives the same samples.
 
-    Parameters
-    ----------
-    count
-        number of samples.
-    spread
-        distance from nominal: 1 for the published small uncertainty, up to 5; see ``widened``.
-    seed
-        seed of the random numbers.
-
-    Returns
-    -------
-    (count, 6) array
-
-    Raises
-    ------
-    ValueError
-        for a number out of range.
+    ``spread`` is the distance from nominal, 1 for the published small uncertainty; see ``widened``.
     """
     checks.whole("count", count, 1)
     if checks.positive("spread", spread) > _MOST_SPREAD:
@@ -98,13 +82,8 @@ def read(path: str | os.PathLike[str]) -> Matrix:
     """Read samples from a CSV file, (count, 6).
 
     The first line names the columns, in any order: ``m1, m2, k_lin, k_nonlin, lambda, tau``, or
-    ``theta_1`` to ``theta_6`` as published. Other columns are ignored.
-
-    Raises
-    ------
-    ValueError
-        if the file can't be read, a column is missing, or a value is no number or out of range; it
-        names line and column.
+    ``theta_1`` to ``theta_6`` as published. Other columns are ignored. A ``ValueError`` names line
+    and column of a fault.
     """
     where = f"samples = {os.fspath(path)!r}"
     rows = csv_rows(read_text(path, where), where)
@@ -112,11 +91,10 @@ def read(path: str | os.PathLike[str]) -> Matrix:
         raise ValueError(f"{where}: must have a line of column names and at least one sample")
     header = [cell.lstrip("\\") for cell in rows[0][1]]
     places = [_column(where, header, j) for j in range(6)]
-    samples = [
-        [_value(where, number, row, place, j) for j, place in enumerate(places)]
-        for number, row in rows[1:]
-    ]
-    return np.array(samples)
+    columns = list(enumerate(places))
+    return np.array(
+        [[_value(where, number, row, place, j) for j, place in columns] for number, row in rows[1:]]
+    )
 
 
 def _column(where: str, header: list[str], j: int) -> int:

@@ -46,10 +46,9 @@ class Result:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries and lists for ``json.dump``."""
-        rates = {
-            spring: {name: judged.to_json() for name, judged in found.items()}
-            for spring, found in self.judged.items()
-        }
+        rates: dict[str, Any] = {}
+        for spring, found in self.judged.items():
+            rates[spring] = {name: judged.to_json() for name, judged in found.items()}
         return rates | {
             "cases": {name: case.to_json() for name, case in self.cases.items()},
             "samples": {"source": self.source, "count": len(self.samples)},
@@ -104,16 +103,8 @@ def records(
     workers: int | None = None,
 ) -> tuple[Vector, Matrix, Matrix]:
     """Return times (samples,), y and u (count, samples); m2 starts with ``speeds`` [m/s]."""
-    impulses = [
-        Scenario(duration=DURATION, x0=[0.0, 0.0, 0.0, speed, 0.0]) for speed in speeds.tolist()
-    ]
-    runs = simulate(
-        PlantBatch(plants),
-        controller,
-        impulses,
-        limit=_LOST,
-        record=("y", "u"),
-        progress=progress,
-        workers=workers,
-    )
+    starts = ([0.0, 0.0, 0.0, speed, 0.0] for speed in speeds.tolist())
+    impulses = [Scenario(duration=DURATION, x0=x0) for x0 in starts]
+    options: dict[str, Any] = {"limit": _LOST, "progress": progress, "workers": workers}
+    runs = simulate(PlantBatch(plants), controller, impulses, record=("y", "u"), **options)
     return runs.t, runs["y"], runs["u"]

@@ -48,31 +48,18 @@ def legend_label(name: str, run: Trajectory) -> str:
 
 
 def make_folder(folder: str | os.PathLike[str]) -> Path:
-    """Create a folder for figures if it does not exist.
-
-    Raises
-    ------
-    ValueError
-        if it can't be created.
-    """
+    """Create a folder for figures if it does not exist; raise a ``ValueError`` if that fails."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(
-            f"figures = {str(path)!r}: must be a folder that can be made ({error.strerror})"
-        ) from None
+        rule = f"must be a folder that can be made ({error.strerror})"
+        raise ValueError(f"figures = {str(path)!r}: {rule}") from None
     return path
 
 
 def save_figure(figure: Any, folder: str | os.PathLike[str], name: str) -> list[Path]:
-    """Write a figure into ``folder`` as PNG and SVG; return the paths.
-
-    Raises
-    ------
-    ValueError
-        if the folder can't be created.
-    """
+    """Write a figure into ``folder`` as PNG and SVG; return the paths."""
     import matplotlib
 
     place, written = make_folder(folder), []
@@ -95,11 +82,6 @@ def save_figures(
 
     ``drawings`` has a function that returns a figure for each name of a file, ``style`` settings of
     matplotlib.
-
-    Raises
-    ------
-    ValueError
-        if the folder can't be created.
     """
     import matplotlib
 

@@ -12,15 +12,11 @@ from quell.types import Vector
 
 Scores = dict[str, float | None]
 
+# Names of the scores in the experiments of the paper.
 METRICS = (
-    "overshoot",
-    "settling_time",
-    "disturbance_peak",
-    "disturbance_rms",
-    "control_variation",
-    "rms_from_step",
+    *("overshoot", "settling_time", "disturbance_peak"),
+    *("disturbance_rms", "control_variation", "rms_from_step"),
 )
-"""Names of the scores in the experiments of the paper."""
 
 
 def step_scores(t: Vector, y: Vector, target: float, band: float, initial: float = 0.0) -> Scores:
@@ -34,8 +30,5 @@ def step_scores(t: Vector, y: Vector, target: float, band: float, initial: float
 
 def ended_early(runs: Mapping[str, Trajectory]) -> dict[str, dict[str, Any]]:
     """Return time and message of the runs that diverged, by name."""
-    return {
-        name: {"at": run.ended, "message": run.message}
-        for name, run in runs.items()
-        if run.diverged
-    }
+    ended = {name: run for name, run in runs.items() if run.diverged}
+    return {name: {"at": run.ended, "message": run.message} for name, run in ended.items()}

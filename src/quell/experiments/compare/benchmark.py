@@ -41,31 +41,14 @@ _MOST_SAMPLES = 5e6
 
 @dataclass(frozen=True)
 class Benchmark:
-    """The real plant, and the limits of the controllers.
+    """The real plant, and the limits of the controllers."""
 
-    Parameters
-    ----------
-    m1, m2, k
-        masses [kg] and stiffness [N/m].
-    dt
-        sample time [s].
-    u_max
-        limit of the control force, in both directions [N].
-    seed
-        seed of the measurement noise.
-
-    Raises
-    ------
-    ValueError
-        for a value that allows no comparison.
-    """
-
-    m1: float = 1.0
-    m2: float = 1.0
-    k: float = 1.0
-    dt: float = 1e-3
-    u_max: float = math.inf
-    seed: int = 0
+    m1: float = 1.0  #: mass that is pushed [kg]
+    m2: float = 1.0  #: mass that is measured [kg]
+    k: float = 1.0  #: stiffness [N/m]
+    dt: float = 1e-3  #: sample time [s]
+    u_max: float = math.inf  #: limit of the control force, in both directions [N]
+    seed: int = 0  #: seed of the measurement noise
 
     def __post_init__(self) -> None:
         if checks.positive("dt", self.dt, "s") > _LONGEST_DT:
@@ -96,22 +79,10 @@ def scenario(settings: Benchmark) -> Scenario:
 
 
 def controller(name: str, dt: float, u_max: float = math.inf) -> Controller:
-    """Return one of the benchmark's controllers, designed for m1 = m2 = k = 1.
+    """Return one of the benchmark's controllers, designed for m1 = m2 = k = 1 and ``|u| <= u_max``.
 
-    Parameters
-    ----------
-    name
-        one of ``NAMES``, with ``zv+`` or ``zvd+`` before it to shape the reference for the plant's
-        resonance.
-    dt
-        sample time [s].
-    u_max
-        limit of the control force, in both directions [N].
-
-    Raises
-    ------
-    ValueError
-        for an unknown name; the message lists the known ones.
+    ``name`` is one of ``NAMES``, with ``zv+`` or ``zvd+`` before it to shape the reference for the
+    plant's resonance. The message for an unknown name lists the known ones.
     """
     *shapers, base = name.split("+")
     if base not in _DESIGNS or len(shapers) > 1 or not set(shapers) <= set(_SHAPERS):
@@ -126,13 +97,7 @@ def controller(name: str, dt: float, u_max: float = math.inf) -> Controller:
 def two_mass(
     settings: Benchmark, names: Sequence[str], progress: Callable[[float], None] | None = None
 ) -> Comparison:
-    """Run the controllers ``names`` on the plant of ``settings``.
-
-    Raises
-    ------
-    ValueError
-        for an unknown name.
-    """
+    """Run the controllers ``names`` on the plant of ``settings``."""
     controllers = {name: controller(name, settings.dt, settings.u_max) for name in names}
     plant = two_mass_spring(settings.m1, settings.m2, settings.k)
     return compare(plant, controllers, scenario(settings), load_at=FORCE_AT, progress=progress)

@@ -38,7 +38,7 @@ def draw(result: Comparison) -> Any:
 
 
 def save(result: Comparison, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write the figure into ``folder``, which is created if need be; return the paths."""
+    """Write the figure into ``folder``, created if missing; return the paths."""
     return save_figures({"compare": partial(draw, result)}, folder)
 
 

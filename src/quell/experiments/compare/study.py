@@ -22,27 +22,18 @@ BAND = 0.02  # half width of the settling band, as a fraction of the step: the u
 
 @dataclass(frozen=True)
 class Comparison:
-    """The result of ``compare``.
-
-    Attributes
-    ----------
-    runs
-        a trajectory for each controller, by name.
-    scores
-        metrics for each controller, by name; None for a number that a run does not have.
-    """
+    """The result of ``compare``, by name of the controller."""
 
     runs: dict[str, Trajectory]
-    scores: dict[str, Scores]
+    scores: dict[str, Scores]  #: None for a number that a run does not have
 
     def to_json(self) -> dict[str, Any]:
         """Return scores and statuses, for programs."""
-        return {
-            "controllers": {
-                name: {**score, "status": run.status.name or "OK", "diverged": run.diverged}
-                for (name, score), run in zip(self.scores.items(), self.runs.values(), strict=True)
-            }
+        ends = {
+            name: {"status": run.status.name or "OK", "diverged": run.diverged}
+            for name, run in self.runs.items()
         }
+        return {"controllers": {name: score | ends[name] for name, score in self.scores.items()}}
 
 
 def compare(
@@ -59,8 +50,8 @@ def compare(
 
     Parameters
     ----------
-    plant, scenario
-        as for ``simulate``.
+    plant, scenario, record_every
+        as for ``simulate``; with ``record_every`` above 1 there is no control variation.
     controllers
         by name, any number, with any sample times.
     load_at
@@ -69,8 +60,6 @@ def compare(
         step.
     band
         half width of the settling band, as a fraction of the step.
-    record_every
-        as for ``simulate``; if it is more than 1, there is no control variation.
     progress
         called with the finished share, 0 to 1.
 
@@ -80,11 +69,6 @@ def compare(
         with ``overshoot`` (fraction), ``settling_time`` [s], ``disturbance_peak`` (largest ``|r −
         y|`` from ``load_at`` on) and ``rms`` of r − y over the whole run [y-unit], and
         ``control_variation`` over the whole run [u-unit].
-
-    Raises
-    ------
-    ValueError
-        if there is no controller, or an argument is out of range.
 
     Examples
     --------
@@ -108,18 +92,17 @@ def compare(
         for controller in controllers.values()
     ]
     runs = dict(zip(controllers, in_parallel(jobs, progress), strict=True))
-    return Comparison(
-        runs, {name: score(run, scenario.duration, load_at, band) for name, run in runs.items()}
-    )
+    duration = scenario.duration
+    scores = {name: score(run, duration, load_at, band) for name, run in runs.items()}
+    return Comparison(runs, scores)
 
 
 def score(
     run: Trajectory, duration: float, load_at: float | None = None, band: float = BAND
 ) -> Scores:
     """Return the scores of one run; None if it ended too early, or y did not settle."""
-    found: Scores = dict.fromkeys(
-        ("overshoot", "settling_time", "disturbance_peak", "rms", "control_variation")
-    )
+    keys = ("overshoot", "settling_time", "disturbance_peak", "rms", "control_variation")
+    found: Scores = dict.fromkeys(keys)
     step_ends = duration if load_at is None else load_at
     t, y, r = run.t, run["y"], run["r"]
     if run.ended >= step_ends - 2.0 * run.dt:

@@ -23,9 +23,8 @@ from quell.observers.eso import ESO
 from quell.types import Vector
 
 # Kinds of ``Adversary``.
-MULTIPLE, WHITE, CONSTANT, EXPONENTIAL, DELAYED, MINUS_U, FLIPPING, NAN, INF, FEATURES, PLAIN = (
-    range(11)
-)
+MULTIPLE, WHITE, CONSTANT, EXPONENTIAL, DELAYED, MINUS_U = range(6)
+FLIPPING, NAN, INF, FEATURES, PLAIN = range(6, 11)
 
 
 class AdversaryDesign(NamedTuple):
@@ -138,24 +137,15 @@ def _coefficients(learner: AdversaryDesign, memory: AdversaryMemory, theta: Vect
 class Adversary:
     """A hostile learner; its kind selects what it returns. f̂ = Δf̂ + f_L is the total estimate.
 
-    ``MULTIPLE``
-        ``size · f̂``; ``PLAIN``: the same multiple of the estimate of an ESO without learner.
-    ``WHITE``
-        white noise of standard deviation ``size``.
-    ``CONSTANT``
-        ``size``.
-    ``EXPONENTIAL``
-        ``size · exp(t/time)``.
-    ``DELAYED``
-        ``size · f̂`` of ``delay`` samples before.
-    ``MINUS_U``
-        ``−size · b0 u``.
-    ``FLIPPING``
-        ``± size · f̂``; the sign changes at random times, ``time`` seconds apart on average.
-    ``NAN``, ``INF``
-        ``size · f̂``, and bursts of NaN or Inf that begin and end at random times.
-    ``FEATURES``
-        ``weights · (x̂_1 … x̂_n, u, 1)``.
+    - ``MULTIPLE``: ``size · f̂``; ``PLAIN``: the same of the estimate of an ESO without learner
+    - ``WHITE``: white noise of standard deviation ``size``
+    - ``CONSTANT``: ``size``; ``EXPONENTIAL``: ``size · exp(t/time)``
+    - ``DELAYED``: ``size · f̂`` of ``delay`` samples before
+    - ``MINUS_U``: ``−size · b0 u``
+    - ``FLIPPING``: ``± size · f̂``; the sign changes every ``time`` seconds on average
+    - ``NAN``, ``INF``: ``size · f̂``, and bursts of NaN or Inf; the mean time between changes is
+      ``time`` seconds
+    - ``FEATURES``: ``weights · (x̂_1 … x̂_n, u, 1)``
     """
 
     kind: int
@@ -175,8 +165,7 @@ class Adversary:
 
     def memory(self, parameters: AdversaryDesign) -> AdversaryMemory:
         """Return the state at the start."""
-        now = np.zeros(5)
-        now[_SIGN] = 1.0
+        now = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
         return AdversaryMemory(np.zeros(parameters.delay + 1), now, np.array([float(self.seed)]))
 
     def feature_names(self, order: int) -> tuple[str, ...]:
@@ -188,31 +177,29 @@ class Adversary:
 # these loops.
 _DRAWS: dict[str, Callable[[np.random.Generator], Learner]] = {
     "opposite sign": lambda rng: Adversary(MULTIPLE, -_log_uniform(rng, 0.1, 10.0)),
-    "over-prediction": lambda rng: Adversary(
-        int(rng.choice([MULTIPLE, PLAIN])), float(rng.uniform(1.5, 10.0))
-    ),
+    "over-prediction": lambda rng: Adversary(_one_of(rng, MULTIPLE, PLAIN), rng.uniform(1.5, 10.0)),
     "white noise": lambda rng: Adversary(WHITE, _log_uniform(rng, 1e-2, 1e3), seed=_seed(rng)),
     "constant": lambda rng: Adversary(CONSTANT, _sign(rng) * _log_uniform(rng, 0.1, 1e3)),
     "exponential": lambda rng: Adversary(
-        EXPONENTIAL, _sign(rng) * _log_uniform(rng, 1e-3, 1.0), float(rng.uniform(1.0, 30.0))
+        EXPONENTIAL, _sign(rng) * _log_uniform(rng, 1e-3, 1.0), rng.uniform(1.0, 30.0)
     ),
     "delay": lambda rng: Adversary(
-        DELAYED, float(rng.uniform(0.5, 1.5)), delay=round(_log_uniform(rng, 1.0, 5000.0))
+        DELAYED, rng.uniform(0.5, 1.5), delay=round(_log_uniform(rng, 1.0, 5000.0))
     ),
-    "minus u": lambda rng: Adversary(MINUS_U, float(rng.uniform(0.3, 2.0))),
+    "minus u": lambda rng: Adversary(MINUS_U, rng.uniform(0.3, 2.0)),
     "sign flips": lambda rng: Adversary(
-        FLIPPING, float(rng.uniform(0.5, 2.0)), _log_uniform(rng, 0.1, 20.0), seed=_seed(rng)
+        FLIPPING, rng.uniform(0.5, 2.0), _log_uniform(rng, 0.1, 20.0), seed=_seed(rng)
     ),
     "NaN and Inf": lambda rng: Adversary(
-        int(rng.choice([NAN, INF])),
-        float(rng.uniform(0.5, 1.2)),
+        _one_of(rng, NAN, INF),
+        rng.uniform(0.5, 1.2),
         _log_uniform(rng, 0.05, 30.0),
         seed=_seed(rng),
     ),
     "Algorithm 1": lambda rng: BatchGradient(_log_uniform(rng, 1e-7, 1.0)),
     "turncoat": lambda rng: Turncoat(
         Kalman() if rng.random() < 0.5 else Harmonic(),
-        float(rng.uniform(20.0, 130.0)),
+        rng.uniform(20.0, 130.0),
         float(rng.choice([-3.0, -1.0, 1.5, 3.0, 10.0])),
     ),
     "random features": lambda rng: Adversary(
@@ -229,6 +216,10 @@ def draw_adversary(kind: str, rng: np.random.Generator) -> Learner:
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _one_of(rng: np.random.Generator, *kinds: int) -> int:
+    return int(rng.choice(kinds))
 
 
 def _sign(rng: np.random.Generator) -> float:

@@ -35,5 +35,5 @@ def draw(result: Result) -> Any:
 
 
 def save(result: Result, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write the figure into ``folder``, which is created if need be; return the paths."""
+    """Write the figure into ``folder``, created if missing; return the paths."""
     return save_figures({"stress": partial(draw, result)}, folder)

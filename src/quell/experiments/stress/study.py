@@ -114,35 +114,16 @@ def run(
     learner: Learner | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Result:
-    """Run a trial.
+    """Run a trial, with the guard or without (None).
 
-    Parameters
-    ----------
-    runs
-        number of runs with hostile learners; all kinds in turn.
-    honest
-        number of runs with ``learner``.
-    seed
-        seed of all random numbers.
-    guard
-        the guard; None for a trial without.
-    learner
-        the honest learner, ``Harmonic()`` by default.
-    progress
-        called with the finished share, 0 to 1.
-
-    Raises
-    ------
-    ValueError
-        for numbers out of range, or if there is nothing to run.
+    There are ``runs`` runs with hostile learners, all kinds in turn, and ``honest`` runs with
+    ``learner``, ``Harmonic()`` by default. ``progress`` is called with the finished share, 0 to 1.
     """
     checks.whole("runs", runs, 0, _MOST_RUNS)
     checks.whole("honest", honest, 0, _MOST_RUNS)
     checks.whole("seed", seed, 0)
     if runs + honest == 0:
-        raise ValueError(
-            "runs = 0, honest = 0: at least one must be positive, or there is nothing to run"
-        )
+        raise ValueError("runs = 0, honest = 0: at least one must be positive")
     rng = np.random.default_rng(seed)
     kinds = [KINDS[i % len(KINDS)] for i in range(runs)]
     jobs = [
@@ -151,26 +132,18 @@ def run(
     ]
     good = Harmonic() if learner is None else learner
     jobs += [partial(run_one, HONEST, loop, good, guard) for loop in draw_loops(honest, rng)]
-    settings = {
-        "runs": runs,
-        "honest": honest,
-        "seed": seed,
-        "guard": None if guard is None else asdict(guard),
-        "learner": repr(good),
-        "loops": random_loops.__doc__,
-        "ratios": __doc__,
-    }
-    return Result(settings, in_parallel(jobs, progress))
+    counts = {"runs": runs, "honest": honest, "seed": seed}
+    parts = {"guard": None if guard is None else asdict(guard), "learner": repr(good)}
+    about = {"loops": random_loops.__doc__, "ratios": __doc__}
+    return Result(counts | parts | about, in_parallel(jobs, progress))
 
 
 def run_one(kind: str, loop: Loop, learner: Learner, guard: Guard | None) -> Outcome:
     """Run one loop with a learner, and without."""
     plain, learned = errors(loop, None, None), errors(loop, learner, guard)
-    ratios = (
-        (np.nan,) * 3
-        if plain is None or learned is None
-        else tuple(float(a / b) for a, b in zip(learned, plain, strict=True))
-    )
+    ratios = [np.nan] * 3
+    if plain is not None and learned is not None:
+        ratios = [float(a / b) for a, b in zip(learned, plain, strict=True)]
     return Outcome(kind, loop, repr(learner), plain is None, learned is None, *ratios)
 
 

@@ -76,9 +76,8 @@ class Turncoat:
 
     def design(self, observer: ESO, omega_c: float) -> TurncoatDesign:
         """Return the parameters."""
-        return TurncoatDesign(
-            self.honest.design(observer, omega_c), self.turns / observer.dt, self.size
-        )
+        honest = self.honest.design(observer, omega_c)
+        return TurncoatDesign(honest, self.turns / observer.dt, self.size)
 
     def memory(self, parameters: TurncoatDesign) -> TurncoatMemory:
         """Return the state at the start."""

@@ -54,7 +54,7 @@ _SMOOTHED = 0.02
 
 
 def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
-    """Draw all figures into ``folder``, which is created if need be; return the paths."""
+    """Draw all figures into ``folder``, created if missing; return the paths."""
     drawings = {
         "torsional-position": partial(_position, result),
         "torsional-control": partial(_control, result),
@@ -132,9 +132,8 @@ def _learning(case: Case) -> Any:
     above.set_title(title, fontsize="medium")
     above.set(ylabel="theta", ylim=(-4000.0, 2000.0))
     for channel, label in ESTIMATES.items():
-        draw_line(
-            below, run.t, _smooth(run[channel], run.dt * run.every), label=label, linewidth=1.0
-        )
+        smooth = _smooth(run[channel], run.dt * run.every)
+        draw_line(below, run.t, smooth, label=label, linewidth=1.0)
     below.set_title("total disturbance as L-ESO has it, averaged over 20 ms", fontsize="medium")
     below.set(xlabel="time [s]", ylabel="f [rad/s⁴]", ylim=(-2e4, 2e4))
     for ax in (above, below):
@@ -149,9 +148,7 @@ def _smooth(values: Vector, dt: float) -> Vector:
     return np.convolve(values, np.full(width, 1.0 / width), mode="same")
 
 
-def _line(
-    ax: Any, run: Trajectory, values: Vector, span: tuple[float, float], **style: Any
-) -> None:
+def _line(ax: Any, run: Trajectory, values: Vector, span: tuple[float, ...], **style: Any) -> None:
     """Draw values of a run in a span of time from the profile's start [s]."""
     part = run.window(PROFILE_AT + span[0], PROFILE_AT + span[1])
     if part.stop > part.start:

@@ -55,23 +55,10 @@ _SHORTEST_DT = 1e-4
 
 @dataclass(frozen=True)
 class Settings:
-    """The parameters of the experiment that may be varied.
+    """The parameters of the experiment that may be varied."""
 
-    Parameters
-    ----------
-    dt
-        sample time [s].
-    seed
-        seed of the starts between two edges of the encoder.
-
-    Raises
-    ------
-    ValueError
-        for a value that allows no experiment.
-    """
-
-    dt: float = 1e-3
-    seed: int = 0
+    dt: float = 1e-3  #: sample time [s]
+    seed: int = 0  #: seed of the starts between two edges of the encoder
 
     def __post_init__(self) -> None:
         if not _SHORTEST_DT <= checks.positive("dt", self.dt, "s") <= _LONGEST_DT:
@@ -91,9 +78,8 @@ def scenarios(settings: Settings, kind: str) -> list[Scenario]:
     """Return the scenario for each start; both disks are turned by the same fraction of a count."""
     training = Sinusoid(amplitude=0.5 * math.pi, omega=0.5 * math.pi)
     profile = Trapezoid(distance=TARGET, duration=MOVE_TIME, ramp_time=RAMP_TIME, start=PROFILE_AT)
-    scenario = Scenario(
-        reference=training.until(PROFILE_AT, then=profile), duration=END, rest_at=(PROFILE_AT,)
-    )
+    reference = training.until(PROFILE_AT, then=profile)
+    scenario = Scenario(reference, duration=END, rest_at=(PROFILE_AT,))
     rest = np.array([1.0, float(kind == FRICTION), 0.0, 0.0]) * math.tau / COUNTS
     parts = np.random.default_rng(settings.seed).uniform(-0.5, 0.5, STARTS)
     return [replace(scenario, x0=part * rest) for part in parts]

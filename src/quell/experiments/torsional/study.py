@@ -48,8 +48,8 @@ class Outcome:
 
     records: Mapping[str, Trajectory]  #: records of the first start
     scores: Mapping[str, Scores]  #: medians over the starts, by controller
+    #: least and largest score over the starts
     spread: Mapping[str, Mapping[str, tuple[float, float] | None]]
-    """Least and largest score over the starts."""
     claims: tuple[Claim, ...]
 
     def to_json(self) -> dict[str, Any]:
@@ -78,12 +78,8 @@ class Case:
     def to_json(self) -> dict[str, Any]:
         """Return the results: those with friction at the top, the linear plant's under its name."""
         bandwidths = {"omega_c": self.omega_c, "omega_o": self.omega_o}
-        return (
-            bandwidths
-            | {"settings": bandwidths}
-            | self.outcomes[FRICTION].to_json()
-            | {LINEAR: self.outcomes[LINEAR].to_json()}
-        )
+        friction, linear = self.outcomes[FRICTION].to_json(), self.outcomes[LINEAR].to_json()
+        return bandwidths | {"settings": bandwidths} | friction | {LINEAR: linear}
 
 
 @dataclass(frozen=True)
@@ -105,10 +101,8 @@ class Result:
             "units": "SI; overshoot as a fraction of the move; "
             "settling time from the profile's start; medians over the starts",
         }
-        return {
-            "settings": asdict(self.settings) | about,
-            "cases": [case.to_json() for case in self.cases],
-        }
+        cases = [case.to_json() for case in self.cases]
+        return {"settings": asdict(self.settings) | about, "cases": cases}
 
 
 def run(settings: Settings, progress: Progress | None = None) -> Result:
@@ -125,7 +119,10 @@ def run(settings: Settings, progress: Progress | None = None) -> Result:
     def outcome(case: tuple[float, float], kind: str) -> Outcome:
         mine = {name: found for (*at, name), found in done.items() if at == [case, kind]}
         scores = {name: _over_starts(found, statistics.median) for name, (_, found) in mine.items()}
-        spread = {name: _over_starts(found, _range) for name, (_, found) in mine.items()}
+        spread = {
+            name: _over_starts(found, lambda values: (min(values), max(values)))
+            for name, (_, found) in mine.items()
+        }
         records = {name: first for name, (first, _) in mine.items()}
         return Outcome(records, scores, spread, tuple(_claims(scores, settings.dt)))
 
@@ -140,10 +137,6 @@ def _starts(
     first = simulate(plant, controller, starts[0])
     others = (simulate(plant, controller, start) for start in starts[1:])
     return first, [score(first), *map(score, others)]
-
-
-def _range(values: list[float]) -> tuple[float, float]:
-    return min(values), max(values)
 
 
 def _over_starts(scores: Sequence[Scores], summary: Callable[[list[float]], Any]) -> dict[str, Any]:

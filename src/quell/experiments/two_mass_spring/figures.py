@@ -40,7 +40,7 @@ _TRUE_THETA = {"x1": 0.0, "x2": 0.0, "x3": -2.0, "x4": 0.0}
 
 
 def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
-    """Draw all figures into ``folder``, which is created if need be; return the paths."""
+    """Draw all figures into ``folder``, created if missing; return the paths."""
     drawings = {
         "position": partial(_comparison, result, "y", "position of m2 [m]"),
         "control": partial(_comparison, result, "u", "control force [N]"),
