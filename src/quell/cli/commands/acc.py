@@ -50,7 +50,8 @@ def acc(
         plants = plant_samples.generated(1000 if count is None else count, spread, seed)
         source = f"generated, spread {spread:g}, seed {seed}"
     elif not (count is None and spread is None and seed is None):
-        raise ValueError("--samples: must be without --count, --spread, --seed, which draw plants")
+        others = "--count, --spread and --seed are for drawing them"
+        raise ValueError(f"--samples reads plants, {others}: give one or the other")
     else:
         plants, source = plant_samples.read(samples), samples.name
     check_outputs(outputs)

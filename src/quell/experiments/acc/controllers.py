@@ -27,8 +27,10 @@ MOST_U = 0.5  # limit of ``|u|`` [N], of Rocchetta, Crespo & Kenny (DSCC 2019)
 DT = 0.01  # sample time [s]: chosen by hand, omega_o dt = 0.1
 
 BASELINES = {
-    **{"PID": "pid", "PI with notch": "pi-notch"},
-    **{"LQG": "lqg", "resonance ratio": "resonance-ratio"},
+    "PID": "pid",
+    "PI with notch": "pi-notch",
+    "LQG": "lqg",
+    "resonance ratio": "resonance-ratio",
 }
 """Controllers of ``quell compare``, for the nominal plant; not tuned for this benchmark."""
 
