@@ -61,7 +61,13 @@ class Excitation:
     __str__ = describe
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``t,u`` as CSV, completely or not at all."""
+        """Write ``t,u`` as CSV, completely or not at all.
+
+        Raises
+        ------
+        ValueError
+            if the file can't be written.
+        """
         samples = zip(self.t.tolist(), self.u.tolist(), strict=True)
         rows = "".join(f"{t:.9g},{u:.9g}\n" for t, u in samples)
         with written_atomically(path) as part:

@@ -49,6 +49,11 @@ def frequency_response(
     -------
     FrequencyResponse
         at frequencies up to half the sampling rate, without zero.
+
+    Raises
+    ------
+    ValueError
+        for records that differ in length, or are too short for the number of segments.
     """
     from scipy.signal import csd, welch
 

@@ -38,7 +38,13 @@ class Measured(NamedTuple):
 
 
 def excited(plant: Plant, design: Excitation) -> Measured:
-    """Return the simulated record of a plant at rest that gets a designed excitation as u."""
+    """Return the simulated record of a plant at rest that gets a designed excitation as u.
+
+    Raises
+    ------
+    ValueError
+        as ``simulate``.
+    """
     none = np.zeros(0)
     law = LinearLaw(np.zeros((0, 0)), none, none, none, none, 1.0, 0.0)  # u = r
     scenario = Scenario(reference=design.signal, duration=(design.u.size - 1) * design.dt)

@@ -161,7 +161,13 @@ class BatchTrajectory(Record):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> BatchTrajectory:
-        """Return the record that ``save`` wrote, without ``final_states``."""
+        """Return the record that ``save`` wrote, without ``final_states``.
+
+        Raises
+        ------
+        ValueError
+            if the file is not such a record.
+        """
         required = {"dt", "every", "plant", *_PER_RUN}
         data = read_dataset(path, "BatchTrajectory.save", ("run", "time"), required)
         return cls(

@@ -154,7 +154,13 @@ class Trajectory(Record):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trajectory:
-        """Return the record that ``save`` wrote, without ``final_state``."""
+        """Return the record that ``save`` wrote, without ``final_state``.
+
+        Raises
+        ------
+        ValueError
+            if the file is not such a record.
+        """
         required = {"dt", "every", "status", "ended", "plant"}
         data = read_dataset(path, "Trajectory.save", ("time",), required)
         return cls(

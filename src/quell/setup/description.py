@@ -60,7 +60,13 @@ class Description(Table):
 
 
 def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
-    """Return the name of a TOML file, for messages, and its content."""
+    """Return the name of a TOML file, for messages, and its content.
+
+    Raises
+    ------
+    SetupError
+        for a file that cannot be read, or is not TOML.
+    """
     name = Path(path).name
     try:
         return name, tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))

@@ -75,7 +75,13 @@ def load(path: str | os.PathLike[str]) -> Setup:
 
 
 def made(name: str, data: Mapping[str, Any]) -> Setup:
-    """Build the objects that ``data`` describes: the content of a TOML file called ``name``."""
+    """Build the objects that ``data`` describes: the content of a TOML file called ``name``.
+
+    Raises
+    ------
+    SetupError
+        as ``load``.
+    """
     tables, builder = describe(name, data), Builder(name)
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
 

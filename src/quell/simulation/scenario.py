@@ -35,6 +35,12 @@ class Scenario:
         keeps what it has learned.
     seed
         seed of all random signals; the same seed gives the same bits.
+
+    Raises
+    ------
+    ValueError
+        if the duration is not positive, the seed is negative, a signal is none, or the times in
+        ``rest_at`` do not increase within the duration.
     """
 
     reference: Signal | float = 0.0

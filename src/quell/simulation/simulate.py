@@ -94,6 +94,12 @@ def simulate(
     -------
     Trajectory or BatchTrajectory
         the recorded samples, up to the end of the run.
+
+    Raises
+    ------
+    ValueError
+        for arguments out of range, a plant that ``LinearPlant.of`` refuses, an x0 of the wrong
+        size, more disturbances than the plant has inputs, or runs that do not fit into one batch.
     """
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
