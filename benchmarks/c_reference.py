@@ -1,4 +1,4 @@
-"""Common parts of the speed benchmarks: the two-mass loop in C (``reference.c``), timing, tables."""
+"""Common parts of the speed benchmarks: the two-mass loop in C (``reference.c``), timing, table."""
 
 from __future__ import annotations
 

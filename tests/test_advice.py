@@ -128,8 +128,8 @@ def test_a_lag_is_judged_by_what_it_leaves_of_the_margins() -> None:
     assert (finding.value, finding.limit) == pytest.approx((after.modulus, 0.8 * before.modulus))
     cost = math.degrees(math.atan(0.02 * before.phase_omega))
     assert (
-        f"an actuator lag of 20 ms, {cost:.1f}° at the crossover of {before.phase_omega:.3g} rad/s, leaves"
-        in str(finding)
+        f"an actuator lag of 20 ms, {cost:.1f}° at the crossover of {before.phase_omega:.3g} "
+        "rad/s, leaves" in str(finding)
     )
     assert f"a phase margin of {after.phase:.1f}° of {before.phase:.1f}°" in str(finding)
 

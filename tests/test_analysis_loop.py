@@ -66,8 +66,8 @@ def test_where_b_can_not_be_compared_with_b0_the_range_is_in_gains_of_the_plant(
         assert loop.b_over_b0 is None
         assert loop.b_range == loop.margins.gain
         assert (
-            f"stable for a gain from {loop.b_range[0]:.3g} to {loop.b_range[1]:.3g} times what it is"
-            in loop.summary()
+            f"stable for a gain from {loop.b_range[0]:.3g} to {loop.b_range[1]:.3g} times what it "
+            "is" in loop.summary()
         )
         axes = analysis.plot_margins_over_time([0.0], [loop])
         assert axes[2].get_ylabel() == "gain for which\nit is stable"

@@ -195,8 +195,10 @@ def test_importing_quell_imports_nothing_heavy() -> None:
 def test_simulating_imports_neither_plots_nor_files() -> None:
     """They cost a second that a run does not need."""
     code = (
-        "import sys, quell as ql; ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0); ql.Trajectory; ql.simulate;"
-        "print([m for m in ('xarray', 'matplotlib', 'control', 'rich', 'pydantic') if m in sys.modules])"
+        "import sys, quell as ql; ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0); "
+        "ql.Trajectory; ql.simulate;"
+        "print([m for m in ('xarray', 'matplotlib', 'control', 'rich', 'pydantic') if m in "
+        "sys.modules])"
     )
     assert (
         subprocess.run(

@@ -78,7 +78,8 @@ def test_a_setup_is_simulated_printed_written_drawn_and_saved(
         ("[guard", "quell: wrong.toml: not TOML"),
         (
             "[[metrics]]\nstart = 30.0",
-            "quell: wrong.toml: metrics[2].start = 30: must be less than the scenario's duration, 12 s",
+            "quell: wrong.toml: metrics[2].start = 30: must be less than the scenario's duration, "
+            "12 s",
         ),
     ],
 )
@@ -174,7 +175,8 @@ def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_pat
     twice = quell("run-rig", "rig.toml", "--mcap", "run.mcap")
     assert (twice.code, twice.err) == (
         2,
-        "quell: path = 'run.mcap': the file exists; recordings are not overwritten: move it, or choose another name\n",
+        "quell: path = 'run.mcap': the file exists; recordings are not overwritten: move it, or "
+        "choose another name\n",
     )
 
 

@@ -345,7 +345,8 @@ def test_derivatives_reach_a_loop_of_ones_own() -> None:
         (lambda c: c.retune(observer="eso"), "observer = 'eso': must be an ESO"),
         (
             lambda c: c.step(1.0, 0.0, 1.0),
-            "step was given 1 derivatives of the reference: make the controller with feedforward=True",
+            "step was given 1 derivatives of the reference: make the controller with "
+            "feedforward=True",
         ),
     ],
 )

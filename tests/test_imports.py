@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-# The order of the folders: each may import itself and whatever stands before it. "x.__init__" is the file
-# that gathers the public names of folder x and its subfolders. A new folder needs an entry here.
+# The order of the folders: each may import itself and whatever stands before it. "x.__init__" is
+# the file that gathers the public names of folder x and its subfolders. A new folder needs an entry
+# here.
 ROWS = (
     ("types", "checks", "files", "parallel", "optional", "kernels"),
     ("lti", "signals", "observers", "plants", "features"),

@@ -62,7 +62,8 @@ def test_the_kalman_learner_finds_the_plant(two_mass_scenario: ql.Scenario) -> N
         )
         run = ql.simulate(ql.plants.two_mass_spring(), controller, two_mass_scenario)
         learned = run["theta"][run.window(19.0, 20.0)][-1]
-        # For y = sin t, x3 = −x1 and x4 = −x2: two sums are certain at once, the rest only through the transient.
+        # For y = sin t, x3 = −x1 and x4 = −x2: two sums are certain at once, the rest only through
+        # the transient.
         np.testing.assert_allclose(
             [learned[2] - learned[0], learned[3] - learned[1], learned[4]],
             [-2.0, 0.0, 0.0],

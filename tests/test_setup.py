@@ -242,7 +242,8 @@ def test_tables_take_what_their_calls_take() -> None:
 def test_signals_add_up_and_follow_each_other() -> None:
     """A list is a sum, ``until`` and ``then`` are ``Signal.until``, a text is a kind, a number a constant."""
     scenario = setup(
-        "[scenario]\nreference = [1.0, 'step', {kind = 'ramp', slope = 2.0, until = 3.0, then = {kind = 'sinusoid'}}]\n"
+        "[scenario]\nreference = [1.0, 'step', {kind = 'ramp', slope = 2.0, until = 3.0, then = "
+        "{kind = 'sinusoid'}}]\n"
         "disturbances = [['step', 0.5], 2.0]\nnoise = 'noise'"
     ).scenario
     shapes, t = ql.signals, np.linspace(0.0, 5.0, 51)

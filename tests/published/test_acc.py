@@ -1,6 +1,7 @@
 """Failure rates on the 1000 published samples of small uncertainty (Rocchetta, Crespo & Kenny, DSCC 2019).
 
-The samples are not part of this repository; they are looked for beside it, in ``shared/benchmarks/acc``.
+The samples are not part of this repository; they are looked for beside it, in
+``shared/benchmarks/acc``.
 """
 
 from __future__ import annotations

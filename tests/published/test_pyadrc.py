@@ -43,7 +43,8 @@ def test_every_sample_agrees_over_a_run_with_limits(order: int, half_gain: bool)
 def test_a_half_gain_law_halves_k_where_pyadrc_halves_the_cancellation_too(order: int) -> None:
     """The paper halves k, and so does ``ADRC``. pyadrc 2 halves ``1/b0`` of f̂ as well, but not the gain of r: then y settles elsewhere.
 
-    From the same y and u the two differ by just that, ``(k_1 r + f̂)/(2 b0)``, and ours settles at r.
+    From the same y and u the two differ by just that, ``(k_1 r + f̂)/(2 b0)``, and ours settles at
+    r.
     """
     dt, b0, omega_c = 0.01, 2.0, 4.0
     ours = ql.ADRC(

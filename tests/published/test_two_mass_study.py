@@ -1,6 +1,7 @@
 """The paper's simulation study: its published figures, and the reference figures of docs/theory.
 
-Seeds 0 to 9, sample times 1 to 10 ms. A bar stands here as it was set; where the measurement misses one, the test says by how much.
+Seeds 0 to 9, sample times 1 to 10 ms. A bar stands here as it was set; where the measurement misses
+one, the test says by how much.
 """
 
 from __future__ import annotations
