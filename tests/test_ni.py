@@ -39,6 +39,7 @@ def paper_s_rack(**more):
 @pytest.fixture
 def rack(monkeypatch):
     """The paper's two cards; nothing may be left on them that still runs."""
+    gc.freeze()  # what other tests left need not be gone through
     rack = paper_s_rack()
     put_under(rack, monkeypatch)
     yield rack
