@@ -23,15 +23,19 @@ LEARNERS: dict[str, Any] = {
 }
 
 
+def stage(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
+    """A mass on a spring that stiffens, with friction."""
+    return x[1], 2.0 * u - x[0] - 2.0 * x[0] ** 3 - math.tanh(x[1] / 0.05)
+
+
+PLANT = cache(lambda: ql.plants.NonlinearPlant(stage, order=2, substeps=4))  # compiled once
+
+
 @cache
 def error(name: str) -> float:
     """RMS of y less the ideal closed loop's response, from 20 s on."""
-
-    def stage(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
-        return x[1], 2.0 * u - x[0] - 2.0 * x[0] ** 3 - math.tanh(x[1] / 0.05)
-
     s = ql.signals
-    plant = ql.plants.NonlinearPlant(stage, order=2, substeps=4)
+    plant = PLANT()
     controller = ql.ADRC(
         ql.ESO.model_free(order=2, b0=2.0, omega_o=30.0, dt=2e-3),
         omega_c=OMEGA_C,
