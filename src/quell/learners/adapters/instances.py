@@ -27,8 +27,8 @@ from quell.types import Matrix, Status, Vector
 # Failures in a row after which a model is disabled; chosen by hand.
 _MAX_FAILURES = 3
 # Delay after which an interrupt is passed on to the main thread [s]: the compiled loop has to
-# return from the model first; chosen by hand.
-_INTERRUPT_DELAY = 0.05
+# return from the model first, which takes more than 50 ms on a busy machine; chosen by hand.
+_INTERRUPT_DELAY = 0.25
 _LATE, _FAILED = int(Status.LEARNER_LATE), int(Status.LEARNER_FAILED)
 
 # Indices of the array in which a loop gets its answer: last prediction, scaled; status flags;
