@@ -131,7 +131,7 @@ def enter_real_time(priority: int, cpu: int | None, notes: list[str]) -> None:
 
 
 def set_low_priority(real_time: bool) -> None:
-    """Give this thread the lowest priority of SCHED_FIFO if permitted, or an ordinary one."""
+    """Set this thread to the lowest priority of SCHED_FIFO if permitted, or to an ordinary one."""
     if not hasattr(os, "sched_setscheduler"):
         return
     if real_time:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, generic_with_default
 from quell.realtime.wire.frames import Buffer
 
 MOST_AT_ONCE = 1024
@@ -36,23 +36,12 @@ def wait_for_frame(transport: Any, nanoseconds: int) -> None:
     raise TypeError
 
 
-@generic
+@generic_with_default
 def reply(transport: Any, frame: Buffer) -> int:
     """Send a frame to the sender of the packet received last; return the same as ``send``."""
-    raise TypeError
-
-
-@generic
-def connect_to_sender(transport: Any) -> None:
-    """Make the sender of the packet received last the other side."""
-    raise TypeError
-
-
-@reply.register(object)
-def _reply(transport: Any, frame: Buffer) -> int:
     return send(transport, frame)
 
 
-@connect_to_sender.register(object)
-def _connect_to_sender(transport: Any) -> None:
-    """Do nothing: by default there is only one other side."""
+@generic_with_default
+def connect_to_sender(transport: Any) -> None:
+    """Make the sender of the packet received last the other side; nothing if there is only one."""
