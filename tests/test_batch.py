@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.parallel import in_parallel
 from quell.plants import PlantBatch, batch, two_mass_spring
 from quell.simulation import sampled_scenario
 
@@ -407,6 +409,36 @@ def test_a_plot_has_two_axes_and_draws_into_given_ones(law: ql.ADRC) -> None:
             r"x0 has shape \(1,\): must be a vector of 4",
         ),
         (
+            lambda: ql.simulate(PLANTS, controller(), [SHORT, SHORT, replace(SHORT, x0=[1.0])]),
+            r"^scenario\[2\]: x0 has shape \(1,\): must be a vector of 4",
+        ),
+        (
+            lambda: ql.simulate("servo", controller(), SHORT),
+            "^plant = 'servo': must be a plant, for example",
+        ),
+        (
+            lambda: ql.simulate("servo", [controller()] * 2, SHORT),
+            "^plant = 'servo': must be a plant, for example",
+        ),
+        (
+            lambda: ql.simulate(PLANTS, "adrc", SHORT),
+            "^controller = 'adrc': must be a controller",
+        ),
+        (
+            lambda: ql.simulate(PLANTS[0], controller(), "step"),
+            "^scenario = 'step': must be a quell.Scenario",
+        ),
+        (
+            lambda: ql.Scenario(disturbances="step"),
+            "^disturbances = 'step': must be a sequence of signals or numbers",
+        ),
+        (lambda: PlantBatch("servo"), "^plants = 'servo': must be a sequence of plants"),
+        (lambda: PlantBatch(1.0), "^plants = 1.0: must be a sequence of plants"),  # type: ignore[arg-type]
+        (
+            lambda: ql.simulate([([1.0], [1.0, 1.0, 0.0])] * 2, controller(), SHORT),
+            "must be an array of numbers, got ",
+        ),
+        (
             lambda: ql.simulate(PLANTS, controller(), SHORT).run(3),
             "i = 3: must be a whole number from 0 to 2",
         ),
@@ -441,3 +473,21 @@ def test_what_goes_wrong_in_a_plant_of_the_user_s_is_told_with_its_run() -> None
     plants = [faulty(9.0), faulty(0.5)]
     with pytest.raises(ValueError, match="run 1: broken"):
         ql.simulate(plants, law, SHORT, interpret=True)
+
+
+def test_of_several_faults_the_first_job_s_is_told_whichever_came_first() -> None:
+    """A batch with two faulty runs names the same one on every machine."""
+    began, ended = threading.Event(), threading.Event()
+
+    def slow() -> None:
+        began.set()
+        ended.wait(10.0)
+        raise ValueError("run 0")
+
+    def quick() -> None:
+        began.wait(10.0)
+        threading.Timer(0.05, ended.set).start()
+        raise ValueError("run 1")
+
+    with pytest.raises(ValueError, match="run 0"):
+        in_parallel([slow, quick], workers=2)

@@ -96,6 +96,11 @@ def samples(name: str, value: Any, dt: float) -> int:
     return count
 
 
+def is_sequence(value: Any) -> bool:
+    """Return whether ``value`` is a sequence of items; a text is one item."""
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray)
+
+
 def vector(name: str, value: Any, size: int | None = None) -> Vector:
     """Return ``value`` as a finite, contiguous float vector, of ``size`` entries if given."""
     array = _array(name, value)

@@ -31,8 +31,12 @@ def in_parallel(
                 future.result()
                 if progress is not None:
                     progress(done / len(futures))
-        except BaseException:
+        except BaseException as error:
             pool.shutdown(cancel_futures=True)
+            if isinstance(error, Exception):
+                for future in futures:  # of several errors the first job's, whichever came first
+                    if not future.cancelled():
+                        future.result()
             raise
         return [future.result() for future in futures]
 

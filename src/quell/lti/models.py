@@ -64,7 +64,7 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
             "E: only a plant with states has an input for the disturbance; leave E out"
         )
     if isinstance(plant, tuple) and len(plant) == 2:
-        if np.ndim(plant[1]) != 0:
+        if not (np.isscalar(plant[1]) or getattr(plant[1], "ndim", 1) == 0):
             return _transfer_function(*plant)
         a = checks.vector("a", plant[0])
         b = checks.nonzero("b", plant[1], "or the input does not reach the plant")

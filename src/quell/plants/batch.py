@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, overload
 
@@ -34,6 +34,8 @@ class PlantBatch(Sequence[Plant]):
     def __init__(
         self, plants: Sequence[Plant], parameters: Mapping[str, Any] | None = None
     ) -> None:
+        if isinstance(plants, str | bytes) or not isinstance(plants, Iterable):
+            raise ValueError(f"plants = {plants!r}: must be a sequence of plants")
         self._plants = tuple(plants)
         if not self._plants:
             raise ValueError("plants has no entries: a batch must hold at least one plant")

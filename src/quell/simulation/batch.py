@@ -42,6 +42,7 @@ def simulate_batch(
     plants, controllers, scenarios = _members(plant, controller, scenario)
     every = checks.whole("record_every", record_every, 1)
     workers = None if workers is None else checks.whole("workers", workers, 1)
+    checks.optional(checks.positive, "limit", limit)
     sampled = _sampled(scenarios, plants[0], controllers, limit)
     dt, samples, runs = sampled[0].dt, sampled[0].samples, len(sampled)
     logged = logged_channels(plants[0], controllers[0])
@@ -107,7 +108,7 @@ def _members(
     """Return plants, controllers and scenarios, one for each run."""
     given = {"plant": plant, "controller": controller, "scenario": scenario}
     check = {"plant": check_plant, "controller": check_controller, "scenario": check_scenario}
-    lengths = {name: len(value) for name, value in given.items() if isinstance(value, Sequence)}
+    lengths = {name: len(value) for name, value in given.items() if checks.is_sequence(value)}
     (leader, runs), *others = lengths.items()
     for name, length in others:
         if length != runs:
@@ -148,7 +149,11 @@ def _sampled(
     for i, (scenario, controller) in enumerate(zip(scenarios, controllers, strict=True)):
         key = id(scenario), getattr(controller, "derivatives", 0)
         if key not in found:
-            found[key] = SampledScenario.of(scenario, plant, controller, limit)
+            try:
+                found[key] = SampledScenario.of(scenario, plant, controller, limit)
+            except ValueError as error:
+                where = "" if all(each is scenario for each in scenarios) else f"scenario[{i}]: "
+                raise ValueError(f"{where}{error}") from None
         sampled.append(found[key])
         if sampled[i].samples != sampled[0].samples:
             raise ValueError(

@@ -56,7 +56,7 @@ class Scenario:
         checks.whole("seed", self.seed, 0)
         as_signal(self.reference, "reference")
         as_signal(self.noise, "noise")
-        if not isinstance(self.disturbances, Sequence):
+        if not checks.is_sequence(self.disturbances):
             raise ValueError(
                 f"disturbances = {self.disturbances!r}: must be a sequence of signals or numbers"
             )

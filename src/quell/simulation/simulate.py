@@ -103,7 +103,7 @@ def simulate(
     """
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
-    if any(isinstance(value, Sequence) for value in (plant, controller, scenario)):
+    if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
         return simulate_batch(
             plant, controller, scenario, record_every, limit, interpret, progress, record, workers
         )
