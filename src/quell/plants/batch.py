@@ -34,7 +34,8 @@ class PlantBatch(Sequence[Plant]):
     def __init__(
         self, plants: Sequence[Plant], parameters: Mapping[str, Any] | None = None
     ) -> None:
-        if isinstance(plants, str | bytes) or not isinstance(plants, Iterable):
+        given: Any = plants
+        if isinstance(given, str | bytes) or not isinstance(given, Iterable):
             raise ValueError(f"plants = {plants!r}: must be a sequence of plants")
         self._plants = tuple(plants)
         if not self._plants:
