@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import tracemalloc
 from typing import Any
 
 import control
@@ -13,6 +14,7 @@ import pytest
 import quell as ql
 from quell import analysis
 from quell.analysis.sampled_plant import sampled_plant
+from quell.analysis.subsystems import subsystem
 from tests.analysed_loops import PLANT, TRAINING, adrc, chain
 
 
@@ -202,3 +204,38 @@ def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
         with pytest.raises(ValueError, match=message) as caught:
             call()
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("known", [0.0, 0.35])
+def test_a_dead_time_is_a_power_of_z(known: float) -> None:
+    """Responses are those of all states to 1e-12, and memory does not grow with the samples of the delay."""
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=2, b0=1.0, omega_o=5.0, dt=0.01, delay=known), omega_c=0.3
+    )
+    loop = analysis.analyse(ql.plants.two_mass_spring(c1=0.5, c2=0.5), controller, delay=1.505)
+    omega = np.geomspace(1e-3, np.pi / 0.01, 2000)
+    few = omega[::100]
+    for name in ("P", "C_r", "C_y", "L"):
+        N, B, C, D = subsystem(loop.plant, loop.law, name)
+        zeta = np.expm1(1j * few * loop.dt)[:, None, None]
+        solved = np.linalg.solve(zeta * np.eye(B.size) - N, np.tile(B[:, None], (few.size, 1, 1)))
+        np.testing.assert_allclose(loop.response(name, few), solved[:, :, 0] @ C + D, rtol=1e-11)
+    tracemalloc.start()
+    loop.response("L", omega)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 40e6  # the matrices of all states took 1.5 GB
+
+
+def test_delays_that_do_not_act_are_poles_at_zero() -> None:
+    """Plant and controller both store the late u: one of the two decides about the poles, the other's are exactly zero."""
+    controller = ql.ADRC(
+        ql.ESO.model_free(order=1, b0=1.0, omega_o=5.0, dt=0.01, delay=0.5), omega_c=0.3
+    )
+    loop = analysis.analyse(([1.0], [1.0, 1.0]), controller, delay=0.5)
+    assert np.count_nonzero(loop.poles == 0.0) >= 50
+    # All of them are those of the whole matrix: compared by its powers' traces.
+    A = np.eye(loop.poles.size) + loop.closed_loop_matrix()
+    for power in (1, 2, 7, 51, 60):
+        trace = np.trace(np.linalg.matrix_power(A, power))
+        assert np.sum(loop.poles**power) == pytest.approx(trace, rel=1e-9, abs=1e-12)

@@ -12,6 +12,7 @@ import pytest
 
 import quell as ql
 from quell import analysis
+from quell.analysis.margins import margins
 from quell.controllers.linear.law import LinearLaw
 from tests.analysed_loops import PLANT, adrc, chain
 
@@ -98,3 +99,50 @@ def test_an_unstable_loop_has_no_margins() -> None:
     )
     assert loop.noise_to_control == math.inf
     assert "unstable" in repr(loop)
+
+
+@pytest.mark.parametrize("samples", [1, 7, 200])
+def test_margins_with_a_dead_time_are_those_of_the_closed_form(samples: int) -> None:
+    """``L = K dt z⁻ᵈ/(z − 1)`` has the phase ``−90° − (d + ½) ω dt`` and the gain ``K dt/(2 sin(ω dt/2))``."""
+    dt = 0.01
+    K = 0.3 / (dt * (samples + 0.5))
+    m = analysis.analyse(([1.0], [1.0, 0.0]), integrator(K, dt), delay=samples * dt).margins
+    turned = math.pi / (2 * samples + 1)
+    assert m.gain == pytest.approx((0.0, 2.0 * math.sin(0.5 * turned) / (K * dt)), rel=1e-11)
+    assert m.gain_omega[1] == pytest.approx(turned / dt, rel=1e-11)
+    crossing = 2.0 / dt * math.asin(0.5 * K * dt)
+    assert m.phase_omega == pytest.approx(crossing, rel=1e-11)
+    assert m.phase == pytest.approx(90.0 - math.degrees((samples + 0.5) * crossing * dt), rel=1e-11)
+    assert m.delay == pytest.approx(math.radians(m.phase) / crossing, rel=1e-11)
+
+
+def test_a_gain_margin_may_lie_at_standstill() -> None:
+    """``2/(s − 1)`` with unit gain: half of it no longer holds the plant, which then drifts away without oscillation."""
+    m = analysis.analyse(([2.0], [1.0, -1.0]), integrator(1.0, 0.01)).margins
+    # At z = 1 the sampled plant is the continuous one, −2; at z = −1 it is 2 tanh(dt/2).
+    assert m.gain == pytest.approx((0.5, 1.0 / (2.0 * math.tanh(0.005))), rel=1e-5)
+    assert 0.0 < m.gain_omega[0] < 0.01
+    assert m.gain_omega[1] == pytest.approx(math.pi / 0.01)
+
+
+def test_a_crossing_that_loses_nothing_is_no_gain_margin() -> None:
+    """The negative real axis is crossed at −1/2 and at −1/3, −2 and −4, and only the outer ones change stability."""
+
+    def loop(omega: Any) -> Any:
+        shape = np.interp(omega, [1.0, 2.0, 3.0, 4.0], [0.5, 1.0 / 3.0, 2.0, 4.0])
+        return -shape * np.exp(1j * (omega - 1.0) * (omega - 2.0) * (omega - 3.0) * (omega - 4.0))
+
+    omega = np.linspace(0.95, 4.05, 300)
+    m = margins(loop, omega, 0.1, lambda gain: 0.3 < gain < 2.9)
+    assert m.gain == pytest.approx((0.25, 3.0), rel=1e-9)
+    assert m.gain_omega == pytest.approx((4.0, 2.0), rel=1e-9)
+    assert margins(loop, omega, 0.1, lambda gain: True).gain == (0.0, math.inf)
+
+
+def test_a_disk_margin_of_two_allows_any_gain_and_a_quarter_turn() -> None:
+    """It is the largest that a loop with L = 0 at some frequency can have."""
+    m = margins(lambda omega: 1j * omega, np.geomspace(0.01, 1.0, 5), 0.1, lambda gain: True)
+    m = m._replace(disk=2.0)
+    assert m.disk_gain == (0.0, math.inf)
+    assert m.disk_phase == pytest.approx(90.0, rel=1e-15)
+    assert m._replace(disk=2.0 - 1e-9).disk_gain[1] == pytest.approx(4e9, rel=1e-6)

@@ -70,8 +70,8 @@ def _measured_law(design: Any, origin: Any) -> LinearLaw:
     """Return the law around a state ``origin`` that no limit and no flag is about to change."""
     fixed_u = [design._replace(limits=Limits(u, u, math.inf)) for u in (0.0, _UNIT)]
     # Entries that are not zero are flags and the like, which do not change any more.
-    arrays = named_arrays(origin).items()
-    places = [(name, at) for name, array in arrays for at in np.argwhere(array == 0.0)]
+    is_zero = {name: array == 0.0 for name, array in named_arrays(origin).items()}
+    places = [(name, at) for name, zero in is_zero.items() for at in np.argwhere(zero)]
 
     def respond(design: Any, place: Any = None, r: float = 0.0, y: float = 0.0) -> Any:
         """Return the next state and u, in units, for one entry of the state, r or y."""
@@ -81,7 +81,8 @@ def _measured_law(design: Any, origin: Any) -> LinearLaw:
             arrays[place[0]][tuple(place[1])] = _UNIT
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             u = control(design, state, r, y)
-        return np.array([arrays[name][tuple(at)] for name, at in places]) / _UNIT, u / _UNIT
+        moved = np.concatenate([arrays[name][zero] for name, zero in is_zero.items()])
+        return moved / _UNIT, u / _UNIT
 
     # The next state is measured with u fixed at zero by the limits, u without limits.
     A = np.array([respond(fixed_u[0], place)[0] for place in places]).T

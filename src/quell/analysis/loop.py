@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.frequency_response import Complex, System, frequencies, in_s_plane, response
+from quell.analysis.frequency_response import Complex, Response, System, frequencies, in_s_plane
 from quell.analysis.linearise import linear_law
 from quell.analysis.margins import Margins, least, margins
+from quell.analysis.pure_delays import eigenvalues
 from quell.analysis.python_control import state_space, transfer_function
 from quell.analysis.sampled_plant import SampledPlant, sampled_plant
 from quell.analysis.subsystems import closed_loop, closed_loop_matrix, law_matrix, subsystem
@@ -94,7 +95,7 @@ class LoopAnalysis:
         self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
         self._N = law_matrix(law)
         names = ("P", "C_r", "C_y")
-        self._open = {name: System.balanced(*subsystem(plant, law, name)) for name in names}
+        self._open = {name: Response(subsystem(plant, law, name)) for name in names}
 
     def __repr__(self) -> str:
         states = f"{self.plant.N.shape[0]} + {self.law.A.shape[0]} states"
@@ -127,23 +128,27 @@ class LoopAnalysis:
 
     def _shifted_poles(self, gain: float = 1.0) -> Complex:
         """Return the closed-loop poles as z − 1, the slowest first."""
-        shifted: Complex = np.linalg.eigvals(self.closed_loop_matrix(gain)).astype(np.complex128)
+        shifted = eigenvalues(self.closed_loop_matrix(gain))
         return shifted[np.argsort(np.abs(shifted), kind="stable")]
 
+    @cached_property
+    def _shifted(self) -> Complex:
+        return self._shifted_poles()
+
     def _stable_with(self, gain: float) -> bool:
-        shifted = self._shifted_poles(gain)
+        shifted = self._shifted if gain == 1.0 else self._shifted_poles(gain)
         return bool(np.all(2.0 * shifted.real + np.abs(shifted) ** 2 < 0.0))  # |z|² − 1
 
     @cached_property
     def poles(self) -> Complex:
         """Closed-loop poles in the z-plane, the slowest first."""
-        poles: Complex = 1.0 + self._shifted_poles()
+        poles: Complex = 1.0 + self._shifted
         return poles
 
     @cached_property
     def s_poles(self) -> Complex:
         """The same as ``log(z)/dt`` [rad/s], as in continuous time; −inf for a pole at z = 0."""
-        return in_s_plane(self._shifted_poles(), self.dt)
+        return in_s_plane(self._shifted, self.dt)
 
     @cached_property
     def stable(self) -> bool:
@@ -155,8 +160,7 @@ class LoopAnalysis:
     @cached_property
     def omega(self) -> Vector:
         """Frequencies [rad/s] for plots, up to half the sampling rate; dense near poles."""
-        poles = (np.linalg.eigvals(N).astype(np.complex128) for N in (self.plant.N, self._N))
-        open_loop = [in_s_plane(shifted, self.dt) for shifted in poles]
+        open_loop = [in_s_plane(eigenvalues(N), self.dt) for N in (self.plant.N, self._N)]
         return frequencies(np.concatenate([self.s_poles, *open_loop]), self.dt)
 
     def response(self, name: str, omega: Any) -> Complex:
@@ -177,7 +181,7 @@ class LoopAnalysis:
         """
         checks.one_of("name", name, ("P", "C_r", "C_y", "L", "S", "T", "PS", "CS", "closed_loop"))
         if name in self._open:
-            return response(self._open[name], omega, self.dt)
+            return self._open[name](omega, self.dt)
         L = self._loop(omega)
         if name == "L":
             return L
