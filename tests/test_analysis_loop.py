@@ -171,7 +171,7 @@ def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
     outside = adrc(2, learner=ql.learners.PythonModel(Python()))
     other = ql.simulate(chain(2), adrc(2, learner=ql.learners.Kalman()), TRAINING)
     for message, call in (
-        ("linearised first", lambda: analysis.analyse(pendulum, adrc(2))),
+        ("give the point at which it is linearised", lambda: analysis.analyse(pendulum, adrc(2))),
         ("biproper", lambda: analysis.analyse(([1.0, 1.0], [1.0, 2.0]), adrc(2))),
         (
             "may not follow the input at once",
@@ -239,3 +239,64 @@ def test_delays_that_do_not_act_are_poles_at_zero() -> None:
     for power in (1, 2, 7, 51, 60):
         trace = np.trace(np.linalg.matrix_power(A, power))
         assert np.sum(loop.poles**power) == pytest.approx(trace, rel=1e-9, abs=1e-12)
+
+
+def test_delays_and_encoders_around_a_plant_are_taken_off() -> None:
+    """The delay is that of the loop, and an encoder's steps are no gain."""
+    inner = ql.plants.two_mass_spring(c1=0.5, c2=0.5)
+    controller = adrc(4)
+    late = ql.plants.encoded(ql.plants.delayed(inner, delay=0.03, dt=0.01), counts=1000)
+    found = analysis.analyse(late, controller, delay=0.01)
+    assert found.margins == analysis.analyse(inner, controller, delay=0.04).margins
+    with pytest.raises(ValueError, match=r"delayed by samples of 0\.02 s, .*dt = 0\.01 s: must be"):
+        analysis.analyse(ql.plants.delayed(inner, delay=0.04, dt=0.02), controller)
+
+
+def test_a_nonlinear_plant_is_analysed_about_its_operating_point() -> None:
+    """The pendulum is a spring when it hangs and drives away when it stands: closed forms for both."""
+    pendulum = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: (x[1], 2.0 * u + w[0] - 9.81 * math.sin(x[0]) - 0.4 * x[1]),
+        order=2,
+        output=lambda x: math.sin(x[0] / 2.0),
+    )
+    for angle in (0.0, 2.0):
+        found = ql.plants.linearised(pendulum, [angle, 0.0])
+        slope = 0.5 * math.cos(angle / 2.0)
+        expected = [[0.0, 1.0], [-9.81 * math.cos(angle), -0.4]]
+        np.testing.assert_allclose(found.A, expected, rtol=1e-8, atol=1e-12)
+        np.testing.assert_allclose(found.C, [[slope, 0.0]], rtol=1e-8, atol=1e-12)
+        loop = analysis.analyse(pendulum, adrc(2), operating_point=([angle, 0.0], 1.0))
+        direct = analysis.analyse((expected, [0.0, 2.0], [slope, 0.0]), adrc(2))
+        assert loop.margins.phase == pytest.approx(direct.margins.phase, rel=1e-6)
+        assert loop.b_over_b0 == pytest.approx(2.0 * slope, rel=1e-8)
+    with pytest.raises(
+        ValueError, match=r"is nonlinear: give the point .* operating_point=\(x, u\)"
+    ):
+        analysis.analyse(pendulum, adrc(2))
+    with pytest.raises(ValueError, match=r"is a function: pass quell\.plants\.NonlinearPlant\(f"):
+        analysis.analyse(pendulum.f, adrc(2))
+    with pytest.raises(ValueError, match=r"operating_point = 3\.0: must be a state and a control"):
+        analysis.analyse(pendulum, adrc(2), operating_point=3.0)
+
+
+def test_a_cubic_spring_is_as_stiff_as_its_twist_makes_it() -> None:
+    """``k + 3 k_cubic d²``, in all entries where k is."""
+    plant = ql.plants.lagged_two_mass_spring(m1=2.0, m2=0.5, k=1.0, k_cubic=0.7)
+    found = ql.plants.linearised(plant, [0.3, -0.2, 0.0, 0.0, 0.0])
+    stiff = ql.plants.lagged_two_mass_spring(m1=2.0, m2=0.5, k=1.0 + 3.0 * 0.7 * 0.25)
+    np.testing.assert_allclose(found.A, stiff.A, rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize("friction", [np.sign, abs, lambda v: max(v, 0.0)])
+def test_a_point_without_derivative_is_refused(friction: Any) -> None:
+    """Dry friction at standstill has no slope; beside it, it has."""
+    plant = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - friction(x[1])), order=2)
+    with pytest.raises(ValueError, match=r"f has no derivative by entry 1 of"):
+        ql.plants.linearised(plant, [0.0, 0.0])
+    ql.plants.linearised(plant, [0.0, 0.1])
+    smooth = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: (x[1], u - math.tanh(x[1] / 1e-3)), order=2
+    )
+    assert ql.plants.linearised(smooth, [0.0, 0.0]).A[1, 1] == pytest.approx(-1000.0, rel=1e-5)
+    with pytest.raises(ValueError, match=r"has dry friction, limits or an encoder.*plant\.linear"):
+        analysis.analyse(ql.plants.torsional(), adrc(2))

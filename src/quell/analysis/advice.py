@@ -31,6 +31,7 @@ def advise(
     actuator_lag: float = 0.0,
     delay: float = 0.0,
     at: Any = None,
+    operating_point: Any = None,
 ) -> list[Finding]:
     """Return the weak points of a design, each with its number, the limit, and what to do.
 
@@ -54,6 +55,8 @@ def advise(
         that the observer assumes.
     at
         instant at which the learner is frozen; see ``analyse``.
+    operating_point
+        state and control signal (x, u) about which a nonlinear plant is linearised.
     """
     observer = controller.observer if isinstance(controller, ADRC) else None
     known_delay, found = 0.0, []
@@ -65,14 +68,15 @@ def advise(
     delay = checks.non_negative("delay", delay, "s")
     if isinstance(controller, ADRC):
         found = sampling_findings(controller.observer, controller.omega_c)
-    loop = analyse(plant, controller, at=at, delay=known_delay)
+    options = {"at": at, "operating_point": operating_point}
+    loop = analyse(plant, controller, delay=known_delay, **options)
     if not loop.stable:
         what_to_do = "check b0, raise omega_o or lower omega_c"
         return [*found, _unstable(loop, "with this plant", what_to_do)]
     found += _judge_margin(loop, observer)
     if actuator_lag > 0.0 or delay > 0.0:
-        lags = {"delay": known_delay + delay, "actuator_lag": actuator_lag}
-        late = analyse(plant, controller, at=at, **lags)
+        lags: dict[str, Any] = {"delay": known_delay + delay, "actuator_lag": actuator_lag}
+        late = analyse(plant, controller, **lags, **options)
         found += _judge_lag(loop, late, actuator_lag, delay)
         loop = late
     if noise_std is not None and loop.stable:

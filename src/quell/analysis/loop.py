@@ -19,6 +19,7 @@ import numpy as np
 
 from quell import checks
 from quell.analysis.frequency_response import Complex, Response, System, frequencies, in_s_plane
+from quell.analysis.linear_part import linear_part
 from quell.analysis.linearise import linear_law
 from quell.analysis.margins import Margins, least, margins
 from quell.analysis.pure_delays import eigenvalues
@@ -38,16 +39,19 @@ def analyse(
     at: Any = None,
     delay: float = 0.0,
     actuator_lag: float = 0.0,
+    operating_point: Any = None,
 ) -> LoopAnalysis:
     """Analyse the loop of a linear plant and a controller, unlimited and with a frozen learner.
 
-    Raises ``ValueError`` for a plant that is not linear or has direct feedthrough, a controller
-    without a linear law, a delay of more than 200 samples.
+    Raises ``ValueError`` for a nonlinear plant without operating point, a plant with direct
+    feedthrough, a controller without a linear law, a delay of more than 200 samples.
 
     Parameters
     ----------
     plant
-        ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction`` or ``(num, den)``.
+        ``LinearPlant``, ``control.StateSpace``, ``control.TransferFunction`` or ``(num, den)``; one
+        of them delayed or encoded (an encoder is left out); or a ``NonlinearPlant``, with its
+        operating point.
     controller
         an ``ADRC`` or a linear controller; a prefilter in front of it is left out.
     at
@@ -58,13 +62,17 @@ def analyse(
         additional dead time of the loop [s].
     actuator_lag
         time constant of a first-order lag between u and the plant [s].
+    operating_point
+        state and control signal ``(x, u)`` about which a nonlinear plant is linearised; see
+        ``quell.plants.linearised``.
     """
     while isinstance(controller, Prefiltered):
         controller = controller.controller
     if not (hasattr(controller, "law") or hasattr(controller, "observer")):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     dt = float(controller.dt)
-    sampled = sampled_plant(plant, dt, delay, actuator_lag)
+    plant, own_delay = linear_part(plant, dt, operating_point)
+    sampled = sampled_plant(plant, dt, own_delay + delay, actuator_lag)
     observer = getattr(controller, "observer", None)
     b_over_b0 = None
     if observer is not None and observer.degree in sampled.b:  # gains to the same derivative of y

@@ -15,7 +15,7 @@ from quell.simulation import Scenario, simulate
 
 
 def loops_over_time(
-    plant: Any, controller: Controller, run: Any, times: Any, **lags: float
+    plant: Any, controller: Controller, run: Any, times: Any, **options: Any
 ) -> list[LoopAnalysis]:
     """Analyse the loop with its learner frozen at several instants.
 
@@ -33,12 +33,14 @@ def loops_over_time(
         run, which is simulated up to each instant and works for every learner.
     times
         instants [s].
-    lags
-        ``delay`` and ``actuator_lag``, as for ``analyse``.
+    options
+        ``delay``, ``actuator_lag`` and ``operating_point``, as for ``analyse``.
     """
     instants = checks.vector("times", times).tolist()
     if isinstance(run, Trajectory):
-        return [analyse(plant, controller, at=frozen(controller, run, t), **lags) for t in instants]
+        return [
+            analyse(plant, controller, at=frozen(controller, run, t), **options) for t in instants
+        ]
     if not isinstance(run, Scenario):
         raise ValueError(f"run = {run!r}: must be a Trajectory or a Scenario")
     loops = []
@@ -50,12 +52,12 @@ def loops_over_time(
         record = simulate(plant, controller, until, record_every=10**9)
         if record.diverged:
             raise ValueError(f"times has {t!r}: the loop diverged at {record.ended:.6g} s")
-        loops.append(analyse(plant, controller, at=record, **lags))
+        loops.append(analyse(plant, controller, at=record, **options))
     return loops
 
 
 def loops_over_omega_o(
-    plant: Any, make_controller: Callable[[float], Controller], omegas: Any, **lags: float
+    plant: Any, make_controller: Callable[[float], Controller], omegas: Any, **options: Any
 ) -> list[LoopAnalysis]:
     """Analyse designs with several observer bandwidths.
 
@@ -67,8 +69,8 @@ def loops_over_omega_o(
         returns the controller for an omega_o [rad/s].
     omegas
         the bandwidths [rad/s], at least one.
-    lags
-        ``delay`` and ``actuator_lag``, as for ``analyse``.
+    options
+        ``delay``, ``actuator_lag`` and ``operating_point``, as for ``analyse``.
 
     Raises
     ------
@@ -78,4 +80,4 @@ def loops_over_omega_o(
     bandwidths = checks.positive_vector("omegas", omegas)
     if bandwidths.size == 0:
         raise ValueError(f"omegas = {omegas!r}: must hold at least one bandwidth")
-    return [analyse(plant, make_controller(omega_o), **lags) for omega_o in bandwidths.tolist()]
+    return [analyse(plant, make_controller(omega_o), **options) for omega_o in bandwidths.tolist()]

@@ -82,7 +82,7 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
     raise ValueError(
         f"plant = {plant!r}: must be a linear plant or control.StateSpace (with A, B, C), matrices "
         "(A, B, C) or (A, B, E, C), a control.TransferFunction, (numerator, denominator) or "
-        "(a, b); a nonlinear plant has to be linearised first"
+        "(a, b); linearise a nonlinear plant first, quell.plants.linearised(plant, x, u)"
     )
 
 

@@ -10,12 +10,13 @@ from quell.plants.cubic_spring import CubicSpringPlant, lagged_two_mass_spring
 from quell.plants.delay import delayed
 from quell.plants.encoder import encoded
 from quell.plants.linear import LinearPlant
+from quell.plants.linearise import linearised
 from quell.plants.nonlinear import NonlinearPlant
 from quell.plants.torsional import TorsionalPlant, torsional, torsional_identified
 from quell.plants.two_mass_spring import two_mass_spring
 
 __all__ = [
     "CubicSpringPlant", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch", "TorsionalPlant",
-    "batch", "delayed", "encoded", "lagged_two_mass_spring", "torsional", "torsional_identified",
-    "two_mass_spring",
+    "batch", "delayed", "encoded", "lagged_two_mass_spring", "linearised", "torsional",
+    "torsional_identified", "two_mass_spring",
 ]  # fmt: skip
