@@ -205,6 +205,23 @@ def test_nonlinear_plants_run_in_batches_compiled_and_as_python() -> None:
     np.testing.assert_allclose(python["y"][0], compiled["y"][0], rtol=1e-9, atol=1e-12)
 
 
+def test_poor_integration_is_told_apart_from_loops_that_diverge() -> None:
+    """Each run has its own check: one is stiff with one sub-step, one loop is unstable, one is fine."""
+    stiff = lambda t, x, u, w: (x[1], u - 1e5 * x[1])  # noqa: E731
+    free = lambda t, x, u, w: (x[1], u)  # noqa: E731
+    laws = [
+        ql.ADRC(ql.ESO.model_free(order=2, b0=b0, omega_o=40.0, dt=1e-3), omega_c=8.0)
+        for b0 in (1.0, -1.0, 1.0)
+    ]
+    plants = [ql.plants.NonlinearPlant(f, order=2, substeps=1) for f in (stiff, free, free)]
+    with pytest.warns(ql.DesignWarning, match="in 1 of 3 runs.* substeps = 64"):
+        runs = ql.simulate(plants, laws, ql.Scenario(1.0, duration=1.0), interpret=True)
+    poor, diverged = ql.Status.POORLY_INTEGRATED, ql.Status.DIVERGED
+    assert runs.status.tolist() == [poor | diverged, diverged, 0]
+    assert "1 of 3 runs: The loop diverged" in runs.message
+    assert "1 of 3 runs: The integration of the plant diverged" in runs.message
+
+
 def test_parameters_of_a_batch_are_arrays_and_read_only() -> None:
     """A number counts for every plant; a part of a batch keeps its part of them."""
     assert (len(PLANTS), PLANTS.order, PLANTS.disturbances, PLANTS.name) == (

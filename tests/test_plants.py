@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,7 +171,33 @@ def test_interpreting_runs_the_users_function_as_python() -> None:
     controller = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=4.0)
     seen.clear()
     ql.simulate(plant, controller, ql.Scenario(1.0, 0.1), interpret=True)
-    assert len(seen) == 4 * 11
+    assert len(seen) >= 4 * 11  # its linearisation and the check of the integration call it, too
+    assert set(seen) == {np.ndarray}
+
+
+def friction(width: float) -> Callable[..., tuple[float, float]]:
+    """The equation of a mass with friction 2 tanh(v/width)."""
+    return lambda t, x, u, w: (x[1], u + w[0] - 2.0 * math.tanh(x[1] / width))
+
+
+def test_substeps_follow_the_fastest_mode_at_rest() -> None:
+    """One where the plant is slow, ``h |λ| <= 1`` where it is fast; a jump has no such number."""
+
+    def chosen(f: Callable[..., Any], dt: float = 1e-3) -> int:
+        return ql.plants.NonlinearPlant(f, order=2).sampled(dt, interpret=True).substeps
+
+    assert chosen(pendulum) == 1
+    assert chosen(lambda t, x, u, w: (x[1], u - 1e5 * x[1])) == 100
+    assert chosen(lambda t, x, u, w: (x[1], u - 9e8 * x[0])) == 30  # 3e4 rad/s, undamped
+    assert [chosen(friction(width)) for width in (0.1, 0.002, 0.001, 0.0001)] == [1, 1, 2, 20]
+    assert chosen(friction(0.001), 1e-2) == 20
+    assert chosen(lambda t, x, u, w: (x[1], u - np.sign(x[1]))) == 1
+    assert chosen(lambda t, x, u, w: (x[1], u - math.log(x[0]))) == 1  # no number at rest
+    given = ql.plants.NonlinearPlant(friction(0.001), order=2, substeps=3)
+    model = given.sampled(1e-3, interpret=True)
+    assert (model.substeps, model.step) == (3, 1e-3 / 3)
+    with pytest.warns(ql.DesignWarning, match=r"eigenvalue of 1e\+07 1/s .* needs? .*1e\+04 sub-s"):
+        assert chosen(lambda t, x, u, w: (x[1], u - 1e7 * x[1])) == 1000
 
 
 def test_methods_and_callable_objects_are_served_too() -> None:

@@ -74,6 +74,71 @@ def test_a_run_that_diverges_ends_early_and_keeps_what_it_has() -> None:
         run.metrics(150.0)
 
 
+def drag(t: float, x: np.ndarray, u: float, w: np.ndarray) -> tuple[float, float]:
+    """A mass in syrup: stiff, with an eigenvalue of −1e5 1/s."""
+    return x[1], u - 1e5 * x[1]
+
+
+def interpreted_run(
+    f: object, b0: float = 1.0, seconds: float = 0.1, **plant: int
+) -> ql.Trajectory:
+    """A nonlinear plant of order 2 under control, interpreted: that compiles nothing."""
+    law = ql.ADRC(ql.ESO.model_free(order=2, b0=b0, omega_o=40.0, dt=1e-3), omega_c=8.0)
+    return ql.simulate(
+        ql.plants.NonlinearPlant(f, order=2, name="mass", **plant),
+        law,
+        ql.Scenario(reference=1.0, duration=seconds),
+        interpret=True,
+    )
+
+
+def test_too_few_substeps_are_the_cause_that_is_named() -> None:
+    """Not b0; the warning has a number of sub-steps, and with it the run does not diverge."""
+    with pytest.warns(ql.DesignWarning, match="mass: with 1 .* at least substeps = 64"):
+        run = interpreted_run(drag, substeps=1)
+    assert run.status == ql.Status.DIVERGED | ql.Status.POORLY_INTEGRATED
+    assert "raise the plant's substeps" in run.message
+    assert "b0" not in run.message
+    better = interpreted_run(drag, substeps=64, seconds=0.02)
+    assert better.status == ql.Status.OK
+    exact = ql.simulate(
+        ql.plants.LinearPlant([[0.0, 1.0], [0.0, -1e5]], [0.0, 1.0], [1.0, 0.0]),
+        ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=40.0, dt=1e-3), omega_c=8.0),
+        ql.Scenario(reference=1.0, duration=0.02),
+        interpret=True,
+    )
+    chosen = interpreted_run(drag, seconds=0.02)  # by default as many as the plant needs
+    np.testing.assert_allclose(chosen["y"], exact["y"], rtol=1e-2, atol=1e-9)
+
+
+def test_a_loop_that_diverges_is_the_cause_though_its_integration_fails_at_last() -> None:
+    """The force grows the faster, the further it goes: the repetition with more sub-steps tells."""
+    escape = interpreted_run(lambda t, x, u, w: (x[1], u + 500.0 * np.exp(x[0])), b0=-1.0)
+    assert escape.status == ql.Status.DIVERGED
+    assert "The loop diverged" in escape.message
+    assert "b0" in escape.message
+
+
+def test_stiff_friction_that_is_not_resolved_is_reported() -> None:
+    """Of width 1e-4 at 1 ms: the run goes on, and says that its states are wrong."""
+    rub = lambda t, x, u, w: (x[1], u - 60.0 * np.tanh(x[1] / 1e-4))  # noqa: E731
+    with pytest.warns(ql.DesignWarning, match="a state has an error of .* % of its range"):
+        run = interpreted_run(rub, substeps=1)
+    assert run.status == ql.Status.POORLY_INTEGRATED
+    assert "too few sub-steps" in run.message
+    assert interpreted_run(rub, substeps=600, seconds=0.003).status == ql.Status.OK
+
+
+def test_the_integration_is_checked_behind_a_delay_and_an_encoder() -> None:
+    """With the u that arrives."""
+    plant = ql.plants.NonlinearPlant(drag, order=2, substeps=1)
+    seen = ql.plants.encoded(ql.plants.delayed(plant, 2e-3, 1e-3), 1000)
+    law = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=40.0, dt=1e-3), omega_c=8.0)
+    with pytest.warns(ql.DesignWarning, match="substeps = 64"):
+        run = ql.simulate(seen, law, ql.Scenario(1.0, duration=0.05), interpret=True)
+    assert ql.Status.POORLY_INTEGRATED in run.status
+
+
 def test_nothing_given_to_the_driver_is_changed(two_mass_scenario: ql.Scenario) -> None:
     """The controller keeps its own state; the scenario's x0 stays."""
     x0 = np.array([0.1, 0.2, 0.3, 0.4])

@@ -37,10 +37,14 @@ class Status(IntFlag):
     LEARNER_CUT = 64
     LEARNER_LATE = 128
     LEARNER_FAILED = 256
+    POORLY_INTEGRATED = 512
 
     @property
     def message(self) -> str:
         """A sentence for each flag: what happened and what to do."""
+        if Status.DIVERGED | Status.POORLY_INTEGRATED in self:
+            others = self & ~(Status.DIVERGED | Status.POORLY_INTEGRATED)
+            return " ".join([*([others.message] if others else []), _INTEGRATION_DIVERGED])
         return " ".join(text for flag, text in _MESSAGES.items() if flag in self) or "All is well."
 
 
@@ -79,4 +83,12 @@ _MESSAGES = {
         "the reason, and last_problem of the learner has it: correct the model or lower its "
         "learning rate."
     ),
+    Status.POORLY_INTEGRATED: (
+        "The plant is integrated with too few sub-steps, its states have errors of more than 1 % "
+        "in a sample: raise its substeps, or lower dt."
+    ),
 }
+_INTEGRATION_DIVERGED = (
+    "The integration of the plant diverged and the run ended early; the cause is not the loop but "
+    "too few sub-steps: raise the plant's substeps, or lower dt."
+)

@@ -62,8 +62,11 @@ class BatchTrajectory(Record):
     @property
     def message(self) -> str:
         """The number of runs that reported each flag, and the time at which the first diverged."""
-        counts = [(np.count_nonzero(self.status & int(flag)), flag.message) for flag in Status]
-        runs = len(self)
+        runs, integration = len(self), Status.DIVERGED | Status.POORLY_INTEGRATED
+        causes = (self.status & int(integration)) == int(integration)
+        own = np.where(causes, self.status & ~int(integration), self.status)
+        counts = [(np.count_nonzero(own & int(flag)), flag.message) for flag in Status]
+        counts.append((np.count_nonzero(causes), integration.message))
         sentences = [f"{count} of {runs} runs: {message}" for count, message in counts if count]
         if np.any(self.diverged):
             first = int(np.argmin(np.where(self.diverged, self.ended, np.inf)))

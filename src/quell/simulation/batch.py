@@ -16,6 +16,7 @@ from quell.plants.base import Plant, check_plant
 from quell.plants.batch import PlantBatch
 from quell.records.batch_trajectory import BatchTrajectory
 from quell.records.channels import columns_of, readable_names
+from quell.simulation.divergence import judge_integration
 from quell.simulation.driver import Loop, logged_channels
 from quell.simulation.sampled_scenario import SampledScenario, Segment, segment_bounds
 from quell.simulation.scenario import Scenario, check_scenario
@@ -86,16 +87,18 @@ def simulate_batch(
         in_parallel(jobs, _progress_within(progress, first, last, samples), workers)
     for i in range(runs):
         log[i, lengths[i] :] = np.nan
+    name = plants.name if isinstance(plants, PlantBatch) else plants[0].name
+    judge_integration(name, loops)
     return BatchTrajectory(
         log=log,
         channels=channels,
         dt=dt,
         every=every,
         lengths=lengths,
-        status=np.array([int(loop.status) for loop in loops]),
+        status=np.array([int(loop.result_status) for loop in loops]),
         ended=np.array([loop.ended for loop in loops]) * dt,
         limit=np.array([s.limit for s in sampled]),
-        plant=plants.name if isinstance(plants, PlantBatch) else plants[0].name,
+        plant=name,
         parameters=plants.parameters if isinstance(plants, PlantBatch) else {},
         features=controllers[0].features,
         final_states=tuple(loop.state for loop in loops),

@@ -17,6 +17,7 @@ from quell.controllers.base import (
 from quell.kernels.dispatch import compiled, dispatcher_for, interpreted
 from quell.kernels.user_types import explain_compile_errors
 from quell.plants.base import Plant, advance, measure
+from quell.simulation.integration import IntegrationCheck, Samples
 from quell.simulation.sampled_scenario import SampledScenario, Segment
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -91,12 +92,15 @@ class Loop:
         scenario: SampledScenario,
         interpret: bool,
     ) -> None:
+        self.plant, self.controller, self.interpret = plant, controller, interpret
         self.model, self.design = model, controller.parameters
         self.state = controller.initial_state()
         self.x0, self.limit = scenario.x0, scenario.limit
         self.x, self.scratch = scenario.x0.copy(), np.zeros(6 * plant.order)
         self.done = self.status = self.until_next = 0
         as_python = interpret or not plant.compiled
+        self.integration = IntegrationCheck(model, as_python)
+        self.scenario = scenario
         self._run_block, self._start_from_rest = (
             interpreted(f) if as_python else dispatcher_for(f, model, self.design)
             for f in (run_block, start_from_rest)
@@ -108,6 +112,17 @@ class Loop:
         return bool(self.status & Status.DIVERGED)
 
     @property
+    def width(self) -> int:
+        """Number of columns of its log."""
+        return sum(width for _, width in logged_channels(self.plant, self.controller))
+
+    @property
+    def result_status(self) -> Status:
+        """All flags of the run, with that of its integration."""
+        poor = Status.POORLY_INTEGRATED if self.integration.poor else Status.OK
+        return Status(self.status) | poor
+
+    @property
     def ended(self) -> int:
         """The sample at which it ended."""
         return self.done if self.diverged else self.done - 1
@@ -115,6 +130,7 @@ class Loop:
     def run(self, segment: Segment, log: Matrix, row: int, every: int) -> int:
         """Run a segment, log every ``every``-th sample from ``row`` on, and return the next row."""
         first, dt, from_rest, *signals = segment
+        from_row, from_sample = row, first + self.until_next
         loop = (self.model, self.x, self.scratch, self.design, self.state, first * dt, dt)
         # An interpreted loop that diverges would warn of every overflow; the status reports it
         # once.
@@ -130,7 +146,22 @@ class Loop:
             )
         self.done = first + samples
         self.status |= flags if samples == segment.r.size else flags | Status.DIVERGED
+        if self.integration.needed:
+            self._check_integration(log[from_row:row], from_sample, every, dt)
         return int(row)
+
+    def _check_integration(self, log: Matrix, first: int, every: int, dt: float) -> None:
+        """Check the plant's integration at rows of the log, ``every`` samples apart.
+
+        Of a run that diverged only the rows before it left its usual range count: far outside, a
+        loop that diverges for another reason may be too fast for its sub-steps, too.
+        """
+        if self.diverged:
+            log = log[: int(np.argmin(np.append(np.abs(log[:, 1]) <= self.scenario.range, False)))]
+        t = (first + every * np.arange(log.shape[0], dtype=np.float64)) * dt
+        first_state = 4 + self.plant.disturbances
+        w, x = log[:, 4:first_state], log[:, first_state : first_state + self.x.size]
+        self.integration.add(Samples(t, log[:, 3], w, x), all_of_them=self.diverged)
 
 
 def logged_channels(plant: Plant, controller: Controller) -> Channels:

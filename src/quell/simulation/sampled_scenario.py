@@ -21,6 +21,11 @@ from quell.types import Matrix, Vector
 # Samples for which signals are evaluated at once: enough that Python's share of the time is small,
 # few enough to stay in the processor's cache. Chosen by hand.
 _SEGMENT = 8192
+# Times the largest of 1, |x0| and the reference: |y| beyond it has diverged. Chosen by hand, far
+# above the overshoot of any loop.
+_DIVERGED = 1e6
+# Times the same: |y| beyond it is outside of the usual range. Chosen by hand.
+_UNUSUAL = 10.0
 # Up to here time in steps of dt is exact to a thousandth of a step (2e-16 · 1e12).
 _MOST_SAMPLES = 10**12
 
@@ -47,6 +52,7 @@ class SampledScenario:
     dt: float
     x0: Vector
     limit: float
+    range: float  # |y| beyond it is unusual, though the run may not have diverged [y-unit]
     rest_samples: frozenset[int]
 
     @classmethod
@@ -64,16 +70,15 @@ class SampledScenario:
         given = scenario.x0
         x0 = np.zeros(plant.order) if given is None else checks.vector("x0", given, plant.order)
         signals = scenario.seeded_signals(plant.disturbances)
-        if limit is None:
-            limit = _default_limit(signals[0], x0, samples, dt)
-        else:
-            limit = checks.positive("limit", limit)
+        size = _size(signals[0], x0, samples, dt)
+        limit = _DIVERGED * size if limit is None else checks.positive("limit", limit)
         rests = frozenset(first_sample_at(time, dt, samples) for time in scenario.rest_at)
         derivative, derivatives = signals[0], []
         for _ in range(getattr(controller, "derivatives", 0)):
             derivative = derivative.derivative()
             derivatives.append(derivative)
-        return cls(signals, tuple(derivatives), samples, dt, x0, limit, rests)
+        usual = _UNUSUAL * size
+        return cls(signals, tuple(derivatives), samples, dt, x0, limit, usual, rests)
 
     def segment(self, first: int, last: int) -> Segment:
         """Return the samples from ``first`` to before ``last``."""
@@ -97,10 +102,10 @@ def _columns(signals: tuple[Signal, ...], t: Vector) -> Matrix:
     return columns
 
 
-def _default_limit(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
-    """Return a million times the largest of 1, ``|x0|`` and the reference in the first samples.
+def _size(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
+    """Return the largest of 1, ``|x0|`` and the reference in the first samples.
 
     The limit depends on these because a loop in encoder counts has large values and is stable.
     """
     early = reference(np.arange(min(samples, _SEGMENT)) * dt)
-    return 1e6 * float(np.max(np.abs([1.0, *x0, *early[np.isfinite(early)]])))
+    return float(np.max(np.abs([1.0, *x0, *early[np.isfinite(early)]])))

@@ -16,10 +16,10 @@ from quell.plants.linear import LinearPlant
 from quell.records.batch_trajectory import BatchTrajectory
 from quell.records.trajectory import Trajectory
 from quell.simulation.batch import simulate_batch
+from quell.simulation.divergence import judge_integration
 from quell.simulation.driver import Loop, logged_channels
 from quell.simulation.sampled_scenario import SampledScenario, segment_bounds
 from quell.simulation.scenario import Scenario, check_scenario
-from quell.types import Status
 
 
 @overload
@@ -127,12 +127,13 @@ def simulate(
             break
         if progress is not None:
             progress(last / samples)
+    judge_integration(plant.name, [loop])
     return Trajectory(
         log=log[:row],
         channels=channels,
         dt=dt,
         every=every,
-        status=Status(loop.status),
+        status=loop.result_status,
         ended=loop.ended * dt,
         limit=sampled.limit,
         plant=plant.name,

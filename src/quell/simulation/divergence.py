@@ -1,0 +1,64 @@
+"""Verdict on the integration of finished runs: whether it is poor, or why a run diverged.
+
+A loop that diverges for its own reasons often becomes too fast for its sub-steps at last. So a run
+that diverged is repeated with enough sub-steps: only if it does not diverge then, the integration
+was the cause.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from quell.simulation.driver import Loop
+from quell.simulation.integration import LARGEST_ERROR, with_substeps
+from quell.simulation.sampled_scenario import segment_bounds
+from quell.types import DesignWarning
+
+
+def judge_integration(plant: str, loops: Sequence[Loop]) -> None:
+    """Find the cause of divergence, and warn of runs whose integration is poor.
+
+    Afterwards ``Loop.result_status`` has ``POORLY_INTEGRATED`` only where that stands. ``plant`` is
+    the plants' name.
+    """
+    for loop in loops:
+        if loop.integration.poor and loop.diverged and _diverges_anyway(loop):
+            loop.integration.acquit()
+    poor = [loop.integration for loop in loops if loop.integration.poor]
+    if not poor:
+        return
+    worst = max(poor, key=lambda check: check.error)
+    runs = f" in {len(poor)} of {len(loops)} runs" if len(loops) > 1 else ""
+    remedy = (
+        f"give at least substeps = {max(check.enough for check in poor)}, or a lower dt"
+        if all(check.enough for check in poor)
+        else "it is stiff, or f jumps: make f smoother, or give many more substeps"
+    )
+    warnings.warn(
+        f"{plant}: with {worst.model.substeps} sub-steps in a sample a state has an error of "
+        f"{100.0 * worst.error:.2g} % of its range in one sample{runs}, more than "
+        f"{100.0 * LARGEST_ERROR:g} %: {remedy}",
+        DesignWarning,
+        stacklevel=3,
+    )
+
+
+def _diverges_anyway(loop: Loop) -> bool:
+    """Return whether a run that diverged leaves its usual range with enough sub-steps, too."""
+    if not loop.integration.enough:
+        return True
+    scenario = replace(loop.scenario, limit=loop.scenario.range)
+    model = with_substeps(loop.model, loop.integration.enough)
+    again = Loop(loop.plant, model, loop.controller, scenario, loop.interpret)
+    again.integration.needed = False
+    samples = loop.ended + 1
+    log, every = np.empty((1, loop.width)), samples
+    for first, last in segment_bounds(samples, (k for k in scenario.rest_samples if k < samples)):
+        again.run(scenario.segment(first, last), log, 0, every)
+        if again.diverged:
+            return True
+    return False
