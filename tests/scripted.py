@@ -153,10 +153,9 @@ def run(
     """Run a loop around a scripted device to its end; ``settle`` is 10 by default."""
     controller = adrc() if controller is None else controller
     width = sum(width for _, width in row_channels(controller.channels))
-    points = reference_samples(
-        as_scenario(reference, duration), DT, getattr(controller, "derivatives", 0), approach
-    )
-    rules = Safety(**{"settle": 10} | safety).rules(controller)
+    scenario = as_scenario(reference, duration)
+    points = reference_samples(scenario, DT, getattr(controller, "derivatives", 0), approach)
+    rules = Safety(**{"settle": 10} | safety).rules(controller, scenario)
     loop = ControlLoop.of(
         device,
         controller,

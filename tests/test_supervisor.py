@@ -20,7 +20,7 @@ from quell.realtime.telemetry.channels import Event
 
 from .scripted import DT, PLANT, Outcome, ScriptedDevice, adrc, run
 
-HOLD, RAMP, SETTLE = 5, 50, 10
+HOLD, RAMP, SETTLE = 5, 10, 10
 SAMPLE = round(1e9 * DT)
 MISS = math.nan
 

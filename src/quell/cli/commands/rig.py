@@ -51,7 +51,8 @@ def rig(
     u_max
         Limit of the commands, either way [V, N].
     rest
-        Start each session from rest, or where the last one left the plant.
+        Start each session from rest, or where the last one left the plant; from rest in any case if
+        that state is not finite, or beyond 1e9.
     seconds
         How long to run [s]; until interrupted by default.
     log
@@ -103,5 +104,10 @@ def _print_counters(server: Rig) -> None:
         f"cut to the limit: {count['clipped']}, never used: {count['skipped']}\n"
         f"frames that were not accepted: {refused}"
     )
+    if count["restored"]:
+        print(
+            f"sessions that began at rest because the plant's state was destroyed (not finite, or "
+            f"beyond 1e9): {count['restored']}"
+        )
     if server.unlogged:
         print(f"the log lacks {server.unlogged} ticks: it could not be written as quickly")

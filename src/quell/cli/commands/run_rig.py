@@ -149,7 +149,7 @@ def _close_loop(
     console: Console, setup: Setup, url: str, options: dict[str, Any], sinks: list[Any]
 ) -> RigRun | None:
     """Run the loop and print each change of mode; return None if the device failed."""
-    from quell.realtime import LiveSink, open_device, run_rig
+    from quell.realtime import LiveSink, Safety, open_device, run_rig
     from quell.setup.errors import with_path
 
     began = False
@@ -163,10 +163,13 @@ def _close_loop(
         print_line(console, str(change))
 
     settings = {"telemetry": sinks, "on_change": print_change, **options}
+    controller, scenario = setup.controller, setup.needed("scenario")
     try:
-        device = open_device(url, setup.controller.dt)
+        rules = (options.get("safety") or Safety()).rules(controller, scenario)
+        print_line(console, f"Safety: {rules.text(controller.dt)}.")
+        device = open_device(url, controller.dt)
         with exit_on_signal(device.close):
-            return run_rig(device, setup.controller, setup.needed("scenario"), **settings)
+            return run_rig(device, controller, scenario, **settings)
     except ValueError as error:
         raise with_path(setup.file, "rig", error, ["device", *options]) from None
     except ConnectionError as error:
@@ -248,6 +251,7 @@ def _as_json(run: RigRun) -> dict[str, Any]:
     timing = {"lateness": run.timing.lateness.summary(), "step": run.timing.step.summary()}
     results = {
         "completed": run.completed,
+        "rules": run.rules._asdict(),
         "timing": timing,
         "tally": run.tally._asdict(),
         "counters": run.counters,

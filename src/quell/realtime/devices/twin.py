@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from quell import checks
 from quell.kernels.dispatch import compiled, dispatcher_for
 from quell.plants.base import Plant, advance, check_plant, measure
+from quell.plants.destroyed import is_destroyed
 from quell.plants.registry import named_plant
 from quell.realtime.devices.base import read_measurement, write_command
 from quell.types import Vector
@@ -78,6 +79,7 @@ class TwinDevice:
         x = np.zeros(order) if x0 is None else checks.vector("x0", x0, order)
         scratch, w = np.zeros(6 * order), np.zeros(plant.disturbances)
         model = plant.sampled(dt, not plant.compiled)
+        self._x0 = x.copy()
         self._handle = TwinHandle(model, x, scratch, w, np.array([0.0, dt]))
         # Without a public handle the loop runs as Python.
         self.handle = self._handle if plant.compiled else None
@@ -106,7 +108,10 @@ class TwinDevice:
             dispatcher_for(_write, self.handle)(self.handle, float(u))
 
     def close(self) -> None:
-        """Do nothing: there is nothing to release."""
+        """Put a plant whose state is destroyed back to ``x0``, so that the device can be reused."""
+        if is_destroyed(self._handle.x, self._x0):
+            self._handle.x[:] = self._x0
+            self._handle.t[0] = 0.0
 
 
 def twin_device(url: str, dt: float) -> TwinDevice:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from quell.kernels.dispatch import compiled, dispatcher_for
 from quell.realtime.loop.cycle import CycleLog, SupervisedController, control_step
-from quell.realtime.loop.supervisor import SupervisorState
+from quell.realtime.loop.state import SupervisorState
 
 
 class CompiledController(NamedTuple):

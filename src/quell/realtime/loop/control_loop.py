@@ -23,7 +23,8 @@ from quell.realtime.loop.cycle import (
 )
 from quell.realtime.loop.modes import Mode
 from quell.realtime.loop.reference import ReferenceSamples
-from quell.realtime.loop.supervisor import FLUSH, Rules, initial_state
+from quell.realtime.loop.state import Rules, initial_state
+from quell.realtime.loop.supervisor import FLUSH
 from quell.realtime.system.histogram import Histogram, Timing, empty_counts
 from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.ring import Ring

@@ -32,10 +32,8 @@ from quell.kernels.dispatch import compiled, generic, is_finite, kernel
 from quell.realtime.devices.base import read_measurement, write_command
 from quell.realtime.loop.modes import Cause, Mode, Request
 from quell.realtime.loop.reference import ReferenceSamples
+from quell.realtime.loop.state import Memory, Rules, SupervisorState
 from quell.realtime.loop.supervisor import (
-    Memory,
-    Rules,
-    SupervisorState,
     change_mode,
     finished,
     supervised_output,

@@ -66,3 +66,12 @@ class Cause(IntEnum):
     RAMPED = 16, "u is zero", Ending.NO
     NO_MEASUREMENT = 17, "no measurement ever came: is the device running?"
     UNSETTLED = 18, "there were never enough good samples in a row to begin with"
+    IMPLAUSIBLE = (
+        19,
+        "y went beyond y_min … y_max: look at the sensor; set them where the plant may go further",
+    )
+    WRONG_WAY = (
+        20,
+        "y ran away against u: look at the sign of y, of u and of b0, or for a load beyond u's "
+        "limits",
+    )

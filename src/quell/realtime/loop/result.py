@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.realtime.loop.modes import Cause, Ending, Mode
-from quell.realtime.loop.supervisor import RESERVED, SupervisorState
+from quell.realtime.loop.state import RESERVED, Rules, SupervisorState
 from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.histogram import Timing
 from quell.records.trajectory import Trajectory
@@ -50,6 +50,7 @@ class RigRun:
     tally: Tally  #: numbers of cycles, overruns, missed samples and so on
     counters: dict[str, int]  #: the device's counters, of frames for instance
     notes: tuple[str, ...]  #: remarks, for example on permitted real-time scheduling
+    rules: Rules  #: safety rules of the run, with those that were derived; ``rules.text(dt)``
 
     @property
     def overruns(self) -> int:

@@ -66,7 +66,7 @@ def run_rig(
     """Close a controller's loop around a device in real time, at the controller's sample time.
 
     The controller starts with nothing learned, on a state of its own, as in ``simulate``. For
-    ``safety.settle`` samples it observes, with u at zero and y as its reference; then it takes over
+    ``safety.settle_time`` it observes, with u at zero and y as its reference; then it takes over
     without a bump, and the scenario's time begins. At the end, on Ctrl-C or SIGTERM, when its
     terminal is closed, and after any fault, u is ramped to zero; a second Ctrl-C makes it zero at
     once. The device is closed in any case.
@@ -83,7 +83,8 @@ def run_rig(
     duration
         duration [s]; the scenario's own by default.
     safety
-        limits, and what happens beyond them; ``Safety()`` by default.
+        limits, and what happens beyond them; ``Safety()`` by default. ``safety.rules(controller,
+        scenario).text(dt)`` shows the rules before a run, ``RigRun.rules`` after it.
     approach
         time [s] in which the reference moves, with the least jerk, from where y is to the
         scenario's; 0 for a jump.
@@ -117,8 +118,8 @@ def run_rig(
             raise ValueError(
                 f"device has dt = {own!r} s, the controller {dt!r} s: must be the same"
             )
-        rules = (Safety() if safety is None else safety).rules(controller)
         scenario = as_scenario(scenario, duration)
+        rules = (Safety() if safety is None else safety).rules(controller, scenario)
         derivatives = getattr(controller, "derivatives", 0)
         reference = reference_samples(scenario, dt, derivatives, approach)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
@@ -153,6 +154,7 @@ def run_rig(
         tally=tally(supervisor, writer.dropped),
         counters=dict(getattr(device, "counters", {})),
         notes=tuple(notes),
+        rules=rules,
     )
 
 

@@ -19,86 +19,14 @@ All of it is arithmetic on arrays, so that tests can run it without a clock or a
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
-
 from quell.kernels.dispatch import is_finite, kernel
-from quell.kernels.scalars import Scalars
+from quell.realtime.loop.direction import ARMED, OFF, runs_away
 from quell.realtime.loop.modes import Cause, Mode, Request
+from quell.realtime.loop.state import RESERVED, Memory, Rules, SupervisorState
 from quell.realtime.system.atomics import load_acquire, store_release
 
 # Once u is zero it is written FLUSH + 1 more times, in case frames are lost. Chosen by hand.
 FLUSH = 3
-# START may take _LONGEST_START · (settle + _SETTLE_MARGIN) samples: enough for a device that misses
-# some. Chosen by hand; not tuned further.
-_LONGEST_START, _SETTLE_MARGIN = 10, 100
-# Number of changes of mode that are kept (96 KiB). The last ones are reserved for the end of the
-# run, which takes two: RAMP and STOPPED.
-_KEPT, RESERVED = 4096, 4
-
-
-class Rules(NamedTuple):
-    """The supervisor's rules; ``Safety.rules`` makes them."""
-
-    low: float  #: lower limit of u [u-unit], ≤ 0
-    high: float  #: upper limit, ≥ 0
-    most_error: float  #: largest ``|r − y|`` [y-unit]
-    most_f: float  #: largest ``|f̂|`` [y-unit/s^n]
-    hold: int
-    ramp: int
-    settle: int
-    most_saturated: int
-    most_overruns: int
-
-
-class Memory(Scalars):
-    """State of the supervisor from one cycle to the next."""
-
-    mode: int
-    samples: int  #: good samples in a row in START, cycles so far in RAMP and STOPPED
-    began: int  #: index k of the scenario's first sample; −1 before it
-    missed_in_row: int  #: deadlines without a good sample, those that were skipped included
-    skipped_in_row: int
-    at_limit_in_row: int  #: samples with u at a limit
-    overruns_in_row: int
-    unsent_in_row: int
-    maybe_stale: int  #: not zero if the next measurement may be an old one
-    tripped: int  #: not zero if the device has set u to zero for good
-    u: float  #: as applied [u-unit]
-    ramp_start: float  #: u at the beginning of the ramp [u-unit]
-    y: float  #: last good measurement [y-unit]; NaN before the first
-    offset: float  #: distance from the reference to y at the scenario's first sample [y-unit]
-
-
-class Counters(Scalars):
-    """Counters of a run; the first fields of ``quell.realtime.loop.result.Tally``, in its order."""
-
-    cycles: int
-    overruns: int
-    skipped: int
-    missed: int
-    clipped: int
-    unsent: int
-
-
-class SupervisorState(NamedTuple):
-    """State of the supervisor, which the loop writes and another thread may read."""
-
-    memory: NDArray[Memory]
-    counters: NDArray[Counters]
-    changes: NDArray[np.int64]  #: k, mode and cause of each change of mode (·, 3)
-    changed: NDArray[np.int64]  #: number of changes of mode that are kept (1,), an atomic word
-    requests: NDArray[np.int64]  #: a ``Request`` (1,), an atomic word that another thread writes
-
-
-def initial_state() -> SupervisorState:
-    """Return the state before the first cycle."""
-    memory, changed, requests = Memory.zeros(), np.zeros(1, np.int64), np.zeros(1, np.int64)
-    memory[0].began, memory[0].y = -1, np.nan
-    changes = np.zeros((_KEPT, 3), np.int64)
-    return SupervisorState(memory, Counters.zeros(), changes, changed, requests)
 
 
 @kernel
@@ -144,9 +72,12 @@ def update_mode(rules: Rules, state: SupervisorState, k: int, y: float, samples:
                 memory.samples = 0
             elif memory.samples >= rules.settle:
                 change_mode(state, k, Mode.RUN, Cause.SETTLED)
-                memory.began = k
+                memory.began, memory.y_began = k, y
+                memory.watching = ARMED if rules.direction != 0.0 else OFF
             else:
                 memory.samples += 1
+                memory.y_rest_low = min(memory.y_rest_low, y)
+                memory.y_rest_high = max(memory.y_rest_high, y)
         elif good and mode == Mode.HOLD:
             change_mode(state, k, Mode.RUN, Cause.RECOVERED)
         elif not good and mode == Mode.RUN:
@@ -170,7 +101,9 @@ def _cause_to_end(rules: Rules, memory: Memory, k: int, request: int, samples: i
         cause = Cause.OVERRUN
     elif memory.tripped != 0:
         cause = Cause.WATCHDOG
-    elif memory.mode == Mode.START and k > _LONGEST_START * (rules.settle + _SETTLE_MARGIN):
+    elif memory.y < rules.y_low or memory.y > rules.y_high:
+        cause = Cause.IMPLAUSIBLE
+    elif memory.mode == Mode.START and k > rules.longest_start:
         cause = Cause.UNSETTLED
     elif memory.began >= 0 and k - memory.began >= samples:
         cause = Cause.COMPLETED
@@ -200,6 +133,8 @@ def supervised_output(
             change_mode(state, k, Mode.RAMP, Cause.F_HAT)
         elif memory.at_limit_in_row > rules.most_saturated:
             change_mode(state, k, Mode.RAMP, Cause.SATURATED)
+        elif runs_away(rules, memory, r):
+            change_mode(state, k, Mode.RAMP, Cause.WRONG_WAY)
     elif memory.mode == Mode.HOLD:
         u = memory.u
     if memory.mode == Mode.RAMP:

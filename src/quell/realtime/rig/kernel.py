@@ -20,7 +20,8 @@ tripped  no fresh, finite command for ``watchdog`` ticks in a row: u = 0 until a
 =======  ========================================================================================
 
 A hello begins a session, unless one is live or waits for less than ``patience`` ticks. A goodbye
-ends it.
+ends it. A session begins at ``x0`` if ``rest``, or if the last one destroyed the plant's state: no
+motion can go on from there.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import compiled, is_finite, kernel
 from quell.plants.base import advance, measure
+from quell.plants.destroyed import is_destroyed
 from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.clock import now, wait_until
 from quell.realtime.system.histogram import count_duration
@@ -48,8 +50,10 @@ STATES = ("idle", "waiting", "live", "tripped")
 _CHECK_STOP_EVERY = 100_000_000
 
 # Entries of ``RigModel.counts``: state, ticks without a fresh command, all ticks, ticks since the
-# plant was at rest, sessions, refused hellos, trips of the watchdog, clipped commands, late ticks.
-STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP = range(9)
+# plant was at rest, sessions, refused hellos, trips of the watchdog, clipped commands, late ticks,
+# destroyed states that were put back to rest.
+STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP, RESTORED = range(10)
+COUNTS = 10
 # Entries of ``RigModel.signals``: u applied, newest command of this tick, largest |command| so far.
 APPLIED, COMMANDED, LARGEST = range(3)
 
@@ -70,7 +74,7 @@ class RigModel(NamedTuple):
     u_max: float  # largest |u| that is applied [u-unit]
     watchdog: int  # ticks without a fresh command before u is set to zero
     patience: int  # ticks that a session has for its first command before another may replace it
-    rest: bool  # whether each session starts from ``x0``
+    rest: bool  # whether each session starts from ``x0``, and not only after a destroyed state
     x: Vector
     x0: Vector
     scratch: Vector
@@ -176,7 +180,9 @@ def _answer_hello(rig: RigModel, time: int) -> bool:
         counts[SILENT] = 0
         counts[SESSIONS] += 1
         rig.signals[APPLIED] = 0.0
-        if rig.rest:
+        destroyed = is_destroyed(rig.x, rig.x0)
+        counts[RESTORED] += 1 if destroyed else 0
+        if rig.rest or destroyed:
             counts[SINCE_REST] = 0
             for i in range(rig.x.size):
                 rig.x[i] = rig.x0[i]

@@ -60,7 +60,8 @@ class Rig:
     u_max
         larger commands are cut to it [u-unit].
     rest
-        whether each session starts from ``x0``, or from where the last one left the plant.
+        whether each session starts from ``x0``, or from where the last one left the plant. If that
+        state is not finite, or beyond 10⁹, the session starts from ``x0`` in any case.
     x0
         the plant's state at the start (n,); zero by default.
     log
@@ -114,7 +115,7 @@ class Rig:
             x0=start,
             scratch=np.zeros(6 * plant.order),
             w=np.zeros(plant.disturbances),
-            counts=np.zeros(9, dtype=np.int64),
+            counts=np.zeros(kernels.COUNTS, dtype=np.int64),
             signals=np.zeros(3),
             row=np.zeros(len(kernels.LOG)),
             log=ring(1 if log is None else rows, len(kernels.LOG)),
@@ -147,6 +148,7 @@ class Rig:
             "clipped": kernels.CLIPPED,
             "ticks": kernels.TICKS,
             "caught_up": kernels.CAUGHT_UP,
+            "restored": kernels.RESTORED,
         }
         return frames.counts_by_name(self.model.endpoint.counters) | {
             name: int(self.model.counts[index]) for name, index in more.items()
