@@ -149,6 +149,7 @@ def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_pat
     assert shown.code == 0, shown.err
     for told in (
         "the scenario is over",
+        "Safety: u from -2 to 2, y from -4.95062 to 5.05062, first motion checked, settle 10 samples (0.1 s)",
         "p99.9",
         "lateness",
         "overruns",

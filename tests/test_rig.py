@@ -158,6 +158,24 @@ def test_a_session_starts_from_rest_or_where_the_last_one_ended(
     assert (y == 0.0) == rest
 
 
+@pytest.mark.parametrize("rest", [True, False])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.1e9, 0.9e9])
+def test_a_destroyed_plant_comes_back_to_rest_for_the_next_session(
+    value: float, rest: bool, bench: Callable[..., Bench]
+) -> None:
+    """Not finite, or beyond any motion; a large but possible state is kept if it is to be."""
+    here = bench("shm", rest=rest, x0=[0.1, 0.0, 0.2, 0.0])
+    device = here.open()
+    here.rig.model.x[3] = value
+    device.close()
+    destroyed = not abs(value) < 1e9
+    here.rig.tick()
+    here.open()
+    back = abs(here.rig.x[3]) < 1.0
+    assert back == (rest or destroyed)
+    assert here.rig.counters["restored"] == destroyed
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

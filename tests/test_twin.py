@@ -39,6 +39,16 @@ def test_the_twin_in_process_is_the_simulated_plant(plant: Any) -> None:
     assert twin.counters["written"] == run["y"].size
 
 
+@pytest.mark.parametrize("value", [np.nan, 2e9, 1e6])
+def test_a_twin_that_is_destroyed_comes_back_to_rest_when_it_is_closed(value: float) -> None:
+    """So that the next run with the same object can begin; other states are kept."""
+    twin = TwinDevice(PLANT, DT, x0=[0.1, 0.0, 0.2, 0.0])
+    start = twin.x
+    twin.handle.x[1] = value  # type: ignore[union-attr]
+    twin.close()
+    assert np.array_equal(twin.x, start) == (value != 1e6)
+
+
 def test_a_twin_of_a_plant_in_python_is_used_through_python() -> None:
     """It has no line of its own."""
 
