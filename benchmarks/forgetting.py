@@ -34,7 +34,10 @@ def main() -> None:
                 rest_at=(step_at,),
             )
             run = ql.simulate(ql.plants.two_mass_spring(), controller, scenario, record_every=10)
-            found, theta = run.metrics(step_at), run["theta"][run.window(step_at, step_at + 1.0)][0]
+            found, theta = (
+                run.metrics(step_at, band=0.002),
+                run["theta"][run.window(step_at, step_at + 1.0)][0],
+            )
             cells = (
                 f"{theta[0]:.2f}",
                 f"{theta[2]:.2f}",

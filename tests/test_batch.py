@@ -119,6 +119,11 @@ def test_metrics_are_arrays_that_miss_what_ended_before() -> None:
         for name, value in runs.run(i).metrics(50.0, target=1.0).items():
             np.testing.assert_array_equal(found[name][i], value)
     assert all(np.isnan(values[1]) for values in found.values())
+    assert found.missing["rms"] == {
+        1: f"the run diverged at {runs.ended[1]:.6g} s, before the window"
+    }
+    assert found.missing["rise_time"].keys() == {1, *np.flatnonzero(np.isnan(found["rise_time"]))}
+    assert "in the window" in runs.metrics().missing["overshoot"][1]
     assert runs.metrics()["peak_error"][1] > 1e5  # judged by what there is of it
     with pytest.raises(ValueError, match="the window must hold at least one sample"):
         runs.metrics(70.0)

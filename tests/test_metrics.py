@@ -46,6 +46,66 @@ def test_settling_time_counts_from_the_first_sample_and_may_be_zero_or_nan() -> 
     assert math.isnan(metrics.settling_time(T[:100], FIRST[:100], 1.0))
 
 
+def test_settling_counts_the_sample_after_the_last_one_outside() -> None:
+    """Not that one, nor the next; a tie with the edge of the band is inside."""
+    t = np.array([5.0, 5.1, 5.2, 5.3, 5.4])
+    y = np.array([0.0, 1.75, 0.5, 1.25, 1.0])  # a band of a quarter: all are exact in binary
+    assert metrics.settling_time(t, y, 1.0, band=0.25) == t[3] - t[0]
+    assert metrics.settling_time(t, y, 1.0, band=0.2499) == t[4] - t[0]
+    assert metrics.settling_time(t, y, 1.0, band=0.5) == t[2] - t[0]
+    assert metrics.settling_time(t, 2.0 - y, 1.0, band=0.5, initial=2.0) == t[2] - t[0]
+    assert metrics.settling_time(t, y, 1.0, band=1.0) == 0.0
+    assert math.isnan(metrics.settling_time(t[:2], y[:2], 1.0, band=0.25))
+    assert math.isnan(metrics.settling_time(t[:1], y[:1], 1.0))
+
+
+def test_the_default_band_is_two_per_cent() -> None:
+    """Of the step, whatever its size."""
+    t, y = np.arange(3.0), np.array([1.0, 5.0 - 4.0 * 0.021, 5.0 - 4.0 * 0.019])
+    assert metrics.SETTLING_BAND == 0.02
+    assert metrics.settling_time(t, y, 5.0, initial=1.0) == 2.0
+    assert metrics.settling_time(t, y, 5.0) == 1.0  # of a step of 5
+
+
+def test_a_record_that_starts_beyond_its_target_overshoots_at_once() -> None:
+    """Measured from ``initial``; a step down is the mirror image of one up."""
+    t, y = np.arange(4.0), np.array([1.5, 1.2, 1.0, 1.0])
+    assert metrics.overshoot(y, 1.0) == 0.5
+    assert metrics.rise_time(t, y, 1.0) == 0.0
+    assert metrics.settling_time(t, y, 1.0) == 2.0
+    assert metrics.overshoot(y, 1.0, initial=1.5) == 0.0  # a step down that is not passed
+    assert metrics.overshoot(y - [0, 0, 0.25, 0], 1.0, initial=1.5) == 0.5
+    assert metrics.rise_time(t, y, 1.0, initial=1.5) == pytest.approx(1.75 - 1 / 6)
+
+
+def test_rise_time_takes_the_first_crossings_and_ties_are_crossings() -> None:
+    """A fall back below 90 % does not count; a sample at exactly 10 or 90 % is a crossing."""
+    t = np.arange(6.0)
+    assert metrics.rise_time(t, np.array([0.0, 0.1, 0.9, 0.5, 0.95, 1.0]), 1.0) == 1.0
+    assert metrics.rise_time(t, np.array([0.0, 0.2, 0.2, 0.05, 0.8, 1.0]), 1.0) == 4.0
+    assert metrics.rise_time(t + 7.0, np.array([0.0, 0.2, 0.2, 0.05, 0.8, 1.0]), 1.0) == 4.0
+    assert math.isnan(metrics.rise_time(t, np.full(6, 0.5), 1.0))
+
+
+def test_integrals_of_few_samples_are_trapezoids() -> None:
+    """By hand; times count from the first sample, and a record of one sample has no area."""
+    t, e = np.array([2.0, 3.0, 5.0]), np.array([1.0, -3.0, 2.0])
+    assert metrics.iae(t, e) == 2.0 + 5.0
+    assert metrics.ise(t, e) == 5.0 + 13.0
+    assert metrics.itae(t, e) == 1.5 + 9.0
+    assert metrics.iae(t[:1], e[:1]) == 0.0
+    assert (metrics.peak(e), metrics.rms(e)) == (3.0, pytest.approx(math.sqrt(14.0 / 3.0)))
+
+
+def test_total_variation_has_the_first_jump_and_control_variation_has_not() -> None:
+    """From the u before the record, zero if the loop starts from rest."""
+    u = np.array([3.0, 5.0, -1.0])
+    assert metrics.control_variation(u) == 8.0
+    assert metrics.total_variation(u) == 11.0
+    assert metrics.total_variation(u, before=4.0) == 9.0
+    assert (metrics.control_variation(u[:1]), metrics.total_variation(u[:1])) == (0.0, 3.0)
+
+
 def test_rise_time_of_a_first_order_step_is_log_nine() -> None:
     """From 10 % to 90 %."""
     assert metrics.rise_time(T, FIRST, 1.0) == pytest.approx(math.log(9.0), abs=1e-6)

@@ -54,8 +54,9 @@ def test_metrics_judge_the_window_as_a_step(run: ql.Trajectory) -> None:
     """The target is where the reference ends; a window at rest has no overshoot to speak of."""
     found = run.metrics(0.0, 10.0)
     assert set(found) == {
-        "overshoot", "settling_time", "rise_time", "peak_error", "rms", "iae", "ise", "itae", "control_variation",
+        "overshoot", "settling_time", "rise_time", "peak_error", "rms", "iae", "ise", "itae", "control_variation", "total_variation",
     }  # fmt: skip
+    assert found.missing == {}
     assert found["peak_error"] == 1.0
     assert 2.0 < found["rise_time"] < 8.0
     assert run.metrics()["rms"] < 1.0
@@ -66,6 +67,113 @@ def test_metrics_judge_the_window_as_a_step(run: ql.Trajectory) -> None:
         run.metrics(30.0)
     with pytest.raises(ValueError, match="time = nan: must be a number"):
         run.metrics(np.nan)
+
+
+def record_of(r: object, y: object, u: object = 0.0, **fields: object) -> ql.Trajectory:
+    """A record of few samples, 0.1 s apart."""
+    columns = np.broadcast_arrays(np.asarray(r, dtype=float), y, u)
+    log = np.column_stack(columns).astype(float)
+    channels = (("r", 1), ("y", 1), ("u", 1))
+    return ql.Trajectory(log, channels, 0.1, ended=0.1 * (len(log) - 1), **fields)
+
+
+STEP = ("overshoot", "settling_time", "rise_time")
+
+
+@pytest.mark.parametrize(
+    ("r", "y", "window", "missing"),
+    [
+        ([1, 1, 1, 1], [0, 0.5, 1, 1], (), {}),
+        ([1, 1, 1, 1], [1, 1.1, 1, 1], (), dict.fromkeys(STEP, "y is at the target at the start of the window: no step")),
+        ([0, 1, 2, 2], [0, 1, 2, 2], (), dict.fromkeys(STEP, "r changes within the window: give target to judge it as a move to there")),
+        ([2, 2, 2, 2], [0, 1, 2, 2], (0.2,), dict.fromkeys(STEP, "y is at the target at the start of the window: no step")),
+        ([2, 2, 2, 2, 2], [0, 0, 0, 1, 2], (0.2,), dict.fromkeys(STEP, "r does not step at the start of the window: no step")),
+        ([0, 0, 2, 2, 2], [0, 0, 0, 1, 2], (0.2,), {}),
+        ([0, 2, 2, 2, 2], [0, 0, 0, 1, 2], (0.2,), {}),  # a sample off
+        ([0, 2, 2, 2, 2], [0, 0, 0, 0, 2], (0.3,), dict.fromkeys(STEP, "r does not step at the start of the window: no step")),
+        ([0, 0, 2, 2, 2], [0, 0, 0, 1, 2], (0.1,), {}),
+        ([1, 1, 1], [0, 0.5, 0.97], (), {"settling_time": "at the end of the window y is not within ±2 % of the step"}),
+        ([1, 1, 1], [0, 0.5, 0.9801], (), {}),
+        ([1, 1, 1], [0, 0.5, 0.8], (), {
+            "settling_time": "at the end of the window y is not within ±2 % of the step",
+            "rise_time": "y does not reach 90 % of the step in the window",
+        }),
+    ],
+)  # fmt: skip
+def test_each_measure_that_is_missing_has_its_reason(
+    r: list[float], y: list[float], window: tuple[float, ...], missing: dict[str, str]
+) -> None:
+    """It is not in the result, or NaN; and nothing else is missing."""
+    found = record_of(r, y).metrics(*window)
+    assert found.missing == missing
+    assert {name for name in STEP if np.isnan(found.get(name, np.nan))} == set(missing)
+    assert found.band == 0.02
+
+
+def test_a_move_is_judged_when_its_target_is_given() -> None:
+    """A trapezoid does not step; the band of 2 % can be another one."""
+    move = record_of([0, 1, 2, 2, 2], [0, 1, 2.1, 2.01, 2.0])
+    assert move.metrics(target=2.0)["settling_time"] == pytest.approx(0.3)
+    assert move.metrics(target=2.0, band=0.002)["settling_time"] == pytest.approx(0.4)
+    assert move.metrics(target=2.0, band=0.1)["settling_time"] == pytest.approx(0.2)
+    with pytest.raises(ValueError, match="band = -1.0: must be finite and greater than zero"):
+        move.metrics(15.0 * 0.01, band=-1.0)
+
+
+def test_a_run_that_diverged_in_the_window_has_no_step_there() -> None:
+    """Though y may not have passed the target; before its end there are windows that are whole."""
+    run = record_of([1, 1, 1, 1], [0, 0.99, -1, -1e6], status=ql.Status.DIVERGED)
+    reason = "the run diverged at 0.3 s, in the window"
+    assert run.metrics().missing == dict.fromkeys(STEP, reason)
+    assert run.metrics()["peak_error"] == 1e6 + 1
+    assert "overshoot" in run.metrics(0.0, 0.2)
+    assert run.metrics(0.0, 0.3).missing.keys() == {"settling_time"}
+    with pytest.raises(ValueError, match=r"the record ends at 0.3 s .*The loop diverged"):
+        run.metrics(0.5)
+
+
+def test_the_total_variation_has_the_first_jump_of_u() -> None:
+    """From zero at the start of the run, from the u before the window later."""
+    run = record_of([1] * 5, [0] * 5, [3, 5, 4, 4, 4])
+    assert (run.metrics()["control_variation"], run.metrics()["total_variation"]) == (3.0, 6.0)
+    later = run.metrics(0.1)
+    assert (later["control_variation"], later["total_variation"]) == (1.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("window", "message"),
+    [
+        ((0.3, 0.1), "start = 0.3, stop = 0.1: start must be less than stop"),
+        ((0.3, 0.3), "start = 0.3, stop = 0.3: start must be less than stop"),
+        ((0.11, 0.19), "must hold at least one sample; they are 0.1 s apart, from 0 s on"),
+        ((-2.0, -1.0), "must hold at least one sample; they are 0.1 s apart, from 0 s on"),
+        ((0.41,), "the record ends at 0.4 s; the window must hold at least one sample"),
+    ],
+)
+def test_a_window_without_samples_says_why(window: tuple[float, ...], message: str) -> None:
+    """Reversed, between two samples, before or after the record; nothing is said of the loop."""
+    with pytest.raises(ValueError, match=message) as raised:
+        record_of([1] * 5, [0] * 5).metrics(*window)
+    assert "All is well" not in str(raised.value)
+
+
+def test_a_record_without_samples_says_so() -> None:
+    """And what happened."""
+    nothing = record_of([], [], status=ql.Status.DIVERGED)
+    with pytest.raises(ValueError, match=r"the record has no sample \(.*The loop diverged"):
+        nothing.metrics()
+
+
+def test_a_record_of_one_sample_has_measures() -> None:
+    """No step can have settled in it."""
+    one = record_of([1.0], [0.0], [2.0]).metrics()
+    assert (one["rms"], one["iae"], one["control_variation"], one["total_variation"]) == (
+        1,
+        0,
+        0,
+        2,
+    )
+    assert one.missing.keys() == {"settling_time", "rise_time"}
 
 
 def test_the_record_becomes_a_labelled_dataset(run: ql.Trajectory) -> None:

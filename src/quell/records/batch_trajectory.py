@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.records.measures import BatchMetrics
+from quell.records.metrics import SETTLING_BAND
 from quell.records.record import Record, read_dataset, record_fields
 from quell.records.trajectory import Trajectory
 from quell.types import Channels, Matrix, Status, Vector
@@ -99,8 +101,8 @@ class BatchTrajectory(Record):
         stop: float | None = None,
         *,
         target: float | None = None,
-        band: float = 0.002,
-    ) -> dict[str, Vector]:
+        band: float = SETTLING_BAND,
+    ) -> BatchMetrics:
         """Return measures of each run in ``[start, stop)`` [s], as ``Trajectory.metrics`` does.
 
         For a run that diverged within the window, its samples up to there count; see ``diverged``.
@@ -114,10 +116,12 @@ class BatchTrajectory(Record):
 
         Returns
         -------
-        dict
-            of arrays (runs,): ``peak_error`` and ``rms`` [y-unit], ``iae`` [y-unit s], ``ise``
-            [y-unit² s], ``itae`` [y-unit s²], ``control_variation`` [u-unit]; for a step
-            ``overshoot`` (fraction of the step), ``settling_time`` and ``rise_time`` [s].
+        BatchMetrics
+            a dictionary of arrays (runs,): ``peak_error`` and ``rms`` [y-unit], ``iae`` [y-unit s],
+            ``ise`` [y-unit² s], ``itae`` [y-unit s²], ``control_variation`` and
+            ``total_variation`` [u-unit]; for a step ``overshoot`` (fraction of the step),
+            ``settling_time`` and ``rise_time`` [s]. Its ``missing[name]`` has the reason for each
+            run that does not have a measure.
 
         Raises
         ------
@@ -127,11 +131,18 @@ class BatchTrajectory(Record):
         window = self.window(start, np.inf if stop is None else stop)
         reached = np.flatnonzero((self.lengths > window.start) | ~self.diverged).tolist()
         found: dict[str, Vector] = {}
+        missing: dict[str, dict[int, str]] = {}
         for i in reached or [0]:  # if no run reached the window, the first one raises the error
             measures = self.run(i).metrics(start, stop, target=target, band=band)
             for name, value in measures.items():
                 found.setdefault(name, np.full(len(self), np.nan))[i] = value
-        return found
+            for name, reason in measures.missing.items():
+                missing.setdefault(name, {})[i] = reason
+        for i in sorted(set(range(len(self))) - set(reached)):
+            reason = f"the run diverged at {self.ended[i]:.6g} s, before the window"
+            for name in found:
+                missing.setdefault(name, {})[i] = reason
+        return BatchMetrics(found, missing, band)
 
     def plot(self, axes: Any = None) -> Any:
         """Draw output and control signal: median, bands of the runs, and when others diverged.

@@ -12,6 +12,10 @@ from numpy.typing import ArrayLike
 from quell import checks
 from quell.types import Vector
 
+SETTLING_BAND = 0.02
+"""Default half width of the settling band, as a fraction of the step: the 2 % of textbooks (Ogata,
+*Modern Control Engineering*, section 5-3)."""
+
 
 def overshoot(y: Vector, target: float, initial: float = 0.0) -> float:
     """Return how far y goes beyond ``target``, as a fraction of the step; 0.0 if it never does."""
@@ -20,12 +24,12 @@ def overshoot(y: Vector, target: float, initial: float = 0.0) -> float:
 
 
 def settling_time(
-    t: Vector, y: Vector, target: float, band: float = 0.002, initial: float = 0.0
+    t: Vector, y: Vector, target: float, band: float = SETTLING_BAND, initial: float = 0.0
 ) -> float:
     """Return the time after ``t[0]`` from which on y stays near ``target`` [s].
 
-    Near means closer than ``band`` times the step. 0.0 if y never leaves this band, NaN if it is
-    outside at the end.
+    Near means not further than ``band`` times the step. 0.0 if y never leaves this band, NaN if it
+    is outside at the end.
     """
     t, y = _pair(t, y)
     move = checks.nonzero("target - initial", target - initial, "there is no move to settle")
@@ -39,7 +43,10 @@ def settling_time(
 
 
 def rise_time(t: Vector, y: Vector, target: float, initial: float = 0.0) -> float:
-    """Return the time from 10 % to 90 % of the step, interpolated [s]; NaN if y stays below."""
+    """Return the time from 10 % to 90 % of the step, interpolated [s].
+
+    0.0 if the first y is beyond 90 % already, NaN if y stays below.
+    """
     t, y = _pair(t, y)
     move = checks.nonzero("target - initial", target - initial, "there is no move to rise")
     done = (y - initial) / move
@@ -75,8 +82,22 @@ def itae(t: Vector, error: Vector) -> float:
 
 
 def control_variation(u: Vector) -> float:
-    """Return ``Σ |u_k − u_{k−1}|``, the travel of the actuator [u-unit]."""
+    """Return ``Σ |u_k − u_{k−1}|`` from the second sample on [u-unit].
+
+    The jump from the u before the record to its first sample is left out; ``total_variation`` has
+    it. At a step of the reference this jump is often the largest.
+    """
     return float(np.sum(np.abs(np.diff(_record(u)))))
+
+
+def total_variation(u: Vector, before: float = 0.0) -> float:
+    """Return ``TV = Σ |u_k − u_{k−1}|`` with the first jump, from ``before`` to ``u_0`` [u-unit].
+
+    It is the sum of all moves of the input up and down (Skogestad, *Simple analytic rules for model
+    reduction and PID controller tuning*, J. Process Control 13, 2003, section 4.1).
+    """
+    first = abs(float(_record(u)[0]) - checks.finite("before", before))
+    return first + control_variation(u)
 
 
 def _first_crossing(t: Vector, done: Vector, level: float) -> float:

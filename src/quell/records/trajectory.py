@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quell import checks
-from quell.records import metrics
+from quell.records.measures import Metrics, Window, measured
+from quell.records.metrics import SETTLING_BAND
 from quell.records.record import Record, read_dataset, record_fields
 from quell.types import Channels, Matrix, Status
 
@@ -66,8 +66,8 @@ class Trajectory(Record):
         stop: float | None = None,
         *,
         target: float | None = None,
-        band: float = 0.002,
-    ) -> dict[str, float]:
+        band: float = SETTLING_BAND,
+    ) -> Metrics:
         """Return measures of the response in ``[start, stop)`` [s], as a step from its first y.
 
         Parameters
@@ -81,53 +81,53 @@ class Trajectory(Record):
 
         Returns
         -------
-        dict
-            ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y, and ``control_variation``;
-            if the reference steps at the start of the window or ``target`` is given, also
-            ``overshoot`` (fraction of the step), ``settling_time`` and ``rise_time`` [s], NaN if y
-            does not reach the target.
+        Metrics
+            a dictionary with ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae`` of r − y,
+            ``control_variation`` and ``total_variation`` of u, which also has the jump from the u
+            before the window (zero before the run); if the reference steps at the start of the
+            window or ``target`` is given, also ``overshoot`` (fraction of the step),
+            ``settling_time`` and ``rise_time`` [s], NaN if y does not reach the target. Its
+            ``missing`` has the reason for each of these that does not exist. If the run diverged in
+            the window, there is no step, and the others are those of the samples up to there.
 
         Raises
         ------
         ValueError
             if the window has no sample, for instance because the run ended before it.
         """
-        part = self.window(start, np.inf if stop is None else stop)
-        if part.start >= len(self) or part.stop <= part.start:
-            raise ValueError(
-                f"start = {start!r}, stop = {stop!r}: the record ends at {self.ended:.6g} s "
-                f"({self.message}); the window must hold at least one sample"
-            )
-        t, y, u = self.t[part], self["y"][part], self["u"][part]
-        error = self["r"][part] - y
-        goal = float(self["r"][part][-1]) if target is None else checks.finite("target", target)
-        initial = float(y[0])
-        found: dict[str, float] = {}
-        if goal != initial and (target is not None or self._steps_at(part, goal)):
-            found |= {
-                "overshoot": metrics.overshoot(y, goal, initial),
-                "settling_time": metrics.settling_time(t, y, goal, band, initial),
-                "rise_time": metrics.rise_time(t, y, goal, initial),
-            }
-        return found | {
-            "peak_error": metrics.peak(error),
-            "rms": metrics.rms(error),
-            "iae": metrics.iae(t, error),
-            "ise": metrics.ise(t, error),
-            "itae": metrics.itae(t, error),
-            "control_variation": metrics.control_variation(u),
-        }
-
-    def _steps_at(self, part: slice, goal: float) -> bool:
-        """Return whether the reference steps to ``goal`` at the start of a window and stays there.
-
-        The step may be a sample off; at 0 s there always is one.
-        """
-        r = self["r"]
-        stays = bool(np.all(r[part.start + 1 : part.stop] == goal))
-        return stays and (
-            part.start == 0 or bool(np.any(r[max(part.start - 2, 0) : part.start + 1] != goal))
+        part = self._part(start, stop)
+        before = slice(max(part.start - 2, 0), part.start)
+        r, u = self["r"], self["u"]
+        window = Window(
+            t=self.t[part],
+            r=r[part],
+            y=self["y"][part],
+            u=u[part],
+            r_before=r[before],
+            u_before=float(u[part.start - 1]) if part.start else 0.0,
         )
+        cut_off = self.diverged and (stop is None or stop > self.ended)
+        fault = f"the run diverged at {self.ended:.6g} s, in the window" if cut_off else None
+        return measured(window, target, band, fault)
+
+    def _part(self, start: float, stop: float | None) -> slice:
+        """Return the samples in ``[start, stop)``; raise a ``ValueError`` if there are none."""
+        part = self.window(start, np.inf if stop is None else stop)
+        window = f"start = {start!r}, stop = {stop!r}"
+        if stop is not None and not start < stop:
+            raise ValueError(f"{window}: start must be less than stop")
+        if part.start >= len(self):
+            end = f"ends at {self.ended:.6g} s" if len(self) else "has no sample"
+            why = f" ({self.message})" if self.diverged else ""
+            raise ValueError(
+                f"{window}: the record {end}{why}; the window must hold at least one sample"
+            )
+        if part.stop <= part.start:
+            raise ValueError(
+                f"{window}: must hold at least one sample; they are {self.every * self.dt:g} s "
+                "apart, from 0 s on"
+            )
+        return part
 
     def plot(self, axes: Any = None) -> Any:
         """Draw output, control signal, estimates of f and, with a guard, its authority.

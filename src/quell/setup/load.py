@@ -14,6 +14,7 @@ from quell.controllers.base import Controller
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.files import nonfinite_to_none
 from quell.plants.base import Plant
+from quell.records.metrics import SETTLING_BAND
 from quell.setup.build import Builder, linear_part
 from quell.setup.description import Description, describe, read
 from quell.setup.errors import SetupError
@@ -111,7 +112,10 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
 
 
 def _check_window(
-    start: float = 0.0, stop: float | None = None, target: float | None = None, band: float = 0.002
+    start: float = 0.0,
+    stop: float | None = None,
+    target: float | None = None,
+    band: float = SETTLING_BAND,
 ) -> None:
     """Check the arguments of ``Trajectory.metrics`` before the run."""
     checks.finite("start", start)

@@ -17,7 +17,12 @@ from quell.records import metrics
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
 
-BAND = 0.02  # half width of the settling band, as a fraction of the step: the usual 2 %
+BAND = metrics.SETTLING_BAND  # half width of the settling band, as a fraction of the step
+
+_KEYS = (
+    *("overshoot", "settling_time", "disturbance_peak", "rms"),
+    *("control_variation", "total_variation"),
+)
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,8 @@ def compare(
     Comparison
         with ``overshoot`` (fraction), ``settling_time`` [s], ``disturbance_peak`` (largest ``|r −
         y|`` from ``load_at`` on) and ``rms`` of r − y over the whole run [y-unit], and
-        ``control_variation`` over the whole run [u-unit].
+        ``control_variation`` and ``total_variation`` over the whole run [u-unit]; the latter has
+        the first jump of u from zero.
 
     Examples
     --------
@@ -101,8 +107,7 @@ def score(
     run: Trajectory, duration: float, load_at: float | None = None, band: float = BAND
 ) -> Scores:
     """Return the scores of one run; None if it ended too early, or y did not settle."""
-    keys = ("overshoot", "settling_time", "disturbance_peak", "rms", "control_variation")
-    found: Scores = dict.fromkeys(keys)
+    found: Scores = dict.fromkeys(_KEYS)
     step_ends = duration if load_at is None else load_at
     t, y, r = run.t, run["y"], run["r"]
     if run.ended >= step_ends - 2.0 * run.dt:
@@ -117,4 +122,5 @@ def score(
         found["rms"] = metrics.rms(error)
         if run.every == 1:
             found["control_variation"] = metrics.control_variation(run["u"])
+            found["total_variation"] = metrics.total_variation(run["u"])
     return found

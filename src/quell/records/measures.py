@@ -1,0 +1,98 @@
+"""Measures of a response in a window of time, with the reason for each that does not exist."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from quell import checks
+from quell.records import metrics
+from quell.types import Vector
+
+STEP_MEASURES = ("overshoot", "settling_time", "rise_time")
+"""Measures that only a step has."""
+
+
+class Metrics(dict[str, float]):
+    """Measures of a response, by name.
+
+    ``missing`` has the reason for each measure that does not exist: it is not in the dictionary, or
+    it is NaN. ``band`` is the half width of the settling band, as a fraction of the step.
+    """
+
+    def __init__(self, values: dict[str, float], missing: dict[str, str], band: float) -> None:
+        super().__init__(values)
+        self.missing, self.band = missing, band
+
+
+class BatchMetrics(dict[str, Vector]):
+    """Measures of the responses of a batch, arrays (runs,) by name.
+
+    ``missing[name][i]`` is the reason why run i does not have a measure. ``band`` is the half width
+    of the settling band, as a fraction of the step.
+    """
+
+    def __init__(
+        self, values: dict[str, Vector], missing: dict[str, dict[int, str]], band: float
+    ) -> None:
+        super().__init__(values)
+        self.missing, self.band = missing, band
+
+
+class Window(NamedTuple):
+    """The samples of a window of time."""
+
+    t: Vector  # [s]
+    r: Vector
+    y: Vector
+    u: Vector
+    r_before: Vector  # the last two references before the window, fewer at the start of the record
+    u_before: float  # the u before the window, zero at the start of the record
+
+
+def measured(window: Window, target: float | None, band: float, incomplete: str | None) -> Metrics:
+    """Return the measures of a window; ``incomplete`` says why it is not all there, if so."""
+    t, r, y, u, r_before, u_before = window
+    error = r - y
+    goal = float(r[-1]) if target is None else checks.finite("target", target)
+    band, initial = checks.positive("band", band), float(y[0])
+    fault = incomplete or _no_step(r, r_before, goal, initial, target is not None)
+    values, missing = {}, dict.fromkeys(STEP_MEASURES, fault) if fault else {}
+    if not fault:
+        values = {
+            "overshoot": metrics.overshoot(y, goal, initial),
+            "settling_time": metrics.settling_time(t, y, goal, band, initial),
+            "rise_time": metrics.rise_time(t, y, goal, initial),
+        }
+        if math.isnan(values["settling_time"]):
+            share = f"±{100.0 * band:g} % of the step"
+            missing["settling_time"] = f"at the end of the window y is not within {share}"
+        if math.isnan(values["rise_time"]):
+            missing["rise_time"] = "y does not reach 90 % of the step in the window"
+    values |= {
+        "peak_error": metrics.peak(error),
+        "rms": metrics.rms(error),
+        "iae": metrics.iae(t, error),
+        "ise": metrics.ise(t, error),
+        "itae": metrics.itae(t, error),
+        "control_variation": metrics.control_variation(u),
+        "total_variation": metrics.total_variation(u, u_before),
+    }
+    return Metrics(values, {name: text for name, text in missing.items() if text}, band)
+
+
+def _no_step(r: Vector, r_before: Vector, goal: float, initial: float, asked: bool) -> str | None:
+    """Return why a window has no step to ``goal``, None if it has one.
+
+    With a target it is a step if the user ``asked`` for it. Else the reference must step at the
+    start of the window, or a sample off, and stay there; at 0 s there always is a step.
+    """
+    if goal == initial:
+        return "y is at the target at the start of the window: no step"
+    if asked:
+        return None
+    if bool((r[1:] != goal).any()):
+        return "r changes within the window: give target to judge it as a move to there"
+    if r_before.size and not bool((r_before != goal).any() or r[0] != goal):
+        return "r does not step at the start of the window: no step"
+    return None
