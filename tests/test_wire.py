@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import socket
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +20,7 @@ from quell.realtime.devices.registry import listen
 from quell.realtime.devices.twin import TwinDevice
 from quell.realtime.system.clock import system_clock
 from quell.realtime.wire import frames
+from quell.realtime.wire.shared_memory import SIZE
 from quell.realtime.wire.udp import UdpDevice
 
 from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed, url_of
@@ -196,6 +200,103 @@ def test_garbage_is_counted_and_changes_nothing(
     assert counted["accepted"] == 4
 
 
+class Stranger:
+    """A program at another port of this computer."""
+
+    def __init__(self, url: str) -> None:
+        host, _, port = url.removeprefix("udp://").partition(":")
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.rig = (host, int(port))
+
+    def send(self, *datagrams: bytes) -> None:
+        """Send to the rig."""
+        for data in datagrams:
+            self.socket.sendto(data, self.rig)
+
+    def received(self) -> list[int]:
+        """Return the kinds of all frames that have come."""
+        kinds = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                kinds.append(self.socket.recv(100)[3])
+        return kinds
+
+    def __enter__(self) -> Stranger:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
+
+
+def test_a_stranger_who_knows_the_session_can_not_use_it(bench: Callable[..., Bench]) -> None:
+    """Commands, a goodbye and a hello with all the right numbers, from another address."""
+    here = bench("udp")
+    device = here.open()
+    here.cycle(device, lambda y: 1.0, 3)
+    numbers = here.rig.model.endpoint.numbers
+    session, sent = int(numbers[frames.SESSION]), int(numbers[frames.SENT])
+    with Stranger(here.url) as stranger:
+        stranger.send(
+            packed(frames.COMMAND, 1000, sent, 9.9, session=session),
+            packed(frames.GOODBYE, 0, 0, 0.0, session=session),
+            packed(frames.HELLO, 0, 0, DT, session=session),
+        )
+        here.rig.tick(3)
+        assert stranger.received() == []
+    assert here.rig.counters["address"] == 3
+    assert (here.rig.state, here.applied) == ("live", 1.0)
+    here.cycle(device, lambda y: 2.0, 2)
+    assert here.applied == 2.0
+    assert here.rig.largest == 2.0
+
+
+def test_a_packet_is_answered_by_three_times_its_bytes_at_most(bench: Callable[..., Bench]) -> None:
+    """A hello may have a forged sender: a second one asks for more, a silent sender gets none."""
+    here = bench("udp")
+    with Stranger(here.url) as stranger:
+        hello = packed(frames.HELLO, 0, 0, DT)
+        stranger.send(hello)
+        here.rig.tick(500)
+        first = [frames.WELCOME, frames.MEASUREMENT, frames.MEASUREMENT]
+        assert stranger.received() == first
+        stranger.send(hello, hello)
+        here.rig.tick(500)
+        assert sorted(stranger.received()) == sorted([frames.WELCOME, *first])
+        stranger.send(packed(frames.HELLO, 0, 0, DT, session=77))
+        here.rig.tick(500)
+        assert stranger.received() == [frames.WELCOME]
+        assert here.rig.state == "waiting"
+
+
+def test_a_rig_is_silent_when_its_loop_is(bench: Callable[..., Bench]) -> None:
+    """Some ticks after the watchdog; the loop has then been told that it has tripped."""
+    here = bench("udp", watchdog=5)
+    device = here.open()
+    here.cycle(device, law, 3)
+    sent = int(here.rig.model.endpoint.numbers[frames.SENT])
+    here.rig.tick(1000)
+    assert here.rig.state == "tripped"
+    assert here.rig.model.endpoint.numbers[frames.SENT] - sent < 5 + 12
+    here.catch_up(device)
+    assert device.lost
+
+
+def test_measurements_may_be_read_without_commands(bench: Callable[..., Bench]) -> None:
+    """The device asks for them."""
+    here = bench("udp")
+    device, read = here.open(), list[float]()
+    here.rig.tick(500)
+    here.catch_up(device)
+
+    def read_some() -> None:
+        read.extend(device.read() for _ in range(20))
+
+    here.tick_during(read_some)
+    assert np.all(np.isfinite(read))
+    assert here.rig.state == "waiting"
+
+
 def test_a_session_that_is_over_does_not_come_back(bench: Callable[..., Bench]) -> None:
     """A hello or a command of it that was late on its way is counted, and u stays zero."""
     here = bench("udp")
@@ -220,7 +321,7 @@ def test_a_session_that_is_over_does_not_come_back(bench: Callable[..., Bench]) 
 
 def test_what_waited_behind_many_others_is_not_taken_for_new(bench: Callable[..., Bench]) -> None:
     """A queue that was full has lost its end; the next measurement is one again."""
-    here = bench("udp")
+    here = bench("udp", watchdog=100)
     device = here.open()
     here.cycle(device, law, 2)
     here.rig.tick(60)
@@ -234,9 +335,8 @@ def test_a_rig_that_was_killed_leaves_nothing_in_the_way(bench: Callable[..., Be
     """Its mailboxes are taken over, also one that was left in the middle of a write."""
     url = url_of("shm")
     dead = listen(url)
-    dead.transport.own[:] = 7
-    dead.transport.others[:] = 7
     for box in dead._boxes:
+        os.pwrite(box.file, struct.pack("<2q", 7, 7) * (SIZE // 16), 0)
         box.close()  # as the system does
     here = bench(url=url)
     device = here.open()

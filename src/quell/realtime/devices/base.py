@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, generic_with_default
 
 
 @runtime_checkable
@@ -60,6 +60,11 @@ def read_measurement(handle: Any, clock: Any, until: int) -> tuple[float, int]:
 def write_command(handle: Any, u: float) -> int:
     """Apply ``u`` [u-unit]; return 0, 1 if it can't be sent, more if the device keeps u at zero."""
     raise TypeError
+
+
+@generic_with_default
+def ask(handle: Any) -> None:
+    """Ask a paced device, which sends only as long as it hears from the loop, for measurements."""
 
 
 class PythonHandle(NamedTuple):

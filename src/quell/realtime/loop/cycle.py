@@ -29,7 +29,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.kernels.dispatch import compiled, generic, is_finite, kernel
-from quell.realtime.devices.base import read_measurement, write_command
+from quell.realtime.devices.base import ask, read_measurement, write_command
 from quell.realtime.loop.modes import Cause, Mode, Request
 from quell.realtime.loop.reference import ReferenceSamples
 from quell.realtime.loop.state import Memory, Rules, SupervisorState
@@ -185,6 +185,7 @@ def _first_deadline(handle: Any, clock: Any, supervisor: SupervisorState, times:
         and load_acquire(supervisor.requests, 0) == Request.NONE
     ):
         before = now(clock)
+        ask(handle)
         y, _ = read_measurement(handle, clock, before + max(_LOOK, int(_LOOK_TICKS * times.period)))
         after = now(clock)
         if is_finite(y):

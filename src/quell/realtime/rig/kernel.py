@@ -22,6 +22,14 @@ tripped  no fresh, finite command for ``watchdog`` ticks in a row: u = 0 until a
 A hello begins a session, unless one is live or waits for less than ``patience`` ticks. A goodbye
 ends it. A session begins at ``x0`` if ``rest``, or if the last one destroyed the plant's state: no
 motion can go on from there.
+
+Commands, goodbyes and repeated hellos of a session are accepted only from the address that
+opened it.
+
+Measurements are sent only as long as the other side asks for them, so that nobody can direct an
+endless stream to an address: a hello is worth ``HELLO_WORTH`` measurements, an accepted command
+those of the watchdog's time and ``LAST_WORDS`` more, which report that it has tripped. After that
+the rig is silent until the next hello or command.
 """
 
 from __future__ import annotations
@@ -40,7 +48,14 @@ from quell.realtime.system.histogram import count_duration
 from quell.realtime.telemetry.ring import Ring, push
 from quell.realtime.wire import frames
 from quell.realtime.wire.frames import Buffer, Endpoint
-from quell.realtime.wire.transport import MOST_AT_ONCE, connect_to_sender, receive, reply, send
+from quell.realtime.wire.transport import (
+    MOST_AT_ONCE,
+    connect_to_sender,
+    is_from_other_side,
+    receive,
+    reply,
+    send,
+)
 from quell.types import Vector
 
 IDLE, WAITING, LIVE, TRIPPED = range(4)
@@ -49,11 +64,19 @@ STATES = ("idle", "waiting", "live", "tripped")
 # Longest wait before ``stop`` is checked again [ns]: 0.1 s, short for a person. Chosen by hand.
 _CHECK_STOP_EVERY = 100_000_000
 
+HELLO_WORTH = 2
+"""Measurements for a hello. With the welcome it is answered by three times its bytes at most, the
+limit of RFC 9000 (QUIC), section 8.1, for an address that has not proved that it receives."""
+# Measurements after the watchdog has tripped, if no command comes any more: one of ten arrives even
+# over a bad wire. Chosen by hand.
+LAST_WORDS = 10
+
 # Entries of ``RigModel.counts``: state, ticks without a fresh command, all ticks, ticks since the
 # plant was at rest, sessions, refused hellos, trips of the watchdog, clipped commands, late ticks,
-# destroyed states that were put back to rest.
-STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP, RESTORED = range(10)
-COUNTS = 10
+# destroyed states that were put back to rest, measurements that the other side has asked for.
+STATE, SILENT, TICKS, SINCE_REST, SESSIONS, REFUSED, TRIPS, CLIPPED, CAUGHT_UP = range(9)
+RESTORED, ASKED = 9, 10
+COUNTS = 11
 # Entries of ``RigModel.signals``: u applied, newest command of this tick, largest |command| so far.
 APPLIED, COMMANDED, LARGEST = range(3)
 
@@ -96,7 +119,8 @@ def tick(rig: RigModel, time: int) -> None:
     fresh = _receive_command(rig, time)
     _update_watchdog(rig, fresh)
     y = measure(rig.plant, rig.x)
-    if counts[STATE] != IDLE:
+    if counts[STATE] != IDLE and counts[ASKED] > 0:
+        counts[ASKED] -= 1
         state = frames.WATCHDOG_TRIPPED if counts[STATE] == TRIPPED else 0
         frames.write_next_frame(rig.outbox, rig.endpoint, frames.MEASUREMENT, time, y, state)
         if send(rig.transport, rig.outbox) != 0:
@@ -127,7 +151,10 @@ def _receive_command(rig: RigModel, time: int) -> bool:
             _end_session(rig)
         elif rig.counts[STATE] == IDLE:
             own.counters[frames.WRONG_SESSION] += 1
+        elif _is_foreign(rig):
+            own.counters[frames.ADDRESS] += 1
         elif frames.accept(frame, own):
+            rig.counts[ASKED] = rig.watchdog + LAST_WORDS
             value = frame.doubles[3]
             if is_finite(value):
                 u = value
@@ -166,6 +193,9 @@ def _answer_hello(rig: RigModel, time: int) -> bool:
     if session == 0 or (known and (counts[STATE] == IDLE or counts[STATE] == TRIPPED)):
         own.counters[frames.WRONG_SESSION] += 1  # a session that has ended can't begin again
         return False
+    if _is_foreign(rig):
+        own.counters[frames.ADDRESS] += 1
+        return False
     if not known:
         if not abs(dt - rig.dt) <= 1e-9 * rig.dt:  # a tolerance for rounding; also refuses NaN
             state = frames.OTHER_DT
@@ -177,7 +207,7 @@ def _answer_hello(rig: RigModel, time: int) -> bool:
         frames.start_session(own, session)
         connect_to_sender(rig.transport)
         counts[STATE] = WAITING
-        counts[SILENT] = 0
+        counts[SILENT] = counts[ASKED] = 0
         counts[SESSIONS] += 1
         rig.signals[APPLIED] = 0.0
         destroyed = is_destroyed(rig.x, rig.x0)
@@ -188,6 +218,8 @@ def _answer_hello(rig: RigModel, time: int) -> bool:
                 rig.x[i] = rig.x0[i]
     elif state != 0:
         counts[REFUSED] += 1
+    if state == 0:
+        counts[ASKED] = max(counts[ASKED], HELLO_WORTH)
     frames.write_frame(rig.outbox, frames.WELCOME, session, 0, 0, time, rig.dt, state)
     reply(rig.transport, rig.outbox)
     return begins
@@ -197,10 +229,19 @@ def _answer_hello(rig: RigModel, time: int) -> bool:
 def _end_session(rig: RigModel) -> None:
     """End the session if the goodbye received belongs to it."""
     own = rig.endpoint
-    if rig.counts[STATE] != IDLE and int(rig.inbox.words[1]) == own.numbers[frames.SESSION]:
-        rig.counts[STATE] = IDLE
-    else:
+    if rig.counts[STATE] == IDLE or int(rig.inbox.words[1]) != own.numbers[frames.SESSION]:
         own.counters[frames.WRONG_SESSION] += 1
+    elif _is_foreign(rig):
+        own.counters[frames.ADDRESS] += 1
+    else:
+        rig.counts[STATE] = IDLE
+
+
+@kernel
+def _is_foreign(rig: RigModel) -> bool:
+    """Return whether the frame has the session's number but not its address."""
+    known = int(rig.inbox.words[1]) == rig.endpoint.numbers[frames.SESSION]
+    return known and not is_from_other_side(rig.transport)
 
 
 @kernel

@@ -11,7 +11,7 @@ from numba import typeof
 
 from quell import checks
 from quell.kernels.dispatch import compiled, dispatcher_for
-from quell.realtime.devices.base import read_measurement, write_command
+from quell.realtime.devices.base import ask, read_measurement, write_command
 from quell.realtime.system.clock import SystemClock, system_clock
 from quell.realtime.wire import frames
 from quell.realtime.wire.handle import GONE, NOT_SENT, TRIPPED, WireHandle, is_own
@@ -70,11 +70,12 @@ class WireDevice:
         self.dt = checks.positive("dt", dt, "s")
         own = frames.endpoint(frames.MEASUREMENT, _new_session(), _MOST_AGE)
         inbox, outbox, watch = frames.buffer(), frames.buffer(), system_clock()
-        self.handle = WireHandle(self._connect(), own, inbox, outbox, watch)
+        self.handle = WireHandle(self._connect(), own, inbox, outbox, watch, self.dt)
         # Not the handle's: compiled code takes it that its arguments share no memory.
         self._clock = system_clock()
         self._timeout = timeout
         self._open, self._compiled = True, False
+        self._answered = 0  # commands sent before the last reading
         try:
             self._begin_session()
         except BaseException:
@@ -207,13 +208,20 @@ class WireDevice:
         send(self.handle.transport, out)
 
     def _read_within(self, seconds: float) -> float:
-        """Return the newest measurement, or the first that comes within ``seconds``."""
+        """Return the newest measurement, or the first that comes within ``seconds``.
+
+        Without a command since the last reading, the device must be asked for measurements.
+        """
         self._check_open()
         handle, clock = self.handle, self._clock
         if not self._compiled:  # this may take seconds and must not count as waiting
             self._compiled = True
             for entry, arguments in ((_read, (clock, 0)), (_write, (0.0,))):
                 dispatcher_for(entry, handle).compile(tuple(map(typeof, (handle, *arguments))))
+        sent = int(handle.endpoint.numbers[frames.SENT])
+        if sent == self._answered:
+            ask(handle)
+        self._answered = sent
         until = time.monotonic_ns() + round(1e9 * seconds)
         return float(dispatcher_for(_read, handle, clock)(handle, clock, until)[0])
 

@@ -39,11 +39,15 @@ VERSION = 1
 MEASUREMENT, COMMAND, HELLO, WELCOME, GOODBYE = range(1, 6)
 WATCHDOG_TRIPPED, BUSY, OTHER_DT, GONE = 1, 2, 4, 8
 
-REFUSALS = ("malformed", "version", "kind", "session", "duplicated", "reordered", "stale")
+REFUSALS = (
+    *("malformed", "version", "kind", "session", "duplicated", "reordered", "stale"),
+    "address",
+)
 COUNTERS = ("accepted", *REFUSALS, "not_finite", "skipped", "not_sent")
-"""Names of the counters. ``skipped`` frames were lost, or replaced by a newer one before use."""
+"""Names of the counters. ``skipped`` frames were lost, or replaced by a newer one before use;
+those under ``address`` came from somebody who has not opened the session."""
 ACCEPTED, MALFORMED, WRONG_VERSION, WRONG_KIND, WRONG_SESSION = range(5)
-DUPLICATED, REORDERED, STALE, NOT_FINITE, SKIPPED, NOT_SENT = range(5, 11)
+DUPLICATED, REORDERED, STALE, ADDRESS, NOT_FINITE, SKIPPED, NOT_SENT = range(5, 12)
 
 _MAGIC = int.from_bytes(b"QL", "little")
 # Frame numbers are 32 bits wide.
@@ -89,7 +93,7 @@ class Endpoint(NamedTuple):
     numbers: NDArray[np.int64]
     """Session, number of the last frame sent, number of the last one accepted, the number that this
     one answered, and its state flags (5,)."""
-    counters: NDArray[np.int64]  # number of frames for each name in ``COUNTERS`` (11,)
+    counters: NDArray[np.int64]  # number of frames for each name in ``COUNTERS`` (12,)
 
 
 SESSION, SENT, RECEIVED, ANSWERED, STATE = range(5)

@@ -11,7 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 from quell.kernels.dispatch import is_finite, kernel
-from quell.realtime.devices.base import read_measurement, write_command
+from quell.realtime.devices.base import ask, read_measurement, write_command
 from quell.realtime.system.clock import SystemClock, now
 from quell.realtime.wire import frames
 from quell.realtime.wire.frames import Buffer, Endpoint
@@ -30,6 +30,7 @@ class WireHandle(NamedTuple):
     inbox: Buffer
     outbox: Buffer
     watch: SystemClock  # limits waiting: a wire takes real time even if the loop's clock is virtual
+    dt: float  # sample time, in hellos [s]
 
 
 @read_measurement.register(WireHandle)
@@ -67,6 +68,15 @@ def _newest(handle: WireHandle) -> tuple[float, bool]:
     if frames.is_backlog(own, accepted):
         return math.nan, False
     return (y if is_finite(y) else math.nan), accepted > 0
+
+
+@ask.register(WireHandle)
+def _ask(handle: WireHandle) -> None:
+    """Repeat the hello of the session: a device is silent if it hears nothing."""
+    own, time = handle.endpoint, now(handle.watch)
+    session = own.numbers[frames.SESSION]
+    frames.write_frame(handle.outbox, frames.HELLO, session, 0, 0, time, handle.dt, 0)
+    send(handle.transport, handle.outbox)
 
 
 @kernel

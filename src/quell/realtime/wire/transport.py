@@ -1,7 +1,7 @@
 """Functions that carry frames: each kind of wire implements them for its transport.
 
 A transport is a NamedTuple; ``receive``, ``send`` and ``wait_for_frame`` are registered for its
-type, and ``reply`` and ``connect_to_sender`` if it can have more than one other side. See
+type, and ``reply``, ``connect_to_sender`` and ``is_from_other_side`` if anyone can send to it. See
 ``udp.py`` for a complete example. None of these functions allocates memory, and only
 ``wait_for_frame`` waits.
 """
@@ -45,3 +45,12 @@ def reply(transport: Any, frame: Buffer) -> int:
 @generic_with_default
 def connect_to_sender(transport: Any) -> None:
     """Make the sender of the packet received last the other side; nothing if there is only one."""
+
+
+@generic_with_default
+def is_from_other_side(transport: Any) -> bool:
+    """Return whether the packet received last came from the other side; True if only it can send.
+
+    The other side is the sender for which ``connect_to_sender`` was called last.
+    """
+    return True

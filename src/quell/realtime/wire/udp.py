@@ -17,7 +17,14 @@ from quell.realtime.system.libc import external
 from quell.realtime.wire.descriptor import Descriptor, descriptor, wait_readable
 from quell.realtime.wire.device import WireDevice
 from quell.realtime.wire.frames import LENGTH, Buffer
-from quell.realtime.wire.transport import connect_to_sender, receive, reply, send, wait_for_frame
+from quell.realtime.wire.transport import (
+    connect_to_sender,
+    is_from_other_side,
+    receive,
+    reply,
+    send,
+    wait_for_frame,
+)
 
 # Room for a sockaddr_in (16 bytes) or a sockaddr_in6 (28 bytes); its length is stored behind it.
 _ADDRESS = 32
@@ -73,6 +80,16 @@ def _reply(udp: UdpTransport, frame: Buffer) -> int:
 def _connect_to_sender(udp: UdpTransport) -> None:
     for i in range(udp.other.size):
         udp.other[i] = udp.sender[i]
+
+
+@is_from_other_side.register(UdpTransport)
+def _is_from_other_side(udp: UdpTransport) -> bool:
+    """Compare host and port; the kernel sets the unused bytes of an address to zero."""
+    length = udp.sender[_ADDRESS // 4]
+    differences = int(udp.other[_ADDRESS // 4] != length)
+    for i in range(length // 4):
+        differences += int(udp.other[i] != udp.sender[i])
+    return differences == 0
 
 
 @wait_for_frame.register(UdpTransport)
