@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.realtime.devices.base import ask
 from quell.realtime.devices.registry import listen
 from quell.realtime.rig.kernel import APPLIED
 from quell.realtime.rig.server import Rig
@@ -103,6 +104,8 @@ class Bench:
             raise made[0]
         self._stack.callback(made[0].close)
         self.catch_up(made[0])
+        ask(made[0].handle)  # the rig may have sent already what the hello was worth
+        self.await_frame()
         return made[0]
 
     def catch_up(self, device: Any) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from quell.kernels.dispatch import interpreted
+from quell.realtime.devices.base import ask
 from quell.realtime.devices.registry import listen
 from quell.realtime.rig.kernel import serve
 from quell.realtime.rig.server import Rig
@@ -43,6 +44,7 @@ def test_the_watchdog_waits_for_the_first_command(bench: Callable[..., Bench]) -
     here.rig.tick(200)
     assert here.rig.state == "waiting"
     here.catch_up(device)
+    ask(device.handle)
     here.cycle(device, law, 2)
     assert here.rig.state == "live"
 
