@@ -39,6 +39,7 @@ def run_rig(
     mcap: Path | None = None,
     csv: Path | None = None,
     live: WholeOrNone = None,
+    live_origin: list[str] | None = None,
     outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
     """Run a setup in real time around a device, for instance the twin that `quell rig` is.
@@ -70,6 +71,9 @@ def run_rig(
         The same, ending in .csv.
     live
         Port for Foxglove and PlotJuggler to watch at.
+    live_origin
+        Web page that may watch, too, such as https://app.foxglove.dev; by default only programs and
+        pages of this computer may.
     """
     from quell.setup import EXAMPLES
 
@@ -86,7 +90,7 @@ def run_rig(
         ("observer", "omega_o"): omega_o,
     }
     files = [path for path in (mcap, csv) if path is not None]
-    if code := _run(file, changes, files, live, outputs):
+    if code := _run(file, changes, files, (live, live_origin or []), outputs):
         sys.exit(code)
 
 
@@ -94,7 +98,7 @@ def _run(
     file: Path,
     changes: Mapping[tuple[str, str], Any],
     files: list[Path],
-    port: int | None,
+    viewers: tuple[int | None, list[str]],
     outputs: RunOutputs,
 ) -> int:
     """Run the loop, print and write its results; return the exit code."""
@@ -108,14 +112,14 @@ def _run(
     files = [*map(Path, options.pop("telemetry", ())), *files]
     for path in files:
         check_recording(path)
-    live = options.pop("live")
+    (port, origins), live = viewers, options.pop("live")
     port = live if port is None else port
     url, dt = options.pop("device"), setup.controller.dt
     console = Console()
     what = f"{setup.title}: {url}, dt = {dt:g} s, for {scenario.duration:g} s"
     print_line(console, f"{what}. Ctrl-C ramps u to zero.")
     # The port first: if it is in use no file is created.
-    sinks = files if port is None else [LiveSink(port), *files]
+    sinks = files if port is None else [LiveSink(port, origins=origins), *files]
     run = _close_loop(console, setup, url, options, sinks)
     if run is None:
         return TRIPPED

@@ -12,7 +12,7 @@ from typing import Any
 from quell.realtime.telemetry.channels import K
 from quell.realtime.telemetry.header import Header
 from quell.records.channels import describe, is_vector
-from quell.types import Matrix
+from quell.types import Matrix, Vector
 
 SCHEMA = "quell/msg/Cycle"
 TOPIC = "/loop"
@@ -30,6 +30,22 @@ def definition(header: Header) -> str:
     return "\n".join(lines) + "\n"
 
 
+def advertised(header: Header) -> dict[str, Any]:
+    """Return the channel for rows as a Foxglove server advertises it."""
+    names = {"id": 1, "topic": TOPIC, "encoding": "cdr", "schemaName": SCHEMA}
+    return {**names, "schemaEncoding": "ros2msg", "schema": definition(header)}
+
+
+def message(row: Vector) -> bytes:
+    """Return a row as a message."""
+    return MARK + row.astype("<f8", copy=False).tobytes()
+
+
+def row_time(header: Header, k: float) -> int:
+    """Return the time of the deadline k, in nanoseconds since 1970."""
+    return header.started + round(k * header.dt * 1e9)
+
+
 def open_topic(foxglove: Any, header: Header, context: Any) -> Any:
     """Return a Foxglove channel for rows in a context."""
     schema = foxglove.Schema(name=SCHEMA, encoding="ros2msg", data=definition(header).encode())
@@ -38,5 +54,5 @@ def open_topic(foxglove: Any, header: Header, context: Any) -> Any:
 
 def log_rows(topic: Any, header: Header, rows: Matrix) -> None:
     """Log a message for each row, at the time of its deadline."""
-    for row, k in zip(rows.astype("<f8", copy=False), rows[:, K].tolist(), strict=True):
-        topic.log(MARK + row.tobytes(), log_time=header.started + round(k * header.dt * 1e9))
+    for row, k in zip(rows, rows[:, K].tolist(), strict=True):
+        topic.log(message(row), log_time=row_time(header, k))
