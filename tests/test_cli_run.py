@@ -8,14 +8,19 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import quell as ql
 from quell.cli.commands.run_rig import exit_code
+from quell.cli.exit_codes import ExitCode
+from quell.cli.report import windowed_metrics
 from quell.realtime.loop.modes import Cause
+from quell.records.measures import MEASURES, STEP_MEASURES
 from quell.setup import EXAMPLES, load
 
 from .commands import Shown
@@ -95,17 +100,93 @@ def test_each_mistake_gives_a_line_and_exit_code_two(
     assert [path.name for path in tmp_path.iterdir()] == ["wrong.toml"]
 
 
-def test_a_run_that_diverges_says_so(quell: Callable[..., Shown], tmp_path: Path) -> None:
-    """Windows that it did not reach have no metrics; it is no mistake in the file, and the exit code is zero."""
+def test_a_run_that_diverges_has_its_own_exit_code_and_no_metrics(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """Not in the window in which it diverged, nor after; those before are whole, and all is written."""
+    text = SHORT.replace("b0 = 1.0", "b0 = -1.0").replace("stop = 8.0", "stop = 2.0")
     (tmp_path / "wild.toml").write_text(
-        SHORT.replace("b0 = 1.0", "b0 = -1.0").replace("start = 8.0", "start = 11.5")
+        text.replace("start = 8.0", "start = 2.0\n[[metrics]]\nstart = 11.5")
     )
-    shown = quell("run", "wild.toml", "--json", "out.json", "--no-figures")
-    assert shown.code == 0, shown.err
+    shown = quell("run", "wild.toml", "--json", "out.json", "--save", "run.nc", "--no-figures")
+    assert (shown.code, shown.err) == (4, "")
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["diverged"]
-    assert "rms" not in result["metrics"][1]
+    whole, partly, after = result["metrics"]
+    assert whole["rms"] > 0.0
+    for window, where in ((partly, "in"), (after, "before")):
+        assert set(window) == {"start", "stop", "settling_band", "missing"}
+        told = f"the run diverged at {ended(tmp_path / 'run.nc'):g} s, {where} the window"
+        assert set(window["missing"].values()) == {told}
+        assert set(window["missing"]) == set(MEASURES)
+        assert told in shown.out
     assert "nan" not in shown.out.lower()
+
+
+def ended(record: Path) -> float:
+    """When a saved run ended [s]."""
+    return ql.Trajectory.load(record).ended
+
+
+def test_dashes_have_their_reason_and_the_band_is_printed(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """On 80 columns: a trapezoid without a target, with one and a wider band, and a load."""
+    trapezoid = "reference = { kind = 'trapezoid', distance = 1.0, duration = 3.0 }"
+    text = SHORT.replace("reference = 1.0", trapezoid)
+    (tmp_path / "move.toml").write_text(
+        text + "[[metrics]]\nstop = 8.0\ntarget = 1.0\nband = 0.1\n"
+    )
+    shown = quell("run", "move.toml", "--json", "out.json", "--no-figures")
+    assert shown.code == 0, shown.err
+    assert "Settling band: row by row ±2 %, ±2 %, ±10 % of the step." in shown.out
+    assert (
+        "– in 0 … 8 s (overshoot, settling time, rise time): r changes within the window: give "
+        "target to judge it as a move to there.\n" in shown.out
+    )
+    assert "– in 8 … 12 s (overshoot, settling time, rise time): r does not step" in shown.out
+    assert "…  " not in shown.out, "a column is cut"
+    windows = json.loads((tmp_path / "out.json").read_text())["metrics"]
+    assert [window["settling_band"] for window in windows] == [0.02, 0.02, 0.1]
+    assert [set(window["missing"]) for window in windows] == [set(STEP_MEASURES)] * 2 + [set()]
+    assert windows[2]["settling_time"] > 0.0
+    assert windows[0]["total_variation"] >= windows[0]["control_variation"]
+
+
+def test_a_run_that_was_ended_at_a_rig_has_no_settling_time() -> None:
+    """Its errors are those up to the end; a window after it has nothing, one before it all."""
+    setup = SimpleNamespace(
+        scenario=ql.Scenario(1.0, duration=1.0),
+        windows=({"start": 0.0}, {"start": 0.0, "stop": 0.3}, {"start": 0.6}),
+    )
+    log = np.column_stack([np.ones(6), [0.0, 0.5, 1.0, 1.0, 1.0, 1.0], np.zeros(6)])
+    run = ql.Trajectory(log, (("r", 1), ("y", 1), ("u", 1)), dt=0.1, ended=0.5)
+    cut, whole, after = windowed_metrics(run, setup)  # type: ignore[arg-type]
+    assert (cut["start"], cut["stop"]) == (0.0, 0.5)
+    assert cut["missing"] == dict.fromkeys(STEP_MEASURES, "the run ended at 0.5 s, in the window")
+    assert cut["peak_error"] == 1.0
+    assert "overshoot" not in cut
+    assert (whole["settling_time"], whole["missing"]) == (0.2, {})
+    assert after["missing"] == dict.fromkeys(MEASURES, "the run ended at 0.5 s, before the window")
+    complete = replace(run, ended=0.95)  # of a scenario of 1 s: the last sample may be before it
+    setup.windows = ({"start": 0.0}, {"start": 0.21, "stop": 0.29})
+    all_of_it, between = windowed_metrics(complete, setup)  # type: ignore[arg-type]
+    assert all_of_it["settling_time"] == 0.2
+    told = "no sample is in the window, they are 0.1 s apart"
+    assert between["missing"] == dict.fromkeys(MEASURES, told)
+
+
+def test_all_exit_codes_are_in_one_table_that_help_shows(quell: Callable[..., Shown]) -> None:
+    """Each with its meaning; commands that use one name it."""
+    codes = {code.name: code.value for code in ExitCode}
+    assert codes == {
+        "DONE": 0, "INTERNAL": 1, "ERROR": 2, "ENDED_BY_SAFETY": 3, "DIVERGED": 4,
+        "INTERRUPTED": 130, "TERMINATED": 143,
+    }  # fmt: skip
+    told = " ".join(quell("--help").out.split())
+    assert all(f"{code.value} {code.about}" in told for code in ExitCode)
+    for command in ("run", "compare", "run-rig"):
+        assert "exit code" in quell(command, "--help").out
 
 
 RIG = """

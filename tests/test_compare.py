@@ -134,7 +134,7 @@ def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     monkeypatch.setenv("COLUMNS", "80")
     names = ["lqg", "pid", "pi-notch", "resonance-ratio", "zvd+lqg"]
     where = ["--json", str(tmp_path / "out.json"), "--no-figures"]
-    with pytest.raises(SystemExit, match="0"):
+    with pytest.raises(SystemExit, match="4"):
         app(["compare", "--k", "0.5", "--dt", "0.01", "--controllers", ",".join(names), *where])
     shown = capsys.readouterr().out
     assert "…" not in shown, "a column is cut"

@@ -24,7 +24,15 @@ ROWS = (
     ("realtime.loop", "realtime.rig", "realtime.__init__", "setup"),
     ("experiments.common", "experiments.two_mass_spring", "experiments.torsional"),
     ("experiments.compare", "experiments.acc", "experiments.stress", "experiments.__init__"),
-    ("__init__", "cli.options", "cli.output", "cli.report", "cli.interrupt", "cli.commands"),
+    (
+        "__init__",
+        "cli.options",
+        "cli.exit_codes",
+        "cli.output",
+        "cli.report",
+        "cli.interrupt",
+        "cli.commands",
+    ),
     ("cli", "__main__"),
 )
 ORDER = [folder for row in ROWS for folder in row]

@@ -18,10 +18,12 @@ from quell.cli.commands.run_rig import run_rig
 from quell.cli.commands.stress import stress
 from quell.cli.commands.torsional import torsional
 from quell.cli.commands.two_mass import two_mass
+from quell.cli.exit_codes import HELP, ExitCode
 
 app = App(
     name="quell",
     help="Disturbance-rejection control that learns.",
+    help_epilogue=HELP,
     version=__version__,
     print_error=False,
     exit_on_error=False,
@@ -35,22 +37,22 @@ for _each in (stress, compare, identify, excite, rig, run, run_rig, replay):
 
 
 def main() -> None:
-    """Run the command line; print one line for each error of the user's, and exit with 2."""
+    """Run the command line; print one line for each error of the user's, and exit with its code."""
     try:
         app()
     except (CycloptsError, ValueError, ImportError) as error:
         for line in getattr(error, "mistakes", (str(error),)):
             _print_error(line)
-        sys.exit(2)
+        sys.exit(ExitCode.ERROR)
     except BrokenPipeError:  # the reader of the output, head for instance, has closed the pipe
         sys.stdout = None
-        sys.exit(0)
+        sys.exit(ExitCode.DONE)
     except (OSError, MemoryError) as error:
         _print_error(f"{type(error).__name__}: {error}")
-        sys.exit(2)
+        sys.exit(ExitCode.ERROR)
     except KeyboardInterrupt:
         _print_error("interrupted")
-        sys.exit(130)
+        sys.exit(ExitCode.INTERRUPTED)
 
 
 def _print_error(text: str) -> None:

@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from quell.cli.output import Column, print_line, table
+from quell.records.measures import MEASURES, STEP_MEASURES
+from quell.records.metrics import SETTLING_BAND
 
 if TYPE_CHECKING:
     from quell.records.trajectory import Trajectory
@@ -23,36 +25,92 @@ COLUMNS = (
     Column("peak_error", "peak of\nr − y", 1.0, ".4g"),
     Column("rms", "RMS of\nr − y", 1.0, ".4g"),
     Column("control_variation", "variation\nof u", 1.0, ".4g"),
+    Column("total_variation", "with first\njump", 1.0, ".4g"),
 )
 
 
 def windowed_metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
     """Return the metrics of each window of a setup; by default after the last start from rest.
 
-    Each also has ``start`` and ``stop`` [s], and nothing else if the run ended before the window.
-    A metric that does not exist is None. Windows after the end of the scenario are left out.
+    Each also has ``start`` and ``stop`` [s], ``settling_band`` and ``missing``, the reason for each
+    metric that does not exist. Such a metric is None, or not there if the window has no sample or
+    no step. Windows after the end of the scenario are left out.
     """
     end = run.ended if setup.scenario is None else setup.scenario.duration
     rests = () if setup.scenario is None else setup.scenario.rest_at
     windows = [window for window in setup.windows if window.get("start", 0.0) < end]
-    results = []
-    for window in windows or [{"start": float(rests[-1]) if len(rests) else 0.0}]:
-        start, stop = window.get("start", 0.0), window.get("stop")
-        values = run.metrics(**window) if len(run) and start < run.t[-1] else {}
-        results.append(
-            {"start": start, "stop": end if stop is None else min(stop, end)}
-            | {name: value if math.isfinite(value) else None for name, value in values.items()}
-        )
-    return results
+    windows = windows or [{"start": float(rests[-1]) if len(rests) else 0.0}]
+    return [_judged(run, window, end) for window in windows]
+
+
+def _judged(run: Trajectory, window: dict[str, Any], end: float) -> dict[str, Any]:
+    """Return the metrics of a window in a run that should go on until ``end`` [s]."""
+    start, stop = window.get("start", 0.0), window.get("stop")
+    stop = end if stop is None else min(stop, end)
+    band = window.get("band", SETTLING_BAND)
+    # The last sample of a run to its end may be up to a sample before ``end``.
+    ended_early = run.diverged or run.ended < end - 1.5 * run.dt
+    cut_off = ended_early and stop > run.ended
+    if reason := _nothing_to_judge(run, start, window.get("stop", math.inf), cut_off):
+        missing = dict.fromkeys(MEASURES, reason)
+        return {"start": start, "stop": stop, "settling_band": band, "missing": missing}
+    found = run.metrics(**window)
+    values, missing = dict(found), found.missing
+    if cut_off:
+        stop = run.ended
+        values = {name: value for name, value in found.items() if name not in STEP_MEASURES}
+        reason = f"the run ended at {run.ended:.6g} s, in the window"
+        missing = missing | dict.fromkeys(STEP_MEASURES, reason)
+    numbers = {name: value if math.isfinite(value) else None for name, value in values.items()}
+    return {"start": start, "stop": stop} | numbers | {"settling_band": band, "missing": missing}
+
+
+def _nothing_to_judge(run: Trajectory, start: float, stop: float, cut_off: bool) -> str:
+    """Return why a window has no metrics at all; empty if it has some.
+
+    ``cut_off`` tells that the run ended before the window's end.
+    """
+    part, before = run.window(start, stop), start > run.ended
+    if cut_off and (run.diverged or before or not len(run)):
+        what, where = "diverged" if run.diverged else "ended", "before" if before else "in"
+        return f"the run {what} at {run.ended:.6g} s, {where} the window"
+    if part.start >= min(part.stop, len(run)):
+        return f"no sample is in the window, they are {run.every * run.dt:g} s apart"
+    return ""
 
 
 def print_metrics(console: Console, title: str, windows: list[dict[str, Any]]) -> None:
-    """Print a table with a row for each window."""
-    rows = table(title, "from … to\n[s]", *(column.heading for column in COLUMNS))
+    """Print a table with a row for each window, the settling band, and reasons for dashes."""
+    headings = (column.heading for column in COLUMNS)
+    rows = table(title, "from … to\n[s]", *headings, padding=(0, 1, 0, 0), pad_edge=False)
     for scores in windows:
         cells = [column.cell(scores) for column in COLUMNS]
-        rows.add_row(f"{scores['start']:g} … {scores['stop']:g}", *cells)
+        rows.add_row(_span(scores), *cells)
     console.print(rows)
+    bands = [f"±{100.0 * scores['settling_band']:g} %" for scores in windows]
+    alike = len(set(bands)) == 1
+    text = bands[0] if alike else f"row by row {', '.join(bands)}"
+    print_line(console, f"Settling band: {text} of the step.")
+    for line in dict.fromkeys(line for scores in windows for line in _reasons(scores)):
+        print_line(console, line)
+    console.print()
+
+
+def _reasons(scores: dict[str, Any]) -> list[str]:
+    """Return a line for each reason why columns of a row are empty."""
+    labels: dict[str, list[str]] = {}
+    for column in COLUMNS:
+        if reason := scores["missing"].get(column.key):
+            labels.setdefault(reason, []).append(column.key.replace("_", " "))
+    return [
+        f"– in {_span(scores)} s"
+        + (f" ({', '.join(names)}): {reason}." if len(names) < len(COLUMNS) else f": {reason}.")
+        for reason, names in labels.items()
+    ]
+
+
+def _span(scores: dict[str, Any]) -> str:
+    return f"{scores['start']:g} … {scores['stop']:g}"
 
 
 def print_outcome(console: Console, run: Trajectory) -> dict[str, float]:

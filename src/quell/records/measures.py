@@ -11,6 +11,11 @@ from quell.types import Vector
 
 STEP_MEASURES = ("overshoot", "settling_time", "rise_time")
 """Measures that only a step has."""
+MEASURES = (
+    *STEP_MEASURES,
+    *("peak_error", "rms", "iae", "ise", "itae", "control_variation", "total_variation"),
+)
+"""All measures, in the order of ``Metrics``."""
 
 
 class Metrics(dict[str, float]):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import OUTPUTS, Outputs, Whole
 from quell.cli.output import COMPILING, check_outputs, progress_bar, table, write_results
 
@@ -40,7 +41,7 @@ def compare(
 ) -> None:
     """Compare controllers on two masses and a spring: a step, a force on the load, noise.
 
-    All are designed for m1 = m2 = k = 1.
+    All are designed for m1 = m2 = k = 1. If a run diverges the exit code is 4.
 
     Parameters
     ----------
@@ -80,6 +81,7 @@ def compare(
     for name, scores in results["controllers"].items():
         scores["stable"] = stable[name]
     write_results(console, {"settings": about | limit, **results}, outputs, paths)
+    exit_if_diverged(result.runs.values())
 
 
 def _is_stable(controller: Controller, settings: Benchmark) -> bool | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch
 from quell.cli.output import COMPILING, check_outputs, progress_bar, write_record, write_results
 from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
@@ -16,6 +17,8 @@ def run(
     setup: Path | None = None, *, example: Switch = False, outputs: RunOutputs = RUN_OUTPUTS
 ) -> None:
     """Simulate the plant, controller and scenario of a setup file.
+
+    If the run diverges the exit code is 4; the part before that is recorded and drawn.
 
     Parameters
     ----------
@@ -68,3 +71,4 @@ def run(
         "setup": given.as_json(),
     }
     write_results(console, results, outputs, paths)
+    exit_if_diverged([result])

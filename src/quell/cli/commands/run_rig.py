@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 from rich.console import Console
 
+from quell.cli.exit_codes import ExitCode
 from quell.cli.interrupt import exit_on_signal
 from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, WholeOrNone
 from quell.cli.output import check_outputs, print_line, table, write_record, write_results
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from quell.realtime.loop.result import ModeChange
     from quell.setup import Setup
 
-DONE, TRIPPED, INTERRUPTED = 0, 3, 130
-"""Exit codes of a run to its end, of one that a limit or fault ended, of one the user stopped."""
 _DEVICE = f"Device in place of the file's, like {examples()}."
 
 
@@ -122,7 +121,7 @@ def _run(
     sinks = files if port is None else [LiveSink(port, origins=origins), *files]
     run = _close_loop(console, setup, url, options, sinks)
     if run is None:
-        return TRIPPED
+        return ExitCode.ENDED_BY_SAFETY
     record = run.trajectory
     scores = windowed_metrics(record, setup)
     _print_timing(console, run)
@@ -139,7 +138,7 @@ def _run(
         "device": url,
         "dt": dt,
         "verdict": run.verdict,
-        "exit_code": code,
+        "exit_code": int(code),
         **_as_json(run),
         "metrics": scores,
         "learned": learned,
@@ -206,9 +205,9 @@ def exit_code(run: RigRun) -> int:
     from quell.realtime.loop.modes import Ending
 
     if run.completed:
-        return DONE
+        return ExitCode.DONE
     asked = any(change.cause.ending is Ending.REQUESTED for change in run.changes)
-    return INTERRUPTED if asked else TRIPPED
+    return ExitCode.INTERRUPTED if asked else ExitCode.ENDED_BY_SAFETY
 
 
 def _print_timing(console: Console, run: RigRun) -> None:

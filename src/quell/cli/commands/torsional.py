@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
+from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import OUTPUTS, Outputs, Whole
 from quell.cli.output import (
     Column,
@@ -65,6 +66,8 @@ def torsional(*, dt: float = 1e-3, seed: Whole = 0, outputs: Outputs = OUTPUTS) 
             runs = {f"{case.label}, {kind}, {name}": run for name, run in outcome.records.items()}
             print_diverged(console, runs)
     write_results(console, result.to_json(), outputs, paths)
+    outcomes = [outcome for case in result.cases for outcome in case.outcomes.values()]
+    exit_if_diverged(run for outcome in outcomes for run in outcome.records.values())
 
 
 def _print_scores(console: Console, case: Case, about: str) -> None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import OUTPUTS, Outputs, Whole
 from quell.cli.output import (
     Column,
@@ -68,6 +69,7 @@ def two_mass(
     _print_claims(console, result)
     _print_scores(console, result)
     write_results(console, result.to_json(), outputs, paths)
+    exit_if_diverged(result.runs.values())
 
 
 def _print_claims(console: Console, result: Result) -> None:

@@ -71,8 +71,16 @@ class RigRun:
     def metrics(
         self, start: float = 0.0, stop: float | None = None, **options: Any
     ) -> dict[str, float]:
-        """Return ``Trajectory.metrics``; times count from the scenario's first sample [s]."""
-        return self.trajectory.metrics(start, stop, **options)
+        """Return ``Trajectory.metrics``; times count from the scenario's first sample [s].
+
+        If the run was ended early, the error about a window without samples says why.
+        """
+        try:
+            return self.trajectory.metrics(start, stop, **options)
+        except ValueError as error:
+            if self.completed:
+                raise
+            raise ValueError(f"{error}; the run was ended early: {self.verdict}") from None
 
     def text(self) -> str:
         """Return changes, counters, timing and notes as lines of text."""
