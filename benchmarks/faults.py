@@ -352,6 +352,8 @@ def trials(
             if found["wrong"]:
                 print(f"{found}", flush=True)
             shutil.rmtree(own)
+            if number % 50 == 49:
+                print(f"{wire}: {number + 1} trials done", file=sys.stderr, flush=True)
     finally:
         rig.end()
     return results
