@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from quell.files import csv_rows, nonfinite_to_none, read_text, write_json, written_atomically
+from quell.files import nonfinite_to_none, write_json, written_atomically
+from quell.reading import csv_rows, whole_text
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -30,10 +31,13 @@ def test_json_has_no_numbers_that_are_not_finite(tmp_path: Path) -> None:
         write_json(tmp_path / "out.json", value)
     assert list(tmp_path.iterdir()) == []
     write_json(tmp_path / "out.json", nonfinite_to_none(value))
-    text = read_text(tmp_path / "out.json", "out.json")
+    text = whole_text(tmp_path / "out.json")
     assert "".join(text.split()) == '{"a":[1.0,null],"b":{"c":null,"d":"nan","e":3}}'
 
 
 def test_rows_of_a_csv_file_have_the_numbers_of_its_lines() -> None:
     """Empty lines count, and are left out."""
-    assert csv_rows("a; b\n\n ;\n1;2\n", "file", ";") == [(1, ["a", "b"]), (4, ["1", "2"])]
+    assert [*csv_rows(["a; b\n", "\n", " ;\n", "1;2\n"], "file", ";")] == [
+        (1, ["a", "b"]),
+        (4, ["1", "2"]),
+    ]

@@ -164,12 +164,14 @@ def _number(name: str, value: Any) -> float:
         return float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{name} = {value!r}: must be a number") from None
+    except OverflowError:
+        raise ValueError(f"{name} = {value!r:.20}…: must be a number up to 1.8e308") from None
 
 
 def _array(name: str, value: Any) -> Vector:
     try:
         array = np.array(value, dtype=np.float64, order="C")
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         got = type(value).__name__
         raise ValueError(f"{name}: must be an array of numbers, got {got}") from None
     if not np.all(np.isfinite(array)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
@@ -45,25 +44,6 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     with written_atomically(path) as part:
         text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
         part.write_text(text + "\n", encoding="utf-8")
-
-
-def read_text(path: str | os.PathLike[str], where: str) -> str:
-    """Return a text file's content; messages of errors begin with ``where``."""
-    try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8"
-        raise ValueError(f"{where}: can't be read as a text file ({reason})") from None
-
-
-def csv_rows(text: str, where: str, delimiter: str = ",") -> list[tuple[int, list[str]]]:
-    """Return number and stripped cells of each line that is not empty; errors name ``where``."""
-    lines = csv.reader(text.splitlines(), delimiter=delimiter)
-    try:
-        rows = [(number, [cell.strip() for cell in row]) for number, row in enumerate(lines, 1)]
-    except csv.Error as error:
-        raise ValueError(f"{where}: is no CSV file ({error})") from None
-    return [(number, row) for number, row in rows if any(row)]
 
 
 def nonfinite_to_none(value: Any) -> Any:

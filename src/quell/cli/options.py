@@ -21,6 +21,10 @@ def whole_number(kind: Any, tokens: Sequence[Token]) -> int:
 
 Whole = Annotated[int, Parameter(converter=whole_number)]
 WholeOrNone = Annotated[int | None, Parameter(converter=whole_number)]
+MaxSize = Annotated[
+    float,
+    Parameter(name="--max-size", help="Limit of what the file that is read may unpack to [MB]."),
+]
 Switch = Annotated[bool, Parameter(negative="")]
 
 

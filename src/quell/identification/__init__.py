@@ -9,7 +9,8 @@ below it.
 from quell.identification.excitation import Excitation, excitation
 from quell.identification.frequency_response import FrequencyResponse, frequency_response
 from quell.identification.identify import identify
-from quell.identification.measured import Measured, excited, read_record
+from quell.identification.measured import Measured, excited
+from quell.identification.record_file import read_record
 from quell.identification.result import Identified
 from quell.identification.roots import Root
 from quell.identification.validation import Residuals

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.reading import MAX_SIZE
 from quell.records.measures import BatchMetrics
 from quell.records.metrics import SETTLING_BAND
-from quell.records.record import Record, read_dataset, record_fields
+from quell.records.netcdf import Stored, load_record
+from quell.records.record import Record
 from quell.records.trajectory import Trajectory
 from quell.types import Channels, Matrix, Status, Vector
 
@@ -174,25 +176,37 @@ class BatchTrajectory(Record):
         return data.assign_coords(coordinates)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> BatchTrajectory:
+    def load(cls, path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> BatchTrajectory:
         """Return the record that ``save`` wrote, without ``final_states``.
+
+        Parameters
+        ----------
+        path, max_size
+            as those of ``Trajectory.load``.
 
         Raises
         ------
-        ValueError
-            if the file is not such a record.
+        FileNotFoundError, ValueError
+            as ``Trajectory.load``.
         """
-        required = {"dt", "every", "plant", *_PER_RUN}
-        data = read_dataset(path, "BatchTrajectory.save", ("run", "time"), required)
-        return cls(
-            **record_fields(data, axes=2),
-            lengths=data["lengths"].values,
-            status=data["run_status"].values,
-            ended=data["ended"].values,
-            limit=data["limit"].values,
-            parameters={
-                str(coordinate.attrs["parameter"]): coordinate.values
-                for coordinate in data.coords.values()
-                if "parameter" in coordinate.attrs
-            },
-        )
+
+        def made(stored: Stored, fields: dict[str, Any]) -> BatchTrajectory:
+            runs, samples, _ = fields["log"].shape
+            values = {name: stored.values[name] for name in (*_PER_RUN, *stored.parameters)}
+            lengths = values["lengths"]
+            if any(each.shape != (runs,) for each in values.values()):
+                raise ValueError("must have one value of each parameter for each run")
+            if np.any((lengths < 0) | (lengths > samples)):
+                raise ValueError(f"lengths must be from 0 to {samples}")
+            return cls(
+                **fields,
+                lengths=lengths.astype(np.int64),
+                status=values["run_status"].astype(np.int64),
+                ended=values["ended"],
+                limit=values["limit"],
+                parameters={called: values[name] for name, called in stored.parameters.items()},
+            )
+
+        axes, attributes, variables = ("run", "time"), {"dt", "every", "plant"}, set(_PER_RUN)
+        writer = "BatchTrajectory.save"
+        return load_record(path, writer, axes, attributes, variables, max_size, made)

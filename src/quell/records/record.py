@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -78,45 +77,3 @@ class Record:
             variables[name] = (of_channel, values, {"long_name": about, "units": unit})
         attributes = {"dt": self.dt, "every": self.every, **attributes}
         return xarray.Dataset(variables, coordinates, attrs=attributes)
-
-
-def read_dataset(
-    path: str | os.PathLike[str], writer: str, axes: tuple[str, ...], required: set[str]
-) -> xarray.Dataset:
-    """Return the dataset that ``writer`` wrote to a NetCDF file.
-
-    It must have channels over ``axes``, and the ``required`` attributes or variables.
-    """
-    import xarray
-
-    where = f"path = {os.fspath(path)!r}"
-    try:
-        with xarray.open_dataset(Path(path), engine="h5netcdf") as dataset:
-            data = dataset.load()
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{where}: must be a NetCDF file written by {writer} ({error})") from None
-    missing = required - set(data.attrs) - set(map(str, data.variables))
-    fault = f"has no {', '.join(sorted(missing))}" if missing else ""
-    over = all(data[name].dims[: len(axes)] == axes for name in data.data_vars)
-    if not fault and not ("time" in data.sizes and over):
-        fault = f"has channels that are not over {' and '.join(axes)}"
-    if fault:
-        raise ValueError(f"{where}: {fault}: it was not written by {writer}")
-    return data
-
-
-def record_fields(data: xarray.Dataset, axes: int) -> dict[str, Any]:
-    """Return the fields of ``Record`` from a dataset whose scalar channels have ``axes`` axes."""
-    channels = {str(name): data[name].values for name in data.data_vars if name != "f_hat"}
-    columns = [values[..., None] if values.ndim == axes else values for values in channels.values()]
-    features = data["theta_index"].values if "theta_index" in data.coords else ()
-    return {
-        "log": np.concatenate(columns, axis=-1),
-        "channels": tuple(zip(channels, (column.shape[-1] for column in columns), strict=True)),
-        "dt": float(data.attrs["dt"]),
-        "every": int(data.attrs["every"]),
-        "plant": str(data.attrs["plant"]),
-        "features": tuple(map(str, features)),
-    }

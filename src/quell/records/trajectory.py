@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quell.reading import MAX_SIZE
 from quell.records.measures import Metrics, Window, measured
 from quell.records.metrics import SETTLING_BAND
-from quell.records.record import Record, read_dataset, record_fields
+from quell.records.netcdf import Stored, load_record
+from quell.records.record import Record
 from quell.types import Channels, Matrix, Status
 
 if TYPE_CHECKING:
@@ -153,19 +155,33 @@ class Trajectory(Record):
         return self._dataset(("time",), attributes)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Trajectory:
+    def load(cls, path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Trajectory:
         """Return the record that ``save`` wrote, without ``final_state``.
+
+        A process with limits of time and memory reads the file.
+
+        Parameters
+        ----------
+        path
+            the file.
+        max_size
+            limit of what the file may unpack to [MB].
 
         Raises
         ------
+        FileNotFoundError
+            if there is no such file.
         ValueError
-            if the file is not such a record.
+            if the file is not such a record, unpacks to more than ``max_size``, or takes too long.
         """
-        required = {"dt", "every", "status", "ended", "plant"}
-        data = read_dataset(path, "Trajectory.save", ("time",), required)
-        return cls(
-            **record_fields(data, axes=1),
-            status=Status(int(data.attrs["status"])),
-            ended=float(data.attrs["ended"]),
-            limit=float(data.attrs.get("limit", math.inf)),
-        )
+
+        def made(stored: Stored, fields: dict[str, Any]) -> Trajectory:
+            return cls(
+                **fields,
+                status=Status(int(stored.attributes["status"])),
+                ended=float(stored.attributes["ended"]),
+                limit=float(stored.attributes.get("limit", math.inf)),
+            )
+
+        attributes = {"dt", "every", "status", "ended", "plant"}
+        return load_record(path, "Trajectory.save", ("time",), attributes, set(), max_size, made)

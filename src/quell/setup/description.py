@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, ValidationError
 
+from quell.reading import whole_text
 from quell.setup.errors import SetupError, from_validation
 from quell.setup.schema import Table
 
@@ -35,6 +37,14 @@ else:
         Rig,
         Scenario,
     )
+
+
+# Tables and lists within each other: setups have up to six; signals that follow each other may have
+# more. Chosen by hand, below what Python and Pydantic can follow.
+_DEEPEST = 50
+# A key of more parts than that. Reading one takes a time of the order of their number squared.
+_PART = r"(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+"
+_DEEP_KEY = re.compile(rf"(?<![\w-]){_PART}(?:\.[ \t]*+{_PART}){{{_DEEPEST}}}")
 
 
 def _optional(description: str) -> Any:
@@ -69,7 +79,12 @@ def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
     """
     name = Path(path).name
     try:
-        return name, tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        text = whole_text(path)
+        if _DEEP_KEY.search(text):
+            raise RecursionError
+        data = tomllib.loads(text)
+        _check_depth(data)
+        return name, data
     except OSError as error:
         raise SetupError([f"{path}: can't be read ({error.strerror})"]) from None
     except UnicodeDecodeError as error:
@@ -78,6 +93,22 @@ def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
         raise SetupError([f"{name}: not TOML: {error}"]) from None
     except RecursionError:
         raise SetupError([f"{name}: not a setup: tables or lists are nested too deeply"]) from None
+    except ValueError as error:  # too long, or a number of more digits than Python reads
+        raise SetupError([f"{name}: not a setup: {error}"]) from None
+
+
+def _check_depth(data: Any) -> None:
+    """Raise a ``RecursionError`` if tables or lists are deeper than those of any setup."""
+    level = [data]
+    for _ in range(_DEEPEST):
+        level = [
+            part
+            for each in level
+            if isinstance(each, dict | list)
+            for part in (each.values() if isinstance(each, dict) else each)
+        ]
+    if level:
+        raise RecursionError
 
 
 def describe(name: str, data: Mapping[str, Any]) -> Description:

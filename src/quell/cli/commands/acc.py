@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
-from quell.cli.options import OUTPUTS, Outputs, WholeOrNone
+from quell.cli.options import OUTPUTS, MaxSize, Outputs, WholeOrNone
 from quell.cli.output import check_outputs, progress_bar, table, write_results
+from quell.reading import MAX_SIZE
 
 if TYPE_CHECKING:
     from quell.experiments.acc.cases import CaseResult
@@ -24,6 +25,7 @@ def acc(
     count: WholeOrNone = None,
     spread: float | None = None,
     seed: WholeOrNone = None,
+    max_size: MaxSize = MAX_SIZE,
     outputs: Outputs = OUTPUTS,
 ) -> None:
     """Run the ACC robust-control benchmark: one fixed controller for many uncertain plants.
@@ -53,7 +55,7 @@ def acc(
         others = "--count, --spread and --seed are for drawing them"
         raise ValueError(f"--samples reads plants, {others}: give one or the other")
     else:
-        plants, source = plant_samples.read(samples), samples.name
+        plants, source = plant_samples.read(samples, max_size), samples.name
     check_outputs(outputs)
     console = Console()
     with console.status("Compiling what is not in the cache: about 20 seconds, once."):

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from quell.cli.options import OUTPUTS, Outputs, Whole, WholeOrNone
+from quell.cli.options import OUTPUTS, MaxSize, Outputs, Whole, WholeOrNone
 from quell.cli.output import check_outputs, print_line, table, write_results
+from quell.reading import MAX_SIZE
 
 if TYPE_CHECKING:
     from quell.identification import Identified, Root
@@ -24,11 +25,13 @@ def identify(
     integrators: WholeOrNone = None,
     columns: str = "",
     dt: float | None = None,
+    time_unit: str | None = None,
     delay: float = 0.0,
     max_delay: float | None = None,
     friction: bool = False,
     held_out: float = 0.3,
     horizon: Whole = 10,
+    max_size: MaxSize = MAX_SIZE,
     outputs: Outputs = OUTPUTS,
 ) -> None:
     """Fit a continuous transfer function to recorded input and output.
@@ -49,6 +52,8 @@ def identify(
         input of a closed loop.
     dt
         Sample time [s] of a record without times; columns are then u,y by default.
+    time_unit
+        Unit of the times of the record: s, ms, us or ns; s by default.
     delay
         Delay of u [s].
     max_delay
@@ -65,7 +70,7 @@ def identify(
     names = tuple(name.strip() for name in columns.split(",")) if columns else ("t", "u", "y")
     if dt is not None and not columns:
         names = ("u", "y")
-    record = read_record(data, names, dt)
+    record = read_record(data, names, dt, time_unit=time_unit, max_size=max_size)
     delays = delay if max_delay is None else (delay, max_delay)
     options: dict[str, Any] = {"friction": friction, "held_out": held_out, "horizon": horizon}
     options |= {"delay": delays, "integrators": integrators, "reference": record.reference}

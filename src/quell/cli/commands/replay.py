@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
-from quell.cli.options import RUN_OUTPUTS, RunOutputs
+from quell.cli.options import RUN_OUTPUTS, MaxSize, RunOutputs
 from quell.cli.output import check_outputs, number, print_line, table, write_record, write_results
 from quell.cli.report import print_outcome, save_run_figure
+from quell.reading import MAX_SIZE
 
 if TYPE_CHECKING:
     from quell.records.trajectory import Trajectory
@@ -18,7 +19,13 @@ _HEADINGS = ("RMS of f̂", "RMS of residual", "learned share\n[%]", "RMS of x̂1
 _FACTORS = (1.0, 1.0, 100.0, 1.0)
 
 
-def replay(record: Path, setup: Path | None = None, *, outputs: RunOutputs = RUN_OUTPUTS) -> None:
+def replay(
+    record: Path,
+    setup: Path | None = None,
+    *,
+    max_size: MaxSize = MAX_SIZE,
+    outputs: RunOutputs = RUN_OUTPUTS,
+) -> None:
     """Run a setup's observer and learner on a recorded run, and compare the estimates.
 
     Parameters
@@ -38,7 +45,7 @@ def replay(record: Path, setup: Path | None = None, *, outputs: RunOutputs = RUN
 
     given = load(setup or EXAMPLES / "torsional_rig.toml")
     check_outputs(outputs)
-    recorded = load_record(record)
+    recorded = load_record(record, max_size)
     try:  # replay refuses a controller that is no ADRC
         replayed = replay_record(recorded, cast(ADRC, given.controller))
     except ValueError as error:

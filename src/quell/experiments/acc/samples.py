@@ -11,12 +11,13 @@ without that the drawn samples are a little harsher.
 from __future__ import annotations
 
 import os
+from array import array
 
 import numpy as np
 
 from quell import checks
-from quell.files import csv_rows, read_text
 from quell.plants import CubicSpringPlant, LinearPlant, lagged_two_mass_spring
+from quell.reading import MAX_SIZE, bytes_of, check_size, csv_rows, text_lines
 from quell.types import Matrix, Vector
 
 COLUMNS = ("m1", "m2", "k_lin", "k_nonlin", "lambda", "tau")
@@ -78,23 +79,25 @@ def widened(samples: Matrix, spread: float) -> Matrix:
     return wide
 
 
-def read(path: str | os.PathLike[str]) -> Matrix:
+def read(path: str | os.PathLike[str], max_size: float = MAX_SIZE) -> Matrix:
     """Read samples from a CSV file, (count, 6).
 
     The first line names the columns, in any order: ``m1, m2, k_lin, k_nonlin, lambda, tau``, or
     ``theta_1`` to ``theta_6`` as published. Other columns are ignored. A ``ValueError`` names line
-    and column of a fault.
+    and column of a fault. The file may have ``max_size`` [MB].
     """
-    where = f"samples = {os.fspath(path)!r}"
-    rows = csv_rows(read_text(path, where), where)
-    if len(rows) < 2:
+    where, most = f"samples = {os.fspath(path)!r}", bytes_of(max_size)
+    rows = csv_rows(text_lines(path, where, most), where)
+    _, names = next(rows, (0, []))
+    header = [cell.lstrip("\\") for cell in names]
+    columns = [(j, _column(where, header, j)) for j in range(6)] if header else []
+    values = array("d")
+    for number, row in rows:
+        values.extend(_value(where, number, row, place, j) for j, place in columns)
+        check_size(8 * len(values), most, where)
+    if not values:
         raise ValueError(f"{where}: must have a line of column names and at least one sample")
-    header = [cell.lstrip("\\") for cell in rows[0][1]]
-    places = [_column(where, header, j) for j in range(6)]
-    columns = list(enumerate(places))
-    return np.array(
-        [[_value(where, number, row, place, j) for j, place in columns] for number, row in rows[1:]]
-    )
+    return np.array(values).reshape(-1, 6)
 
 
 def _column(where: str, header: list[str], j: int) -> int:

@@ -6,18 +6,23 @@ vector channel. Numbers have the digits that it takes to read the same bits back
 
 from __future__ import annotations
 
-import io
 import os
+from collections.abc import Iterator
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from quell.files import check_new_file, written_atomically
+from quell.reading import byte_lines, check_size, whole_text
 from quell.realtime.telemetry.channels import K
 from quell.realtime.telemetry.header import Header
 from quell.types import Channels, Matrix, Vector
+
+# Numbers that are converted to an array at once when reading; chosen by hand, not tuned further.
+_BLOCK = 100_000
 
 
 class CsvSink:
@@ -70,33 +75,54 @@ def header_path(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def read_csv(path: Path) -> tuple[Header, Matrix]:
+def read_csv(path: Path, most: int) -> tuple[Header, Matrix]:
     """Return header and rows of a ``CsvSink``'s file, without a last line that was cut short.
 
-    Without the header beside it, dt comes from the column ``time``; ``features`` are unknown.
+    Without the header beside it, dt comes from the column ``time``; ``features`` are unknown. The
+    rows may take ``most`` bytes.
     """
-    text = path.read_bytes()
-    first, _, body = text[: text.rfind(b"\n") + 1].partition(b"\n")
-    names = first.decode("utf-8", errors="replace").strip().split(",")
+    lines = byte_lines(path)
+    names = next(lines, b"").decode("utf-8", errors="replace").strip().split(",")
     if names[:2] != ["time", "k"]:
         raise ValueError("its first line is not the names of a recording's columns: time, k, …")
-    try:
-        table = np.empty((0, len(names)))
-        if body:
-            table = np.loadtxt(io.BytesIO(body), delimiter=",", ndmin=2, comments=None)
-    except ValueError as error:
-        raise ValueError(f"a line is not {len(names)} numbers ({error})") from None
-    if table.shape[1] != len(names):
-        raise ValueError(f"it names {len(names)} columns and has {table.shape[1]}")
-    time, rows = table[:, 0], np.ascontiguousarray(table[:, 1:])
     beside = header_path(path)
-    if beside.is_file():
-        header = Header.from_json(beside.read_text(encoding="utf-8"))
-    else:
-        header = Header(_channels(names[1:]), _sample_time(time, rows[:, K]), started=0)
+    header = Header.from_json(whole_text(beside)) if beside.is_file() else None
+    channels = _channels(names[1:]) if header is None else header.channels
+    table = _table(lines, len(names), most)
+    time, rows = table[:, 0], np.ascontiguousarray(table[:, 1:])
+    if header is None:
+        header = Header(channels, _sample_time(time, rows[:, K]), started=0)
     if header.columns != tuple(names[1:]):
         raise ValueError(f"its columns differ from those in {beside.name}")
     return header, rows
+
+
+def _table(lines: Iterator[bytes], width: int, most: int) -> Matrix:
+    """Return lines of ``width`` numbers as a matrix of at most ``most`` bytes."""
+    filled = ((number, line) for number, line in enumerate(lines, 2) if line.strip())
+    blocks, size = [np.empty((0, width))], 0
+    while block := list(islice(filled, max(1, _BLOCK // width))):
+        size += 8 * width * len(block)
+        check_size(size, most)
+        rows = _numbers([line for _, line in block])
+        if rows is None or rows.shape[1] != width:
+            numbers = (number for number, line in block if not _is_row(line, width))
+            raise ValueError(f"line {next(numbers)} is not {width} numbers")
+        blocks.append(rows)
+    return np.concatenate(blocks)
+
+
+def _numbers(lines: list[bytes]) -> Matrix | None:
+    """Return lines as a matrix; None if they are not equally many numbers each."""
+    try:
+        return np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
+    except ValueError:
+        return None
+
+
+def _is_row(line: bytes, width: int) -> bool:
+    row = _numbers([line])
+    return row is not None and row.shape[1] == width
 
 
 def _channels(columns: list[str]) -> Channels:
@@ -118,5 +144,6 @@ def _sample_time(time: Vector, k: Vector) -> float:
     last = later[-1]
     about = float(time[last] / k[last])
     rounded = [float(f"{about:.{digits}g}") for digits in (3, 6, 9, 12, 15)]
-    candidates = [*rounded, about, *np.nextafter(about, [0.0, 2.0 * about]).tolist()]
-    return next((dt for dt in candidates if np.array_equal(k * dt, time)), about)
+    with np.errstate(all="ignore"):  # a damaged file may hold any numbers
+        candidates = [*rounded, about, *np.nextafter(about, [0.0, 2.0 * about]).tolist()]
+        return next((dt for dt in candidates if np.array_equal(k * dt, time)), about)

@@ -13,6 +13,8 @@ from quell.realtime.telemetry.channels import LOOP_CHANNELS
 from quell.records.channels import is_vector
 from quell.types import Channels
 
+# Numbers in a row, far above those of any controller: chosen by hand.
+_MOST_COLUMNS = 10_000
 VERSION = 1  # version of the recording's layout; a reader refuses others
 
 
@@ -49,6 +51,10 @@ class Header:
 
     def __post_init__(self) -> None:
         checks.positive("dt", self.dt, "s")
+        if any(width < 0 for _, width in self.channels) or self.width > _MOST_COLUMNS:
+            raise ValueError(
+                f"channels: a row of {self.width} numbers; must be at most {_MOST_COLUMNS}"
+            )
         if tuple(self.channels[: len(LOOP_CHANNELS)]) != LOOP_CHANNELS:
             first = ", ".join(name for name, _ in LOOP_CHANNELS)
             raise ValueError(f"channels = {self.channels!r}: must begin with {first}")
@@ -77,10 +83,17 @@ class Header:
         try:
             fields = json.loads(text)
             version = fields.pop("quell_recording")
-            fields["channels"] = tuple((str(name), int(w)) for name, w in fields["channels"])
+            fields["channels"] = tuple(_channel(*entry) for entry in fields["channels"])
             fields["features"] = tuple(map(str, fields["features"]))
+            fields["device"] = str(fields["device"])
             if version != VERSION:
                 raise ValueError(f"its layout has version {version!r}, this quell reads {VERSION}")
             return cls(**fields)
-        except (KeyError, TypeError, AttributeError) as error:
+        except RecursionError:
+            raise ValueError("its header is nested too deeply") from None
+        except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"its header is not that of a quell recording ({error!r})") from None
+
+
+def _channel(name: Any, width: Any) -> tuple[str, int]:
+    return str(name), checks.whole("width", width, 0)

@@ -9,18 +9,14 @@ for milliseconds of work. The log time of a message is its deadline.
 from __future__ import annotations
 
 import os
-import struct
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from quell.files import check_new_file
 from quell.optional import import_extra
 from quell.realtime.telemetry.header import Header
-from quell.realtime.telemetry.ros_message import MARK, SCHEMA, TOPIC, log_rows, open_topic
+from quell.realtime.telemetry.ros_message import log_rows, open_topic
 from quell.types import Matrix
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -28,8 +24,6 @@ RECORD = "quell"  # name of the metadata record with the header
 
 # Time between two chunks [s]: with the writer's 0.25 s a killed process loses less than 1 s.
 _CHUNK_TIME = 0.5
-# Messages that are converted to an array at once when reading; chosen by hand, not tuned further.
-_BLOCK = 4096
 
 
 class _File:
@@ -120,58 +114,3 @@ class McapSink:
         """Raise the error that the file kept."""
         if self._file.error is not None:
             raise self._file.error
-
-
-def read_mcap(path: Path) -> tuple[Header, Matrix]:
-    """Return header and rows of a ``McapSink``'s file, up to its last complete chunk."""
-    import_extra("mcap", "telemetry", "reading an MCAP file")
-    header: Header | None = None
-    schemas: dict[int, str] = {}
-    topics: dict[int, tuple[str, str | None]] = {}
-    messages: list[bytes] = []
-    blocks: list[Matrix] = []
-    for record in _records(path):
-        kind = type(record).__name__
-        if kind == "Message":
-            if topics.get(record.channel_id) == (TOPIC, SCHEMA):
-                messages.append(record.data)
-                if len(messages) == _BLOCK:
-                    blocks.append(_rows(messages))
-                    messages = []
-        elif kind == "Schema":
-            schemas[record.id] = record.name
-        elif kind == "Channel":
-            topics[record.id] = (record.topic, schemas.get(record.schema_id))
-        elif kind == "Metadata" and record.name == RECORD:
-            header = Header.from_json(record.metadata.get("header", ""))
-    if header is None:
-        raise ValueError(f"it has no metadata record {RECORD!r}: it was not recorded by quell")
-    blocks = [block for block in (*blocks, _rows(messages)) if block.size]
-    if any(block.shape[1] != header.width for block in blocks):
-        raise ValueError(f"a message on {TOPIC} is not a row of {header.width} numbers")
-    return header, np.concatenate(blocks) if blocks else np.empty((0, header.width))
-
-
-def _rows(messages: list[bytes]) -> Matrix:
-    """Return the rows (messages, width) of messages."""
-    if not messages:
-        return np.empty((0, 0))
-    size = len(messages[0])
-    if size % 8 != len(MARK) or not all(
-        len(message) == size and message.startswith(MARK) for message in messages
-    ):
-        raise ValueError(f"the messages on {TOPIC} are not rows of the same width")
-    values = np.frombuffer(b"".join(message[len(MARK) :] for message in messages), dtype="<f8")
-    return values.reshape(len(messages), -1).astype(np.float64)
-
-
-def _records(path: Path) -> Iterator[Any]:
-    """Return the records of a file up to its end or the first that is damaged."""
-    from mcap.exceptions import McapError
-    from mcap.stream_reader import StreamReader
-
-    with path.open("rb") as file:
-        try:
-            yield from StreamReader(file).records
-        except (McapError, struct.error, UnicodeDecodeError):
-            return
