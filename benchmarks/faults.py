@@ -98,6 +98,9 @@ class RigProcess:
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().partition(" at ")[2].partition(": ")[0]
         self._seen = 0
+        deadline = time.monotonic() + 60.0
+        while self.log.read_text("utf-8").count("\n") < 2 and time.monotonic() < deadline:
+            time.sleep(0.05)  # until it ticks
 
     def rows(self) -> np.ndarray:
         """Return the rows of the log since the last call, with the columns of ``LOG``."""
