@@ -17,7 +17,7 @@ TRAINED = 90.0
 
 def main() -> None:
     """Train on sin t, load m2 for a while, then step from rest without the load."""
-    table = Table("learner", "load lasts [s]", "θ1", "θ3", "overshoot", "settling [s]")
+    table = Table("learner", "load lasts [s]", "θ1", "θ3", "overshoot", "settling ±0.2 % [s]")
     settings = study.Settings()
     for name, learner in (("Kalman", ql.learners.Kalman()), ("Harmonic", ql.learners.Harmonic())):
         controller = study.controller(settings, learner=learner)

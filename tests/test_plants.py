@@ -234,6 +234,10 @@ def test_methods_and_callable_objects_are_served_too() -> None:
             "dt = 0.0: must be finite and greater than zero",
         ),
         (
+            lambda: ql.plants.two_mass_spring(k=1e300).sampled(0.01),
+            r"dt = 0.01 s: two-mass-spring can't be sampled with it, exp\(A dt\) is beyond all",
+        ),
+        (
             lambda: ql.plants.NonlinearPlant(pendulum, order=3),
             r"f returns shape \(2,\): must return the 3 derivatives",
         ),

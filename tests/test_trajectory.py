@@ -86,6 +86,7 @@ STEP = ("overshoot", "settling_time", "rise_time")
         ([1, 1, 1, 1], [0, 0.5, 1, 1], (), {}),
         ([1, 1, 1, 1], [1, 1.1, 1, 1], (), dict.fromkeys(STEP, "y is at the target at the start of the window: no step")),
         ([0, 1, 2, 2], [0, 1, 2, 2], (), dict.fromkeys(STEP, "r changes within the window: give target to judge it as a move to there")),
+        ([0, 0, 2, 2], [0, 0, 1, 2], (), dict.fromkeys(STEP, "r steps at 0.2 s, within the window: start the window there")),
         ([2, 2, 2, 2], [0, 1, 2, 2], (0.2,), dict.fromkeys(STEP, "y is at the target at the start of the window: no step")),
         ([2, 2, 2, 2, 2], [0, 0, 0, 1, 2], (0.2,), dict.fromkeys(STEP, "r does not step at the start of the window: no step")),
         ([0, 0, 2, 2, 2], [0, 0, 0, 1, 2], (0.2,), {}),
@@ -132,6 +133,22 @@ def test_a_run_that_diverged_in_the_window_has_no_step_there() -> None:
         run.metrics(0.5)
 
 
+def test_a_limit_near_to_the_reference_is_no_sign_of_an_unstable_loop() -> None:
+    """The message says so, and does not blame b0; far from it, it does."""
+    near = record_of([1, 1], [0, 5], status=ql.Status.DIVERGED | ql.Status.SATURATED, limit=9.9)
+    assert "need not mean that the loop is unstable. The control signal is at" in near.message
+    assert "b0" not in near.message
+    far = record_of([1, 1], [0, 5], status=ql.Status.DIVERGED, limit=10.1)
+    assert "b0" in far.message
+
+
+def test_a_measure_beyond_all_numbers_says_so() -> None:
+    """Squares of 1e200, for instance; no warning of numpy's."""
+    found = record_of([1e200, 1e200], [0.0, 1e200]).metrics()
+    assert found.missing == dict.fromkeys(("rms", "ise"), "the number is too large for a float")
+    assert found["peak_error"] == 1e200
+
+
 def test_the_total_variation_has_the_first_jump_of_u() -> None:
     """From zero at the start of the run, from the u before the window later."""
     run = record_of([1] * 5, [0] * 5, [3, 5, 4, 4, 4])
@@ -154,7 +171,7 @@ def test_a_window_without_samples_says_why(window: tuple[float, ...], message: s
     """Reversed, between two samples, before or after the record; nothing is said of the loop."""
     with pytest.raises(ValueError, match=message) as raised:
         record_of([1] * 5, [0] * 5).metrics(*window)
-    assert "All is well" not in str(raised.value)
+    assert "problem" not in str(raised.value)
 
 
 def test_a_record_without_samples_says_so() -> None:
@@ -173,7 +190,8 @@ def test_a_record_of_one_sample_has_measures() -> None:
         0,
         2,
     )
-    assert one.missing.keys() == {"settling_time", "rise_time"}
+    assert set(one.missing.values()) == {"there is only one sample in the window: no step response"}
+    assert one.missing.keys() == set(STEP)
 
 
 def test_the_record_becomes_a_labelled_dataset(run: ql.Trajectory) -> None:

@@ -14,4 +14,4 @@ def test_messages_of_several_flags_add_up_and_ok_is_well() -> None:
     both = Status.MEASUREMENT_HELD | Status.SATURATED
     assert Status.MEASUREMENT_HELD.message in both.message
     assert Status.SATURATED.message in both.message
-    assert Status.OK.message == "All is well."
+    assert Status.OK.message == "No step reported a problem."

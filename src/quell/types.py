@@ -45,7 +45,7 @@ class Status(IntFlag):
         if Status.DIVERGED | Status.POORLY_INTEGRATED in self:
             others = self & ~(Status.DIVERGED | Status.POORLY_INTEGRATED)
             return " ".join([*([others.message] if others else []), _INTEGRATION_DIVERGED])
-        return " ".join(text for flag, text in _MESSAGES.items() if flag in self) or "All is well."
+        return " ".join(text for flag, text in _MESSAGES.items() if flag in self) or _NOTHING
 
 
 _MESSAGES = {
@@ -88,6 +88,7 @@ _MESSAGES = {
         "in a sample: raise its substeps, or lower dt."
     ),
 }
+_NOTHING = "No step reported a problem."
 _INTEGRATION_DIVERGED = (
     "The integration of the plant diverged and the run ended early; the cause is not the loop but "
     "too few sub-steps: raise the plant's substeps, or lower dt."

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from quell import checks
 from quell.lti.discretize import zero_order_hold
 from quell.lti.models import TransferFunction, check_matrices, read_model, to_state_space
@@ -146,4 +148,9 @@ class LinearPlant:
         """Return the plant sampled at ``dt`` [s] with zero-order hold on u and w."""
         inputs = [self.B, self.E]
         phi, (gamma, gamma_w) = zero_order_hold(self.A, inputs, checks.positive("dt", dt, "s"))
+        if not all(np.all(np.isfinite(part)) for part in (phi, gamma, gamma_w)):
+            raise ValueError(
+                f"dt = {dt!r} s: {self.name} can't be sampled with it, exp(A dt) is beyond all "
+                "numbers; check the units of dt and of the plant"
+            )
         return LinearModel(phi, gamma[:, 0].copy(), gamma_w, self.C[0].copy())

@@ -75,7 +75,7 @@ class BatchTrajectory(Record):
         if np.any(self.diverged):
             first = int(np.argmin(np.where(self.diverged, self.ended, np.inf)))
             sentences.append(f"The first to diverge was run {first}, at {self.ended[first]:.6g} s.")
-        return " ".join(sentences) or f"All is well in all {len(self)} runs."
+        return " ".join(sentences) or f"No step reported a problem in any of {len(self)} runs."
 
     def __len__(self) -> int:
         """Return the number of runs."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from quell import checks
 from quell.records import metrics
 from quell.types import Vector
@@ -16,6 +18,8 @@ MEASURES = (
     *("peak_error", "rms", "iae", "ise", "itae", "control_variation", "total_variation"),
 )
 """All measures, in the order of ``Metrics``."""
+
+_TOO_LARGE = "the number is too large for a float"
 
 
 class Metrics(dict[str, float]):
@@ -61,7 +65,7 @@ def measured(window: Window, target: float | None, band: float, incomplete: str 
     error = r - y
     goal = float(r[-1]) if target is None else checks.finite("target", target)
     band, initial = checks.positive("band", band), float(y[0])
-    fault = incomplete or _no_step(r, r_before, goal, initial, target is not None)
+    fault = incomplete or _no_step(t, r, r_before, goal, initial, target is not None)
     values, missing = {}, dict.fromkeys(STEP_MEASURES, fault) if fault else {}
     if not fault:
         values = {
@@ -74,19 +78,30 @@ def measured(window: Window, target: float | None, band: float, incomplete: str 
             missing["settling_time"] = f"at the end of the window y is not within {share}"
         if math.isnan(values["rise_time"]):
             missing["rise_time"] = "y does not reach 90 % of the step in the window"
+    with np.errstate(over="ignore", invalid="ignore"):
+        values |= _errors(t, error)
     values |= {
+        "control_variation": metrics.control_variation(u),
+        "total_variation": metrics.total_variation(u, u_before),
+    }
+    unexplained = values.keys() - missing.keys()
+    missing |= {name: _TOO_LARGE for name in unexplained if not math.isfinite(values[name])}
+    return Metrics(values, missing, band)
+
+
+def _errors(t: Vector, error: Vector) -> dict[str, float]:
+    return {
         "peak_error": metrics.peak(error),
         "rms": metrics.rms(error),
         "iae": metrics.iae(t, error),
         "ise": metrics.ise(t, error),
         "itae": metrics.itae(t, error),
-        "control_variation": metrics.control_variation(u),
-        "total_variation": metrics.total_variation(u, u_before),
     }
-    return Metrics(values, {name: text for name, text in missing.items() if text}, band)
 
 
-def _no_step(r: Vector, r_before: Vector, goal: float, initial: float, asked: bool) -> str | None:
+def _no_step(
+    t: Vector, r: Vector, r_before: Vector, goal: float, initial: float, asked: bool
+) -> str | None:
     """Return why a window has no step to ``goal``, None if it has one.
 
     With a target it is a step if the user ``asked`` for it. Else the reference must step at the
@@ -96,6 +111,11 @@ def _no_step(r: Vector, r_before: Vector, goal: float, initial: float, asked: bo
         return "y is at the target at the start of the window: no step"
     if asked:
         return None
+    if r.size == 1:
+        return "there is only one sample in the window: no step response"
+    changes = np.flatnonzero(np.diff(r))
+    if changes.size == 1 and changes[0] > 0:
+        return f"r steps at {t[changes[0] + 1]:.6g} s, within the window: start the window there"
     if bool((r[1:] != goal).any()):
         return "r changes within the window: give target to judge it as a move to there"
     if r_before.size and not bool((r_before != goal).any() or r[0] != goal):

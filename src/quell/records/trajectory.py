@@ -19,6 +19,10 @@ from quell.types import Channels, Matrix, Status
 if TYPE_CHECKING:
     import xarray
 
+# Times the largest of 1 and the reference: a loop may well reach a limit below it, for example by
+# its overshoot. Chosen by hand.
+_NEAR = 10.0
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(Record):
@@ -53,10 +57,19 @@ class Trajectory(Record):
         """All that the run reported, with times, and what to do."""
         if not self.diverged:
             return self.status.message
-        return (
-            f"|y| went beyond limit = {self.limit:.3g}, or was no number, at {self.ended:.6g} s. "
-            f"{self.status.message}"
-        )
+        what = f"|y| went beyond limit = {self.limit:.3g}, or was no number, at {self.ended:.6g} s"
+        if Status.POORLY_INTEGRATED in self.status or not self._limit_is_near:
+            return f"{what}. {self.status.message}"
+        others = self.status & ~Status.DIVERGED
+        more = f" {others.message}" if others else ""
+        meaning = "So near to the reference that need not mean that the loop is unstable"
+        return f"{what}, and the run ended there. {meaning}.{more}"
+
+    @property
+    def _limit_is_near(self) -> bool:
+        """Whether a stable loop may reach the limit."""
+        largest = np.max(np.abs(self["r"]), initial=1.0) if "r" in self.names else 0.0
+        return self.limit < _NEAR * float(largest)
 
     def __len__(self) -> int:
         """Return the number of samples."""

@@ -121,7 +121,8 @@ def _print(
     console.print(
         f"Unit step from rest, judged until {FORCE_AT:g} s (settling ±{100.0 * BAND:g} %); "
         f"{FORCE:g} N on m2 from then on (peak). RMS and variation: all {END:g} s. "
-        f"dt = {settings.dt:g} s, {limit}. –: not reached. "
+        f"dt = {settings.dt:g} s, {limit}. –: not settled, or diverged before. "
+        "Variation of u without its first jump. "
         "Unstable: the linear loop has a growing pole, perhaps a slow one.",
         soft_wrap=True,
     )

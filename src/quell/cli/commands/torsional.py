@@ -58,7 +58,7 @@ def torsional(*, dt: float = 1e-3, seed: Whole = 0, outputs: Outputs = OUTPUTS) 
     console.print(
         "Profile to π in 2 s, after 40 s of training; settling (±0.2 %) from its start.\n"
         "friction: the twin with Coulomb friction; linear: as the paper identified it. The encoder "
-        "has 16000 counts.\n"
+        "has 16000 counts. –: not settled from each start, or diverged before.\n"
     )
     _print_claims(console, result)
     for case in result.cases:

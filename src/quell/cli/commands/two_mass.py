@@ -95,7 +95,7 @@ def _print_scores(console: Console, result: Result) -> None:
     console.print(scores)
     console.print(
         "Overshoot, settling (±0.2 %) and variation: step, 110–150 s. Peak and RMS of y − 1: force "
-        "on m2, 170–250 s.\n"
+        "on m2, 170–250 s. –: not settled, or diverged before.\n"
     )
     print_diverged(console, result.runs)
 

@@ -64,7 +64,7 @@ class Benchmark:
         if not self.u_max > 0.0:
             raise ValueError(f"u_max = {self.u_max!r}: must be greater than zero [N], inf for none")
         checks.whole("seed", self.seed, 0)
-        two_mass_spring(self.m1, self.m2, self.k)
+        two_mass_spring(self.m1, self.m2, self.k).sampled(self.dt)
 
 
 def scenario(settings: Benchmark) -> Scenario:
