@@ -26,6 +26,18 @@ def finite(name: str, value: Any) -> float:
     return number
 
 
+# No quantity is so large in any unit: the observable universe is 1e62 Planck lengths wide.
+LARGEST_SIGNAL = 1e60
+
+
+def signal(name: str, value: Any) -> float:
+    """Return ``value`` as a float that can be a reference, a measurement or a control signal."""
+    number = finite(name, value)
+    if abs(number) > LARGEST_SIGNAL:
+        raise ValueError(f"{name} = {value!r}: must be within ±{LARGEST_SIGNAL:g}")
+    return number
+
+
 def positive(name: str, value: Any, unit: str = "") -> float:
     """Return ``value`` as a float above zero."""
     number, unit = _number(name, value), unit and f" [{unit}]"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import pickle
 from typing import Any
 
@@ -15,7 +16,7 @@ from quell import plants as plant_room
 from quell.controllers.base import control
 from quell.controllers.stateful import named_arrays as _named_arrays
 from quell.kernels.dispatch import compiled, dispatcher_for, interpreted
-from quell.learners.base import adapt, coefficients, commit, predict
+from quell.learners.base import adapt, coefficients, commit, forget, predict
 from quell.observers.base import begin, observe
 from quell.observers.delay import without_delay
 from quell.plants import registry
@@ -233,6 +234,57 @@ def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.
             assert np.all(np.abs(array) < 1e30), label
     assert np.all(np.abs(said[0]) < 1e20)
     np.testing.assert_array_equal(said[0], said[1])
+
+
+@pytest.mark.parametrize("name", [name for name in LEARNERS if name != "NoLearner"])
+def test_a_learner_that_forgets_is_a_new_one(name: str, rng: np.random.Generator) -> None:
+    """Whatever it was shown before: from there on it predicts what a new one does."""
+    learner = LEARNERS[name]
+    design = learner.design(OBSERVERS["model-free, order 2, current"], 1.0)
+    one, other = learner.memory(design), learner.memory(design)
+
+    def show(memory: Any, seen: Any, y: float) -> Any:
+        adapt(design, memory, seen, y, 0.3, seen[2])
+        said = predict(design, memory, seen, 0.3)
+        commit(design, memory, seen, 0.3, 0.1)
+        return said
+
+    for size in np.repeat([1e8, 1e3], 100):
+        seen = size * rng.normal(size=3)
+        show(one, seen, seen[0] + 1e-6)
+    forget(design, one)
+    again = []
+    for _ in range(200):
+        seen = rng.normal(size=3)
+        again.append(show(one, seen, seen[0] + 1e-6))
+        assert show(other, seen, seen[0] + 1e-6) == again[-1]
+    assert any(said != (0.0, 0.0) for said in again)
+
+
+@pytest.mark.parametrize(
+    ("name", "guard"),
+    [(name, None) for name in LEARNERS if name != "NoLearner"] + [("Kalman", ql.Guard())],
+)
+def test_a_learner_starts_again_after_measurements_beyond_its_numbers(
+    name: str, guard: ql.Guard | None
+) -> None:
+    """Ten of 1e19, and soon it holds nothing of their size, f̂ is right, and the status said so."""
+    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=80.0, dt=0.01)
+    law = ql.ADRC(observer, 6.0, learner=LEARNERS[name], guard=guard, u_min=-5.0, u_max=5.0)
+    model, x, started_again = CHAIN.sampled(0.01), np.zeros(2), []
+    for k in range(350):
+        y = measure(model, x)
+        lies = 60 <= k < 70
+        with np.errstate(over="ignore", invalid="ignore"):
+            u = control(law.parameters, law._state, 0.5, 1e19 * math.sin(k) if lies else y)
+        if ql.Status.OVERFLOWED in law.estimate.status:
+            started_again.append(k)
+        if k >= 300:
+            assert abs(law.estimate.f - (-2.0 * x[0] - 0.3 * x[1])) < 1.5
+        advance(model, x, np.zeros(12), 0.0, u, np.zeros(0))
+    assert 70 <= started_again[-1] < 300
+    for label, array in _named_arrays(law._state).items():
+        assert np.all(np.abs(array) < 1e12), label
 
 
 @pytest.mark.parametrize("name", LEARNERS)

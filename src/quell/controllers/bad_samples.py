@@ -1,11 +1,16 @@
-"""Replacement of references and measurements that are not finite."""
+"""Replacement of references and measurements that are not numbers of any physical quantity.
+
+What is not finite, or beyond 1e60, counts as missing. Arithmetic with larger numbers would overflow
+in squares, and an observer would need longer to return from them.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+from quell.checks import LARGEST_SIGNAL
 from quell.controllers.limits import Limits
-from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.dispatch import kernel
 from quell.types import Status
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
@@ -13,18 +18,24 @@ _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 
 
 @kernel
-def hold_last_good(loop: Any, r: float, y: float) -> int:
-    """Store the finite values of a sample in ``loop``; return the status flags of the others.
+def is_usable(value: float) -> bool:
+    """Return whether ``value`` can be a reference, one of its derivatives or a measurement."""
+    return abs(value) <= LARGEST_SIGNAL
 
-    The fields ``r``, ``y`` and ``has_reference`` of ``loop`` are set. Before the first finite
+
+@kernel
+def hold_last_good(loop: Any, r: float, y: float) -> int:
+    """Store the usable values of a sample in ``loop``; return the status flags of the others.
+
+    The fields ``r``, ``y`` and ``has_reference`` of ``loop`` are set. Before the first usable
     reference r is the last y, so that the loop stays where it is.
     """
     status = 0
-    if is_finite(y):
+    if is_usable(y):
         loop.y = y
     else:
         status |= _MEASUREMENT_HELD
-    if is_finite(r):
+    if is_usable(r):
         loop.r = r
         loop.has_reference = 1.0
     else:

@@ -12,6 +12,10 @@ from quell.types import Status
 _SATURATED = int(Status.SATURATED)
 _RATE_LIMITED = int(Status.RATE_LIMITED)
 
+# A law that asks for so many times its limits has a state that absurd samples have left: an
+# integrator would need 28 times its tracking time to return, and no signal spans such a range.
+_LARGEST_WISH = 2.0**40
+
 
 class Limits(NamedTuple):
     """Magnitude and rate limits; infinite if there are none."""
@@ -27,6 +31,12 @@ def checked_limits(u_min: float, u_max: float, rate_limit: float, dt: float) -> 
     if rate_limit != math.inf:
         rate_limit = checks.positive("rate_limit", rate_limit, "u-unit/s")
     return Limits(low, high, float(rate_limit) * dt)
+
+
+@kernel
+def largest_wish(limits: Limits) -> float:
+    """Return the u beyond which the state of a law is of no use; infinite without limits."""
+    return _LARGEST_WISH * max(abs(limits.low), abs(limits.high))
 
 
 @kernel

@@ -87,7 +87,7 @@ class StatefulController:
         Call it before the next ``step``. Limits that are known beforehand belong in ``u_min``,
         ``u_max`` and ``rate_limit``.
         """
-        set_applied_control(self.parameters, self._state, checks.finite("u", u))
+        set_applied_control(self.parameters, self._state, checks.signal("u", u))
 
     @property
     def limits(self) -> Limits:

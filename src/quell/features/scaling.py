@@ -45,6 +45,15 @@ def initial_scale(scaling: Scaling) -> Vector:
 
 
 @kernel
+def reset_scale(scaling: Scaling, scale: Vector) -> None:
+    """Go back to the scales before the first sample, unless they are given."""
+    if scaling.fixed:
+        return
+    for i in range(scale.size):
+        scale[i] = _LEAST
+
+
+@kernel
 def update_scale(scaling: Scaling, scale: Vector, estimate: Vector, u: float, f: float) -> None:
     """Increase ``scale`` (n + 2,) to cover the state in ``estimate`` (n + 1,), ``u`` and ``f``."""
     if scaling.fixed:

@@ -11,6 +11,7 @@ from quell.guard.base import (
     limit,
     record_output,
     reset_filters,
+    start_again,
     write_channels,
 )
 from quell.guard.guard import Guard
@@ -26,5 +27,6 @@ __all__ = [
     "limit",
     "record_output",
     "reset_filters",
+    "start_again",
     "write_channels",
 ]

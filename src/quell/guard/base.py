@@ -53,5 +53,10 @@ def write_channels(guard: Any, memory: Any, row: Vector) -> int:
 
 
 @generic_with_default
+def start_again(guard: Any, memory: Any) -> None:
+    """Return to the state before the first sample."""
+
+
+@generic_with_default
 def reset_filters(guard: Any, memory: Any) -> None:
     """Set the filters to zero; keep the learner's averages."""

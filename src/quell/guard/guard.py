@@ -44,10 +44,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.guard.base import assess, limit, record_output, reset_filters, write_channels
+from quell.guard.base import (
+    assess,
+    limit,
+    record_output,
+    reset_filters,
+    start_again,
+    write_channels,
+)
 from quell.guard.reason import Reason
 from quell.kernels.dispatch import is_finite, kernel
-from quell.kernels.scalars import Scalars
+from quell.kernels.scalars import Scalars, clear
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -241,6 +248,14 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
         for j in range(memory.chain.shape[1]):
             memory.chain[i, j] = 0.0
     memory.sample[0].output = memory.sample[0].f_learned = 0.0
+
+
+@start_again.register(GuardDesign)
+def _start_again(guard: GuardDesign, memory: GuardMemory) -> None:
+    reset_filters(guard, memory)
+    clear(memory.averages)
+    clear(memory.sample)
+    _withdraw_authority(memory.averages[0])
 
 
 @dataclass(frozen=True)

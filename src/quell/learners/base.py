@@ -9,7 +9,8 @@ functions below are registered for the type of the parameters. In each sample th
    learner with u among its features is compensated exactly, not one sample late;
 3. ``commit`` with the u that was applied.
 
-``restart`` is called when the loop starts from rest, ``coefficients`` when a run is recorded.
+``restart`` is called when the loop starts from rest, ``forget`` when the learner has lost its
+numbers (``recovery.py``), ``coefficients`` when a run is recorded.
 
 A learner whose memory refers to objects outside of its arrays, for example to a Python model, has
 three more members: ``external_fields``, the names of the fields that refer to them;
@@ -74,6 +75,12 @@ def commit(learner: Any, memory: Any, seen: Vector, u: float, f_learned: float) 
 def restart(learner: Any, memory: Any) -> None:
     """Reset the filters; keep what was learned if it is finite, else start from the beginning."""
     raise TypeError
+
+
+@generic_with_default
+def forget(learner: Any, memory: Any) -> None:
+    """Return to the state before anything was learned; by default only ``restart``."""
+    restart(learner, memory)
 
 
 @generic

@@ -13,7 +13,8 @@ only the correction is nonlinear::
 
 Within ±δ the correction is ``L_i e`` for any α: the linear observer of the bandwidth omega_o. With
 α = 1 it is linear everywhere. Beyond δ it corrects less, so it responds less to an outlier or to a
-wrong initial state. Han's gains are ``β_i = L_i δ^(1−α_i) / dt``.
+wrong initial state, and needs longer to return from a state that is far off: the time grows with a
+power of e. Beyond 2⁴⁰ δ it starts again at y. Han's gains are ``β_i = L_i δ^(1−α_i) / dt``.
 """
 
 from __future__ import annotations
@@ -25,9 +26,13 @@ import numpy as np
 
 from quell import checks
 from quell.kernels.dispatch import kernel
-from quell.observers.base import observe, predict_state
+from quell.observers.base import begin, observe, predict_state
 from quell.observers.linear import EsoModel
 from quell.types import Matrix, Vector
+
+# An error of so many δ is no error of estimation. From a smaller one an observer of order 2 with
+# Han's powers returns in 10⁴ samples (benchmarks/hostile_steps.py).
+_LARGEST_ERROR = 2.0**40
 
 
 class NonlinearModel(NamedTuple):
@@ -64,6 +69,9 @@ def _observe(
 ) -> None:
     predict_state(model, z, estimate, u, f_learned)
     error = y - estimate[0]
+    if not abs(error) <= _LARGEST_ERROR * model.delta:
+        begin(model, z, estimate, y)
+        return
     for i in range(z.size):
         estimate[i] += (
             model.gain[i]

@@ -26,6 +26,7 @@ from quell.controllers.stateful import StatefulController
 from quell.guard import GUARD_CHANNELS, Guard, UnguardedDesign, UnguardedMemory
 from quell.learners.base import Learner, NoLearner, checked_design
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
+from quell.learners.recovery import LearnerWatch, window_samples
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
 from quell.types import Channels
@@ -116,6 +117,7 @@ class ADRC(StatefulController):
         self.features = self.learner.feature_names(self.observer.order)
 
     def _design(self, observer: ESO, omega_c: float) -> AdrcDesign:
+        learns = not isinstance(self.learner, NoLearner)
         law = law_gains(observer.degree, omega_c) * (0.5 if self.half_gain else 1.0)
         return AdrcDesign(
             eso=observer.model,
@@ -126,8 +128,9 @@ class ADRC(StatefulController):
             b0=observer.b0,
             limits=self._limits,
             learner=checked_design(self.learner, observer, self._learner_omega_c),
-            lag=NO_LAG if isinstance(self.learner, NoLearner) else lag_of(observer),
+            lag=lag_of(observer) if learns else NO_LAG,
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer),
+            window=window_samples(observer) if learns else 0,
         )
 
     @property
@@ -158,6 +161,7 @@ class ADRC(StatefulController):
             learner=self.learner.memory(design.learner),
             shadow=lag_memory(design.lag, 1),
             guard=guard if self.guard is None else self.guard.memory(design.guard),
+            watch=LearnerWatch.zeros(),
         )
 
     def step(self, r: float, y: float, *derivatives: float) -> float:
@@ -208,8 +212,8 @@ class ADRC(StatefulController):
             reference of the next step [y-unit]; ``y`` by default. With another one u still
             continues without a jump, and the move begins with the observer's own dynamics.
         """
-        y, u = checks.finite("y", y), checks.finite("u", u)
-        goal = y if r is None else checks.finite("r", r)
+        y, u = checks.signal("y", y), checks.signal("u", u)
+        goal = y if r is None else checks.signal("r", r)
         start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), y, u, goal)
 
     def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
@@ -218,7 +222,7 @@ class ADRC(StatefulController):
         Return the control signal that the controller would have applied [u-unit]; ``r``, ``y`` and
         ``derivatives`` are as for ``step``.
         """
-        with manual_operation(self._state, checks.finite("u", u)):
+        with manual_operation(self._state, checks.signal("u", u)):
             self.step(r, y, *derivatives)
         return float(self._state.loop[0].u_limited)
 

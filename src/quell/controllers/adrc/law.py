@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.controllers.bad_samples import control_at_rest, hold_last_good
+from quell.controllers.bad_samples import control_at_rest, hold_last_good, is_usable
 from quell.controllers.base import (
     bumpless_transfer,
     control,
@@ -32,11 +32,27 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.limits import Limits, apply_limits
-from quell.guard import assess, limit, record_output, reset_filters, write_channels
+from quell.guard import (
+    assess,
+    limit,
+    record_output,
+    reset_filters,
+    start_again,
+    write_channels,
+)
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
-from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    forget,
+    predict,
+    restart,
+    trouble,
+)
 from quell.learners.lag import lag_push
+from quell.learners.recovery import LearnerWatch, has_lost_range, is_in_proportion
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Matrix, Status, Vector
 
@@ -82,6 +98,7 @@ class AdrcDesign(NamedTuple):
     learner: Any
     lag: Any  # lag filter of f_L; without taps if there is no learner
     guard: Any
+    window: int  # samples of the windows in which the learner is watched; 0 without a learner
 
 
 class AdrcState(NamedTuple):
@@ -94,6 +111,7 @@ class AdrcState(NamedTuple):
     learner: Any
     shadow: Matrix  # lag filter of f_L (1, …)
     guard: Any
+    watch: NDArray[LearnerWatch]  # (1,)
 
 
 @control.register(AdrcDesign)
@@ -116,7 +134,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             # The last y would look like a disturbance while the plant moves; the expected y does
             # not change the estimates.
             y = expected_measurement(design.eso, state.z, loop.u, loop.f_learned)
-            if is_finite(y):
+            if is_usable(y):
                 loop.y = y
         observe(design.eso, state.z, seen, loop.y, loop.u, loop.f_learned)
         f_plain = seen[seen.size - 1] + loop.f_learned_shown
@@ -125,6 +143,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             adapt(design.learner, state.learner, seen, loop.y, u_acting, f_plain)
             status |= trouble(design.learner, state.learner)
     constant, slope = predict(design.learner, state.learner, seen, u_acting)
+    output = constant + slope * u_acting
     constant, slope, was_cut = limit(design.guard, state.guard, f_plain, constant, slope, u_acting)
     if was_cut:
         status |= _LEARNER_CUT
@@ -152,8 +171,31 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop.u = u
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
+    if design.window > 0 and status & _MEASUREMENT_HELD == 0:
+        excess = abs(unlimited) / max(abs(u), _SMALLEST_OFFSET)
+        if has_lost_range(state.watch[0], design.window, loop.y, f_plain, output, excess):
+            status |= _OVERFLOWED
+            _start_learning_again(design, state)
     loop.status = status
     return u
+
+
+@kernel
+def _start_learning_again(design: AdrcDesign, state: AdrcState) -> None:
+    """Forget what was learned; the observer's estimate takes over what was fed forward.
+
+    If that was out of all proportion, the whole estimate is useless, and the observer begins at y.
+    """
+    loop, order = state.loop[0], design.law.size
+    if is_in_proportion(state.watch[0], loop.f_learned_shown):
+        state.z[order] += loop.f_learned_shown
+        state.seen[order] += loop.f_learned_shown
+    else:
+        begin(design.eso, state.z, state.seen, loop.y)
+    loop.constant = loop.slope = loop.f_learned = 0.0
+    reset_lag_filters(design, state)
+    start_again(design.guard, state.guard)
+    forget(design.learner, state.learner)
 
 
 @kernel
@@ -196,7 +238,7 @@ def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slo
 @set_reference_derivatives.register(AdrcDesign)
 def _set_reference_derivatives(design: AdrcDesign, state: AdrcState, derivatives: Vector) -> None:
     for i in range(state.reference.size):
-        known = i < derivatives.size and is_finite(derivatives[i])
+        known = i < derivatives.size and is_usable(derivatives[i])
         state.reference[i] = derivatives[i] if known else 0.0
 
 

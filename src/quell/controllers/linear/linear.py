@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.controllers.bad_samples import control_at_rest, hold_last_good
 from quell.controllers.base import control, reset_loop, set_applied_control, status_flags, write_row
-from quell.controllers.limits import Limits, apply_limits, checked_limits
+from quell.controllers.limits import Limits, apply_limits, checked_limits, largest_wish
 from quell.controllers.linear.law import LinearLaw, checked_law, rest_state
 from quell.controllers.linear.transfer import as_state_space, sampled_law
 from quell.controllers.stateful import StatefulController
@@ -58,6 +58,14 @@ def _set_rest(design: LinearDesign, state: LinearState, y: float) -> None:
         state.x[i] = design.start[i] * y
 
 
+@kernel
+def _unlimited_control(design: LinearDesign, state: LinearState) -> float:
+    unlimited = design.law.D_r * state.loop[0].r + design.law.D_y * state.loop[0].y
+    for i in range(state.x.size):
+        unlimited += design.law.C[i] * state.x[i]
+    return unlimited
+
+
 @control.register(LinearDesign)
 def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> float:
     law, x, loop = design.law, state.x, state.loop[0]
@@ -69,13 +77,15 @@ def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> fl
             return loop.u
         _set_rest(design, state, loop.y)
         loop.started = 1.0
-    unlimited = law.D_r * loop.r + law.D_y * loop.y
-    for i in range(x.size):
-        unlimited += law.C[i] * x[i]
+    unlimited = _unlimited_control(design, state)
     if not is_finite(unlimited):
         status |= _OVERFLOWED
         _set_rest(design, state, loop.y)
         unlimited = loop.u
+    elif abs(unlimited) > largest_wish(design.limits):
+        status |= _OVERFLOWED
+        _set_rest(design, state, loop.y)
+        unlimited = _unlimited_control(design, state)
     u, cut = apply_limits(design.limits, unlimited, loop.u)
     for i in range(x.size):
         total = law.B_r[i] * loop.r + law.B_y[i] * loop.y + law.B_u[i] * u

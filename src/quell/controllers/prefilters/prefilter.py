@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.handover import manual_operation
+from quell.controllers.bad_samples import is_usable
 from quell.controllers.base import (
     Controller,
     bumpless_transfer,
@@ -95,10 +96,10 @@ class PrefilteredState(NamedTuple):
 def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: float) -> float:
     loop = state.loop[0]
     loop.status = 0.0
-    if loop.started == 0.0 and is_finite(y):
+    if loop.started == 0.0 and is_usable(y):
         settle(design.prefilter, state.prefilter, y)
         loop.started = 1.0
-    if is_finite(r):
+    if is_usable(r):
         loop.r = r
         loop.has_reference = 1.0
     else:
@@ -219,7 +220,7 @@ class Prefiltered(StatefulController):
     def track(self, r: float, y: float, u: float) -> float:
         """Take one sample in manual operation, see ``ADRC.track``."""
         state = self._adrc._state
-        with manual_operation(state, checks.finite("u", u)):
+        with manual_operation(state, checks.signal("u", u)):
             self.step(r, y)
         return float(state.loop[0].u_limited)
 

@@ -53,6 +53,7 @@ class Instance:
         self.source, self.name, self.budget, self.report = source, name, budget, report
         self.model = copy.deepcopy(source)
         self.failures = 0
+        self.starts_again = False  # whether the next job begins with a new copy of ``source``
         self.warned = False
         self.worker = None if budget is None else Worker()
 
@@ -87,6 +88,7 @@ class Instance:
             self.worker.wait()
             self.worker.result(0.0)  # discard the result of the old model
         self.model, self.failures = copy.deepcopy(model), failures
+        self.starts_again = False
 
     @property
     def disabled(self) -> bool:
@@ -96,6 +98,9 @@ class Instance:
     def _call(self, features: Matrix, targets: Vector, now: Vector) -> tuple[float, str]:
         """Return the prediction and an empty text, or NaN and a description of the problem."""
         try:
+            if self.starts_again:
+                self.starts_again = False
+                self.model = copy.deepcopy(self.source)
             self.model.learn(features, targets)
             return finite_number(self.model.predict(now)), ""
         except KeyboardInterrupt:
@@ -183,11 +188,17 @@ def _array(address: int, *shape: int) -> Any:
 def _call_instance(
     holder: int, features: int, targets: int, count: int, width: int, now: int, answer: int
 ) -> None:
-    """Call the instance of a loop with copies of the arrays at these addresses."""
+    """Call the instance of a loop with copies of the arrays at these addresses.
+
+    Without pairs, ``count = 0``, it starts again at the next call.
+    """
     reply = None
     try:
         reply = _array(answer, 4)
         instance = INSTANCES[int(_array(holder, 1)[0])]
+        if count == 0:
+            instance.starts_again = True
+            return
         value, status = instance.update(
             _array(features, count, width).copy(),
             _array(targets, count).copy(),

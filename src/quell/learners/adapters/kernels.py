@@ -12,7 +12,7 @@ import numpy as np
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.function_pointers import call
 from quell.learners.adapters.instances import COUNTDOWN, DISABLED, PREDICTION, STATUS
-from quell.learners.base import adapt, coefficients, commit, predict, restart, trouble
+from quell.learners.base import adapt, coefficients, commit, forget, predict, restart, trouble
 from quell.learners.feature_learner import write_features
 from quell.learners.online.learner import OnlineDesign, OnlineMemory, has_pairs
 from quell.learners.online.model import infer, learn
@@ -142,6 +142,18 @@ def _restart(learner: PythonDesign, memory: PythonMemory) -> None:
     restart(learner.online, memory.online)
     memory.online.model.filled[0] = 0.0
     memory.answer[PREDICTION] = memory.answer[COUNTDOWN] = 0.0
+
+
+@forget.register(PythonDesign)
+def _forget(learner: PythonDesign, memory: PythonMemory) -> None:
+    forget(learner.online, memory.online)
+    restart(learner, memory)
+    now, batch = memory.online.features, memory.online.model
+    # Without pairs the call means that the model is to start again.
+    call(
+        *(learner.address, memory.model, batch.features, batch.targets, 0),
+        *(now.size, now, memory.answer),
+    )
 
 
 @trouble.register(PythonDesign)

@@ -14,8 +14,14 @@ from quell import checks
 from quell.features import Features
 from quell.features.base import checked_design
 from quell.features.scaling import initial_scale, scaling
-from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.gradient.buffers import Buffers, empty_buffers, restart_buffers, take_step
+from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
+from quell.learners.gradient.buffers import (
+    Buffers,
+    empty_buffers,
+    forget_buffers,
+    restart_buffers,
+    take_step,
+)
 from quell.learners.gradient.scaled_features import ScaledDesign, ScaledLoop, ScaledMemory
 from quell.learners.lag import startup_samples
 from quell.observers.eso import ESO
@@ -61,6 +67,11 @@ def _commit(
 @restart.register(BatchDesign)
 def _restart(learner: BatchDesign, memory: Buffers) -> None:
     restart_buffers(memory)
+
+
+@forget.register(BatchDesign)
+def _forget(learner: BatchDesign, memory: Buffers) -> None:
+    forget_buffers(memory)
 
 
 @coefficients.register(BatchDesign)

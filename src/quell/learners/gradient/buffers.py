@@ -93,6 +93,12 @@ def restart_buffers(memory: Buffers) -> None:
     for i in range(memory.theta.size):
         finite = finite and is_finite(memory.theta[i]) and is_finite(memory.total[i])
     if not finite:
-        for i in range(memory.theta.size):
-            memory.theta[i] = 0.0
-        clear_buffers(memory)
+        forget_buffers(memory)
+
+
+@kernel
+def forget_buffers(memory: Buffers) -> None:
+    """Start from zero."""
+    for i in range(memory.theta.size):
+        memory.theta[i] = 0.0
+    clear_buffers(memory)

@@ -13,11 +13,17 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from quell.features.base import unit, write
-from quell.features.scaling import Scaling, update_scale
+from quell.features.scaling import Scaling, reset_scale, update_scale
 from quell.kernels.dispatch import kernel
-from quell.kernels.scalars import Scalars
-from quell.learners.base import adapt, coefficients, commit, predict, restart
-from quell.learners.gradient.buffers import Buffers, clear_buffers, restart_buffers, take_step
+from quell.kernels.scalars import Scalars, clear
+from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
+from quell.learners.gradient.buffers import (
+    Buffers,
+    clear_buffers,
+    forget_buffers,
+    restart_buffers,
+    take_step,
+)
 from quell.types import Vector
 
 
@@ -121,6 +127,15 @@ def _commit(
 def _restart(learner: ScaledDesign, memory: ScaledMemory) -> None:
     memory.loop[0].samples = 0.0
     restart_buffers(memory.buffers)
+
+
+@forget.register(ScaledDesign)
+def _forget(learner: ScaledDesign, memory: ScaledMemory) -> None:
+    forget_buffers(memory.buffers)
+    clear(memory.loop)
+    reset_scale(learner.scaling, memory.scale)
+    for i in range(memory.units.size):
+        memory.units[i] = 1.0
 
 
 @coefficients.register(ScaledDesign)

@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
-from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
 from quell.learners.lag import STARTUP_LAGS, lag_push
 from quell.learners.noise_gate import RESOLUTION
@@ -244,13 +244,18 @@ def _commit(
 
 @restart.register(KalmanDesign)
 def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
+    _reset_filters(memory)
+    memory.averages[0].time = 0.0
+    if not _all_finite(memory):
+        forget(learner, memory)
+
+
+@kernel
+def _reset_filters(memory: KalmanMemory) -> None:
     for i in range(memory.filtered.size):
         memory.filtered[i] = 0.0
         for j in range(memory.chain.shape[1]):
             memory.chain[i, j] = 0.0
-    memory.averages[0].time = 0.0
-    if not _all_finite(memory):
-        _forget(learner, memory)
 
 
 @kernel
@@ -268,9 +273,9 @@ def _all_finite(memory: KalmanMemory) -> bool:
     return finite
 
 
-@kernel
+@forget.register(KalmanDesign)
 def _forget(learner: KalmanDesign, memory: KalmanMemory) -> None:
-    """Return to a state with nothing learned."""
+    _reset_filters(memory)
     clear(memory.averages)
     for j in range(memory.omega.size):
         memory.phase[j] = 0.0

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.features import Features
-from quell.features.scaling import update_scale
+from quell.features.scaling import reset_scale, update_scale
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
-from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.feature_learner import FeatureLearner, Inputs, write_features
 from quell.learners.lag import group_delay
 from quell.learners.noise_gate import (
@@ -142,8 +142,20 @@ def _restart(learner: OnlineDesign, memory: OnlineMemory) -> None:
     for i in range(memory.flat.size):
         finite = finite and abs(memory.flat[i]) <= _LARGEST
     if not finite:
-        for i in range(memory.flat.size):
-            memory.flat[i] = memory.initial[i]
+        _forget_model(memory)
+
+
+@kernel
+def _forget_model(memory: OnlineMemory) -> None:
+    for i in range(memory.flat.size):
+        memory.flat[i] = memory.initial[i]
+
+
+@forget.register(OnlineDesign)
+def _forget(learner: OnlineDesign, memory: OnlineMemory) -> None:
+    restart(learner, memory)
+    _forget_model(memory)
+    reset_scale(learner.inputs.scaling, memory.scale)
 
 
 @coefficients.register(OnlineDesign)

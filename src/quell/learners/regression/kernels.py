@@ -31,10 +31,10 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from quell.features.base import unit
-from quell.features.scaling import update_scale
+from quell.features.scaling import reset_scale, update_scale
 from quell.kernels.dispatch import generic, is_finite, kernel
-from quell.kernels.scalars import Scalars
-from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.kernels.scalars import Scalars, clear
+from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.feature_learner import Inputs, write_features
 from quell.learners.lag import lag_push
 from quell.learners.noise_gate import NoiseGateMemory, confidence, reset_gate, update_gate
@@ -223,9 +223,24 @@ def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
     for i in range(memory.theta.size):
         finite = finite and is_finite(memory.theta[i])
     if not finite:
-        for i in range(memory.theta.size):
-            memory.theta[i] = 0.0
-        reset_uncertainty(learner.rule, memory.rule)
+        _forget_theta(learner, memory)
+
+
+@kernel
+def _forget_theta(learner: LinearDesign, memory: LinearMemory) -> None:
+    for i in range(memory.theta.size):
+        memory.theta[i] = 0.0
+    reset_uncertainty(learner.rule, memory.rule)
+
+
+@forget.register(LinearDesign)
+def _forget(learner: LinearDesign, memory: LinearMemory) -> None:
+    restart(learner, memory)
+    clear(memory.loop)
+    _forget_theta(learner, memory)
+    reset_scale(learner.inputs.scaling, memory.scale)
+    for i in range(memory.units.size):
+        memory.units[i] = 1.0
 
 
 @coefficients.register(LinearDesign)

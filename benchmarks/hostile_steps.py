@@ -1,0 +1,359 @@
+"""Test of controllers with hostile samples: limits hold, and the loop recovers afterwards.
+
+    python benchmarks/hostile_steps.py                    # 30 configurations, 10⁶ samples each
+    python benchmarks/hostile_steps.py --steps 50000 --only MLP --json hostile.json
+    python benchmarks/hostile_steps.py --minutes 10       # at most so long; the rest is left out
+
+Each configuration runs rounds of hostile samples: references, measurements and derivatives that are
+not finite, of any size from denormal to 1e300, of alternating sign, held, exploding, or good ones
+with single outliers; between them calls of ``applied``, ``retune``, ``start``, ``track`` and
+``hand_over`` with such values. Learners run with and without a guard. It checks:
+
+* u is finite and within its limits in every sample;
+* *recovery*: after each round the plant starts from rest and is measured well. From 8000 to 10 000
+  samples later, the RMS error is at most 1.5 times that of a new controller plus 0.1 % of the
+  reference's amplitude.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import quell as ql
+from quell import baselines, features, learners
+from quell.controllers import Prefiltered, ReferenceModel, TrackingDifferentiator
+from quell.controllers.base import control, set_reference_derivatives
+from quell.kernels.dispatch import compiled, dispatcher_for, interpreted
+from quell.plants import registry
+from quell.plants.base import advance, measure
+from quell.types import Matrix, Vector
+
+DT, LOW, HIGH = 0.01, -12.0, 15.0
+ROUND = 50_000  # hostile samples before each recovery
+BLOCK = 1000  # samples between calls other than ``step``
+GOOD, JUDGED = 10_000, 8000  # samples of a recovery, and the first that counts
+WORSE, TOLERANCE = 1.5, 1e-3
+LIMITS = {"u_min": LOW, "u_max": HIGH}
+DERIVATIVES = 3  # offered in each sample; a controller takes those that it uses
+
+PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.6]], [0.0, 1.5], [1.0, 0.0])
+
+
+@compiled
+def lie(
+    design: Any, state: Any, r: Vector, y: Vector, derivatives: Matrix, low: float, high: float
+) -> int:
+    """Take ``r.size`` samples; return the number of bad values of u."""
+    bad = 0
+    for k in range(r.size):
+        set_reference_derivatives(design, state, derivatives[k])
+        if not low <= control(design, state, r[k], y[k]) <= high:
+            bad += 1
+    return bad
+
+
+@compiled
+def tell_the_truth(
+    plant: Any,
+    x: Vector,
+    scratch: Vector,
+    design: Any,
+    state: Any,
+    r: Vector,
+    derivatives: Matrix,
+    w: Matrix,
+    noise: Vector,
+    error: Vector,
+    low: float,
+    high: float,
+) -> int:
+    """Close the loop around the plant; write ``y − r``; return the number of bad values of u."""
+    bad = 0
+    for k in range(r.size):
+        y = measure(plant, x)
+        error[k] = y - r[k]
+        set_reference_derivatives(design, state, derivatives[k])
+        u = control(design, state, r[k], y + noise[k])
+        if not low <= u <= high:
+            bad += 1
+            u = 0.0
+        advance(plant, x, scratch, 0.0, u, w[k])
+    return bad
+
+
+def observer(order: int = 2, omega_o: float = 20.0, **options: Any) -> ql.ESO:
+    """Return a model-free observer."""
+    return ql.ESO.model_free(order, 1.5, omega_o, DT, **options)
+
+
+def adrc(eso: ql.ESO | None = None, omega_c: float = 3.0, **options: Any) -> ql.ADRC:
+    """Return an ADRC with limits."""
+    return ql.ADRC(observer() if eso is None else eso, omega_c, **(LIMITS | options))
+
+
+def chain(order: int) -> Any:
+    """Return a stable plant of the order, with the gain 1.5."""
+    A = np.diag(np.ones(order - 1), 1)
+    A[-1] = -np.poly([-1.0] * order)[:0:-1]
+    return ql.plants.LinearPlant(A, 1.5 * np.eye(order)[-1], np.eye(order)[0])
+
+
+def own_channel() -> ql.ESO:
+    """Return an observer of a plant where f enters through a channel of its own."""
+    A, B, C = [[0.0, 1.0], [-2.0, -0.6]], [0.0, 1.5], [1.0, 0.0]
+    return ql.ESO.model_based((A, B, [0.0, 1.0], C), 20.0, DT)
+
+
+ZERO = ([1.5, 4.5], [1.0, 1.6, 2.6, 2.0])  # a zero at −3 rad/s
+WITH_ZERO = registry.PLANTS["linear"](num=ZERO[0], den=ZERO[1])
+
+LEARNERS: dict[str, Callable[[], Any]] = {
+    "Kalman": learners.Kalman,
+    "Kalman with u": lambda: learners.Kalman(u=True),
+    "Harmonic": lambda: learners.Harmonic(count=2),
+    "NLMS": learners.NLMS,
+    "RLS": learners.RLS,
+    "RLS with u": lambda: learners.RLS(
+        features.State() + features.Polynomial(3) + features.Bias() + features.Input()
+    ),
+    "MLP": lambda: learners.MLP(5),
+    "GaussianProcess": lambda: learners.GaussianProcess(15),
+    "BatchGradient": learners.BatchGradient,
+    "BatchGradient, scaled": lambda: learners.BatchGradient(
+        1e-3, features=features.State() + features.Bias()
+    ),
+}
+CONTROLLERS: dict[str, tuple[Callable[[], Any], Any]] = {
+    "order 1": (lambda: adrc(observer(1)), chain(1)),
+    "order 2, no limits": (lambda: ql.ADRC(observer(), 3.0), PLANT),
+    "order 2, rate limit": (lambda: adrc(rate_limit=200.0), PLANT),
+    "order 3, predictor": (lambda: adrc(observer(3, form="predictor")), chain(3)),
+    "order 4, Kalman": (lambda: adrc(observer(4), 2.0, learner=learners.Kalman()), chain(4)),
+    "order 8": (lambda: adrc(observer(8, 25.0), 2.0, u_min=-500.0, u_max=500.0), chain(8)),
+    "reduced": (lambda: adrc(observer(form="reduced")), PLANT),
+    "half gain": (lambda: adrc(observer(half_gain=True), half_gain=True), PLANT),
+    "delay, Kalman": (
+        lambda: adrc(observer(delay=0.03), learner=learners.Kalman()),
+        ql.plants.delayed(PLANT, 0.03, DT),
+    ),
+    "cascade": (lambda: adrc(ql.ESO.cascade(2, 1.5, 20.0, DT)), PLANT),
+    "nonlinear": (lambda: adrc(ql.ESO.nonlinear(2, 1.5, 20.0, DT, delta=0.05)), PLANT),
+    "Kalman gains": (
+        lambda: adrc(ql.ESO.kalman(2, 1.5, DT, noise_variance=1e-6, drift=1.0)),
+        PLANT,
+    ),
+    "model-based, zero": (lambda: adrc(ql.ESO.model_based(ZERO, 20.0, DT)), WITH_ZERO),
+    "own channel for f": (lambda: adrc(own_channel()), PLANT),
+    "feedforward": (lambda: adrc(feedforward=True), PLANT),
+    "prefiltered": (
+        lambda: Prefiltered(adrc(feedforward=True), ReferenceModel(4.0)),
+        PLANT,
+    ),
+    "Han's differentiator": (
+        lambda: Prefiltered(adrc(feedforward=True), TrackingDifferentiator(20.0)),
+        PLANT,
+    ),
+    "input shaper": (lambda: Prefiltered(adrc(), baselines.ZVD(3.0, 0.1)), PLANT),
+    "PID": (lambda: baselines.PID(8.0, 6.0, 3.0, tf=0.05, dt=DT, **LIMITS), PLANT),
+    "LQG": (lambda: baselines.LQG(PLANT, 3.0, 12.0, DT, **LIMITS), PLANT),
+} | {
+    name: (lambda make=make: adrc(learner=make()), PLANT)  # type: ignore[misc]
+    for name, make in LEARNERS.items()
+}
+
+
+def sizes(rng: np.random.Generator, count: int, most: float) -> Vector:
+    """Return numbers of either sign, of all sizes up to ``10^most``."""
+    numbers: Vector = rng.choice([-1.0, 1.0], count) * 10.0 ** rng.uniform(-most, most, count)
+    return numbers
+
+
+def hostile(rng: np.random.Generator, count: int) -> Vector:
+    """Return a hostile signal, in pieces of one kind each."""
+    pieces: list[Vector] = []
+    while sum(piece.size for piece in pieces) < count:
+        n = int(10.0 ** rng.uniform(0.0, 3.3))
+        most = float(rng.choice([1.0, 3.0, 6.0, 12.0, 20.0, 60.0, 300.0]))
+        calm = np.sin(0.01 * rng.uniform(0.0, 30.0) * np.arange(n))
+        kind = rng.integers(9)
+        if kind == 0:
+            piece = sizes(rng, n, most)
+        elif kind == 1:
+            piece = np.full(n, sizes(rng, 1, most)[0])
+        elif kind == 2:
+            piece = sizes(rng, 1, most)[0] * (-1.0) ** np.arange(n)
+        elif kind == 3:
+            piece = rng.choice([math.nan, math.inf, -math.inf], n)
+        elif kind == 4:
+            piece = 5e-324 * rng.integers(-(10**9), 10**9, n).astype(float)
+        elif kind == 5:
+            piece = 10.0 ** rng.uniform(-3.0, 3.0) * np.cumsum(rng.normal(size=n))
+        elif kind == 6:
+            piece = np.exp(np.minimum(rng.uniform(0.0, 0.2) * np.arange(n), 690.0))
+        elif kind == 7:
+            piece = np.where(rng.random(n) < 0.3, math.nan, calm)
+        else:
+            piece = np.where(rng.random(n) < 1e-2, sizes(rng, n, most), calm)
+        pieces.append(piece)
+    return np.concatenate(pieces)[:count]
+
+
+def one_size(rng: np.random.Generator, count: int, size: float) -> Vector:
+    """Return noise of one size, with good samples first."""
+    return np.where(np.arange(count) < count // 2, 1.0, size) * rng.normal(size=count)
+
+
+def call_something(rng: np.random.Generator, controller: Any) -> None:
+    """Call one of the methods that a running controller has, with hostile numbers."""
+    value = float(sizes(rng, 1, float(rng.choice([1.0, 6.0, 20.0, 60.0])))[0])
+    kind = rng.integers(5)
+    if kind == 0:
+        controller.applied(value)
+    if not isinstance(controller, ql.ADRC):
+        return
+    if kind == 1:
+        controller.retune(omega_c=float(rng.uniform(1.0, 5.0)))
+    elif kind == 2:
+        controller.start(value, float(rng.uniform(LOW, HIGH)), float(sizes(rng, 1, 6.0)[0]))
+    elif kind == 3:
+        y, u = float(sizes(rng, 1, 20.0)[0]), float(sizes(rng, 1, 20.0)[0])
+        for _ in range(5):
+            controller.track(value, y, u)
+        controller.hand_over()
+    elif kind == 4 and isinstance(controller.learner, learners.base.NoLearner):
+        # The same observer again: gains are designed anew, the state is converted.
+        controller.retune(observer=controller.observer)
+
+
+class Trial:
+    """A controller with its plant, and a new controller's error for comparison."""
+
+    def __init__(self, make: Callable[[], Any], plant: Any, interpret: bool = False) -> None:
+        self.make, self.plant = make, plant
+        self.controller = make()
+        self.model = plant.sampled(DT)
+        limits = self.controller.limits
+        finite = np.finfo(float).max
+        self.limits = max(limits.low, -finite), min(limits.high, finite)
+        design = self.controller.parameters
+        self.lie, self.tell_the_truth = (
+            interpreted(entry) if interpret else dispatcher_for(entry, design)
+            for entry in (lie, tell_the_truth)
+        )
+        self.fresh = self.good_samples(make(), np.random.default_rng(1))[0]
+
+    def hostile_samples(self, rng: np.random.Generator, count: int, level: float | None) -> int:
+        """Take hostile samples; return the number of bad values of u."""
+        bad = 0
+        for first in range(0, count, BLOCK):
+            n = min(BLOCK, count - first)
+            if level is None:
+                r, y = hostile(rng, n), hostile(rng, n)
+                call_something(rng, self.controller)
+            else:
+                r, y = np.zeros(n), one_size(rng, n, level)
+            derivatives = np.column_stack([hostile(rng, n) for _ in range(DERIVATIVES)])
+            design, state = self.controller.parameters, self.controller._state
+            bad += self.lie(design, state, r, y, np.ascontiguousarray(derivatives), *self.limits)
+        return bad
+
+    def good_samples(self, controller: Any, rng: np.random.Generator) -> tuple[float, int]:
+        """Return the RMS error of the loop at the end, and the number of bad values of u."""
+        t = DT * np.arange(GOOD)
+        omega = 0.5
+        r = np.sin(omega * t)
+        derivatives = np.column_stack([omega * np.cos(omega * t), -(omega**2) * r, -(omega**3) * r])
+        w = np.zeros((GOOD, self.plant.disturbances))
+        if w.shape[1]:
+            w[:, 0] = 1.0 + np.sin(1.3 * t)
+        x, error = np.zeros(self.plant.order), np.zeros(GOOD)
+        bad = self.tell_the_truth(
+            *(self.model, x, np.zeros(6 * x.size), controller.parameters, controller._state),
+            *(r, derivatives, w, 1e-5 * rng.normal(size=GOOD), error, *self.limits),
+        )
+        return float(np.sqrt(np.mean(error[JUDGED:] ** 2))), bad
+
+    def rounds(self, seed: int) -> Iterator[tuple[int, float]]:
+        """Yield the bad values of u of each round, and the error over a new controller's."""
+        rng = np.random.default_rng(seed)
+        for number in itertools.count():
+            level = None if number % 2 == 0 else 10.0 ** rng.uniform(0.0, 60.0)
+            bad = self.hostile_samples(rng, ROUND, level)
+            error, more = self.good_samples(self.controller, rng)
+            allowed = WORSE * self.fresh + TOLERANCE
+            yield bad + more, error / allowed if math.isfinite(error) else math.inf
+
+
+def configurations() -> dict[str, tuple[Callable[[], Any], Any]]:
+    """Return all configurations, those with a learner also with a guard."""
+    found = dict(CONTROLLERS)
+    for name, (make, plant) in CONTROLLERS.items():
+        if not isinstance(getattr(make(), "learner", None), learners.base.NoLearner | None):
+            found[f"{name}, guarded"] = (lambda make=make: guarded(make()), plant)
+    return found
+
+
+def guarded(controller: ql.ADRC) -> ql.ADRC:
+    """Return the same controller with a guard."""
+    limits = controller.limits
+    return ql.ADRC(
+        controller.observer,
+        controller.omega_c,
+        learner=controller.learner,
+        guard=ql.Guard(),
+        u_min=limits.low,
+        u_max=limits.high,
+    )
+
+
+def main() -> None:
+    """Run the configurations and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--steps", type=int, default=1_000_000, help="hostile samples for each")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="longest run time")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="part of a configuration's name")
+    parser.add_argument("--json", type=Path, help="file for the results")
+    arguments = parser.parse_args()
+    end = time.monotonic() + 60.0 * arguments.minutes
+    table = Table("configuration", "samples", "u bad", "recovered", "worst error / allowed")
+    results = []
+    np.seterr(all="ignore")
+    for name, (make, plant) in configurations().items():
+        if arguments.only not in name or time.monotonic() > end:
+            continue
+        count = max(arguments.steps // ROUND, 1)
+        found = list(itertools.islice(Trial(make, plant).rounds(arguments.seed), count))
+        bad, worst = sum(bad for bad, _ in found), max(error for _, error in found)
+        recovered = sum(error <= 1.0 for _, error in found)
+        results.append(
+            {
+                "configuration": name,
+                "samples": count * ROUND,
+                "bad": bad,
+                "rounds": count,
+                "recovered": recovered,
+                "worst": worst,
+            }
+        )
+        cells = f"{count * ROUND:g}", f"{bad}", f"{recovered} of {count}", f"{worst:.3g}"
+        table.add_row(name, *cells)
+        print(name, *cells, flush=True)
+    Console().print(table)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(results, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""Detection of a learner that has lost its numbers, for all learners alike.
+
+Samples that are absurd, but finite, can take a learner to where it does not return from: scales and
+mean squares are then so large that it no longer sees what comes, or its output is so large that
+u stays at its limits. Two comparisons over windows of ``WINDOW_LAGS`` lags of the observer find
+this, in any unit:
+
+* *range*: while y moves, the largest ``|f_plain|`` of a window is below 2⁻⁴⁰ of the largest ever.
+  No real loop works over such a range: sensors resolve ``RESOLUTION`` of theirs. Where y moves by
+  less than that, and where ``|f_plain|`` still decays, nothing is concluded, so a loop that comes
+  to rest, also without any noise, forgets nothing;
+* *output*: in most samples of a window the law asks for more than 2¹⁰ times the u that is applied,
+  and the learner's output is more than 2¹⁰ times the largest ``|f_plain|``. Without limits this can
+  not happen.
+
+The controller then calls ``forget`` (``learners/base.py``).
+"""
+
+from __future__ import annotations
+
+from quell.kernels.dispatch import kernel
+from quell.kernels.scalars import Scalars
+from quell.learners.noise_gate import AVERAGING_LAGS, RESOLUTION
+from quell.observers.eso import ESO
+
+# The time over which learners average: what has decayed in it is gone from them as well.
+WINDOW_LAGS = AVERAGING_LAGS
+# 2⁻⁴⁰ = 9e-13: three decades below what noise of RESOLUTION leaves of f at omega_o dt = 0.01,
+# and with 12 of the 52 bits left to a learner whose scale is so much too large.
+_LEAST_SHARE = 2.0**-40
+# An output so many times larger than f is no prediction; ten times what a guard cuts off.
+_TOO_LARGE = 2.0**10
+# A window counts only if |f_plain| has not decayed to less than this share of the last one. At
+# rest without noise a loop with omega_c = omega_o/10 decays faster.
+_STEADY = 0.5
+
+
+class LearnerWatch(Scalars):
+    """What the comparison has seen."""
+
+    peak: float  # largest |f_plain| since the learner began
+    most: float  # largest |f_plain| in this window
+    most_before: float  # largest |f_plain| in the last window
+    y_low: float  # least y in this window
+    y_high: float  # largest y in this window
+    excessive: float  # samples in this window with an output that is too large
+    samples: float  # samples in this window
+
+
+def window_samples(observer: ESO) -> int:
+    """Return the length of a window in samples."""
+    return max(round(WINDOW_LAGS * observer.lag_time / observer.dt), 1)
+
+
+@kernel
+def is_in_proportion(watch: LearnerWatch, output: float) -> bool:
+    """Return whether ``output`` could be a prediction of the f of the last window."""
+    return abs(output) <= _TOO_LARGE * watch.most_before
+
+
+@kernel
+def has_lost_range(
+    watch: LearnerWatch, window: int, y: float, f_plain: float, output: float, excess: float
+) -> bool:
+    """Return whether the learner has to start again; call it once for each good sample.
+
+    ``output`` is the learner's own, before a guard; ``excess`` is the ratio of the u that the law
+    asks for to the u that is applied.
+    """
+    size = abs(f_plain)
+    if watch.samples == 0.0:
+        watch.y_low = watch.y_high = y
+    watch.samples += 1.0
+    if size > watch.most:  # false for a NaN
+        watch.most = size
+    watch.y_low, watch.y_high = min(watch.y_low, y), max(watch.y_high, y)
+    if excess > _TOO_LARGE and abs(output) > _TOO_LARGE * max(watch.most, watch.most_before):
+        watch.excessive += 1.0
+    if watch.samples < window:
+        return False
+    watch.peak = max(watch.peak, watch.most)
+    moves = watch.y_high - watch.y_low > RESOLUTION * max(abs(watch.y_low), abs(watch.y_high))
+    steady = watch.most >= _STEADY * watch.most_before
+    out_of_range = moves and steady and watch.most < _LEAST_SHARE * watch.peak
+    lost = out_of_range or 2.0 * watch.excessive > watch.samples
+    if lost:
+        watch.peak = watch.most
+    watch.most_before = watch.most
+    watch.most = watch.excessive = watch.samples = 0.0
+    return bool(lost)
