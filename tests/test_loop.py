@@ -11,7 +11,13 @@ import pytest
 import quell as ql
 from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compilations
-from quell.realtime.devices.base import PythonHandle, read_measurement, write_command
+from quell.realtime.devices.base import (
+    PythonHandle,
+    Tick,
+    read_measurement,
+    read_tick,
+    write_command,
+)
 from quell.realtime.loop.control_loop import ControlLoop
 from quell.realtime.loop.cycle import run_cycles
 from quell.realtime.loop.modes import Cause
@@ -38,33 +44,27 @@ class Ticking(NamedTuple):
     """Last tick that was read, and greatest age of one after the first thousand [ns] (2,)."""
 
 
-@read_measurement.register(Ticking)
-def _read_measurement(handle: Ticking, clock: Any, until: int) -> tuple[float, int]:
+@read_tick.register(Ticking)
+def _read_tick(handle: Ticking, clock: Any, until: int) -> Tick:
     begin = now(clock)
-    newest = _newest(handle, begin)
-    if newest > handle.seen[0]:
-        handle.seen[0] = newest
-        if newest > 1000:
-            handle.seen[1] = max(handle.seen[1], begin - int(newest * handle.period))
-        return float(newest), 0
-    for k in range(int(handle.seen[0]) + 1, int(until / handle.period) + 1):
-        comes = int(k * handle.period) + int(handle.late[min(k, handle.late.size - 1)])
-        if comes <= until:
-            pass_time(clock, max(comes - begin, 1))
-            handle.seen[0] = k
-            return float(k), now(clock) - begin
-    pass_time(clock, max(until - begin, 0))
-    return math.nan, now(clock) - begin
+    k = int(handle.seen[0]) + 1
+    comes = _comes(handle, k)
+    if comes > until:
+        pass_time(clock, max(until - begin, 0))
+        return Tick(math.nan, 0, math.nan, 0, now(clock) - begin)
+    pass_time(clock, max(comes - begin, 0))
+    handle.seen[0] = k
+    handle.seen[1] = max(handle.seen[1], now(clock) - comes) if k > 1000 else 0
+    left = 0
+    while _comes(handle, k + 1 + left) <= now(clock):
+        left += 1
+    return Tick(float(k), 1, math.nan, left, now(clock) - begin)
 
 
-def _newest(handle: Ticking, time: int) -> int:
-    last = int(time / handle.period)
-    came = [
-        k
-        for k in range(max(last - 50, 0), last + 1)
-        if int(k * handle.period) + handle.late[min(k, handle.late.size - 1)] <= time
-    ]
-    return came[-1] if came else -1
+def _comes(handle: Ticking, k: int) -> int:
+    """Return the time of tick k, which never comes before the one before it."""
+    late = [handle.late[min(i, handle.late.size - 1)] for i in range(max(k - 9, 0), k + 1)]
+    return max(int(i * handle.period) + int(late[i - k - 1]) for i in range(max(k - 9, 0), k + 1))
 
 
 @write_command.register(Ticking)
@@ -139,25 +139,53 @@ def test_the_grid_follows_a_devices_clock(drift: float) -> None:
 # Of two cycles one wakes just before the tick, the next one just after.
 @pytest.mark.parametrize("k", [300, 301])
 @pytest.mark.parametrize("hiccup", [SAMPLE // 2 + 1000, SAMPLE, 5 * SAMPLE // 2])
-def test_after_a_delay_of_the_device_no_measurement_is_old(hiccup: int, k: int) -> None:
-    """Shortly after the last late tick all measurements are fresh again."""
+def test_a_delay_of_the_device_costs_no_measurement(hiccup: int, k: int) -> None:
+    """Its late ticks come at once; the loop takes a step for each, with its own measurement."""
     late = {k + i: max(hiccup - i * SAMPLE, 0) for i in range(4)}
-    found, _ = ticks(TickingDevice(SAMPLE, late), 10.0)
+    found, loop = ticks(TickingDevice(SAMPLE, late), 10.0)
     ahead = found[:, LOOP_WIDTH - 2] - found[:, 0]
-    assert np.any(np.isnan(ahead))
-    np.testing.assert_array_equal(np.delete(ahead, slice(k - 5, k + 5)), ahead[0])
+    np.testing.assert_array_equal(np.diff(found[:, 0]), 1.0)
+    np.testing.assert_array_equal(ahead, ahead[0])
+    counters = loop.controller.supervisor.counters[0]
+    assert (counters.missed, counters.overruns) == (0, 0)
+    assert counters.skipped == hiccup // SAMPLE
 
 
 @pytest.mark.parametrize("k", [300, 301])
 @pytest.mark.parametrize("hiccup", [SAMPLE // 2, 3 * SAMPLE - 1000, 3 * SAMPLE + 1000])
-def test_after_a_delay_of_the_loop_no_measurement_is_old(hiccup: int, k: int) -> None:
-    """The loop wakes late: it takes the newest tick, and the grid stays."""
+def test_a_delay_of_the_loop_costs_no_measurement(hiccup: int, k: int) -> None:
+    """The loop wakes late: it makes up for the ticks meanwhile, and sends u for the newest."""
     late = np.zeros(20_000, dtype=np.int64)
     late[k] = hiccup
-    found, _ = ticks(TickingDevice(SAMPLE), 10.0, late)
+    found, loop = ticks(TickingDevice(SAMPLE), 10.0, late)
     ahead = found[:, LOOP_WIDTH - 2] - found[:, 0]
-    assert np.max(np.diff(found[:, 0])) == 1.0 + hiccup // SAMPLE
+    np.testing.assert_array_equal(np.diff(found[:, 0]), 1.0)
     np.testing.assert_array_equal(ahead, ahead[0])
+    counters = loop.controller.supervisor.counters[0]
+    assert counters.missed == 0
+    assert abs(counters.skipped - hiccup // SAMPLE) <= 1
+    assert counters.overruns == (hiccup >= SAMPLE)
+
+
+def test_a_loop_that_stood_still_for_too_long_is_stopped() -> None:
+    """Though all measurements are there: u was held for more than ``hold`` samples."""
+    late = np.zeros(20_000, dtype=np.int64)
+    late[300] = 7 * SAMPLE
+    _, loop = ticks(TickingDevice(SAMPLE), 10.0, late, hold=5)
+    causes = [change.cause for change in mode_changes(loop.controller.supervisor, DT)]
+    assert causes == [Cause.SETTLED, Cause.STALLED, Cause.RAMPED]
+
+
+def test_a_device_that_falls_silent_is_lost_after_the_time_for_which_u_is_held() -> None:
+    """The loop goes on by its own clock: the ramp, then the end."""
+    found, loop = ticks(TickingDevice(SAMPLE, {301: 10**15}), 10.0, hold=5)
+    (settled, held, lost, _) = mode_changes(loop.controller.supervisor, DT)
+    assert (settled.cause, held.cause, lost.cause) == (Cause.SETTLED, Cause.MISSED, Cause.LOST)
+    assert round((lost.t - held.t) / DT) == 5
+    np.testing.assert_array_equal(np.diff(found[:, 0]), 1.0)
+    gone = np.isnan(found[:, LOOP_WIDTH - 2])
+    assert np.flatnonzero(gone)[0] == held.t / DT
+    assert np.all(gone[round(held.t / DT) :])
 
 
 def test_a_device_that_sends_nothing_is_not_started() -> None:

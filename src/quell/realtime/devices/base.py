@@ -4,8 +4,8 @@ A device is an object with ``read() -> y``, ``write(u)`` and ``close()``. A devi
 from compiled code also has a ``handle``: a NamedTuple for whose type ``read_measurement`` and
 ``write_command`` are registered. Any other device gets a ``PythonHandle``; its loop runs as Python.
 
-A device with its own clock sends a measurement at each of its ticks; its attribute ``paced`` is
-True, and ``read_measurement`` waits for the next tick. Other devices answer at any time.
+A device with its own clock sends a numbered measurement at each of its ticks; its attribute
+``paced`` is True, and ``read_tick`` waits for the next one. Other devices answer at any time.
 """
 
 from __future__ import annotations
@@ -52,6 +52,25 @@ def read_measurement(handle: Any, clock: Any, until: int) -> tuple[float, int]:
 
     Each measurement is returned once. If there is no new one, the handle of a paced device waits
     until the time ``until`` [ns] of ``clock``. NaN if none has come, or if the device has sent NaN.
+    """
+    raise TypeError
+
+
+class Tick(NamedTuple):
+    """A tick of a device with its own clock."""
+
+    y: float  #: measurement [y-unit]; NaN if none came, or if the device has sent NaN
+    steps: int  #: ticks since the last one that was returned; 0 if none came in time
+    u: float  #: control signal from this tick on [u-unit]; NaN if it is not known
+    left: int  #: number of newer ticks that have come already
+    waited: int  #: time spent waiting [ns]
+
+
+@generic
+def read_tick(handle: Any, clock: Any, until: int) -> Tick:
+    """Return the next tick of a paced device in order, however late it comes.
+
+    If there is none, wait for it until the time ``until`` [ns] of ``clock``.
     """
     raise TypeError
 

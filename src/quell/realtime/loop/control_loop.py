@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,16 +15,15 @@ from quell.realtime.devices.base import Device, PythonHandle, handle_of
 from quell.realtime.loop.compiled_controller import compiled_controller
 from quell.realtime.loop.cycle import (
     CycleLog,
-    CycleTimes,
     SupervisedController,
     control_step,
-    cycle_times,
     run_cycles,
 )
 from quell.realtime.loop.modes import Mode
 from quell.realtime.loop.reference import ReferenceSamples
 from quell.realtime.loop.state import Rules, initial_state
 from quell.realtime.loop.supervisor import FLUSH
+from quell.realtime.loop.ticks import follow_ticks
 from quell.realtime.system.histogram import Histogram, Timing, empty_counts
 from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.ring import Ring
@@ -41,8 +40,9 @@ class ControlLoop:
 
     handle: Any
     clock: Any
-    times: CycleTimes
+    period: float  # sample time [ns]
     controller: SupervisedController
+    paced: bool  # whether the device's ticks pace the loop, and not the loop's own deadlines
     interpret: bool = False
 
     @classmethod
@@ -73,8 +73,9 @@ class ControlLoop:
             reference=reference,
             log=CycleLog(ring, row, f_learned, f_residual, empty_counts(), empty_counts()),
         )
-        times = cycle_times(controller.dt, getattr(device, "paced", False))
-        loop = cls(handle_of(device), clock, times, supervised, interpret)
+        handle = handle_of(device)
+        paced = getattr(device, "paced", False) and not isinstance(handle, PythonHandle)
+        loop = cls(handle, clock, controller.dt * 1e9, supervised, paced, interpret)
         loop._compile()
         return loop
 
@@ -92,13 +93,14 @@ class ControlLoop:
     def run(self) -> None:
         """Run all cycles."""
         controller: Any = self.controller
+        entry: Any = follow_ticks if self.paced else run_cycles
         if self.interpreted:
-            entry = interpreted(run_cycles)
+            entry = interpreted(entry)
             controller = controller if self.interpret else compiled_controller(controller)
         else:
-            entry = dispatcher_for(run_cycles, self.handle, self.clock, controller)
+            entry = dispatcher_for(entry, self.handle, self.clock, controller)
         with np.errstate(over="ignore", invalid="ignore"):
-            entry(self.handle, self.clock, self.times, controller)
+            entry(self.handle, self.clock, self.period, controller)
 
     def _compile(self) -> None:
         """Compile by a run that is finished before it begins, or by a step after its end."""
@@ -107,6 +109,6 @@ class ControlLoop:
         state = copy.deepcopy(self.controller.state)
         over = self.controller._replace(supervisor=finished, state=state)
         with explain_compile_errors(self.handle, self.controller.design):
-            ControlLoop(self.handle, self.clock, self.times, over, self.interpret).run()
+            replace(self, controller=over).run()
             if self.interpreted and not self.interpret:
                 control_step(compiled_controller(over), 0, 0, 0.0)

@@ -60,7 +60,6 @@ class Memory(Scalars):
     at_limit_in_row: int  #: samples with u at a limit
     overruns_in_row: int
     unsent_in_row: int
-    maybe_stale: int  #: not zero if the next measurement may be an old one
     tripped: int  #: not zero if the device has set u to zero for good
     u: float  #: as applied [u-unit]
     ramp_start: float  #: u at the beginning of the ramp [u-unit]

@@ -14,7 +14,14 @@ from quell.kernels.dispatch import compiled, dispatcher_for
 from quell.realtime.devices.base import ask, read_measurement, write_command
 from quell.realtime.system.clock import SystemClock, system_clock
 from quell.realtime.wire import frames
-from quell.realtime.wire.handle import GONE, NOT_SENT, TRIPPED, WireHandle, is_own
+from quell.realtime.wire.handle import (
+    GONE,
+    NOT_SENT,
+    TRIPPED,
+    WireHandle,
+    is_own,
+    tick_queue,
+)
 from quell.realtime.wire.transport import receive, send, wait_for_frame
 
 # A measurement is stale if it answers a command older than this number of samples, or if more than
@@ -72,7 +79,7 @@ class WireDevice:
         self.dt = checks.positive("dt", dt, "s")
         own = frames.endpoint(frames.MEASUREMENT, _new_session(), _MOST_AGE)
         inbox, outbox, watch = frames.buffer(), frames.buffer(), system_clock()
-        self.handle = WireHandle(self._connect(), own, inbox, outbox, watch, self.dt)
+        self.handle = WireHandle(self._connect(), own, inbox, outbox, watch, self.dt, tick_queue())
         # Not the handle's: compiled code takes it that its arguments share no memory.
         self._clock = system_clock()
         self._timeout = timeout
@@ -130,6 +137,7 @@ class WireDevice:
         # If a frame replaces the one before it, the device must have time to read the goodbye.
         time.sleep(min(2.0 * self.dt, _HELLO_EVERY))
         frames.start_session(self.handle.endpoint, _new_session())
+        self.handle.queue.counts[:] = 0
         self._begin_session(former)
 
     def tick(self, timeout: float = 1.0) -> int:

@@ -165,6 +165,12 @@ def is_well_formed(frame: Buffer, size: int, counters: NDArray[np.int64]) -> boo
 
 
 @kernel
+def ahead_of(number: int, of: int) -> int:
+    """Return how far ``number`` (modulo 2^32) is ahead of the count ``of``: −2^31 … 2^31 − 1."""
+    return (number - of + _MODULUS // 2) % _MODULUS - _MODULUS // 2
+
+
+@kernel
 def accept(frame: Buffer, own: Endpoint) -> bool:
     """Return whether a well-formed frame is a new one of the expected kind; count it in any case.
 
@@ -178,11 +184,11 @@ def accept(frame: Buffer, own: Endpoint) -> bool:
     if int(frame.words[1]) != numbers[SESSION]:
         counters[WRONG_SESSION] += 1
         return False
-    ahead = _ahead(int(frame.words[2]), numbers[RECEIVED])
+    ahead = ahead_of(int(frame.words[2]), numbers[RECEIVED])
     if ahead <= 0:
         counters[DUPLICATED if ahead == 0 else REORDERED] += 1
         return False
-    age = -_ahead(int(frame.words[3]), numbers[SENT])
+    age = -ahead_of(int(frame.words[3]), numbers[SENT])
     if age > own.most_age or age < 0:
         counters[STALE] += 1
         return False
@@ -218,12 +224,6 @@ def start_session(own: Endpoint, session: int) -> None:
     for i in range(own.numbers.size):
         own.numbers[i] = 0
     own.numbers[SESSION] = session
-
-
-@kernel
-def _ahead(number: int, of: int) -> int:
-    """Return how far ``number`` (modulo 2^32) is ahead of the count ``of``: −2^31 … 2^31 − 1."""
-    return (number - of + _MODULUS // 2) % _MODULUS - _MODULUS // 2
 
 
 def counts_by_name(counters: NDArray[np.int64]) -> dict[str, int]:
