@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -11,9 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import quell as ql
 from quell.kernels.dispatch import interpreted
 from quell.realtime.devices.base import ask
 from quell.realtime.devices.registry import listen
+from quell.realtime.devices.twin import TwinDevice
 from quell.realtime.rig.kernel import serve
 from quell.realtime.rig.server import Rig
 from quell.realtime.system.clock import virtual_clock
@@ -35,6 +38,38 @@ def test_ticks_that_were_slept_over_are_caught_up(bench: Callable[..., Bench]) -
     assert here.rig.counters["caught_up"] == 7
     assert here.rig.lateness.max == pytest.approx(0.0705)
     assert np.array_equal(*positions)
+
+
+@pytest.mark.parametrize("wire", ["udp", "shm"])
+def test_a_rig_that_waits_moves_as_in_the_simulation_however_late_its_loop_is(
+    wire: str, bench: Callable[..., Bench]
+) -> None:
+    """Bit for bit; the rig ticks as fast as it can on a thread of its own."""
+    here = bench(wire, wait=30.0)
+    device = here.open()
+    twin = TwinDevice(ql.plants.delayed(PLANT, DT, DT), DT)
+    thread = threading.Thread(target=lambda: here.rig.tick(60))
+    (y,) = here.cycle(device, law)
+    thread.start()
+    for k in range(60):
+        assert y == twin.read()
+        twin.write(law(y))
+        y = device.read()
+        if k % 20 == 0:
+            time.sleep(0.01)
+        device.write(law(y))
+    thread.join()
+    assert here.rig.counters["accepted"] == 60
+    assert here.rig.counters["skipped"] == 0
+
+
+def test_a_rig_that_waits_trips_if_no_command_comes(bench: Callable[..., Bench]) -> None:
+    """Each tick waits for its time only."""
+    here = bench("udp", wait=1e-3, watchdog=5)
+    device = here.open()
+    here.cycle(device, law, 3)
+    here.rig.tick(7)
+    assert (here.rig.state, here.applied) == ("tripped", 0.0)
 
 
 def test_the_watchdog_waits_for_the_first_command(bench: Callable[..., Bench]) -> None:
@@ -187,6 +222,8 @@ def test_a_destroyed_plant_comes_back_to_rest_for_the_next_session(
         ({"x0": [1.0]}, "x0"),
         ({"log": "/nowhere/x.csv"}, "log = '/nowhere/x.csv'"),
         ({"rest": 1}, "rest"),
+        ({"wait": -1.0}, "wait"),
+        ({"wait": 1e6}, "wait = 1000000.0 s: must be at most 100 s"),
         ({"dt": 1e-9}, "dt = 1e-09 s: must be from 1e-06 to 100 s"),
         ({"dt": 1e300}, "must be from 1e-06 to 100 s"),
         ({"watchdog": 10**20}, "watchdog = 1.*: must be a whole number from 1 to 1000000"),

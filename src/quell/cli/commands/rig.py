@@ -31,6 +31,7 @@ def rig(
     watchdog: Whole = 20,
     u_max: float = math.inf,
     rest: bool = True,
+    wait: float = 0.0,
     seconds: float | None = None,
     log: Path | None = None,
     priority: Whole = 50,
@@ -53,6 +54,10 @@ def rig(
     rest
         Start each session from rest, or where the last one left the plant; from rest in any case if
         that state is not finite, or beyond 1e9.
+    wait
+        How long a tick waits for the command that answers the measurement before it [s]. The plant
+        stands still meanwhile, as no real one does: a loop that is late then does as in a
+        simulation.
     seconds
         How long to run [s]; until interrupted by default.
     log
@@ -74,7 +79,13 @@ def rig(
         checked_seconds("--seconds", seconds)
     checked_priority(priority)
     checked_cpu(cpu)
-    limits: dict[str, Any] = {"watchdog": watchdog, "u_max": u_max, "rest": rest, "log": log}
+    limits: dict[str, Any] = {
+        "watchdog": watchdog,
+        "u_max": u_max,
+        "rest": rest,
+        "log": log,
+        "wait": wait,
+    }
     with closing(listen(device)) as listener, Rig(model, dt, listener=listener, **limits) as server:
         with exit_on_signal(listener.close):  # compiling may take a minute the first time
             server.prepare()
@@ -82,6 +93,7 @@ def rig(
             limit = f", |u| <= {u_max:g}" if math.isfinite(u_max) else ""
             rules = f"u = 0 after {watchdog} ticks without a command{limit}"
             start = ", from rest" if rest else ""
+            start += f", waits up to {wait:g} s for each command" if wait > 0.0 else ""
             print(f"{plant} at {listener.url}: a tick every {dt:g} s, {rules}{start}", flush=True)
             notes = server.run(seconds, priority=priority, cpu=cpu)
     _print_counters(server)

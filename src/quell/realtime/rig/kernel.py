@@ -19,6 +19,9 @@ live     u is the last command
 tripped  no fresh, finite command for ``watchdog`` ticks in a row: u = 0 until a new session
 =======  ========================================================================================
 
+A simulated plant need not move on while the loop is late: with ``wait`` a tick waits for the
+command that answers the measurement before it, and the rig's clock stands still meanwhile.
+
 A hello begins a session, unless one is live or waits for less than ``patience`` ticks. A goodbye
 ends it. A session begins at ``x0`` if ``rest``, or if the last one destroyed the plant's state: no
 motion can go on from there.
@@ -55,6 +58,7 @@ from quell.realtime.wire.transport import (
     receive,
     reply,
     send,
+    wait_for_frame,
 )
 from quell.types import Vector
 
@@ -97,6 +101,7 @@ class RigModel(NamedTuple):
     u_max: float  # largest |u| that is applied [u-unit]
     watchdog: int  # ticks without a fresh command before u is set to zero
     patience: int  # ticks that a session has for its first command before another may replace it
+    wait: int  # how long a tick waits for the answer to the measurement before it [ns]
     rest: bool  # whether each session starts from ``x0``, and not only after a destroyed state
     x: Vector
     x0: Vector
@@ -112,11 +117,13 @@ class RigModel(NamedTuple):
 
 
 @kernel
-def tick(rig: RigModel, time: int) -> None:
-    """Perform one tick; the rig's clock shows ``time`` [ns]."""
+def tick(rig: RigModel, time: int, fresh: bool) -> None:
+    """Perform one tick; the rig's clock shows ``time`` [ns].
+
+    ``fresh`` says whether a fresh command has been received since the last tick already.
+    """
     counts, signals = rig.counts, rig.signals
-    signals[COMMANDED] = np.nan
-    fresh = _receive_command(rig, time)
+    fresh |= _receive_command(rig, time)
     _update_watchdog(rig, fresh)
     y = measure(rig.plant, rig.x)
     if counts[STATE] != IDLE and counts[ASKED] > 0:
@@ -127,6 +134,7 @@ def tick(rig: RigModel, time: int) -> None:
             rig.endpoint.counters[frames.NOT_SENT] += 1
     if rig.logged:
         _log(rig, y)
+    signals[COMMANDED] = np.nan
     advance(rig.plant, rig.x, rig.scratch, counts[SINCE_REST] * rig.dt, signals[APPLIED], rig.w)
     counts[SINCE_REST] += 1
     counts[TICKS] += 1
@@ -281,5 +289,31 @@ def serve(rig: RigModel, clock: Any, most: int, paced: bool) -> None:
             count_duration(rig.lateness, late)
             if late > period:
                 rig.counts[CAUGHT_UP] += 1
-        tick(rig, time)
+        fresh = False
+        if rig.wait > 0:
+            fresh, waited = _await_answer(rig, clock)
+            begin += waited
+        tick(rig, time, fresh)
         k += 1
+
+
+@kernel
+def _await_answer(rig: RigModel, clock: Any) -> tuple[bool, int]:
+    """Wait for the command that answers the last measurement, for ``rig.wait`` [ns] at most.
+
+    Return whether a fresh command has come, and how long it took [ns].
+    """
+    own = rig.endpoint
+    begin = now(clock)
+    fresh = _receive_command(rig, begin)
+    waited = 0
+    while (
+        rig.counts[STATE] == LIVE
+        and frames.ahead_of(own.numbers[frames.ANSWERED], own.numbers[frames.SENT]) != 0
+        and waited < rig.wait
+        and load_acquire(rig.stop, 0) == 0
+    ):
+        wait_for_frame(rig.transport, min(rig.wait - waited, _CHECK_STOP_EVERY))
+        waited = now(clock) - begin
+        fresh |= _receive_command(rig, begin + waited)
+    return fresh, waited

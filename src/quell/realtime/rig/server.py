@@ -62,6 +62,9 @@ class Rig:
     rest
         whether each session starts from ``x0``, or from where the last one left the plant. If that
         state is not finite, or beyond 10⁹, the session starts from ``x0`` in any case.
+    wait
+        how long a tick waits for the command that answers the measurement before it [s]; the later
+        ticks are shifted by that time. A loop that is late then has no effect on the motion.
     x0
         the plant's state at the start (n,); zero by default.
     log
@@ -83,6 +86,7 @@ class Rig:
         watchdog: int = 20,
         u_max: float = np.inf,
         rest: bool = True,
+        wait: float = 0.0,
         x0: ArrayLike | None = None,
         log: str | Path | None = None,
     ) -> None:
@@ -110,13 +114,14 @@ class Rig:
             u_max=u_max,
             watchdog=watchdog,
             patience=max(round(_PATIENCE / dt), 1),
+            wait=round(1e9 * _checked_wait(wait)),
             rest=checks.flag("rest", rest),
             x=start.copy(),
             x0=start,
             scratch=np.zeros(6 * plant.order),
             w=np.zeros(plant.disturbances),
             counts=np.zeros(kernels.COUNTS, dtype=np.int64),
-            signals=np.zeros(3),
+            signals=np.array([0.0, np.nan, 0.0]),
             row=np.zeros(len(kernels.LOG)),
             log=ring(1 if log is None else rows, len(kernels.LOG)),
             logged=log is not None,
@@ -279,6 +284,12 @@ class Rig:
             self._log_failure = f"the log was given up: {error.strerror}"
             with suppress(OSError):
                 self._file.close()
+
+
+def _checked_wait(wait: float) -> float:
+    if checks.non_negative("wait", wait, "s") > _LONGEST:
+        raise ValueError(f"wait = {wait!r} s: must be at most {_LONGEST:g} s")
+    return wait
 
 
 def checked_seconds(name: str, seconds: float) -> float:
