@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.controllers.base import control
+from quell.observers.base import expected_measurement
 from quell.observers.eso import ESO
 from quell.plants.base import advance, measure
 
@@ -366,3 +368,63 @@ def test_what_was_learned_forbids_another_nominal_gain() -> None:
     controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman())
     with pytest.raises(ValueError, match="what was learned refers to that"):
         controller.retune(observer=ESO.model_free(2, 1.0, 20.0, DT))
+
+
+@pytest.mark.parametrize("learner", [None, ql.learners.Kalman()])
+@pytest.mark.parametrize("delay", [0.0, 0.02])
+def test_a_start_in_motion_goes_on_from_the_estimates(learner: object, delay: float) -> None:
+    """With the estimates and u of another controller, every later u is that controller's; with a delay, after a constant u."""
+    observer = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=DT, delay=delay)
+    one = ql.ADRC(observer, omega_c=3.0, learner=learner, u_min=-4.0, u_max=4.0)
+    for k in range(300):
+        one.step(1.0, 0.3 * math.sin(0.05 * k))
+    for _ in range(3):
+        one.track(1.0, 0.1, 0.7)
+    known = one.estimate
+    other = ql.ADRC(observer, omega_c=3.0, learner=learner, u_min=-4.0, u_max=4.0)
+    if learner is not None:  # which has to know the same
+        other.state = other.state | {
+            name: value for name, value in one.state.items() if name.startswith("learner.")
+        }
+    other.start_at(known.x, known.f, u=0.7, r=1.0)
+    told = other.estimate
+    assert told.x.tolist() == known.x.tolist()
+    assert told.f == pytest.approx(known.f, rel=1e-12)
+    assert told.u == 0.7
+    ys = (0.1, 0.12, math.nan, 0.15, 0.2)
+    if learner is not None:  # whose own filters start afresh
+        ys = ys[:1]
+    later = [(one.step(1.0, y), other.step(1.0, y)) for y in ys]
+    np.testing.assert_allclose(*np.transpose(later), rtol=1e-12)
+
+
+def test_a_start_in_motion_may_continue_from_u() -> None:
+    """By ``hand_over``; without it the next u is the law's own. All forms of the observer take the estimates."""
+    for make in (
+        lambda: OBSERVER,
+        lambda: ESO.cascade(2, 2.0, 20.0, DT),
+        lambda: ESO.nonlinear(2, 2.0, 20.0, DT, delta=0.1),
+    ):
+        controller = ql.ADRC(make(), omega_c=3.0)
+        design, state = controller.parameters, controller._state
+        controller.start_at([0.2, -0.5], 0.8, u=0.4, r=0.5)
+        # What the law says of the estimates, a sample later by the model: y moves as predicted.
+        y = expected_measurement(design.eso, state.z, 0.4, 0.0)
+        assert y == pytest.approx(0.2 - 0.5 * DT + 0.5 * DT**2 * (0.8 + 2.0 * 0.4), rel=1e-12)
+        u = control(design, state, math.nan, y)
+        speed = -0.5 + DT * (0.8 + 2.0 * 0.4)
+        law = (9.0 * (0.5 - y) - 6.0 * speed - 0.8) / 2.0
+        assert u == pytest.approx(law, rel=1e-9)
+        controller.start_at([0.2, -0.5], 0.8, u=0.4, r=0.5)
+        controller.hand_over()
+        assert control(design, state, 0.5, y) == pytest.approx(0.4, rel=1e-12)
+    with pytest.raises(ValueError, match=r"x has shape \(3,\): must be a vector of 2"):
+        controller.start_at([0.0, 0.0, 0.0])
+
+
+def test_behind_a_prefilter_a_start_in_motion_settles_the_prefilter_there() -> None:
+    """The next reference is a step from y on."""
+    shaped = ql.controllers.Prefiltered(ql.ADRC(OBSERVER, 3.0), ql.baselines.ZV(omega=5.0))
+    shaped.start_at([0.2, 0.0], 0.0, u=0.1)
+    assert shaped.step(0.2, 0.2) == pytest.approx(ql.ADRC(OBSERVER, 3.0).step(0.2, 0.2), abs=0.5)
+    assert shaped.state["loop"][0] == pytest.approx(0.2)

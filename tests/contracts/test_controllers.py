@@ -28,6 +28,9 @@ LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
 PID = baseline_room.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT, **LIMITS)
 CONTROLLERS: dict[str, Any] = {
     "ADRC": ql.ADRC(ESO, 1.5, **LIMITS),
+    "ADRC, Han's law": ql.ADRC(
+        ESO, 1.5, feedback=room.NonlinearFeedback((0.75, 1.25), 0.05), **LIMITS
+    ),
     "LinearController": room.LinearController.from_transfer_function(
         [2.0, 3.0], [1.0, 0.0], dt=DT, **LIMITS
     ),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -88,3 +90,89 @@ def test_the_tracking_differentiator_is_pyadrcs(horizon: float) -> None:
         r = float(k // 400 % 3) + 0.3 * np.sin(0.02 * k)
         v1 = prefilter(design, memory, r)
         np.testing.assert_allclose([v1, memory.v[1]], theirs(r), atol=1e-8)
+
+
+class AsPyadrc:
+    """An ``ADRC`` with the interface of pyadrc's ``StateSpace``, in absolute form and full gain."""
+
+    def __init__(
+        self,
+        order: int,
+        delta: float,
+        b0: float,
+        w_cl: float,
+        k_eso: float,
+        eso_init: Any = None,
+        r_lim: Any = (None, None),
+        m_lim: Any = (None, None),
+    ) -> None:
+        observer = ql.ESO.model_free(order=order, b0=b0, omega_o=k_eso * w_cl, dt=delta)
+        self.controller = ql.ADRC(observer, omega_c=w_cl)
+        self.limiter = (m_lim, r_lim)
+        self.reset(eso_init)
+
+    def __call__(self, y: float, u: float, r: float) -> float:
+        """Return the control signal for y, the last u and r."""
+        self.controller.applied(u)
+        return self.controller.step(r, y)
+
+    def reset(self, x0: Any = None) -> None:
+        """Set the estimates (x̂, f̂)."""
+        x0 = np.zeros(self.controller.observer.order + 1) if x0 is None else np.asarray(x0, float)
+        self.controller.start_at(x0[:-1], f=x0[-1], r=0.0)
+
+    @property
+    def eso_states(self) -> Any:
+        """The estimates as a column."""
+        known = self.controller.estimate
+        return np.append(known.x, known.f)[:, None]
+
+    @property
+    def limiter(self) -> Any:
+        """Limits of magnitude, and of the change in a sample."""
+        return self._limiter
+
+    @limiter.setter
+    def limiter(self, limits: Any) -> None:
+        (low, high), (fall, rise) = self._limiter = limits
+        dt, inf = self.controller.dt, np.inf
+        self.controller.set_limits(
+            u_min=-inf if low is None else low,
+            u_max=inf if high is None else high,
+            rate_limit=(-inf if fall is None else fall / dt, inf if rise is None else rise / dt),
+        )
+
+
+@pytest.mark.filterwarnings("ignore::quell.DesignWarning")
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("delta", "k_eso"), [(1.0, 1.0), (0.01, 5.0), (1.0, 3.0)])
+def test_coarse_sampling_one_sided_limits_and_given_states_agree(
+    order: int, delta: float, k_eso: float
+) -> None:
+    """``omega_o dt`` up to 12, limits of the rate that differ by direction and change while it runs, and an initial state: every sample agrees.
+
+    pyadrc's own tests design with ``omega_o dt = 4``.
+    """
+    rng = np.random.default_rng(order)
+    settings = {"order": order, "delta": delta, "b0": 2.0, "w_cl": 4.0, "k_eso": k_eso}
+    initial = rng.normal(size=order + 1)
+    limits = {"r_lim": (-0.1, 0.4), "m_lim": (-1.5, None)}
+    ours = AsPyadrc(**settings, eso_init=initial, **limits)
+    theirs = pyadrc.StateSpace(**settings, eso_init=initial, **limits)
+    before = 0.0
+    for k in range(400):
+        if k == 100:
+            ours.limiter = theirs.limiter = ((-0.2, 1.1), (None, 0.05))
+        if k == 200:
+            ours.limiter = theirs.limiter = ((None, None), (0.0, 1.0))
+        if k == 300:
+            fresh = rng.normal(size=order + 1)
+            ours.limiter = theirs.limiter = ((None, None), (None, None))
+            ours.reset(fresh)
+            theirs.reset(fresh)
+        y, r = rng.normal(), float(k // 50 % 2)
+        u = ours(y, before, r)
+        assert u == pytest.approx(float(theirs(y, before, r)), rel=1e-9)
+        known = theirs.eso_states
+        np.testing.assert_allclose(ours.eso_states, known, atol=1e-12 * np.max(np.abs(known)))
+        before = u

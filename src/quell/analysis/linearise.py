@@ -9,7 +9,6 @@ map that is linear for small errors only. State entries that do not reach u, or 
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from quell.analysis.frozen_learner import Frozen, copy_state, frozen
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller, control
-from quell.controllers.limits import Limits
+from quell.controllers.limits import NO_LIMITS
 from quell.controllers.linear.law import LinearLaw
 from quell.controllers.stateful import named_arrays
 from quell.guard import UnguardedDesign, UnguardedMemory
@@ -26,7 +25,6 @@ from quell.learners.base import NoLearnerMemory
 from quell.types import Matrix, Vector
 
 _UNIT = 2.0**-60
-_UNLIMITED = Limits(-math.inf, math.inf, math.inf)
 
 
 def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
@@ -52,7 +50,7 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     learner = at if isinstance(at, Frozen) else frozen(controller, at)
     design = controller.parameters._replace(learner=learner, guard=UnguardedDesign())
-    design, nothing = design._replace(limits=_UNLIMITED), np.zeros(0)
+    design, nothing = design._replace(limits=NO_LIMITS), np.zeros(0)
     nothing_learned, unguarded = NoLearnerMemory(nothing), UnguardedMemory(nothing)
     state = controller.initial_state()._replace(learner=nothing_learned, guard=unguarded)
     control(design, state, 0.0, 0.0)
@@ -68,7 +66,7 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
 
 def _measured_law(design: Any, origin: Any) -> LinearLaw:
     """Return the law around a state ``origin`` that no limit and no flag is about to change."""
-    fixed_u = [design._replace(limits=Limits(u, u, math.inf)) for u in (0.0, _UNIT)]
+    fixed_u = [design._replace(limits=NO_LIMITS._replace(low=u, high=u)) for u in (0.0, _UNIT)]
     # Entries that are not zero are flags and the like, which do not change any more.
     is_zero = {name: array == 0.0 for name, array in named_arrays(origin).items()}
     places = [(name, at) for name, zero in is_zero.items() for at in np.argwhere(zero)]

@@ -6,7 +6,13 @@ May import ``guard``, ``learners``, ``plants``, ``observers`` and what they impo
 
 from quell.controllers import baselines
 from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.adrc.dead_time import (
+    DeadTimeTuning,
+    adrc_for_dead_time,
+    dead_time_tuning,
+)
 from quell.controllers.adrc.estimate import Estimate
+from quell.controllers.adrc.feedback import NonlinearFeedback
 from quell.controllers.bandwidth import omega_c_for
 from quell.controllers.base import Controller
 from quell.controllers.design_checks import warn_if_unwise
@@ -19,14 +25,18 @@ from quell.controllers.prefilters.reference_model import ReferenceModel
 __all__ = [
     "ADRC",
     "Controller",
+    "DeadTimeTuning",
     "Estimate",
     "LinearController",
     "LinearLaw",
+    "NonlinearFeedback",
     "Prefilter",
     "Prefiltered",
     "ReferenceModel",
     "TrackingDifferentiator",
+    "adrc_for_dead_time",
     "baselines",
+    "dead_time_tuning",
     "omega_c_for",
     "warn_if_unwise",
 ]

@@ -13,9 +13,11 @@ with omega_o 3 to 10 times omega_c, the chains have modulus margins of about 0.3
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import NamedTuple
 
+from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
 from quell.types import DesignWarning
 
@@ -45,9 +47,14 @@ def sampling_findings(observer: ESO, omega_c: float) -> list[Finding]:
     value, limit = observer.omega_o * dt, _OBSERVER_LIMIT.get(form, _OBSERVER_LIMIT["current"])
     if value > limit:
         current_helps = form == "predictor" and value <= _OBSERVER_LIMIT["current"]
+        cost = "there sampling costs up to a sixth of the modulus margin, beyond it more"
+        if value >= math.pi:
+            cost = (
+                f"with its poles at z = {observer.pole:.2g} the observer follows every sample of "
+                "y, noise included"
+            )
         message = (
-            f"omega_o * dt = {value:.3g} is above {limit:g}: there sampling costs up to a sixth of "
-            "the modulus margin, beyond it more; "
+            f"omega_o * dt = {value:.3g} is above {limit:g}: {cost}; "
             f"sample every {limit / observer.omega_o:.3g} s or faster, "
             f"lower omega_o to {limit / dt:.3g} rad/s{', or take the current form' * current_helps}"
         )
@@ -77,3 +84,15 @@ def warn_if_unwise(observer: ESO, omega_c: float, stacklevel: int = 3) -> None:
     """Issue a ``DesignWarning`` for each finding, with the caller's caller as its source."""
     for finding in sampling_findings(observer, omega_c):
         warnings.warn(finding.message, DesignWarning, stacklevel=stacklevel)
+
+
+def check_zeros(observer: ESO) -> None:
+    """Check that the plant's inverse is stable: the zeros from u become poles of u."""
+    unstable = observer.plant.unstable_zeros
+    if unstable.size:
+        raise ValueError(
+            f"observer: the plant has zeros from u at {format_roots(unstable)} rad/s, not in the "
+            "left half plane; ADRC inverts the plant, so u would grow or oscillate while "
+            "y looks well; control another output, or use a controller that does not invert the "
+            "plant (linear-quadratic, for instance)"
+        )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.controllers.base import set_applied_control
 from quell.controllers.compiled_step import PackedController, entry_point, step_packed
-from quell.controllers.limits import Limits
+from quell.controllers.limits import Limits, RateLimit, changed_limits
 from quell.kernels.dispatch import dispatcher_for
 from quell.kernels.user_types import explain_compile_errors
 
@@ -91,8 +91,38 @@ class StatefulController:
 
     @property
     def limits(self) -> Limits:
-        """Limits of the control signal: ``low``, ``high`` and ``most_change`` in a sample."""
+        """Limits of the control signal: ``low``, ``high``, and the largest changes in a sample."""
         return self._limits
+
+    def set_limits(
+        self,
+        *,
+        u_min: float | None = None,
+        u_max: float | None = None,
+        rate_limit: RateLimit | None = None,
+    ) -> None:
+        """Change limits of the control signal while running; allowed in every sample.
+
+        What is not given stays. The next ``step`` is within the new range of u, even if u has to
+        change faster than the rate limit for that. Nothing is compiled again. A run or rig that
+        was started before keeps its limits.
+
+        Parameters
+        ----------
+        u_min, u_max
+            new limits [u-unit].
+        rate_limit
+            new limit of the rate in both directions, or (lowest, highest) [u-unit/s].
+
+        Raises
+        ------
+        ValueError
+            as for a new controller; then the limits are unchanged.
+        """
+        this: Any = self
+        self._limits = changed_limits(self._limits, float(this.dt), u_min, u_max, rate_limit)
+        self.parameters = self.parameters._replace(limits=self._limits)
+        self._pack_again()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy, also one in another process, is made from."""

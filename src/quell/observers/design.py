@@ -48,11 +48,6 @@ def design_model(
 ) -> EsoModel:
     """Return the update of the observer of ``plant`` with the bandwidth ``omega_o``."""
     checks.one_of("form", form, FORMS)
-    if omega_o * dt >= math.pi:
-        raise ValueError(
-            f"omega_o = {omega_o!r} rad/s with dt = {dt!r} s: omega_o * dt = {omega_o * dt:.3g} "
-            "must be below pi, half the sampling rate; lower omega_o or dt"
-        )
     if checks.flag("half_gain", half_gain) and form == "reduced":
         raise ValueError(
             "half_gain = True with form = 'reduced': they exclude each other; use form='current'"

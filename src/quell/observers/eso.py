@@ -81,7 +81,8 @@ class ESO:
             nominal control gain [y-unit / u-unit / s^n]; a factor of 2 off is usually tolerated,
             the wrong sign is not.
         omega_o
-            observer bandwidth [rad/s]; below π/dt, and for a good result below about 0.5/dt.
+            observer bandwidth [rad/s]; for a good result below about 0.5/dt. ``ADRC`` warns from
+            1/dt on; far beyond, all poles are almost at z = 0, and the observer filters nothing.
         dt
             sample time [s].
         form

@@ -9,7 +9,14 @@ from functools import partial
 from typing import Any
 
 from quell import features, guard, learners, signals
-from quell.controllers import ADRC, LinearController, ReferenceModel, TrackingDifferentiator
+from quell.controllers import (
+    ADRC,
+    LinearController,
+    NonlinearFeedback,
+    ReferenceModel,
+    TrackingDifferentiator,
+    adrc_for_dead_time,
+)
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, NotchPID, ResonanceRatio, Shaper, notch
 from quell.observers import ESO
 from quell.plants import registry as plants
@@ -118,10 +125,13 @@ LEARNERS = _call_tables(
     _public_classes(learners, "design", "memory"), {"features": list_of(one_of(FEATURES)) | None}
 )
 Notch = call_table("notch", notch.Notch.at, only=True)
+Feedback = call_table("nonlinear-feedback", NonlinearFeedback, only=True)
+_FEEDBACK = {"feedback": Feedback | None}
 _DOUBLE_INTEGRATOR = "pid-simc-double-integrator"
 _PLANT, _LINEAR, _PID = {"plant": Plant | None}, (LinearController,), (PID, LinearController)
 _CONTROLLERS = (
-    call_table("adrc", ADRC),
+    call_table("adrc", ADRC, types=_FEEDBACK),
+    call_table("adrc-dead-time", adrc_for_dead_time, forwards_to=(ADRC,), types=_FEEDBACK),
     call_table("pid", PID, forwards_to=_LINEAR),
     call_table("pid-simc", PID.simc, forwards_to=_PID),
     call_table(_DOUBLE_INTEGRATOR, PID.simc_double_integrator, forwards_to=_PID),

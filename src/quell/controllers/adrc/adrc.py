@@ -10,6 +10,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.adrc.estimate import Estimate, read_estimate
+from quell.controllers.adrc.feedback import NonlinearFeedback, checked_feedback, feedback_design
 from quell.controllers.adrc.handover import (
     change_design,
     check_replacement,
@@ -17,17 +18,17 @@ from quell.controllers.adrc.handover import (
     manual_operation,
     samples_to_settle,
     start_at_rest,
+    start_in_motion,
 )
 from quell.controllers.adrc.law import AdrcDesign, AdrcLoop, AdrcState, law_gains
 from quell.controllers.base import set_reference_derivatives
-from quell.controllers.design_checks import warn_if_unwise
-from quell.controllers.limits import checked_limits
+from quell.controllers.design_checks import check_zeros, warn_if_unwise
+from quell.controllers.limits import RateLimit, checked_limits
 from quell.controllers.stateful import StatefulController
 from quell.guard import GUARD_CHANNELS, Guard, UnguardedDesign, UnguardedMemory
 from quell.learners.base import Learner, NoLearner, checked_design
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.learners.recovery import LearnerWatch, window_samples
-from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
 from quell.types import Channels
 
@@ -55,16 +56,18 @@ class ADRC(StatefulController):
     u_min, u_max
         limits of the control signal [u-unit].
     rate_limit
-        largest rate of the control signal, in either direction [u-unit/s].
+        largest rate of the control signal, in both directions, or (lowest, highest) [u-unit/s].
     half_gain
         whether to halve the gains k of the law, reference included, but not the cancellation of f.
         The gain from noise in x̂ is halved, and the loop settles to 2 % in 2.0, 1.4, 1.2 and 1.0
         times the time for orders 1 to 4 (Herbst, Hempel, Göhrt & Streif 2020, arXiv 2003.03986).
+    feedback
+        Han's nonlinear law of the errors; the linear law by default.
 
     Raises
     ------
     ValueError
-        for a bandwidth or rate limit that is not positive, limits in the wrong order, and an
+        for a bandwidth or rate limit that is not positive, limits in the wrong order, an
         observer of a plant with zeros outside of the left half plane.
 
     Examples
@@ -88,13 +91,14 @@ class ADRC(StatefulController):
         feedforward: bool = False,
         u_min: float = -math.inf,
         u_max: float = math.inf,
-        rate_limit: float = math.inf,
+        rate_limit: RateLimit = math.inf,
         half_gain: bool = False,
+        feedback: NonlinearFeedback | None = None,
     ) -> None:
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO, as from ESO.model_free")
         self.observer = observer
-        _check_zeros(observer)
+        check_zeros(observer)
         self.omega_c = checks.positive("omega_c", omega_c, "rad/s")
         self.guard = guard
         self.learner: Learner = NoLearner() if learner is None else learner
@@ -107,6 +111,7 @@ class ADRC(StatefulController):
             raise ValueError(f"guard = {guard!r}: must be a quell.Guard(), or None")
         self.feedforward = checks.flag("feedforward", feedforward)
         self.half_gain = checks.flag("half_gain", half_gain)
+        self.feedback = checked_feedback(feedback)
         self._learner_omega_c = self.omega_c  # the learner keeps its scales when omega_c is retuned
         self._limits = checked_limits(u_min, u_max, rate_limit, observer.dt)
         self._initialise()
@@ -124,6 +129,7 @@ class ADRC(StatefulController):
             law=np.append(law, np.zeros(observer.order - observer.degree)),
             cancel=observer.cancel,
             cancel_f=observer.cancel_f,
+            feedback=feedback_design(self.feedback, observer.degree, omega_c),
             fade=math.exp(-omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,
@@ -216,6 +222,29 @@ class ADRC(StatefulController):
         goal = y if r is None else checks.signal("r", r)
         start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), y, u, goal)
 
+    def start_at(self, x: Any, f: float = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
+        """Start with given estimates, for a plant in motion; what was learned is kept.
+
+        They are those of the sample before the next ``step``, which takes u for the control signal
+        applied since then. Unlike after ``start``, the next u is the law's own; call ``hand_over``
+        next for one that continues from ``u``.
+
+        Parameters
+        ----------
+        x
+            estimates x̂ (n,), y and its derivatives; see ``observer.states_of`` if there are zeros.
+        f
+            total disturbance [y-unit/s^n].
+        u
+            control signal applied until the next step [u-unit]; a delayed one has the same past.
+        r
+            reference until the next one that is finite [y-unit]; ``x[0]`` by default.
+        """
+        estimates = checks.vector("x", x, self.observer.order)
+        f, u = checks.finite("f", f), checks.signal("u", u)
+        goal = float(estimates[0]) if r is None else checks.signal("r", r)
+        start_in_motion(self.parameters, self._state, estimates, f, u, goal)
+
     def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
         """Take one sample in manual operation: ``u`` is applied, unlimited, until the next sample.
 
@@ -298,15 +327,3 @@ class ADRC(StatefulController):
     def read(self, state: AdrcState) -> Estimate:
         """Return the estimates and the status in ``state``."""
         return read_estimate(self.parameters, state, self.features)
-
-
-def _check_zeros(observer: ESO) -> None:
-    """Check that the plant's inverse is stable: the zeros from u become poles of u."""
-    unstable = observer.plant.unstable_zeros
-    if unstable.size:
-        raise ValueError(
-            f"observer: the plant has zeros from u at {format_roots(unstable)} rad/s, not in the "
-            "left half plane; ADRC inverts the plant, so u would grow or oscillate while "
-            "y looks well; control another output, or use a controller that does not invert the "
-            "plant (linear-quadratic, for instance)"
-        )

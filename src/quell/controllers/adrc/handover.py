@@ -27,6 +27,7 @@ from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
 from quell.observers.nonlinear import NonlinearModel
 from quell.observers.response import scaled_response
+from quell.observers.start import state_for
 from quell.types import Vector
 
 # Time constants after which an initial error is below the unit roundoff: exp(−40) = 4e-18.
@@ -39,18 +40,40 @@ def start_at_rest(
     design: AdrcDesign, state: AdrcState, samples: int, y: float, u: float, r: float
 ) -> None:
     """Set the state to rest at y under u, with the reference r; see ``samples_to_settle``."""
-    reset_loop(design, state)
+    _start_loop(design, state, y, u, r)
     begin(design.eso, state.z, state.seen, y)
+    loop = state.loop[0]
+    _observe_at_rest(design.eso, state.z, state.seen, y, u, 0.0, samples)
+    _feed_forward(design, state, u)
+    _observe_at_rest(design.eso, state.z, state.seen, y, u, loop.f_learned, samples)
+    loop.bumpless = 1.0
+
+
+def start_in_motion(
+    design: AdrcDesign, state: AdrcState, x: Vector, f: float, u: float, r: float
+) -> None:
+    """Set the state to the estimates ``x`` (n,) and ``f`` under u, with the reference r."""
+    _start_loop(design, state, float(x[0]), u, r)
+    state.seen[:] = np.append(x, f)
+    _feed_forward(design, state, u)
+    state.seen[x.size] -= state.loop[0].f_learned
+    state.z[:] = state_for(design.eso, x, float(state.seen[x.size]), u)
+
+
+def _start_loop(design: AdrcDesign, state: AdrcState, y: float, u: float, r: float) -> None:
+    reset_loop(design, state)
     loop = state.loop[0]
     loop.y, loop.r, loop.u = y, r, u
     loop.started = loop.has_reference = 1.0
-    _observe_at_rest(design.eso, state.z, state.seen, y, u, 0.0, samples)
+
+
+def _feed_forward(design: AdrcDesign, state: AdrcState, u: float) -> None:
+    """Set the learner's share of f for the estimates in ``state`` under u."""
+    loop = state.loop[0]
     constant, slope = predict(design.learner, state.learner, state.seen, u)
     constant, slope, _ = limit(design.guard, state.guard, 0.0, constant, slope, u)
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * u
-    _observe_at_rest(design.eso, state.z, state.seen, y, u, loop.f_learned, samples)
-    loop.bumpless = 1.0
 
 
 def samples_to_settle(observer: ESO) -> int:

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.controllers.adrc.feedback import nonlinear_part
 from quell.controllers.bad_samples import control_at_rest, hold_last_good, is_usable
 from quell.controllers.base import (
     bumpless_transfer,
@@ -92,6 +93,7 @@ class AdrcDesign(NamedTuple):
     law: Vector  # k (n,); zero from the relative degree on
     cancel: Vector  # a (n,)
     cancel_f: float  # 1 if f enters where u enters, else 0
+    feedback: Any  # linear or nonlinear law of the errors, see ``feedback``
     fade: float  # factor of the offset from one sample to the next
     b0: float
     limits: Limits
@@ -232,6 +234,8 @@ def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slo
         unlimited += reference[reference.size - 1]
     for i in range(order):
         unlimited += (design.cancel[i] - design.law[i]) * seen[i]
+    r = state.loop[0].r
+    unlimited = nonlinear_part(design.feedback, design.law, seen, r, reference, unlimited)
     return unlimited / (design.b0 + design.cancel_f * slope)
 
 

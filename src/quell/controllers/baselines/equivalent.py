@@ -73,6 +73,8 @@ def _check_linear(controller: Any) -> None:
             f"controller has a learner, {type(controller.learner).__name__}: only a linear ADRC, "
             "without one, has an equivalent"
         )
+    if controller.feedback is not None:
+        raise ValueError("controller has a nonlinear feedback law: only a linear one is a PID")
     if observer.order > 2:
         raise ValueError(
             f"controller is of order {observer.order}: must be of order 1 (PI) or 2 (PID); an ADRC "

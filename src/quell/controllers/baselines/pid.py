@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.controllers.limits import RateLimit
 from quell.controllers.linear.linear import LinearController
 from quell.controllers.linear.transfer import realised, sampled_law
 
@@ -76,7 +77,7 @@ class PID(LinearController):
         setpoint: Sequence[float] | None = None,
         u_min: float = -math.inf,
         u_max: float = math.inf,
-        rate_limit: float = math.inf,
+        rate_limit: RateLimit = math.inf,
         name: str = "PID",
     ) -> None:
         self.kp, self.ki = checks.finite("kp", kp), checks.finite("ki", ki)

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.controllers.bad_samples import control_at_rest, hold_last_good
 from quell.controllers.base import control, reset_loop, set_applied_control, status_flags, write_row
-from quell.controllers.limits import Limits, apply_limits, checked_limits, largest_wish
+from quell.controllers.limits import (
+    Limits,
+    RateLimit,
+    apply_limits,
+    checked_limits,
+    largest_wish,
+)
 from quell.controllers.linear.law import LinearLaw, checked_law, rest_state
 from quell.controllers.linear.transfer import as_state_space, sampled_law
 from quell.controllers.stateful import StatefulController
@@ -146,7 +152,7 @@ class LinearController(StatefulController):
     u_min, u_max
         limits of the control signal [u-unit].
     rate_limit
-        limit of its rate of change, in both directions [u-unit/s].
+        largest rate of the control signal, in both directions, or (lowest, highest) [u-unit/s].
     name
         label in tables and plots.
 
@@ -176,7 +182,7 @@ class LinearController(StatefulController):
         *,
         u_min: float = -math.inf,
         u_max: float = math.inf,
-        rate_limit: float = math.inf,
+        rate_limit: RateLimit = math.inf,
         name: str = "linear controller",
     ) -> None:
         self.law = checked_law(law)
@@ -198,7 +204,7 @@ class LinearController(StatefulController):
         tracking_time: float | None = None,
         u_min: float = -math.inf,
         u_max: float = math.inf,
-        rate_limit: float = math.inf,
+        rate_limit: RateLimit = math.inf,
         name: str = "transfer function",
     ) -> LinearController:
         """Return the controller ``u = C (r − y)`` or ``u = −C y`` for a transfer function C(s).

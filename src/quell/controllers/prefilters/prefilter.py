@@ -29,7 +29,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.limits import Limits
+from quell.controllers.limits import Limits, RateLimit
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import generic, generic_with_default, is_finite
 from quell.kernels.scalars import Scalars, clear
@@ -146,8 +146,8 @@ class Prefiltered(StatefulController):
 
     The prefilter starts at rest at the first finite measurement, so another reference in the first
     sample acts as a step. The shaped reference is the channel ``r_shaped``. The given controller is
-    copied and not changed. If it is an ADRC, its methods ``start``, ``track``, ``hand_over``,
-    ``applied``, ``increment`` and ``retune`` are available here.
+    copied and not changed. If it is an ADRC, its methods ``start``, ``start_at``, ``track``,
+    ``hand_over``, ``applied``, ``increment`` and ``retune`` are available here.
 
     Parameters
     ----------
@@ -212,10 +212,19 @@ class Prefiltered(StatefulController):
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
         """Start at rest at ``y``, see ``ADRC.start``; the prefilter is at rest there too."""
         self._inner.start(y, u, r)
-        settle(self.parameters.prefilter, self._state.prefilter, float(y))
+        self._settle_at(float(y), float(y if r is None else r))
+
+    def start_at(self, x: Any, f: float = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
+        """Start with given estimates, see ``ADRC.start_at``; the prefilter is at rest at x[0]."""
+        self._inner.start_at(x, f, u=u, r=r)
+        y = float(np.ravel(x)[0])
+        self._settle_at(y, float(y if r is None else r))
+
+    def _settle_at(self, y: float, r: float) -> None:
+        settle(self.parameters.prefilter, self._state.prefilter, y)
         loop = self._state.loop[0]
         loop.started = loop.has_reference = 1.0
-        loop.r = float(y if r is None else r)
+        loop.r = r
 
     def track(self, r: float, y: float, u: float) -> float:
         """Take one sample in manual operation, see ``ADRC.track``."""
@@ -236,6 +245,10 @@ class Prefiltered(StatefulController):
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, see ``ADRC.retune``."""
         self._inner.retune(omega_c=omega_c, observer=observer)
+        self._take_parameters()
+
+    def _take_parameters(self) -> None:
+        """Use the parameters that the controller has now."""
         self.parameters = self.parameters._replace(controller=self.controller.parameters)
         self._pack_again()
 
@@ -252,6 +265,17 @@ class Prefiltered(StatefulController):
     def limits(self) -> Limits:
         """Limits of the control signal."""
         return self.controller.limits
+
+    def set_limits(
+        self,
+        *,
+        u_min: float | None = None,
+        u_max: float | None = None,
+        rate_limit: RateLimit | None = None,
+    ) -> None:
+        """Change limits while running, see ``ADRC.set_limits``."""
+        self.controller.set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
+        self._take_parameters()
 
     @property
     def features(self) -> tuple[str, ...]:

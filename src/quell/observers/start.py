@@ -1,0 +1,29 @@
+"""The running state of an observer for given estimates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from quell.observers.cascade import CascadeModel
+from quell.observers.delay import DelayedModel
+from quell.types import Vector
+
+
+def state_for(model: Any, x: Vector, f: float, u: float) -> Vector:
+    """Return the running state whose estimates are ``x`` (n,) and ``f``, after a constant ``u``.
+
+    All levels of a cascade have the same x, and the first one has f; the others estimate what the
+    levels before them miss.
+    """
+    if isinstance(model, DelayedModel):
+        inner = state_for(model.inner, x, f, u)
+        return np.append(inner, np.full(model.samples, u))
+    z = np.zeros(model.states)
+    z[: x.size], z[x.size] = x, f
+    if isinstance(model, CascadeModel):
+        for level in range(1, model.gains.shape[0]):
+            start = level * (x.size + 1)
+            z[start : start + x.size] = x
+    return z
