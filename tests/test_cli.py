@@ -181,6 +181,78 @@ def test_an_old_result_outlives_a_run_that_fails(
     assert (tmp_path / "keep.json").read_text() == "old"
 
 
+EXISTING = [
+    ("reproduce two-mass", "position.svg"),
+    ("reproduce torsional", "torsional-control.png"),
+    ("reproduce acc", "acc-spread.png"),
+    ("stress", "stress.png"),
+    ("compare", "compare.svg"),
+    ("run setup.toml", "setup.png"),
+    ("run-rig --device twin:torsional", "timing.svg"),
+    ("replay run.csv", "run-replayed.png"),
+    ("identify data.csv", "identified.png"),
+]
+
+
+@pytest.mark.parametrize(("command", "figure"), EXISTING, ids=lambda text: text.partition(".")[0])
+def test_no_command_replaces_a_file_unless_asked(
+    command: str, figure: str, quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """It refuses before the work, in one line."""
+    from quell.setup import EXAMPLES
+
+    (tmp_path / "setup.toml").write_text((EXAMPLES / "two_mass.toml").read_text())
+    (tmp_path / "data.csv").write_text("t,u,y\n" + "".join(f"{i},0,{i % 2}\n" for i in range(99)))
+    (tmp_path / "pictures").mkdir()
+    old = [tmp_path / "out.json", tmp_path / "pictures" / figure]
+    for path in old:
+        path.write_text("precious")
+    for place in ("--json out.json", "--figures pictures"):
+        shown = quell(*command.split(), *place.split())
+        assert (shown.code, shown.out) == (2, "")
+        assert (
+            "the file exists; choose another name, or ask to replace it (--overwrite" in shown.err
+        )
+        assert len(shown.err.splitlines()) == 1
+    assert [path.read_text() for path in old] == ["precious"] * 2
+    assert len(list((tmp_path / "pictures").iterdir())) == 1
+    assert not (tmp_path / "quell-figures").exists()
+
+
+def test_two_outputs_have_two_files(quell: Callable[..., Shown], tmp_path: Path) -> None:
+    """Otherwise the second would replace the first."""
+    from quell.setup import EXAMPLES
+
+    (tmp_path / "setup.toml").write_text((EXAMPLES / "two_mass.toml").read_text())
+    shown = quell("run", "setup.toml", "--json", "out", "--save", "out")
+    assert shown.code == 2
+    assert "out': must be a file for one output, is for two" in shown.err
+
+
+def test_a_command_can_be_run_twice_and_replaces_where_asked(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """Figures get a folder with a number; other files want --overwrite."""
+    rows = "".join(f"{i},{(i // 7) % 2},{(i // 7) % 2}\n" for i in range(200))
+    (tmp_path / "data.csv").write_text("t,u,y\n" + rows)
+    identify = ("identify", "data.csv", "--order", "1", "--integrators", "0", "--json", "out.json")
+    first = quell(*identify)
+    assert first.code == 0, first.err
+    assert "in quell-figures/" in first.out
+    assert quell(*identify).code == 2
+    second = quell(*identify, "--overwrite")
+    assert second.code == 0, second.err
+    assert "in quell-figures-2/" in second.out
+    for folder in ("quell-figures", "quell-figures-2"):
+        assert (tmp_path / folder / "identified.png").stat().st_size > 1000
+    assert quell("excite", "u.csv").code == 0
+    old = (tmp_path / "u.csv").read_bytes()
+    assert "the file exists" in quell("excite", "u.csv", "--seed", "1").err
+    assert (tmp_path / "u.csv").read_bytes() == old
+    assert quell("excite", "u.csv", "--seed", "1", "--overwrite").code == 0
+    assert (tmp_path / "u.csv").read_bytes() != old
+
+
 def test_importing_quell_imports_nothing_heavy() -> None:
     """Numba, scipy, xarray, matplotlib and python-control come when they are used."""
     code = "import sys, quell; print([m for m in ('numba', 'scipy', 'xarray', 'matplotlib', 'control', 'numpy') if m in sys.modules])"

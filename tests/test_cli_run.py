@@ -257,8 +257,8 @@ def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_pat
     twice = quell("run-rig", "rig.toml", "--mcap", "run.mcap")
     assert (twice.code, twice.err) == (
         2,
-        "quell: path = 'run.mcap': the file exists; recordings are not overwritten: move it, or "
-        "choose another name\n",
+        "quell: path = 'run.mcap': the file exists; choose another name, or ask to replace it "
+        "(--overwrite on the command line, overwrite=True in Python)\n",
     )
 
 

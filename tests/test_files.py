@@ -7,7 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from quell.files import nonfinite_to_none, write_json, written_atomically
+from quell.files import (
+    check_writable,
+    new_folder,
+    nonfinite_to_none,
+    write_json,
+    written_atomically,
+)
 from quell.reading import csv_rows, whole_text
 
 
@@ -15,13 +21,70 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     """A failure leaves the old file and no other."""
     path = tmp_path / "file.txt"
     path.write_text("old")
-    with pytest.raises(ZeroDivisionError), written_atomically(path) as part:
+    with pytest.raises(ZeroDivisionError), written_atomically(path, overwrite=True) as part:
         part.write_text(f"new {1 / 0}")
     assert [p.name for p in tmp_path.iterdir()] == ["file.txt"]
     assert path.read_text() == "old"
-    with written_atomically(path) as part:
+    with written_atomically(path, overwrite=True) as part:
         part.write_text("new")
     assert path.read_text() == "new"
+    with written_atomically(tmp_path / "other.txt") as part:
+        part.write_text("other")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file.txt", "other.txt"]
+    assert (tmp_path / "other.txt").read_text() == "other"
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_no_file_is_replaced_unless_asked(
+    links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither one that is there before, nor one that comes meanwhile; on any file system."""
+
+    def no_link(part: Path, target: Path) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    if not links:
+        monkeypatch.setattr("quell.files.os.link", no_link)
+    path = tmp_path / "file.txt"
+    writing = written_atomically(path)
+    writing.__enter__().write_text("new")
+    path.write_text("came meanwhile")
+    with pytest.raises(ValueError, match="the file exists; choose another name, or ask"):
+        writing.__exit__(None, None, None)
+    (tmp_path / "link.txt").symlink_to("nothing.txt")
+    for name in ("file.txt", "link.txt"):
+        with pytest.raises(ValueError, match=f"path = .*{name}.: the file exists"):
+            check_writable(tmp_path / name)
+        with pytest.raises(ValueError, match="the file exists"):
+            write_json(tmp_path / name, {})
+    assert path.read_text() == "came meanwhile"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file.txt", "link.txt"]
+    with written_atomically(tmp_path / "free.txt") as part:
+        part.write_text("new")
+    assert (tmp_path / "free.txt").read_text() == "new"
+    write_json(path, {}, overwrite=True)
+    assert path.read_text() == "{}\n"
+
+
+def test_a_device_is_not_replaced_by_a_file() -> None:
+    """Where root could, too."""
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match="path = '/dev/null': "):
+            write_json("/dev/null", {}, overwrite)
+    assert Path("/dev/null").is_char_device()
+
+
+def test_a_new_folder_gets_the_first_name_that_is_free(tmp_path: Path) -> None:
+    """An empty one is free, and a file is not."""
+    names = []
+    for _ in range(3):
+        folder = new_folder(tmp_path / "figures")
+        (folder / "one.png").touch()
+        names.append(folder.name)
+    (tmp_path / "figures-4").touch()
+    (tmp_path / "figures-5").mkdir()
+    names.append(new_folder(tmp_path / "figures").name)
+    assert names == ["figures", "figures-2", "figures-3", "figures-5"]
 
 
 def test_json_has_no_numbers_that_are_not_finite(tmp_path: Path) -> None:

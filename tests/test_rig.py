@@ -130,6 +130,18 @@ def test_a_rig_goes_on_without_its_log_where_the_disk_is_full() -> None:
     assert "the log was given up: No space left on device" in notes
 
 
+def test_a_rig_replaces_a_log_only_where_asked(tmp_path: Path) -> None:
+    """As all outputs."""
+    log = tmp_path / "log.csv"
+    log.write_text("precious")
+    with closing(listen(url_of("shm"))) as listener:
+        with pytest.raises(ValueError, match="log.csv': the file exists; choose another name"):
+            Rig(PLANT, DT, listener, log=log)
+        assert log.read_text() == "precious"
+        Rig(PLANT, DT, listener, log=log, overwrite=True).close()
+    assert log.read_text().startswith("tick,t,")
+
+
 def test_a_rig_does_not_hide_what_went_wrong_on_its_thread(
     bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -379,8 +379,9 @@ def test_a_sink_that_does_not_end_is_given_up_and_the_others_are_complete(tmp_pa
     [
         (lambda folder: CsvSink(folder / "no" / "run.csv"), "folder .* must exist"),
         (lambda folder: McapSink(folder / "no" / "run.mcap"), "folder .* must exist"),
-        (lambda folder: CsvSink(folder / "old.csv"), "recordings are not overwritten"),
-        (lambda folder: McapSink(folder / "old.mcap"), "recordings are not overwritten"),
+        (lambda folder: CsvSink(folder / "old.csv"), "the file exists; choose another name"),
+        (lambda folder: McapSink(folder / "old.mcap"), "the file exists; choose another name"),
+        (lambda folder: CsvSink(folder / "new.csv"), "new.csv.json': the file exists"),
         (lambda folder: McapSink(folder), "must be a file"),
     ],
 )
@@ -390,13 +391,29 @@ def test_what_can_not_be_written_is_refused_before_the_loop_starts(
     """One line says why; sinks that were open already are closed."""
     for suffix in ("csv", "mcap"):
         (tmp_path / f"old.{suffix}").write_text("precious")
+    (tmp_path / "new.csv.json").write_text("precious")
     first = CsvSink(tmp_path / "first.csv")
     telemetry = TelemetryWriter(NARROW, [first, make(tmp_path)])
     with pytest.raises(ValueError, match=rule) as refused:
         telemetry.start()
     assert "\n" not in str(refused.value)
     assert first._file is None
-    assert (tmp_path / "old.csv").read_text() == "precious"
+    for name in ("old.csv", "old.mcap", "new.csv.json"):
+        assert (tmp_path / name).read_text() == "precious"
+
+
+def test_a_recording_is_replaced_where_asked_for_and_never_what_a_link_points_to(
+    tmp_path: Path,
+) -> None:
+    """The link itself becomes the file."""
+    (tmp_path / "precious").write_text("precious")
+    for suffix in ("csv", "mcap"):
+        path = tmp_path / f"run.{suffix}"
+        path.symlink_to("precious")
+        for count in (300, 200):
+            recorded(NARROW, counted(count), file_sink(path, overwrite=True))
+            assert len(load(path)) == count
+    assert (tmp_path / "precious").read_text() == "precious"
 
 
 def test_other_suffixes_and_long_periods_are_refused() -> None:

@@ -215,6 +215,9 @@ def test_the_record_becomes_a_labelled_dataset(run: ql.Trajectory) -> None:
 def test_a_saved_record_is_loaded_back_whole(run: ql.Trajectory, tmp_path: Path) -> None:
     """All channels, names, times and the status."""
     run.save(tmp_path / "run.nc")
+    with pytest.raises(ValueError, match="run.nc': the file exists; choose another name"):
+        run.save(tmp_path / "run.nc")
+    run.save(tmp_path / "run.nc", overwrite=True)
     again = ql.Trajectory.load(tmp_path / "run.nc")
     assert again.names == run.names
     for name in run.names:

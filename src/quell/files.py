@@ -1,7 +1,12 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and replace no other file unless asked to.
+
+The rule of all outputs: an existing file is replaced only where the caller asks for it, with
+``overwrite=True`` or ``--overwrite``, and that is checked before the work begins.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -12,36 +17,66 @@ from pathlib import Path
 from typing import Any
 
 
-def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check that ``written_atomically`` can write ``path``; a file there is not changed."""
+def check_writable(path: str | os.PathLike[str], overwrite: bool = False) -> None:
+    """Check that ``written_atomically`` can write ``path``; a file there is not changed.
+
+    Raises
+    ------
+    ValueError
+        if the file exists and is not to be replaced, or can't be written.
+    """
+    check_free(path, overwrite)
     _new_file_beside(Path(path)).unlink()
 
 
-def check_new_file(path: Path) -> None:
-    """Check that a recording can be written to ``path``."""
-    if path.exists() and not path.is_dir():
+def check_free(path: str | os.PathLike[str], overwrite: bool = False) -> None:
+    """Check that no file would be replaced, or only a regular one that may be."""
+    target = Path(path)
+    if target.is_dir() or not os.path.lexists(target):
+        return
+    if not overwrite:
         raise ValueError(
-            f"path = {str(path)!r}: the file exists; recordings are not overwritten: "
-            "move it, or choose another name"
+            f"path = {str(target)!r}: the file exists; choose another name, or ask to replace it "
+            "(--overwrite on the command line, overwrite=True in Python)"
         )
-    check_writable(path)
+    if target.exists() and not target.is_file():
+        raise ValueError(f"path = {str(target)!r}: must be a file, is a device or a pipe")
 
 
 @contextmanager
-def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a path to write to; at the end it replaces ``path``, or is removed after an error."""
+def written_atomically(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
+    """Yield a path to write to; at the end it becomes ``path``, or is removed after an error.
+
+    A ``ValueError`` says that ``path`` exists and is not to be replaced, also if it came into being
+    meanwhile.
+    """
     target = Path(path)
+    check_free(target, overwrite)
     part = _new_file_beside(target)
     try:
         yield part
-        part.replace(target)
+        if overwrite:
+            part.replace(target)
+        else:
+            _link(part, target)
     finally:
         part.unlink(missing_ok=True)
 
 
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
+def new_folder(path: str | os.PathLike[str]) -> Path:
+    """Create and return the first of ``path``, ``path-2``, ``path-3`` … that holds no file."""
+    first = Path(path)
+    for number in itertools.count(1):
+        folder = first if number == 1 else first.with_name(f"{first.name}-{number}")
+        if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
+            folder.mkdir(parents=True, exist_ok=True)
+            return folder
+    raise AssertionError
+
+
+def write_json(path: str | os.PathLike[str], value: Any, overwrite: bool = False) -> None:
     """Write dictionaries, lists, strings and finite numbers to a JSON file, whole or not at all."""
-    with written_atomically(path) as part:
+    with written_atomically(path, overwrite) as part:
         text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
         part.write_text(text + "\n", encoding="utf-8")
 
@@ -53,6 +88,17 @@ def nonfinite_to_none(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [nonfinite_to_none(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _link(part: Path, target: Path) -> None:
+    """Give a file its name, unless a file has it already."""
+    try:
+        os.link(part, target)
+    except FileExistsError:
+        check_free(target)
+    except OSError:  # a file system without hard links
+        check_free(target)
+        part.replace(target)
 
 
 def _new_file_beside(target: Path) -> Path:

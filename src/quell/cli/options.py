@@ -26,6 +26,12 @@ MaxSize = Annotated[
     Parameter(name="--max-size", help="Limit of what the file that is read may unpack to [MB]."),
 ]
 Switch = Annotated[bool, Parameter(negative="")]
+Overwrite = Annotated[
+    bool, Parameter(negative="", help="Replace files that exist; they are refused otherwise.")
+]
+
+FIGURES = Path("quell-figures")
+"""Folder for figures if none is named; if it holds files, it gets a number."""
 
 
 @Parameter(name="*")
@@ -38,11 +44,13 @@ class Outputs:
     json
         Write all results and settings to this file, for programs.
     figures
-        Put the figures into this folder, as PNG and SVG.
+        Put the figures into this folder, as PNG and SVG; by default into quell-figures, or
+        quell-figures-2 and so on if that holds files.
     """
 
     json: Annotated[Path | None, Parameter(name="--json")] = None
-    figures: Annotated[Path | None, Parameter(negative_none="no-")] = Path("quell-figures")
+    figures: Annotated[Path | None, Parameter(negative_none="no-", show_default=False)] = FIGURES
+    overwrite: Overwrite = False
 
 
 @Parameter(name="*")
@@ -55,7 +63,8 @@ class RunOutputs(Outputs):
     json
         Write metrics, events and settings to this file, for programs.
     figures
-        Put the figures into this folder, as PNG and SVG.
+        Put the figures into this folder, as PNG and SVG; by default into quell-figures, or
+        quell-figures-2 and so on if that holds files.
     save
         Write the whole record to this file, which `Trajectory.load` reads.
     """

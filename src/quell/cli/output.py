@@ -5,15 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from quell.cli.options import Outputs, RunOutputs
+from quell.cli.options import FIGURES, Outputs, RunOutputs
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from quell.plants import Plant
     from quell.records.trajectory import Trajectory
     from quell.types import Progress as ProgressCallback
+
+T = TypeVar("T", bound=Outputs)
 
 COMPILING = "simulating (the first run compiles for some seconds)"
 """Label of a progress bar until the first samples are done."""
@@ -70,19 +73,32 @@ def print_line(console: Console, text: str) -> None:
     console.print(escape(text), soft_wrap=True)
 
 
-def check_outputs(outputs: Outputs) -> None:
+def check_outputs(outputs: T, figures: Sequence[str], recordings: Sequence[Path] = ()) -> T:
     """Check, before the work is done, that the results can be written; create the figures' folder.
 
-    Raises a ``ValueError`` for a file that cannot be written, or a folder that cannot be created.
-    """
-    from quell.experiments.common.figures import make_folder
-    from quell.files import check_writable
+    Return the outputs with the folder for the figures, whose names are given. ``recordings`` are
+    further files, which somebody else checks.
 
-    for file in (outputs.json, outputs.save if isinstance(outputs, RunOutputs) else None):
-        if file is not None:
-            check_writable(file)
-    if outputs.figures is not None:
-        make_folder(outputs.figures)
+    Raises
+    ------
+    ValueError
+        for a file that exists, unless ``outputs.overwrite``; that cannot be written; or that two
+        outputs have in common; or a folder that cannot be created.
+    """
+    from quell.experiments.common.figures import figure_files, make_folder
+    from quell.files import check_writable, new_folder
+
+    named = (outputs.json, outputs.save if isinstance(outputs, RunOutputs) else None)
+    files = [file for file in named if file is not None]
+    if outputs.figures is not None and outputs.figures is not FIGURES:
+        files += figure_files(make_folder(outputs.figures), figures)
+    for file in files:
+        check_writable(file, outputs.overwrite)
+    places = [file.absolute() for file in (*files, *recordings)]
+    for file in places:
+        if places.count(file) > 1:
+            raise ValueError(f"path = {str(file)!r}: must be a file for one output, is for two")
+    return replace(outputs, figures=new_folder(FIGURES)) if outputs.figures is FIGURES else outputs
 
 
 def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -> None:
@@ -118,11 +134,11 @@ def progress_bar(
         yield lambda what, share: bar.update(task, description=what, completed=share)
 
 
-def write_record(console: Console, run: Trajectory, path: Path | None, name: str) -> None:
+def write_record(console: Console, run: Trajectory, outputs: RunOutputs, name: str) -> None:
     """Write a record where that is asked for, and print where it is."""
-    if path is not None and len(run):
-        run.save(path)
-        print_line(console, f"{name}: {path}")
+    if outputs.save is not None and len(run):
+        run.save(outputs.save, outputs.overwrite)
+        print_line(console, f"{name}: {outputs.save}")
 
 
 def write_results(
@@ -136,5 +152,5 @@ def write_results(
         noun = "Figures" if len(names) > 1 else "Figure"
         print_line(console, f"{noun}: {', '.join(names)} (PNG and SVG) in {outputs.figures}/")
     if outputs.json is not None:
-        write_json(outputs.json, results)
+        write_json(outputs.json, results, outputs.overwrite)
         print_line(console, f"Results: {outputs.json}")

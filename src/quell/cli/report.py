@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.markup import escape
 
+from quell.cli.options import Outputs
 from quell.cli.output import Column, print_line, table
 from quell.records.measures import MEASURES, STEP_MEASURES
 from quell.records.metrics import SETTLING_BAND
@@ -128,11 +129,13 @@ def print_outcome(console: Console, run: Trajectory) -> dict[str, float]:
 def save_run_figure(
     run: Trajectory,
     title: str,
-    folder: Path,
+    outputs: Outputs,
     name: str,
     add: Callable[[Trajectory, Any], None] | None = None,
 ) -> list[Path]:
     """Save a run's figure, with what ``add`` draws into its axes; return the paths of the files."""
+    if outputs.figures is None:
+        return []
     import matplotlib.pyplot as plt
 
     from quell.experiments.common.figures import save_figure
@@ -143,6 +146,6 @@ def save_run_figure(
     if add is not None:
         add(run, axes)
     try:
-        return save_figure(figure, folder, name)
+        return save_figure(figure, outputs.figures, name, outputs.overwrite)
     finally:
         plt.close(figure)

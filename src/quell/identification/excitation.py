@@ -60,17 +60,17 @@ class Excitation:
 
     __str__ = describe
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write ``t,u`` as CSV, completely or not at all.
 
         Raises
         ------
         ValueError
-            if the file can't be written.
+            if the file can't be written, or exists and ``overwrite`` is False.
         """
         samples = zip(self.t.tolist(), self.u.tolist(), strict=True)
         rows = "".join(f"{t:.9g},{u:.9g}\n" for t, u in samples)
-        with written_atomically(path) as part:
+        with written_atomically(path, overwrite) as part:
             part.write_text("t,u\n" + rows, encoding="utf-8")
 
 

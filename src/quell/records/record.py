@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quell import checks
-from quell.files import written_atomically
+from quell.files import check_writable, written_atomically
 from quell.records.channels import columns_of, describe, is_vector, readable_names
 from quell.records.sample_times import first_sample_at
 from quell.types import Channels, Matrix, Vector
@@ -53,10 +53,14 @@ class Record:
         """Return an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
         raise NotImplementedError
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the record to a NetCDF file, whole or not at all; ``load`` reads it."""
+    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Write the record to a NetCDF file, whole or not at all; ``load`` reads it.
+
+        A ``ValueError`` says that the file exists, unless ``overwrite`` allows to replace it.
+        """
+        check_writable(path, overwrite)
         dataset = self.to_xarray()
-        with written_atomically(path) as part:
+        with written_atomically(path, overwrite) as part:
             dataset.to_netcdf(part, engine="h5netcdf")
 
     def _dataset(self, axes: tuple[str, ...], attributes: dict[str, Any]) -> xarray.Dataset:

@@ -152,5 +152,5 @@ Scenario = call_table("scenario", SimulationScenario, only=True, types=_SIGNALS)
 Metrics = call_table("metrics", Trajectory.metrics, only=True)
 Safety = call_table("safety", RigSafety, only=True)
 _RIG = {"safety": Safety | None, "telemetry": list_of(str)}
-_NO_KEYS = ("duration", "on_change")
+_NO_KEYS = ("duration", "on_change", "overwrite")
 Rig = call_table("rig", rig, only=True, forwards_to=(run_rig,), types=_RIG, without=_NO_KEYS)

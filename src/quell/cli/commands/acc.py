@@ -56,7 +56,7 @@ def acc(
         raise ValueError(f"--samples reads plants, {others}: give one or the other")
     else:
         plants, source = plant_samples.read(samples, max_size), samples.name
-    check_outputs(outputs)
+    outputs = check_outputs(outputs, figures.NAMES)
     console = Console()
     with console.status("Compiling what is not in the cache: about 20 seconds, once."):
         for controller in designs(DT).values():
@@ -64,7 +64,9 @@ def acc(
                 study.judge_sampled(controller, plants[:1], cubic)
     with progress_bar(console, width=28) as report:
         result = study.run(plants, source, report)
-        paths = figures.save(result, outputs.figures, report) if outputs.figures else []
+        paths = []
+        if outputs.figures:
+            paths = figures.save(result, outputs.figures, report, outputs.overwrite)
     _print_rates(console, result, DT)
     _print_cases(console, result)
     write_results(console, result.to_json(), outputs, paths)

@@ -69,12 +69,12 @@ def compare(
         known = ", ".join(benchmark.NAMES)
         raise ValueError(f"controllers = {controllers!r}: must be names with commas, of {known}")
     stable = {name: _is_stable(benchmark.controller(name, dt, u_max), settings) for name in names}
-    check_outputs(outputs)
+    outputs = check_outputs(outputs, ["compare"])
     console = Console()
     with progress_bar(console, COMPILING) as report:
         result = benchmark.two_mass(settings, names, partial(report, COMPILING))
     _print(console, result, settings, stable)
-    paths = figures.save(result, outputs.figures) if outputs.figures else []
+    paths = figures.save(result, outputs.figures, outputs.overwrite) if outputs.figures else []
     about = {"m1": m1, "m2": m2, "k": k, "dt": dt, "seed": seed}
     limit = {} if u_max == inf else {"u_max": u_max}
     results = result.to_json()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from quell.cli.options import Whole
+from quell.cli.options import Overwrite, Whole
 from quell.cli.output import print_line
 
 
@@ -21,6 +21,7 @@ def excite(
     u_min: float = -1.0,
     u_max: float = 1.0,
     seed: Whole = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Design an input that excites a band within limits, for quell identify, and write it as CSV.
 
@@ -48,9 +49,9 @@ def excite(
     from quell.files import check_writable
     from quell.identification import excitation
 
-    check_writable(out)
+    check_writable(out, overwrite)
     design = excitation(kind, (low, high), duration, dt, u_min, u_max, seed=seed)
-    design.save(out)
+    design.save(out, overwrite)
     console = Console()
     print_line(console, design.describe())
     print_line(console, f"Samples: {out}, {design.u.size} of t,u")

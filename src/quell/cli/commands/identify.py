@@ -74,23 +74,23 @@ def identify(
     delays = delay if max_delay is None else (delay, max_delay)
     options: dict[str, Any] = {"friction": friction, "held_out": held_out, "horizon": horizon}
     options |= {"delay": delays, "integrators": integrators, "reference": record.reference}
-    check_outputs(outputs)
+    outputs = check_outputs(outputs, ["identified"])
     console = Console()
     with console.status("Searching; the first time, code is compiled for some seconds."):
         model = identify(record.u, record.y, record.dt, order, zeros, **options)
     _print(console, model, data.name)
-    paths = _save_figure(model, outputs.figures) if outputs.figures else []
+    paths = _save_figure(model, outputs.figures, outputs.overwrite) if outputs.figures else []
     write_results(console, model.to_json(), outputs, paths)
 
 
-def _save_figure(model: Identified, folder: Path) -> list[Path]:
+def _save_figure(model: Identified, folder: Path, overwrite: bool) -> list[Path]:
     import matplotlib.pyplot as plt
 
     from quell.experiments.common.figures import save_figure
 
     figure = model.plot()[0].figure
     try:
-        return save_figure(figure, folder, "identified")
+        return save_figure(figure, folder, "identified", overwrite)
     finally:
         plt.close(figure)
 

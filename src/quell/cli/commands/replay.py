@@ -44,7 +44,8 @@ def replay(
     from quell.setup.errors import with_path
 
     given = load(setup or EXAMPLES / "torsional_rig.toml")
-    check_outputs(outputs)
+    name = f"{record.stem}-replayed"
+    outputs = check_outputs(outputs, [name])
     recorded = load_record(record, max_size)
     try:  # replay refuses a controller that is no ADRC
         replayed = replay_record(recorded, cast(ADRC, given.controller))
@@ -65,11 +66,8 @@ def replay(
         "samples under control."
     )
     learned = print_outcome(console, replayed)
-    paths = []
-    if outputs.figures:
-        name = f"{record.stem}-replayed"
-        paths = save_run_figure(replayed, given.title, outputs.figures, name, _draw_wished)
-    write_record(console, replayed, outputs.save, "Replay")
+    paths = save_run_figure(replayed, given.title, outputs, name, _draw_wished)
+    write_record(console, replayed, outputs, "Replay")
     results = {
         "record": str(record),
         "title": given.title,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from quell.cli.interrupt import exit_on_signal
-from quell.cli.options import Whole, WholeOrNone
+from quell.cli.options import Overwrite, Whole, WholeOrNone
 from quell.realtime.devices.registry import examples
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def rig(
     wait: float = 0.0,
     seconds: float | None = None,
     log: Path | None = None,
+    overwrite: Overwrite = False,
     priority: Whole = 50,
     cpu: WholeOrNone = None,
 ) -> None:
@@ -85,6 +86,7 @@ def rig(
         "rest": rest,
         "log": log,
         "wait": wait,
+        "overwrite": overwrite,
     }
     with closing(listen(device)) as listener, Rig(model, dt, listener=listener, **limits) as server:
         with exit_on_signal(listener.close):  # compiling may take a minute the first time

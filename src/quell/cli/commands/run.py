@@ -45,7 +45,7 @@ def run(
     ]
     if late:
         raise SetupError(late)
-    check_outputs(outputs)
+    outputs = check_outputs(outputs, [setup.stem])
     console = Console()
     with progress_bar(console, COMPILING) as report:
         progress = partial(report, COMPILING)
@@ -56,10 +56,8 @@ def run(
     scores = windowed_metrics(result, given)
     print_metrics(console, f"{given.title}: {result.plant}, dt = {result.dt:g} s", scores)
     learned = print_outcome(console, result)
-    paths = []
-    if outputs.figures:
-        paths = save_run_figure(result, given.title, outputs.figures, setup.stem)
-    write_record(console, result, outputs.save, "Record")
+    paths = save_run_figure(result, given.title, outputs, setup.stem)
+    write_record(console, result, outputs, "Record")
     results = {
         "title": given.title,
         "plant": result.plant,

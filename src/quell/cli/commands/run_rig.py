@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -107,10 +107,10 @@ def _run(
     name, data = read(file)
     setup = made(name, _changed(data, changes))
     scenario, options = setup.needed("scenario"), dict(setup.needed("rig"))
-    check_outputs(outputs)
     files = [*map(Path, options.pop("telemetry", ())), *files]
-    for path in files:
-        check_recording(path)
+    check_recordings(files, outputs.overwrite)
+    outputs = check_outputs(outputs, [Path(name).stem, "timing"], files)
+    options["overwrite"] = outputs.overwrite
     (port, origins), live = viewers, options.pop("live")
     port = live if port is None else port
     url, dt = options.pop("device"), setup.controller.dt
@@ -129,9 +129,9 @@ def _run(
     learned = print_outcome(console, record)
     paths = []
     if outputs.figures and len(record):
-        paths = save_run_figure(record, setup.title, outputs.figures, Path(name).stem)
-        paths += _save_timing_figure(run, setup, outputs.figures)
-    write_record(console, record, outputs.save, "Record")
+        paths = save_run_figure(record, setup.title, outputs, Path(name).stem)
+        paths += _save_timing_figure(run, setup, outputs.figures, outputs.overwrite)
+    write_record(console, record, outputs, "Record")
     code = exit_code(run)
     results = {
         "title": setup.title,
@@ -191,13 +191,12 @@ def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) ->
     return tables
 
 
-def check_recording(file: Path) -> None:
-    """Check suffix and place of a recording, before the device is opened."""
-    from quell.files import check_new_file
+def check_recordings(files: Iterable[Path], overwrite: bool) -> None:
+    """Check suffixes and places of recordings, before the device is opened."""
     from quell.realtime.telemetry.sinks import file_sink
 
-    file_sink(file)
-    check_new_file(file)
+    for file in files:
+        file_sink(file, overwrite).check()
 
 
 def exit_code(run: RigRun) -> int:
@@ -232,7 +231,7 @@ def _counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
 
 
-def _save_timing_figure(run: RigRun, setup: Setup, folder: Path) -> list[Path]:
+def _save_timing_figure(run: RigRun, setup: Setup, folder: Path, overwrite: bool) -> list[Path]:
     import matplotlib.pyplot as plt
 
     from quell.experiments.common.figures import save_figure
@@ -243,7 +242,7 @@ def _save_timing_figure(run: RigRun, setup: Setup, folder: Path) -> list[Path]:
     axes.legend()
     axes.set_title(f"{setup.title}: {run.tally.cycles} cycles, {run.overruns} overruns")
     try:
-        return save_figure(figure, folder, "timing")
+        return save_figure(figure, folder, "timing", overwrite)
     finally:
         plt.close(figure)
 

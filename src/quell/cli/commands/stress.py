@@ -47,7 +47,7 @@ def stress(
     from quell.experiments.stress import figures, study
     from quell.guard import Guard
 
-    check_outputs(outputs)
+    outputs = check_outputs(outputs, ["stress"])
     console = Console()
     first = "simulating (the first run compiles for half a minute)"
     columns = (TextColumn("{task.percentage:>3.0f} %"), TimeRemainingColumn())
@@ -55,7 +55,7 @@ def stress(
         used, progress = Guard() if guard else None, partial(report, "simulating")
         result = study.run(runs, honest, seed, guard=used, progress=progress)
     _print(console, result, guard)
-    paths = figures.save(result, outputs.figures) if outputs.figures else []
+    paths = figures.save(result, outputs.figures, outputs.overwrite) if outputs.figures else []
     write_results(console, result.to_json(), outputs, paths)
 
 

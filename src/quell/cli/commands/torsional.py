@@ -44,14 +44,16 @@ def torsional(*, dt: float = 1e-3, seed: Whole = 0, outputs: Outputs = OUTPUTS) 
     from quell.experiments.torsional import figures, setup, study
 
     settings = setup.Settings(dt=dt, seed=seed)
-    check_outputs(outputs)
+    outputs = check_outputs(outputs, figures.NAMES)
     console = Console()
     controllers = setup.controllers(settings, *setup.CASES[0]).values()
     plants = [setup.plant(kind) for kind in setup.PLANTS]
     compile_loops(console, list(product(plants, controllers)))
     with progress_bar(console, width=15) as report:
         result = study.run(settings, report)
-        paths = figures.save(result, outputs.figures, report) if outputs.figures else []
+        paths = []
+        if outputs.figures:
+            paths = figures.save(result, outputs.figures, report, outputs.overwrite)
     about = f"dt = {dt:g} s, medians of {setup.STARTS} starts, seed {seed}"
     for case in result.cases:
         _print_scores(console, case, about)

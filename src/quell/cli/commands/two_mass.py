@@ -60,12 +60,14 @@ def two_mass(
         controllers = setup.controllers(settings)
     except ValueError as error:
         raise ValueError(f"{error} (the study goes up to 3 times omega_o)") from None
-    check_outputs(outputs)
+    outputs = check_outputs(outputs, figures.NAMES)
     console = Console()
     compile_loops(console, [(two_mass_spring(), each) for each in controllers.values()])
     with progress_bar(console, width=15) as report:
         result = study.run(settings, report)
-        paths = figures.save(result, outputs.figures, report) if outputs.figures else []
+        paths = []
+        if outputs.figures:
+            paths = figures.save(result, outputs.figures, report, outputs.overwrite)
     _print_claims(console, result)
     _print_scores(console, result)
     write_results(console, result.to_json(), outputs, paths)

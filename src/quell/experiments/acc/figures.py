@@ -24,15 +24,21 @@ _COUNT, _RESPONSES = 200, 200
 
 Rates = Mapping[str, Mapping[str, Sequence[tuple[float, float, float]]]]
 
+NAMES = ("acc-failures", "acc-responses", "acc-spread")
+"""Names of the figures."""
 
-def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
+
+def save(
+    result: Result, folder: str | os.PathLike[str], progress: Progress, overwrite: bool = False
+) -> list[Path]:
     """Draw the figures into ``folder``, created if missing; return the paths."""
-    drawings: dict[str, Callable[[], Any]] = {
-        "acc-failures": partial(_failures, result),
-        "acc-responses": partial(_responses, result.samples[:_RESPONSES]),
-        "acc-spread": lambda: _spread(against_spread(progress)),
-    }
-    return save_figures(drawings, folder, progress)
+    drawings: tuple[Callable[[], Any], ...] = (
+        partial(_failures, result),
+        partial(_responses, result.samples[:_RESPONSES]),
+        lambda: _spread(against_spread(progress)),
+    )
+    named = dict(zip(NAMES, drawings, strict=True))
+    return save_figures(named, folder, progress, overwrite=overwrite)
 
 
 def against_spread(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from quell.files import written_atomically
+from quell.files import check_free, written_atomically
 from quell.records.trajectory import Trajectory
 from quell.types import Progress
 
@@ -58,17 +58,25 @@ def make_folder(folder: str | os.PathLike[str]) -> Path:
     return path
 
 
-def save_figure(figure: Any, folder: str | os.PathLike[str], name: str) -> list[Path]:
+def figure_files(folder: str | os.PathLike[str], names: Iterable[str]) -> list[Path]:
+    """Return the files of figures with these names."""
+    return [Path(folder) / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
+
+
+def save_figure(
+    figure: Any, folder: str | os.PathLike[str], name: str, overwrite: bool = False
+) -> list[Path]:
     """Write a figure into ``folder`` as PNG and SVG; return the paths."""
     import matplotlib
 
-    place, written = make_folder(folder), []
+    written = figure_files(make_folder(folder), [name])
+    for path in written:
+        check_free(path, overwrite)
     with matplotlib.rc_context({"svg.hashsalt": "quell"}):
-        for suffix in ("png", "svg"):
-            path = place / f"{name}.{suffix}"
-            with written_atomically(path) as part:
-                figure.savefig(part, dpi=130, metadata={"Date": None} if suffix == "svg" else None)
-            written.append(path)
+        for path in written:
+            with written_atomically(path, overwrite) as part:
+                about = {"Date": None} if path.suffix == ".svg" else None
+                figure.savefig(part, dpi=130, metadata=about)
     return written
 
 
@@ -77,19 +85,22 @@ def save_figures(
     folder: str | os.PathLike[str],
     progress: Progress | None = None,
     style: Any = None,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Draw figures and write each as PNG and SVG; return the paths.
 
     ``drawings`` has a function that returns a figure for each name of a file, ``style`` settings of
-    matplotlib.
+    matplotlib. Nothing is drawn if a file exists, unless ``overwrite`` allows to replace it.
     """
     import matplotlib
 
+    for path in figure_files(folder, drawings):
+        check_free(path, overwrite)
     report = progress or (lambda part, share: None)
     written = []
     with matplotlib.rc_context(style):
         for i, (name, draw) in enumerate(drawings.items()):
             report("figures", i / len(drawings))
-            written += save_figure(draw(), folder, name)
+            written += save_figure(draw(), folder, name, overwrite)
     report("figures", 1.0)
     return written

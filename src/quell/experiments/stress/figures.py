@@ -34,6 +34,6 @@ def draw(result: Result) -> Any:
     return figure
 
 
-def save(result: Result, folder: str | os.PathLike[str]) -> list[Path]:
+def save(result: Result, folder: str | os.PathLike[str], overwrite: bool = False) -> list[Path]:
     """Write the figure into ``folder``, created if missing; return the paths."""
-    return save_figures({"stress": partial(draw, result)}, folder)
+    return save_figures({"stress": partial(draw, result)}, folder, overwrite=overwrite)

@@ -52,15 +52,21 @@ _NEAR = 100.0 * 4.0 * BAND
 # Time over which f is averaged [s]: chosen by hand.
 _SMOOTHED = 0.02
 
+NAMES = ("torsional-position", "torsional-control", "torsional-learning")
+"""Names of the figures."""
 
-def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
+
+def save(
+    result: Result, folder: str | os.PathLike[str], progress: Progress, overwrite: bool = False
+) -> list[Path]:
     """Draw all figures into ``folder``, created if missing; return the paths."""
-    drawings = {
-        "torsional-position": partial(_position, result),
-        "torsional-control": partial(_control, result),
-        "torsional-learning": partial(_learning, result.cases[-1]),
-    }
-    return save_figures(drawings, folder, progress, PAPER_STYLE)
+    drawings = (
+        partial(_position, result),
+        partial(_control, result),
+        partial(_learning, result.cases[-1]),
+    )
+    named = dict(zip(NAMES, drawings, strict=True))
+    return save_figures(named, folder, progress, PAPER_STYLE, overwrite)
 
 
 def _position(result: Result) -> Any:

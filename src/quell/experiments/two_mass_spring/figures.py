@@ -38,16 +38,22 @@ _STYLES: Mapping[str, dict[str, Any]] = {
 # = 1, b0 = b).
 _TRUE_THETA = {"x1": 0.0, "x2": 0.0, "x3": -2.0, "x4": 0.0}
 
+NAMES = ("position", "control", "learning", "algorithm-1")
+"""Names of the figures."""
 
-def save(result: Result, folder: str | os.PathLike[str], progress: Progress) -> list[Path]:
+
+def save(
+    result: Result, folder: str | os.PathLike[str], progress: Progress, overwrite: bool = False
+) -> list[Path]:
     """Draw all figures into ``folder``, created if missing; return the paths."""
-    drawings = {
-        "position": partial(_comparison, result, "y", "position of m2 [m]"),
-        "control": partial(_comparison, result, "u", "control force [N]"),
-        "learning": partial(_learning, result),
-        "algorithm-1": partial(_algorithm_1, result),
-    }
-    return save_figures(drawings, folder, progress, PAPER_STYLE)
+    drawings = (
+        partial(_comparison, result, "y", "position of m2 [m]"),
+        partial(_comparison, result, "u", "control force [N]"),
+        partial(_learning, result),
+        partial(_algorithm_1, result),
+    )
+    named = dict(zip(NAMES, drawings, strict=True))
+    return save_figures(named, folder, progress, PAPER_STYLE, overwrite)
 
 
 def _comparison(result: Result, channel: str, label: str) -> Any:

@@ -62,6 +62,7 @@ def run_rig(
     priority: int = 50,  # the middle of the range; chosen by hand
     cpu: int | None = None,
     on_change: Callable[[ModeChange], None] | None = None,
+    overwrite: bool = False,
 ) -> RigRun:
     """Close a controller's loop around a device in real time, at the controller's sample time.
 
@@ -101,6 +102,8 @@ def run_rig(
         number of the processor for the loop; any by default.
     on_change
         called with each change of the supervisor's mode, soon after it, in this thread.
+    overwrite
+        whether files of ``telemetry`` that exist are replaced; they are refused otherwise.
 
     Raises
     ------
@@ -124,7 +127,9 @@ def run_rig(
         reference = reference_samples(scenario, dt, derivatives, approach)
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
         memory = MemorySink()
-        writer = TelemetryWriter(_header(device, controller), [memory, *_sinks(telemetry)])
+        writer = TelemetryWriter(
+            _header(device, controller), [memory, *_sinks(telemetry, overwrite)]
+        )
         if isinstance(handle, PythonHandle):
             device.read()  # an error of the driver comes before compiling
         loop = ControlLoop.of(device, controller, reference, rules, system_clock(spin), writer.ring)
@@ -168,10 +173,19 @@ def _header(device: Device, controller: Controller) -> Header:
     )
 
 
-def _sinks(telemetry: Sequence[str | PathLike[str] | Sink]) -> list[Sink]:
+def _sinks(telemetry: Sequence[str | PathLike[str] | Sink], overwrite: bool) -> list[Sink]:
+    """Return the sinks; those for files are checked, because compiling may take a minute."""
     if isinstance(telemetry, str | PathLike):
         raise ValueError(f"telemetry = {str(telemetry)!r}: must be a list of files and sinks")
-    return [file_sink(entry) if isinstance(entry, str | PathLike) else entry for entry in telemetry]
+    sinks: list[Sink] = []
+    for entry in telemetry:
+        if isinstance(entry, str | PathLike):
+            file = file_sink(entry, overwrite)
+            file.check()
+            sinks.append(file)
+        else:
+            sinks.append(entry)
+    return sinks
 
 
 def _run_thread(

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
+from quell.files import check_writable
 from quell.kernels.dispatch import dispatcher_for
 from quell.plants.base import Plant, check_plant
 from quell.realtime.devices.base import Listener
@@ -68,8 +69,9 @@ class Rig:
     x0
         the plant's state at the start (n,); zero by default.
     log
-        CSV file for y, u, command and state of each tick (``quell.realtime.rig.kernel.LOG``); an
-        existing file is overwritten.
+        CSV file for y, u, command and state of each tick (``quell.realtime.rig.kernel.LOG``).
+    overwrite
+        whether a log that exists is replaced; it is refused otherwise.
 
     Raises
     ------
@@ -89,6 +91,7 @@ class Rig:
         wait: float = 0.0,
         x0: ArrayLike | None = None,
         log: str | Path | None = None,
+        overwrite: bool = False,
     ) -> None:
         check_plant(plant)
         dt = checks.positive("dt", dt, "s")
@@ -128,7 +131,7 @@ class Rig:
             lateness=empty_counts(),
             stop=np.zeros(1, dtype=np.int64),
         )
-        self._file = None if log is None else _opened(log)
+        self._file = None if log is None else _opened(log, overwrite)
         self._log_failure = ""
         self._clock = system_clock()
         self._open = True
@@ -299,10 +302,15 @@ def checked_seconds(name: str, seconds: float) -> float:
     return seconds
 
 
-def _opened(path: str | Path) -> TextIO:
-    """Return the open log, with its header written."""
+def _opened(path: str | Path, overwrite: bool) -> TextIO:
+    """Return the open log, with its header written; a device like /dev/null may be one, too."""
+    target = Path(path)
+    if target.is_file():
+        check_writable(target, overwrite)
     try:
-        file = Path(path).open("w", encoding="utf-8", newline="")  # noqa: SIM115  closed by Rig
+        if target.is_file():
+            target.unlink()
+        file = target.open("w" if target.exists() else "x", encoding="utf-8", newline="")
     except OSError as error:
         raise ValueError(f"log = {str(path)!r}: can't be written ({error.strerror})") from None
     file.write(",".join(kernels.LOG) + "\n")

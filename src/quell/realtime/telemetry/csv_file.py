@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from quell.files import check_new_file, written_atomically
+from quell.files import check_writable, written_atomically
 from quell.reading import byte_lines, check_size, whole_text
 from quell.realtime.telemetry.channels import K
 from quell.realtime.telemetry.header import Header
@@ -26,19 +26,28 @@ _BLOCK = 100_000
 
 
 class CsvSink:
-    """Write rows to a new CSV file ``path``, which grows as they come."""
+    """Write rows to a CSV file ``path``, which grows as they come, and a header beside it.
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+    Files that exist are refused, or replaced if ``overwrite`` is True.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        self.path, self.overwrite = Path(path), overwrite
         self.name = str(self.path)
         self._file: BinaryIO | None = None
         self._dt = 0.0
         self._first = True
 
+    def check(self) -> None:
+        """Raise a ``ValueError`` if a file can't be written or may not be replaced."""
+        for path in (self.path, header_path(self.path)):
+            check_writable(path, self.overwrite)
+
     def open(self, header: Header) -> None:
         """Write the line of names, and the header beside the file."""
-        check_new_file(self.path)
-        with written_atomically(header_path(self.path)) as part:
+        self.check()
+        self.path.unlink(missing_ok=True)
+        with written_atomically(header_path(self.path), self.overwrite) as part:
             part.write_text(header.to_json() + "\n", encoding="utf-8")
         self._dt, self._first = header.dt, True
         self._file = self.path.open("xb")

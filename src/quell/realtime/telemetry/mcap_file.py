@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from quell.files import check_new_file
+from quell.files import check_writable
 from quell.optional import import_extra
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.ros_message import log_rows, open_topic
@@ -66,19 +66,27 @@ class _File:
 
 
 class McapSink:
-    """Write rows to a new MCAP file ``path``, which grows as they come."""
+    """Write rows to an MCAP file ``path``, which grows as they come.
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+    A file that exists is refused, or replaced if ``overwrite`` is True.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        self.path, self.overwrite = Path(path), overwrite
         self.name = str(self.path)
         self._writer: Any = None
         self._flushed = 0.0
+
+    def check(self) -> None:
+        """Raise a ``ValueError`` if the file can't be written or may not be replaced."""
+        check_writable(self.path, self.overwrite)
 
     def open(self, header: Header) -> None:
         """Begin the file; the header is on disk at once."""
         foxglove = import_extra("foxglove", "telemetry", "an MCAP file")
         mcap = import_extra("foxglove.mcap", "telemetry", "an MCAP file")
-        check_new_file(self.path)
+        self.check()
+        self.path.unlink(missing_ok=True)
         self._header = header
         self._context = foxglove.Context()  # kept: a topic is closed with it
         self._file = _File(self.path)

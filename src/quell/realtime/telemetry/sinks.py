@@ -65,10 +65,10 @@ class MemorySink:
         return trajectory_of(self._header, rows)
 
 
-def file_sink(path: str | os.PathLike[str]) -> Sink:
+def file_sink(path: str | os.PathLike[str], overwrite: bool = False) -> CsvSink | McapSink:
     """Return the sink for a file by its suffix, ``.csv`` or ``.mcap``."""
     kinds: dict[str, type[CsvSink | McapSink]] = {".csv": CsvSink, ".mcap": McapSink}
     suffix = Path(path).suffix.lower()
     if suffix not in kinds:
         raise ValueError(f"path = {os.fspath(path)!r}: must end in {' or '.join(kinds)}")
-    return kinds[suffix](path)
+    return kinds[suffix](path, overwrite)
