@@ -202,7 +202,9 @@ def test_no_command_replaces_a_file_unless_asked(
     from quell.setup import EXAMPLES
 
     (tmp_path / "setup.toml").write_text((EXAMPLES / "two_mass.toml").read_text())
-    (tmp_path / "data.csv").write_text("t,u,y\n" + "".join(f"{i},0,{i % 2}\n" for i in range(99)))
+    (tmp_path / "data.csv").write_text(
+        "t,u,y\n" + "".join(f"{0.1 * i:.1f},0,{i % 2}\n" for i in range(99))
+    )
     (tmp_path / "pictures").mkdir()
     old = [tmp_path / "out.json", tmp_path / "pictures" / figure]
     for path in old:
@@ -233,7 +235,7 @@ def test_a_command_can_be_run_twice_and_replaces_where_asked(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
     """Figures get a folder with a number; other files want --overwrite."""
-    rows = "".join(f"{i},{(i // 7) % 2},{(i // 7) % 2}\n" for i in range(200))
+    rows = "".join(f"{0.1 * i:.1f},{(i // 7) % 2},{(i // 7) % 2}\n" for i in range(200))
     (tmp_path / "data.csv").write_text("t,u,y\n" + rows)
     identify = ("identify", "data.csv", "--order", "1", "--integrators", "0", "--json", "out.json")
     first = quell(*identify)

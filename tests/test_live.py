@@ -50,7 +50,8 @@ def counted(count: int) -> Matrix:
 
 async def _watch(url: str, wanted: int, begin: Any) -> tuple[list[dict[str, Any]], list[bytes]]:
     """Subscribe as a Foxglove viewer does, call ``begin``; return greetings and messages."""
-    async with websockets.connect(url, subprotocols=["foxglove.sdk.v1"]) as socket:  # type: ignore[list-item]
+    protocols: Any = ["foxglove.sdk.v1"]
+    async with websockets.connect(url, subprotocols=protocols, open_timeout=60.0) as socket:
         greetings: list[dict[str, Any]] = [json.loads(await socket.recv()) for _ in range(2)]
         await socket.send(SUBSCRIBE)
         messages: list[bytes] = []

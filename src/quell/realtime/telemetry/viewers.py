@@ -184,6 +184,8 @@ async def run(rows: socket.socket, listening: Iterable[socket.socket]) -> None:
         "server_header": None,
     }
     servers = [await serve(viewers.serve, sock=each, **options) for each in listening]
+    with suppress(OSError):
+        os.nice(5)  # the loop's process comes first
     with suppress(asyncio.IncompleteReadError, ConnectionError):
         while True:
             viewers.offer(await _frame(reader))
@@ -205,8 +207,6 @@ async def _frame(reader: asyncio.StreamReader) -> bytes:
 def main() -> None:
     """Serve until the loop's process closes the socket; write nothing to its terminal."""
     logging.disable()
-    with suppress(OSError):
-        os.nice(5)  # the loop's process comes first
     rows = socket.socket(fileno=os.dup(0))
     asyncio.run(run(rows, [socket.socket(fileno=int(number)) for number in sys.argv[1:]]))
     os._exit(0)  # a connection that does not end must not keep the process
