@@ -182,6 +182,46 @@ def test_the_limit_follows_the_size_of_what_is_asked_for() -> None:
     assert ql.simulate(plant, law, ql.Scenario(reference=2e6, duration=10.0), limit=1e6).diverged
 
 
+def test_a_plant_that_varies_in_time_gets_the_time_of_each_sample(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """``x' = t`` gives ``t²/2``, within a block of samples and over its end; Runge-Kutta is exact there."""
+    monkeypatch.setattr(sampled_scenario, "_SEGMENT", 7)
+    plant = ql.plants.NonlinearPlant(lambda t, x, u, w: (t,), order=1)
+    law = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=1.0, dt=0.5), omega_c=1.0)
+    run = ql.simulate(plant, law, ql.Scenario(duration=10.0), interpret=True)
+    np.testing.assert_allclose(run["y"], 0.5 * run.t**2, rtol=1e-12)
+
+
+def test_an_output_that_is_no_number_ends_the_run_at_its_sample() -> None:
+    """``√(0.2 − t)`` from 0.3 s on; what is recorded is finite, and the end is that sample's time."""
+    plant = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: (1.0,), order=1, output=lambda x: np.sqrt(0.25 - x[0])
+    )
+    law = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=1.0, dt=0.1), omega_c=1.0)
+    run = ql.simulate(plant, law, ql.Scenario(duration=1.0), interpret=True)
+    assert run.diverged
+    assert (len(run), run.ended) == (3, pytest.approx(0.3))
+    assert np.all(np.isfinite(run.log))
+
+
+class Gap(ql.signals.Signal):
+    """A sensor that fails for one sample."""
+
+    def evaluate(self, t: np.ndarray) -> np.ndarray:
+        """NaN at 0.5 s."""
+        return np.where(np.abs(t - 0.5) < 1e-9, np.nan, 0.0)
+
+
+def test_a_measurement_that_is_no_number_does_not_end_the_run() -> None:
+    """The record shows it, the status reports it, and u goes on."""
+    run = ql.simulate(PLANT, controller(), ql.Scenario(1.0, duration=1.0, noise=Gap()))
+    assert run.status == ql.Status.MEASUREMENT_HELD
+    assert np.flatnonzero(np.isnan(run["y_measured"])).tolist() == [100]
+    assert np.all(np.isfinite(run["u"]))
+    assert len(run) == 201
+
+
 def test_the_status_of_a_run_has_what_any_step_reported() -> None:
     """Also of samples that were not recorded."""
     law = controller(u_min=-0.1, u_max=0.1)
