@@ -194,7 +194,7 @@ def test_a_plant_that_varies_in_time_gets_the_time_of_each_sample(
 
 
 def test_an_output_that_is_no_number_ends_the_run_at_its_sample() -> None:
-    """``√(0.2 − t)`` from 0.3 s on; what is recorded is finite, and the end is that sample's time."""
+    """``√(0.25 − t)`` from 0.3 s on; what is recorded is finite, and the end is that sample's time."""
     plant = ql.plants.NonlinearPlant(
         lambda t, x, u, w: (1.0,), order=1, output=lambda x: np.sqrt(0.25 - x[0])
     )
