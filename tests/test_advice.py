@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -242,3 +243,84 @@ def test_a_wish_that_can_not_be_met_is_said_in_a_line() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             ql.omega_c_for(*arguments)
+
+
+CHAIN = ([1.0], [1.0, 0.0, 0.0])
+
+
+@pytest.mark.filterwarnings("ignore::quell.DesignWarning")
+@pytest.mark.parametrize(
+    ("plant", "poor", "advice", "better"),
+    [
+        (CHAIN, {"b0": -1.0}, "b = 1 and b0 = -1 differ in sign: correct b0", {}),
+        (([5.0], CHAIN[1]), {}, "b/b0 = 5: take b0 = 5,", {"b0": 5.0}),
+        (([0.02], CHAIN[1]), {}, "b/b0 = 0.02: take b0 = 0.02,", {"b0": 0.02}),
+        (
+            ([1.0], [1.0, 1.0, 0.0]),
+            {"order": 1},
+            "u reaches the derivative 2 of y first, and the observer assumes 1: take an observer of "
+            "order 2,",
+            {"order": 2},
+        ),
+        (
+            CHAIN,
+            {"dt": 1.0},
+            "sample faster, or lower omega_o and omega_c together",
+            {"dt": 1.0, "omega_o": 1.0, "omega_c": 0.2},
+        ),
+        (CHAIN, {"delay": 0.2}, ": lower omega_c", {"delay": 0.2, "omega_c": 1.25}),
+        (
+            ([1.0], [1.0, -30.0]),
+            {"order": 1},
+            "raise omega_o (noise permitting): the plant itself is unstable",
+            {"order": 1, "omega_o": 90.0},
+        ),
+        (
+            ([1.0], [1.0, 0.0, 0.0, 0.0, 0.0]),
+            {"order": 4, "omega_c": 6.5, "dt": 1e-3},
+            "raise omega_o (noise permitting) or lower omega_c",
+            {"order": 4, "omega_c": 2.0, "dt": 1e-3},
+        ),
+    ],
+)
+def test_what_is_advised_helps(
+    plant: Any, poor: dict[str, Any], advice: str, better: dict[str, Any]
+) -> None:
+    """A loop that is lost or nearly so gets the advice of its cause, and with it nothing is found but the sampling."""
+
+    def found(**changes: Any) -> list[analysis.Finding]:
+        design = {"order": 2, "b0": 1.0, "omega_o": 20.0, "dt": 0.01} | changes
+        omega_c = design.pop("omega_c", 4.0)
+        return analysis.advise(ql.ADRC(ql.ESO.model_free(**design), omega_c), plant, delay=0.0)
+
+    worst = found(**poor)[-1]
+    assert worst.subject in ("stability", "margin")
+    assert advice in str(worst)
+    assert found(**better) == []
+
+
+def test_advice_to_a_linear_controller_does_not_speak_of_observers() -> None:
+    """It has gains."""
+    (finding,) = analysis.advise(ql.baselines.PID(-0.5, dt=0.01), ([1.0], [1.0, 0.0]))
+    assert str(finding).endswith(": change its gains")
+    late = analysis.advise(ql.baselines.PID(2.0, dt=0.01), ([1.0], [1.0, 0.0]), delay=1.0)
+    assert str(late[-1]).endswith("shorten it, or lower its gains")
+
+
+def test_a_known_delay_is_not_advised_to_be_made_known() -> None:
+    """And times from a second on are said in seconds."""
+    for known, hint in ((0.0, True), (2.0, False)):
+        observer = ql.ESO.model_free(order=1, b0=1.0, omega_o=4.0, dt=0.1, delay=known)
+        controller = ql.ADRC(observer, omega_c=0.2)
+        finding = analysis.advise(controller, ([1.0], [1.0, 0.0]), delay=2.0)[-1]
+        assert ("let the observer know of the delay" in str(finding)) is hint
+        assert "a delay of 2 s" in str(finding)
+
+
+def test_the_summary_of_a_loop_that_needs_no_phase_margin_says_so() -> None:
+    """There are no infinite degrees and no times that are not numbers."""
+    loop = analysis.analyse(([1e-9], [1.0, 1.0]), ql.baselines.PID(0.5, dt=0.01))
+    assert "no limit of the phase: the gain is never 1" in loop.summary()
+    assert "delay margin infinite" in loop.summary()
+    assert "nan" not in loop.summary()
+    assert loop.margins.phase == math.inf

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.loop import LoopAnalysis, analyse
+from quell.analysis.loop import LoopAnalysis, analyse, duration
+from quell.analysis.pure_delays import eigenvalues
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
-from quell.controllers.design_checks import Finding, sampling_findings
+from quell.controllers.design_checks import Finding, known_samples, sampling_findings
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
 
@@ -19,6 +20,11 @@ from quell.plants.linear import LinearPlant
 _NOISE = 0.05
 # Between loops of four integrators with omega_o = 10 omega_c, 0.41, and with 3 omega_c, 0.24.
 _LEAST_MODULUS = 0.3
+# Factor between b and b0 from which on b0 is blamed for too little margin. Chosen by hand: a factor
+# of 2 takes a chain of four integrators with omega_o = 10 omega_c from 0.41 to 0.08 or less.
+_WRONG_GAIN = 1.3
+# A plant with a pole beyond is unstable; integrators, to rounding of coinciding ones, are not.
+_RUNS_AWAY = 1.0 + 1e-5
 # Share of the modulus margin that a lag must leave. Chosen by hand.
 _LAG_LEAVES = 0.8
 
@@ -71,13 +77,12 @@ def advise(
     options = {"at": at, "operating_point": operating_point}
     loop = analyse(plant, controller, delay=known_delay, **options)
     if not loop.stable:
-        what_to_do = "check b0, raise omega_o or lower omega_c"
-        return [*found, _unstable(loop, "with this plant", what_to_do)]
-    found += _judge_margin(loop, observer)
+        return [*found, _unstable(loop, "with this plant", _remedy(loop, controller, found))]
+    found += _judge_margin(loop, controller, found)
     if actuator_lag > 0.0 or delay > 0.0:
         lags: dict[str, Any] = {"delay": known_delay + delay, "actuator_lag": actuator_lag}
         late = analyse(plant, controller, **lags, **options)
-        found += _judge_lag(loop, late, actuator_lag, delay)
+        found += _judge_lag(loop, late, actuator_lag, delay, observer)
         loop = late
     if noise_std is not None and loop.stable:
         found += _judge_noise(loop, controller, checks.non_negative("noise_std", noise_std))
@@ -90,8 +95,7 @@ def _assumed_plant(observer: ESO) -> tuple[LinearPlant, float]:
     A = np.diag(np.ones(observer.order - 1), 1)
     A[-1] = -known.a
     B, C = known.B * (observer.b0 / known.b), np.eye(observer.order)[0]
-    delay = observer.dt * getattr(observer.model, "samples", 0)
-    return LinearPlant(A, B, C, known.E[:, None]), delay
+    return LinearPlant(A, B, C, known.E[:, None]), observer.dt * known_samples(observer)
 
 
 def _unstable(loop: LoopAnalysis, when: str, what_to_do: str) -> Finding:
@@ -100,31 +104,64 @@ def _unstable(loop: LoopAnalysis, when: str, what_to_do: str) -> Finding:
     return Finding("stability", size, 1.0, message)
 
 
-def _judge_margin(loop: LoopAnalysis, observer: ESO | None) -> list[Finding]:
+def _remedy(loop: LoopAnalysis, controller: Controller, found: list[Finding]) -> str:
+    """Return what to do about a loop with too little margin or none."""
+    if not isinstance(controller, ADRC):
+        return "change its gains"
+    observer, ratio = controller.observer, loop.b_over_b0
+    if ratio is None and loop.plant.b:
+        ((reached, _),) = loop.plant.b.items()
+        return (
+            f"u reaches the derivative {reached} of y first, and the observer assumes "
+            f"{observer.degree}: take an observer of order {reached}, or lower omega_o and omega_c "
+            "together"
+        )
+    if ratio is not None and ratio < 0.0:
+        b = ratio * observer.b0
+        return f"the plant's gain b = {b:.3g} and b0 = {observer.b0:.3g} differ in sign: correct b0"
+    if ratio is not None and not 1.0 / _WRONG_GAIN <= ratio <= _WRONG_GAIN:
+        return f"b/b0 = {ratio:.3g}: take b0 = {ratio * observer.b0:.3g}, or identify the plant"
+    subjects = [finding.subject for finding in found]
+    if "sampling" in subjects:
+        return "sample faster, or lower omega_o and omega_c together"
+    if "lag" in subjects:
+        return "lower omega_c"
+    if np.any(np.abs(1.0 + eigenvalues(loop.plant.N)) > _RUNS_AWAY):
+        return "raise omega_o (noise permitting): the plant itself is unstable"
+    return "raise omega_o (noise permitting) or lower omega_c"
+
+
+def _judge_margin(
+    loop: LoopAnalysis, controller: Controller, found: list[Finding]
+) -> list[Finding]:
     margins = loop.margins
     if margins.modulus >= _LEAST_MODULUS:
         return []
-    what_to_do = "detune it"
-    if observer is not None:
-        what_to_do = "raise omega_o (noise permitting) or lower omega_c"
     message = (
         f"modulus margin {margins.modulus:.3g} is below {_LEAST_MODULUS:g} "
         f"(phase margin {margins.phase:.1f}°, worst at {margins.modulus_omega:.3g} rad/s): "
-        f"{what_to_do}"
+        f"{_remedy(loop, controller, found)}"
     )
     return [Finding("margin", margins.modulus, _LEAST_MODULUS, message)]
 
 
 def _judge_lag(
-    loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, delay: float
+    loop: LoopAnalysis,
+    late: LoopAnalysis,
+    actuator_lag: float,
+    delay: float,
+    observer: ESO | None,
 ) -> list[Finding]:
     parts = (("an actuator lag", actuator_lag), ("a delay", delay))
-    cause = " and ".join(f"{what} of {1e3 * time:.3g} ms" for what, time in parts if time > 0.0)
+    cause = " and ".join(f"{what} of {duration(time)}" for what, time in parts if time > 0.0)
+    shorter = "shorten it"
+    if observer is not None and delay > 0.0 and known_samples(observer) == 0:
+        shorter += ", let the observer know of the delay"
     before, after = loop.margins, late.margins
     if not late.stable:
-        margin = f"its delay margin is {1e3 * before.delay:.3g} ms"
-        what_to_do = "shorten it, or lower omega_o and omega_c together"
-        return [_unstable(late, f"with {cause}", f"{margin}; {what_to_do}")]
+        margin = f"its delay margin is {duration(before.delay)}"
+        what_to_do = f"{margin}; {shorter}, or {_slower(observer)}"
+        return [_unstable(late, f"with {cause}", what_to_do)]
     if after.modulus >= _LAG_LEAVES * before.modulus:
         return []
     # Without a crossover the phase margin is infinite, and there is no angle to lose.
@@ -134,9 +171,13 @@ def _judge_lag(
     message = (
         f"{cause}{angle} leaves a phase margin of {after.phase:.1f}° of {before.phase:.1f}°, "
         f"a modulus margin of {after.modulus:.3g} of {before.modulus:.3g}: "
-        "shorten it, let the controller know of it, or lower omega_o and omega_c together"
+        f"{shorter}, or {_slower(observer)}"
     )
     return [Finding("lag", after.modulus, _LAG_LEAVES * before.modulus, message)]
+
+
+def _slower(observer: ESO | None) -> str:
+    return "lower its gains" if observer is None else "lower omega_o and omega_c together"
 
 
 def _judge_noise(loop: LoopAnalysis, controller: Controller, noise: float) -> list[Finding]:

@@ -116,10 +116,12 @@ class LoopAnalysis:
         m, (noise, peak) = self.margins, (self.noise_to_control, self.noise_to_control_peak)
         low, high = self.b_range
         what, unit = ("a gain", " times what it is") if self.b_over_b0 is None else ("b/b0", "")
+        phase = f"phase margin {m.phase:.1f}° at {m.phase_omega:.3g} rad/s"
+        if math.isinf(m.phase):
+            phase = "no limit of the phase: the gain is never 1"
         return (
-            f"gain margin {m.gain[0]:.3g} … {m.gain[1]:.3g}, "
-            f"phase margin {m.phase:.1f}° at {m.phase_omega:.3g} rad/s\n"
-            f"modulus margin {m.modulus:.3f}, delay margin {1e3 * m.delay:.3g} ms\n"
+            f"gain margin {m.gain[0]:.3g} … {m.gain[1]:.3g}, {phase}\n"
+            f"modulus margin {m.modulus:.3f}, delay margin {duration(m.delay)}\n"
             f"disk margin {m.disk:.3f}: gain {m.disk_gain[0]:.3g} … {m.disk_gain[1]:.3g} "
             f"or phase ±{m.disk_phase:.1f}°, or some of both\n"
             f"stable for {what} from {low:.3g} to {high:.3g}{unit}\n"
@@ -287,6 +289,13 @@ class LoopAnalysis:
         for order 4; that of the closed loop as one fraction to 1e-9, 1e-6, 3e-3 for orders 2 to 4.
         """
         return transfer_function(subsystem(self.plant, self.law, name), self.dt)
+
+
+def duration(time: float) -> str:
+    """Return a time as text, in ms or, from 1 s on, in s."""
+    if math.isinf(time):
+        return "infinite"
+    return f"{time:.3g} s" if time >= 1.0 else f"{1e3 * time:.3g} ms"
 
 
 def _h2_squared(system: System) -> float:

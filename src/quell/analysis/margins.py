@@ -42,7 +42,8 @@ class Margins(NamedTuple):
     """Margins of a loop, each with its frequency [rad/s] or NaN; zero for an unstable loop."""
 
     gain: tuple[float, float]
-    """Range of factors of the gain; (1, 1) for an unstable loop."""
+    """Range of factors of the gain; (1, 1) for an unstable loop. Factors below 1e-9 and above 1e9
+    are not searched, and count as 0 and as infinite."""
     gain_omega: tuple[float, float]
     phase: float
     """[degrees]; infinite if the gain is never 1."""

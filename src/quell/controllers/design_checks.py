@@ -40,6 +40,11 @@ class Finding(NamedTuple):
         return self.message
 
 
+def known_samples(observer: ESO) -> int:
+    """Return the delay of u that an observer knows [samples]."""
+    return int(getattr(observer.model, "samples", 0))
+
+
 def sampling_findings(observer: ESO, omega_c: float) -> list[Finding]:
     """Return the findings about the sample time and about a delay that the observer knows."""
     dt, form = observer.dt, observer.form
@@ -68,7 +73,7 @@ def sampling_findings(observer: ESO, omega_c: float) -> list[Finding]:
             f"or lower omega_c to {_LAW_LIMIT / dt:.3g} rad/s"
         )
         found.append(Finding("sampling", value, _LAW_LIMIT, message))
-    delay = dt * getattr(observer.model, "samples", 0)
+    delay = dt * known_samples(observer)
     value = observer.degree * omega_c * delay
     if value > _DELAY_LIMIT:
         message = (
