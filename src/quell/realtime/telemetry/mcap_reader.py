@@ -7,6 +7,7 @@ file for true, and expands a chunk to any size.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 from collections.abc import Iterator
@@ -53,27 +54,28 @@ def read_mcap(path: Path, most: int) -> tuple[Header, Matrix]:
     ours: set[int] = set()  # numbers of the channels that have the rows
     messages: list[bytes] = []
     blocks: list[Matrix] = []
-    for opcode, body in _records(path, most):
-        if opcode == _MESSAGE:
-            if int.from_bytes(body[:2], "little") in ours and len(body) >= _MESSAGE_START.size:
-                messages.append(body[_MESSAGE_START.size :])
-                if len(messages) == _BLOCK:
-                    blocks.append(_rows(messages))
-                    messages = []
-        elif opcode == _SCHEMA:
-            schema = _fields("Schema", body)
-            schemas[schema.id] = schema.name
-        elif opcode == _CHANNEL:
-            channel = _fields("Channel", body)
-            if (channel.topic, schemas.get(channel.schema_id)) == (TOPIC, SCHEMA):
-                ours.add(channel.id)
-            else:
-                ours.discard(channel.id)
-        elif opcode == _METADATA:
-            check_settings(len(body))
-            metadata = _fields("Metadata", body)
-            if metadata.name == RECORD:
-                header = Header.from_json(metadata.metadata.get("header", ""))
+    with contextlib.suppress(_DamagedError):  # all up to there is good
+        for opcode, body in _records(path, most):
+            if opcode == _MESSAGE:
+                if int.from_bytes(body[:2], "little") in ours and len(body) >= _MESSAGE_START.size:
+                    messages.append(body[_MESSAGE_START.size :])
+                    if len(messages) == _BLOCK:
+                        blocks.append(_rows(messages))
+                        messages = []
+            elif opcode == _SCHEMA:
+                schema = _fields("Schema", body)
+                schemas[schema.id] = schema.name
+            elif opcode == _CHANNEL:
+                channel = _fields("Channel", body)
+                if (channel.topic, schemas.get(channel.schema_id)) == (TOPIC, SCHEMA):
+                    ours.add(channel.id)
+                else:
+                    ours.discard(channel.id)
+            elif opcode == _METADATA:
+                check_settings(len(body))
+                metadata = _fields("Metadata", body)
+                if metadata.name == RECORD:
+                    header = Header.from_json(metadata.metadata.get("header", ""))
     if header is None:
         raise ValueError(f"it has no metadata record {RECORD!r}: it was not recorded by quell")
     blocks = [block for block in (*blocks, _rows(messages)) if block.size]
@@ -96,19 +98,16 @@ def _rows(messages: list[bytes]) -> Matrix:
 
 
 def _records(path: Path, most: int) -> Iterator[_Record]:
-    """Yield the records that matter, up to the file's end or the first that is damaged."""
+    """Yield the records that matter; a ``_DamagedError`` ends them."""
     size = 0
-    try:
-        with path.open("rb") as file:
-            file.seek(len(MAGIC))
-            for record in _top_level(file, os.fstat(file.fileno()).st_size, most):
-                in_chunk = record.opcode == _CHUNK
-                for each in _split(_expanded(record.body, most)) if in_chunk else (record,):
-                    size += max(len(each.body), _LEAST_RECORD)
-                    check_size(size, most)
-                    yield each
-    except _DamagedError:
-        return
+    with path.open("rb") as file:
+        file.seek(len(MAGIC))
+        for record in _top_level(file, os.fstat(file.fileno()).st_size, most):
+            in_chunk = record.opcode == _CHUNK
+            for each in _split(_expanded(record.body, most)) if in_chunk else (record,):
+                size += max(len(each.body), _LEAST_RECORD)
+                check_size(size, most)
+                yield each
 
 
 def _top_level(file: BinaryIO, end: int, most: int) -> Iterator[_Record]:
