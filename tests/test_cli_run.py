@@ -19,7 +19,8 @@ import quell as ql
 from quell.cli.commands.run_rig import exit_code
 from quell.cli.exit_codes import ExitCode
 from quell.cli.report import windowed_metrics
-from quell.realtime.loop.modes import Cause
+from quell.realtime.loop.modes import Cause, Mode
+from quell.realtime.loop.result import ModeChange, RigRun
 from quell.records.measures import MEASURES, STEP_MEASURES
 from quell.setup import EXAMPLES, load
 
@@ -174,6 +175,24 @@ def test_a_run_that_was_ended_at_a_rig_has_no_settling_time() -> None:
     assert all_of_it["settling_time"] == 0.2
     told = "no sample is in the window, they are 0.1 s apart"
     assert between["missing"] == dict.fromkeys(MEASURES, told)
+
+
+def test_a_window_after_the_end_of_a_rig_run_has_the_cause_of_the_end() -> None:
+    """Not only that there is no sample; for a run to its end the window itself is wrong."""
+    log = np.column_stack([np.ones(6), [0.0, 0.5, 1.0, 1.0, 1.0, 1.0], np.zeros(6)])
+    record = ql.Trajectory(log, (("r", 1), ("y", 1), ("u", 1)), dt=0.1, ended=0.5)
+    parts = dict.fromkeys(("record", "timing", "tally", "counters", "notes"))
+    ends = {
+        "went beyond most_error": (Mode.RAMP, Cause.TRACKING_ERROR),
+        "": (Mode.RAMP, Cause.COMPLETED),
+    }
+    for told, (mode, cause) in ends.items():
+        run = RigRun(trajectory=record, changes=(ModeChange(1.2, mode, cause),), **parts)  # type: ignore[arg-type]
+        assert run.metrics()["peak_error"] == 1.0
+        with pytest.raises(ValueError, match="the record ends at 0.5 s") as raised:
+            run.metrics(0.7)
+        assert told in str(raised.value)
+        assert ("ended early" in str(raised.value)) == bool(told)
 
 
 def test_all_exit_codes_are_in_one_table_that_help_shows(quell: Callable[..., Shown]) -> None:

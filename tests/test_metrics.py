@@ -85,6 +85,7 @@ def test_rise_time_takes_the_first_crossings_and_ties_are_crossings() -> None:
     assert metrics.rise_time(t, np.array([0.0, 0.2, 0.2, 0.05, 0.8, 1.0]), 1.0) == 4.0
     assert metrics.rise_time(t + 7.0, np.array([0.0, 0.2, 0.2, 0.05, 0.8, 1.0]), 1.0) == 4.0
     assert math.isnan(metrics.rise_time(t, np.full(6, 0.5), 1.0))
+    assert metrics.rise_time(t[:3] + 7.0, np.array([0.5, 0.7, 1.1]), 1.0) == pytest.approx(1.5)
 
 
 def test_integrals_of_few_samples_are_trapezoids() -> None:

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.plants.nonlinear import PythonNonlinear
 from quell.simulation import sampled_scenario
+from quell.simulation.integration import (
+    LARGEST_ERROR,
+    IntegrationCheck,
+    Samples,
+    chosen_samples,
+)
 
 PLANT = ql.plants.two_mass_spring()
 
@@ -127,6 +134,64 @@ def test_stiff_friction_that_is_not_resolved_is_reported() -> None:
     assert run.status == ql.Status.POORLY_INTEGRATED
     assert "too few sub-steps" in run.message
     assert interpreted_run(rub, substeps=600, seconds=0.003).status == ql.Status.OK
+
+
+def runge_kutta(z: float) -> float:
+    """What a classical Runge-Kutta step makes of ``x' = −λ x`` with ``h λ = z``."""
+    return 1.0 - z + z**2 / 2.0 - z**3 / 6.0 + z**4 / 24.0
+
+
+def mode_check(*, bad: float = 2.0) -> tuple[IntegrationCheck, Samples]:
+    """A check of ``x' = −bad x, z' = −z/10`` with steps of 1 s, and three samples of it."""
+    model = PythonNonlinear(lambda t, x, u, w: (-bad * x[0], -0.1 * x[1]), None, 1.0, 1)
+    x = np.array([[0.5, 3.0], [-4.0, 1.0], [1.0, 2.0]])
+    return IntegrationCheck(model, as_python=True), Samples(
+        np.arange(3.0), np.zeros(3), np.zeros((3, 0)), x
+    )
+
+
+def test_the_estimated_error_of_a_mode_is_the_difference_of_two_steps_and_one() -> None:
+    """As a share of the largest value; the number of sub-steps that is enough follows from it."""
+    check, samples = mode_check()
+    check.add(samples, all_of_them=True)
+    assert check.error == pytest.approx(abs(runge_kutta(2.0) - runge_kutta(1.0) ** 2))
+    assert check.poor
+    assert abs(runge_kutta(1.0) - runge_kutta(0.5) ** 2) < LARGEST_ERROR
+    assert check.enough == 2
+    worse, samples = mode_check(bad=3.0)
+    worse.add(samples, all_of_them=True)
+    assert worse.enough == 4
+    worse.add(Samples(*(part[:1] * 1e-3 for part in samples)), all_of_them=True)  # fine by then
+    assert worse.enough == 4
+    fine, samples = mode_check(bad=1.0)
+    fine.add(samples, all_of_them=True)
+    assert (fine.poor, fine.enough) == (False, 0)
+    assert fine.error == pytest.approx(abs(runge_kutta(1.0) - runge_kutta(0.5) ** 2))
+
+
+def test_samples_without_numbers_are_left_out_of_the_check() -> None:
+    """A state that y does not show may overflow first."""
+    check, samples = mode_check(bad=1.0)
+    samples.x[1, 0] = np.nan
+    check.add(samples, all_of_them=True)
+    assert 0.0 < check.error < LARGEST_ERROR
+    check, samples = mode_check()
+    samples.x[:] = np.inf
+    check.add(samples, all_of_them=True)
+    assert check.error == 0.0
+
+
+def test_samples_are_checked_all_over_a_segment_and_where_states_turn() -> None:
+    """Sixteen of each; a small state counts as much as a large one."""
+    x = np.zeros((1000, 2))
+    x[:, 0] = 1e6 * np.linspace(0.0, 1.0, 1000)
+    x[345, 1] = 1e-3  # its corners are at 344, 345 and 346
+    chosen = chosen_samples(x, np.max(np.abs(x), axis=0)).tolist()
+    assert {0, 999, 344, 345, 346} <= set(chosen)
+    assert 24 <= len(chosen) <= 32
+    assert max(np.diff(chosen)) < 1000 / 15 + 1
+    assert chosen_samples(x[:32], np.ones(2)) == slice(None)
+    assert len(chosen_samples(x[:33], np.ones(2))) <= 32
 
 
 def test_the_integration_is_checked_behind_a_delay_and_an_encoder() -> None:

@@ -99,7 +99,7 @@ class IntegrationCheck:
         if self._delay:  # the state ends with the values of u on their way, the oldest last
             u, x = x[:, -1], x[:, : self._size]
         scale = np.max(np.abs(x), axis=0)
-        chosen = slice(None) if all_of_them else _chosen(x, scale)
+        chosen = slice(None) if all_of_them else chosen_samples(x, scale)
         picked = Samples(*(np.ascontiguousarray(part[chosen]) for part in (t, u, w, x)))
         errors = self._errors(self.model, picked, scale)
         error, worst = float(np.max(errors)), int(np.argmax(errors))
@@ -131,7 +131,7 @@ class IntegrationCheck:
         return np.asarray(np.max(np.where(np.isfinite(share), share, 1.0), axis=1))
 
 
-def _chosen(x: Matrix, scale: Vector) -> Any:
+def chosen_samples(x: Matrix, scale: Vector) -> Any:
     """Return the indices of samples that are spread over a segment, or turn most sharply."""
     if len(x) <= _SPREAD + _SHARPEST:
         return slice(None)

@@ -100,6 +100,12 @@ def simulate(
     ValueError
         for arguments out of range, a plant that ``LinearPlant.of`` refuses, an x0 of the wrong
         size, more disturbances than the plant has inputs, or runs that do not fit into one batch.
+
+    Warns
+    -----
+    DesignWarning
+        if a nonlinear plant has too few sub-steps; the status then has ``POORLY_INTEGRATED``. A run
+        that diverged is repeated with enough of them, to find out whether they were the cause.
     """
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
