@@ -181,7 +181,7 @@ def test_a_window_after_the_end_of_a_rig_run_has_the_cause_of_the_end() -> None:
     """Not only that there is no sample; for a run to its end the window itself is wrong."""
     log = np.column_stack([np.ones(6), [0.0, 0.5, 1.0, 1.0, 1.0, 1.0], np.zeros(6)])
     record = ql.Trajectory(log, (("r", 1), ("y", 1), ("u", 1)), dt=0.1, ended=0.5)
-    parts = dict.fromkeys(("record", "timing", "tally", "counters", "notes"))
+    parts = dict.fromkeys(("record", "timing", "tally", "counters", "notes", "rules"))
     ends = {
         "went beyond most_error": (Mode.RAMP, Cause.TRACKING_ERROR),
         "": (Mode.RAMP, Cause.COMPLETED),
