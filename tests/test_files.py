@@ -99,7 +99,8 @@ def test_json_has_no_numbers_that_are_not_finite(tmp_path: Path) -> None:
 
 
 def test_rows_of_a_csv_file_have_the_numbers_of_its_lines() -> None:
-    """Empty lines count, and are left out."""
+    """Empty lines count, and are left out; a cell is one line."""
+    assert [*csv_rows(['"a\n', ' b",c\n'], "file")] == [(2, ["a b", "c"])]
     assert [*csv_rows(["a; b\n", "\n", " ;\n", "1;2\n"], "file", ";")] == [
         (1, ["a", "b"]),
         (4, ["1", "2"]),

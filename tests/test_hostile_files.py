@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import shutil
 import sys
+import time
+import warnings
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +28,7 @@ from quell.realtime.telemetry.load import load
 from quell.realtime.telemetry.ros_message import MARK, SCHEMA, TOPIC
 from quell.records import netcdf
 from quell.setup import load as load_setup
+from tests.mutations import mutated, write_seeds
 
 HEADER = Header(row_channels((("status", 1),)), dt=0.01)
 LOADERS: dict[str, Callable[..., Any]] = {
@@ -288,3 +293,34 @@ def test_long_lines_and_long_files_of_numbers_are_refused(tmp_path: Path) -> Non
     assert read_record(path).u.size == 20_000
     with pytest.raises(ValueError, match="data.csv.*unpacks to more than max_size = 0.5 MB"):
         read_record(path, max_size=0.5)
+
+
+def test_random_changes_of_files_are_read_or_refused_in_a_line(tmp_path: Path) -> None:
+    """A short version of ``benchmarks/mutated_files.py``, without processes and commands."""
+    valid = tmp_path / "valid"
+    valid.mkdir()
+    seeds, random_ = write_seeds(valid), random.Random(5)
+    readers: dict[str, Callable[..., Any]] = {
+        "recording in CSV": load,
+        "recording in MCAP": load,
+        "record": read_record,
+        "samples": read_samples,
+        "setup": load_setup,
+    }
+    began, results = time.monotonic(), Counter[bool]()
+    while time.monotonic() - began < 1.5 or sum(results.values()) < 20:
+        kind = random_.choice([*readers])
+        path = random_.choice(seeds[kind])
+        other = random_.choice(seeds["setup"]).read_bytes()
+        changed_ = tmp_path / path.name
+        changed_.write_bytes(mutated(path.read_bytes(), kind, other, random_))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                readers[kind](changed_)
+                results[True] += 1
+            except ValueError as error:
+                lines = getattr(error, "mistakes", (str(error),))
+                assert all(line and "\n" not in line for line in lines), lines
+                results[False] += 1
+    assert min(results[True], results[False]) > 0

@@ -142,7 +142,8 @@ def csv_rows(
     reader = csv.reader(lines, delimiter=delimiter)
     try:
         for row in reader:
-            cells = [cell.strip() for cell in row]
+            # A quoted cell may have line breaks, which no message should have.
+            cells = [" ".join(cell.split()) if "\n" in cell else cell.strip() for cell in row]
             if any(cells):
                 yield reader.line_num, cells
     except csv.Error as error:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import warnings
+from typing import Any
 
 from cyclopts import App, CycloptsError
 
@@ -38,6 +40,8 @@ for _each in (stress, compare, identify, excite, rig, run, run_rig, replay):
 
 def main() -> None:
     """Run the command line; print one line for each error of the user's, and exit with its code."""
+    format_before = warnings.formatwarning
+    warnings.formatwarning = _warning_line
     try:
         app()
     except (CycloptsError, ValueError, ImportError) as error:
@@ -53,6 +57,12 @@ def main() -> None:
     except KeyboardInterrupt:
         _print_error("interrupted")
         sys.exit(ExitCode.INTERRUPTED)
+    finally:
+        warnings.formatwarning = format_before
+
+
+def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:
+    return f"quell: warning: {' '.join(str(message).split())}\n"
 
 
 def _print_error(text: str) -> None:
