@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -71,6 +72,77 @@ def test_a_trapezoid_starts_and_ends_at_rest_and_covers_its_distance(
         np.max(np.abs(np.diff(speed)))
         <= 1.01 * abs(distance) / (duration - ramp) / ramp * (t[1] - t[0]) + 1e-9
     )
+
+
+@pytest.mark.parametrize("logarithmic", [False, True])
+def test_the_phase_of_a_chirp_is_the_integral_of_its_frequency(logarithmic: bool) -> None:
+    """Before its start, along the sweep, and beyond it, where the last frequency stays."""
+    chirp = s.Chirp(2.0, 0.5, 8.0, duration=4.0, start=1.0, logarithmic=logarithmic)
+    t = np.linspace(1.0, 7.0, 60_001)
+    phase = np.concatenate(
+        [[0.0], np.cumsum(0.5 * np.diff(t) * (chirp.omega(t)[1:] + chirp.omega(t)[:-1]))]
+    )
+    np.testing.assert_allclose(chirp(t), 2.0 * np.sin(phase), atol=1e-6)
+    assert chirp(0.3) == 0.0
+    middle = math.sqrt(0.5 * 8.0) if logarithmic else 0.5 * (0.5 + 8.0)
+    np.testing.assert_allclose(chirp.omega([0.0, 1.0, 3.0, 5.0, 9.0]), [0.5, 0.5, middle, 8.0, 8.0])
+    same = s.Chirp(2.0, 3.0, 3.0, duration=4.0, start=1.0, logarithmic=logarithmic)
+    np.testing.assert_allclose(same(t), 2.0 * np.sin(3.0 * (t - 1.0)), atol=1e-12)
+
+
+def test_moves_have_the_values_of_their_formulas() -> None:
+    """By hand: ramps of a third by default; 3σ² − 2σ³ and its derivatives for a smooth move."""
+    third = s.Trapezoid(distance=-4.0, duration=3.0, start=1.0)
+    np.testing.assert_allclose(
+        third(np.array([0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 9.0])),
+        [0.0, 0.0, -0.25, -1.0, -2.0, -3.0, -3.75, -4.0, -4.0],
+    )
+    triangle = s.Trapezoid(distance=2.0, duration=2.0, ramp_time=1.0)
+    np.testing.assert_allclose(triangle([0.5, 1.0, 1.5, 2.0]), [0.25, 1.0, 1.75, 2.0])
+    move, t = (
+        s.SmoothMove(distance=2.0, duration=4.0, smoothness=1, start=1.0),
+        np.array([1.5, 2.0, 4.5]),
+    )
+    sigma = (t - 1.0) / 4.0
+    np.testing.assert_allclose(move(t), 2.0 * (3.0 * sigma**2 - 2.0 * sigma**3))
+    speed = move.derivative()
+    np.testing.assert_allclose(speed(t), 2.0 * (6.0 * sigma - 6.0 * sigma**2) / 4.0)
+    np.testing.assert_allclose(speed.derivative()(t), 2.0 * (6.0 - 12.0 * sigma) / 16.0)
+    assert (move(0.9), move(5.0), move(7.0), speed(0.9), speed(5.1)) == (0.0, 2.0, 2.0, 0.0, 0.0)
+    assert speed.derivative()(1.0) == pytest.approx(0.75)
+    assert speed.derivative()(5.0) == 0.0
+
+
+def test_edges_of_ramps_sinusoids_and_samples() -> None:
+    """At the edge, before and after it; derivatives are those of the pieces."""
+    ramp = s.Ramp(slope=2.0, start=1.0, stop=3.0)
+    np.testing.assert_allclose(ramp([0.0, 1.0, 2.0, 3.0, 5.0]), [0.0, 0.0, 2.0, 4.0, 4.0])
+    np.testing.assert_allclose(ramp.derivative()([0.5, 1.0, 2.9, 3.0]), [0.0, 2.0, 2.0, 0.0])
+    np.testing.assert_allclose(s.Ramp(2.0, 1.0).derivative()([0.5, 9.0]), [0.0, 2.0])
+    wave = s.Sinusoid(amplitude=3.0, omega=2.0, phase=0.4, start=1.0)
+    np.testing.assert_allclose(wave([0.9, 1.0, 2.0]), [0.0, 3 * math.sin(0.4), 3 * math.sin(2.4)])
+    np.testing.assert_allclose(wave([1.5, 2.0]), 3.0 * np.sin([1.4, 2.4]))
+    np.testing.assert_allclose(wave([0.1, 0.2]), [0.0, 0.0])
+    held = s.Samples([1.0, 2.0, 4.0], [5.0, 7.0, 1.0], hold="previous")
+    np.testing.assert_allclose(held([0.0, 1.0, 1.999, 2.0, 3.0, 4.0, 9.0]), [5, 5, 5, 7, 7, 1, 1])
+    assert held.derivative()(1.5) == 0.0
+    joined = s.Samples([1.0, 2.0, 4.0], [5.0, 7.0, 1.0])
+    np.testing.assert_allclose(joined([0.0, 1.5, 3.0, 9.0]), [5.0, 6.0, 4.0, 1.0])
+    slopes = joined.derivative()
+    np.testing.assert_allclose(
+        slopes([0.0, 1.0, 1.5, 2.0, 3.9, 4.0]), [0.0, 2.0, 2.0, -3.0, -3.0, 0.0]
+    )
+    assert s.Samples([1.0], [5.0]).derivative()(1.0) == 0.0
+    two = s.Samples([0.0, 1.0], [0.0, 3.0]).derivative()
+    assert two(0.5) == 3.0
+
+
+def test_arithmetic_has_the_signs_of_numbers() -> None:
+    """With signals and numbers on both sides."""
+    one, t = s.Ramp(), 3.0
+    assert ((one - 1.0)(t), (1.0 - one)(t), (-one)(t), (one / 2.0)(t)) == (2.0, -2.0, -3.0, 1.5)
+    assert ((one + one)(t), (2.0 * one)(t), (one - s.Step(0.5))(t)) == (6.0, 6.0, 2.5)
+    assert (one * -2.0).derivative()(t) == -2.0
 
 
 def test_signals_add_subtract_and_scale() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.plants.delay import DelayedPlantModel
 from quell.plants.nonlinear import PythonNonlinear
 from quell.simulation import sampled_scenario
 from quell.simulation.integration import (
@@ -167,6 +168,30 @@ def test_the_estimated_error_of_a_mode_is_the_difference_of_two_steps_and_one() 
     fine.add(samples, all_of_them=True)
     assert (fine.poor, fine.enough) == (False, 0)
     assert fine.error == pytest.approx(abs(runge_kutta(1.0) - runge_kutta(0.5) ** 2))
+
+
+def test_the_estimated_error_is_a_share_whatever_the_unit() -> None:
+    """Of the largest value before or after the step; what overflows is an error of 1."""
+    wild, samples = mode_check(bad=6.0)
+    wild.add(samples, all_of_them=True)
+    once, twice = runge_kutta(6.0), runge_kutta(3.0) ** 2
+    assert wild.error == pytest.approx((once - twice) / once)
+    small, samples = mode_check()
+    samples.x[:] *= 1e-9
+    small.add(samples, all_of_them=True)
+    assert small.error == pytest.approx(abs(runge_kutta(2.0) - runge_kutta(1.0) ** 2))
+    beyond, samples = mode_check(bad=1e200)
+    beyond.add(samples, all_of_them=True)
+    assert (beyond.error, beyond.enough) == (1.0, 0)
+
+
+def test_behind_a_delay_the_check_takes_the_u_that_arrives() -> None:
+    """The oldest, at the end of the state: here it is the rate of decay."""
+    inner = PythonNonlinear(lambda t, x, u, w: (-u * x[0],), None, 1.0, 1)
+    check = IntegrationCheck(DelayedPlantModel(inner, 1), as_python=True)
+    x = np.array([[1.0, 0.1, 0.2, 2.0]])  # the plant's state, and three values of u on their way
+    check.add(Samples(np.zeros(1), np.array([0.3]), np.zeros((1, 0)), x), all_of_them=True)
+    assert check.error == pytest.approx(abs(runge_kutta(2.0) - runge_kutta(1.0) ** 2))
 
 
 def test_samples_without_numbers_are_left_out_of_the_check() -> None:

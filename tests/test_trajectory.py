@@ -128,7 +128,7 @@ def test_a_run_that_diverged_in_the_window_has_no_step_there() -> None:
     assert run.metrics().missing == dict.fromkeys(STEP, reason)
     assert run.metrics()["peak_error"] == 1e6 + 1
     assert "overshoot" in run.metrics(0.0, 0.2)
-    assert run.metrics(0.0, 0.3).missing.keys() == {"settling_time"}
+    assert run.metrics(0.0, run.ended).missing.keys() == {"settling_time"}
     with pytest.raises(ValueError, match=r"the record ends at 0.3 s .*The loop diverged"):
         run.metrics(0.5)
 
@@ -140,6 +140,9 @@ def test_a_limit_near_to_the_reference_is_no_sign_of_an_unstable_loop() -> None:
     assert "b0" not in near.message
     far = record_of([1, 1], [0, 5], status=ql.Status.DIVERGED, limit=10.1)
     assert "b0" in far.message
+    assert "b0" not in record_of([-2, 1], [0, 5], status=ql.Status.DIVERGED, limit=19.9).message
+    nothing = record_of([], [], status=ql.Status.DIVERGED, limit=9.9)
+    assert "need not mean" in nothing.message
 
 
 def test_a_measure_beyond_all_numbers_says_so() -> None:
