@@ -317,9 +317,11 @@ def test_the_command_writes_what_programs_read(
 
 
 def test_a_sweep_of_the_cubic_part_may_go_through_zero() -> None:
-    """All plants of a batch are of one kind then."""
-    swept = ql.plants.batch(lagged_two_mass_spring, k_cubic=np.linspace(-0.2, 0.2, 5))
-    assert len(swept) == 5
+    """All plants of a batch are of one kind then, each with its own value."""
+    cubic = np.linspace(-0.2, 0.2, 5)
+    swept = ql.plants.batch(lagged_two_mass_spring, k_cubic=cubic)
+    assert {type(swept[i]) for i in range(5)} == {type(lagged_two_mass_spring(k_cubic=0.3))}
+    np.testing.assert_allclose([swept[i].k_cubic for i in range(5)], cubic)
 
 
 def test_samples_are_read_or_drawn(tmp_path: Path) -> None:

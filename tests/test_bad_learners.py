@@ -147,7 +147,8 @@ def test_a_model_that_does_not_fit_is_named(name: str) -> None:
 
 def test_a_model_that_divides_by_zero_on_the_trial_is_let_through() -> None:
     """Compiled, that gives inf, which is the guard's business."""
-    law(ql.learners.Online(model_with(lambda m, s, x: 1.0 / s.weight[0].item())))
+    learner = ql.learners.Online(model_with(lambda m, s, x: 1.0 / s.weight[0].item()))
+    assert law(learner).learner is learner
 
 
 def test_the_trial_leaves_no_trace() -> None:

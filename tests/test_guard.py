@@ -24,7 +24,7 @@ from quell.experiments.stress.adversaries import (
     Turncoat,
 )
 from quell.experiments.stress.random_loops import Loop
-from quell.guard import assess, limit, record_output
+from quell.guard import assess, limit, record_output, start_again
 from quell.learners.lag import lag_of, lag_push
 from quell.types import Status
 
@@ -123,6 +123,142 @@ def test_what_is_permitted_lies_within_its_bounds(rng: np.random.Generator) -> N
         last = permitted
         heard += permitted != 0.0
     assert heard > 5000, "hardly anything was permitted: the test says nothing"
+
+
+def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
+    """A guard with the record of a learner that is always right, κ = 1.2 and the typical error e."""
+    observer = ql.ESO.model_free(order=4, b0=b0, omega_o=10.0, dt=5e-3)
+    design = ql.Guard().design(observer)._replace(fastest=1e9)
+    memory = ql.Guard().memory(design)
+    memory.averages.view(float)[:3] = 0.5
+    memory.sample[0].typical_error = e
+    return design, memory
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("e", [1.0, 1e-3])
+def test_an_output_beyond_its_bound_is_clipped_and_fades_to_zero_at_three_times_the_bound(
+    side: float, e: float
+) -> None:
+    """At the distance d from f: g itself to κe, then f ± κe times (3 − d/κe)/2, then nothing."""
+    design, memory = trusted(e)
+    f, bound = 4.0 * side * e, 1.2 * e
+    for share, expected in (
+        (0.99, f + side * 0.99 * bound),
+        (2.0, 0.5 * (f + side * bound)),
+        (2.9, 0.05 * (f + side * bound)),
+        (3.1, 0.0),
+        (20.0, 0.0),
+    ):
+        memory.sample[0].f_learned = expected
+        permitted, slope, cut = limit(design, memory, f, f + side * share * bound, 0.0, 0.0)
+        assert permitted == pytest.approx(expected, rel=1e-9, abs=1e-12 * e), share
+        assert (slope, cut) == (0.0, False)
+        reason = memory.sample[0].reason
+        assert reason == (ql.Reason.OUT_OF_BOUNDS if share > 1.0 else ql.Reason.TRUSTED)
+
+
+def test_f_learned_moves_no_faster_than_two_omega_o_e() -> None:
+    """Up and down alike, and the reason is told; then the output counts as a constant."""
+    for side in (-1.0, 1.0):
+        design, memory = trusted()
+        change = 2.0 * 10.0 * 5e-3
+        design = design._replace(fastest=ql.Guard().design(OBSERVER).fastest)
+        memory.sample[0].f_learned = 1.5 * side
+        permitted, slope, _ = limit(design, memory, 2.0 * side, 1.8 * side, 0.3, 0.0)
+        assert (permitted, slope) == (pytest.approx(side * (1.5 + change)), 0.0)
+        assert memory.sample[0].reason == ql.Reason.TOO_FAST
+        permitted, slope, _ = limit(design, memory, 2.0 * side, 1.3 * side, 0.3, 0.0)
+        assert (permitted, slope) == (pytest.approx(side * (1.5 - change)), 0.0)
+
+
+@pytest.mark.parametrize("b0", [2.0, -2.0])
+def test_a_slope_is_permitted_while_the_effective_gain_is_half_to_twice_b0(b0: float) -> None:
+    """``(b0 + s)/b0`` from 1/2 to 2, edges included; beyond, the output counts as a constant."""
+    for share, kept in ((0.5, True), (2.0, True), (1.3, True), (0.49, False), (2.01, False)):
+        design, memory = trusted(1.0, b0)
+        slope, u = b0 * (share - 1.0), 0.4
+        memory.sample[0].f_learned = 2.0
+        found = limit(design, memory, 2.0, 2.0 - slope * u, slope, u)
+        expected = (2.0 - slope * u, slope, False) if kept else (2.0, 0.0, False)
+        assert found == (pytest.approx(expected[0]), expected[1], False), share
+
+
+def test_an_output_is_cut_off_where_it_is_a_hundred_times_larger_than_f() -> None:
+    """Or than e, where that is larger; then the learner has to prove itself again, and is not restarted."""
+    for f, e in ((3.0, 1.0), (0.1, 3.0), (-3.0, 1.0)):
+        for output, exploded in ((299.0, False), (-299.0, False), (301.0, True), (-301.0, True)):
+            design, memory = trusted(e)
+            permitted, slope, restart = limit(design, memory, f, output, 0.1, 0.0)
+            assert (memory.sample[0].reason == ql.Reason.EXPLODED) == exploded
+            assert not restart
+            averages = memory.averages[0]
+            if exploded:
+                assert (permitted, slope, memory.sample[0].authority) == (0.0, 0.0, 0.0)
+                assert (averages.qq, averages.qp, averages.pp) == (0.5, 0.0, 0.5)
+                assert memory.sample[0].output == math.copysign(300.0, output)
+
+
+@pytest.mark.parametrize(
+    ("qq", "qp", "pp", "authority", "reason"),
+    [
+        (0.5, 0.0, 0.5, 0.0, ql.Reason.UNPROVEN),
+        (0.5, 0.25, 0.5, 0.0, ql.Reason.UNPROVEN),
+        (0.5, 0.275, 0.5, 0.5, ql.Reason.UNPROVEN),
+        (0.5, 0.31, 0.5, 1.0, ql.Reason.TRUSTED),
+        (0.5, 0.7, 0.8, 0.75, ql.Reason.TOO_LOUD),
+        (0.0, 0.5, 0.1, 0.0, ql.Reason.UNPROVEN),
+    ],
+)
+def test_the_authority_is_what_a_learner_has_explained(
+    qq: float, qp: float, pp: float, authority: float, reason: ql.Reason
+) -> None:
+    """``β = min(clip((2 m_qp − m_pp)/m_qq/0.2, 0, 1), 1.2 m_qq/m_pp)``, and why."""
+    design, memory = trusted()
+    memory.averages.view(float)[:3] = qq, qp, pp
+    limit(design, memory, 1.0, 1.0, 0.0, 0.0)
+    assert memory.sample[0].authority == pytest.approx(authority)
+    assert memory.sample[0].reason == reason
+
+
+def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
+    """``m_xy ← m_xy + (dt/T) a (x y/s − m_xy)``, and e with its rise, decay and outliers."""
+    guard = ql.Guard(time=0.4)
+    design = guard.design(OBSERVER)
+    memory = guard.memory(design)
+    forget, lag = -math.expm1(-5e-3 / 0.4), 5 / 10.0
+    rise, decay = -math.expm1(-5e-3 / (2.0 * lag)), -math.expm1(-5e-3 / (200.0 * lag))
+    m, e, squares = np.array([0.5, 0.0, 0.5]), 0.0, np.zeros(2)
+    for k in range(200):
+        f, g = rng.normal(), rng.normal() * (100.0 if k % 50 == 40 else 1.0)
+        f *= 100.0 if k % 50 == 20 else 0.01 if 60 <= k < 70 else 1.0
+        q, p = f - memory.shown[0], memory.shown[1] - memory.shown[2]
+        assess(design, memory, f)
+        large = abs(q) if (k + 1) * forget < 1.0 else min(abs(q), 5.0 * e)
+        e += rise * (large - e) if large > e else -decay * e
+        s = q * q + p * p
+        a = min(1.0, s / (0.4 * e) ** 2)
+        m += forget * a * (np.array([q * q, q * p, p * p]) / s - m)
+        squares += forget * (np.array([q * q, (q - p) ** 2]) - squares)
+        limit(design, memory, f, g, 0.0, 0.0)
+        record_output(design, memory, 0.0)
+        found = memory.averages.view(float)
+        if memory.sample[0].reason == ql.Reason.EXPLODED:
+            m[:] = 0.5, 0.0, 0.5
+        np.testing.assert_allclose(found, [*m, *squares], rtol=1e-9, atol=1e-12)
+        assert memory.sample[0].typical_error == pytest.approx(e, rel=1e-12)
+
+
+def test_a_guard_that_starts_again_is_a_new_one(rng: np.random.Generator) -> None:
+    """All of its state is that before the first sample."""
+    design, memory = trusted()
+    for _ in range(50):
+        assess(design, memory, rng.normal())
+        limit(design, memory, 1.0, rng.normal(), 0.0, 0.0)
+        record_output(design, memory, 0.3)
+    start_again(design, memory)
+    for array, fresh in zip(memory, ql.Guard().memory(design), strict=True):
+        np.testing.assert_array_equal(array, fresh)
 
 
 def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:

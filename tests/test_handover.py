@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.controllers.adrc.law import unlimited_control
 from quell.controllers.base import control
 from quell.observers.base import expected_measurement
 from quell.observers.eso import ESO
@@ -128,6 +129,52 @@ def test_retuning_while_running_makes_no_bump(learner: object) -> None:
     for _ in range(400):
         rig.apply(controller.step(1.0, rig.y))
     assert rig.y == pytest.approx(1.0, abs=1e-3)
+
+
+def test_retuning_again_before_the_next_sample_makes_no_bump_either() -> None:
+    """Each change adds its part to the offset, whether the one before has faded or not."""
+    controller = ql.ADRC(OBSERVER, omega_c=2.0)
+    for k in range(60):
+        u = control(controller.parameters, controller._state, 1.0, 0.01 * k)
+    unchanged = copy.deepcopy(controller)
+    for omega_c in (4.0, 9.0):
+        controller.retune(omega_c=omega_c)
+    loop = controller._state.loop[0]
+    wished = unlimited_control(controller.parameters, controller._state, 0.0, 0.0)
+    assert wished + loop.offset == pytest.approx(u, rel=1e-12)
+    first = control(controller.parameters, controller._state, 1.0, 0.6)
+    expected = control(unchanged.parameters, unchanged._state, 1.0, 0.6)
+    assert abs(wished - u) > 5.0
+    assert first == pytest.approx(expected, abs=0.1 * abs(wished - u))
+
+
+def test_another_nominal_gain_counts_the_u_that_acts() -> None:
+    """With a delay f changes by (b0 − b0') times the u that reaches the plant now, not the newest."""
+    observer = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=DT, delay=0.03)
+    controller = ql.ADRC(observer, omega_c=3.0)
+    for k in range(40):
+        control(controller.parameters, controller._state, 1.0, math.sin(0.1 * k))
+    state, before = controller._state, controller.estimate.f
+    acting = float(state.z[-1])
+    assert abs(acting - state.loop[0].u) > 0.5
+    controller.retune(observer=ESO.model_free(2, 1.2, 20.0, DT, delay=0.03))
+    assert controller.estimate.f - before == pytest.approx((2.0 - 1.2) * acting, rel=1e-12)
+    assert state.z[2] == pytest.approx(state.seen[2], rel=1e-12)
+
+
+def test_a_start_counts_what_a_learner_says_of_u() -> None:
+    """F_L = h + s u at once, and the observer has only the rest to find; u continues."""
+    controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman(u=True))
+    controller._state.learner.theta[:] = -2.0, 0.5, 1.5, 0.25  # x1, x2, bias, u over b0
+    y, u = 0.5, 3.25
+    controller.start(y, u)
+    loop = controller._state.loop[0]
+    f_learned = -2.0 / 3.0**0 * y + 1.5 + 0.25 * 2.0 * u
+    assert loop.f_learned == pytest.approx(f_learned, rel=1e-12)
+    assert (loop.constant, loop.slope) == pytest.approx((-2.0 * y + 1.5, 0.5), rel=1e-12)
+    np.testing.assert_allclose(controller.estimate.x, [y, 0.0], atol=1e-9)
+    assert controller.estimate.f == pytest.approx(-2.0 * u, abs=1e-9)
+    assert control(controller.parameters, controller._state, y, y) == pytest.approx(u, abs=1e-9)
 
 
 def test_another_nominal_gain_changes_nothing_at_rest() -> None:

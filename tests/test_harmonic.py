@@ -26,6 +26,8 @@ def test_a_turning_pair_retunes_its_oscillator_by_how_much_it_turns() -> None:
     assert omega[0] == 10.0
     retune(oscillators, omega, 0, 0.0 * theta, *change, 0.0)
     assert omega[0] == 10.0
+    retune(oscillators, omega, 0, theta, *(-1e9 * change), 0.0)
+    assert omega[0] == 0.1
 
 
 def test_phases_turn_at_their_frequency() -> None:

@@ -109,6 +109,24 @@ def test_the_effective_gain_stays_in_its_interval(rng: np.random.Generator) -> N
             commit(design, memory, seen, u, 0.0)
 
 
+@pytest.mark.parametrize("b0", [2.0, -2.0])
+@pytest.mark.parametrize(("sign", "edge"), [(1.0, 1.5), (-1.0, 0.4)])
+def test_data_that_ask_for_more_leave_the_effective_gain_at_its_edge(
+    b0: float, sign: float, edge: float
+) -> None:
+    """The target is ±5 b0 u: θ_u ends at the limit itself, and what the clamp takes is not learned."""
+    learner = ql.learners.Kalman(state=False, bias=False, u=True, gain_interval=(0.4, 1.5))
+    observer = ESO.model_free(order=2, b0=b0, omega_o=10.0, dt=1e-2)
+    design, memory = kalman_memory(learner, observer)
+    for k in range(600):
+        memory.filtered[0] = b0 * math.sin(0.1 * k)
+        adapt(design, memory, np.zeros(3), 1.0, 0.0, 5.0 * sign * memory.filtered[0])
+    assert memory.theta[0] == edge - 1.0
+    constant, slope = predict(design, memory, np.zeros(3), 0.3)
+    assert constant == 0.0
+    assert (b0 + slope) / b0 == pytest.approx(edge, rel=1e-12)
+
+
 def test_rounding_is_not_data() -> None:
     """At rest and without noise the learner stays where it is: nothing winds up."""
     controller = ql.ADRC(

@@ -19,6 +19,7 @@ from quell.observers.base import begin, observe
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
 from quell.observers.placement import place_poles
+from quell.observers.response import scaled_response
 
 
 def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:
@@ -348,6 +349,35 @@ def test_with_its_poles_at_the_zeros_the_observer_shows_f_as_if_there_were_none(
     assert np.sum(taps) == pytest.approx(1.0, abs=1e-8)
     if kept == len(zeros):
         assert np.all(taps[: 5 - kept] > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("zeros", "kept"), [([-300.0, -1.0], [-1.0]), ([-0.5, 0.4], [-0.5]), ([-25.0, -21.0], [])]
+)
+def test_a_zero_keeps_a_pole_only_if_it_is_stable_and_slower_than_omega_o(
+    zeros: list[float], kept: list[float]
+) -> None:
+    """All other poles of the observer lie at ``exp(−omega_o dt)``."""
+    plant = (np.poly(zeros), np.poly([-1.0, -0.3, 0.5, 0.0]))
+    observer = ESO.model_based(plant, omega_o=20.0, dt=2e-3, keep_zeros=True)
+    found = scaled_response(observer.model, observer.units).transition
+    rates = [-20.0] * (5 - len(kept)) + kept
+    # About z = 1, in the time unit 1/omega_o: a multiple pole is not found by eigenvalues.
+    wanted = np.poly(np.expm1(2e-3 * np.array(rates)) / 0.04)
+    np.testing.assert_allclose(np.poly((found - np.eye(5)) / 0.04), wanted, rtol=1e-5, atol=1e-9)
+
+
+def test_a_zero_at_rest_hides_f_only_where_f_enters_through_it() -> None:
+    """Through a channel of its own a constant f is found although y rests for any constant u."""
+    A, B, E, C = [[0.0, 1.0], [-2.0, -0.5]], [1.0, -0.5], [0.0, 1.0], [1.0, 0.0]
+    with pytest.raises(ValueError, match="zero at s = 0"):
+        ESO.model_based((A, B, C), 20.0, 0.01)
+    observer = ESO.model_based((A, B, E, C), 20.0, 0.01)
+    assert observer.plant.zeros == pytest.approx([0.0], abs=1e-12)
+    z, seen = np.zeros(3), np.zeros(3)
+    for _ in range(400):  # at rest under f = 3: y = 1.5
+        observe(observer.model, z, seen, 1.5, 0.0, 0.0)
+    np.testing.assert_allclose(seen, [1.5, 0.0, 3.0], atol=1e-6)
 
 
 def test_poles_at_slow_zeros_spare_noise_and_learn_where_the_other_observer_cannot() -> None:

@@ -233,6 +233,18 @@ def test_the_nonlinear_observer_with_powers_of_one_is_the_linear_one(
     assert np.max(np.abs(other - linear)) > 1.0
 
 
+def test_the_nonlinear_observer_starts_again_beyond_all_errors() -> None:
+    """From 2⁴⁰ δ on, where its powers would take for ever to return; below, it only corrects."""
+    observer = ESO.nonlinear(2, 2.0, 20.0, DT, delta=0.25)
+    z, seen = np.zeros(3), np.zeros(3)
+    edge = 0.25 * 2.0**40
+    for y in (-edge, 1.01 * edge, -4e11, 1.0):
+        observe(observer.model, z, seen, y, 0.0, 0.0)
+        began = abs(y) != edge
+        assert (seen.tolist() == [y, 0.0, 0.0]) == began, y
+        np.testing.assert_array_equal(z, seen)
+
+
 def test_the_nonlinear_observer_is_hans_for_short_samples() -> None:
     """Against his Euler form with ``β_i = L_i δ^(1−α_i)/dt``: the difference falls with dt."""
     alpha, delta, errors = (1.0, 0.5, 0.25), 0.02, []

@@ -46,6 +46,34 @@ def test_rls_without_forgetting_is_ridge_regression(rng: np.random.Generator) ->
     np.testing.assert_allclose(memory.covariance, np.linalg.inv(information), atol=1e-11)
 
 
+def test_rls_learns_less_from_what_is_less_sure(rng: np.random.Generator) -> None:
+    """A confidence c is the noise R/c: ridge regression with these weights; for ``NLMS`` a step c."""
+    features, targets = rng.normal(size=(60, 3)), rng.normal(size=60)
+    sure = rng.uniform(0.1, 1.0, 60)
+    rule, memory = rls(3)
+    theta, slow = np.zeros(3), np.zeros(3)
+    for row, target, share in zip(features, targets, sure, strict=True):
+        update_theta(rule, memory, theta, row, target - theta @ row, share)
+    weights = sure / rule.noise
+    information = np.eye(3) / rule.prior + features.T * weights @ features
+    expected = np.linalg.solve(information, features.T @ (weights * targets))
+    np.testing.assert_allclose(theta, expected, atol=1e-11)
+    update_theta(NlmsRule(0.5, 0.0), np.zeros(0), slow, features[0], 2.0, 0.3)
+    np.testing.assert_allclose(slow @ features[0], 0.5 * 0.3 * 2.0, rtol=1e-12)
+
+
+def test_the_rules_take_their_times_from_the_controllers_bandwidth() -> None:
+    """``RLS`` remembers 100/omega_c, its noise is correlated over the observer's lag; ``NLMS`` learns at omega_c."""
+    rule = ql.learners.RLS().rule(OBSERVER, 4.0, 3)
+    assert -math.log1p(-rule.forget) == pytest.approx(5e-3 * 4.0 / 100.0, rel=1e-9)
+    assert rule.noise == pytest.approx(3 / 20.0 / 5e-3, rel=1e-12)
+    assert rule.prior == 100.0
+    assert ql.learners.RLS(memory_time=2.0).rule(OBSERVER, 4.0, 3).forget == pytest.approx(
+        -math.expm1(-5e-3 / 2.0), rel=1e-12
+    )
+    assert ql.learners.NLMS().rule(OBSERVER, 4.0, 3).gain == pytest.approx(5e-3 * 4.0, rel=1e-12)
+
+
 def test_rls_forgets_along_what_it_sees_and_nowhere_else() -> None:
     """After a sample the uncertainty along φ is ζ/(λ(1+ζ)); across, nothing has changed."""
     rule, memory = rls(2, forget=0.01)

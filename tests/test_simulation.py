@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -259,7 +261,34 @@ def test_a_run_of_ten_million_samples_needs_the_memory_of_its_record() -> None:
     """``record_every`` thins it: a hundred rows here, whatever the length."""
     run = ql.simulate(PLANT, controller(), ql.Scenario(duration=10_000.0), record_every=20_000)
     assert len(run) == 101
-    assert run.log.base is None or run.log.base.nbytes < 50_000
+    owner = run.log
+    while isinstance(owner.base, np.ndarray):  # a view would keep all that it is part of
+        owner = owner.base
+    assert owner.base is None
+    assert owner.nbytes < 50_000
+
+
+def test_a_plant_sees_the_time_of_each_sample_within_a_block() -> None:
+    """``x' = 3 t²`` is t³, whichever block and segment a sample is in."""
+    clock = ql.plants.NonlinearPlant(lambda t, x, u, w: (3.0 * t * t,), order=1)
+    law = ql.ADRC(ql.ESO.model_free(1, 1.0, 5.0, 0.01), omega_c=1.0)
+    run = ql.simulate(clock, law, ql.Scenario(duration=3.0), interpret=True)
+    np.testing.assert_allclose(run["y"], run.t**3, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_plant_that_returns_no_number_ends_the_run(bad: float) -> None:
+    """At the first sample without one: the run has diverged, and all that it recorded is finite."""
+    broken = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: (bad if t > 0.495 else 0.0,), order=1, substeps=1
+    )
+    law = ql.ADRC(ql.ESO.model_free(1, 1.0, 5.0, 0.01), omega_c=1.0)
+    run = ql.simulate(broken, law, ql.Scenario(duration=1.0), interpret=True)
+    assert run.diverged
+    assert ql.Status.DIVERGED in run.status
+    assert run.ended == pytest.approx(0.5, abs=0.011)
+    assert np.all(np.isfinite(run.log))
+    assert len(run) >= 49
 
 
 def test_the_limit_follows_the_size_of_what_is_asked_for() -> None:
@@ -324,10 +353,9 @@ def test_the_last_sample_is_there_whatever_the_sample_time() -> None:
     plant = ql.plants.LinearPlant([[0.0]], [1.0], [1.0])
     for dt in (0.1, 0.3, 1e-3 / 3.0, 7e-4):
         law = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=1.0, dt=dt), omega_c=1.0)
-        assert (
-            len(ql.simulate(plant, law, ql.Scenario(1.0, duration=3000 * dt), record_every=100))
-            == 31
-        )
+        run = ql.simulate(plant, law, ql.Scenario(1.0, duration=3000 * dt), record_every=100)
+        np.testing.assert_allclose(run.t, 100 * dt * np.arange(31), rtol=1e-12)
+        assert run.ended == pytest.approx(3000 * dt, rel=1e-12)
 
 
 @pytest.mark.parametrize(

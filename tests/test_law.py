@@ -1,0 +1,180 @@
+"""The control law, one interpreted sample at a time: what it does with what is held, cut or reset."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.controllers.adrc.law import unlimited_control
+from quell.controllers.base import control, reset_loop, set_reference_derivatives
+from quell.controllers.limits import Limits, apply_limits
+from quell.controllers.stateful import named_arrays
+from quell.learners.base import commit, restart
+from quell.types import Status
+
+DT = 0.01
+OBSERVER = ql.ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=DT)
+LEARNING = ql.ADRC(OBSERVER, 3.0, learner=ql.learners.Kalman(), guard=ql.Guard())
+
+
+def step(law: ql.ADRC, r: float, y: float, *derivatives: float) -> float:
+    """Take a sample, interpreted."""
+    set_reference_derivatives(law.parameters, law._state, np.array(derivatives))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return control(law.parameters, law._state, r, y)
+
+
+def used(law: ql.ADRC, samples: int = 150) -> ql.ADRC:
+    """Return a copy that has seen a motion."""
+    law = copy.deepcopy(law)
+    for k in range(samples):
+        step(law, math.sin(0.03 * k), math.sin(0.03 * k - 0.4) + 0.2 * math.sin(0.11 * k))
+    return law
+
+
+def test_a_learner_does_not_learn_from_a_measurement_that_is_held() -> None:
+    """It only goes on with its filters, as after any sample: the expected y is no news."""
+    law = used(LEARNING)
+    expected = copy.deepcopy(law._state.learner)
+    # What the sample does before y comes: the last u has acted.
+    loop = law._state.loop[0]
+    commit(law.parameters.learner, expected, law._state.seen, loop.u, loop.f_learned)
+    step(law, 0.3, math.nan)
+    found = named_arrays(law._state.learner)
+    for name, array in named_arrays(expected).items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    step(law, 0.3, 0.3)
+    assert law._state.learner.averages[0].time > expected.averages[0].time
+
+
+@pytest.mark.parametrize("own_channel", [False, True])
+def test_f_is_cancelled_where_it_enters_as_u_does(
+    own_channel: bool, rng: np.random.Generator
+) -> None:
+    """``u = (k (r − x̂) − f_L − Δf̂ + a·x̂) / (b0 + s)``; else neither f nor the slope s counts."""
+    A, C, E = [[0.0, 1.0], [-2.0, -0.6]], [1.0, 0.0], [0.0, 1.0]
+    plant = (A, [1.5, 4.5], E, C) if own_channel else (A, [0.0, 1.5], C)
+    observer = ql.ESO.model_based(plant, 20.0, DT)
+    law = ql.ADRC(observer, 3.0, learner=ql.learners.Kalman(u=True))
+    state = law._state
+    state.loop[0].r = r = 0.7
+    state.seen[:] = seen = rng.normal(size=3)
+    constant, slope = 0.9, 0.4
+    if own_channel:  # of degree 1: y' = x̂_2 + b0 u
+        wish = (3.0 * (r - seen[0]) - seen[1]) / 1.5
+    else:
+        u_0 = 9.0 * (r - seen[0]) - 6.0 * seen[1] + 2.0 * seen[0] + 0.6 * seen[1]
+        wish = (u_0 - seen[2] - constant) / (1.5 + slope)
+    found = unlimited_control(law.parameters, state, constant, slope)
+    assert found == pytest.approx(wish, rel=1e-12)
+
+
+def test_a_reference_derivative_that_is_no_number_counts_as_zero() -> None:
+    """Also one that is missing, or beyond any quantity; the others keep their places."""
+    law = used(ql.ADRC(OBSERVER, 3.0, feedforward=True), 20)
+    for bad in (math.nan, math.inf, -math.inf, 1e300):
+        assert step(copy.deepcopy(law), 1.0, 0.9, bad, 0.4) == step(
+            copy.deepcopy(law), 1.0, 0.9, 0.0, 0.4
+        )
+        assert step(copy.deepcopy(law), 1.0, 0.9, 0.4, bad) == step(
+            copy.deepcopy(law), 1.0, 0.9, 0.4
+        )
+    assert step(copy.deepcopy(law), 1.0, 0.9, 0.4) != step(copy.deepcopy(law), 1.0, 0.9, 0.0, 0.4)
+
+
+@pytest.mark.parametrize("bad", [1.1e60, -1e300])
+def test_a_measurement_beyond_any_quantity_is_held(bad: float) -> None:
+    """As one that is not finite; one of 1e60 is taken."""
+    one, other = used(ql.ADRC(OBSERVER, 3.0), 20), used(ql.ADRC(OBSERVER, 3.0), 20)
+    assert step(one, 1.0, bad) == step(other, 1.0, math.nan)
+    assert step(one, bad, 0.5) == step(other, math.nan, 0.5)
+    assert one.estimate.status == Status.REFERENCE_HELD
+    step(one, 1.0, 1e60)
+    assert one.estimate.status == Status.OK
+
+
+def test_an_overflow_starts_everything_again_but_u() -> None:
+    """U holds; estimate, learner's filters, lag filters and the offset of a hand-over begin anew."""
+    law = used(LEARNING)
+    before = law.estimate.u
+    state = law._state
+    state.loop[0].offset = 5.0
+    state.z[:] = 1.7e308
+    assert step(law, 1.0, 0.25) == before
+    assert law.estimate.status & Status.OVERFLOWED
+    np.testing.assert_array_equal(state.z, [0.25, 0.0, 0.0])
+    loop = state.loop[0]
+    assert (loop.offset, loop.constant, loop.slope, loop.f_learned) == (0.0, 0.0, 0.0, 0.0)
+    assert not np.any(state.shadow)
+    assert not np.any(state.guard.chain)
+    assert not np.any(state.learner.chain)
+    assert np.isfinite(step(law, 1.0, 0.25))
+
+
+def test_a_start_from_rest_resets_all_filters() -> None:
+    """Of f_L, the guard and the learner, the guard's last output too; what was learned stays."""
+    law = used(LEARNING, 400)
+    state, design = law._state, law.parameters
+    state.loop[0].offset = 1.0
+    guard = state.guard.sample[0]
+    assert guard.output != 0.0
+    guard.f_learned = 0.5
+    theta, authority = state.learner.theta.copy(), guard.authority
+    reset_loop(design, state)
+    assert not np.any(state.loop.view(float))
+    for filters in (state.shadow, state.guard.chain, state.guard.shown, state.learner.chain):
+        assert not np.any(filters)
+    assert (guard.output, guard.f_learned) == (0.0, 0.0)
+    assert guard.authority == authority
+    np.testing.assert_array_equal(state.learner.theta, theta)
+    assert np.any(theta)
+    restart(design.learner, state.learner)
+    assert state.learner.averages[0].time == 0.0
+
+
+def test_reference_derivatives_are_forgotten_at_a_start_from_rest() -> None:
+    """They belong to the sample they came with."""
+    law = ql.ADRC(OBSERVER, 3.0, feedforward=True)
+    step(law, 0.0, 0.0, 3.0, 4.0)
+    reset_loop(law.parameters, law._state)
+    np.testing.assert_array_equal(law._state.reference, [0.0, 0.0])
+
+
+LIMITS = Limits(-1.0, 2.0, 0.5)
+BOTH = int(Status.SATURATED | Status.RATE_LIMITED)
+
+
+@pytest.mark.parametrize(
+    ("wish", "before", "expected"),
+    [
+        (0.25, 0.0, (0.25, 0)),
+        (0.5, 0.0, (0.5, 0)),
+        (-0.5, 0.0, (-0.5, 0)),
+        (0.75, 0.0, (0.5, int(Status.RATE_LIMITED))),
+        (-0.75, 0.0, (-0.5, int(Status.RATE_LIMITED))),
+        (2.0, 1.75, (2.0, 0)),
+        (-1.0, -0.75, (-1.0, 0)),
+        (2.25, 1.75, (2.0, int(Status.SATURATED))),
+        (-1.25, -0.75, (-1.0, int(Status.SATURATED))),
+        (9.0, 1.75, (2.0, BOTH)),
+        (-9.0, -0.75, (-1.0, BOTH)),
+        (9.0, -9.0, (-1.0, BOTH)),
+        (-9.0, 9.0, (2.0, BOTH)),
+    ],
+)
+def test_limits_cut_to_their_edges_and_say_which(wish: float, before: float, expected: Any) -> None:
+    """A wish at the very edge is not cut; after a foreign u the magnitude wins over the rate."""
+    assert apply_limits(LIMITS, wish, before) == expected
+
+
+def test_the_observer_waits_at_the_limit_nearest_to_zero() -> None:
+    """Before the first measurement, on either side of zero."""
+    for low, high, u in ((1.0, 2.0, 1.0), (-2.0, -1.0, -1.0), (-1.0, 1.0, 0.0)):
+        law = ql.ADRC(OBSERVER, 3.0, u_min=low, u_max=high)
+        assert step(law, 1.0, math.nan) == u
+        assert law.estimate.u == u
