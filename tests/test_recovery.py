@@ -1,0 +1,137 @@
+"""When a learner has to start again: hostile samples, and what is only large, at rest or decaying."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.learners.recovery import (
+    LearnerWatch,
+    has_lost_range,
+    is_in_proportion,
+    window_samples,
+)
+
+WINDOW = 20
+
+
+def verdicts(
+    y: Callable[[int], float],
+    f: Callable[[int], float],
+    output: Callable[[int], float] = lambda k: 0.0,
+    excess: Callable[[int], float] = lambda k: 1.0,
+    samples: int = 200,
+) -> list[int]:
+    """Return the samples at which a learner that saw these has lost its range."""
+    watch = LearnerWatch.zeros()[0]
+    return [
+        k for k in range(samples) if has_lost_range(watch, WINDOW, y(k), f(k), output(k), excess(k))
+    ]
+
+
+def wave(k: int) -> float:
+    """A motion."""
+    return math.sin(0.7 * k)
+
+
+def test_after_one_sample_beyond_its_range_a_learner_starts_again_once() -> None:
+    """At the end of the first window that does not follow a larger one."""
+    assert verdicts(wave, lambda k: 1e13 if k == 30 else wave(k)) == [79]
+    assert verdicts(wave, lambda k: -1e13 if k == 30 else wave(k)) == [79]
+    assert verdicts(wave, lambda k: 1e12 if k == 30 else wave(k)) == []  # 2⁴⁰ is 1.1e12
+
+
+def test_a_loop_at_rest_forgets_nothing() -> None:
+    """Neither where f is rounding, nor where all decays to zero; a motion of 1e-7 of y counts."""
+
+    def at_rest(move: float) -> list[int]:
+        return verdicts(
+            lambda k: 1.0 + move * wave(k), lambda k: 1e13 if k == 0 else wave(k), samples=100
+        )
+
+    assert at_rest(1e-16) == []
+    assert at_rest(2e-9) == []
+    assert at_rest(1e-7) == [59]
+    decay = 0.5 ** (1.0 / 15.0)  # a half in less than a window
+    assert verdicts(lambda k: decay**k, lambda k: decay**k, samples=2000) == []
+
+
+def test_a_learner_whose_output_keeps_u_at_its_limits_starts_again() -> None:
+    """In most samples of a window far beyond f, while the law asks for far more than is applied."""
+
+    def excessive(output: float, excess: float, share: int = 10) -> list[int]:
+        return verdicts(
+            wave,
+            wave,
+            lambda k: output if k % 20 >= 20 - share else 0.0,
+            lambda k: excess,
+            samples=40,
+        )
+
+    assert excessive(1100.0, 2000.0, 11) == [19, 39]
+    assert excessive(-1100.0, 2000.0, 11) == [19, 39]
+    assert excessive(1100.0, 2000.0, 10) == []
+    assert excessive(900.0, 2000.0, 20) == []
+    assert excessive(1100.0, 1000.0, 20) == []
+
+
+def test_the_f_of_the_window_before_counts_for_the_output_too() -> None:
+    """Else a quiet moment would condemn an output that fitted just before."""
+    assert (
+        verdicts(
+            wave, lambda k: 1.0 if k < 20 else 1e-3, lambda k: 100.0, lambda k: 1e9, samples=40
+        )
+        == []
+    )
+    assert verdicts(
+        wave, lambda k: 1.0 if k < 20 else 1e-3, lambda k: 100.0, lambda k: 1e9, samples=60
+    ) == [59]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_number_that_is_none_does_not_blind_the_watch(bad: float) -> None:
+    """Nor does it hold up the verdict on what comes later."""
+    found = verdicts(wave, lambda k: bad if k == 30 else 1e13 if k == 110 else wave(k))
+    assert found[-1] == 159
+
+
+def test_a_window_is_ten_lags_of_the_observer() -> None:
+    """At least a sample; an output is in proportion up to 2¹⁰ of the f of the last window."""
+    assert window_samples(ql.ESO.model_free(2, 1.0, 20.0, 0.01)) == 150
+    watch = LearnerWatch.zeros()[0]
+    watch.most_before = 2.0
+    assert is_in_proportion(watch, -2048.0)
+    assert not is_in_proportion(watch, 2049.0)
+
+
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "hostile_steps.py"
+
+
+@pytest.fixture(scope="module")
+def trial() -> Any:
+    """The script of the full trial, as a module."""
+    spec = importlib.util.spec_from_file_location("hostile_steps", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["NLMS", "Kalman, guarded", "nonlinear", "PID"])
+def test_after_hostile_samples_a_loop_settles_as_a_new_one_does(name: str, trial: Any) -> None:
+    """U is a number within its limits all the time; see benchmarks/hostile_steps.py for the rest."""
+    make, plant = trial.configurations()[name]
+    with np.errstate(all="ignore"):
+        rounds = trial.Trial(make, plant, interpret=True, hostile=400, good=1500).rounds(seed=3)
+        for _ in range(2):
+            bad, error = next(rounds)
+            assert bad == 0
+            assert error <= 1.0
