@@ -252,6 +252,7 @@ class Trial:
     ) -> None:
         self.plant, self.hostile, self.good = plant, hostile, good
         self.controller = make()
+        self.omega_c = getattr(self.controller, "omega_c", 0.0)
         self.model = plant.sampled(DT)
         limits = self.controller.limits
         finite = np.finfo(float).max
@@ -283,6 +284,8 @@ class Trial:
             derivatives = np.column_stack([piece(n) for _ in range(DERIVATIVES)])
             design, state = self.controller.parameters, self.controller._state
             bad += self.lie(design, state, r, y, np.ascontiguousarray(derivatives), *self.limits)
+        if isinstance(self.controller, ql.ADRC):
+            self.controller.retune(omega_c=self.omega_c)
         return bad
 
     def good_samples(self, controller: Any, rng: np.random.Generator) -> tuple[float, int]:

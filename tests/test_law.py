@@ -11,7 +11,7 @@ import pytest
 
 import quell as ql
 from quell.controllers.adrc.law import unlimited_control
-from quell.controllers.base import control, reset_loop, set_reference_derivatives
+from quell.controllers.base import control, reset_loop, set_reference_derivatives, write_row
 from quell.controllers.limits import Limits, apply_limits
 from quell.controllers.stateful import named_arrays
 from quell.learners.base import commit, restart
@@ -137,6 +137,39 @@ def test_a_start_from_rest_resets_all_filters() -> None:
     assert state.learner.averages[0].time == 0.0
 
 
+def test_an_offset_fades_with_the_bandwidth_of_the_controller() -> None:
+    """Added to u, it falls as ``exp(−omega_c t)``; too small to matter, it is gone."""
+    law, plain = used(ql.ADRC(OBSERVER, 3.0), 20), used(ql.ADRC(OBSERVER, 3.0), 20)
+    law._state.loop[0].offset = 2.0
+    for k in range(1, 4):
+        u, wished = step(law, 0.5, 0.2), unlimited_control(law.parameters, law._state, 0.0, 0.0)
+        assert u - wished == pytest.approx(2.0 * math.exp(-3.0 * DT * (k - 1)), rel=1e-9)
+        assert law._state.loop[0].offset == pytest.approx(2.0 * math.exp(-3.0 * DT * k), rel=1e-12)
+    law._state.loop[0].offset = 9e-201
+    step(law, 0.5, 0.2)
+    assert law._state.loop[0].offset == 0.0
+    step(plain, 0.5, 0.2)
+    assert plain._state.loop[0].offset == 0.0
+
+
+def test_a_row_has_estimates_status_guard_and_coefficients_in_order() -> None:
+    """As ``channels`` names them."""
+    law = used(LEARNING, 400)
+    row = np.full(sum(width for _, width in law.channels), math.nan)
+    write_row(law.parameters, law._state, row)
+    estimate, guard = law.estimate, law._state.guard
+    expected = [
+        *(*estimate.x, estimate.f_residual, estimate.f_learned, int(estimate.status)),
+        guard.sample[0].authority,
+        math.sqrt(guard.averages[0].error_plain),
+        math.sqrt(guard.averages[0].error_learned),
+        guard.sample[0].reason,
+        *estimate.theta.values(),
+    ]
+    np.testing.assert_array_equal(row, expected)
+    assert estimate.theta["x1"] != 0.0
+
+
 def test_reference_derivatives_are_forgotten_at_a_start_from_rest() -> None:
     """They belong to the sample they came with."""
     law = ql.ADRC(OBSERVER, 3.0, feedforward=True)
@@ -145,7 +178,7 @@ def test_reference_derivatives_are_forgotten_at_a_start_from_rest() -> None:
     np.testing.assert_array_equal(law._state.reference, [0.0, 0.0])
 
 
-LIMITS = Limits(-1.0, 2.0, 0.5)
+LIMITS = Limits(-1.0, 2.0, 0.5, -0.25)
 BOTH = int(Status.SATURATED | Status.RATE_LIMITED)
 
 
@@ -154,15 +187,15 @@ BOTH = int(Status.SATURATED | Status.RATE_LIMITED)
     [
         (0.25, 0.0, (0.25, 0)),
         (0.5, 0.0, (0.5, 0)),
-        (-0.5, 0.0, (-0.5, 0)),
+        (-0.25, 0.0, (-0.25, 0)),
         (0.75, 0.0, (0.5, int(Status.RATE_LIMITED))),
-        (-0.75, 0.0, (-0.5, int(Status.RATE_LIMITED))),
+        (-0.375, 0.0, (-0.25, int(Status.RATE_LIMITED))),
         (2.0, 1.75, (2.0, 0)),
         (-1.0, -0.75, (-1.0, 0)),
-        (2.25, 1.75, (2.0, int(Status.SATURATED))),
-        (-1.25, -0.75, (-1.0, int(Status.SATURATED))),
+        (2.125, 1.75, (2.0, int(Status.SATURATED))),
+        (-1.125, -0.875, (-1.0, int(Status.SATURATED))),
         (9.0, 1.75, (2.0, BOTH)),
-        (-9.0, -0.75, (-1.0, BOTH)),
+        (-9.0, -0.875, (-1.0, BOTH)),
         (9.0, -9.0, (-1.0, BOTH)),
         (-9.0, 9.0, (2.0, BOTH)),
     ],

@@ -125,7 +125,7 @@ def trial() -> Any:
     return module
 
 
-@pytest.mark.parametrize("name", ["NLMS", "Kalman, guarded", "nonlinear", "PID"])
+@pytest.mark.parametrize("name", ["NLMS", "Kalman, guarded", "order 1", "PID"])
 def test_after_hostile_samples_a_loop_settles_as_a_new_one_does(name: str, trial: Any) -> None:
     """U is a number within its limits all the time; see benchmarks/hostile_steps.py for the rest."""
     make, plant = trial.configurations()[name]

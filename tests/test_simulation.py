@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -266,29 +264,6 @@ def test_a_run_of_ten_million_samples_needs_the_memory_of_its_record() -> None:
         owner = owner.base
     assert owner.base is None
     assert owner.nbytes < 50_000
-
-
-def test_a_plant_sees_the_time_of_each_sample_within_a_block() -> None:
-    """``x' = 3 t²`` is t³, whichever block and segment a sample is in."""
-    clock = ql.plants.NonlinearPlant(lambda t, x, u, w: (3.0 * t * t,), order=1)
-    law = ql.ADRC(ql.ESO.model_free(1, 1.0, 5.0, 0.01), omega_c=1.0)
-    run = ql.simulate(clock, law, ql.Scenario(duration=3.0), interpret=True)
-    np.testing.assert_allclose(run["y"], run.t**3, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_plant_that_returns_no_number_ends_the_run(bad: float) -> None:
-    """At the first sample without one: the run has diverged, and all that it recorded is finite."""
-    broken = ql.plants.NonlinearPlant(
-        lambda t, x, u, w: (bad if t > 0.495 else 0.0,), order=1, substeps=1
-    )
-    law = ql.ADRC(ql.ESO.model_free(1, 1.0, 5.0, 0.01), omega_c=1.0)
-    run = ql.simulate(broken, law, ql.Scenario(duration=1.0), interpret=True)
-    assert run.diverged
-    assert ql.Status.DIVERGED in run.status
-    assert run.ended == pytest.approx(0.5, abs=0.011)
-    assert np.all(np.isfinite(run.log))
-    assert len(run) >= 49
 
 
 def test_the_limit_follows_the_size_of_what_is_asked_for() -> None:

@@ -321,5 +321,9 @@ def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
 
 
 def test_the_interpreted_driver_is_the_same_function() -> None:
-    """There is one algorithm, not two."""
-    assert interpreted(run_block).__name__ == run_block.__name__
+    """There is one algorithm, not two: what is compiled is the code that runs interpreted."""
+    plain = interpreted(run_block)
+    assert plain is not run_block
+    for entry in (run_block, dispatcher_for(run_block, object())):
+        assert entry.py_func.__code__ is plain.__code__
+    assert interpreted(plain) is plain
