@@ -12,7 +12,7 @@ import pytest
 import quell as ql
 from quell.controllers.adrc.law import unlimited_control
 from quell.controllers.base import control, reset_loop, set_reference_derivatives, write_row
-from quell.controllers.limits import Limits, apply_limits
+from quell.controllers.limits import Limits, apply_limits, largest_wish
 from quell.controllers.stateful import named_arrays
 from quell.learners.base import commit, restart
 from quell.types import Status
@@ -211,3 +211,37 @@ def test_the_observer_waits_at_the_limit_nearest_to_zero() -> None:
         law = ql.ADRC(OBSERVER, 3.0, u_min=low, u_max=high)
         assert step(law, 1.0, math.nan) == u
         assert law.estimate.u == u
+
+
+def test_without_a_reference_the_loop_stays_where_y_is() -> None:
+    """Until the first one comes; then it is held when it is missing."""
+    law = ql.ADRC(OBSERVER, 3.0)
+    assert step(law, math.nan, 5.0) == 0.0
+    assert law._state.loop[0].r == 5.0
+    step(law, math.nan, 5.5)
+    assert law._state.loop[0].r == 5.5
+    step(law, 7.0, 5.5)
+    step(law, math.nan, 6.0)
+    assert law._state.loop[0].r == 7.0
+
+
+def test_a_law_without_limits_has_no_largest_wish() -> None:
+    """Else it is 2⁴⁰ times the larger limit."""
+    assert largest_wish(LIMITS) == 2.0**41
+    assert largest_wish(Limits(-3.0, 2.0, 0.5, -0.5)) == 3.0 * 2.0**40
+    assert largest_wish(Limits(-1.0, math.inf, 0.5, -0.5)) == math.inf
+
+
+def test_an_integrator_returns_at_once_from_an_absurd_measurement() -> None:
+    """The law starts again from rest at the next good one, and says so; a high gain alone is none."""
+    pid = ql.baselines.PID(8.0, 6.0, 3.0, tf=0.05, dt=DT, u_min=-2.0, u_max=3.0)
+    fresh = copy.deepcopy(pid)
+    for y in (0.5, 0.4, 1e50):
+        control(pid.parameters, pid._state, 0.5, y)
+    for y in (0.4, 0.45):
+        u = control(pid.parameters, pid._state, 0.5, y)
+        assert u == pytest.approx(control(fresh.parameters, fresh._state, 0.5, y), rel=1e-9)
+    assert np.max(np.abs(pid._state.x)) < 100.0
+    relay = ql.baselines.PID(1e15, dt=DT, u_min=-2.0, u_max=3.0)
+    assert control(relay.parameters, relay._state, 1.0, 0.5) == 3.0
+    assert control(relay.parameters, relay._state, 0.0, 0.5) == -2.0
