@@ -19,6 +19,8 @@ import quell as ql
 from quell.cli.commands.run_rig import exit_code
 from quell.cli.exit_codes import ExitCode
 from quell.cli.report import windowed_metrics
+from quell.realtime import CsvSink
+from quell.realtime import load as load_recording
 from quell.realtime.loop.modes import Cause, Mode
 from quell.realtime.loop.result import ModeChange, RigRun
 from quell.records.measures import MEASURES, STEP_MEASURES
@@ -279,6 +281,34 @@ def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_pat
         "quell: path = 'run.mcap': the file exists; choose another name, or ask to replace it "
         "(--overwrite on the command line, overwrite=True in Python)\n",
     )
+
+
+def test_a_full_disk_is_told_once_and_ends_neither_run_nor_exit_code(
+    quell: Callable[..., Shown],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The other recording is complete; a trip is told though its results can't be written."""
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(CsvSink, "write", full)
+    (tmp_path / "rig.toml").write_text(RIG)
+    places = ("--csv", "run.csv", "--mcap", "run.mcap", "--no-figures", "--json", "out.json")
+    shown = quell("run-rig", "rig.toml", "--seconds", "0.3", *places)
+    assert shown.code == 0, shown.err
+    assert (shown.out + shown.err + caplog.text).count("No space left on device") == 1
+    cycles = json.loads((tmp_path / "out.json").read_text())["tally"]["cycles"]
+    assert len(load_recording(tmp_path / "run.mcap")) == cycles
+    (tmp_path / "trip.toml").write_text(
+        RIG.replace("settle = 10", "most_error = 0.05, settle = 10")
+    )
+    monkeypatch.setattr("quell.files.write_json", full)
+    shown = quell("run-rig", "trip.toml", "--no-figures", "--json", "other.json")
+    assert shown.code == 3
+    assert shown.err.count("No space left on device") == 1
 
 
 def test_a_trip_is_told_by_exit_code_three(quell: Callable[..., Shown], tmp_path: Path) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import resource
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import quell as ql
 from quell.files import (
     check_writable,
     new_folder,
@@ -85,6 +88,24 @@ def test_a_new_folder_gets_the_first_name_that_is_free(tmp_path: Path) -> None:
     (tmp_path / "figures-5").mkdir()
     names.append(new_folder(tmp_path / "figures").name)
     assert names == ["figures", "figures-2", "figures-3", "figures-5"]
+
+
+def test_a_full_disk_is_named_with_the_file_in_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    """A limit on the file size acts as a full disk; HDF5's own text has a page."""
+    run = ql.Trajectory(np.zeros((2000, 3)), (("r", 1), ("y", 1), ("u", 1)), 0.01)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+    try:
+        for name, write in (
+            ("out.json", lambda path: write_json(path, list(range(9999)))),
+            ("run.nc", run.save),
+        ):
+            with pytest.raises(OSError, match=f"File too large: '.*{name}'") as failed:
+                write(tmp_path / name)
+            assert "\n" not in str(failed.value)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_json_has_no_numbers_that_are_not_finite(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def written_atomically(path: str | os.PathLike[str], overwrite: bool = False) ->
     """Yield a path to write to; at the end it becomes ``path``, or is removed after an error.
 
     A ``ValueError`` says that ``path`` exists and is not to be replaced, also if it came into being
-    meanwhile.
+    meanwhile; an ``OSError`` names it and the reason, such as a full disk.
     """
     target = Path(path)
     check_free(target, overwrite)
@@ -59,6 +59,10 @@ def written_atomically(path: str | os.PathLike[str], overwrite: bool = False) ->
             part.replace(target)
         else:
             _link(part, target)
+    except OSError as error:  # of a library, its text may be a page
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(target)) from None
     finally:
         part.unlink(missing_ok=True)
 

@@ -59,9 +59,9 @@ class Record:
         A ``ValueError`` says that the file exists, unless ``overwrite`` allows to replace it.
         """
         check_writable(path, overwrite)
-        dataset = self.to_xarray()
+        image = _netcdf(self.to_xarray())
         with written_atomically(path, overwrite) as part:
-            dataset.to_netcdf(part, engine="h5netcdf")
+            part.write_bytes(image)
 
     def _dataset(self, axes: tuple[str, ...], attributes: dict[str, Any]) -> xarray.Dataset:
         """Return the channels over ``axes``, with more ``attributes`` of the dataset."""
@@ -81,3 +81,21 @@ class Record:
             variables[name] = (of_channel, values, {"long_name": about, "units": unit})
         attributes = {"dt": self.dt, "every": self.every, **attributes}
         return xarray.Dataset(variables, coordinates, attrs=attributes)
+
+
+def _netcdf(dataset: xarray.Dataset) -> bytes:
+    """Return a dataset as a NetCDF file in memory.
+
+    HDF5 must not write to the disk itself: when that is full, it leaves objects behind that end the
+    process as soon as they are collected.
+    """
+    import h5netcdf
+    import h5py
+    from xarray.backends import H5NetCDFStore
+
+    memory = {"driver": "core", "backing_store": False, "track_order": True}
+    with h5py.File("in memory", "w", **memory) as file:
+        with h5netcdf.File(file, "w") as netcdf:
+            dataset.dump_to_store(H5NetCDFStore(netcdf))
+        file.flush()
+        return bytes(file.id.get_file_image())

@@ -127,11 +127,6 @@ def _run(
     _print_timing(console, run)
     print_metrics(console, f"{setup.title}: the scenario", scores)
     learned = print_outcome(console, record)
-    paths = []
-    if outputs.figures and len(record):
-        paths = save_run_figure(record, setup.title, outputs, Path(name).stem)
-        paths += _save_timing_figure(run, setup, outputs.figures, outputs.overwrite)
-    write_record(console, record, outputs, "Record")
     code = exit_code(run)
     results = {
         "title": setup.title,
@@ -144,8 +139,25 @@ def _run(
         "learned": learned,
         "setup": setup.as_json(),
     }
-    write_results(console, results, outputs, paths)
+    try:
+        _write(console, run, setup, results, outputs)
+    except OSError as error:  # the disk is full: the code of a run that safety ended goes first
+        if code == ExitCode.DONE:
+            raise
+        print(f"quell: {error}", file=sys.stderr)
     return code
+
+
+def _write(
+    console: Console, run: RigRun, setup: Setup, results: dict[str, Any], outputs: RunOutputs
+) -> None:
+    """Write figures, record and results where they are asked for."""
+    record, paths = run.trajectory, []
+    if outputs.figures and len(record):
+        paths = save_run_figure(record, setup.title, outputs, Path(setup.file).stem)
+        paths += _save_timing_figure(run, setup, outputs.figures, outputs.overwrite)
+    write_record(console, record, outputs, "Record")
+    write_results(console, results, outputs, paths)
 
 
 def _close_loop(
@@ -224,7 +236,8 @@ def _print_timing(console: Console, run: RigRun) -> None:
     if run.counters:
         print_line(console, f"Device: {_counted(run.counters)}")
     for note in run.notes:
-        print_line(console, f"Note: {note}")
+        if not note.startswith("telemetry: "):  # these were logged at once
+            print_line(console, f"Note: {note}")
 
 
 def _counted(counts: Mapping[str, int]) -> str:
