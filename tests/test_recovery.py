@@ -114,9 +114,10 @@ def test_a_window_is_ten_lags_of_the_observer() -> None:
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "hostile_steps.py"
 
 
-@pytest.fixture(scope="module")
-def trial() -> Any:
+@pytest.fixture
+def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The script of the full trial, as a module."""
+    monkeypatch.syspath_prepend(SCRIPT.parent)
     spec = importlib.util.spec_from_file_location("hostile_steps", SCRIPT)
     assert spec is not None
     assert spec.loader is not None
