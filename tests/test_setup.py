@@ -287,6 +287,10 @@ def test_a_model_is_the_files_plant_or_its_own() -> None:
         "plant = 'torsional'\n[observer]\nkind = 'model-based'\nomega_o = 40.0", without=("plant",)
     )
     assert rough.controller.observer.order == 4
+    own_rough = setup(
+        "[observer]\nkind = 'model-based'\nomega_o = 40.0\nplant = {kind = 'torsional'}"
+    )
+    np.testing.assert_array_equal(own_rough.controller.observer.a, rough.controller.observer.a)
     late = setup("[plant]\nkind = 'delayed'\ndelay = 0.03\nplant = {kind = 'two-mass', m2 = 0.5}")
     assert late.plant.samples == 3
     linear = setup("[plant]\nkind = 'linear'\nnum = [2.0]\nden = [1.0, 3.0, 0.0]").plant

@@ -11,7 +11,7 @@ from quell.identification.closed_loop import instrumental_variables
 from quell.identification.result import Identified
 from quell.identification.roots import poles_of, zeros_of
 from quell.identification.search import Fit, fit
-from quell.identification.structure import free_run
+from quell.identification.structure import Structure, free_run
 from quell.identification.validation import (
     fit_predictor,
     nrmse,
@@ -20,7 +20,7 @@ from quell.identification.validation import (
     simulate_fit,
 )
 from quell.parallel import one_blas_thread
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 _METHODS = (
     "output error, started by refined instrumental variables",
@@ -50,11 +50,13 @@ def identify(
     """Fit a continuous transfer function to recorded input and output.
 
     The result is the model of least output error, ``min Σ (y − ŷ)²``, with ŷ simulated from u alone
-    and exact at the samples for a u that is held between them. The search starts at an ARX model in
-    continuous time, found by least squares on filtered signals and freed of bias by refined
-    instrumental variables, and continues with Levenberg and Marquardt's method
-    (``quell.identification``: ``initial_estimate``, ``output_error`` and ``structure`` have
-    equations and sources).
+    and exact at the samples for a u that is held between them. The search starts at ARX
+    models in continuous time, found by least squares on filtered signals and freed of bias by
+    refined instrumental variables, at reduced models of high order, and at smaller models; the best
+    are refined by Levenberg and Marquardt's method (``quell.identification``: ``best_start``,
+    ``initial_estimate``, ``reduced``, ``output_error`` and ``structure`` have equations and
+    sources). ``converged`` is true if no step reduces the error further and the model is confirmed:
+    a second start led to it, or its error is white.
 
     Parameters
     ----------
@@ -66,7 +68,9 @@ def identify(
     dt
         sample time [s].
     order, zeros
-        number of poles n, 1 to 8, and of zeros, less than n.
+        number of poles n, 1 to 8, and of zeros, at most n. With n zeros u also acts on y at once
+        (direct feedthrough, as for an acceleration behind a force). Such a model describes and
+        simulates the record, but is no plant for an observer or a simulated loop.
     integrators
         number of poles at s = 0. By default a pole is set there if it can't be distinguished from s
         = 0: if it is within three of its standard deviations, or slower than ten times the record;
@@ -122,7 +126,12 @@ def identify(
             )
     dt = checks.positive("dt", dt, "s")
     order = checks.whole("order", order, 1, 8)
-    zeros = checks.whole("zeros", zeros, 0, order - 1)
+    zeros = checks.whole("zeros", zeros, 0, order)
+    if zeros == order and reference is not None:
+        raise ValueError(
+            f"zeros = {zeros}: with reference must be less than order = {order}: instrumental "
+            "variables do not find direct feedthrough"
+        )
     if integrators is not None:
         integrators = checks.whole("integrators", integrators, 0, order)
     bias, friction = checks.flag("bias", bias), checks.flag("friction", friction)
@@ -169,14 +178,15 @@ def _validated(
     theta = fitted.estimate.theta * seconds
     covariance = fitted.estimate.covariance * np.outer(seconds, seconds)
     a, numerators = structure.denominator(theta), structure.numerators(theta)
-    b, free = numerators[0, : structure.degrees[0] + 1], structure.free
+    free = structure.free
+    b, covariance = _numerator(structure, theta, covariance)
     of_b = slice(free, free + b.size)
     gain = b[0] if b[0] != 0.0 else np.nan
     rubbing = numerators[numerators.shape[0] - len(structure.friction) :, 0]
     return Identified(
         num=b[::-1].copy(),
         den=np.append(1.0, a[::-1]),
-        covariance=covariance[: free + b.size, : free + b.size],
+        covariance=covariance,
         poles=poles_of(a, covariance, structure.integrators),
         zeros=zeros_of(b, covariance[of_b, of_b]),
         integrators=structure.integrators,
@@ -196,6 +206,22 @@ def _validated(
         converged=fitted.estimate.converged,
         method=_METHODS[r is not None],
     )
+
+
+def _numerator(structure: Structure, theta: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
+    """Return b in ascending powers, and the covariance of a and b."""
+    free, a = structure.free, structure.denominator(theta)
+    count = structure.degrees[0] + 1
+    b, size = structure.numerators(theta)[0, :count], free + count
+    if not structure.direct:
+        return b, covariance[:size, :size]
+    # B + D_u A, with the derivatives by a, B and D_u
+    at, direct = structure.size - structure.order - 1, structure.feedthrough(theta)
+    slope = np.zeros((size + 1, structure.size))
+    slope[:size, :size] = np.eye(size)
+    slope[free + structure.integrators : size, :free] = direct * np.eye(free)
+    slope[free:size, at], slope[size, at] = a, 1.0
+    return np.append(b + direct * a, direct), slope @ covariance @ slope.T
 
 
 def _resolution(y: Vector) -> float:

@@ -22,6 +22,7 @@ import math
 
 import numpy as np
 
+from quell.identification.output_error import projected
 from quell.identification.sampling import chain
 from quell.identification.structure import (
     Structure,
@@ -36,53 +37,36 @@ from quell.types import Matrix, Vector
 # Number of λ, log-spaced from 10 per length of the record (at most 0.01 per sample) to 0.5 per
 # sample: chosen by hand.
 _RATES = 7
-# Share of the output's power that may stay unexplained before lower orders are tried (by hand).
-_POOR = 1e-3
-# Fast pole that is added to a model of lower order: beyond the π per sample that samples show.
-_FAST_POLE = 10.0
-# Rounds of refined instrumental variables, least relative gain of one: chosen by hand, not tuned.
-_ROUNDS, _GAIN = 8, 1e-3
+# Most rounds of refined instrumental variables, and the relative change of A that ends them: chosen
+# by hand; not tuned further.
+_ROUNDS, _SAME = 8, 1e-3
 # For slow λ, samples are averaged: over this share of the filter's time constant at most, with this
 # number of averages for each parameter at least. Chosen by hand; the result is only a start.
 _SHARE, _AVERAGES = 0.1, 100
 
 
-def initial_estimates(structure: Structure, v: Matrix, y: Vector) -> tuple[Vector, ...]:
-    """Return one or more θ near the least output error, for inputs ``v`` and output ``y``.
-
-    If the first leaves much unexplained, those of lower orders with added fast poles follow.
-    """
+def filtered_estimates(structure: Structure, v: Matrix, y: Vector) -> list[Vector]:
+    """Return a θ by least squares for each λ, the one of least output error first."""
     rates = np.geomspace(min(10.0 / y.size, 1e-2), 0.5, _RATES).tolist()
     tried = [_filtered(structure, v, y, rate) for rate in rates]
-    costs = ((cost(structure, theta, v, y), theta) for theta in tried)
-    best, theta = min(costs, key=lambda pair: pair[0])
+    return sorted(tried, key=lambda theta: cost(structure, theta, v, y))
+
+
+def refined(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
+    """Return the least output error and its θ among ``theta`` and rounds of refined instruments."""
+    best, theta = projected(structure, theta, v, y)
+    found = theta
     for _ in range(_ROUNDS):
-        refined = stable(structure, _refined(structure, theta, v, y))
-        value = cost(structure, refined, v, y)
-        if not value < best * (1.0 - _GAIN):
+        theta, before = stable(structure, _refined(structure, theta, v, y)), theta
+        value = cost(structure, theta, v, y)
+        if value < best:
+            best, found = value, theta
+        change = np.abs(theta - before)[: structure.free]
+        if not np.all(np.isfinite(theta)) or np.all(
+            change <= _SAME * np.abs(before[: change.size])
+        ):
             break
-        best, theta = value, refined
-    least_order = max(structure.degrees[0] + 1, structure.integrators)
-    if best <= _POOR * float(np.var(y)) or structure.order <= least_order:
-        return (theta,)
-    others = (max(min(degree, structure.order - 3), 0) for degree in structure.degrees[1:])
-    lower = structure._replace(order=structure.order - 1, degrees=(structure.degrees[0], *others))
-    simpler = initial_estimates(lower, v, y)
-    return theta, *(_with_fast_pole(structure, lower, one) for one in simpler)
-
-
-def _with_fast_pole(structure: Structure, lower: Structure, theta: Vector) -> Vector:
-    """Return θ of the model ``lower`` with a fast pole added, cut to the terms of ``structure``."""
-
-    def times(polynomial: Vector) -> Vector:
-        return np.append(0.0, polynomial) + _FAST_POLE * np.append(polynomial, 0.0)
-
-    a = times(np.append(lower.denominator(theta), 1.0))
-    numerators = [
-        times(row)[: degree + 1]
-        for row, degree in zip(lower.numerators(theta), structure.degrees, strict=True)
-    ]
-    return np.concatenate([a[structure.integrators : -1], *numerators, times(lower.initial(theta))])
+    return best, found
 
 
 def stable(structure: Structure, theta: Vector) -> Vector:
@@ -107,7 +91,8 @@ def _filtered(structure: Structure, v: Matrix, y: Vector, rate: float) -> Vector
     prefilter = np.array([math.comb(n, i) * (every * rate) ** (n - i) for i in range(n)])
     known = linear_columns(structure, prefilter, mean)
     target, regressors = equation(structure, prefilter, known, coarse)
-    return stable(structure, _solve(regressors, target) / structure.powers(float(every)))
+    theta = _proper(structure, prefilter, _solve(regressors, target))
+    return stable(structure, theta / structure.powers(float(every)))
 
 
 def equation(
@@ -123,8 +108,18 @@ def _refined(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Vecto
     with np.errstate(all="ignore"):
         _, instruments = gradient(structure, theta, v)
         known = instruments[:, structure.free :]
-        target, regressors = equation(structure, structure.denominator(theta), known, y)
-        return _solve(regressors, target, instruments)
+        prefilter = structure.denominator(theta)
+        target, regressors = equation(structure, prefilter, known, y)
+        return _proper(structure, prefilter, _solve(regressors, target, instruments))
+
+
+def _proper(structure: Structure, prefilter: Vector, theta: Vector) -> Vector:
+    """Return θ from the solution of the equation, where b contains ``D_u (A − Λ)`` too."""
+    if structure.direct:
+        theta = theta.copy()
+        of_u = slice(structure.free, structure.free + structure.order)
+        theta[of_u] += structure.feedthrough(theta) * (prefilter - structure.denominator(theta))
+    return theta
 
 
 def _solve(regressors: Matrix, target: Vector, instruments: Matrix | None = None) -> Vector:

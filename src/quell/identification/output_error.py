@@ -1,15 +1,22 @@
 """Output-error refinement: the parameters whose simulated output is nearest to the measured one.
 
-With e = y − ŷ(θ) and the gradient ψ of ŷ (``structure``), a step of Levenberg and Marquardt (Ljung
-1999, sec. 10.2) solves::
+For given poles the output is linear in all other parameters. So only the coefficients a of A are
+searched for, and the others are solved for at each of them (variable projection: Golub & Pereyra,
+*SIAM J. Numerical Analysis* 10, 1973). With the columns Φ of the linear parameters, the derivatives
+ψ by a, the error e = y − ŷ and the projection ``P = I − Φ Φ⁺``, a step of Levenberg and Marquardt
+(Ljung 1999, sec. 10.2) solves (Kaufman, *BIT* 15, 1975)::
 
-    (Σ ψ ψᵀ + μ diag(Σ ψ ψᵀ)) δθ = Σ ψ e
+    (ψᵀ P ψ + μ diag(ψᵀ ψ)) δa = ψᵀ P e
 
-and lowers μ after a step that reduces the error, or raises it. For white and normal e this is the
-maximum-likelihood estimate. For coloured e it is still consistent if u is open loop (Ljung 1999,
-th. 8.3), but the usual covariance is wrong. So the covariance is computed from sums of ψ e over
-blocks that are longer than the correlation of e (the sandwich of Huber and White; Liang & Zeger,
-*Biometrika* 73, 1986)::
+and lowers μ after a step that reduces the error, or raises it. Both equations are solved by the QR
+decomposition of ``[Φ ψ e]``, by blocks of rows (Demmel et al., *SIAM J. Scientific Computing* 34,
+2012), without squaring the condition number. The search has converged if the step with μ = 0
+predicts a relative gain below a limit: a small gain of a damped step shows nothing.
+
+For white and normal e the result is the maximum-likelihood estimate. For coloured e it is still
+consistent if u is open loop (Ljung 1999, th. 8.3), but the usual covariance is wrong. So the
+covariance is computed from sums of ψ e over blocks that are longer than the correlation of e (the
+sandwich of Huber and White; Liang & Zeger, *Biometrika* 73, 1986), here with ψ for all parameters::
 
     cov θ = H⁻¹ (Σ_blocks s sᵀ) H⁻¹,     H = Σ ψ ψᵀ,  s = Σ_{k in block} ψ_k e_k
 """
@@ -22,21 +29,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.structure import Structure, cost, gradient
+from quell.identification.structure import Structure, gradient, linear_columns, nonzero_lengths
 from quell.types import Matrix, Vector
 
-# Convergence: relative gain of a step, chosen by hand; not tuned further.
+# Convergence: relative gain that the step without damping predicts, chosen by hand: the standard
+# deviations of a record of N samples are worth 1/N.
 _CONVERGED = 1e-7
 # First μ, least μ after a failed step, μ at which the search ends: chosen by hand, not tuned. The
 # factor of 10 for each step is Marquardt's.
-_MU, _LEAST_MU, _MOST_MU = 1e-4, 1e-8, 1e8
-# Relative singular value of H that counts as zero: some 50 units of rounding.
+_MU, _LEAST_MU, _MOST_MU = 1e-3, 1e-8, 1e8
+# Relative singular value that counts as zero: some 50 units of rounding.
 _RANK = 1e-14
 # Relative mean square that counts as zero: rounding in long simulations adds up to errors of 1e-12.
 _ROUNDING = 1e-24
-# Least number of blocks: longer ones hold more correlation, fewer make the covariance uncertain;
-# chosen by hand.
+# Least number of blocks for the covariance: longer ones hold more correlation, fewer make the
+# covariance uncertain; chosen by hand.
 _BLOCKS = 60
+# Rows of a block of the QR decomposition: it stays in the processor's cache; by measurement.
+_ROWS = 700
 
 
 class ParameterEstimate(NamedTuple):
@@ -52,40 +62,81 @@ def refine(
     structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: int
 ) -> ParameterEstimate:
     """Return θ of least output error near ``theta``, for inputs ``v`` and output ``y``."""
-    best, mu = cost(structure, theta, v, y), _MU
+    found = descend(structure, theta, v, y, steps)
+    return found._replace(covariance=covariance(structure, found.theta, v, y))
+
+
+def descend(
+    structure: Structure, theta: Vector, v: Matrix, y: Vector, steps: int
+) -> ParameterEstimate:
+    """Return what ``refine`` returns, without the covariance."""
+    free, mu = structure.free, _MU
+    best, theta = projected(structure, theta, v, y)
     # Without noise the error falls to its own rounding, where a step may not reduce it further.
     rounding = _ROUNDING * float(np.mean(y**2))
-    converged = best <= rounding
+    converged = best <= rounding or (free == 0 and math.isfinite(best))
     near = _linearise(structure, theta, v, y)
-    for _ in range(steps):
-        if converged or not near.finite:
+    for _ in range(steps if free else 0):
+        if near is None or best <= rounding:
             break
-        step = np.linalg.solve(near.hessian + mu * np.eye(theta.size), near.right) / near.size
-        value = cost(structure, theta + step, v, y)
+        converged = near.gain <= _CONVERGED * max(near.error, best * y.size)
+        if converged or mu > _MOST_MU:
+            break
+        trial = theta.copy()
+        trial[:free] += _damped(near.inner, near.right, mu) / near.size[:free]
+        value, trial = projected(structure, trial, v, y)
         if value < best:
-            converged = best - value <= _CONVERGED * best
-            best, theta, mu = value, theta + step, 0.1 * mu
+            best, theta, mu = value, trial, 0.1 * mu
             near = _linearise(structure, theta, v, y)
         else:
-            # The part of e in the range of its gradient may be no more than rounding.
-            gain = near.right @ np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0]
-            converged = bool(gain <= _CONVERGED * best * y.size)
             mu = max(10.0 * mu, _LEAST_MU)
-        converged = converged or best <= rounding or mu > _MOST_MU
-    if not near.finite:
-        return ParameterEstimate(theta, np.full(near.hessian.shape, np.inf), best, False)
-    half = np.linalg.pinv(near.hessian, rcond=_RANK, hermitian=True) @ near.scores.T
-    covariance = half @ half.T / np.outer(near.size, near.size)
-    return ParameterEstimate(theta, covariance, best, converged)
+    none = np.full((theta.size, theta.size), np.inf)
+    return ParameterEstimate(
+        theta, none, best, (converged or best <= rounding) and near is not None
+    )
+
+
+def projected(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
+    """Return the least mean square error for the poles of ``theta``, and θ with this error."""
+    if not np.all(np.isfinite(theta[: structure.free])):
+        return math.inf, theta
+    with np.errstate(all="ignore"):
+        columns = linear_columns(structure, structure.denominator(theta), v)
+        size = nonzero_lengths(columns)
+        if not np.all(np.isfinite(size)):
+            return math.inf, theta
+        R = _triangle(np.column_stack([columns / size, y]))
+        linear, error = _least_squares(R[:, :-1], R[:, -1])
+    found = np.append(theta[: structure.free], linear / size)
+    value = error / y.size
+    return (value, found) if math.isfinite(value) else (math.inf, theta)
+
+
+def covariance(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Matrix:
+    """Return the covariance of θ at an optimum, infinite for a model whose output is not finite."""
+    with np.errstate(all="ignore"):
+        predicted, psi = gradient(structure, theta, v)
+        size = nonzero_lengths(psi)
+        error = y - predicted
+    if not (np.all(np.isfinite(size)) and np.all(np.isfinite(error))):
+        return np.full((theta.size, theta.size), np.inf)
+    psi = psi / size
+    scores = block_sums(psi, error, min(max(4 * theta.size, _BLOCKS), y.size))
+    half = np.linalg.pinv(psi.T @ psi, rcond=_RANK, hermitian=True) @ scores.T
+    return half @ half.T / np.outer(size, size)
 
 
 def gauss_newton(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
     """Return the mean square error that a Gauss-Newton step predicts, and θ after it."""
-    near = _linearise(structure, theta, v, y)
-    if not near.finite:
+    with np.errstate(all="ignore"):
+        predicted, psi = gradient(structure, theta, v)
+        size = nonzero_lengths(psi)
+        error = y - predicted
+    if not (np.all(np.isfinite(size)) and np.all(np.isfinite(error))):
         return math.inf, theta
-    step = np.linalg.lstsq(near.hessian, near.right, rcond=_RANK)[0]
-    return max(near.error - float(near.right @ step), 0.0) / y.size, theta + step / near.size
+    R = _triangle(np.column_stack([psi / size, error]))
+    step, left = _least_squares(R[:, :-1], R[:, -1])
+    return left / y.size, theta + step / size
 
 
 def block_sums(columns: Matrix, error: Vector, blocks: int) -> Matrix:
@@ -98,23 +149,50 @@ class _Linearisation(NamedTuple):
     """The output error near a θ, with the columns of the gradient scaled to length 1."""
 
     size: Vector  # lengths of the columns
-    hessian: Matrix
-    right: Vector  # Σ ψ e
-    scores: Matrix  # its sums over blocks
+    inner: Matrix  # the triangle of P ψ, its columns scaled as ψ
+    right: Vector  # P e in the same coordinates
+    gain: float  # reduction of Σ e² that the step without damping predicts
     error: float  # Σ e²
-    finite: bool  # false for a model whose output is not finite
 
 
-def _linearise(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Linearisation:
+def _linearise(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Linearisation | None:
+    """Return the linearisation, None for a model whose output is not finite."""
+    free = structure.free
     with np.errstate(all="ignore"):
         predicted, psi = gradient(structure, theta, v)
+        size = nonzero_lengths(psi)
         error = y - predicted
-        hessian, power = psi.T @ psi, float(error @ error)
-    finite = bool(np.all(np.isfinite(hessian))) and math.isfinite(power)
-    if not finite:
-        error, psi, hessian = np.zeros_like(error), np.zeros_like(psi), np.zeros_like(hessian)
-    size = np.sqrt(np.diag(hessian))
-    size = np.where(size > 0.0, size, 1.0)
-    scores = block_sums(psi, error, min(max(4 * theta.size, _BLOCKS), y.size)) / size
-    scaled = hessian / np.outer(size, size)
-    return _Linearisation(size, scaled, np.sum(scores, axis=0), scores, power, finite)
+        power = float(error @ error)
+    if not (np.all(np.isfinite(size)) and math.isfinite(power)):
+        return None
+    psi /= size
+    # The linear columns first: the rest of the triangle is then free of them.
+    R = _triangle(np.column_stack([psi[:, free:], psi[:, :free], error]))
+    at = theta.size - free
+    inner, right = R[at:-1, at:-1], R[at:-1, -1]
+    _, left = _least_squares(inner, right)
+    return _Linearisation(size, inner, right, max(float(right @ right) - left, 0.0), power)
+
+
+def _damped(inner: Matrix, right: Vector, mu: float) -> Vector:
+    """Return the step of Levenberg and Marquardt for columns of length 1."""
+    count = right.size
+    left = np.vstack([inner, math.sqrt(mu) * np.eye(count)])
+    return np.asarray(np.linalg.lstsq(left, np.append(right, np.zeros(count)), rcond=None)[0])
+
+
+def _least_squares(columns: Matrix, target: Vector) -> tuple[Vector, float]:
+    """Return the least-squares solution, and the sum of the squared error that is left."""
+    found: Vector = np.linalg.lstsq(columns, target, rcond=math.sqrt(_RANK))[0].astype(np.float64)
+    error = target - columns @ found
+    return found, float(error @ error)
+
+
+def _triangle(columns: Matrix) -> Matrix:
+    """Return the triangle R of a QR decomposition (columns, columns), by blocks of rows."""
+    count = columns.shape[1]
+    blocks = columns.shape[0] // max(_ROWS, 4 * count)
+    if blocks > 1:
+        parts = [np.linalg.qr(part, mode="r") for part in np.array_split(columns, blocks)]
+        columns = np.vstack(parts)
+    return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)

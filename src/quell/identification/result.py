@@ -48,12 +48,24 @@ class Identified:
     y: Vector
     simulated: Vector  #: the model's output (N,) [y-unit]; it starts again at the held-out samples
     reference: Vector | None
-    converged: bool
+    converged: bool  #: whether the search ended at a minimum that a second start or tests confirm
     method: str
 
     @cached_property
     def plant(self) -> LinearPlant:
-        """The transfer function as a plant, without delay, bias and friction."""
+        """The transfer function as a plant, without delay, bias and friction.
+
+        Raises
+        ------
+        ValueError
+            for a model with direct feedthrough.
+        """
+        if self.num.size == self.den.size:
+            raise ValueError(
+                f"zeros = {self.num.size - 1}: the model has direct feedthrough, u acts on y at "
+                "once; observers and simulated loops need a plant without it. Identify with fewer "
+                "zeros, or use num, den and response"
+            )
         return LinearPlant.of((self.num, self.den), name="identified plant")
 
     @property
@@ -71,13 +83,20 @@ class Identified:
             fast = (root for root in roots if root.omega > fastest)
             found += [f"the {kind} at {_format(root)} is {limit}" for root in fast]
         for zero in zeros:
-            cancelled = [
-                f"the pole at {_format(pole)} nearly equals a zero; use one pole and one zero less"
+            near = [
+                pole
                 for pole in poles
                 if abs(pole.value - zero.value) <= _DEVIATIONS * (pole.deviation + zero.deviation)
             ]
-            found += cancelled[:1]
-        return tuple(found)
+            if near:
+                # A zero cancels one pole only, and this one no other zero.
+                cancelled = min(near, key=lambda pole: abs(pole.value - zero.value))
+                poles.remove(cancelled)
+                found.append(
+                    f"the pole at {_format(cancelled)} nearly equals a zero; use one pole and one "
+                    "zero less"
+                )
+        return tuple(dict.fromkeys(found))
 
     @property
     def t(self) -> Vector:
@@ -92,7 +111,10 @@ class Identified:
         """
         s = 1j * np.asarray(omega, dtype=np.float64)
         hold = np.exp(-0.5 * s * self.dt) * np.sinc(s.imag * self.dt / (2.0 * np.pi))
-        return np.polyval(self.num, s) / np.polyval(self.den, s) * hold * np.exp(-s * self.delay)
+        # What acts at once is not delayed by the hold.
+        direct = self.num[0] if self.num.size == self.den.size else 0.0
+        rest = np.polyval(self.num, s) / np.polyval(self.den, s) - direct
+        return (rest * hold + direct) * np.exp(-s * self.delay)
 
     def empirical(self, segments: int = 8) -> FrequencyResponse:
         """Return the frequency response of the record itself; see ``frequency_response``."""

@@ -10,6 +10,9 @@ state. The output is exact at the samples, and with ``ŷ = A⁻¹(B u + …)`` s
 
 (Ljung, *System Identification*, 2nd ed. 1999, eqs. (10.52)–(10.55), in the shift operator.)
 
+With *direct feedthrough* u also acts on y at once, ``y = B/A u + D_u u + …``: a numerator ``B + D_u
+A`` with as many zeros as poles. D_u is a linear parameter as b is, and its derivative is u.
+
 **Coulomb friction** is an input of its own, minus the sign of a speed::
 
     A y = B u + F₁ v₁ + F₂ v₂,      v₁ = −sign(speed of the driven side),   v₂ = −sign(y')
@@ -42,13 +45,15 @@ from quell.types import Matrix, Vector
 
 
 class Structure(NamedTuple):
-    """The parameters θ, in this order: a_q … a_{n−1}; the numerator of each input; D."""
+    """The parameters θ, in this order: a_q … a_{n−1}; the numerator of each input; D_u; D."""
 
     order: int  #: n
     integrators: int  #: q, the number of poles that are set to s = 0
     degrees: tuple[int, ...]  #: degree of the numerator of each input, u first
     friction: tuple[float, ...] = ()
     """1/ω_a² [samples²] of each friction input, the last ones; 0.0 on the measured side."""
+    direct: bool = False
+    """Whether u also acts on y at once: ``y = … + D_u u``; then B has the degree n − 1."""
 
     @property
     def free(self) -> int:
@@ -58,7 +63,7 @@ class Structure(NamedTuple):
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return self.free + sum(self.degrees) + len(self.degrees) + self.order
+        return self.free + sum(self.degrees) + len(self.degrees) + self.direct + self.order
 
     def denominator(self, theta: Vector) -> Vector:
         """Return a (n,), in ascending powers."""
@@ -78,18 +83,24 @@ class Structure(NamedTuple):
         """Return D (n,), in ascending powers."""
         return theta[self.size - self.order :]
 
+    def feedthrough(self, theta: Vector) -> float:
+        """Return D_u, zero without direct feedthrough."""
+        return float(theta[self.size - self.order - 1]) if self.direct else 0.0
+
     def powers(self, unit: float) -> Vector:
         """Return the factor of each parameter for a unit of time that is ``unit`` times as long."""
         n = self.order
         a = unit ** (n - np.arange(float(self.integrators), n))
         numerators = [unit ** (n - np.arange(degree + 1.0)) for degree in self.degrees]
-        return np.concatenate([a, *numerators, unit ** (n - 1.0 - np.arange(n))])
+        direct = np.ones(int(self.direct))
+        return np.concatenate([a, *numerators, direct, unit ** (n - 1.0 - np.arange(n))])
 
 
 def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
     """Return the derivatives of y by all parameters except those of A (N, size − free)."""
-    bank, degrees = chains(a, v), (*structure.degrees, structure.order - 1)
-    return np.hstack([bank[:, : degree + 1, j] for j, degree in enumerate(degrees)])
+    bank = chains(a, v)
+    parts = [bank[:, : degree + 1, j] for j, degree in enumerate(structure.degrees)]
+    return np.hstack([*parts, v[:, : int(structure.direct)], bank[:, :, -1]])
 
 
 def output(structure: Structure, theta: Vector, v: Matrix) -> Vector:
@@ -104,14 +115,15 @@ def free_run(
     A = observable(structure.denominator(theta))
     B = np.ascontiguousarray(structure.numerators(theta)[:, ::-1].T)
     system, initial = sampled(A, B), structure.initial(theta)[::-1]
+    direct = structure.feedthrough(theta) * v[:, 0]
     if not (own_friction and structure.friction):
-        return states(system, v, initial)[:, 0], v
+        return states(system, v, initial)[:, 0] + direct, v
     # y' and y‴ without the direct effect of the inputs; y = x_1
     first = A[0]
     third = first @ A @ A
     speeds = np.array([first + weight * third for weight in structure.friction])
     x, inputs = states_with_friction(system, v, speeds, initial)
-    return x[:, 0], inputs
+    return x[:, 0] + direct, inputs
 
 
 def cost(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> float:
@@ -128,11 +140,17 @@ def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Ma
     n, degrees = structure.order, (*structure.degrees, structure.order - 1)
     columns, at = np.full((n, len(degrees)), -1), structure.free
     for j, degree in enumerate(degrees):
+        at += structure.direct * (j == len(structure.degrees))
         columns[: degree + 1, j] = np.arange(at, at + degree + 1)
         at += degree + 1
     a, B = structure.denominator(theta), structure.numerators(theta)[:, ::-1].T
     initial = structure.initial(theta)[::-1]
-    return sampling.gradient(a, B, initial, columns, structure.integrators, v, structure.size)
+    y, psi = sampling.gradient(a, B, initial, columns, structure.integrators, v, structure.size)
+    if structure.direct:
+        # The derivatives by a are those of the part of y that has passed through 1/A.
+        psi[:, structure.size - n - 1] = v[:, 0]
+        y += structure.feedthrough(theta) * v[:, 0]
+    return y, psi
 
 
 def lengths(columns: Matrix) -> Vector:

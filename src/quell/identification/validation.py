@@ -8,7 +8,9 @@ gets the simplest; Ljung 1999, sec. 3.2).
 
 The error ε of the simulation is tested as in Ljung 1999, sec. 16.6. *Whiteness*: ``ζ = N
 Σ_{τ=1}^{M} (R_ε(τ)/R_ε(0))²`` is χ² with M degrees of freedom for white ε. *Independence of u*: if
-ε does not depend on past u, ``√N R_εu(τ)`` is normal with variance ``Σ_k R_ε(k) R_u(k)``. The first
+ε does not depend on past u, ``√N R_εu(τ)`` is normal with variance ``Σ_k R_ε(k) R_u(k)``. All M + 1
+of them are within a limit with the probability 1 − α if each exceeds it with the probability
+``α/(M + 1)`` at most (Bonferroni), however they depend on each other. The first
 tests a model of the noise, which an output-error model does not have; the second tests the model of
 the plant.
 """
@@ -19,9 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quell.identification.correlation import correlation
 from quell.identification.sampling import chains
 from quell.identification.search import Fit
-from quell.identification.structure import free_run, lengths
+from quell.identification.structure import free_run, nonzero_lengths
 from quell.types import Matrix, Vector
 
 # Rounds that adapt the start and the signs of friction to each other: chosen by hand, not tuned.
@@ -40,7 +43,9 @@ class Residuals(NamedTuple):
     whiteness_limit: float  #: limit that ζ of a white sequence exceeds with 1 % probability
     #: correlation of ε and u, of variance 1, for ε later by τ = −M … M samples (2 M + 1,)
     cross_correlation: Vector
-    cross_limit: float  #: limit that 1 % of them exceed if ε does not depend on u
+    #: limit that the largest of those for τ ≥ 0 exceeds with 1 % probability if ε does not depend
+    #: on u
+    cross_limit: float
 
     @property
     def white(self) -> bool:
@@ -49,9 +54,8 @@ class Residuals(NamedTuple):
 
     @property
     def independent(self) -> bool:
-        """True if at most 1 % of the correlations with past u, or one of them, exceed the limit."""
-        outside = np.abs(self.cross_correlation[self.lags :]) > self.cross_limit
-        return bool(np.count_nonzero(outside) <= max(1, round(0.01 * outside.size)))
+        """True if no correlation with past u exceeds the limit, at 99 % for all together."""
+        return bool(np.max(np.abs(self.cross_correlation[self.lags :])) <= self.cross_limit)
 
 
 def nrmse(y: Vector, predicted: Vector) -> float:
@@ -71,7 +75,7 @@ def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
     theta = theta.copy()
     theta[-structure.order :] = 0.0
     free = chains(structure.denominator(theta), np.zeros((y.size, 0)))[:, :, 0]
-    size = lengths(free)
+    size = nonzero_lengths(_finite(free))
     predicted = _finite(free_run(structure, theta, v)[0])
     # With friction the start decides the sign of the speed, and the sign the start.
     for _ in range(_ROUNDS if structure.friction else 1):
@@ -81,8 +85,8 @@ def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
     return predicted
 
 
-def _finite(predicted: Vector) -> Vector:
-    """Return a simulated output if it is finite."""
+def _finite(predicted: Matrix) -> Matrix:
+    """Return a simulated output, or the outputs from several states, if they are finite."""
     if not np.all(np.isfinite(predicted)):
         raise ValueError("order: the fitted model is unstable; lower the order, or set integrators")
     return predicted
@@ -114,7 +118,7 @@ def residuals(error: Vector, u: Vector, lags: int) -> Residuals:
 
     e, v = error - np.mean(error), u - np.mean(u)
     count = e.size
-    re, ru, cross = (_correlation(*pair, lags) for pair in ((e, e), (v, v), (e, v)))
+    re, ru, cross = (correlation(*pair, lags) for pair in ((e, e), (v, v), (e, v)))
     # Without any error there is no correlation.
     power = re[lags] or 1.0
     auto = re[lags:] / power
@@ -128,14 +132,5 @@ def residuals(error: Vector, u: Vector, lags: int) -> Residuals:
         whiteness=float(count * np.sum(auto[1:] ** 2)),
         whiteness_limit=float(chi2.ppf(0.99, lags)),
         cross_correlation=cross / scale,
-        cross_limit=float(norm.ppf(0.995) * np.sqrt(variance / count)),
+        cross_limit=float(norm.isf(0.005 / (lags + 1)) * np.sqrt(variance / count)),
     )
-
-
-def _correlation(a: Vector, b: Vector, lags: int) -> Vector:
-    """Return ``mean(a[k + τ] b[k])`` for τ = −lags … lags."""
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    size = next_fast_len(a.size + lags, real=True)
-    found = irfft(rfft(a, size) * np.conj(rfft(b, size)), size) / a.size
-    return np.concatenate([found[size - lags :], found[: lags + 1]])

@@ -43,7 +43,7 @@ def identify(
     order
         Number of poles.
     zeros
-        Number of zeros.
+        Number of zeros; as many as poles if u acts on y at once.
     integrators
         Number of poles at s = 0; by default one if the slowest pole cannot be
         distinguished from it.
