@@ -24,14 +24,20 @@ def judged(
 ) -> dict[str, Any]:
     """Return the errors found and how the trial ended."""
     wrong = judge_wire(log, rig_killed)
-    found: dict[str, Any] = {"ended": "the loop was killed", "wrong": wrong}
+    found: dict[str, Any] = {"ended": "it was killed", "wrong": wrong}
     files = [folder / "run.csv", folder / "run.mcap"]
     if disk_full:
         files = [folder.parent / "full" / path.name for path in files]
     if loop_killed:
         found["lost"] = [judge_loss(path, log, wrong) for path in files]
     elif (folder / "error.txt").exists():
-        wrong.append(f"the loop raised {(folder / 'error.txt').read_text(encoding='utf-8')}")
+        raised = (folder / "error.txt").read_text(encoding="utf-8")
+        if disk_full and "can't be written (No space left" in raised:
+            found["ended"] = "refused: no space"
+        elif "no device answers" in raised:  # within three seconds, on a busy machine
+            found["ended"] = "no device answered"
+        else:
+            wrong.append(f"the loop raised {raised}")
     else:
         told = json.loads((folder / "run.json").read_text(encoding="utf-8"))
         found["ended"] = (
@@ -153,5 +159,10 @@ def judge_record(path: Path, told: dict[str, Any], wrong: list[str]) -> None:
         record["events"][down].astype(int) >> 16 & 1
     ):
         wrong.append(f"{path.name}: the loop took {down.size} samples to stop")
-    if np.any(np.diff(np.abs(u[down])) > 1e-12):
+    # The record has the u that acted, where the device has told it: it may be that of a command
+    # before, but none is larger than the u at which the ramp began.
+    if (
+        np.max(np.abs(u[down]))
+        > np.max(np.abs(u[max(down[0] - HOLD - 1, 0) : down[0] + 1])) + 1e-12
+    ):
         wrong.append(f"{path.name}: |u| increased during the ramp")

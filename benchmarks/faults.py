@@ -321,6 +321,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--wires", nargs="+", choices=WIRES, default=WIRES)
     parser.add_argument("--kinds", nargs="+", choices=TROUBLES, default=TROUBLES)
+    parser.add_argument("--minutes", type=float, default=60.0, help="longest time for a wire")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     results: list[dict[str, Any]] = []
@@ -328,7 +329,8 @@ def main() -> None:
         for i, wire in enumerate(options.wires):
             count = (options.trials + i) // len(options.wires)
             draw = random.Random(f"{options.seed} {wire}")
-            results += trials(wire, count, options.kinds, Path(place), draw)
+            kinds = possible(options.kinds, wire, Path(place) / "full")
+            results += trials(wire, count, kinds, Path(place), draw, 60.0 * options.minutes)
     bad = print_table(results)
     if options.json is not None:
         write_json(options.json, nonfinite_to_none(results))
@@ -336,15 +338,18 @@ def main() -> None:
 
 
 def trials(
-    wire: str, count: int, kinds: Sequence[str], folder: Path, draw: random.Random
+    wire: str, count: int, kinds: list[str], folder: Path, draw: random.Random, seconds: float
 ) -> list[dict[str, Any]]:
-    """Run the trials over one wire; print those with errors."""
-    kinds = possible(kinds, wire, folder / "full")
+    """Run the trials over one wire, as many as fit into the time; print those with errors."""
+    end = time.monotonic() + seconds
     results = []
     rig = RigProcess(folder, 0, wire)
     try:
-        close_loop(rig.url, 0.2, [])  # compile once; the trials are forked from this process
+        # Compile and import once: the trials are forked from this process.
+        close_loop(rig.url, 0.2, [folder / f"{wire}.csv", folder / f"{wire}.mcap"])
         for number in range(count):
+            if time.monotonic() > end:
+                break
             if rig.process.poll() is not None:
                 rig.log.unlink()
                 rig = RigProcess(folder, number + 1, wire)

@@ -26,7 +26,7 @@ def controller(omega_o: float) -> ql.ADRC:
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "run.csv"
     device = open_device("twin:torsional", DT)
-    safety = Safety(most_error=3.0, settle=50)
+    safety = Safety(most_error=3.0, settle_time=0.25)
     run = run_rig(
         device,
         controller(60.0),

@@ -171,6 +171,23 @@ def test_ctrl_c_after_the_run_loses_nothing_of_the_record(tmp_path: Path) -> Non
     assert len(load(tmp_path / "run.csv")) == len(run.record)
 
 
+def test_a_disk_without_room_for_a_record_is_named_before_the_loop_begins() -> None:
+    """In a line; the device is closed, and nothing was written to it."""
+
+    class Full(MemorySink):
+        name = "run.csv"
+
+        def open(self, header: Any) -> None:
+            raise OSError(28, "No space left on device")
+
+    device = Rig()
+    expected = r"telemetry = 'run.csv': can't be written \(No space left on device\)"
+    with pytest.raises(ValueError, match=expected):
+        short(device, telemetry=[Full()])
+    assert not device.written
+    assert device.closed
+
+
 def test_nothing_is_written_to_a_device_before_the_loop_can_go_on() -> None:
     """The first write may start a watchdog: it comes after compiling and opening files."""
     happened: list[str] = []

@@ -179,7 +179,7 @@ def test_a_load_that_is_released_with_the_take_over_does_not_trip() -> None:
     assert np.min(outcome["Y"][10:100]) < -0.05
 
 
-RULES = Rules(-2.0, 4.0, math.inf, math.inf, 5, 5, 5, 5, 5, direction=1.0, reach=1.0)
+RULES = Rules(-2.0, 4.0, math.inf, math.inf, 5, 5, 5, 5, 5, direction=1.0, reach=1.25)
 
 
 def memory(**fields: float) -> Any:
@@ -195,17 +195,21 @@ def memory(**fields: float) -> Any:
 @pytest.mark.parametrize(
     ("fields", "r", "watching"),
     [
-        ({"y": 9.981, "u": 1.0}, 10.5, ARMED),  # within the noise: ten times the range at rest
-        ({"y": 9.979, "u": 1.0}, 10.5, SUSPECT),
-        ({"y": 9.979, "u": 1.0}, 9.5, OFF),  # the reference goes the same way
-        ({"y": 9.979, "u": 1.0}, 10.02, OFF),  # y moved before the reference: a load
-        ({"y": 9.979, "u": -1.0}, 10.5, OFF),  # u pushes that way
-        ({"y": 9.979, "u": -1.0, "pushed": 5.0}, 10.5, SUSPECT),  # it pushed the other way so far
-        ({"y": 10.021, "u": 1.0}, 10.5, OFF),  # the right way
+        ({"y": 9.976, "u": 1.0}, 10.5, ARMED),  # less than 2 % of the reach of u
+        ({"y": 9.974, "u": 1.0}, 10.5, SUSPECT),
+        ({"y": 9.974, "u": 1.0, "y_rest_low": 9.998}, 10.5, ARMED),  # ten times the noise
+        ({"y": 9.974, "u": 1.0}, 10.026, SUSPECT),
+        ({"y": 9.974, "u": 1.0}, 9.5, OFF),  # the reference goes the same way
+        ({"y": 9.974, "u": 1.0}, 10.025, OFF),  # y moved before the reference: a load
+        ({"y": 9.974, "u": -1.0}, 10.5, OFF),  # u pushes that way
+        ({"y": 9.974, "u": -1.0, "pushed": 5.0}, 10.5, SUSPECT),  # it pushed the other way so far
+        ({"y": 10.026, "u": 1.0}, 10.5, OFF),  # the right way
         ({"y": 9.0, "u": 1.0, "watching": OFF}, 10.5, OFF),
-        ({"y": 10.051, "u": 1.0, "watching": SUSPECT}, 10.5, OFF),  # the right way after all
-        ({"y": 10.049, "u": 1.0, "watching": SUSPECT}, 10.5, SUSPECT),
-        ({"y": 10.051, "u": -1.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
+        ({"y": 9.99, "u": 0.0}, 10.5, ARMED),
+        ({"y": 10.063, "u": 0.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
+        ({"y": 10.063, "u": 1.0, "watching": SUSPECT}, 10.5, OFF),  # the right way after all
+        ({"y": 10.062, "u": 1.0, "watching": SUSPECT}, 10.5, SUSPECT),
+        ({"y": 10.063, "u": -1.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
     ],
 )
 def test_the_first_motion_is_judged(
@@ -221,15 +225,15 @@ def test_the_first_motion_is_judged(
 @pytest.mark.parametrize(
     ("fields", "r", "trips"),
     [
-        ({"y": 7.99, "u": 2.0}, 10.5, True),  # twice the reach of u
-        ({"y": 8.01, "u": 2.0}, 10.5, False),
-        ({"y": 7.99, "u": 1.99}, 10.5, False),  # less than half of the limit
-        ({"y": 7.99, "u": 2.0}, 11.01, False),  # the reference is further away
-        ({"y": 7.99, "u": 2.0, "y_rest_low": 9.89}, 10.5, False),  # noisy
-        ({"y": 7.99, "u": 2.0, "pushed": -9.0}, 10.5, False),  # u has only just turned
-        ({"y": 12.01, "u": -1.0, "pushed": -9.0}, 9.5, True),  # the lower limit is −2
-        ({"y": 12.01, "u": -0.99, "pushed": -9.0}, 9.5, False),
-        ({"y": 12.01, "u": 2.0}, 10.5, False),  # with u
+        ({"y": 7.49, "u": 2.0}, 10.5, True),  # twice the reach of u
+        ({"y": 7.51, "u": 2.0}, 10.5, False),
+        ({"y": 7.49, "u": 1.99}, 10.5, False),  # less than half of the limit
+        ({"y": 7.49, "u": 2.0}, 11.26, False),  # the reference is further away
+        ({"y": 7.49, "u": 2.0, "y_rest_low": 9.875}, 10.5, False),  # noisy
+        ({"y": 7.49, "u": 2.0, "pushed": -9.0}, 10.5, False),  # u has only just turned
+        ({"y": 12.51, "u": -1.0, "pushed": -9.0}, 9.5, True),  # the lower limit is −2
+        ({"y": 12.51, "u": -0.99, "pushed": -9.0}, 9.5, False),
+        ({"y": 12.51, "u": 2.0}, 10.5, False),  # with u
     ],
 )
 def test_a_motion_against_u_trips_when_it_is_large(
@@ -237,3 +241,6 @@ def test_a_motion_against_u_trips_when_it_is_large(
 ) -> None:
     """Beyond twice the scales of an honest loop, with u pushing against it."""
     assert runs_away(RULES, memory(watching=SUSPECT, **fields), r) == trips
+    # Each direction has its own limit.
+    one_way = RULES._replace(low=-1.0)
+    assert not runs_away(one_way, memory(watching=SUSPECT, y=7.49, u=0.9), 10.5)

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from quell.realtime.loop.modes import Cause, Mode, Request
-from quell.realtime.loop.result import lost_changes, mode_changes, scenario_part, tally
+from quell.realtime.loop.result import (
+    ModeChange,
+    RigRun,
+    lost_changes,
+    mode_changes,
+    scenario_part,
+    tally,
+)
 from quell.realtime.loop.state import Rules, SupervisorState, initial_state
 from quell.realtime.loop.supervisor import (
     FLUSH,
@@ -35,6 +42,7 @@ RULES = Rules(
     longest_start=50,
 )
 SAMPLES = 100
+REST: Any = {"plant": "", "features": (), "final_state": None}
 
 
 def state(mode: Mode = Mode.RUN, **fields: Any) -> SupervisorState:
@@ -254,12 +262,36 @@ def test_every_cause_says_how_it_ends_the_run() -> None:
     assert [int(request) for request in Request] == [0, 1, 2]
 
 
+def test_a_run_that_was_ended_has_no_measures_of_a_step_and_says_why() -> None:
+    """In a window that it did not finish; in an earlier one it has them."""
+    log = np.column_stack([np.ones(20), np.linspace(0.0, 0.5, 20), np.ones(20)])
+    channels = (("r", 1), ("y", 1), ("u", 1))
+    part = Trajectory(log=log, channels=channels, dt=0.5, status=Status(0), ended=9.5, **REST)
+
+    def run(*causes: Cause) -> RigRun:
+        changes = tuple(ModeChange(9.5, Mode.RAMP, cause) for cause in causes)
+        parts: Any = (part, part, None, changes, None, {}, (), RULES)
+        return RigRun(*parts)
+
+    ended, done = run(Cause.SETTLED, Cause.LOST, Cause.RAMPED), run(Cause.COMPLETED)
+    assert "rise_time" in done.metrics()
+    found = ended.metrics()
+    assert not {"overshoot", "settling_time", "rise_time"} & found.keys()
+    assert found["rms"] == done.metrics()["rms"]
+    reason = "the run was ended early: 9.500 s  RAMP: too many samples in a row were missed"
+    assert found.missing["overshoot"].startswith(reason)
+    assert "overshoot" in ended.metrics(0.0, 9.5)
+    with pytest.raises(ValueError, match=f"the record ends at 9.5 s; .* {reason}"):
+        ended.metrics(10.0)
+    with pytest.raises(ValueError, match="must hold at least one sample$"):
+        done.metrics(10.0)
+
+
 def test_the_scenarios_part_has_its_samples_only() -> None:
     """From the sample at which the controller took over, as many as the scenario has."""
     log = np.column_stack([np.arange(20.0), np.zeros(20)])
-    record = Trajectory(
-        *(log, (("k", 1), ("y", 1)), 0.5, Status(0), 9.5), plant="", features=(), final_state=None
-    )
+    channels = (("k", 1), ("y", 1))
+    record = Trajectory(log=log, channels=channels, dt=0.5, status=Status(0), ended=9.5, **REST)
     part = scenario_part(record, state(), 5)
     assert part["k"].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0]
     assert part.ended == 2.0

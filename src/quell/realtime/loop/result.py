@@ -12,6 +12,7 @@ from quell.realtime.loop.modes import Cause, Ending, Mode
 from quell.realtime.loop.state import RESERVED, Rules, SupervisorState
 from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.histogram import Timing
+from quell.records.measures import STEP_MEASURES, Metrics
 from quell.records.trajectory import Trajectory
 
 
@@ -68,19 +69,23 @@ class RigRun:
         changes = (change for change in reversed(self.changes) if change.cause is not Cause.RAMPED)
         return str(next(changes, "it never began")).strip()
 
-    def metrics(
-        self, start: float = 0.0, stop: float | None = None, **options: Any
-    ) -> dict[str, float]:
+    def metrics(self, start: float = 0.0, stop: float | None = None, **options: Any) -> Metrics:
         """Return ``Trajectory.metrics``; times count from the scenario's first sample [s].
 
-        If the run was ended early, the error about a window without samples says why.
+        If the run was ended early, there are no measures of a step in the window in which it ended,
+        and ``missing`` says why, as does the error about a window without samples.
         """
+        run, why = self.trajectory, f"the run was ended early: {self.verdict}"
         try:
-            return self.trajectory.metrics(start, stop, **options)
+            found = run.metrics(start, stop, **options)
         except ValueError as error:
             if self.completed:
                 raise
-            raise ValueError(f"{error}; the run was ended early: {self.verdict}") from None
+            raise ValueError(f"{error}; {why}") from None
+        if self.completed or (stop is not None and stop <= run.ended):
+            return found
+        values = {name: value for name, value in found.items() if name not in STEP_MEASURES}
+        return Metrics(values, found.missing | dict.fromkeys(STEP_MEASURES, why), found.band)
 
     def text(self) -> str:
         """Return changes, counters, timing and notes as lines of text."""

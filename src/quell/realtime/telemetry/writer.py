@@ -112,9 +112,13 @@ class TelemetryWriter:
             for sink in self._sinks:
                 sink.open(self.header)
                 opened.append(sink)
-        except BaseException:
+        except BaseException as error:
             for sink in opened:
                 sink.close()
+            if isinstance(error, OSError):  # a full disk, for instance
+                path = self._sinks[len(opened)].name
+                why = error.strerror or error
+                raise ValueError(f"telemetry = {path!r}: can't be written ({why})") from None
             raise
         drain(self.ring)  # compiles it, or loads it from disk
         self._deliveries = [
