@@ -188,3 +188,24 @@ def test_every_module_with_compiled_code_is_part_of_the_key() -> None:
         if "\nimport numba" in text or "\nfrom numba" in text:
             module = ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts)
             assert module.removesuffix(".__init__") in covered
+
+
+def test_code_that_another_user_could_have_written_is_not_loaded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Numba unpickles it: the folder is this user's, and only this user writes to it."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    path = cache.cache_path.__wrapped__()
+    assert path is not None
+    assert path.stat().st_mode & 0o077 == 0
+    path.chmod(0o777)
+    assert cache.cache_path.__wrapped__() == path
+    assert path.stat().st_mode & 0o022 == 0
+    monkeypatch.setattr(cache.os, "geteuid", lambda: os.getuid() + 1)
+    assert cache.cache_path.__wrapped__() is None
+    monkeypatch.undo()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "other"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "other" / "quell-compiled").symlink_to(tmp_path / "elsewhere")
+    assert cache.cache_path.__wrapped__() is None

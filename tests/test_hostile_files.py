@@ -151,6 +151,7 @@ def test_a_header_is_refused_in_a_line_if_it_is_none(tmp_path: Path) -> None:
             json.dumps(good | {"channels": [[*LOOP_CHANNELS[0], 3]]}),
             "not that of a quell recording",
         ),
+        (json.dumps(good | {"dt": 1e308}), "its times are beyond all numbers"),
         (json.dumps(good | {"dt": 10**400}), "must be a number up to 1.8e308"),
         (" " * 1_100_000, "at most 1 MB of settings"),
     ):
@@ -206,6 +207,7 @@ def test_shapes_and_attributes_of_a_netcdf_file_are_checked_before_its_data(
         (replaced(lambda file: file.create_group("y")), "has groups"),
         (lambda file: file["y"].attrs.create("scale_factor", 2.0), "scaled numbers"),
         (lambda file: file.attrs.create("dt", np.zeros(10**4)), "no number and no text"),
+        (lambda file: file.attrs.create("dt", 1e308), "its times are beyond all numbers"),
         (lambda file: file.attrs.create("every", 0), "every = 0: must be a whole number"),
         (lambda file: file.attrs.__delitem__("dt"), "has no dt: it was not written by Traj"),
     ):

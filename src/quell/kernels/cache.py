@@ -12,6 +12,7 @@ import hashlib
 import os
 import re
 import shutil
+import stat
 import tempfile
 import uuid
 from collections.abc import Callable
@@ -42,6 +43,8 @@ _NAME = re.compile(rb"\w+")
 def cache_path() -> Path | None:
     """Return the folder of this version's compiled code; None if it can't be created or written to.
 
+    None, too, if it is another user's: Numba unpickles what is in it.
+
     It is in ``quell-compiled`` under ``NUMBA_CACHE_DIR`` if that is set, else under the user's
     cache directory. Versions that were not used lately are removed, if they have quell's marker.
     """
@@ -49,7 +52,9 @@ def cache_path() -> Path | None:
     versions = Path(root) / "quell-compiled"
     path = versions / cache_key(Path(__file__).parents[1])
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        Path(root).mkdir(parents=True, exist_ok=True)
+        if not (_is_private(versions) and _is_private(path)):
+            return None
         with tempfile.TemporaryFile(dir=path):  # checks for write access
             pass
         os.utime(path)  # it is the version that was used last
@@ -144,6 +149,19 @@ class _FaultTolerantCache(FunctionCache):
         """Write compiled code to the disk if that is possible: the disk may be full."""
         with suppress(OSError):
             super().save_overload(sig, data)
+
+
+def _is_private(folder: Path) -> bool:
+    """Create a folder; return whether it is this user's, and make sure that no other can write."""
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if not hasattr(os, "geteuid"):  # Windows: the user's own folders are private
+        return True
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+        return False
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        folder.chmod(0o700)
+    return True
 
 
 def _remove_old_versions(versions: Path, current: Path) -> None:

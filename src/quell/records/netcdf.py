@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.reading import TooLargeError, bytes_of, check_regular, check_size
 from quell.records import netcdf_reader
+from quell.records.sample_times import check_times
 
 R = TypeVar("R")
+# Samples from one recorded sample to the next: as many as a scenario may have.
+_MOST_EVERY = 10**12
 # Time that the process may take as a multiple of its processor time: it may have to wait for a disk
 # or a busy machine. Chosen by hand.
 _PATIENCE = 10.0
@@ -151,11 +154,16 @@ def _record_fields(stored: Stored, axes: tuple[str, ...], besides: set[str]) -> 
     log = np.empty((*columns[0].shape[:-1], sum(widths)))
     for i, column in enumerate(columns):
         log[..., sum(widths[:i]) : sum(widths[: i + 1])] = column
+    dt = checks.positive("dt", stored.attributes["dt"], "s")
+    every = checks.whole("every", stored.attributes["every"], 1)
+    if every > _MOST_EVERY:
+        raise ValueError(f"every = {every}: must be at most {_MOST_EVERY}")
+    check_times(log.shape[-2], every * dt)
     return {
         "log": log,
         "channels": tuple(zip(channels, widths, strict=True)),
-        "dt": checks.positive("dt", stored.attributes["dt"], "s"),
-        "every": checks.whole("every", stored.attributes["every"], 1),
+        "dt": dt,
+        "every": every,
         "plant": str(stored.attributes["plant"]),
         "features": tuple(map(str, stored.values.get("theta_index", ()))),
     }

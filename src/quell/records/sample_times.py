@@ -5,6 +5,12 @@ from __future__ import annotations
 import math
 
 
+def check_times(samples: int, step: float) -> None:
+    """Raise a ``ValueError`` if the times of ``samples`` samples are beyond all numbers."""
+    if not math.isfinite(samples * step):
+        raise ValueError(f"its samples are {step:g} s apart: its times are beyond all numbers")
+
+
 def first_sample_at(time: float, step: float, samples: int) -> int:
     """Return the first of ``samples`` samples, ``step`` apart, that is not before ``time``.
 

@@ -16,6 +16,7 @@ from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.mcap_file import MAGIC
 from quell.realtime.telemetry.mcap_reader import read_mcap
 from quell.records.channels import columns_of
+from quell.records.sample_times import check_times
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix, Status, Vector
 
@@ -72,6 +73,7 @@ def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE
     if rows.shape[0] == 0:
         raise ValueError("it has no row")
     log, status = _filled(rows, most), 0
+    check_times(log.shape[0], header.dt)
     if any(name == "status" for name, _ in header.channels):
         status = _all_flags(rows[:, columns_of(header.channels, "status").start])
     return Trajectory(
