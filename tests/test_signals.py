@@ -137,6 +137,13 @@ def test_edges_of_ramps_sinusoids_and_samples() -> None:
     assert two(0.5) == 3.0
 
 
+def test_pieces_without_duration_are_refused_and_a_constant_is_zero_by_default() -> None:
+    """Two switches at one time have nothing between them."""
+    with pytest.raises(ValueError, match="must increase"):
+        s.Switched((1.0, 1.0), (s.Step(), s.Ramp(), s.Constant()))
+    assert s.Constant()(3.0) == 0.0
+
+
 def test_arithmetic_has_the_signs_of_numbers() -> None:
     """With signals and numbers on both sides."""
     one, t = s.Ramp(), 3.0
