@@ -205,6 +205,14 @@ def test_noise_does_not_depend_on_how_time_is_cut(cuts: list[int], dt: float) ->
     np.testing.assert_array_equal(np.concatenate(pieces), noise(t))
 
 
+def test_a_seed_gives_the_same_draws_for_ever() -> None:
+    """4096 from each generator, whose seeds are those of the noise and of the block."""
+    noise = s.BandLimitedNoise(power=0.5, sample_time=2.0, seed=3)
+    for k in (0, 1, 4095, 4096, 12_287):
+        draws = np.random.default_rng([3, k // 4096]).standard_normal(4096)
+        assert noise(2.0 * k) == pytest.approx(0.5 * draws[k % 4096], rel=1e-15)
+
+
 def test_noise_can_be_asked_for_anywhere() -> None:
     """Far apart, before the start, and nowhere."""
     noise = s.BandLimitedNoise(power=1.0, sample_time=0.01)

@@ -219,6 +219,32 @@ def test_samples_are_checked_all_over_a_segment_and_where_states_turn() -> None:
     assert len(chosen_samples(x[:33], np.ones(2))) <= 32
 
 
+def test_the_check_gets_the_samples_that_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Times, u, w and states, over all segments of a thinned record; only the usual range of a run that diverged."""
+    monkeypatch.setattr(sampled_scenario, "_SEGMENT", 10)
+    seen: list[Samples] = []
+    monkeypatch.setattr(
+        IntegrationCheck, "add", lambda self, samples, all_of_them: seen.append(samples)
+    )
+    plant = ql.plants.NonlinearPlant(
+        lambda t, x, u, w: (x[1], u + w[0] + 2.0 * w[1]), order=2, disturbances=2
+    )
+    law = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=40.0, dt=1e-3), omega_c=8.0)
+    scenario = ql.Scenario(1.0, duration=0.05, disturbances=(ql.signals.Ramp(), 0.5))
+    run = ql.simulate(plant, law, scenario, record_every=3, interpret=True)
+    whole = Samples(*map(np.concatenate, zip(*seen, strict=True)))
+    np.testing.assert_allclose(whole.t, run.t, atol=1e-12)
+    for part, channel in ((whole.u, "u"), (whole.w, "w"), (whole.x, "x")):
+        np.testing.assert_array_equal(part, run[channel])
+    monkeypatch.setattr(sampled_scenario, "_SEGMENT", 10_000)
+    seen.clear()
+    wild = interpreted_run(lambda t, x, u, w: (x[1], u), b0=-1.0, seconds=2.0)
+    usual = np.abs(wild["y"]) <= 10.0
+    assert wild.diverged
+    assert not usual.all()
+    assert sum(part.t.size for part in seen) == usual.sum()
+
+
 def test_the_integration_is_checked_behind_a_delay_and_an_encoder() -> None:
     """With the u that arrives."""
     plant = ql.plants.NonlinearPlant(drag, order=2, substeps=1)
