@@ -213,6 +213,15 @@ def test_a_seed_gives_the_same_draws_for_ever() -> None:
         assert noise(2.0 * k) == pytest.approx(0.5 * draws[k % 4096], rel=1e-15)
 
 
+@pytest.mark.parametrize("bits", range(2, 15))
+def test_a_prbs_of_each_length_has_the_longest_period(bits: int) -> None:
+    """Its autocorrelation over a period is 1 at lag zero and ``−1/(2^bits − 1)`` at all others."""
+    size = 2**bits - 1
+    period = s.PRBS(bits=bits, step=1.0)(np.arange(size) + 0.5)
+    lags = np.fft.irfft(np.abs(np.fft.rfft(period)) ** 2, size) / size
+    np.testing.assert_allclose(lags, [1.0] + [-1.0 / size] * (size - 1), atol=1e-9)
+
+
 def test_noise_can_be_asked_for_anywhere() -> None:
     """Far apart, before the start, and nowhere."""
     noise = s.BandLimitedNoise(power=1.0, sample_time=0.01)
