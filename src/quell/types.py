@@ -64,7 +64,7 @@ _MESSAGES = {
     ),
     Status.OVERFLOWED: (
         "The observer or the learner overflowed and was reset: lower the learning rate, omega_o or "
-        "omega_c, or check b0."
+        "omega_c, or check b0 and the sensor."
     ),
     Status.LEARNER_CUT: (
         "The learner's output was not finite; the guard cut it off and the learner started anew: "
