@@ -342,7 +342,7 @@ def test_a_plot_has_two_axes_and_draws_into_given_ones(law: ql.ADRC) -> None:
         ),
         (
             lambda: batch(two_mass_spring, m3=[1.0]),
-            "parameters = m3: the factory can't be called with them: .*'m3'",
+            "parameters = m3: the factory can't be called with them: 'm3' is unknown, must be one of m1, m2",
         ),
         (
             lambda: batch(two_mass_spring, m1=np.ones((2, 2))),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -106,6 +107,12 @@ def samples(name: str, value: Any, dt: float) -> int:
             f"the nearest are {below * dt:.9g} and {(below + 1) * dt:.9g} s"
         )
     return count
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """Return ``did you mean …?`` with the nearest of the known names, or all of them."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {near[0]}?" if near else f"must be one of {', '.join(known)}"
 
 
 def is_sequence(value: Any) -> bool:

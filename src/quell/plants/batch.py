@@ -10,6 +10,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from quell import checks
 from quell.plants.base import Plant, check_plant
 
 
@@ -127,8 +128,13 @@ def batch(factory: Callable[..., Plant], **parameters: Any) -> PlantBatch:
     whole = {name: np.broadcast_to(array, (runs,)) for name, array in arrays.items()}
     columns = {name: values.tolist() for name, values in whole.items()}
     try:
+        takes = inspect.signature(factory).parameters
+        named = all(parameter.kind is not parameter.VAR_KEYWORD for parameter in takes.values())
+        for name in parameters:
+            if named and name not in takes:
+                raise TypeError(f"{name!r} is unknown, {checks.nearest(name, [*takes])}")
         inspect.signature(factory).bind(**columns)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(
             f"parameters = {', '.join(parameters) or 'none'}: the factory can't be called with "
             f"them: {error}"

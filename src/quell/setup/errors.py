@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
 
+from quell.checks import nearest
 from quell.setup.schema import CONTEXT
 
 # Pydantic's names of type errors, and the type that is expected.
@@ -62,12 +62,6 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
             lines.append(f"{path} = {_short(value)}: {found['msg']}")
     lines += [f"{line} {' or '.join(dict.fromkeys(names))}" for line, names in expected.items()]
     return SetupError([f"{name}: {line}" for line in lines])
-
-
-def nearest(name: str, known: Sequence[str]) -> str:
-    """Return ``did you mean …?`` with the nearest of the known names, or all of them."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]}?" if near else f"must be one of {', '.join(known)}"
 
 
 def _hint(key: str, known: Sequence[str]) -> str:
