@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 import quell as ql
-from quell.realtime import RigRun, Safety, open_device, run_rig
+from quell.realtime import Device, RigRun, Safety, open_device, run_rig
 
 DT = 1e-3
 # A machine of which the host takes the processors away for tenths of a second must not end the run:
@@ -85,12 +85,20 @@ def rig(wire: str, priority: int, wait: float) -> Iterator[str]:
         process.wait()
 
 
+def opened(url: str) -> Device:
+    """Open the device; a rig on a busy machine may take seconds until it ticks."""
+    for _ in range(20):
+        with contextlib.suppress(ConnectionError):
+            return open_device(url, DT)
+    return open_device(url, DT)
+
+
 def over_the_wire(
     url: str, reference: ql.signals.Signal, seconds: float, options: argparse.Namespace
 ) -> RigRun:
     """Run the controller over the wire."""
     return run_rig(
-        *(open_device(url, DT), controller(), reference),
+        *(opened(url), controller(), reference),
         duration=seconds,
         approach=0.0,
         safety=Safety(settle=500, hold=HOLD),
