@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import socket
 import struct
@@ -24,6 +25,8 @@ from quell.realtime.wire.shared_memory import SIZE
 from quell.realtime.wire.udp import UdpDevice
 
 from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed, url_of
+
+HOSTILE = Path(__file__).parents[1] / "benchmarks" / "hostile_wire.py"
 
 
 @pytest.mark.parametrize("wire", WIRES)
@@ -249,6 +252,24 @@ def test_a_stranger_who_knows_the_session_can_not_use_it(bench: Callable[..., Be
     here.cycle(device, lambda y: 2.0, 2)
     assert here.applied == 2.0
     assert here.rig.largest == 2.0
+
+
+@pytest.mark.skipif(not HOSTILE.exists(), reason="the trial is in the repository only")
+@pytest.mark.parametrize("wire", WIRES)
+def test_hostile_packets_bytes_and_files_do_nothing(wire: str) -> None:
+    """The trial of ``benchmarks/hostile_wire.py``, for less than a second."""
+    if wire == "serial":
+        pytest.importorskip("serial")
+    spec = importlib.util.spec_from_file_location("hostile_wire", HOSTILE)
+    assert spec is not None
+    assert spec.loader is not None
+    trial = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(trial)
+    found = trial.trial(wire, 900, 0.8, seed=5)
+    assert found["attacks"] > 30
+    assert found["wrong"] == []
+    assert found["files"] == 0
+    assert found["returned"] <= 3 * found["sent"]
 
 
 def test_a_packet_is_answered_by_three_times_its_bytes_at_most(bench: Callable[..., Bench]) -> None:
