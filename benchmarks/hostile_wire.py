@@ -317,9 +317,11 @@ def attacks(wire: str, stack: ExitStack, draw: random.Random) -> Iterator[tuple[
 
 def trial(wire: str, count: int, seconds: float, seed: int) -> dict[str, Any]:
     """Attack a wire ``count`` times or for ``seconds``, whichever ends first."""
-    begin, done, before = time.monotonic(), 0, (0, 0)
+    done, before = 0, (0, 0)
     with ExitStack() as stack:
         attacked = attacks(wire, stack, random.Random(seed))
+        next(attacked)  # compiles the rig and the loop
+        begin = time.monotonic()
         while True:
             many, session, balance = next(attacked)
             done += many

@@ -257,7 +257,7 @@ def test_a_stranger_who_knows_the_session_can_not_use_it(bench: Callable[..., Be
 @pytest.mark.skipif(not HOSTILE.exists(), reason="the trial is in the repository only")
 @pytest.mark.parametrize("wire", WIRES)
 def test_hostile_packets_bytes_and_files_do_nothing(wire: str) -> None:
-    """The trial of ``benchmarks/hostile_wire.py``, for less than a second."""
+    """The trial of ``benchmarks/hostile_wire.py``, six hundred attacks."""
     if wire == "serial":
         pytest.importorskip("serial")
     spec = importlib.util.spec_from_file_location("hostile_wire", HOSTILE)
@@ -265,8 +265,8 @@ def test_hostile_packets_bytes_and_files_do_nothing(wire: str) -> None:
     assert spec.loader is not None
     trial = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(trial)
-    found = trial.trial(wire, 900, 0.8, seed=5)
-    assert found["attacks"] > 30
+    found = trial.trial(wire, 600, 60.0, seed=5)
+    assert found["attacks"] >= 600
     assert found["wrong"] == []
     assert found["files"] == 0
     assert found["returned"] <= 3 * found["sent"]
