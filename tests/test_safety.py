@@ -50,6 +50,8 @@ def test_bounds_of_y_follow_from_reference_and_reach_of_u() -> None:
     # Without b0 there is no scale of y but the reference.
     pid = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT, u_min=-3, u_max=3)
     assert Safety().rules(pid, CONSTANT)[9:11] == (-1e6, 1e6 + 1.0)
+    assert Safety(u_min=-1.0).rules(adrc(), CONSTANT).reach == pytest.approx(reach)
+    assert plausible_range([-7.0, 5.0], math.nan) == (-7e6 - 7.0, 7e6 + 5.0)
     assert plausible_range([-3.0, 5.0], math.nan) == (-5e6 - 3.0, 5e6 + 5.0)
     assert Safety().rules(adrc())[9:11] == (-math.inf, math.inf)
     given = Safety(y_min=-1.0, y_max=math.inf).rules(adrc(), CONSTANT)

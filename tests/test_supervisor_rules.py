@@ -218,6 +218,7 @@ def test_u_is_held_ramped_and_then_zero() -> None:
         assert supervised_output(RULES, made, 15, 3.0, 0.0, 0.0) == 0.0
         more += 1
     assert more == FLUSH + 1
+    assert not any(finished(state(mode, samples=99)) for mode in Mode if mode != Mode.STOPPED)
     still = state(Mode.RAMP)  # u was zero: there is nothing to ramp
     assert supervised_output(RULES, still, 10, 3.0, 0.0, 0.0) == 0.0
     assert last_change(still) == (Mode.STOPPED, Cause.RAMPED)
