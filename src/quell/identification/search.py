@@ -30,11 +30,10 @@ _DEVIATIONS = 3.0
 _PAIR = 11.8
 _SLOWER = 10.0
 # These tests are of first order, which fails for poles that are nearly equal. So one and two
-# integrators may increase the mean square error by this factor at most, and take this share of the
-# fit; or increase it to this share of the output's mean square. With friction the signs that are
-# not settled increase it too. Chosen by hand.
-_MOST_COST, _FIT_SHARE = 1.02, 0.005
-_MOST_COST_WITH_FRICTION = {1: 30.0, 2: 1.05}
+# integrators may increase the mean square error by these factors at most, and take this share of
+# the fit; or increase it to this share of the output's mean square. With friction the signs that
+# are not settled decide the fit, and only the factors hold. Chosen by hand.
+_MOST_COST, _FIT_SHARE = {1: 30.0, 2: 1.05}, 0.005
 _ROUNDING = 1e-18
 
 
@@ -194,9 +193,8 @@ def _set_integrators(
 
 def _most_cost(structure: Structure, count: int, cost: float, y: Vector) -> float:
     """Return the mean square error that a model with ``count`` integrators may have."""
-    if structure.friction:
-        most = _MOST_COST_WITH_FRICTION[count] * cost
-    else:
+    most = _MOST_COST[count] * cost
+    if not structure.friction:
         error, spread = float(np.sqrt(cost)), float(np.std(y))
-        most = min(_MOST_COST * cost, (error + _FIT_SHARE * max(spread - error, 0.0)) ** 2)
+        most = min(most, (error + _FIT_SHARE * max(spread - error, 0.0)) ** 2)
     return max(most, _ROUNDING * float(np.mean(y**2)))
