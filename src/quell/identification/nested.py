@@ -13,8 +13,9 @@ import numpy as np
 from quell.identification.structure import Structure
 from quell.types import Vector
 
-# Fast pole that is added to a model of lower order: beyond the π per sample that samples show.
-_FAST_POLE = 10.0
+# Fast poles that are added to a model of lower order: beyond the π per sample that samples show.
+# The faster one changes the output less, the other one is easier to move.
+_FAST_POLES = (10.0, 50.0)
 # Range of the other one, the mean of the poles that there are [1/sample]: what samples show.
 _RANGE = (1e-3, 3.0)
 
@@ -33,7 +34,7 @@ def extended(structure: Structure, lower: Structure, theta: Vector) -> Iterator[
 
     Numerators are cut to the terms of ``structure``: what is left out is small for a fast pole.
     """
-    rates = [_FAST_POLE]
+    rates = [*_FAST_POLES]
     if structure.degrees[0] > lower.degrees[0]:
         poles = np.abs(np.roots(np.append(1.0, lower.denominator(theta)[::-1])))
         rates.append(float(np.exp(np.mean(np.log(np.clip(poles, *_RANGE))))))
