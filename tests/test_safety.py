@@ -110,6 +110,7 @@ def test_times_are_given_in_seconds_or_in_samples() -> None:
         with pytest.raises(ValueError, match=f"{name} = 0.0: must be finite and greater than zero"):
             Safety(**{name: 0.0})
     assert Safety(hold=0).rules(controller(0.01)).hold == 0
+    assert Safety(most_overruns=0, ramp=1, settle=1, most_saturated=1).ramp == 1
 
 
 def test_a_setup_file_gives_times_in_seconds(tmp_path: Path) -> None:
