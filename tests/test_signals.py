@@ -144,6 +144,18 @@ def test_pieces_without_duration_are_refused_and_a_constant_is_zero_by_default()
     assert s.Constant()(3.0) == 0.0
 
 
+def test_parameters_of_moves_have_their_documented_defaults_and_limits() -> None:
+    """Two seconds over a distance of 1; durations must be positive."""
+    assert s.Trapezoid() == s.Trapezoid(1.0, 2.0, None, 0.0)
+    assert s.SmoothMove() == s.SmoothMove(1.0, 2.0, 4, 0.0, 0)
+    assert s.Chirp() == s.Chirp(1.0, 0.1, 10.0, 10.0, 0.0, False)
+    for kind in (s.Trapezoid, s.SmoothMove, s.Chirp):
+        with pytest.raises(ValueError, match="duration = 0.0: must be finite and greater"):
+            kind(duration=0.0)
+    with pytest.raises(ValueError, match="smoothness = 13"):
+        s.SmoothMove(smoothness=13)
+
+
 def test_arithmetic_has_the_signs_of_numbers() -> None:
     """With signals and numbers on both sides."""
     one, t = s.Ramp(), 3.0
