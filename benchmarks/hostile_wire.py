@@ -81,6 +81,7 @@ class Session:
         self.loop: Any = None
         self.ended = 0
         self.begin()
+        stack.callback(lambda: self.loop.close())
 
     @property
     def number(self) -> int:
