@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy import signal
 
 import quell as ql
-from quell.identification.delay import delayed
-from quell.identification.output_error import refine
-from quell.identification.structure import Structure, output
+from quell.identification.model.structure import Structure, output
+from quell.identification.search.delay import delayed
+from quell.identification.search.output_error import refine
 from quell.identification.validation import nrmse
 from quell.types import Vector
 

@@ -15,8 +15,8 @@ import pytest
 import quell as ql
 from quell.cli.app import app
 from quell.identification import Identified, excitation, excited, frequency_response, read_record
-from quell.identification.roots import root_covariance
-from quell.identification.structure import Structure, gradient, output
+from quell.identification.model.roots import root_covariance
+from quell.identification.model.structure import Structure, gradient, output
 
 from .commands import Shown
 

@@ -13,12 +13,12 @@ from scipy import signal
 
 import quell as ql
 from quell.identification import Root, excitation, read_record
-from quell.identification.delay import delayed
 from quell.identification.identify import identify
-from quell.identification.initial_estimate import stable
-from quell.identification.output_error import descend, projected
-from quell.identification.reduced import reduced_models
-from quell.identification.structure import Structure, gradient, output
+from quell.identification.model.structure import Structure, gradient, output
+from quell.identification.search.delay import delayed
+from quell.identification.search.initial_estimate import stable
+from quell.identification.search.output_error import descend, projected
+from quell.identification.search.reduced import reduced_models
 from quell.identification.validation import residuals
 
 from .test_identification import answer

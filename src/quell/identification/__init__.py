@@ -2,17 +2,17 @@
 
 May import ``controllers``, ``plants``, ``simulation`` and what they import.
 
-``identify`` is the search; ``structure`` has the model and its gradient, ``sampling`` the filters
-below it.
+``experiment`` has excitations and records, ``model`` the model and its gradient, ``search`` the
+search for its parameters; the files here put them together.
 """
 
-from quell.identification.excitation import Excitation, excitation
-from quell.identification.frequency_response import FrequencyResponse, frequency_response
+from quell.identification.experiment.excitation import Excitation, excitation
+from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
+from quell.identification.experiment.measured import Measured, excited
+from quell.identification.experiment.record_file import read_record
 from quell.identification.identify import identify
-from quell.identification.measured import Measured, excited
-from quell.identification.record_file import read_record
+from quell.identification.model.roots import Root
 from quell.identification.result import Identified
-from quell.identification.roots import Root
 from quell.identification.validation import Residuals
 
 __all__ = [

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.identification.closed_loop import instrumental_variables
+from quell.identification.model.roots import poles_of, zeros_of
+from quell.identification.model.structure import Structure, free_run
 from quell.identification.result import Identified
-from quell.identification.roots import poles_of, zeros_of
-from quell.identification.search import Fit, fit
-from quell.identification.structure import Structure, free_run
+from quell.identification.search.closed_loop import instrumental_variables
+from quell.identification.search.search import Fit, fit
 from quell.identification.validation import (
     fit_predictor,
     nrmse,

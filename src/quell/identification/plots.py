@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.identification.frequency_response import FrequencyResponse
+from quell.identification.experiment.frequency_response import FrequencyResponse
 from quell.identification.validation import Residuals
 from quell.records.plotting import draw_line
 from quell.types import Vector

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from quell.identification import plots
-from quell.identification.frequency_response import FrequencyResponse, frequency_response
-from quell.identification.roots import Root
+from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
+from quell.identification.model.roots import Root
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
 from quell.plants.linear import LinearPlant

@@ -21,10 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.correlation import correlation
-from quell.identification.sampling import chains
-from quell.identification.search import Fit
-from quell.identification.structure import free_run, nonzero_lengths
+from quell.identification.model.correlation import correlation
+from quell.identification.model.sampling import chains
+from quell.identification.model.structure import free_run, nonzero_lengths
+from quell.identification.search.search import Fit
 from quell.types import Matrix, Vector
 
 # Rounds that adapt the start and the signs of friction to each other: chosen by hand, not tuned.

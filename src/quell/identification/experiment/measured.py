@@ -8,7 +8,7 @@ import numpy as np
 
 from quell.controllers.linear.law import LinearLaw
 from quell.controllers.linear.linear import LinearController
-from quell.identification.excitation import Excitation
+from quell.identification.experiment.excitation import Excitation
 from quell.plants import Plant
 from quell.simulation import Scenario, simulate
 from quell.types import Vector

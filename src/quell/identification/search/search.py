@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.delay import delayed, nearest_delay, start_with_delay, with_delay
-from quell.identification.output_error import ParameterEstimate, gauss_newton, refine
-from quell.identification.roots import squared_distance_from_zero
-from quell.identification.structure import Structure, free_run
+from quell.identification.model.roots import squared_distance_from_zero
+from quell.identification.model.structure import Structure, free_run
+from quell.identification.search.delay import delayed, nearest_delay, start_with_delay, with_delay
+from quell.identification.search.output_error import ParameterEstimate, gauss_newton, refine
 from quell.types import Matrix, Vector
 
 # Half width of the mean slope that stands for the measured speed until there is a model [samples]:

@@ -22,9 +22,8 @@ import math
 
 import numpy as np
 
-from quell.identification.output_error import projected
-from quell.identification.sampling import chain
-from quell.identification.structure import (
+from quell.identification.model.sampling import chain
+from quell.identification.model.structure import (
     Structure,
     cost,
     gradient,
@@ -32,6 +31,7 @@ from quell.identification.structure import (
     linear_columns,
     nonzero_lengths,
 )
+from quell.identification.search.output_error import projected
 from quell.types import Matrix, Vector
 
 # Number of λ, log-spaced from 10 per length of the record (at most 0.01 per sample) to 0.5 per

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.identification.structure import Structure, nonzero_lengths
+from quell.identification.model.structure import Structure, nonzero_lengths
 from quell.types import Matrix, Vector
 
 # Lags of the ARX model: at least, for each pole, and as a share of the samples at most. Chosen by

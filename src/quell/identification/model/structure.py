@@ -39,8 +39,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification import sampling
-from quell.identification.sampling import chains, observable, sampled, states, states_with_friction
+from quell.identification.model import sampling
+from quell.identification.model.sampling import (
+    chains,
+    observable,
+    sampled,
+    states,
+    states_with_friction,
+)
 from quell.types import Matrix, Vector
 
 

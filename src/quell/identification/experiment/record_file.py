@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from quell import checks
-from quell.identification.measured import Measured
-from quell.identification.record_times import (
+from quell.identification.experiment.measured import Measured
+from quell.identification.experiment.record_times import (
     UNITS,
     check_unit,
     sample_time,

@@ -21,12 +21,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.correlation import autocorrelation
-from quell.identification.initial_estimate import filtered_estimates, refined
-from quell.identification.nested import extended, smaller
-from quell.identification.output_error import ParameterEstimate, descend
-from quell.identification.reduced import reduced_models
-from quell.identification.structure import Structure, output
+from quell.identification.model.correlation import autocorrelation
+from quell.identification.model.structure import Structure, output
+from quell.identification.search.initial_estimate import filtered_estimates, refined
+from quell.identification.search.nested import extended, smaller
+from quell.identification.search.output_error import ParameterEstimate, descend
+from quell.identification.search.reduced import reduced_models
 from quell.types import Matrix, Vector
 
 # Share of the output's power that may stay unexplained if the search is to end early: a fit of

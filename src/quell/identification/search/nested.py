@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from quell.identification.structure import Structure
+from quell.identification.model.structure import Structure
 from quell.types import Vector
 
 # Fast poles that are added to a model of lower order: beyond the π per sample that samples show.

@@ -29,7 +29,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.structure import Structure, gradient, linear_columns, nonzero_lengths
+from quell.identification.model.structure import (
+    Structure,
+    gradient,
+    linear_columns,
+    nonzero_lengths,
+)
 from quell.types import Matrix, Vector
 
 # Convergence: relative gain that the step without damping predicts, chosen by hand: the standard

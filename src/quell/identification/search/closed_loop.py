@@ -21,10 +21,16 @@ from itertools import product
 
 import numpy as np
 
-from quell.identification.initial_estimate import equation, stable
-from quell.identification.output_error import ParameterEstimate, block_sums
-from quell.identification.sampling import chain, sampled, states
-from quell.identification.structure import Structure, cost, lengths, linear_columns, nonzero_lengths
+from quell.identification.model.sampling import chain, sampled, states
+from quell.identification.model.structure import (
+    Structure,
+    cost,
+    lengths,
+    linear_columns,
+    nonzero_lengths,
+)
+from quell.identification.search.initial_estimate import equation, stable
+from quell.identification.search.output_error import ParameterEstimate, block_sums
 from quell.types import Matrix, Vector
 
 # Most rounds, and the relative change of θ that ends them: chosen by hand; not tuned further.

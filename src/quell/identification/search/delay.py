@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from quell.identification.best_start import Start, best_start
-from quell.identification.initial_estimate import filtered_estimates, refined
-from quell.identification.output_error import descend
-from quell.identification.structure import Structure
+from quell.identification.model.structure import Structure
+from quell.identification.search.best_start import Start, best_start
+from quell.identification.search.initial_estimate import filtered_estimates, refined
+from quell.identification.search.output_error import descend
 from quell.types import Matrix, Vector
 
 # Most delays that are estimated, number of samples for it, and number of delays that are searched

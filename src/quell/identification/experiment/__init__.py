@@ -1,0 +1,4 @@
+"""Experiments: excitations, measured records and their files, frequency responses.
+
+May import what ``identification`` may import.
+"""
