@@ -66,7 +66,7 @@ CONTROLLERS: dict[str, tuple[Callable[[], Any], Any]] = {
     "order 2, rate limit": (lambda: adrc(rate_limit=200.0), PLANT),
     "order 3, predictor": (lambda: adrc(observer(3, form="predictor")), chain(3)),
     "order 4, Kalman": (lambda: adrc(observer(4), 2.0, learner=learners.Kalman()), chain(4)),
-    "order 8": (lambda: adrc(observer(8, 25.0), 2.0, u_min=-500.0, u_max=500.0), chain(8)),
+    "order 8": (lambda: adrc(ql.ESO.model_based(chain(8), 5.0, DT), 1.0), chain(8)),
     "reduced": (lambda: adrc(observer(form="reduced")), PLANT),
     "half gain": (lambda: adrc(observer(half_gain=True), half_gain=True), PLANT),
     "delay, Kalman": (

@@ -149,7 +149,7 @@ def test_the_guards_trial_is_printed_written_and_drawn(
     [
         (("--dt", "-1"), "dt = -1.0: must be finite and greater than zero"),
         (("--dt", "nan"), "dt = nan: must be finite and greater than zero"),
-        (("--omega-o", "400", "--dt", "0.01"), "omega_o * dt"),
+        (("--omega-o", "0"), "omega_o = 0.0: must be finite and greater than zero"),
         (("--seed", "-1"), "seed = -1: must be a whole number"),
         (("--seed", "1.5"), "--seed = '1.5': must be a whole number"),
         (("--dt", "fast"), "dt"),

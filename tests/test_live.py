@@ -53,7 +53,9 @@ async def _watch(url: str, wanted: int, begin: Any) -> tuple[list[dict[str, Any]
     protocols: Any = ["foxglove.sdk.v1"]
     async with websockets.connect(url, subprotocols=protocols, open_timeout=60.0) as socket:
         greetings: list[dict[str, Any]] = [json.loads(await socket.recv()) for _ in range(2)]
-        await socket.send(SUBSCRIBE)
+        # foxglove-sdk counts the channels of a process.
+        number = greetings[1]["channels"][0].pop("id")
+        await socket.send(SUBSCRIBE.replace('"channelId": 1', f'"channelId": {number}'))
         messages: list[bytes] = []
         while len(messages) < wanted:
             begin()

@@ -73,9 +73,15 @@ def changed_limits(
 
 
 @kernel
+def largest_magnitude(limits: Limits) -> float:
+    """Return the largest ``|u|`` within the limits; infinite without limits."""
+    return max(abs(limits.low), abs(limits.high))
+
+
+@kernel
 def largest_wish(limits: Limits) -> float:
     """Return the u beyond which the state of a law is of no use; infinite without limits."""
-    return _LARGEST_WISH * max(abs(limits.low), abs(limits.high))
+    return _LARGEST_WISH * largest_magnitude(limits)
 
 
 @kernel

@@ -55,6 +55,9 @@ class Builder:
             return action(*arguments)
         except ValueError as error:
             raise with_path(self.name, path, error, keys) from None
+        except ArithmeticError as error:
+            beyond = ValueError(f"these numbers are beyond what can be computed ({error})")
+            raise with_path(self.name, path, beyond, keys) from None
 
     def _value(self, value: Any, path: str, add_up: bool, context: dict[str, Any]) -> Any:
         """Build the tables in a value; add up the features or signals of a list if ``add_up``."""

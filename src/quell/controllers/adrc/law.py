@@ -32,7 +32,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.limits import Limits, apply_limits
+from quell.controllers.limits import Limits, apply_limits, largest_magnitude
 from quell.guard import (
     assess,
     limit,
@@ -64,6 +64,9 @@ _LEARNER_CUT = int(Status.LEARNER_CUT)
 # A decaying offset below this is set to zero: arithmetic with denormal numbers (below 2.2e-308) is
 # slow. Any value between that and the rounding error of u gives the same u.
 _SMALLEST_OFFSET = 1e-200
+# An offset so many times the limits of u comes from absurd estimates, which return faster than it
+# decays: there is nothing to continue from. It would decay to the limits in 7/omega_c.
+_LARGEST_OFFSET = 2.0**10
 
 
 class AdrcLoop(Scalars):
@@ -161,6 +164,8 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     if loop.bumpless != 0.0:
         loop.offset = loop.u - unlimited
         loop.bumpless = 0.0
+    if not abs(loop.offset) <= _LARGEST_OFFSET * largest_magnitude(design.limits):
+        loop.offset = 0.0
     if loop.offset != 0.0:
         unlimited += loop.offset
         loop.offset = loop.offset * design.fade if abs(loop.offset) > _SMALLEST_OFFSET else 0.0
