@@ -14,8 +14,8 @@ with single outliers; between them calls of ``applied``, ``retune``, ``start``, 
   and bears a load. From 8000 to 10 000 samples later, the RMS error is at most 1.5 times that of a
   new controller plus 0.1 % of the reference's amplitude.
 
-Observers have omega_o dt = 0.2 here, that of order 8 has 0.05; one that was thrown by a factor s returns within
-``ln s / (omega_o dt)`` samples and some lags.
+Observers have omega_o dt = 0.2 here, that of order 8 has 0.05; one that was thrown by a factor s
+returns within ``ln s / (omega_o dt)`` samples and some lags.
 """
 
 from __future__ import annotations

@@ -365,6 +365,7 @@ WASHED_OUT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [0.0,
         (lambda: LQG(WASHED_OUT, 1.0, 5.0, 0.01), "plant has a zero at s = 0"),
         (lambda: LQG(LAG, 1.0, 5.0, 0.01, Q=np.eye(3)), r"Q has shape \(3, 3\)"),
         (lambda: LQG(LAG, 0.0, 5.0, 0.01), "omega_c = 0.0"),
+        (lambda: LQG(LAG, 1e200, 5.0, 0.01), "rho = b² / omega_c.2m = 0.0: must be finite"),
         (
             lambda: LQG(control.ss(LAG.A, LAG.B, LAG.C, 0.0, 0.1), 1.0, 5.0, 0.01),
             "plant has a sample time, dt = 0.1",

@@ -146,6 +146,11 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
             "[controller]\nkind = 'pid'\nkp = 1.0",
             "observer: a controller of the kind pid does not use it",
         ),
+        ("learner = {kind = 'harmonic', limits = [0.1]}", "learner.limits[1]: missing"),
+        (
+            "learner = {kind = 'rls', features = [{kind = 'polynomial', degree = 100000000}]}",
+            "controller: degree = 100000000: has 4.17e+30 monomials of 4 states",
+        ),
     ],
 )
 def test_a_mistake_gives_a_line_with_file_key_and_rule(text: str, message: str) -> None:

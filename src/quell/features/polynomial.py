@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
@@ -14,6 +15,9 @@ from quell import checks
 from quell.features.base import Features, unit, write
 from quell.features.states import check_states, state_indices
 from quell.types import Vector
+
+# A learner's covariance of so many features takes 8 MB, and a sample of it a millisecond.
+_MOST_FEATURES = 1000
 
 
 class PolynomialDesign(NamedTuple):
@@ -39,7 +43,8 @@ class Polynomial(Features):
     Raises
     ------
     ValueError
-        for a degree below 2, or a state that the plant does not have.
+        for a degree below 2, more than a thousand monomials, or a state that the plant does not
+        have.
     """
 
     degree: int = 3
@@ -52,6 +57,12 @@ class Polynomial(Features):
     def design(self, order: int) -> PolynomialDesign:
         """Return the table of factors."""
         chosen = state_indices(self.states, order).tolist()
+        count = math.comb(len(chosen) + self.degree, len(chosen)) - 1 - len(chosen)
+        if count > _MOST_FEATURES:
+            raise ValueError(
+                f"degree = {self.degree}: has {count:.3g} monomials of {len(chosen)} states: must "
+                f"have at most {_MOST_FEATURES}; lower degree, or choose states"
+            )
         rows = [
             [*factors, *[-1] * (self.degree - degree)]
             for degree in range(2, self.degree + 1)

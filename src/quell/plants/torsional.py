@@ -40,6 +40,8 @@ from quell.types import Vector
 
 # Longest sub-step [s]: short against the period of the disks' mode at about 6.5 Hz. Chosen by hand.
 _SUBSTEP = 1e-4
+# Longest sample with dry friction [s]: six periods of that mode, which no loop can control.
+_LONGEST_SAMPLE = 1.0
 # Each iteration reduces the error of the two friction torques by six digits, the square of the
 # disks' coupling within a sub-step.
 _ITERATIONS = 3
@@ -127,7 +129,11 @@ class TorsionalPlant:
     ) -> TorsionalModel | DelayedPlantModel | EncodedPlantModel:
         """Return the parameters for a sample time ``dt`` [s]: disks, in a delay, in an encoder."""
         dry = any(c > 0.0 for c in self.coulomb)
-        substeps = math.ceil(checks.positive("dt", dt, "s") / _SUBSTEP - 1e-9) if dry else 1
+        if checks.positive("dt", dt, "s") > _LONGEST_SAMPLE and dry:
+            raise ValueError(
+                f"dt = {dt!r} s: must be at most {_LONGEST_SAMPLE} s with dry friction"
+            )
+        substeps = math.ceil(dt / _SUBSTEP - 1e-9) if dry else 1
         disks = self.linear.sampled(dt / substeps)
         model: TorsionalModel | DelayedPlantModel = TorsionalModel(
             disks, substeps, np.array(self.coulomb), self.u_max, self.step

@@ -89,7 +89,7 @@ def _path(loc: Sequence[str | int], data: Any, absent: bool) -> str:
             data = data.get(step)
         elif isinstance(step, int) and isinstance(data, Sequence):
             path += f"[{step}]"
-            data = data[step]
+            data = data[step] if step < len(data) else None  # it may be absent
     return path
 
 
