@@ -152,6 +152,25 @@ def test_an_offset_fades_with_the_bandwidth_of_the_controller() -> None:
     assert plain._state.loop[0].offset == 0.0
 
 
+@pytest.mark.parametrize(
+    ("limits", "offset", "kept"),
+    [
+        ({"u_min": -2.0, "u_max": 1.0}, 1e30, False),
+        ({"u_min": -2.0, "u_max": 1.0}, -200.0, True),
+        ({}, 1e30, True),
+    ],
+)
+def test_an_offset_beyond_all_limits_of_u_is_dropped(
+    limits: dict[str, float], offset: float, kept: bool
+) -> None:
+    """It comes from absurd estimates; at 100 times the limit, or without limits, it fades."""
+    law = used(ql.ADRC(OBSERVER, 3.0, **limits), 20)
+    law._state.loop[0].offset = offset
+    step(law, 0.5, 0.2)
+    left = offset * math.exp(-3.0 * DT) if kept else 0.0
+    assert law._state.loop[0].offset == pytest.approx(left, rel=1e-12)
+
+
 def test_a_row_has_estimates_status_guard_and_coefficients_in_order() -> None:
     """As ``channels`` names them."""
     law = used(LEARNING, 400)
