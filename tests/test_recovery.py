@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.controllers.base import control
 from quell.learners.recovery import (
     LearnerWatch,
+    has_escaped,
     has_lost_range,
     is_in_proportion,
     window_samples,
@@ -27,12 +29,15 @@ def verdicts(
     f: Callable[[int], float],
     output: Callable[[int], float] = lambda k: 0.0,
     excess: Callable[[int], float] = lambda k: 1.0,
+    limited: Callable[[int], bool] = lambda k: False,
     samples: int = 200,
 ) -> list[int]:
     """Return the samples at which a learner that saw these has lost its range."""
     watch = LearnerWatch.zeros()[0]
     return [
-        k for k in range(samples) if has_lost_range(watch, WINDOW, y(k), f(k), output(k), excess(k))
+        k
+        for k in range(samples)
+        if has_lost_range(watch, WINDOW, y(k), f(k), output(k), excess(k), limited(k))
     ]
 
 
@@ -93,6 +98,54 @@ def test_the_f_of_the_window_before_counts_for_the_output_too() -> None:
     assert verdicts(
         wave, lambda k: 1.0 if k < 20 else 1e-3, lambda k: 100.0, lambda k: 1e9, samples=60
     ) == [59]
+
+
+def test_at_the_limits_of_u_a_smaller_range_is_enough() -> None:
+    """2⁻¹⁰ of the largest f, with u at its limits in most samples of the window."""
+
+    def at_limits(shock: float, share: int) -> list[int]:
+        return verdicts(
+            wave,
+            lambda k: shock if k == 30 else wave(k),
+            limited=lambda k: k % 20 >= 20 - share,
+            samples=100,
+        )
+
+    assert at_limits(1100.0, 11) == [79]
+    assert at_limits(1100.0, 10) == []
+    assert at_limits(1000.0, 20) == []
+
+
+def test_an_output_that_grows_without_bound_is_found_in_the_sample() -> None:
+    """Beyond 2⁴⁰ of all f before this window, and the law asks for 2¹⁰ of u; f now does not count."""
+
+    def watched(peak: float) -> LearnerWatch:
+        watch = LearnerWatch.zeros()[0]
+        watch.peak, watch.most, watch.most_before = peak, 1e20, 1.5
+        watch.samples = watch.excessive = watch.limited = 7.0
+        return watch
+
+    watch = watched(1.0)
+    assert has_escaped(watch, -1.2e12, 2000.0)
+    assert (watch.most, watch.samples, watch.excessive, watch.limited) == (0.0, 0.0, 0.0, 0.0)
+    assert (watch.peak, watch.most_before) == (1.0, 1.0)
+    assert not has_escaped(watched(1.0), 1e12, 2000.0)
+    assert not has_escaped(watched(1.0), 1.2e12, 1000.0)
+    assert not has_escaped(watched(0.0), 1.2e12, 2000.0)  # the first window
+
+
+def test_coefficients_that_overflow_are_forgotten() -> None:
+    """They are finite: kept, they would overflow again in each sample."""
+    observer = ql.ESO.model_free(2, 1.0, 20.0, 0.01)
+    loop = ql.ADRC(observer, 3.0, learner=ql.learners.NLMS(), u_min=-5.0, u_max=5.0)
+    flags = []
+    with np.errstate(all="ignore"):
+        for k in range(240):
+            if k == 200:
+                loop._state.learner.theta[0] = loop._state.learner.scale[3] = 1e300
+            control(loop.parameters, loop._state, wave(k), 0.5 * wave(k - 1))  # interpreted
+            flags.append(bool(int(loop._state.loop[0].status) & ql.Status.OVERFLOWED))
+    assert np.flatnonzero(flags).tolist() == [200]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])

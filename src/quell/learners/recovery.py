@@ -2,16 +2,22 @@
 
 Samples that are absurd, but finite, can take a learner to where it does not return from: scales and
 mean squares are then so large that it no longer sees what comes, or its output is so large that
-u stays at its limits. Two comparisons over windows of ``WINDOW_LAGS`` lags of the observer find
-this, in any unit:
+u stays at its limits. Three comparisons find this, in any unit, the first two over windows of
+``WINDOW_LAGS`` lags of the observer:
 
 * *range*: while y moves, the largest ``|f_plain|`` of a window is below 2⁻⁴⁰ of the largest ever.
   No real loop works over such a range: sensors resolve ``RESOLUTION`` of theirs. Where y moves by
   less than that, and where ``|f_plain|`` still decays, nothing is concluded, so a loop that comes
-  to rest, also without any noise, forgets nothing;
+  to rest, also without any noise, forgets nothing. If u is at its limits in most samples of the
+  window, 2⁻¹⁰ suffices: features that are so small correct nothing within the memory of a learner,
+  and what it learned at the larger scale may be what keeps u at its limits;
 * *output*: in most samples of a window the law asks for more than 2¹⁰ times the u that is applied,
   and the learner's output is more than 2¹⁰ times the largest ``|f_plain|``. Without limits this can
-  not happen.
+  not happen;
+* *escape*: the learner's output is more than 2⁴⁰ times the largest ``|f_plain|`` of all windows
+  before, and the law asks for more than 2¹⁰ times the u that is applied. Then estimates and output
+  drive each other, for example with a cube of x̂, while y is still good; f_plain contains them, so
+  that no later comparison with it would be of use.
 
 The controller then calls ``forget`` (``learners/base.py``).
 """
@@ -30,6 +36,8 @@ WINDOW_LAGS = AVERAGING_LAGS
 _LEAST_SHARE = 2.0**-40
 # An output so many times larger than f is no prediction; ten times what a guard cuts off.
 _TOO_LARGE = 2.0**10
+# With features of this size a regression learns 2⁻²⁰ of what it learns at its scale from a sample.
+_LEAST_SHARE_AT_LIMITS = 2.0**-10
 # A window counts only if |f_plain| has not decayed to less than this share of the last one. At
 # rest without noise a loop with omega_c = omega_o/10 decays faster.
 _STEADY = 0.5
@@ -44,6 +52,7 @@ class LearnerWatch(Scalars):
     y_low: float  # least y in this window
     y_high: float  # largest y in this window
     excessive: float  # samples in this window with an output that is too large
+    limited: float  # samples in this window in which u was at its limits
     samples: float  # samples in this window
 
 
@@ -59,13 +68,35 @@ def is_in_proportion(watch: LearnerWatch, output: float) -> bool:
 
 
 @kernel
+def has_escaped(watch: LearnerWatch, output: float, excess: float) -> bool:
+    """Return whether ``output`` grows without bound; the window then begins anew.
+
+    The arguments are those of ``has_lost_range``.
+    """
+    if not (watch.peak > 0.0 and excess > _TOO_LARGE):
+        return False
+    if abs(output) * _LEAST_SHARE <= watch.peak:
+        return False
+    # The window before may have seen the beginning, but not the peak.
+    watch.most_before = min(watch.most_before, watch.peak)
+    watch.most = watch.excessive = watch.limited = watch.samples = 0.0
+    return True
+
+
+@kernel
 def has_lost_range(
-    watch: LearnerWatch, window: int, y: float, f_plain: float, output: float, excess: float
+    watch: LearnerWatch,
+    window: int,
+    y: float,
+    f_plain: float,
+    output: float,
+    excess: float,
+    limited: bool,
 ) -> bool:
     """Return whether the learner has to start again; call it once for each good sample.
 
     ``output`` is the learner's own, before a guard; ``excess`` is the ratio of the u that the law
-    asks for to the u that is applied.
+    asks for to the u that is applied; ``limited`` tells whether limits have changed it.
     """
     size = abs(f_plain)
     if watch.samples == 0.0:
@@ -76,15 +107,17 @@ def has_lost_range(
     watch.y_low, watch.y_high = min(watch.y_low, y), max(watch.y_high, y)
     if excess > _TOO_LARGE and abs(output) > _TOO_LARGE * max(watch.most, watch.most_before):
         watch.excessive += 1.0
+    watch.limited += 1.0 if limited else 0.0
     if watch.samples < window:
         return False
     watch.peak = max(watch.peak, watch.most)
     moves = watch.y_high - watch.y_low > RESOLUTION * max(abs(watch.y_low), abs(watch.y_high))
     steady = watch.most >= _STEADY * watch.most_before
-    out_of_range = moves and steady and watch.most < _LEAST_SHARE * watch.peak
+    least = _LEAST_SHARE_AT_LIMITS if 2.0 * watch.limited > watch.samples else _LEAST_SHARE
+    out_of_range = moves and steady and watch.most < least * watch.peak
     lost = out_of_range or 2.0 * watch.excessive > watch.samples
     if lost:
         watch.peak = watch.most
     watch.most_before = watch.most
-    watch.most = watch.excessive = watch.samples = 0.0
+    watch.most = watch.excessive = watch.limited = watch.samples = 0.0
     return bool(lost)

@@ -53,7 +53,7 @@ from quell.learners.base import (
     trouble,
 )
 from quell.learners.lag import lag_push
-from quell.learners.recovery import LearnerWatch, has_lost_range, is_in_proportion
+from quell.learners.recovery import LearnerWatch, has_escaped, has_lost_range, is_in_proportion
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Matrix, Status, Vector
 
@@ -156,7 +156,10 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     unlimited = unlimited_control(design, state, constant, slope)
     if not is_finite(unlimited):
         status |= _OVERFLOWED
-        restart(design.learner, state.learner)
+        # Else a finite θ that is out of all proportion overflows again in the next sample.
+        forget(design.learner, state.learner)
+        start_again(design.guard, state.guard)
+        clear(state.watch)
         reset_lag_filters(design, state)
         begin(design.eso, state.z, seen, loop.y)
         constant = slope = loop.offset = 0.0
@@ -180,7 +183,10 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
     if design.window > 0 and status & _MEASUREMENT_HELD == 0:
         excess = abs(unlimited) / max(abs(u), _SMALLEST_OFFSET)
-        if has_lost_range(state.watch[0], design.window, loop.y, f_plain, output, excess):
+        limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
+        if has_escaped(watch, output, excess) or has_lost_range(
+            watch, design.window, loop.y, f_plain, output, excess, limited
+        ):
             status |= _OVERFLOWED
             _start_learning_again(design, state)
     loop.status = status
