@@ -287,7 +287,10 @@ def test_features_that_do_not_fit_are_named(make: Any, message: str, around: Any
 def test_features_of_ones_own_that_fit_are_taken() -> None:
     """And learned from."""
     run = ql.simulate(
-        CHAIN, law(ql.learners.RLS(block_with(both))), ql.Scenario(ql.signals.Sinusoid(), 0.5)
+        CHAIN,
+        law(ql.learners.RLS(block_with(both))),
+        ql.Scenario(ql.signals.Sinusoid(), 0.5),
+        interpret=True,  # compiled features of one's own run in test_features
     )
     assert run.features == ("a", "b")
 

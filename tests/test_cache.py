@@ -23,7 +23,7 @@ STEP = """
 import quell as ql
 from quell.controllers.compiled_step import step_packed
 from quell.kernels.dispatch import compilations
-controller = ql.ADRC(ql.ESO.model_free(1, 1.0, 10.0, 0.01), 1.0)
+controller = ql.baselines.PID(1.0, dt=0.01)
 print(controller.step(1.0, 0.0), compilations(step_packed))
 """
 

@@ -147,7 +147,7 @@ class Mine:
 """
     script = """
 import quell as ql, mine
-controller = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=0.01), omega_c=1.0)
+controller = ql.baselines.PID(1.0, dt=0.01)
 runs = [ql.simulate(mine.Mine(), controller, ql.Scenario(1.0, 1.0), interpret=i) for i in (False, True)]
 print(abs(runs[0]["y"] - runs[1]["y"]).max() < 1e-9, runs[0]["y"][-1])
 """
