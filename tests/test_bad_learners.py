@@ -421,14 +421,17 @@ def test_a_model_that_explodes_is_cut_off(then: float) -> None:
 
 @pytest.mark.parametrize("then", [ValueError("no more"), math.nan, 1e200])
 def test_a_python_model_that_breaks_in_a_guarded_loop_leaves_a_plain_one(then: Any) -> None:
-    """What raises or is no number is reported; what is only huge is cut off."""
-    learner = ql.learners.PythonModel(Broken(60, then))
+    """What raises or is no number is reported; what is only huge is cut off.
+
+    As Python: compiled, such a model breaks in a loop without guard (``test_adapter_faults``).
+    """
+    guarded = law(ql.learners.PythonModel(Broken(60, then)), guard=ql.Guard())
     if isinstance(then, float) and math.isfinite(then):
-        run = ql.simulate(CHAIN, law(learner, guard=ql.Guard()), SCENARIO)
+        run = ql.simulate(CHAIN, guarded, SCENARIO, interpret=True)
         assert Reason.EXPLODED in set(run["reason"].astype(int))
     else:
         with pytest.warns(RuntimeWarning, match="learner Broken raised"):
-            run = ql.simulate(CHAIN, law(learner, guard=ql.Guard()), SCENARIO)
+            run = ql.simulate(CHAIN, guarded, SCENARIO, interpret=True)
         assert Status.LEARNER_FAILED in run.status
     plain = ql.simulate(CHAIN, law(None), SCENARIO)
     assert np.max(np.abs(run["y"] - run["r"])) <= 1.05 * np.max(np.abs(plain["y"] - plain["r"]))

@@ -15,6 +15,8 @@ from quell.observers.base import expected_measurement
 from quell.observers.eso import ESO
 from quell.plants.base import advance, measure
 
+from .python_step import interpreted
+
 DT = 0.01
 OBSERVER = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=DT)
 PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0])
@@ -422,13 +424,15 @@ def test_what_was_learned_forbids_another_nominal_gain() -> None:
 def test_a_start_in_motion_goes_on_from_the_estimates(learner: object, delay: float) -> None:
     """With the estimates and u of another controller, every later u is that controller's; with a delay, after a constant u."""
     observer = ESO.model_free(order=2, b0=2.0, omega_o=20.0, dt=DT, delay=delay)
-    one = ql.ADRC(observer, omega_c=3.0, learner=learner, u_min=-4.0, u_max=4.0)
+    limits = {"u_min": -4.0, "u_max": 4.0}
+    one, other = (
+        interpreted(ql.ADRC(observer, omega_c=3.0, learner=learner, **limits)) for _ in range(2)
+    )
     for k in range(300):
         one.step(1.0, 0.3 * math.sin(0.05 * k))
     for _ in range(3):
         one.track(1.0, 0.1, 0.7)
     known = one.estimate
-    other = ql.ADRC(observer, omega_c=3.0, learner=learner, u_min=-4.0, u_max=4.0)
     if learner is not None:  # which has to know the same
         other.state = other.state | {
             name: value for name, value in one.state.items() if name.startswith("learner.")
@@ -471,7 +475,9 @@ def test_a_start_in_motion_may_continue_from_u() -> None:
 
 def test_behind_a_prefilter_a_start_in_motion_settles_the_prefilter_there() -> None:
     """The next reference is a step from y on."""
-    shaped = ql.controllers.Prefiltered(ql.ADRC(OBSERVER, 3.0), ql.baselines.ZV(omega=5.0))
+    shaped = interpreted(
+        ql.controllers.Prefiltered(ql.ADRC(OBSERVER, 3.0), ql.baselines.ZV(omega=5.0))
+    )
     shaped.start_at([0.2, 0.0], 0.0, u=0.1)
     assert shaped.step(0.2, 0.2) == pytest.approx(ql.ADRC(OBSERVER, 3.0).step(0.2, 0.2), abs=0.5)
     assert shaped.state["loop"][0] == pytest.approx(0.2)

@@ -18,6 +18,8 @@ from quell.observers.noise import noise_gains
 from quell.observers.nonlinear import fal
 from quell.observers.response import response
 
+from .python_step import interpreted
+
 DT = 5e-3
 
 
@@ -314,7 +316,8 @@ def test_a_known_delay_saves_a_loop_that_swings_without() -> None:
     swing = []
     for delay in (0.0, 0.2):
         observer = ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01, delay=delay)
-        run = ql.simulate(plant, ql.ADRC(observer, omega_c=2.0, u_min=-50.0, u_max=50.0), scenario)
+        controller = ql.ADRC(observer, omega_c=2.0, u_min=-50.0, u_max=50.0)
+        run = ql.simulate(plant, controller, scenario, interpret=True)
         swing.append(np.ptp(run["y"][run.t > 25.0]))
     assert swing[0] > 1.0
     assert swing[1] < 1e-6
@@ -326,6 +329,7 @@ def test_a_delayed_plant_is_the_plant_with_the_u_of_then() -> None:
         ql.plants.delayed(PLANT, 0.03, 0.01),
         ql.ADRC(ESO.model_free(2, 1.5, 10.0, 0.01), 1.0),
         ql.Scenario(1.0, 2.0),
+        interpret=True,
     )
     np.testing.assert_array_equal(
         run["x"][4:, 2:], np.column_stack([run["u"][3:-1], run["u"][2:-2], run["u"][1:-3]])
@@ -348,6 +352,7 @@ def test_a_learner_finds_the_gain_of_a_delayed_plant() -> None:
         plant,
         controller,
         ql.Scenario(ql.signals.Sinusoid(omega=1.0) + ql.signals.Sinusoid(omega=2.7), duration=80.0),
+        interpret=True,
     )
     theta = dict(zip(controller.features, run["theta"][-1], strict=True))
     assert theta["u"] == pytest.approx(0.4, abs=0.04)
@@ -415,7 +420,7 @@ def test_time_scales_are_those_of_the_poles() -> None:
 def test_a_hand_over_is_bumpless_in_every_form(name: str) -> None:
     """From somebody else's u at rest, with a load: u goes on from there, and y stays."""
     observer = ESO.nonlinear(2, 1.5, 20.0, DT, delta=0.05) if name == "nonlinear" else FORMS[name]
-    controller = ql.ADRC(observer, omega_c=2.0)
+    controller = interpreted(ql.ADRC(observer, omega_c=2.0))
     # y = 1 is held against the spring by u = 2/1.5.
     controller.start(y=1.0, u=2.0 / 1.5)
     x, model = np.array([1.0, 0.0]), PLANT.sampled(DT)
