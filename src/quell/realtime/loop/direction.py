@@ -1,7 +1,7 @@
 """A check of the signs of y, u and b0 by the first motion after the controller takes over.
 
 With one of the signs wrong the loop has positive feedback: y leaves its place of rest against the
-push of u, and |r − y| grows by a factor e in about 1/omega_c. A load, a zero in the right half
+push of u, and ``|r − y|`` grows by a factor e in about 1/omega_c. A load, a zero in the right half
 plane and noise move y against u as well, but not so far. So the run ends only if
 
 1. y first moves (beyond its noise before the run, and 2 % of the reach of u) against the sum of
