@@ -329,7 +329,7 @@ def test_prediction_beats_simulation_and_both_are_told() -> None:
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_a_higher_order_than_the_plants_finds_it_too(order: int, noise: float) -> None:
     """A lag by a model of up to six poles: it is fitted as well as by one, and the report says which poles no sample shows."""
-    u = excitation("prbs", (0.2, 40.0), 40.0, 0.01, seed=3).u
+    u = excitation("prbs", (0.2, 40.0), 20.0, 0.01, seed=3).u
     y = answer(([3.0], [1.0, 2.0]), u, 0.01)
     y = y + noise * np.std(y) * np.random.default_rng(1).standard_normal(y.size)
     found = ql.identify(u, y, 0.01, order=order)
