@@ -11,8 +11,8 @@ from quell.controllers import ADRC
 from quell.controllers.base import Controller
 
 # Default distance from the reference's range to a bound of y, in units of that range plus the reach
-# of u. In 2000 random stable loops with loads of up to 0.9 of u's limit, y left the range by at
-# most 2.4 of these units (benchmarks/direction.py).
+# of u. In 1500 random stable loops with loads of up to 0.9 of u's limit, y left the range by at
+# most 6.5 of these units (two seeds of benchmarks/direction.py).
 _MARGIN = 10.0
 # The same without a known b0, times the largest of 1 and |r|: as the limit of ``simulate``.
 _MARGIN_WITHOUT_MODEL = 1e6
