@@ -34,13 +34,21 @@ from rich.progress import track
 from rich.table import Table
 
 REPOSITORY = Path(__file__).parents[2]
-# Tests of commands, of processes and threads, of adapters and of compilation itself take seconds
-# each, and are not about these areas.
+# Tests of commands, of processes and threads, of adapters, of compilation itself and of published
+# figures take seconds each, and are not about these areas.
 LEFT_OUT = [
     *("adapter_faults", "adapters", "api_page", "batch", "cache", "cli", "cli_rig", "cli_run"),
     *("cobs", "dispatch", "faults", "fault_injection", "frames", "function_pointers", "histogram"),
     *("hostile_files", "live", "loop", "ni", "replay", "rig", "ring", "run_rig", "scalars"),
-    *("security", "serial_device", "serial_line", "shared_memory", "telemetry", "torsional"),
+    *(
+        "security",
+        "serial_device",
+        "serial_line",
+        "shared_memory",
+        "stress",
+        "telemetry",
+        "torsional",
+    ),
     *("twin", "wire"),
 ]
 AREAS = {
@@ -123,7 +131,11 @@ def unchanged_run(folder: Path, workers: int) -> Tests:
     report, data = folder / "report.xml", folder / "coverage"
     if not report.exists():
         copy = _copy(folder / "copy")
-        names = [p for p in _test_files() if Path(p).stem.removeprefix("test_") not in LEFT_OUT]
+        names = [
+            path
+            for path in _test_files()
+            if Path(path).stem.removeprefix("test_") not in LEFT_OUT and "/published/" not in path
+        ]
         _pytest(
             copy,
             [*names, f"-n{workers}", f"--junitxml={report}", "--cov", "--cov-context=test"],
