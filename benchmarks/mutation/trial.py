@@ -182,7 +182,7 @@ def _judge(mutant: Mutant, copy: Path, tests: Tests) -> tuple[bool, str]:
 
 def _failure(copy: Path, tests: list[str], interpret: bool) -> str | None:
     """Return the test that fails; None if all pass."""
-    for part in itertools.batched(tests, 200):
+    for part in (tests[i : i + 200] for i in range(0, len(tests), 200)):
         done = _pytest(copy, ["-x", "-n0", "--no-header", *part], interpret=interpret)
         if done.returncode not in (0, 5):
             lines = [x for x in done.stdout.splitlines() if x.startswith(("FAILED", "ERROR"))]
