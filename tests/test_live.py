@@ -147,8 +147,9 @@ def test_an_origin_that_is_none_is_refused() -> None:
     for origin in ("app.foxglove.dev", "https://", "https://a.example/path", "*"):
         with pytest.raises(ValueError, match=r"origins\[0\] = .* must be the scheme and host"):
             LiveSink(origins=[origin])
-    with pytest.raises(ValueError, match="must be a list of origins"):
-        LiveSink(origins="https://a.example")  # type: ignore[arg-type]
+    for origins in ("https://a.example", None):
+        with pytest.raises(ValueError, match="must be a list of origins"):
+            LiveSink(origins=origins)  # type: ignore[arg-type]
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(live: LiveSink) -> None:

@@ -95,7 +95,7 @@ def nonfinite_to_none(value: Any) -> Any:
 
 
 def _link(part: Path, target: Path) -> None:
-    """Give a file its name, unless a file has it already."""
+    """Name the file ``part`` as ``target``, unless there is such a file already."""
     try:
         os.link(part, target)
     except FileExistsError:

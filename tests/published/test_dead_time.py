@@ -96,6 +96,8 @@ def test_a_setup_file_can_have_it_and_mistakes_are_named() -> None:
         ({"dead_time": 0.0}, "dead_time = 0.0: must be finite and greater"),
         ({"rule": "zn"}, "rule = 'zn': must be one of simc, amigo"),
         ({"rule": "amigo", "tau_c": 1.0}, "tau_c = 1.0 with rule = 'amigo': only"),
+        ({"gain": 1e-300, "time_constant": 1e300}, "beyond all numbers; check the units"),
+        ({"rule": "amigo", "time_constant": 1e300}, "beyond all numbers; check the units"),
     ):
         with pytest.raises(ValueError, match=message):
             made("late.toml", {"dt": DT, "controller": table | change})

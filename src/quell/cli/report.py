@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from quell.cli.options import Outputs
 from quell.cli.output import Column, print_line, table
-from quell.records.measures import MEASURES, STEP_MEASURES
+from quell.records.measures import MEASURES
 from quell.records.metrics import SETTLING_BAND
 
 if TYPE_CHECKING:
@@ -56,14 +56,12 @@ def _judged(run: Trajectory, window: dict[str, Any], end: float) -> dict[str, An
         missing = dict.fromkeys(MEASURES, reason)
         return {"start": start, "stop": stop, "settling_band": band, "missing": missing}
     found = run.metrics(**window)
-    values, missing = dict(found), found.missing
     if cut_off:
         stop = run.ended
-        values = {name: value for name, value in found.items() if name not in STEP_MEASURES}
-        reason = f"the run ended at {run.ended:.6g} s, in the window"
-        missing = missing | dict.fromkeys(STEP_MEASURES, reason)
-    numbers = {name: value if math.isfinite(value) else None for name, value in values.items()}
-    return {"start": start, "stop": stop} | numbers | {"settling_band": band, "missing": missing}
+        found = found.without_step(f"the run ended at {run.ended:.6g} s, in the window")
+    numbers = {name: value if math.isfinite(value) else None for name, value in found.items()}
+    about = {"settling_band": band, "missing": found.missing}
+    return {"start": start, "stop": stop} | numbers | about
 
 
 def _nothing_to_judge(run: Trajectory, start: float, stop: float, cut_off: bool) -> str:

@@ -44,7 +44,7 @@ _STEADY = 0.5
 
 
 class LearnerWatch(Scalars):
-    """What the comparison has seen."""
+    """Extremes and counts of a window, and the extremes before it."""
 
     peak: float  # largest |f_plain| since the learner began
     most: float  # largest |f_plain| in this window

@@ -33,6 +33,11 @@ class Metrics(dict[str, float]):
         super().__init__(values)
         self.missing, self.band = missing, band
 
+    def without_step(self, reason: str) -> Metrics:
+        """Return all but the measures of a step, which are missing for a ``reason``."""
+        values = {name: value for name, value in self.items() if name not in STEP_MEASURES}
+        return Metrics(values, self.missing | dict.fromkeys(STEP_MEASURES, reason), self.band)
+
 
 class BatchMetrics(dict[str, Vector]):
     """Measures of the responses of a batch, arrays (runs,) by name.

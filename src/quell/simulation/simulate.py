@@ -125,7 +125,7 @@ def simulate(
     dt, samples = sampled.dt, sampled.samples
     loop = Loop(plant, plant.sampled(dt, interpret), controller, sampled, interpret)
     channels = logged_channels(plant, controller)
-    log = np.empty(((samples - 1) // every + 1, sum(width for _, width in channels)))
+    log = np.empty(((samples - 1) // every + 1, loop.width))
     row = 0
     for first, last in segment_bounds(samples, sampled.rest_samples):
         row = loop.run(sampled.segment(first, last), log, row, every)

@@ -76,7 +76,8 @@ def dead_time_tuning(
     Raises
     ------
     ValueError
-        for a gain of zero, a time that is not positive, ``tau_c`` with another rule.
+        for a gain of zero, a time that is not positive, ``tau_c`` with another rule, or numbers
+        from which no finite b0 follows.
 
     Examples
     --------
@@ -86,14 +87,35 @@ def dead_time_tuning(
     K = checks.nonzero("gain", gain, "or u does not reach y")
     T = checks.positive("time_constant", time_constant, "s")
     L = checks.positive("dead_time", dead_time, "s")
-    if checks.one_of("rule", rule, RULES) == "simc":
-        total = L + (L if tau_c is None else checks.positive("tau_c", tau_c, "s"))
-        Kc, Ti = T / (K * total), min(T, 4.0 * total)
-    elif tau_c is not None:
+    if checks.one_of("rule", rule, RULES) == "amigo" and tau_c is not None:
         raise ValueError(f"tau_c = {tau_c!r} with rule = {rule!r}: only the rule 'simc' has it")
-    else:
-        Kc = (0.15 + (0.35 - L * T / (L + T) ** 2) * T / L) / K
-        Ti = 0.35 * L + 13.0 * L * T**2 / (T**2 + 12.0 * L * T + 7.0 * L**2)
+    closed = L if tau_c is None else checks.positive("tau_c", tau_c, "s")
+    try:
+        found = _solved(L, *(_simc(K, T, L, closed) if rule == "simc" else _amigo(K, T, L)))
+        usable = all(math.isfinite(number) and number != 0.0 for number in found)
+    except ArithmeticError:
+        usable = False
+    if not usable:
+        raise ValueError(
+            f"gain = {gain!r}, time_constant = {time_constant!r}, dead_time = {dead_time!r}: b0 "
+            "and the bandwidths are beyond all numbers; check the units"
+        )
+    return found
+
+
+def _simc(K: float, T: float, L: float, tau_c: float) -> tuple[float, float]:
+    """Return K_c and T_i."""
+    return T / (K * (L + tau_c)), min(T, 4.0 * (L + tau_c))
+
+
+def _amigo(K: float, T: float, L: float) -> tuple[float, float]:
+    """Return K_c and T_i."""
+    Kc = (0.15 + (0.35 - L * T / (L + T) ** 2) * T / L) / K
+    return Kc, 0.35 * L + 13.0 * L * T**2 / (T**2 + 12.0 * L * T + 7.0 * L**2)
+
+
+def _solved(L: float, Kc: float, Ti: float) -> DeadTimeTuning:
+    """Return the ADRC that is this PI controller with a filter."""
     tf = _FILTER * min(L, Ti)
     x = Ti / tf
     omega_o = (x + 3.0 + math.sqrt((x - 1.0) * (x - 9.0))) / (4.0 * Ti)

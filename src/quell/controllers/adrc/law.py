@@ -157,19 +157,17 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     if not is_finite(unlimited):
         status |= _OVERFLOWED
         # Else a finite θ that is out of all proportion overflows again in the next sample.
-        forget(design.learner, state.learner)
-        start_again(design.guard, state.guard)
+        _forget_learning(design, state)
         clear(state.watch)
-        reset_lag_filters(design, state)
         begin(design.eso, state.z, seen, loop.y)
         constant = slope = loop.offset = 0.0
         unlimited = loop.u
     if loop.bumpless != 0.0:
         loop.offset = loop.u - unlimited
         loop.bumpless = 0.0
-    if not abs(loop.offset) <= _LARGEST_OFFSET * largest_magnitude(design.limits):
-        loop.offset = 0.0
     if loop.offset != 0.0:
+        if not abs(loop.offset) <= _LARGEST_OFFSET * largest_magnitude(design.limits):
+            loop.offset = 0.0
         unlimited += loop.offset
         loop.offset = loop.offset * design.fade if abs(loop.offset) > _SMALLEST_OFFSET else 0.0
     u, cut = apply_limits(design.limits, unlimited, loop.u)
@@ -206,6 +204,12 @@ def _start_learning_again(design: AdrcDesign, state: AdrcState) -> None:
     else:
         begin(design.eso, state.z, state.seen, loop.y)
     loop.constant = loop.slope = loop.f_learned = 0.0
+    _forget_learning(design, state)
+
+
+@kernel
+def _forget_learning(design: AdrcDesign, state: AdrcState) -> None:
+    """Return learner, guard and the lag filter of f_L to their states before the first sample."""
     reset_lag_filters(design, state)
     start_again(design.guard, state.guard)
     forget(design.learner, state.learner)

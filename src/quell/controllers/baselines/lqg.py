@@ -103,10 +103,12 @@ class LQG(LinearController):
         if first is None:
             raise ValueError("u does not reach y: B or C is zero, or they have no mode in common")
         b, degree = first
-        with np.errstate(all="ignore"):
-            usual = float(b**2 / np.float64(omega_c) ** (2 * degree))
-        rho = checks.positive("rho = b² / omega_c^2m", usual) if rho is None else rho
-        rho = checks.positive("rho", rho)
+        name = "rho"
+        if rho is None:
+            name = "rho = b² / omega_c^2m"
+            with np.errstate(all="ignore"):
+                rho = float(b**2 / np.float64(omega_c) ** (2 * degree))
+        rho = checks.positive(name, rho)
         weight = C.T @ C if Q is None else checks.weight("Q", Q, n)
         self.K = _state_gain(A, B, weight, rho, dt)
         self.model = with_disturbance(A, B, C, B, dt)

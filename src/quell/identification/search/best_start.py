@@ -37,7 +37,7 @@ _SAME = 1e-3
 # Relative mean square that counts as zero: rounding in long simulations.
 _ROUNDING = 1e-18
 # Number of starts that are refined by output error; most steps of each, and of the best two.
-# By hand, so that the trial of benchmarks/identification.py passes with a margin.
+# By hand, so that the trial of benchmarks/identification_trial.py passes with a margin.
 _KEPT, _FINISHED, _FEW_STEPS, _STEPS = 5, 2, 12, 60
 # Lags of the test of whiteness, and its level: a model is rarely searched for longer in vain.
 _LAGS, _LEVEL = 50, 1e-3

@@ -119,13 +119,10 @@ def projected(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tupl
 
 def covariance(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Matrix:
     """Return the covariance of θ at an optimum, infinite for a model whose output is not finite."""
-    with np.errstate(all="ignore"):
-        predicted, psi = gradient(structure, theta, v)
-        size = nonzero_lengths(psi)
-        error = y - predicted
-    if not (np.all(np.isfinite(size)) and np.all(np.isfinite(error))):
+    found = _error_and_gradient(structure, theta, v, y)
+    if found is None:
         return np.full((theta.size, theta.size), np.inf)
-    psi = psi / size
+    error, psi, size = found
     scores = block_sums(psi, error, min(max(4 * theta.size, _BLOCKS), y.size))
     half = np.linalg.pinv(psi.T @ psi, rcond=_RANK, hermitian=True) @ scores.T
     return half @ half.T / np.outer(size, size)
@@ -133,13 +130,11 @@ def covariance(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Mat
 
 def gauss_newton(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:
     """Return the mean square error that a Gauss-Newton step predicts, and θ after it."""
-    with np.errstate(all="ignore"):
-        predicted, psi = gradient(structure, theta, v)
-        size = nonzero_lengths(psi)
-        error = y - predicted
-    if not (np.all(np.isfinite(size)) and np.all(np.isfinite(error))):
+    found = _error_and_gradient(structure, theta, v, y)
+    if found is None:
         return math.inf, theta
-    R = _triangle(np.column_stack([psi / size, error]))
+    error, psi, size = found
+    R = _triangle(np.column_stack([psi, error]))
     step, left = _least_squares(R[:, :-1], R[:, -1])
     return left / y.size, theta + step / size
 
@@ -162,21 +157,34 @@ class _Linearisation(NamedTuple):
 
 def _linearise(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> _Linearisation | None:
     """Return the linearisation, None for a model whose output is not finite."""
-    free = structure.free
-    with np.errstate(all="ignore"):
-        predicted, psi = gradient(structure, theta, v)
-        size = nonzero_lengths(psi)
-        error = y - predicted
-        power = float(error @ error)
-    if not (np.all(np.isfinite(size)) and math.isfinite(power)):
+    free, found = structure.free, _error_and_gradient(structure, theta, v, y)
+    if found is None:
         return None
-    psi /= size
+    error, psi, size = found
+    with np.errstate(all="ignore"):
+        power = float(error @ error)
+    if not math.isfinite(power):
+        return None
     # The linear columns first: the rest of the triangle is then free of them.
     R = _triangle(np.column_stack([psi[:, free:], psi[:, :free], error]))
     at = theta.size - free
     inner, right = R[at:-1, at:-1], R[at:-1, -1]
     _, left = _least_squares(inner, right)
     return _Linearisation(size, inner, right, max(float(right @ right) - left, 0.0), power)
+
+
+def _error_and_gradient(
+    structure: Structure, theta: Vector, v: Matrix, y: Vector
+) -> tuple[Vector, Matrix, Vector] | None:
+    """Return error, gradient with columns of length 1, and the lengths; None if not all finite."""
+    with np.errstate(all="ignore"):
+        predicted, psi = gradient(structure, theta, v)
+        size = nonzero_lengths(psi)
+        error = y - predicted
+    if not (np.all(np.isfinite(size)) and np.all(np.isfinite(error))):
+        return None
+    psi /= size
+    return error, psi, size
 
 
 def _damped(inner: Matrix, right: Vector, mu: float) -> Vector:

@@ -12,7 +12,7 @@ from quell.realtime.loop.modes import Cause, Ending, Mode
 from quell.realtime.loop.state import RESERVED, Rules, SupervisorState
 from quell.realtime.system.atomics import load_acquire
 from quell.realtime.system.histogram import Timing
-from quell.records.measures import STEP_MEASURES, Metrics
+from quell.records.measures import Metrics
 from quell.records.trajectory import Trajectory
 
 
@@ -84,8 +84,7 @@ class RigRun:
             raise ValueError(f"{error}; {why}") from None
         if self.completed or (stop is not None and stop <= run.ended):
             return found
-        values = {name: value for name, value in found.items() if name not in STEP_MEASURES}
-        return Metrics(values, found.missing | dict.fromkeys(STEP_MEASURES, why), found.band)
+        return found.without_step(why)
 
     def text(self) -> str:
         """Return changes, counters, timing and notes as lines of text."""

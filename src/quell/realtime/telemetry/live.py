@@ -11,7 +11,7 @@ import math
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -155,7 +155,7 @@ def _url(host: str, port: int) -> str:
 
 def _checked_origins(origins: Any) -> tuple[str, ...]:
     """Return origins; each must be a scheme and a host, as browsers send them."""
-    if isinstance(origins, str):
+    if isinstance(origins, str) or not isinstance(origins, Iterable):
         raise ValueError(f"origins = {origins!r}: must be a list of origins")
     for i, origin in enumerate(origins):
         scheme, mark, host = str(origin).partition("://")

@@ -36,9 +36,8 @@ _FIRST, _WAITING, _LAST = range(3)
 class TickQueue(NamedTuple):
     """Measurements that have come and were not used yet; make it with ``tick_queue``."""
 
-    counts: NDArray[
-        np.int64
-    ]  # index of the oldest, how many wait, number of the last one used (3,)
+    counts: NDArray[np.int64]
+    """Index of the oldest, how many wait, number of the last one used (3,)."""
     numbers: NDArray[np.int64]  # (64,)
     y: NDArray[np.float64]  # [y-unit] (64,)
     u: NDArray[np.float64]  # what acts since then [u-unit] (64,)

@@ -71,7 +71,7 @@ class Mailbox:
         return True
 
     def enlarge(self) -> None:
-        """Give a new file its size; the contents of an existing one stay."""
+        """Extend a new file to its size; the contents of an existing one stay."""
         os.ftruncate(self.file, self._size)
 
     def word(self, offset: int) -> int:
