@@ -96,6 +96,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the verdicts to this file")
     parser.add_argument("--baseline", type=Path, help="folder that keeps the unchanged run")
     options = parser.parse_args()
+    console = Console()
     areas = options.areas.split(",")
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
@@ -115,8 +116,14 @@ def main() -> None:
                 copies.put(copy)
 
         with concurrent.futures.ThreadPoolExecutor(options.workers) as pool:
-            verdicts = list(track(pool.map(judge, drawn), total=len(drawn)))
-    _report(verdicts)
+            verdicts = []
+            for verdict in track(pool.map(judge, drawn), total=len(drawn), console=console):
+                verdicts.append(verdict)
+                if not verdict.killed:
+                    v = verdict.mutant
+                    text = f"survived, line {v.line} ({verdict.reason}): {v.name}"
+                    console.print(text, markup=False, soft_wrap=True)
+    console.print(_table(verdicts))
     if options.json:
         rows = [
             {"area": v.area, "mutant": v.mutant.name, "line": v.mutant.line}
@@ -234,7 +241,7 @@ def _equivalents() -> dict[str, str]:
     return {entry["mutant"]: entry["reason"] for entry in tomllib.loads(text).get("known", [])}
 
 
-def _report(verdicts: list[Verdict]) -> None:
+def _table(verdicts: list[Verdict]) -> Table:
     table = Table("area", "mutants", "killed", "equivalent", "survived", "killed of the rest")
     groups = {area: [v for v in verdicts if v.area == area] for area in AREAS}
     for area, group in (*groups.items(), ("all", verdicts)):
@@ -244,12 +251,7 @@ def _report(verdicts: list[Verdict]) -> None:
             share = f"{killed / max(len(group) - same, 1):.1%}"
             counts = (len(group), killed, same, len(group) - killed - same)
             table.add_row(area, *map(str, counts), share)
-    console = Console()
-    for v in verdicts:
-        if not v.killed and not v.reason.startswith("equivalent"):
-            text = f"survived, line {v.mutant.line} ({v.reason}): {v.mutant.name}"
-            console.print(text, markup=False)
-    console.print(table)
+    return table
 
 
 if __name__ == "__main__":
