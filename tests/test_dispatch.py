@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from numba.core.errors import NumbaError
 
+from quell.controllers.base import control
+from quell.controllers.compiled_step import PackedController, entry_point, step_packed
 from quell.kernels import dispatch
 
 
@@ -47,6 +49,31 @@ def _square(shape: Square, factor: float) -> float:
 def total(one: Any, other: Any) -> float:
     """Add areas of any shapes."""
     return area(one, 1.0) + area(other, 2.0)
+
+
+class MixedLaw(NamedTuple):
+    """Parameters of all kinds."""
+
+    shape: Square
+    weights: np.ndarray  # not contiguous
+    shift: int
+    negative: bool
+
+
+class MixedState(NamedTuple):
+    """A state that counts."""
+
+    calls: np.ndarray
+
+
+@control.register(MixedLaw)
+def _control(law: MixedLaw, state: MixedState, r: float, y: float) -> float:
+    state.calls[0] += law.shift
+    total = law.shape.side * r
+    for i in range(law.weights.shape[0]):
+        for j in range(law.weights.shape[1]):
+            total += law.weights[i, j] * (y + 10.0 * i + 100.0 * j)
+    return -total if law.negative else total
 
 
 @dispatch.compiled
@@ -187,3 +214,19 @@ def test_a_kernel_prints_and_raises_in_what_it_is_inlined_into(
     assert capsys.readouterr().out == "it was 1.0\n"
     with pytest.raises(ValueError, match="too much"):
         prints.uncached(3.0)
+
+
+def test_a_packed_controller_has_the_parameters_and_the_state_of_the_interpreted_one() -> None:
+    """Nested, negative, true and strided ones; new parameters of the same types need no other code."""
+    weights = np.arange(24.0).reshape(4, 6)[::2, ::3]
+    law, state = MixedLaw(Square(3.0), weights, -7, True), MixedState(np.zeros(1, np.int64))
+    packed = PackedController(law, state)
+    step = entry_point(step_packed.uncached, packed)
+    assert step(packed, 2.0, 0.5) == control(law, state, 2.0, 0.5)
+    other = law._replace(shape=Square(-1.0), weights=weights + 1.0, shift=2, negative=False)
+    with pytest.raises(TypeError, match="contain 'three': must be numbers, arrays, or tuples"):
+        PackedController(law._replace(shift="three"), state)
+    other = other._replace(weights=np.repeat(other.weights, 2, axis=0)[::2])
+    packed = PackedController(other, state, before=packed)
+    assert step(packed, 2.0, 0.5) == control(other, state, 2.0, 0.5)
+    assert state.calls[0] == 2 * (2 - 7)

@@ -47,11 +47,15 @@ def _step(packed: Any, r: float, y: float) -> float:
     return float(control(packed.design, packed.state, float(r), float(y)))
 
 
+def _pack(design: Any, state: Any, before: Any = None) -> SimpleNamespace:
+    return SimpleNamespace(design=design, state=state)
+
+
 for module in (compiled_step, stateful):
     vars(module).update(
-        PackedController=lambda design, state: SimpleNamespace(design=design, state=state),
+        PackedController=_pack,
         step_packed=_plain(_step),
-        entry_point=lambda dispatcher, *args: dispatcher,
+        entry_point=lambda dispatcher, packed: dispatcher,
     )
 
 

@@ -1,78 +1,134 @@
 """A compiled controller step, called from Python one sample at a time.
 
-Numba unpacks a NamedTuple at each call, array by array: 2.7 µs for ten arrays. A ``structref``
-holds the same parameters and state unpacked, and a call of the compiled function itself, without
-the look-up of its argument types, costs a tenth of a microsecond.
-
-Inside the call the parameters and the state are used without reference counting, which with thirty
-arrays would take longer than the control law. The step therefore runs the same code as the
-simulation, which does not allocate.
+Numba unpacks a NamedTuple at each call, array by array: 2.7 µs for ten arrays. A packed controller
+holds the same parameters and state as the words that compiled code needs, in the memory of one
+Python object. A call of the compiled function itself with it, without the look-up of its argument
+types, costs a tenth of a microsecond. The words are written from Python, so packing compiles
+nothing.
 """
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
 from typing import Any
 
+import numba
 from numba.core import types as nb_types
-from numba.experimental import structref
-from numba.extending import intrinsic
+from numba.extending import NativeValue, intrinsic, models, register_model, unbox
 
 from quell.controllers.base import control
-from quell.kernels.dispatch import compiled, compiled_call
+from quell.kernels.dispatch import compiled_call
 
 
-@structref.register
-class _PackedType(nb_types.StructRef):
-    pass
+class PackedType(nb_types.Type):
+    """The Numba type of a packed controller; ``content`` is that of (parameters, state)."""
+
+    def __init__(self, content: Any) -> None:
+        self.content = content
+        super().__init__(f"Packed({content})")
 
 
-class PackedController(structref.StructRefProxy):
-    """Parameters and state of a controller for compiled code; shares the state's arrays."""
-
-    def __new__(cls, design: Any, state: Any) -> Any:
-        """Make a packed controller."""
-        return structref.StructRefProxy.__new__(cls, design, state)
+register_model(PackedType)(models.OpaqueModel)
 
 
-structref.define_proxy(PackedController, _PackedType, ["design", "state"])
+class PackedController(bytes):
+    """Parameters and state of a controller for compiled code; shares the state's arrays.
+
+    The bytes are the words that Numba passes to a compiled function for them, 8 bytes each.
+
+    Parameters
+    ----------
+    design, state
+        of the controller.
+    before
+        one with the same state, and with parameters of the same types: then only the new parameters
+        are packed.
+
+    Raises
+    ------
+    TypeError
+        if they contain something that compiled code can not receive.
+    """
+
+    type: PackedType
+    arrays: Any
+
+    def __new__(
+        cls, design: Any, state: Any, before: PackedController | None = None
+    ) -> PackedController:
+        """Pack a controller."""
+        kind = PackedType(numba.typeof((design, state))) if before is None else before.type
+        parameters = _words(kind.content[0], design)
+        rest = _words(kind.content[1], state) if before is None else before[len(parameters) :]
+        packed = super().__new__(cls, parameters + rest)
+        packed.type, packed.arrays = kind, (design, state)  # keeps the arrays alive
+        return packed
 
 
-@compiled
-def _one_sample(design: Any, state: Any, r: float, y: float) -> float:
-    return control(design, state, r, y)
+def _words(kind: Any, value: Any) -> bytes:
+    """Return the words of a value of a Numba type."""
+    formats: list[str] = []
+    words: list[float] = []
+
+    def add(kind: Any, value: Any) -> None:
+        if isinstance(kind, nb_types.BaseTuple):
+            for part, entry in zip(kind, value, strict=True):
+                add(part, entry)
+        elif isinstance(kind, nb_types.Array):
+            formats.append("qqqqq" + 2 * value.ndim * "q")
+            owners = (0, 0)  # nothing is counted
+            words.extend((*owners, value.size, value.itemsize, value.ctypes.data))
+            words.extend((*value.shape, *value.strides))
+        elif kind == nb_types.float64:
+            formats.append("d")
+            words.append(value)
+        elif isinstance(kind, nb_types.Integer | nb_types.Boolean):
+            formats.append("q")
+            words.append(int(value))
+        else:
+            raise TypeError(
+                f"parameters or state contain {value!r}: must be numbers, arrays, or tuples of them"
+            )
+
+    add(kind, value)
+    return struct.pack("".join(formats), *words)
+
+
+@unbox(PackedType)
+def _address(kind: Any, packed: Any, c: Any) -> Any:
+    return NativeValue(c.pyapi.bytes_as_string(packed))
 
 
 @intrinsic
-def _control_without_counting(typing_context: Any, packed: Any, r: Any, y: Any) -> Any:
-    """Call ``_one_sample`` with borrowed references; the caller's ``packed`` keeps them alive."""
-    fields = packed.field_dict
-    callee = nb_types.Dispatcher(_one_sample.uncached)  # type: ignore[attr-defined]
-    inner = callee.get_call_type(typing_context, (fields["design"], fields["state"], r, y), {})
+def _unpacked(typing_context: Any, packed: Any) -> Any:
+    """Return parameters and state of a packed controller."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        struct = context.make_helper(builder, packed, value=values[0])
-        address = context.nrt.meminfo_data(builder, struct.meminfo)
-        pointer_type = context.get_value_type(packed.get_data_type()).as_pointer()
-        address = builder.bitcast(address, pointer_type)
-        data = context.make_helper(builder, packed.get_data_type(), ref=address)
-        arguments = (data.design, data.state, values[1], values[2])
-        return context.get_function(callee, inner)(builder, arguments)
+        packer = context.get_arg_packer([packed.content])
+        arguments = []
+        for i, kind in enumerate(packer.argument_types):
+            address = builder.gep(values[0], [context.get_constant(nb_types.intp, 8 * i)])
+            arguments.append(builder.load(builder.bitcast(address, kind.as_pointer())))
+        return packer.from_arguments(builder, arguments)[0]
 
-    return nb_types.float64(packed, r, y), generate
+    return packed.content(packed), generate
 
 
 @compiled_call
 def step_packed(packed: Any, r: float, y: float) -> float:
     """Take one sample; see ``controllers.base.control``."""
-    return _control_without_counting(packed, r, y)
+    design, state = _unpacked(packed)
+    return control(design, state, r, y)
 
 
-def entry_point(dispatcher: Any, *args: Any) -> Any:
-    """Return the compiled function that ``dispatcher`` calls for arguments of these types.
+def entry_point(dispatcher: Any, packed: PackedController) -> Callable[[Any, float, float], float]:
+    """Return the compiled function of ``dispatcher`` for controllers of one type.
 
-    Without access to it, return the dispatcher itself. The function checks its arguments less than
-    the dispatcher: pass only arguments of exactly these types, or Python numbers for floats.
+    It checks its arguments less than the dispatcher: pass only packed controllers of this type, and
+    numbers.
     """
-    signature = tuple(dispatcher.typeof_pyval(arg) for arg in args)
-    compiled = dispatcher.overloads.get(signature)
-    return getattr(compiled, "entry_point", None) or dispatcher
+    compiled: Callable[[Any, float, float], float] = dispatcher.compile(
+        (packed.type, nb_types.float64, nb_types.float64)
+    )
+    return compiled

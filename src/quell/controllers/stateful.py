@@ -47,7 +47,7 @@ class StatefulController:
     def _pack_again(self) -> None:
         """Update the arguments of the compiled step after a change of the parameters."""
         if self._packed is not None:
-            self._packed = PackedController(self.parameters, self._state)
+            self._packed = PackedController(self.parameters, self._state, before=self._packed)
 
     def _update_parameters(self) -> None:
         raise NotImplementedError
@@ -58,12 +58,10 @@ class StatefulController:
 
     def prepare(self) -> None:
         """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
-        dispatcher = dispatcher_for(step_packed, self.parameters)
-        self._packed = PackedController(self.parameters, self._state)
-        # The first call runs on another state, because it must not count as a sample.
+        packed = PackedController(self.parameters, self._state)
         with explain_compile_errors(self.parameters):
-            dispatcher(PackedController(self.parameters, self.initial_state()), 0.0, 0.0)
-        self._step = entry_point(dispatcher, self._packed, 0.0, 0.0)
+            self._step = entry_point(dispatcher_for(step_packed, self.parameters), packed)
+        self._packed = packed
 
     def step(self, r: float, y: float) -> float:
         """Take one sample: return the control signal [u-unit] for reference and measurement.

@@ -135,11 +135,8 @@ def compiled(function: F) -> F:
 
 
 def compiled_call(function: F) -> F:
-    """Compile an entry point for single calls from Python with a ``structref`` argument.
-
-    It counts references and keeps the interpreter lock.
-    """
-    return _dispatcher(function)
+    """Compile an entry point for single calls from Python: it keeps the interpreter lock."""
+    return _dispatcher(function, _nrt=False)
 
 
 def dispatcher_for(entry: Any, *arguments: Any) -> Any:
