@@ -217,6 +217,68 @@ def test_noise_does_not_depend_on_how_time_is_cut(cuts: list[int], dt: float) ->
     np.testing.assert_array_equal(np.concatenate(pieces), noise(t))
 
 
+def drawn(t: np.ndarray, seed: int) -> np.ndarray:
+    """Standard normal draws that are held for 7 ms, one time after the other."""
+    held = (t * (1.0 / 0.007) + (1.0 + 1e-6)).astype(np.int64) - 1
+    blocks = {b: np.random.default_rng([seed, b]).standard_normal(4096) for b in range(5)}
+    return np.array([blocks[k // 4096][k % 4096] if k >= 0 else 0.0 for k in held.tolist()])
+
+
+def smooth(t: np.ndarray) -> np.ndarray:
+    """The acceleration of the move of least jerk, along 3 in 4 s."""
+    position = np.polynomial.Polynomial([0.0, 0.0, 1.0, -2.0, 1.0]).integ()
+    sigma = np.clip(t / 4.0, 0.0, 1.0)
+    value = position.deriv(2)(np.where(sigma > 0.5, 1.0 - sigma, sigma))
+    value = np.where(sigma > 0.5, -1.0, 1.0) * (value / (position(0.5) * 2.0) * 3.0 / 4.0**2)
+    return np.where((t >= -1e-9) & (t < 4.0 - 1e-9), value, 0.0)
+
+
+# Signals, and their values by formulas for all times at once.
+WAVE, NOISE = s.Sinusoid(2.0, 3.0, 0.4, start=1.5), s.BandLimitedNoise(1e-3, 0.007, seed=4)
+FORMULAS = {
+    "sinusoid": (
+        WAVE,
+        lambda t: np.where(t - 1.5 >= -1e-9, 2.0 * np.sin(3.0 * (t - 1.5) + 0.4), 0.0),
+    ),
+    "noise": (NOISE, lambda t: math.sqrt(1e-3 / 0.007) * drawn(t, 4)),
+    "sum": (
+        WAVE + s.Ramp(0.3, 0.1, 5.0) - 0.1,
+        lambda t: 0.0 + WAVE(t) + 0.3 * (np.clip(t, 0.1, 5.0) - 0.1) + -1.0 * 0.1,
+    ),
+    "switched": (
+        WAVE.until(7.0, then=s.Step(5.0)).until(9.0, then=0.25),
+        lambda t: np.where(t < 7.0 - 1e-9, WAVE(t), np.where(t < 9.0 - 1e-9, 5.0, 0.25)),
+    ),
+    "smooth": (s.SmoothMove(3.0, 4.0, 2).derivative().derivative(), smooth),
+}
+
+
+@pytest.mark.parametrize("kind", FORMULAS)
+@pytest.mark.parametrize("size", [1, 7, 4096, 8192, 10**6])
+def test_a_signal_has_the_bits_of_its_formula_in_blocks_of_any_size(kind: str, size: int) -> None:
+    """From −1 s on, over edges and blocks of draws, and in any order of times."""
+    signal, formula = FORMULAS[kind]
+    t = np.arange(-1000, 100 if size == 1 else 40_000) * 1e-3
+    expected = formula(t)
+    blocks = [signal(t[first : first + size]) for first in range(0, t.size, size)]
+    np.testing.assert_array_equal(np.concatenate(blocks), expected)
+    mixed = np.random.default_rng(0).permutation(t.size)[:size]
+    np.testing.assert_array_equal(signal(t[mixed]), expected[mixed])
+
+
+@pytest.mark.parametrize("kind", s.KINDS)
+def test_a_signal_of_each_kind_has_the_same_bits_in_blocks_and_alone(kind: str) -> None:
+    """A run makes its signals in blocks; whoever plots them asks for all times at once."""
+    given = {"samples": {"times": [0.0, 1.0, 4.0], "values": [1.0, -2.0, 3.0]}}
+    signal = s.make(kind, **given.get(kind, {}))
+    t = np.arange(-3, 20_000) * 1e-3
+    for size in (1000, 8192):
+        blocks = [signal(t[first : first + size]) for first in range(0, t.size, size)]
+        np.testing.assert_array_equal(np.concatenate(blocks), signal(t))
+    some = range(0, t.size, 777)
+    np.testing.assert_array_equal([signal(t[k]) for k in some], signal(t)[some])
+
+
 def test_a_seed_gives_the_same_draws_for_ever() -> None:
     """4096 from each generator, whose seeds are those of the noise and of the block."""
     noise = s.BandLimitedNoise(power=0.5, sample_time=2.0, seed=3)

@@ -21,7 +21,7 @@ needs (``dtype``, ``view``, ``copy`` …).
 from __future__ import annotations
 
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,16 +42,19 @@ class Scalars(_Record):
     Annotations must be postponed (``from __future__ import annotations``).
     """
 
+    _dtype: ClassVar[np.dtype[Any]]
+
     def __init_subclass__(cls) -> None:
         # With np.record instead of these properties, interpreted loops take up to twice as long.
         for name in cls.__annotations__:
             setattr(cls, name, _field(name))
+        fields = [(name, _DTYPES[kind]) for name, kind in cls.__annotations__.items()]
+        cls._dtype = np.dtype((cls, fields))
 
     @classmethod
     def zeros(cls) -> NDArray[Self]:
         """Return an array (1,) whose record is zero in all fields."""
-        fields = [(name, _DTYPES[kind]) for name, kind in cls.__annotations__.items()]
-        return np.zeros(1, np.dtype((cls, fields)))
+        return np.zeros(1, cls._dtype)
 
 
 def _field(name: str) -> property:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from functools import lru_cache
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -18,16 +19,25 @@ def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Mat
 
         exp([[A, B], [0, 0]] dt) = [[Φ, Γ], [0, I]]
     """
+    n = A.shape[0]
+    edges = list(accumulate((B.shape[1] for B in inputs), initial=n))
+    parts = [slice(*edge) for edge in pairwise(edges)]
+    block = np.zeros((edges[-1], edges[-1]))
+    block[:n, :n] = A
+    for part, B in zip(parts, inputs, strict=True):
+        block[:n, part] = B
+    sampled = _exponential(edges[-1], (block * dt).tobytes())
+    return sampled[:n, :n].copy(), [sampled[:n, part].copy() for part in parts]
+
+
+@lru_cache(maxsize=64)
+def _exponential(size: int, block: bytes) -> Matrix:
+    """Return exp of a matrix; kept, because a plant is sampled again for each of its runs."""
     from scipy.linalg import expm
 
-    n = A.shape[0]
-    B = np.hstack([np.zeros((n, 0)), *inputs])
-    block = np.zeros((n + B.shape[1],) * 2)
-    block[:n, :n], block[:n, n:] = A, B
-    sampled = expm(block * dt)
-    edges = np.cumsum([0, *(b.shape[1] for b in inputs)]) + n
-    gammas = [np.ascontiguousarray(sampled[:n, i:j]) for i, j in pairwise(edges)]
-    return np.ascontiguousarray(sampled[:n, :n]), gammas
+    found: Matrix = expm(np.frombuffer(block).reshape(size, size))
+    found.flags.writeable = False
+    return found
 
 
 def gramian(A: Matrix, Q: Matrix, dt: float) -> Matrix:

@@ -148,7 +148,7 @@ class LinearPlant:
         """Return the plant sampled at ``dt`` [s] with zero-order hold on u and w."""
         inputs = [self.B, self.E]
         phi, (gamma, gamma_w) = zero_order_hold(self.A, inputs, checks.positive("dt", dt, "s"))
-        if not all(np.all(np.isfinite(part)) for part in (phi, gamma, gamma_w)):
+        if not all(np.isfinite(part).all() for part in (phi, gamma, gamma_w)):
             raise ValueError(
                 f"dt = {dt!r} s: {self.name} can't be sampled with it, exp(A dt) is beyond all "
                 "numbers; check the units of dt and of the plant"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -124,7 +126,7 @@ class Sum(Signal):
         """Return the sum."""
         total = np.zeros(t.shape)
         for term in self.terms:
-            total = total + term(t)
+            total += term(t)
         return total
 
     def derivative(self) -> Signal:
@@ -156,9 +158,9 @@ class Switched(Signal):
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the values of the piece at each time."""
-        edges = np.asarray(self.times) - EDGE_TOLERANCE
+        edges = [time - EDGE_TOLERANCE for time in self.times]
         if t.size:
-            first, last = np.searchsorted(edges, (t.min(), t.max()), side="right")
+            first, last = bisect_right(edges, t.min()), bisect_right(edges, t.max())
             if first == last:
                 return self.pieces[first](t)
         which = np.searchsorted(edges, t, side="right")
@@ -186,8 +188,13 @@ def seeded_apart(signals: Sequence[Signal], seed: int) -> tuple[Signal, ...]:
     """Return the signals seeded from one seed, with independent streams."""
     if not signals:
         return ()
-    children = np.random.SeedSequence(seed).generate_state(len(signals), np.uint32).tolist()
-    return tuple(signal.seeded(child) for signal, child in zip(signals, children, strict=True))
+    seeds = _seeds(seed, len(signals))
+    return tuple(signal.seeded(child) for signal, child in zip(signals, seeds, strict=True))
+
+
+@lru_cache(maxsize=64)
+def _seeds(seed: int, count: int) -> tuple[int, ...]:
+    return tuple(np.random.SeedSequence(seed).generate_state(count, np.uint32).tolist())
 
 
 def check_finite_fields(signal: Signal, *names: str) -> None:

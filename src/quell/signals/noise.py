@@ -15,8 +15,8 @@ from quell.types import Vector
 # Each block of draws has its own generator, so any interval of time can be evaluated alone. The
 # size decides which draws a seed gives, so it must not change.
 _BLOCK = 4096
-# In a range of more blocks than this, those that are used are found first. Chosen by hand; results
-# do not depend on it.
+# In a range of more blocks than this, those that are used are evaluated one by one. Chosen by hand;
+# results do not depend on it.
 _BLOCKS_AT_ONCE = 64
 
 
@@ -46,23 +46,26 @@ class BandLimitedNoise(Signal):
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the draws that are held at ``t``; zero for negative times."""
-        count = t * (1.0 / self.sample_time) + (1.0 + 1e-6)
-        if t.size and not float(np.max(np.abs(count))) < 2.0**52:
+        if not t.size:
+            return np.zeros(t.shape)
+        count = t * (1.0 / self.sample_time)
+        count += 1.0 + 1e-6
+        low, high = float(count.min()), float(count.max())
+        if not max(-low, high) < 2.0**52:
             most = float(np.max(np.abs(t)))
             raise ValueError(f"sample_time = {self.sample_time!r}: too short to count {most:g} s")
-        index = count.astype(np.int64) - 1  # floor, for times from 0 on
-        if t.size and np.ptp(index) < _BLOCKS_AT_ONCE * _BLOCK:
-            blocks = np.arange(index.min() // _BLOCK, index.max() // _BLOCK + 1)
-        else:
-            blocks = np.unique(index // _BLOCK)
-        values = np.zeros(t.shape)
-        sigma = math.sqrt(self.power / self.sample_time)
-        for block in blocks[blocks >= 0].tolist():
-            at = index - block * _BLOCK
-            if blocks.size == 1:
-                return sigma * _draws(self.seed, block)[at]
-            inside = (at >= 0) & (at < _BLOCK)
-            values[inside] = sigma * _draws(self.seed, block)[at[inside]]
+        index = count.astype(np.int64)  # floor, for times from 0 on
+        first, last = (int(low) - 1) // _BLOCK, (int(high) - 1) // _BLOCK
+        if last - first > _BLOCKS_AT_ONCE:
+            which = (index - 1) // _BLOCK
+            values = np.empty(t.shape)
+            for block in np.unique(which):
+                values[which == block] = self.evaluate(t[which == block])
+            return values
+        blocks = [_draws(self.seed, block) for block in range(first, last + 1)]
+        index -= 1 + first * _BLOCK
+        values = (blocks[0] if first == last else np.concatenate(blocks))[index]
+        values *= math.sqrt(self.power / self.sample_time)
         return values
 
     def seeded(self, seed: int) -> Signal:
@@ -72,6 +75,9 @@ class BandLimitedNoise(Signal):
 
 @lru_cache(maxsize=16)
 def _draws(seed: int, block: int) -> Vector:
+    """Return a block of draws; zeros for negative times."""
+    if block < 0:
+        return np.zeros(_BLOCK)
     draws = np.random.default_rng([seed, block]).standard_normal(_BLOCK)
     draws.flags.writeable = False
     return draws

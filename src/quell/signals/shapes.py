@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -216,14 +217,12 @@ class SmoothMove(Signal):
 
     def evaluate(self, t: Vector) -> Vector:
         """Return the position along the move, or its derivative."""
-        m, sigma = self.smoothness, np.clip((t - self.start) / self.duration, 0.0, 1.0)
+        sigma = np.clip((t - self.start) / self.duration, 0.0, 1.0)
         # Mirror the first half, because near σ = 1 rounding errors of the polynomial are large.
         second_half = sigma > 0.5
         near = np.where(second_half, 1.0 - sigma, sigma)
-        power = np.polynomial.Polynomial([math.comb(m, i) * (-1.0) ** i for i in range(m + 1)])
-        position = (power * np.polynomial.Polynomial.basis(m)).integ()
-        value = position.deriv(self.order)(near) if self.order else position(near)
-        value = value / (position(0.5) * 2.0) * self.distance / self.duration**self.order
+        polynomial, end = _smooth_position(self.smoothness, self.order)
+        value = polynomial(near) / end * self.distance / self.duration**self.order
         if self.order == 0:
             return np.where(second_half, self.distance - value, value)
         value = np.where(second_half, (-1.0) ** (self.order + 1) * value, value)
@@ -233,6 +232,14 @@ class SmoothMove(Signal):
     def derivative(self) -> Signal:
         """Return the next derivative."""
         return replace(self, order=self.order + 1)
+
+
+@lru_cache(maxsize=64)
+def _smooth_position(m: int, order: int) -> tuple[np.polynomial.Polynomial, float]:
+    """Return a derivative of ``∫ σ^m (1 − σ)^m dσ``, and the integral over the whole move."""
+    power = np.polynomial.Polynomial([math.comb(m, i) * (-1.0) ** i for i in range(m + 1)])
+    position = (power * np.polynomial.Polynomial.basis(m)).integ()
+    return position.deriv(order) if order else position, position(0.5) * 2.0
 
 
 @dataclass(frozen=True, eq=False)

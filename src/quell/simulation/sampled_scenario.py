@@ -83,7 +83,8 @@ class SampledScenario:
     def segment(self, first: int, last: int) -> Segment:
         """Return the samples from ``first`` to before ``last``."""
         reference, disturbances, noise = self.signals
-        t = np.arange(first, last, dtype=np.float64) * self.dt
+        t = np.arange(first, last, dtype=np.float64)
+        t *= self.dt
         derivatives, w = _columns(self.derivatives, t), _columns(disturbances, t)
         r, added = np.ascontiguousarray(reference(t)), np.ascontiguousarray(noise(t))
         return Segment(first, self.dt, first in self.rest_samples, r, derivatives, w, added)
@@ -108,4 +109,5 @@ def _size(reference: Signal, x0: Vector, samples: int, dt: float) -> float:
     The limit depends on these because a loop in encoder counts has large values and is stable.
     """
     early = reference(np.arange(min(samples, _SEGMENT)) * dt)
-    return float(np.max(np.abs([1.0, *x0, *early[np.isfinite(early)]])))
+    largest = np.max(np.abs(early), initial=1.0, where=np.isfinite(early))
+    return float(np.max(np.abs(x0), initial=largest))
