@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.learners.base import adapt, predict, restart
+from quell.learners.base import adapt, coefficients, predict, restart
 from quell.learners.gradient.buffers import outputs
 from quell.observers.eso import ESO
 
@@ -63,6 +63,30 @@ def test_algorithm_1_is_silent_until_its_buffers_are_full(rng: np.random.Generat
         assert predict(design, memory, np.ones(3), 1.0) == (0.0, 0.0), k
         adapt(design, memory, rng.normal(size=3), 0.0, 0.1, 0.0)
     assert predict(design, memory, np.ones(3), 1.0) != (0.0, 0.0)
+
+
+def test_algorithm_1_predicts_and_shows_theta_by_its_features() -> None:
+    """``θ · (x̂_1 … x̂_n, u, 1)``, as a constant: it is not solved for u."""
+    learner = ql.learners.BatchGradient()
+    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
+    memory, theta = learner.memory(design), np.zeros(4)
+    memory.theta[:] = 2.0, 3.0, 5.0, 7.0
+    assert predict(design, memory, np.array([10.0, 0.1, 9.0]), -1.0) == (2e1 + 0.3 - 5.0 + 7.0, 0.0)
+    coefficients(design, memory, theta)
+    np.testing.assert_array_equal(theta, memory.theta)
+
+
+def test_a_position_outside_of_the_buffers_does_no_harm(rng: np.random.Generator) -> None:
+    """It can only come from a state that somebody has changed: the nearest row is written."""
+    learner = ql.learners.BatchGradient(batch=4)
+    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
+    for position, row in ((1e9, 3), (-1e9, 0)):
+        memory = learner.memory(design)
+        assert memory.position.shape == (2,)
+        memory.position[0] = position
+        adapt(design, memory, np.array([1.0, 2.0, 3.0]), 1.0, 0.5, 3.0)
+        assert np.flatnonzero(memory.residuals).tolist() == [row]
+        assert 0 <= memory.position[0] < 4
 
 
 def test_the_sliding_sum_of_algorithm_1_does_not_drift(rng: np.random.Generator) -> None:

@@ -203,6 +203,7 @@ def test_an_output_is_cut_off_where_it_is_a_hundred_times_larger_than_f() -> Non
     ("qq", "qp", "pp", "authority", "reason"),
     [
         (0.5, 0.0, 0.5, 0.0, ql.Reason.UNPROVEN),
+        (0.5, 0.24, 0.5, 0.0, ql.Reason.UNPROVEN),
         (0.5, 0.25, 0.5, 0.0, ql.Reason.UNPROVEN),
         (0.5, 0.275, 0.5, 0.5, ql.Reason.UNPROVEN),
         (0.5, 0.31, 0.5, 1.0, ql.Reason.TRUSTED),

@@ -95,6 +95,8 @@ def test_frequencies_start_apart_and_stay_within_their_limits() -> None:
         ({"count": 2, "omegas": (1.0,)}, "omegas"),
         ({"omegas": (-1.0,)}, "omegas = -1.0"),
         ({"limits": (2.0, 1.0)}, "0 < low < high"),
+        ({"limits": (0.0, 1.0)}, "0 < low < high"),
+        ({"limits": (1.0, 1.0)}, "0 < low < high"),
         ({"pair_bandwidth": 0.0}, "pair_bandwidth = 0.0"),
         ({"bias_bandwidth": -1.0}, "bias_bandwidth"),
     ],
@@ -106,7 +108,12 @@ def test_mistakes_are_named(options: dict[str, object], message: str) -> None:
 
 
 def test_a_start_outside_of_the_limits_is_refused() -> None:
-    """Not clipped without a word."""
+    """Not clipped without a word; at a limit it is taken."""
+    at_limits = ql.learners.Harmonic(count=2, omegas=(2.0, 0.5), limits=(0.5, 2.0))
+    observer = ql.ESO.model_free(2, 1.0, 20.0, 1e-2)
+    assert at_limits.design(observer, 1.0).oscillators.omega.tolist() == [2.0, 0.5]
+    with pytest.raises(ValueError, match=r"omegas = \(0.4,\) rad/s: must lie within limits"):
+        ql.learners.Harmonic(omegas=(0.4,), limits=(0.5, 2.0)).design(observer, 1.0)
     with pytest.raises(ValueError, match=r"omegas = \(50.0,\) rad/s: must lie within limits"):
         ql.ADRC(
             ql.ESO.model_free(2, 1.0, 20.0, 1e-2), 1.0, learner=ql.learners.Harmonic(omegas=(50.0,))

@@ -171,6 +171,19 @@ def test_an_offset_beyond_all_limits_of_u_is_dropped(
     assert law._state.loop[0].offset == pytest.approx(left, rel=1e-12)
 
 
+def test_only_limits_of_the_law_count_as_limits_for_the_watch() -> None:
+    """Neither a u within them nor one of manual operation; see ``learners/recovery.py``."""
+    law = ql.ADRC(OBSERVER, 3.0, learner=ql.learners.Kalman(), u_min=-1.0, u_max=1.0)
+    watch = law._state.watch[0]
+    step(law, 0.0, 0.0)
+    assert (watch.samples, watch.limited) == (1.0, 0.0)
+    step(law, 100.0, 0.0)
+    assert (watch.samples, watch.limited) == (2.0, 1.0)
+    law._state.loop[0].manual = 1.0
+    step(law, 100.0, 0.0)
+    assert (watch.samples, watch.limited) == (3.0, 1.0)
+
+
 def test_a_row_has_estimates_status_guard_and_coefficients_in_order() -> None:
     """As ``channels`` names them."""
     law = used(LEARNING, 400)

@@ -181,10 +181,11 @@ def test_a_record_is_mapped_like_a_sample() -> None:
         record[3],
         atol=1e-9 * np.max(np.abs(record)),
     )
-    with pytest.raises(
-        ValueError, match=r"x_hat has shape \(3,\): the last axis must have the 4 states"
-    ):
-        observer.states_of([1.0, 2.0, 3.0])
+    for wrong, shape in ((np.ones(3), r"\(3,\)"), (np.ones((4, 8)), r"\(4, 8\)"), (1.0, r"\(\)")):
+        with pytest.raises(
+            ValueError, match=f"x_hat has shape {shape}: the last axis must have the 4 states"
+        ):
+            observer.states_of(wrong)
 
 
 @pytest.mark.parametrize(

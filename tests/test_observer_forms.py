@@ -292,8 +292,10 @@ def test_an_observer_behind_a_delay_is_the_plain_one_fed_the_u_of_then(
     np.testing.assert_array_equal(
         run_observer(late_one, y, u), run_observer(ESO.model_free(**options), y, shifted)
     )
-    z, seen = np.zeros(late_one.states), np.zeros(3)
+    z, seen = np.full(late_one.states, 9.0), np.full(3, 9.0)
     begin(late_one.model, z, seen, 0.0)
+    assert not np.any(z)
+    assert not np.any(seen)
     for k in range(1, 30):
         # What reaches the plant in the sample that u[k - 1] is sent for.
         assert acting_control(late_one.model, z, u[k - 1]) == shifted[k - 1]
@@ -385,6 +387,31 @@ def test_noise_gains_are_what_noise_does(name: str, rng: np.random.Generator) ->
     np.testing.assert_allclose(total / noise.size, noise_gains(observer), rtol=0.2)
 
 
+@pytest.mark.parametrize("name", FORMS)
+def test_the_response_of_an_observer_is_its_update_as_matrices(
+    name: str, rng: np.random.Generator
+) -> None:
+    """Inputs are y, u and f_L, estimates x̂ and Δf̂, whatever the state."""
+    observer = FORMS[name]
+    found = response(observer.model, 3)
+    z, inputs, seen = rng.normal(size=observer.states), rng.normal(size=3), np.zeros(3)
+    after = z.copy()
+    observe(observer.model, after, seen, *inputs)
+    for wanted, state, direct in (
+        (after, found.transition, found.input),
+        (seen, found.output, found.feedthrough),
+    ):
+        assert direct.shape == (wanted.size, 3)
+        np.testing.assert_allclose(state @ z + direct @ inputs, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_noise_gains_of_order_one_are_those_of_the_closed_form() -> None:
+    """``∫ |2 w s + w²|²/|s + w|⁴ = 5 w/4`` and ``∫ |w² s|²/|s + w|⁴ = w³/4``, over ω/2π."""
+    w, dt = 20.0, 1e-3
+    found = noise_gains(ESO.model_free(1, 2.0, w, dt))
+    np.testing.assert_allclose(found, [dt * 1.25 * w, dt * 0.25 * w**3], rtol=1e-3)
+
+
 @pytest.mark.parametrize("learner", [ql.learners.Kalman(), ql.learners.NLMS(), ql.learners.MLP()])
 def test_learners_that_must_tell_noise_from_motion_refuse_the_reduced_form(learner: Any) -> None:
     """Its x̂_1 is y itself; Algorithm 1, which looks at no noise, takes it."""
@@ -462,7 +489,11 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
         (lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=0.0, drift=1.0), "noise_variance = 0.0"),
         (
             lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-30, drift=1e30),
-            "no steady-state gain",
+            r"no steady-state gain is found; they ask for about 2.15e\+10 rad/s",
+        ),
+        (
+            lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-20, drift=1e-20, jitter=1e10),
+            r"no steady-state gain is found; they ask for about 1e\+08 rad/s",
         ),
         (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.0), "delta = 0.0"),
         (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.1, alpha=(1.0, 0.5, 1.5)), "alpha = "),

@@ -140,6 +140,16 @@ def test_a_network_fits_a_nonlinear_function(rng: np.random.Generator) -> None:
         assert memory.gradient[i] == pytest.approx((above - below) / (2.0 * step), abs=1e-7)
 
 
+def test_noise_in_the_targets_counts_for_as_many_pairs_as_it_lasts() -> None:
+    """``σ² max(τ/step, 1)``, with ``step`` the time between two pairs, which also counts for forgetting."""
+    for every, dt, count in ((1, 0.1, 5.0), (2, 0.1, 2.5), (4, 0.1, 1.25), (9, 0.1, 1.0)):
+        rule = Network(2, 0, every, 3.0, 0.2, 0.5).design(2, dt).rule
+        process = GaussianProcessModel(5, 0.5, every, 3.0, 0.2, 0.5).design(2, dt)
+        for found in (rule, process):
+            assert found.noise == pytest.approx(0.04 * count, rel=1e-12)
+            assert 1.0 - found.forget == pytest.approx(math.exp(-every * dt / 3.0), rel=1e-12)
+
+
 def test_a_network_says_nothing_before_it_has_learned() -> None:
     """And the seed decides about its first weights."""
     design = Network(8, 3, 1, 1.0, 0.1, 1.0).design(2, 1.0)
@@ -178,6 +188,35 @@ def test_a_process_is_a_gaussian_process_while_its_budget_lasts(rng: np.random.G
         kernel(grid, grid) + design.noise * np.eye(25), targets
     )
     np.testing.assert_allclose([infer(design, memory, x) for x in points], expected, atol=1e-9)
+
+
+def test_rounding_of_the_inverse_makes_no_novelty_negative() -> None:
+    """A point as known as can be: γ² is zero and no less, also where Q is a little too large."""
+    model = GaussianProcessModel(5, 0.5, 1, math.inf, 0.1, 1.0)
+    design = model.design(2, 1.0)
+    memory, x = model.memory(design), np.array([0.2, -0.1])
+    learn(design, memory, x, 1.0)
+    memory.inverse[0, 0] = q = 1.01
+    mean, variance = memory.mean[0], memory.covariance[0, 0]
+    learn(design, memory, x, 2.0)
+    gain = variance * q / (variance * q**2 + design.noise)
+    assert memory.mean[0] == pytest.approx(mean + gain * (2.0 - q * mean), rel=1e-12)
+
+
+def test_a_process_forgets_towards_its_prior() -> None:
+    """``μ ← √λ μ`` and ``Σ ← λΣ + (1−λ)K`` with each pair, wherever it is."""
+    model = GaussianProcessModel(5, 0.5, 1, 4.0, 0.1, 1.0)
+    design = model.design(1, 0.5)
+    keep = math.exp(-0.5 / 4.0)
+    assert 1.0 - design.forget == pytest.approx(keep, rel=1e-12)
+    memory = model.memory(design)
+    learn(design, memory, np.array([0.0]), 1.0)
+    learn(design, memory, np.array([0.4]), -1.0)
+    mean, covariance, K = memory.mean[:2].copy(), memory.covariance[:2, :2].copy(), memory.kernel
+    learn(design, memory, np.array([90.0]), 0.0)  # far away: it tells nothing of the others
+    np.testing.assert_allclose(memory.mean[:2], math.sqrt(keep) * mean, rtol=1e-12)
+    expected = keep * covariance + (1.0 - keep) * K[:2, :2]
+    np.testing.assert_allclose(memory.covariance[:2, :2], expected, rtol=1e-12)
 
 
 def test_a_process_with_a_budget_of_one_still_works(rng: np.random.Generator) -> None:

@@ -124,6 +124,11 @@ def test_settling_takes_good_samples_in_a_row_and_has_an_end() -> None:
     assert (memory.mode, memory.began, memory.y_began, memory.samples) == (Mode.RUN, 5, 0.7, 0)
     assert (memory.y_rest_low, memory.y_rest_high, memory.watching) == (-0.2, 0.5, 0)
     assert last_change(made) == (Mode.RUN, Cause.SETTLED)
+    made = state(Mode.START)  # a scenario that is shorter than the settling has not begun
+    update_mode(RULES, made, 40, 0.0, 5)
+    assert last_change(made) is None
+    assert updated(k=99, began=0) is None
+    assert updated(k=100, began=0) == (Mode.RAMP, Cause.COMPLETED)
     assert updated(k=50, mode=Mode.START) is None
     assert updated(k=51, mode=Mode.START) == (Mode.RAMP, Cause.UNSETTLED)
     assert updated(k=51) is None

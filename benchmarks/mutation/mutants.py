@@ -36,6 +36,8 @@ class Mutant(NamedTuple):
 
     path: str  # of the file, relative to the repository
     line: int
+    statement: range  # lines of the innermost statement
+    function: str  # name of the function
     before: str
     after: str
     source: str  # of the whole file
@@ -43,7 +45,7 @@ class Mutant(NamedTuple):
     @property
     def name(self) -> str:
         """The change in one line."""
-        return f"{self.path}: {self.before} -> {self.after}"
+        return f"{self.path}, {self.function}: {self.before} -> {self.after}"
 
 
 def draw(repository: Path, paths: Iterable[str], count: int, seed: int) -> list[Mutant]:
@@ -58,10 +60,11 @@ def mutants(repository: Path, path: str) -> list[Mutant]:
     tree = ast.parse(source)
     lines = _lines_of_functions(tree)
     unique = {}
-    for changed in (*_by_operators(source, lines), *_without_a_statement(source, tree)):
+    for changed in (*_by_operators(source, set(lines)), *_without_a_statement(source, tree)):
         line, before, after = _difference(source, changed)
         if line in lines and _RECORD.sub("[]", before) != _RECORD.sub("[]", after):
-            unique[changed] = Mutant(path, line, before, after, changed)
+            statement, function = lines[line]
+            unique[changed] = Mutant(path, line, statement, function, before, after, changed)
     return list(unique.values())
 
 
@@ -89,14 +92,25 @@ def _is_docstring(node: ast.stmt) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
 
 
-def _lines_of_functions(tree: ast.Module) -> set[int]:
-    """Return the lines of statements in functions, without signatures and docstrings."""
-    found: set[int] = set()
-    for function in ast.walk(tree):
-        if isinstance(function, ast.FunctionDef):
-            for node in function.body:
-                if not _is_docstring(node) and not isinstance(node, ast.FunctionDef | ast.ClassDef):
-                    found |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+def _lines_of_functions(tree: ast.Module) -> dict[int, tuple[range, str]]:
+    """Return the innermost statement and function of each line of a statement in a function.
+
+    Signatures and docstrings have none.
+    """
+    found: dict[int, tuple[range, str]] = {}
+    for function in ast.walk(tree):  # from the outside inwards
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        for node in (inner for statement in function.body for inner in ast.walk(statement)):
+            if isinstance(node, ast.stmt) and not _is_docstring(node):
+                if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                    for line in range(node.lineno, (node.end_lineno or node.lineno) + 1):
+                        found.pop(line, None)
+                    continue
+                lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
+                header = range(lines.start, node.body[0].lineno) if hasattr(node, "body") else lines
+                for line in lines:
+                    found[line] = (header if line in header else lines), function.name
     return found
 
 

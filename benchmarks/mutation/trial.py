@@ -2,18 +2,17 @@
 
     python benchmarks/mutation/trial.py [--count 300] [--seed 1] [--areas law,guard] [--json FILE]
 
-Each mutant runs, in a copy of the repository, the tests that execute its line, the quickest first,
-until one fails. The tests run interpreted (``interpret_all.py``), so that nothing is compiled for a
-mutant; tests that take too long that way run compiled, for the mutants that have survived. Mutants
-in ``equivalent.toml`` are known not to change anything that a caller can observe; each has its
-reason there.
+Each mutant runs, in a copy of the repository, the tests that execute its statement, the quickest
+first, until one fails. The tests run interpreted (``interpret_all.py``), so that nothing is
+compiled for a mutant; tests that take longer than ``LIMIT`` that way are left out. A test that
+fails without the mutant, too, does not count. Mutants in ``equivalent.toml`` are known not to
+change anything that a caller can observe; each has its reason there.
 """
 
 from __future__ import annotations
 
 import argparse
 import concurrent.futures
-import itertools
 import json
 import os
 import queue
@@ -63,18 +62,39 @@ AREAS = {
     "metrics": ("records/metrics.py",),
     "margins": ("analysis/margins.py",),
 }
+# The files of tests that run first: to collect all takes seconds, and most mutants fail in these.
+NEAR = {
+    "law": ("law", "adrc", "nonlinear_feedback"),
+    "hand-over": ("handover", "law"),
+    "guard": ("guard", "law"),
+    "learners": (
+        *("kalman", "kalman_equations", "learner_equations", "harmonic", "regression", "recovery"),
+        *("lag", "bad_learners"),
+    ),
+    "gradient learners": ("batch_gradient", "online", "learner_equations", "recovery"),
+    "observers": ("observers", "observer_forms"),
+    "limits": ("limits", "law"),
+    "supervisor": ("supervisor", "supervisor_rules", "safety"),
+    "metrics": ("metrics",),
+    "margins": ("analysis_margins", "analysis_loop"),
+}
 # CPU time of a test under interpretation [s]: the quickest four fifths of the tests take less.
 LIMIT = 3.0
 # CPU time of the tests that one mutant runs [s]; more tests of the same line rarely find more.
 BUDGET = 60.0
+# A statement that fewer tests execute themselves may run in a fixture, at import or in a cache, for
+# tests that come later.
+FEW = 10
+# Exit code of a run that was ended, as that of ``timeout``.
+TIMED_OUT = 124
 
 
 class Tests(NamedTuple):
-    """The tests that pass under interpretation."""
+    """The tests, and what they execute."""
 
-    seconds: dict[str, float]
+    seconds: dict[str, float]  # of those that pass under interpretation
     of_line: dict[tuple[str, int], set[str]]  # by file and line
-    slow: dict[str, list[str]]  # tests that need compiled code, by file
+    of_file: dict[str, set[str]]
 
 
 class Verdict(NamedTuple):
@@ -104,6 +124,7 @@ def main() -> None:
         tests = unchanged_run(baseline, options.workers)
         area_of = {path: area for area in areas for path in _files(area)}
         drawn = draw(REPOSITORY, area_of, options.count, options.seed)
+        passing: set[str] = set()
         copies: queue.Queue[Path] = queue.Queue()
         for i in range(options.workers):
             copies.put(_copy(work / f"copy{i}"))
@@ -111,26 +132,23 @@ def main() -> None:
         def judge(mutant: Mutant) -> Verdict:
             copy = copies.get()
             try:
-                return Verdict(area_of[mutant.path], mutant, *_judge(mutant, copy, tests))
+                area = area_of[mutant.path]
+                return Verdict(area, mutant, *_judge(mutant, area, copy, tests, passing))
             finally:
                 copies.put(copy)
 
         with concurrent.futures.ThreadPoolExecutor(options.workers) as pool:
             verdicts = []
-            for verdict in track(pool.map(judge, drawn), total=len(drawn), console=console):
-                verdicts.append(verdict)
-                if not verdict.killed:
-                    v = verdict.mutant
-                    text = f"survived, line {v.line} ({verdict.reason}): {v.name}"
+            jobs = concurrent.futures.as_completed([pool.submit(judge, each) for each in drawn])
+            for job in track(jobs, total=len(drawn), console=console):
+                verdicts.append(job.result())
+                if not verdicts[-1].killed:
+                    v = verdicts[-1].mutant
+                    text = f"survived, line {v.line} ({verdicts[-1].reason}): {v.name}"
                     console.print(text, markup=False, soft_wrap=True)
+                if options.json:
+                    options.json.write_text(_rows(verdicts), encoding="utf-8")
     console.print(_table(verdicts))
-    if options.json:
-        rows = [
-            {"area": v.area, "mutant": v.mutant.name, "line": v.mutant.line}
-            | {"killed": v.killed, "reason": v.reason}
-            for v in verdicts
-        ]
-        options.json.write_text(json.dumps(rows, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
 def unchanged_run(folder: Path, workers: int) -> Tests:
@@ -147,71 +165,120 @@ def unchanged_run(folder: Path, workers: int) -> Tests:
             copy,
             [*names, f"-n{workers}", f"--junitxml={report}", "--cov", "--cov-context=test"],
             {"COVERAGE_FILE": str(data)},
+            limit=None,
         )
-    seconds, slow = {}, defaultdict(list)
+    seconds = {}
     for case in ET.parse(report).iter("testcase"):
-        path = case.attrib["classname"].replace(".", "/") + ".py"
-        name = f"{path}::{case.attrib['name']}"
-        if case.find("failure") is None and case.find("error") is None:
-            seconds[name] = float(case.attrib["time"])
-        else:
-            slow[path].append(name)
+        if not any(case.find(kind) is not None for kind in ("failure", "error", "skipped")):
+            path = case.attrib["classname"].replace(".", "/") + ".py"
+            seconds[f"{path}::{case.attrib['name']}"] = float(case.attrib["time"])
     covered = CoverageData(str(data))
     covered.read()
     of_line: dict[tuple[str, int], set[str]] = defaultdict(set)
+    of_file: dict[str, set[str]] = defaultdict(set)
     for file in covered.measured_files():
         path = file[file.index("src/quell") :]
         for line, contexts in covered.contexts_by_lineno(file).items():
-            names = {context.rpartition("|")[0] for context in contexts}
-            of_line[path, line] |= names & seconds.keys()
-    return Tests(seconds, of_line, slow)
+            names = {context.rpartition("|")[0] for context in contexts} - {""}
+            of_line[path, line] |= names
+            of_file[path] |= names
+    return Tests(seconds, of_line, of_file)
 
 
-def _judge(mutant: Mutant, copy: Path, tests: Tests) -> tuple[bool, str]:
-    """Return whether a test notices the mutant, and which, or why not."""
+def _judge(
+    mutant: Mutant, area: str, copy: Path, tests: Tests, passing: set[str]
+) -> tuple[bool, str]:
+    """Return whether a test notices the mutant, and which, or why not.
+
+    ``passing`` collects the tests that were seen to pass alone and without a mutant.
+    """
     if (reason := _equivalents().get(mutant.name)) is not None:
         return False, f"equivalent: {reason}"
-    chosen = sorted(tests.of_line[mutant.path, mutant.line], key=tests.seconds.__getitem__)
-    spent = itertools.accumulate(tests.seconds[name] for name in chosen)
-    chosen = [name for name, total in zip(chosen, spent, strict=True) if total <= BUDGET]
+    executing = set().union(*(tests.of_line[mutant.path, line] for line in mutant.statement))
+    files = {f"tests/test_{name}.py" for name in NEAR[area]}
+    near = {name for name in executing if name.partition("::")[0] in files}
+    near = _quickest(near, tests, 0.2 * BUDGET)
+    far = _quickest(executing - set(near), tests, 0.8 * BUDGET)
+    if len(executing) < FEW:
+        far += _quickest(tests.of_file[mutant.path] - executing, tests, 0.5 * BUDGET)
+    tested = len(near) + len(far)
     changed = copy / mutant.path
     original = changed.read_text(encoding="utf-8")
-    changed.write_text(mutant.source, encoding="utf-8")
-    try:
-        found = _failure(copy, chosen, interpret=True)
-        if found is None:
-            files = {name.partition("::")[0] for name in chosen}
-            found = _failure(copy, [n for f in sorted(files) for n in tests.slow[f]], False)
-    finally:
-        changed.write_text(original, encoding="utf-8")
-    return (True, found) if found else (False, f"{len(chosen)} tests pass")
+    for left in (near, far):
+        while left:
+            changed.write_text(mutant.source, encoding="utf-8")
+            try:
+                found, line = _failure(copy, left)
+            finally:
+                changed.write_text(original, encoding="utf-8")
+            if found is None:
+                break
+            if found not in passing and _passes(copy, found):
+                passing.add(found)
+            if found in passing:
+                return True, line
+            left.remove(found)  # it fails anyway, for example alone or on a busy machine
+            tested -= 1
+    return False, f"{tested} tests pass"
 
 
-def _failure(copy: Path, tests: list[str], interpret: bool) -> str | None:
-    """Return the test that fails; None if all pass."""
+def _quickest(names: set[str], tests: Tests, budget: float) -> list[str]:
+    """Return the quickest tests that run interpreted, of ``budget`` seconds in all."""
+    chosen, spent = [], 0.0
+    for name in sorted(names & tests.seconds.keys(), key=lambda each: (tests.seconds[each], each)):
+        spent += tests.seconds[name]
+        if spent > budget:
+            break
+        chosen.append(name)
+    return chosen
+
+
+def _failure(copy: Path, tests: list[str]) -> tuple[str | None, str]:
+    """Return the first test that fails, None if all pass, and pytest's line about it."""
     for part in (tests[i : i + 200] for i in range(0, len(tests), 200)):
-        done = _pytest(copy, ["-x", "-n0", "--no-header", *part], interpret=interpret)
-        if done.returncode not in (0, 5):
-            lines = [x for x in done.stdout.splitlines() if x.startswith(("FAILED", "ERROR"))]
-            return lines[0] if lines else f"exit code {done.returncode}"
-    return None
+        done = _pytest(copy, ["-x", "-n0", *part], limit=4.0 * BUDGET)
+        lines = [x for x in done.stdout.splitlines() if x.startswith(("FAILED", "ERROR"))]
+        if lines:
+            named = lines[0].split(" ", 1)[1]
+            found = [x for x in part if named.startswith(x)]
+            if found:
+                return max(found, key=len), lines[0]
+            # An error of collection names a file.
+            return next((x for x in part if x.startswith(named.split(" ")[0])), part[0]), lines[0]
+        if done.returncode not in (0, 5, TIMED_OUT):
+            return part[0], f"exit code {done.returncode}"
+    return None, ""
+
+
+def _passes(copy: Path, test: str) -> bool:
+    """Return whether a test passes alone and without a mutant."""
+    return _pytest(copy, ["-n0", test], limit=4.0 * BUDGET).returncode == 0
 
 
 def _pytest(
-    copy: Path, arguments: list[str], extra: dict[str, str] | None = None, interpret: bool = True
+    copy: Path,
+    arguments: list[str],
+    extra: dict[str, str] | None = None,
+    *,
+    limit: float | None,
 ) -> subprocess.CompletedProcess[str]:
     path = f"{copy / 'src'}{os.pathsep}{Path(__file__).parent}"
     environment = os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(copy / "cache")}
-    plugin = ["-p", "interpret_all", f"--cpu-limit={LIMIT}"] if interpret else []
+    # Without coverage the tests are quicker than in the unchanged run: who passed there has time.
     command = [sys.executable, "-B", "-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=no"]
-    return subprocess.run(
-        [*command, *plugin, *arguments],
-        cwd=copy,
-        env=environment | (extra or {}),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command += ["-p", "interpret_all", f"--cpu-limit={LIMIT}", *arguments]
+    try:
+        return subprocess.run(
+            command,
+            cwd=copy,
+            env=environment | (extra or {}),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=limit,
+        )
+    except subprocess.TimeoutExpired:
+        return subprocess.CompletedProcess(command, TIMED_OUT, "", "")
 
 
 def _copy(target: Path) -> Path:
@@ -239,6 +306,16 @@ def _equivalents() -> dict[str, str]:
     """Return the reasons of mutants that change nothing, by name."""
     text = Path(__file__).with_name("equivalent.toml").read_text(encoding="utf-8")
     return {entry["mutant"]: entry["reason"] for entry in tomllib.loads(text).get("known", [])}
+
+
+def _rows(verdicts: list[Verdict]) -> str:
+    """Return the verdicts as JSON."""
+    rows = [
+        {"area": v.area, "mutant": v.mutant.name, "line": v.mutant.line}
+        | {"killed": v.killed, "reason": v.reason}
+        for v in verdicts
+    ]
+    return json.dumps(rows, indent=1, ensure_ascii=False)
 
 
 def _table(verdicts: list[Verdict]) -> Table:
