@@ -41,6 +41,15 @@ def in_parallel(
         return [future.result() for future in futures]
 
 
+def part_of(
+    progress: Callable[[float], None] | None, first: int, last: int, total: int
+) -> Callable[[float], None] | None:
+    """Return a callback for the share done of the part from ``first`` to ``last`` of ``total``."""
+    if progress is None:
+        return None
+    return lambda share: progress((first + share * (last - first)) / total)
+
+
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Make BLAS use one thread, for many operations on small matrices.

@@ -11,13 +11,14 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import Controller, check_controller
-from quell.parallel import in_parallel, one_blas_thread
+from quell.parallel import in_parallel, one_blas_thread, part_of
 from quell.plants.base import Plant, check_plant
 from quell.plants.batch import PlantBatch
 from quell.records.batch_trajectory import BatchTrajectory
 from quell.records.channels import columns_of, readable_names
 from quell.simulation.divergence import judge_integration
 from quell.simulation.driver import Loop, logged_channels
+from quell.simulation.lane_batch import Outcome, run_over_lanes
 from quell.simulation.sampled_scenario import SampledScenario, Segment, segment_bounds
 from quell.simulation.scenario import Scenario, check_scenario
 from quell.types import Channels
@@ -38,6 +39,7 @@ def simulate_batch(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
+    exact: bool = True,
 ) -> BatchTrajectory:
     """Run every plant, controller and scenario of a batch; see ``quell.simulate``."""
     plants, controllers, scenarios = _members(plant, controller, scenario)
@@ -50,13 +52,54 @@ def simulate_batch(
     width = sum(width for _, width in logged)
     channels = _selected(_RECORDED if record is None else record, logged)
     columns = [k for name, _ in channels for k in range(width)[columns_of(logged, name)]]
-    loops = [
-        Loop(*parts, interpret)
-        for parts in zip(plants, _models(plants, dt, interpret), controllers, sampled, strict=True)
-    ]
-    # Column by column, so that a channel of all runs is contiguous in memory.
-    log = np.moveaxis(np.empty((len(columns), runs, (samples - 1) // every + 1)), 0, -1)
-    lengths = np.zeros(runs, dtype=np.int64)
+    recorded = [(name, j) for name, width in channels for j in range(width)]
+    # Channel by channel, so that a channel of all runs is contiguous in memory.
+    log = np.empty((len(recorded), runs, (samples - 1) // every + 1))
+    outcome = Outcome(log, *(np.zeros(runs, dtype=np.int64) for _ in range(3)))
+    left: Sequence[int] = range(runs)
+    if not (checks.flag("exact", exact) or interpret):
+        parts = plants, controllers, sampled, recorded
+        left = run_over_lanes(*parts, every, outcome, progress, workers)
+    models = _models([plants[i] for i in left], dt, interpret)
+    loops = {
+        i: Loop(plants[i], model, controllers[i], sampled[i], interpret)
+        for i, model in zip(left, models, strict=True)
+    }
+    progress = part_of(progress, runs - len(left), runs, runs)
+    _run_loops(loops, columns, width, every, outcome, progress, workers)
+    for i in np.flatnonzero(outcome.lengths < log.shape[2]).tolist():
+        log[:, i, outcome.lengths[i] :] = np.nan
+    name = plants.name if isinstance(plants, PlantBatch) else plants[0].name
+    judge_integration(name, list(loops.values()))
+    for i, loop in loops.items():
+        outcome.status[i], outcome.ended[i] = int(loop.result_status), loop.ended
+    return BatchTrajectory(
+        log=np.moveaxis(log, 0, -1),
+        channels=channels,
+        dt=dt,
+        every=every,
+        lengths=outcome.lengths,
+        status=outcome.status,
+        ended=np.asarray(outcome.ended * dt, dtype=np.float64),
+        limit=np.array([s.limit for s in sampled]),
+        plant=name,
+        parameters=plants.parameters if isinstance(plants, PlantBatch) else {},
+        features=controllers[0].features,
+        final_states=tuple(loop.state for loop in loops.values()) if exact else (),
+    )
+
+
+def _run_loops(
+    loops: Mapping[int, Loop],
+    columns: Sequence[int],
+    width: int,
+    every: int,
+    outcome: Outcome,
+    progress: Callable[[float], None] | None,
+    workers: int | None,
+) -> None:
+    """Run loops, by the index of their run, and record some columns of their logs."""
+    log, lengths = outcome.log, outcome.lengths
 
     def run_some(
         which: Sequence[int], first: int, last: int, shared: Mapping[SampledScenario, Segment]
@@ -64,19 +107,20 @@ def simulate_batch(
         """Take some runs through a segment, in a thread."""
         buffer = np.empty(((last - first) // every + 1, width))
         for i in which:
-            segment = shared.get(sampled[i]) or sampled[i].segment(first, last)
+            segment = shared.get(loops[i].scenario) or loops[i].scenario.segment(first, last)
             try:
                 rows = loops[i].run(segment, buffer, 0, every)
             except ValueError as error:
                 raise ValueError(f"run {i}: {error}") from error
             at = int(lengths[i])
             for k, column in enumerate(columns):
-                log[i, at : at + rows, k] = buffer[:rows, column]
+                log[k, i, at : at + rows] = buffer[:rows, column]
             lengths[i] += rows
 
-    counts = Counter(sampled)
+    counts = Counter(loop.scenario for loop in loops.values())
+    samples = max((scenario.samples for scenario in counts), default=0)
     for first, last in segment_bounds(samples, set().union(*(s.rest_samples for s in counts))):
-        live = [i for i in range(runs) if not loops[i].diverged]
+        live = [i for i, loop in loops.items() if not loop.diverged]
         if not live:
             break
         shared = {s: s.segment(first, last) for s, count in counts.items() if count > 1}
@@ -84,25 +128,7 @@ def simulate_batch(
             partial(run_some, live[i : i + _RUNS_PER_JOB], first, last, shared)
             for i in range(0, len(live), _RUNS_PER_JOB)
         ]
-        in_parallel(jobs, _progress_within(progress, first, last, samples), workers)
-    for i in range(runs):
-        log[i, lengths[i] :] = np.nan
-    name = plants.name if isinstance(plants, PlantBatch) else plants[0].name
-    judge_integration(name, loops)
-    return BatchTrajectory(
-        log=log,
-        channels=channels,
-        dt=dt,
-        every=every,
-        lengths=lengths,
-        status=np.array([int(loop.result_status) for loop in loops]),
-        ended=np.array([loop.ended for loop in loops]) * dt,
-        limit=np.array([s.limit for s in sampled]),
-        plant=name,
-        parameters=plants.parameters if isinstance(plants, PlantBatch) else {},
-        features=controllers[0].features,
-        final_states=tuple(loop.state for loop in loops),
-    )
+        in_parallel(jobs, part_of(progress, first, last, samples), workers)
 
 
 def _members(
@@ -186,12 +212,3 @@ def _selected(record: Sequence[str], logged: Channels) -> Channels:
     if "f_hat" in wanted:
         wanted |= {"f_learned", "f_residual"}
     return tuple((name, width) for name, width in logged if name in wanted)
-
-
-def _progress_within(
-    progress: Callable[[float], None] | None, first: int, last: int, samples: int
-) -> Callable[[float], None] | None:
-    """Return a callback for the share done of the samples from ``first`` to ``last``."""
-    if progress is None:
-        return None
-    return lambda share: progress((first + share * (last - first)) / samples)

@@ -45,6 +45,7 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
+    exact: bool = True,
 ) -> BatchTrajectory: ...
 def simulate(
     plant: Any,
@@ -57,6 +58,7 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
+    exact: bool = True,
 ) -> Trajectory | BatchTrajectory:
     """Run a controller on a plant through a scenario, or a batch of them on all cores.
 
@@ -89,6 +91,14 @@ def simulate(
         for a batch: channels to record, ``("r", "y", "u")`` by default. A single run records all.
     workers
         for a batch: number of threads; the number of cores by default.
+    exact
+        for a batch: whether each run has the bits of the run alone. With ``False`` linear runs are
+        advanced 32 at a time, several times as fast, and ``final_states`` is empty. All channels
+        are then within 1e-9 of their range of the exact ones if the loop is stable. A run is linear
+        if its plant is a ``LinearPlant``, delayed or not, and its controller an ``ADRC`` with a
+        linear observer, without learner, guard or nonlinear feedback, or a linear controller (PID,
+        LQG, …); limits may act. All others, and runs in which a measurement or reference is held,
+        are exact all the same.
 
     Returns
     -------
@@ -110,12 +120,15 @@ def simulate(
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
-        return simulate_batch(
-            plant, controller, scenario, record_every, limit, interpret, progress, record, workers
-        )
-    for name, value in (("record", record), ("workers", workers)):
-        if value is not None:
-            rule = "is for a batch; a single run records all channels, in this thread"
+        options = (record_every, limit, interpret, progress, record, workers, exact)
+        return simulate_batch(plant, controller, scenario, *options)
+    for name, value, usual in (
+        ("record", record, None),
+        ("workers", workers, None),
+        ("exact", checks.flag("exact", exact), True),
+    ):
+        if value is not usual:
+            rule = "is for a batch; a single run records all channels, in this thread, exactly"
             raise ValueError(f"{name} = {value!r}: {rule}")
     check_plant(plant)
     check_controller(controller)
