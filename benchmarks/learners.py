@@ -25,7 +25,7 @@ import quell as ql
 from quell.controllers.base import control
 from quell.experiments.two_mass_spring import setup as study
 from quell.features import RBF, Bias, Input, RandomFourier, State
-from quell.kernels.dispatch import compiled, dispatcher_for
+from quell.kernels.dispatch import call, compiled
 from quell.learners.online.model import infer, learn
 
 TRIALS = 11
@@ -148,8 +148,7 @@ def steps(design: Any, state: Any, r: Any, y: Any) -> float:
 
 def stepping(controller: ql.ADRC, r: np.ndarray, y: np.ndarray) -> Any:
     """Return a function that runs the controller alone."""
-    dispatcher = dispatcher_for(steps, controller.parameters)
-    return lambda: dispatcher(controller.parameters, controller.initial_state(), r, y)
+    return lambda: call(steps, controller.parameters, controller.initial_state(), r, y)
 
 
 def nanoseconds(*runs: float, of: str) -> str:
@@ -185,10 +184,10 @@ def guard(rows: list[dict[str, object]]) -> None:
         plain, guarded = law(LEARNERS[name]), law(LEARNERS[name], ql.Guard())
         candidates = [guarded, plain, with_one_tap(plain)]
         for what, made in (("loop sample", loop), ("step", lambda c: stepping(c, r, y))):
-            calls = [made(candidate) for candidate in candidates]
-            for call in calls:
-                call()  # compiles
-            both, learner, bare = best(*calls, trials=3 * TRIALS)
+            runs = [made(candidate) for candidate in candidates]
+            for run in runs:
+                run()  # compiles
+            both, learner, bare = best(*runs, trials=3 * TRIALS)
             for label, one, other, bar in (
                 ("with guard / without", both, learner, "≤ 1.4"),
                 ("exact lag filter / one tap", learner, bare, ""),

@@ -36,7 +36,12 @@ def _plain(function: Callable[..., Any], **options: Any) -> Any:
     return entry
 
 
+def _not_specialised(entry: Any, *arguments: Any) -> Any:
+    return entry
+
+
 dispatch._dispatcher = _plain
+dispatch.specialised = _not_specialised
 
 # Only now, because they use the entry points.
 from quell.controllers import compiled_step, stateful  # noqa: E402

@@ -13,12 +13,12 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
-import numba
 from numba.core import types as nb_types
 from numba.extending import NativeValue, intrinsic, models, register_model, unbox
 
 from quell.controllers.base import control
 from quell.kernels.dispatch import compiled_call
+from quell.kernels.sized import Constant, ConstantFlag, SizedArray, type_of
 
 
 class PackedType(nb_types.Type):
@@ -42,8 +42,8 @@ class PackedController(bytes):
     design, state
         of the controller.
     before
-        one with the same state, and with parameters of the same types: then only the new parameters
-        are packed.
+        one with the same state, and with parameters of the same ``layout_of``: then only the new
+        parameters are packed.
 
     Raises
     ------
@@ -58,7 +58,7 @@ class PackedController(bytes):
         cls, design: Any, state: Any, before: PackedController | None = None
     ) -> PackedController:
         """Pack a controller."""
-        kind = PackedType(numba.typeof((design, state))) if before is None else before.type
+        kind = PackedType(type_of((design, state))) if before is None else before.type
         parameters = _words(kind.content[0], design)
         rest = _words(kind.content[1], state) if before is None else before[len(parameters) :]
         packed = super().__new__(cls, parameters + rest)
@@ -75,6 +75,9 @@ def _words(kind: Any, value: Any) -> bytes:
         if isinstance(kind, nb_types.BaseTuple):
             for part, entry in zip(kind, value, strict=True):
                 add(part, entry)
+        elif isinstance(kind, SizedArray):
+            formats.append("q")
+            words.append(value.ctypes.data)
         elif isinstance(kind, nb_types.Array):
             formats.append("qqqqq" + 2 * value.ndim * "q")
             owners = (0, 0)  # nothing is counted
@@ -83,6 +86,8 @@ def _words(kind: Any, value: Any) -> bytes:
         elif kind == nb_types.float64:
             formats.append("d")
             words.append(value)
+        elif isinstance(kind, Constant | ConstantFlag):
+            pass  # compiled code knows it
         elif isinstance(kind, nb_types.Integer | nb_types.Boolean):
             formats.append("q")
             words.append(int(value))

@@ -13,6 +13,7 @@ from quell.controllers.base import set_applied_control
 from quell.controllers.compiled_step import PackedController, entry_point, step_packed
 from quell.controllers.limits import Limits, RateLimit, changed_limits
 from quell.kernels.dispatch import dispatcher_for
+from quell.kernels.sized import layout_of
 from quell.kernels.user_types import explain_compile_errors
 
 # A copy makes these again: compiled functions and shared arrays belong to one process.
@@ -45,9 +46,15 @@ class StatefulController:
         self._packed = None
 
     def _pack_again(self) -> None:
-        """Update the arguments of the compiled step after a change of the parameters."""
-        if self._packed is not None:
-            self._packed = PackedController(self.parameters, self._state, before=self._packed)
+        """Update the arguments of the compiled step after a change of the parameters.
+
+        If they have other shapes now, the next step is compiled for these.
+        """
+        before = self._packed
+        if before is not None and layout_of(self.parameters) == layout_of(before.arrays[0]):
+            self._packed = PackedController(self.parameters, self._state, before)
+        else:
+            self._packed = None
 
     def _update_parameters(self) -> None:
         raise NotImplementedError

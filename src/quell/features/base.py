@@ -14,6 +14,7 @@ import numpy as np
 
 from quell.kernels import validation
 from quell.kernels.dispatch import generic
+from quell.kernels.sized import Size
 from quell.types import Vector
 
 
@@ -115,7 +116,7 @@ class JoinedDesign(NamedTuple):
 
     first: Any
     second: Any
-    split: int  # number of features of the first
+    split: Size  # number of features of the first
 
 
 @write.register(JoinedDesign)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from quell import checks
 from quell.features.base import Features, dimensionless, unit, write
 from quell.features.states import StateIndices, check_states, state_indices
+from quell.kernels.sized import Flag
 from quell.types import Vector
 
 
@@ -18,7 +19,7 @@ class FrictionDesign(NamedTuple):
 
     states: StateIndices
     width: float
-    sign: bool
+    sign: Flag
 
 
 @dataclass(frozen=True)

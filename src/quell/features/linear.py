@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 from quell import checks
 from quell.features.base import Features, dimensionless, unit, write
+from quell.kernels.sized import Size
 from quell.types import Vector
 
 
 class StateDesign(NamedTuple):
     """Parameters of ``State``."""
 
-    width: int
+    width: Size
 
 
 @dataclass(frozen=True)

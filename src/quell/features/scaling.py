@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.sized import Flag
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -29,7 +30,7 @@ class Scaling(NamedTuple):
     """Parameters, for a plant of order n."""
 
     floors: Vector  # least scales (n + 2,) over that of x_1: ω^(i−1)/8 for x_2 … x_n, else 0
-    fixed: bool  # whether the scales are given and do not change
+    fixed: Flag  # whether the scales are given and do not change
 
 
 def scaling(observer: ESO, frequency: float, fixed: bool) -> Scaling:

@@ -15,8 +15,10 @@ and arrays) and explicit state (a NamedTuple of arrays), under one of these deco
 from __future__ import annotations
 
 import functools
+import inspect
 import sys
 from collections.abc import Callable
+from types import FunctionType
 from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import numba
@@ -24,7 +26,9 @@ from numba.core import types as nb_types
 from numba.extending import overload, register_jitable
 
 from quell.kernels.cache import code_cache
-from quell.kernels.linking import KERNEL_OPTIONS
+from quell.kernels.linking import KERNEL_OPTIONS, WithoutOverlaps
+from quell.kernels.overlaps import overlap
+from quell.kernels.sized import layout_of, type_of
 from quell.kernels.user_types import add_user_type, uses_user_types
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -134,9 +138,51 @@ def compiled(function: F) -> F:
     return _dispatcher(function, nogil=True, _nrt=False)
 
 
+def compiled_loop(*read_only: str) -> Callable[[F], F]:
+    """Return a decorator as ``compiled``, for a function that runs for many samples.
+
+    It writes to no array in its arguments ``read_only``. If none of the others overlaps another
+    array, ``specialised`` returns code that relies on that, and is quicker; else code that does
+    not.
+    """
+
+    def decorate(function: F) -> F:
+        plain: Any = FunctionType(function.__code__, function.__globals__, function.__name__)
+        plain.__qualname__ = f"{function.__qualname__}_with_overlaps"  # the name in the disk cache
+        entry = _dispatcher(function, nogil=True, _nrt=False, pipeline_class=WithoutOverlaps)
+        entry.with_overlaps = _dispatcher(plain, nogil=True, _nrt=False)
+        names = inspect.signature(function).parameters
+        entry.written = tuple(i for i, name in enumerate(names) if name not in read_only)
+        return cast("F", entry)
+
+    return decorate
+
+
 def compiled_call(function: F) -> F:
-    """Compile an entry point for single calls from Python: it keeps the interpreter lock."""
+    """Compile an entry point for short calls from Python: it keeps the interpreter lock."""
     return _dispatcher(function, _nrt=False)
+
+
+def specialised(entry: Any, *arguments: Any) -> Any:
+    """Return an entry point compiled for arguments like these: shapes and constants included.
+
+    See ``kernels/sized.py``. It does not check the types of its arguments: call it with arguments
+    of the same types, shapes and constants only.
+    """
+    if hasattr(entry, "with_overlaps") and overlap(arguments, entry.written):
+        entry = entry.with_overlaps
+    dispatcher = dispatcher_for(entry, *arguments)
+    layouts = tuple(map(layout_of, arguments))
+    found = dispatcher.specialised.get(layouts)
+    if found is None:
+        found = dispatcher.compile(tuple(map(type_of, arguments)))
+        dispatcher.specialised[layouts] = found
+    return found
+
+
+def call(entry: Any, *arguments: Any) -> Any:
+    """Call an entry point, ``specialised`` for its arguments."""
+    return specialised(entry, *arguments)(*arguments)
 
 
 def dispatcher_for(entry: Any, *arguments: Any) -> Any:
@@ -162,9 +208,10 @@ def _dispatcher(function: Any, **options: Any) -> Any:
     """Return a dispatcher with a disk cache if possible; its ``uncached`` is one without."""
     options |= OPTIONS
     dispatcher = numba.njit(function, **options)
-    dispatcher.uncached = dispatcher
+    dispatcher.uncached, dispatcher.specialised = dispatcher, {}
     cache = code_cache(function)
     if cache is not None:
         dispatcher.uncached = numba.njit(function, **options)
+        dispatcher.uncached.specialised = {}
         dispatcher._cache = cache  # what ``cache=True`` does with Numba's own
     return dispatcher

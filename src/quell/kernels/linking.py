@@ -73,6 +73,18 @@ class KernelCompiler(CompilerBase):
         return [passes]
 
 
+class WithoutOverlaps(CompilerBase):
+    """Numba's compiler for an entry point that writes to no memory which it reaches in two ways.
+
+    LLVM may then keep in registers what it has read, although the code writes to other arrays.
+    """
+
+    def define_pipelines(self) -> list[Any]:
+        """Return Numba's passes."""
+        self.state.flags.noalias = True
+        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
+
+
 # Options for ``overload`` and ``register_jitable``. They depend on internals of Numba: with
 # versions that were not tested, kernels are compiled in Numba's own way, which takes twice as long.
 _TESTED_VERSIONS = ("0.68.",)

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.kernels.dispatch import generic
+from quell.kernels.sized import Flag
 from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
 from quell.observers.response import f_lag, f_learned_response, response, scaled_response
@@ -37,7 +38,7 @@ class Lag(NamedTuple):
     pole: float  # β
     rise: float  # 1 − β, without cancellation
     taps: Vector  # c (N,)
-    predictor: bool  # whether the observer is in predictor form: its estimate is a sample later
+    predictor: Flag  # whether the observer is in predictor form: its estimate is a sample later
 
     @property
     def width(self) -> int:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from quell import checks
+from quell.kernels.sized import Size
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Vector
 
@@ -25,7 +26,7 @@ class DelayedModel(NamedTuple):
     """Parameters of an observer with a delay of u."""
 
     inner: Any  # parameters of the observer without delay
-    size: int  # length of the running state of ``inner``
+    size: Size  # length of the running state of ``inner``
     samples: int  # d, at least 1
 
     @property

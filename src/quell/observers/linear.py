@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from quell.kernels.sized import Flag
 from quell.observers.base import observe, predict_state
 from quell.types import Matrix, Vector
 
@@ -24,7 +25,7 @@ class EsoModel(NamedTuple):
     input: Vector  # Γ_u (N,)
     feed: Vector  # Γ_f (N,)
     gain: Vector  # L (N,)
-    predictor: bool  # whether the controller gets z⁻ instead of z
+    predictor: Flag  # whether the controller gets z⁻ instead of z
 
     @property
     def states(self) -> int:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from quell import checks
+from quell.kernels.sized import Size
 from quell.plants.base import Plant, PlantWrapper, advance, check_plant, measure
 from quell.types import Vector
 
@@ -18,7 +19,7 @@ class DelayedPlantModel(NamedTuple):
     """A sampled plant with a delay of at least one sample."""
 
     inner: Any  # parameters of the plant without delay
-    size: int  # number of its states
+    size: Size  # number of its states
 
 
 @measure.register(DelayedPlantModel)

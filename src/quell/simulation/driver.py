@@ -14,7 +14,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.kernels.dispatch import compiled, dispatcher_for, interpreted
+from quell.kernels.dispatch import compiled, compiled_loop, interpreted, specialised
 from quell.kernels.user_types import explain_compile_errors
 from quell.plants.base import Plant, advance, measure
 from quell.simulation.integration import IntegrationCheck, Samples
@@ -22,7 +22,7 @@ from quell.simulation.sampled_scenario import SampledScenario, Segment
 from quell.types import Channels, Matrix, Status, Vector
 
 
-@compiled
+@compiled_loop("plant", "design", "r", "derivatives", "w", "noise")
 def run_block(
     plant: Any,
     x: Vector,
@@ -101,10 +101,12 @@ class Loop:
         as_python = interpret or not plant.compiled
         self.integration = IntegrationCheck(model, as_python)
         self.scenario = scenario
-        self._run_block, self._start_from_rest = (
-            interpreted(f) if as_python else dispatcher_for(f, model, self.design)
-            for f in (run_block, start_from_rest)
-        )
+        self._as_python = as_python
+        self._run_block: Any = None  # the compiled function, from the first segment on
+
+    def _entry(self, function: Any, *arguments: Any) -> Any:
+        """Return a function to call with arguments like these."""
+        return interpreted(function) if self._as_python else specialised(function, *arguments)
 
     @property
     def diverged(self) -> bool:
@@ -140,10 +142,12 @@ class Loop:
         ):
             if from_rest:
                 self.x[:] = self.x0
-                self._start_from_rest(self.design, self.state)
-            samples, row, self.until_next, flags = self._run_block(
-                *loop, *signals, log, row, every, self.until_next, self.limit
-            )
+                start = (self.design, self.state)
+                self._entry(start_from_rest, *start)(*start)
+            arguments = (*loop, *signals, log, row, every, self.until_next, self.limit)
+            if self._run_block is None:
+                self._run_block = self._entry(run_block, *arguments)
+            samples, row, self.until_next, flags = self._run_block(*arguments)
         self.done = first + samples
         self.status |= flags if samples == segment.r.size else flags | Status.DIVERGED
         if self.integration.needed:

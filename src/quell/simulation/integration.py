@@ -7,11 +7,12 @@ as many. Of a method of order 4 the difference is 15/16 of the error (Hairer, NÃ
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.kernels.dispatch import compiled, interpreted
+from quell.kernels.dispatch import call, compiled, interpreted
 from quell.plants.base import advance
 from quell.plants.delay import DelayedPlantModel
 from quell.plants.encoder import EncodedPlantModel
@@ -76,7 +77,9 @@ class IntegrationCheck:
             model = model.inner
         self.needed = isinstance(model, CompiledNonlinear | PythonNonlinear)
         self.model, self.error, self.enough = model, 0.0, 0
-        self._step_differences = interpreted(step_differences) if as_python else step_differences
+        self._step_differences = (
+            interpreted(step_differences) if as_python else partial(call, step_differences)
+        )
 
     def acquit(self) -> None:
         """Forget the errors: the run diverges with enough sub-steps, too."""

@@ -14,6 +14,7 @@ from quell import checks
 from quell.features import Features
 from quell.features.base import checked_design
 from quell.features.scaling import initial_scale, scaling
+from quell.kernels.sized import Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.gradient.buffers import (
     Buffers,
@@ -33,7 +34,7 @@ class BatchDesign(NamedTuple):
 
     rate: float  # α, per sample
     batch: int  # n
-    order: int  # order of the plant; there are two more features
+    order: Size  # order of the plant; there are two more features
 
 
 @adapt.register(BatchDesign)

@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
+from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
 from quell.learners.lag import STARTUP_LAGS, lag_push
@@ -67,10 +68,10 @@ class KalmanDesign(NamedTuple):
     prior: Vector
     fastest: float  # λ_m [rad/s]
     f_noise: float  # variance that white noise of unit variance in y causes in f̂
-    states: int  # n, or 0 without state features
-    bias: bool
+    states: Size  # n, or 0 without state features
+    bias: Flag
     oscillators: Oscillators
-    with_u: bool
+    with_u: Flag
     slope_low: float  # least θ_u in scaled units
     slope_high: float  # largest θ_u in scaled units
     dt: float

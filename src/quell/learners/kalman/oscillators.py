@@ -19,6 +19,7 @@ import math
 from typing import NamedTuple
 
 from quell.kernels.dispatch import kernel
+from quell.kernels.sized import Size
 from quell.types import Vector
 
 # κ and c: a broad optimum over random loops (docs/theory).
@@ -28,7 +29,7 @@ _FREQUENCY_GAIN, _UNEXPLAINED_WEIGHT = 0.4, 60.0
 class Oscillators(NamedTuple):
     """Parameters of m oscillators, whose features are consecutive in θ."""
 
-    first: int  # index in θ of the first pair
+    first: Size  # index in θ of the first pair
     omega: Vector  # initial frequencies [rad/s] (m,)
     low: float  # least frequency [rad/s]
     high: float  # largest frequency [rad/s]

@@ -25,6 +25,7 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.sized import Size
 from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
 from quell.observers.eso import ESO
@@ -39,7 +40,7 @@ _MEMORY = 1000.0
 class ProcessDesign(NamedTuple):
     """Parameters of a process with a budget of M points."""
 
-    inputs: int
+    inputs: Size
     budget: int
     weight: float  # ``1/(2 length²)``
     noise: float  # σ²

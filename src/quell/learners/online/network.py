@@ -19,6 +19,7 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.sized import Size
 from quell.learners.least_squares import RlsRule, least_squares_gain
 from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
@@ -40,8 +41,8 @@ class NetworkDesign(NamedTuple):
     """Parameters of a network with m inputs and h hidden units, p = h (m + 2) + 1 weights."""
 
     rule: RlsRule
-    inputs: int
-    hidden: int
+    inputs: Size
+    hidden: Size
     every: int  # learn from every ``every``-th pair
     seed: int
 

@@ -34,6 +34,7 @@ from quell.features.base import unit
 from quell.features.scaling import reset_scale, update_scale
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
+from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.feature_learner import Inputs, write_features
 from quell.learners.lag import lag_push
@@ -68,8 +69,8 @@ class LinearDesign(NamedTuple):
     inputs: Inputs
     lag: Any
     rule: Any
-    constant: int  # index of the feature that is the constant 1; −1 without one
-    with_u: bool
+    constant: Size  # index of the feature that is the constant 1; −1 without one
+    with_u: Flag
     slope_low: float  # least θ_u, in the plant's units
     slope_high: float  # largest θ_u
     depends: Matrix  # (p, n + 1): 1 if a feature depends on the state or on u, else 0

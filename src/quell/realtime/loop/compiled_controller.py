@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from quell.kernels.dispatch import compiled, dispatcher_for
+from quell.kernels.dispatch import compiled, specialised
 from quell.realtime.loop.cycle import CycleLog, SupervisedController, control_step
 from quell.realtime.loop.state import SupervisorState
 
@@ -30,6 +30,6 @@ def _call_step(controller: CompiledController, k: int, left_out: int, y: float) 
 
 
 def compiled_controller(controller: SupervisedController) -> CompiledController:
-    """Return the controller with its control step compiled at the first call."""
-    step = dispatcher_for(_step, controller)
+    """Return the controller with its compiled control step."""
+    step = specialised(_step, controller, 0, 0, 0.0)
     return CompiledController(controller.supervisor, controller.log, controller, step)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from quell.controllers.base import Controller
-from quell.kernels.dispatch import dispatcher_for, interpreted
+from quell.kernels.dispatch import interpreted, specialised
 from quell.kernels.user_types import explain_compile_errors
 from quell.realtime.devices.base import Device, PythonHandle, handle_of
 from quell.realtime.loop.compiled_controller import compiled_controller
@@ -98,7 +98,7 @@ class ControlLoop:
             entry = interpreted(entry)
             controller = controller if self.interpret else compiled_controller(controller)
         else:
-            entry = dispatcher_for(entry, self.handle, self.clock, controller)
+            entry = specialised(entry, self.handle, self.clock, self.period, controller)
         with np.errstate(over="ignore", invalid="ignore"):
             entry(self.handle, self.clock, self.period, controller)
 

@@ -7,10 +7,8 @@ import time
 from collections.abc import Iterator
 from typing import Any, Self
 
-from numba import typeof
-
 from quell import checks
-from quell.kernels.dispatch import compiled, dispatcher_for
+from quell.kernels.dispatch import call, compiled, specialised
 from quell.realtime.devices.base import ask, read_measurement, write_command
 from quell.realtime.system.clock import SystemClock, system_clock
 from quell.realtime.wire import frames
@@ -125,7 +123,7 @@ class WireDevice:
             or it has ended the session.
         """
         self._check_open()
-        fault = dispatcher_for(_write, self.handle)(self.handle, float(u))
+        fault = call(_write, self.handle, float(u))
         if fault:
             raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
 
@@ -227,8 +225,8 @@ class WireDevice:
         if not self._compiled:  # this may take seconds and must not count as waiting
             self._compiled = True
             for entry, arguments in ((_read, (clock, 0)), (_write, (0.0,))):
-                dispatcher_for(entry, handle).compile(tuple(map(typeof, (handle, *arguments))))
-        read = dispatcher_for(_read, handle, clock)
+                specialised(entry, handle, *arguments)
+        read = specialised(_read, handle, clock, 0)
         numbers, counters = handle.endpoint.numbers, handle.endpoint.counters
         unanswered, self._answered = self._answered == numbers[frames.SENT], numbers[frames.SENT]
         accepted, begin = counters[frames.ACCEPTED], time.monotonic_ns()

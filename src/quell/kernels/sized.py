@@ -1,0 +1,216 @@
+"""Numba types of arguments that tell the compiler what does not change while a loop runs.
+
+Numba's types of arrays do not contain shapes, so LLVM can neither unroll a loop over four states
+nor keep them in registers: the same loop in C takes 1.4 times as long if its sizes are variables.
+Here the type of an array that is a field of a NamedTuple contains its shape, and the type of an
+integer that is annotated with ``Size`` or ``Flag`` contains its value:
+
+::
+
+    class Design(NamedTuple):
+        a: Matrix
+        order: Size
+
+Kernels do not see any of it. Such an array is passed as one pointer instead of seven words or more,
+which makes compilation quicker, too. Numba does not know these types of values by itself: call an
+entry point by ``specialised`` (``kernels/dispatch.py``).
+"""
+
+from __future__ import annotations
+
+import functools
+from math import prod
+from typing import Annotated, Any, TypeAlias
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import types as nb_types
+from numba.core.datamodel import models
+from numba.extending import NativeValue, lower_cast, register_model, unbox
+
+Size: TypeAlias = Annotated[int, "constant"]
+"""Annotates an integer field of a NamedTuple that is a constant in compiled code."""
+
+Flag: TypeAlias = Annotated[bool, "constant"]
+"""Annotates a flag in a NamedTuple that is a constant in compiled code."""
+
+# Larger arrays are passed in Numba's own way: loops over them are not unrolled, and buffers of
+# many lengths would each be compiled for. 16 × 16 is a Kalman learner with 16 features.
+_MOST_ELEMENTS = 256
+
+_PLAIN = (float, int, bool)
+
+_types: dict[Any, nb_types.Type] = {}
+
+
+class SizedArray(nb_types.Array):
+    """The type of arrays of one shape."""
+
+    def __init__(self, array: np.ndarray) -> None:
+        plain = numba.typeof(array)
+        self.lengths, self.steps = array.shape, array.strides
+        name = f"{plain}, {self.lengths}, {self.steps}"
+        super().__init__(
+            *(plain.dtype, plain.ndim, plain.layout),
+            readonly=not plain.mutable,
+            name=name,
+            aligned=plain.aligned,
+        )
+        self.itemsize = array.itemsize
+
+    @property
+    def key(self) -> Any:
+        """What makes the type equal to another."""
+        return (*super().key, self.lengths, self.steps)
+
+    @property
+    def mangling_args(self) -> Any:
+        """What makes the name of a function compiled for it unique."""
+        name, arguments = super().mangling_args
+        return name, [*arguments, *self.lengths, *self.steps]
+
+
+class Constant(nb_types.IntegerLiteral):
+    """The type of one integer."""
+
+
+class ConstantFlag(nb_types.BooleanLiteral):
+    """The type of ``True``, or of ``False``."""
+
+
+@register_model(SizedArray)
+class _SizedArrayModel(models.ArrayModel):
+    """As an argument, the pointer to the data."""
+
+    def get_argument_type(self) -> Any:
+        return self._model_of("data").get_argument_type()
+
+    def as_argument(self, builder: Any, value: Any) -> Any:
+        return self.get(builder, value, "data")
+
+    def from_argument(self, builder: Any, value: Any) -> Any:
+        kind = self._fe_type
+        word = ir.IntType(64)
+        known = {
+            "nitems": ir.Constant(word, prod(kind.lengths)),
+            "itemsize": ir.Constant(word, kind.itemsize),
+            "shape": _words(kind.lengths),
+            "strides": _words(kind.steps),
+            "meminfo": self._null("meminfo"),
+            "parent": self._null("parent"),
+            "data": value,
+        }
+        array = ir.Constant(self.get_value_type(), ir.Undefined)
+        for name, part in known.items():
+            array = self.set(builder, array, part, name)
+        return array
+
+    def _model_of(self, name: str) -> Any:
+        return self.get_model(self.get_field_position(name))
+
+    def _null(self, name: str) -> Any:
+        return ir.Constant(self._model_of(name).get_value_type(), None)
+
+
+class _ConstantModel(models.DataModel):
+    """As an argument, nothing."""
+
+    def get_argument_type(self) -> Any:
+        return ()
+
+    def as_argument(self, builder: Any, value: Any) -> Any:
+        return ()
+
+    def from_argument(self, builder: Any, value: Any) -> Any:
+        return ir.Constant(self.get_value_type(), int(self._fe_type.literal_value))
+
+
+@register_model(Constant)
+class _ConstantIntegerModel(_ConstantModel, models.IntegerModel):
+    """A whole number."""
+
+
+@register_model(ConstantFlag)
+class _ConstantFlagModel(_ConstantModel, models.BooleanModel):
+    """True or false."""
+
+
+@unbox(Constant)
+@unbox(ConstantFlag)
+def _unbox_constant(kind: Any, value: Any, compiler: Any) -> NativeValue:
+    word = compiler.context.get_value_type(kind)
+    return NativeValue(ir.Constant(word, int(kind.literal_value)))
+
+
+@lower_cast(SizedArray, nb_types.Array)
+def _forget_shape(context: Any, builder: Any, kind: Any, other: Any, value: Any) -> Any:
+    return value
+
+
+def _words(numbers: tuple[int, ...]) -> Any:
+    word = ir.IntType(64)
+    return ir.Constant(ir.ArrayType(word, len(numbers)), [ir.Constant(word, n) for n in numbers])
+
+
+def layout_of(value: Any, inside: bool = False) -> Any:
+    """Return, hashable, what the type of an argument depends on; quicker than to make the type.
+
+    ``inside`` a NamedTuple arrays have known shapes.
+    """
+    kind: Any = type(value)
+    if kind in _PLAIN:
+        return kind
+    if kind is np.ndarray:
+        flags = value.flags
+        if inside and value.size <= _MOST_ELEMENTS:
+            return value.shape, value.strides, value.dtype, flags.aligned, flags.writeable
+        order = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
+        return value.ndim, order, value.dtype, flags.aligned, flags.writeable
+    if isinstance(value, tuple):
+        constants = tuple((type(value[i]), value[i]) for i in constant_fields(kind))
+        return kind, constants, tuple(layout_of(part, True) for part in value)
+    return numba.typeof(value)
+
+
+def type_of(value: Any, inside: bool = False) -> nb_types.Type:
+    """Return the type of an argument; see ``layout_of``."""
+    layout = layout_of(value, inside)
+    found = _types.get(layout)
+    if found is None:
+        found = _types[layout] = _make_type(value, inside)
+    return found
+
+
+def _make_type(value: Any, inside: bool) -> nb_types.Type:
+    if isinstance(value, np.ndarray) and inside and value.size <= _MOST_ELEMENTS:
+        return SizedArray(value)
+    if not isinstance(value, tuple):
+        return numba.typeof(value)
+    constants = constant_fields(type(value))
+    parts = [
+        _constant_type(part) if i in constants else type_of(part, True)
+        for i, part in enumerate(value)
+    ]
+    if not hasattr(value, "_fields"):
+        return nb_types.BaseTuple.from_types(parts)
+    if parts and not constants and parts.count(parts[0]) == len(parts):
+        return nb_types.NamedUniTuple(parts[0], len(parts), type(value))
+    return nb_types.NamedTuple(parts, type(value))
+
+
+def _constant_type(value: Any) -> nb_types.Type:
+    return ConstantFlag(value) if isinstance(value, bool) else Constant(int(value))
+
+
+@functools.cache
+def constant_fields(kind: Any) -> tuple[int, ...]:
+    """Return the indices of the fields of a NamedTuple that are annotated as constants."""
+    notes = getattr(kind, "__annotations__", {})
+    fields = [notes.get(name) for name in getattr(kind, "_fields", ())]
+    return tuple(i for i, note in enumerate(fields) if _is_constant(note))
+
+
+def _is_constant(note: Any) -> bool:
+    postponed = getattr(note, "__forward_arg__", None)
+    return note in (Size, Flag) or postponed in ("Size", "Flag")
