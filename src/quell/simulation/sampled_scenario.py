@@ -86,7 +86,7 @@ class SampledScenario:
         t = np.arange(first, last, dtype=np.float64)
         t *= self.dt
         derivatives, w = _columns(self.derivatives, t), _columns(disturbances, t)
-        r, added = np.ascontiguousarray(reference(t)), np.ascontiguousarray(noise(t))
+        r, added = (np.ascontiguousarray(s(t), np.float64) for s in (reference, noise))
         return Segment(first, self.dt, first in self.rest_samples, r, derivatives, w, added)
 
 
