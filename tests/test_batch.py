@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import quell as ql
-from quell.parallel import in_parallel
+from quell.parallel import in_parallel, one_blas_thread
 from quell.plants import PlantBatch, batch, two_mass_spring
 from quell.simulation import sampled_scenario
 
@@ -513,3 +514,19 @@ def test_of_several_faults_the_first_job_s_is_told_whichever_came_first() -> Non
 
     with pytest.raises(ValueError, match="run 0"):
         in_parallel([slow, quick], workers=2)
+
+
+def test_blas_has_one_thread_until_the_last_of_several_blocks_ends() -> None:
+    """They may be nested, and in several threads end in any order."""
+
+    def threads() -> set[int]:
+        return {lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"}
+
+    with threadpool_limits(2, user_api="blas"):
+        first, second = one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert threads() == {1}
+        second.__exit__(None, None, None)
+        assert threads() == {2}

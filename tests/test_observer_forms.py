@@ -48,6 +48,19 @@ def records(rng: np.random.Generator, samples: int = 800) -> tuple[np.ndarray, n
     return np.cumsum(rng.normal(size=samples)) * 1e-2, np.cumsum(rng.normal(size=samples)) * 1e-2
 
 
+def test_a_model_that_is_sampled_again_is_as_it_was() -> None:
+    """Whatever was done to the first result: matrix exponentials are kept."""
+    for A, inputs in (([[-2.0]], [[[1.0]]]), ([[0.0, 1.0], [-4.0, -0.1]], [])):
+        first, second = (
+            zero_order_hold(np.array(A), [np.array(B) for B in inputs], 0.1) for _ in range(2)
+        )
+        for one, other in zip((first[0], *first[1]), (second[0], *second[1]), strict=True):
+            one += 1.0
+            np.testing.assert_array_equal(one, other + 1.0)
+    phi, _ = zero_order_hold(np.array([[-2.0]]), [np.ones((1, 1))], 0.1)
+    assert phi[0, 0] == pytest.approx(math.exp(-0.2), rel=1e-15)
+
+
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_the_reduced_form_is_the_reduced_order_observer(
     order: int, rng: np.random.Generator

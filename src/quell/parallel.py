@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 R = TypeVar("R")
 _BLAS_LOCK = threading.Lock()
+_BLAS_LIMITS: list[Any] = []  # the first block's setting, and None for each further block
 
 
 def in_parallel(
@@ -56,10 +57,18 @@ def one_blas_thread() -> Iterator[None]:
 
     OpenBLAS divides even the solution of seven equations among its threads. If another program uses
     a core, each call then waits for the operating system: ten milliseconds, not ten microseconds.
+    Blocks may be nested, and in several threads.
     """
-    # The setting holds for the whole process: two at a time could restore each other's.
-    with _BLAS_LOCK, _blas().limit(limits=1, user_api="blas"):
+    # The setting holds for the whole process: the first block makes it, the last one restores it.
+    with _BLAS_LOCK:
+        _BLAS_LIMITS.append(None if _BLAS_LIMITS else _blas().limit(limits=1, user_api="blas"))
+    try:
         yield
+    finally:
+        with _BLAS_LOCK:
+            first = _BLAS_LIMITS.pop()
+            if first is not None:
+                first.restore_original_limits()
 
 
 @cache

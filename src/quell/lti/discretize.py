@@ -8,6 +8,7 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 
+from quell.parallel import one_blas_thread
 from quell.types import Matrix
 
 
@@ -35,7 +36,8 @@ def _exponential(size: int, block: bytes) -> Matrix:
     """Return exp of a matrix; kept, because a plant is sampled again for each of its runs."""
     from scipy.linalg import expm
 
-    found: Matrix = expm(np.frombuffer(block).reshape(size, size))
+    with one_blas_thread():
+        found: Matrix = expm(np.frombuffer(block).reshape(size, size))
     found.flags.writeable = False
     return found
 
@@ -50,9 +52,8 @@ def gramian(A: Matrix, Q: Matrix, dt: float) -> Matrix:
     Q (n, n) is symmetric. For white noise of density Q on x' the result is the covariance added in
     a sample. With Aᵀ for A it is the weight of x(0) in the cost ``∫ xᵀ Q x dt`` of a sample.
     """
-    from scipy.linalg import expm
-
     n = A.shape[0]
-    block = expm(np.block([[-A, Q], [np.zeros((n, n)), A.T]]) * dt)
-    found: Matrix = block[n:, n:].T @ block[:n, n:]
+    block = np.block([[-A, Q], [np.zeros((n, n)), A.T]]) * dt
+    sampled = _exponential(2 * n, block.tobytes())
+    found: Matrix = sampled[n:, n:].T @ sampled[:n, n:]
     return 0.5 * (found + found.T)
