@@ -12,7 +12,7 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.analysis.margins import margins
+from quell.analysis.margins import least, margins
 from quell.controllers.linear.law import LinearLaw
 from tests.analysed_loops import PLANT, adrc, chain
 
@@ -137,6 +137,26 @@ def test_a_crossing_that_loses_nothing_is_no_gain_margin() -> None:
     assert m.gain == pytest.approx((0.25, 3.0), rel=1e-9)
     assert m.gain_omega == pytest.approx((4.0, 2.0), rel=1e-9)
     assert margins(loop, omega, 0.1, lambda gain: True).gain == (0.0, math.inf)
+
+
+def test_the_lowest_of_several_dips_is_found_between_the_points_of_the_grid() -> None:
+    """Also where the grid shows it as the third lowest; at the ends of the grid it is a grid point."""
+
+    def dips(omega: Any) -> Any:
+        x = np.log(omega)
+        depths = ((0.5, 1.0), (0.6, 2.0), (0.8, 3.15), (0.1, 4.0))
+        return 1.0 - sum(depth * np.exp(-(((x - at) / 0.1) ** 2)) for depth, at in depths)
+
+    omega = np.exp(np.arange(0.0, 5.01, 0.25))
+    order = np.argsort(dips(omega))
+    assert np.log(omega[order[:3]]) == pytest.approx([2.0, 1.0, 3.25])
+    value, at = least(dips, omega, dips(omega))
+    assert value == pytest.approx(0.2, abs=1e-9)
+    assert math.log(at) == pytest.approx(3.15, abs=1e-4)
+    for turned in (1.0, -1.0):
+        values = (lambda w, turned=turned: turned * np.log(w))(omega)
+        found = least(lambda w, turned=turned: turned * np.log(w), omega, values)
+        assert found == (np.min(values), omega[int(np.argmin(values))])
 
 
 def test_a_disk_margin_of_two_allows_any_gain_and_a_quarter_turn() -> None:

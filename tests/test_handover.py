@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.controllers.adrc.handover import samples_to_settle
 from quell.controllers.adrc.law import unlimited_control
 from quell.controllers.base import control
 from quell.observers.base import expected_measurement
@@ -54,6 +55,17 @@ def test_a_start_under_load_makes_no_bump() -> None:
         worst[name] = moved
     assert worst["start"] < 1e-12
     assert worst["cold"] > 0.1
+
+
+def test_a_start_takes_forty_time_constants_of_the_slowest_part_of_the_observer() -> None:
+    """Of its lag or of its slowest pole, whichever is longer, and no more than some seconds."""
+    assert samples_to_settle(OBSERVER) == round(40.0 * (3 / 20.0) / DT) + 3
+    nonlinear = ESO.nonlinear(2, 2.0, 20.0, DT, delta=0.1, delay=0.02)
+    assert samples_to_settle(nonlinear) == round(40.0 * (3 / 20.0) / DT) + 5
+    for zero, wanted in ((-0.05, 40.0 / 0.05 / DT), (-1e-9, 1e8)):
+        plant = ([3.0, -3.0 * zero], np.poly([-1.0, -0.3, -0.5]))
+        slow = ESO.model_based(plant, 20.0, DT, keep_zeros=True)
+        assert samples_to_settle(slow) == pytest.approx(wanted + 4, rel=1e-4)
 
 
 def test_a_start_towards_another_reference_goes_on_from_u() -> None:

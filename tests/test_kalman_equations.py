@@ -16,15 +16,22 @@ OBSERVER = ql.ESO.model_free(order=2, b0=2.0, omega_o=21.0, dt=5e-3)
 DT, TAU = 5e-3, 3 / 21.0
 LEARNERS = {
     "all features": ql.learners.Harmonic(count=2, u=True, state_bandwidth=(0.3, 0.7)),
-    "no bias": ql.learners.Kalman(bias=False, u=True, state_bandwidth=0.5, prior=3.0),
+    "no bias": ql.learners.Kalman(
+        bias=False, u=True, state_bandwidth=0.5, prior=3.0, frequency=2.0, gain_interval=(0.8, 1.3)
+    ),
     "bias and u": ql.learners.Kalman(state=False, u=True, bias_bandwidth=50.0),
+    "slow pair": ql.learners.Harmonic(bias_bandwidth=5.0),
+    "pair without bias": ql.learners.Harmonic(
+        bias=False, omegas=(2.5,), limits=(2.3, 2.7), pair_bandwidth=9.0
+    ),
 }
 
 
 class Reference:
     """The equations of ``learners/kalman/kernels.py`` and ``oscillators.py``, with matrices."""
 
-    def __init__(self, learner: ql.learners.Kalman, frequency: float) -> None:
+    def __init__(self, learner: ql.learners.Kalman, omega_c: float) -> None:
+        frequency = omega_c if learner.frequency is None else learner.frequency
         n, pairs = 2 * learner.state, 2 * getattr(learner, "count", 0)
         bias, u = int(learner.bias), int(learner.u)
         self.learner, self.n, self.pairs, self.p = learner, n, pairs, n + bias + pairs + u
@@ -36,13 +43,16 @@ class Reference:
         self.limits = np.concatenate([limits[:n], [0.0] * (bias + pairs), limits[2:] * u])[: self.p]
         fast = 21.0 if learner.bias_bandwidth is None else learner.bias_bandwidth
         slow = np.resize(learner.state_bandwidth, 2)[:n]
-        self.walk = np.concatenate([slow, [fast] * bias, [2.5 * fast] * pairs, [0.0] * u])
+        pair = getattr(learner, "pair_bandwidth", None) or 2.5 * fast
+        self.walk = np.concatenate([slow, [fast] * bias, [pair] * pairs, [0.0] * u])
         prior = [learner.prior * frequency**2] * n + [0.0] * (bias + pairs) + [1.0] * u
         self.P, self.theta = np.diag(np.square(prior)), np.zeros(self.p)
         self.fastest, self.f_noise = max(fast, 21.0), noise[2]
         self.mean, self.variance = np.zeros(self.p), np.zeros(self.p)
         self.weighted, self.weight, self.samples = np.zeros(2), 0.0, 0
-        self.omega = frequency * 0.3 ** np.arange(pairs // 2)
+        start = getattr(learner, "omegas", None) or omega_c * 0.3 ** np.arange(pairs // 2)
+        self.omega = np.array(start)
+        self.limits_of_omega = getattr(learner, "limits", None) or (0.02 * omega_c, 0.5 * 21.0)
         self.psi = np.zeros(pairs // 2)
         self.chain = lag_memory(lag_of(OBSERVER), self.p)
         self.filtered = np.zeros(self.p)
@@ -90,7 +100,8 @@ class Reference:
             s, c = self.theta[first + 2 * j : first + 2 * j + 2]
             turn_s, turn_c = (gain * error)[first + 2 * j : first + 2 * j + 2]
             angle = (s * turn_c - c * turn_s) / (s**2 + c**2 + 60.0 * self.weighted[1])
-            self.omega[j] = np.clip(self.omega[j] * (1.0 + 0.4 * angle), 0.02 * 3.0, 0.5 * 21.0)
+            turned = self.omega[j] * (1.0 + 0.4 * angle)
+            self.omega[j] = np.clip(turned, *self.limits_of_omega)
 
     def commit(self, x: np.ndarray, u: float) -> None:
         """Store what was applied."""

@@ -26,7 +26,8 @@ STARTUP = round(2.0 * LAG / DT)
 class Gate:
     """The equations of ``learners/noise_gate.py``."""
 
-    def __init__(self) -> None:
+    def __init__(self, frequency: float = FREQUENCY) -> None:
+        self.frequency = frequency
         noise = relative_noise(OBSERVER)
         self.f_noise = noise[2]
         self.least = 36.0 * noise / [1.0, 1.0, B0**2]
@@ -53,7 +54,7 @@ class Gate:
 
     def confidence(self, size: float) -> float:
         """Return ``F²/(F² + (3σ)²)``."""
-        motion = (FREQUENCY**2 * size) ** 2 * self.noise[1]
+        motion = (self.frequency**2 * size) ** 2 * self.noise[1]
         return float(motion / (motion + 9.0 * self.f_noise * self.noise[0]))
 
 
@@ -62,14 +63,15 @@ class Regression:
 
     def __init__(self, learner: Any, bias_bandwidth: float = OMEGA_O) -> None:
         self.learner, self.design = learner, learner.design(OBSERVER, FREQUENCY)
-        self.gate, self.lag = Gate(), lag_of(OBSERVER)
+        self.gate, self.lag = Gate(learner.frequency or FREQUENCY), lag_of(OBSERVER)
         self.p = len(learner.feature_names(2))
-        self.scale = np.full(4, 1e-100)
+        self.scale = np.full(4, 1e-100) if learner.scale is None else learner.scale.copy()
         self.theta, self.filtered = np.zeros(self.p), np.zeros(self.p)  # in the plant's units
         self.chain = lag_memory(self.lag, self.p)
-        self.bias, self.bias_gain = 0.0, bias_bandwidth * DT
+        self.bias, self.bias_gain = 0.0, min(bias_bandwidth * DT, 1.0)
         self.samples, self.learn_after, self.has_scale = 0, 0, False
-        self.P = getattr(self.design.rule, "prior", 1.0) * np.eye(self.p)
+        self.prior = getattr(learner, "prior", 10.0) ** 2
+        self.P = self.prior * np.eye(self.p)
 
     @property
     def units(self) -> np.ndarray:
@@ -100,7 +102,7 @@ class Regression:
             if np.any(self.scale[:2] != before[:2]) and np.any(lost):
                 self.theta[lost] = self.filtered[lost] = self.chain[lost] = 0.0
                 self.learn_after = self.samples + STARTUP
-            self.P = getattr(self.design.rule, "prior", 1.0) * np.eye(self.p)
+            self.P = self.prior * np.eye(self.p)
         error = f - self.theta @ self.filtered
         self.bias += self.bias_gain * (error - self.bias)
         share = self.gate.confidence(self.scale[0])
@@ -109,20 +111,24 @@ class Regression:
         phi, error = self.filtered * self.units, error / self.scale[3]
         self.theta += self.step(phi, error, share) * self.units * self.scale[3]
         if self.learner.features.has_input:
-            self.theta[-1] = np.clip(self.theta[-1], -0.5 * B0, B0)
+            low, high = self.learner.gain_interval
+            self.theta[-1] = np.clip(self.theta[-1], B0 * (low - 1.0), B0 * (high - 1.0))
 
     def step(self, phi: np.ndarray, error: float, share: float) -> np.ndarray:
         """Return the change of the scaled θ."""
-        rule = self.design.rule
-        if hasattr(rule, "gain"):
-            return FREQUENCY * DT * share * error * phi / (0.01 + phi @ phi)
-        R, keep = LAG / DT / share, math.exp(-DT * FREQUENCY / 100.0)
+        learner = self.learner
+        if isinstance(learner, ql.learners.NLMS):
+            rate = learner.rate or FREQUENCY
+            return rate * DT * share * error * phi / (learner.regularisation + phi @ phi)
+        R, keep = LAG / DT / share, math.exp(-DT / (learner.memory_time or 100.0 / FREQUENCY))
         gain = self.P @ phi
         zeta = phi @ gain / R
         if zeta == 0.0:
             return np.zeros(self.p)
         factor = (keep - (1.0 - keep) / zeta) / (R * keep * (1.0 + zeta))
-        if not (factor < 0.0 and np.trace(self.P - factor * np.outer(gain, gain)) > self.p * 100.0):
+        if not (
+            factor < 0.0 and np.trace(self.P - factor * np.outer(gain, gain)) > self.p * self.prior
+        ):
             self.P = self.P - factor * np.outer(gain, gain)
         return gain * error / (R * (1.0 + zeta))
 
@@ -164,6 +170,18 @@ LINEAR = {
     "RLS, radial": ql.learners.RLS(State() + RBF(6) + Bias()),
     "NLMS": ql.learners.NLMS(features=State() + Bias() + Input(), bias_bandwidth=3.0),
     "NLMS, radial": ql.learners.NLMS(features=State() + RBF(6)),
+    "RLS, given": ql.learners.RLS(
+        State() + Input(),
+        memory_time=2.0,
+        prior=3.0,
+        frequency=1.1,
+        scale=[2.0, 8.0, 1.0, 16.0],
+        gain_interval=(0.97, 1.05),
+        bias_bandwidth=1e9,
+    ),
+    "NLMS, given": ql.learners.NLMS(
+        5.0, State() + Input(), regularisation=0.2, gain_interval=(0.8, 1.1)
+    ),
 }
 
 

@@ -177,6 +177,24 @@ def test_the_levels_of_a_cascade_have_the_poles_they_were_given() -> None:
     )
 
 
+def test_a_cascade_follows_its_equations(rng: np.random.Generator) -> None:
+    """Each level is fed the f of the levels before it, of the sample before, and follows their output."""
+    observer = ESO.cascade(2, 2.0, 40.0, DT, levels=3, ratio=2.0)
+    plain = [ESO.model_free(2, 2.0, omega, DT).model for omega in (10.0, 20.0, 40.0)]
+    (y, u), f_learned = records(rng, 100), rng.normal(size=100)
+    found = run_observer(observer, y, u, f_learned)
+    levels = np.array([[y[0], 0.0, 0.0]] * 3)
+    for k in range(1, 100):
+        fed = f_learned[k - 1] + np.append(0.0, np.cumsum(levels[:-1, 2]))
+        target = y[k]
+        for level, model in enumerate(plain):
+            z = model.transition @ levels[level] + model.input * u[k - 1] + model.feed * fed[level]
+            levels[level] = z + model.gain * (target - z[0])
+            target = levels[level][0]
+        expected = [*levels[2][:2], np.sum(levels[:, 2])]
+        np.testing.assert_allclose(found[k], expected, rtol=1e-9, atol=1e-9)
+
+
 def test_a_cascade_finds_a_ramp_of_f_without_lag() -> None:
     """Each level adds a power: one level trails a ramp by N/omega_o, two do not."""
     observer, plain = ESO.cascade(1, 1.0, 20.0, DT), ESO.model_free(1, 1.0, 20.0, DT)
@@ -416,6 +434,16 @@ def test_the_response_of_an_observer_is_its_update_as_matrices(
     ):
         assert direct.shape == (wanted.size, 3)
         np.testing.assert_allclose(state @ z + direct @ inputs, wanted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in FORMS if not FORMS[name].has_one_pole])
+def test_noise_gains_are_those_of_the_lyapunov_equation(name: str) -> None:
+    """``P = M P Mᵀ + g gᵀ`` and ``diag (C P Cᵀ + d dᵀ)``, where poles are not in one place."""
+    found = response(FORMS[name].model, 3)
+    g, d = found.input[:, :1], found.feedthrough[:, :1]
+    P = solve_discrete_lyapunov(found.transition, g @ g.T)
+    expected = np.diag(found.output @ P @ found.output.T + d @ d.T)
+    np.testing.assert_allclose(noise_gains(FORMS[name]), expected, rtol=1e-5)
 
 
 def test_noise_gains_of_order_one_are_those_of_the_closed_form() -> None:

@@ -190,6 +190,93 @@ def test_a_process_is_a_gaussian_process_while_its_budget_lasts(rng: np.random.G
     np.testing.assert_allclose([infer(design, memory, x) for x in points], expected, atol=1e-9)
 
 
+def test_a_process_follows_its_equations_when_points_are_added_and_removed(
+    rng: np.random.Generator,
+) -> None:
+    """Van Vaerenbergh et al., eqs. (9)-(13), with matrices; the point is removed that costs least."""
+    model = GaussianProcessModel(6, 0.6, 1, 30.0, 0.2, 1.0)
+    design, keep, noise = model.design(2, 1.0), math.exp(-1.0 / 30.0), 0.04
+    memory = model.memory(design)
+
+    def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.exp(-np.sum((a[:, None] - b[None]) ** 2, axis=2) / (2.0 * 0.6**2))
+
+    points, mean, cov, merged = np.zeros((0, 2)), np.zeros(0), np.zeros((0, 0)), 0
+    for k in range(60):
+        x, target = rng.uniform(-1.0, 1.0, 2), rng.normal()
+        if k % 5 == 4:
+            x = points[0] + 0.01
+        learn(design, memory, x, target)
+        K = kernel(points, points)
+        mean, cov = math.sqrt(keep) * mean, keep * cov + (1.0 - keep) * K
+        to_x = kernel(points, x[None])[:, 0]
+        q = np.linalg.solve(K, to_x)
+        novelty, h = 1.0 - to_x @ q, cov @ q
+        variance, error = novelty + q @ h, target - q @ mean
+        if novelty > 1e-2:
+            points, mean = np.vstack([points, x]), np.append(mean, q @ mean)
+            h = np.append(h, variance)
+            cov = np.block([[cov, h[:-1, None]], [h[None]]])
+        else:
+            merged += 1
+        mean, cov = mean + h * error / (variance + noise), cov - np.outer(h, h) / (variance + noise)
+        if len(points) > 6:
+            Q = np.linalg.inv(kernel(points, points))
+            out = int(np.argmin((Q @ mean) ** 2 / np.diag(Q)))
+            points, mean = np.delete(points, out, 0), np.delete(mean, out)
+            cov = np.delete(np.delete(cov, out, 0), out, 1)
+        assert memory.counters[0] == len(points)
+        there = np.vstack([points, rng.uniform(-1.0, 1.0, (3, 2))])
+        expected = kernel(there, points) @ np.linalg.solve(kernel(points, points), mean)
+        np.testing.assert_allclose([infer(design, memory, x) for x in there], expected, atol=1e-7)
+        count = len(points)
+        order = [int(np.argmin(np.sum((memory.points[:count] - c) ** 2, axis=1))) for c in points]
+        found = memory.covariance[:count, :count][np.ix_(order, order)]
+        np.testing.assert_allclose(found, cov, atol=1e-7)
+    assert merged > 5
+
+
+def test_a_network_follows_the_equations_of_its_filter(rng: np.random.Generator) -> None:
+    """The extended Kalman filter with directional forgetting; errors and weights are bounded."""
+    model = Network(3, 1, 2, 9.0, 0.3, 4.0)
+    design = model.design(2, 0.5)
+    memory = model.memory(design)
+    theta, P = memory.theta.copy(), 9.0 * np.eye(13)
+    first = theta[:12].reshape(3, 4)
+    assert not np.any(first[:, 0])
+    # Each unit switches within the range of the features: c_j + W_j φ = 0 for a φ in [−1, 1]².
+    assert np.all(np.abs(first[:, 1]) <= np.sum(np.abs(first[:, 2:]), axis=1))
+    assert np.std(first[:, 2:]) == pytest.approx(3.0, rel=0.7)
+    R, keep, bounded = 0.09 * 4.0, math.exp(-1.0 / 9.0), 0
+    for k in range(120):
+        x, target = rng.uniform(-1.0, 1.0, 2), 3.0 * rng.normal() if k > 60 else rng.normal()
+        learn(design, memory, x, target)
+        if k % 2 == 1:  # every second pair
+            v, c, W = theta[:12:4], theta[1:12:4], theta[:12].reshape(3, 4)[:, 2:]
+            unit = np.tanh(c + W @ x)
+            slope = v * (1.0 - unit**2)
+            g = np.append(np.column_stack([unit, slope, slope[:, None] * x]).ravel(), 1.0)
+            error = np.clip(target - theta[12] - v @ unit, -1.0, 1.0)
+            gain = P @ g
+            zeta = g @ gain / R
+            theta = np.clip(theta + gain * error / (R * (1.0 + zeta)), -30.0, 30.0)
+            bounded += abs(error) == 1.0
+            factor = (keep - (1.0 - keep) / zeta) / (R * keep * (1.0 + zeta))
+            P = P - factor * np.outer(gain, gain)
+            assert np.trace(P) < 13 * 9.0
+        np.testing.assert_allclose(memory.theta, theta, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(memory.covariance, P, rtol=1e-5, atol=1e-8)
+    assert bounded > 10
+    memory.theta[:] = 29.9
+    for _ in range(4):
+        learn(design, memory, np.ones(2), 1e9)
+    assert np.max(np.abs(memory.theta)) <= 30.0
+    before = memory.theta.copy()
+    learn(design, memory, np.ones(2), math.nan)
+    learn(design, memory, np.ones(2), math.nan)
+    np.testing.assert_array_equal(memory.theta, before)
+
+
 def test_rounding_of_the_inverse_makes_no_novelty_negative() -> None:
     """A point as known as can be: γ² is zero and no less, also where Q is a little too large."""
     model = GaussianProcessModel(5, 0.5, 1, math.inf, 0.1, 1.0)

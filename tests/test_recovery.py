@@ -158,6 +158,7 @@ def test_a_number_that_is_none_does_not_blind_the_watch(bad: float) -> None:
 def test_a_window_is_ten_lags_of_the_observer() -> None:
     """At least a sample; an output is in proportion up to 2¹⁰ of the f of the last window."""
     assert window_samples(ql.ESO.model_free(2, 1.0, 20.0, 0.01)) == 150
+    assert window_samples(ql.ESO.model_free(1, 1.0, 1e4, 0.01)) == 1
     watch = LearnerWatch.zeros()[0]
     watch.most_before = 2.0
     assert is_in_proportion(watch, -2048.0)
