@@ -100,18 +100,24 @@ def test_the_sliding_sum_of_algorithm_1_does_not_drift(rng: np.random.Generator)
     np.testing.assert_allclose(memory.total, memory.residuals @ memory.features, rtol=1e-12)
 
 
-def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
-    """Restarting keeps what was learned, but not where it is no number."""
+def test_a_learner_that_left_the_range_of_numbers_begins_anew(rng: np.random.Generator) -> None:
+    """Restarting keeps what was learned and is in the buffers, but not where it is no number."""
     learner = ql.learners.BatchGradient(batch=4)
     design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
     memory = learner.memory(design)
-    memory.theta[:] = 0.25
-    restart(design, memory)
-    assert np.all(memory.theta == 0.25)
-    memory.theta[0] = np.inf
-    restart(design, memory)
-    for array, fresh in zip(memory, learner.memory(design), strict=True):
-        np.testing.assert_array_equal(array, fresh)
+    for lost in ("theta", "total"):
+        for _ in range(6):
+            adapt(design, memory, rng.normal(size=3), 0.0, 0.3, rng.normal())
+        before = [array.copy() for array in memory]
+        restart(design, memory)
+        for array, kept in zip(memory, before, strict=True):
+            np.testing.assert_array_equal(array, kept)
+        getattr(memory, lost)[1] = np.inf
+        memory.features[2, 1] = np.inf
+        restart(design, memory)
+        for name, fresh in learner.memory(design)._asdict().items():
+            if name != "current":  # work space
+                np.testing.assert_array_equal(getattr(memory, name), fresh)
 
 
 @pytest.mark.parametrize(

@@ -91,6 +91,28 @@ def test_rls_forgets_along_what_it_sees_and_nowhere_else() -> None:
     )
 
 
+def test_the_uncertainty_of_rls_does_not_grow_beyond_that_of_the_prior() -> None:
+    """Forgetting along a feature ends where the trace is that of the prior, and not before."""
+    rule, memory = rls(2, forget=0.01)
+    small = np.array([1e-3, 0.0])
+    update_theta(rule, memory, np.zeros(2), small, 0.0, 1.0)
+    np.testing.assert_array_equal(memory.covariance, 9.0 * np.eye(2))
+    update_theta(rule, memory, np.zeros(2), np.array([0.0, 2.0]), 0.0, 1.0)
+    update_theta(rule, memory, np.zeros(2), small, 0.0, 1.0)
+    assert memory.covariance[0, 0] == pytest.approx(9.0 / 0.99, rel=1e-4)
+
+
+@pytest.mark.parametrize("covariance", [-9.0, 1e100, math.nan])
+def test_rls_learns_nothing_with_what_is_no_covariance(covariance: float) -> None:
+    """θ and P stay as they are."""
+    rule, memory = rls(2, forget=0.01)
+    memory.covariance[:] = before = covariance * np.eye(2)
+    theta = np.array([0.5, -0.25])
+    update_theta(rule, memory, theta, np.array([1.0, 2.0]), 3.0, 1.0)
+    np.testing.assert_array_equal(memory.covariance, before)
+    assert theta.tolist() == [0.5, -0.25]
+
+
 def test_rls_follows_what_drifts_in_its_memory_time(rng: np.random.Generator) -> None:
     """A step of a coefficient is learned with the time constant 1/forget samples."""
     rule, memory = rls(1, forget=0.01)

@@ -45,6 +45,8 @@ def least_squares_gain(
         length += total * total
         trace += covariance[i, i]
     if not 0.0 < spread < 1e100:  # φ is zero, or P is not a covariance any more: learn nothing
+        for i in range(size):
+            gain[i] = 0.0  # zero times what is not finite would be NaN
         return 0.0
     inverse = 1.0 / (noise + spread)
     share = (1.0 - rule.forget - rule.forget * noise / spread) * inverse / (1.0 - rule.forget)
