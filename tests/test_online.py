@@ -375,6 +375,11 @@ def test_what_a_model_learned_is_kept_unless_it_is_no_number(rng: np.random.Gene
             lambda: ql.learners.GaussianProcess(length=0.0),
             "length = 0.0: must be finite and greater than zero",
         ),
+        *(
+            (lambda values=values: ql.learners.GaussianProcess(**values), f"{name} = {value}: must")
+            for values in ({"every": 0}, {"memory_time": -1.0}, {"noise": 0.0})
+            for name, value in values.items()
+        ),
         (lambda: ql.learners.BatchGradient(features=3), "features = 3: must be made of blocks"),
     ],
 )
