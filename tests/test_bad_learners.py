@@ -296,22 +296,26 @@ def test_features_of_ones_own_that_fit_are_taken() -> None:
 
 
 def learner_with(
-    missing: tuple[str, ...] = (), says: Any = (0.0, 0.0), width: int = 1, memory: Any = None
+    missing: tuple[str, ...] = (),
+    says: Any = (0.0, 0.0),
+    width: int = 1,
+    memory: Any = None,
+    **other: Callable[..., Any],
 ) -> Any:
-    """A learner called Whole, without the functions that are ``missing``."""
+    """A learner called Whole, without the functions that are ``missing``, or with ``other`` ones."""
 
     class WholeDesign(NamedTuple):
         width: int
 
     class Whole:
         def design(self, observer: Any, omega_c: float) -> Any:
-            return WholeDesign(1)
+            return other["design"]() if "design" in other else WholeDesign(1)
 
         def memory(self, parameters: Any) -> Any:
             return Memory(np.zeros(1)) if memory is None else memory()
 
         def feature_names(self, order: int) -> tuple[str, ...]:
-            return ("a",) * width
+            return other["names"]() if "names" in other else ("a",) * width
 
     def nothing(learner: Any, memory: Any, *others: Any) -> None: ...
 
@@ -326,8 +330,9 @@ def learner_with(
         ql.learners.base.coefficients: theta,
     }
     for function, implementation in functions.items():
-        if function.__name__ not in missing:  # type: ignore[attr-defined]
-            function.register(WholeDesign)(implementation)
+        name = function.__name__  # type: ignore[attr-defined]
+        if name not in missing:
+            function.register(WholeDesign)(other.get(name, implementation))
     return Whole()
 
 
@@ -350,6 +355,50 @@ def learner_with(
             lambda: learner_with(width=0),
             "Whole: coefficients fails with IndexError.*it has 0 names",
         ),
+        *(
+            (
+                lambda says=says: learner_with(says=says),
+                r"Whole: predict returns \(.*\): must return \(constant, slope\), two numbers",
+            )
+            for says in ((1.0,), (1.0, 2.0, 3.0))
+        ),
+        (
+            lambda: learner_with(says=("1", 0.0)),
+            "Whole: predict, constant, returns str: must return one number",
+        ),
+        *(
+            (
+                lambda name=name: learner_with(**{name: raises}),
+                f"Whole: {name} fails with KeyError: 'nothing here'; {rule}",
+            )
+            for name, rule in (
+                *dict.fromkeys(("adapt", "predict", "commit", "restart"), "docs/extend").items(),
+                ("coefficients", "it has 1 names"),
+            )
+        ),
+        (
+            lambda: learner_with(design=raises),
+            r"Whole.design\(observer, 4\) fails with KeyError.*design takes \(observer, omega_c\)",
+        ),
+        (
+            lambda: learner_with(design=lambda: {"rate": 1.0}),
+            r"Whole.design\(observer, 4\) returns dict: must return a NamedTuple",
+        ),
+        (
+            lambda: learner_with(memory=raises),
+            r"Whole.memory\(...\) fails with KeyError.*memory takes \(parameters\)",
+        ),
+        (
+            lambda: learner_with(names=raises),
+            r"Whole.feature_names\(2\) fails with KeyError.*feature_names takes the plant's order",
+        ),
+        *(
+            (
+                lambda names=names: learner_with(names=lambda: names),
+                r"Whole.feature_names\(2\) returns .*: must return a tuple with a name for each",
+            )
+            for names in (["a"], ("a", 1), "a")
+        ),
         (lambda: learner_with(memory=lambda: Memory([0.0])), "Whole.memory has weight, list"),
         (
             lambda: learner_with(memory=lambda: Memory(np.zeros(1, dtype=int))),
@@ -361,6 +410,37 @@ def test_a_learner_that_does_not_fit_is_named(make: Any, message: str) -> None:
     """With its class and the rule."""
     with pytest.raises(ValueError, match=message):
         law(make())
+
+
+def test_a_learner_is_tried_on_what_a_loop_shows_it() -> None:
+    """Estimates (n + 1,), numbers, and room for each coefficient; its memory may be nested."""
+    shown: dict[str, tuple[Any, ...]] = {}
+
+    def keeps(name: str, says: Any = None) -> Callable[..., Any]:
+        def keep(learner: Any, memory: Any, *arguments: Any) -> Any:
+            shown[name] = arguments
+            return says
+
+        return keep
+
+    learner = learner_with(
+        width=4,
+        memory=lambda: Lists(np.zeros(1), Memory(np.zeros(2))),
+        adapt=keeps("adapt"),
+        predict=keeps("predict", (0.0, 0.0)),
+        commit=keeps("commit"),
+        coefficients=keeps("coefficients"),
+        restart=keeps("restart"),
+    )
+    law(learner)
+    sizes = {name: [np.size(each) for each in arguments] for name, arguments in shown.items()}
+    assert sizes == {
+        "adapt": [3, 1, 1, 1],
+        "predict": [3, 1],
+        "commit": [3, 1, 1],
+        "coefficients": [4],
+        "restart": [],
+    }
 
 
 class ExplodesDesign(NamedTuple):

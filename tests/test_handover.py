@@ -24,6 +24,11 @@ PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0]
 LOAD = -3.0  # enters as u does
 
 
+def zero_at(zero: float) -> tuple[list[list[float]], list[float]]:
+    """Return A and B of a plant with y = x_1 and this zero from u."""
+    return [[0.0, 1.0], [-1.0, -0.6]], [1.0, -0.6 - zero]
+
+
 class Rig:
     """A plant under a constant load, sample by sample."""
 
@@ -402,8 +407,30 @@ def test_derivatives_reach_a_loop_of_ones_own() -> None:
             "observer has order = 3, the present one 2",
         ),
         (
+            lambda c: c.retune(observer=ESO.model_free(1, 1.0, 20.0, DT)),
+            "observer has order = 1, the present one 2: must be the same",
+        ),
+        (
             lambda c: c.retune(observer=ESO.model_free(2, 2.0, 20.0, 0.02)),
             "observer has dt = 0.02, the present one 0.01",
+        ),
+        (
+            lambda c: c.retune(observer=ESO.model_free(2, 2.0, 20.0, 0.005)),
+            "observer has dt = 0.005, the present one 0.01",
+        ),
+        (
+            lambda c: c.retune(observer=ESO.model_free(2, 2.0, 20.0, DT, form="predictor")),
+            "observer has form = 'predictor', the present one 'current'",
+        ),
+        (
+            lambda c: c.retune(observer=ESO.model_free(2, 2.0, 20.0, DT, delay=DT)),
+            "observer has states = 4, the present one 3",
+        ),
+        (
+            lambda c: c.retune(
+                observer=ESO.model_based((*zero_at(-1.0), [0.0, 1.0], [1.0, 0.0]), 20.0, DT)
+            ),
+            "observer has degree = 1, the present one 2",
         ),
         (lambda c: c.retune(observer="eso"), "observer = 'eso': must be an ESO"),
         (
@@ -425,10 +452,42 @@ def test_a_mistake_is_named_and_changes_nothing(make: object, message: str) -> N
 
 
 def test_what_was_learned_forbids_another_nominal_gain() -> None:
-    """Its coefficients refer to the old one."""
+    """Its coefficients refer to the old one; nor may the model change, but the bandwidth may."""
     controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman())
-    with pytest.raises(ValueError, match="what was learned refers to that"):
-        controller.retune(observer=ESO.model_free(2, 1.0, 20.0, DT))
+    for other in (
+        ESO.model_free(2, 1.0, 20.0, DT),
+        ESO.model_free(2, 3.0, 20.0, DT),
+        ESO.model_based(PLANT, 20.0, DT),
+    ):
+        with pytest.raises(ValueError, match="what was learned refers to that"):
+            controller.retune(observer=other)
+    controller.retune(observer=ESO.model_free(2, 2.0, 30.0, DT))
+    assert controller.observer.omega_o == 30.0
+
+
+@pytest.mark.parametrize("said", [0.9, -0.9])
+def test_a_guard_limits_what_a_learner_says_at_the_start(said: float) -> None:
+    """As in a sample with f_plain = 0: no faster than 2 omega_o e from zero, which both lie within."""
+    learner, guard = ql.learners.Kalman(state=False), ql.Guard()
+    controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=learner, guard=guard)
+    state = controller._state
+    state.learner.theta[0] = said
+    state.guard.averages.view(float)[:3] = 0.5  # the record of one that is always right
+    state.guard.sample[0].typical_error = 1.0
+    controller.start_at([0.5, 0.0], 2.0)
+    change = 2.0 * 20.0 * DT
+    assert state.loop[0].f_learned == pytest.approx(math.copysign(change, said), rel=1e-12)
+    assert controller.estimate.f == pytest.approx(2.0, rel=1e-12)
+    assert state.seen[2] == pytest.approx(2.0 - math.copysign(change, said), rel=1e-12)
+
+
+def test_without_a_reference_a_started_loop_keeps_the_one_it_was_started_with() -> None:
+    """It counts as the last one; a loop that was not started stays where y is."""
+    for r in (0.5, 0.8):
+        controller = ql.ADRC(OBSERVER, omega_c=3.0)
+        controller.start(0.5, 3.25, r=r)
+        control(controller.parameters, controller._state, math.nan, 0.5)
+        assert controller._state.loop[0].r == r
 
 
 @pytest.mark.parametrize("learner", [None, ql.learners.Kalman()])

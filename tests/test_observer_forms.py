@@ -12,11 +12,12 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import quell as ql
 from quell.lti.discretize import zero_order_hold
-from quell.observers.base import acting_control, begin, observe
+from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
 from quell.observers.nonlinear import fal
 from quell.observers.response import response
+from quell.observers.start import state_for
 
 from .python_step import interpreted
 
@@ -419,6 +420,51 @@ def test_noise_gains_are_what_noise_does(name: str, rng: np.random.Generator) ->
 
 
 @pytest.mark.parametrize("name", FORMS)
+def test_an_observer_begins_at_y_whatever_its_state_was(name: str) -> None:
+    """At rest: x̂_1 = y and all else zero, for any later sample as well while y and u = 0 stay."""
+    observer = FORMS[name]
+    z, seen = np.full(observer.states, 9.0), np.full(3, 9.0)
+    begin(observer.model, z, seen, 2.0)
+    assert seen.tolist() == [2.0, 0.0, 0.0]
+    for _ in range(5):
+        observe(observer.model, z, seen, 2.0, 0.0, 0.0)
+        np.testing.assert_allclose(seen, [2.0, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_states_for_given_estimates_show_them(name: str) -> None:
+    """After a sample with the expected y they are the estimates that the model moves."""
+    observer = FORMS[name]
+    x, f, u = np.array([0.3, -0.8]), 1.7, 0.6
+    z, seen = state_for(observer.model, x, f, u), np.zeros(3)
+    assert z.shape == (observer.states,)
+    y = 0.3 - 0.8 * DT + 0.5 * DT**2 * (1.5 * u + f)
+    assert expected_measurement(observer.model, z, u, 0.0) == pytest.approx(y, rel=1e-12)
+    observe(observer.model, z, seen, y, u, 0.0)
+    assert seen == pytest.approx([y, -0.8 + DT * (1.5 * u + f), f], rel=1e-9)
+
+
+def test_an_observer_says_what_it_is() -> None:
+    """Its lag is that of one pole or of several, its order from 1 to 8."""
+    one_pole = {name for name, observer in FORMS.items() if observer.has_one_pole}
+    assert one_pole == {"current", "predictor", "delay"}
+    assert repr(FORMS["cascade"]) == (
+        "ESO(order=2, b0=1.5, omega_o=20, dt=0.005, form='current') [Cascade]"
+    )
+    assert not ESO.nonlinear(1, 1.0, 10.0, 0.01, delta=0.1).has_one_pole
+    assert ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.1).model.alpha.tolist() == [1.0, 0.5, 0.25]
+    assert ESO.nonlinear(1, 1.0, 10.0, 0.01, delta=0.1).lag_time == pytest.approx(0.2)
+    assert ESO.cascade(1, 1.0, 10.0, 0.01, levels=8, ratio=1.1).states == 16
+    for order in (1, 8):
+        kalman = ESO.kalman(order, 1.0, 0.01, noise_variance=1e-6, drift=1e-2)
+        assert (kalman.order, kalman.degree, kalman.f_degree) == (order, order, order)
+        based = ESO.model_based((np.ones(order), 1.0), 10.0, 0.01)
+        assert (based.order, based.b0, based.cancel_f) == (order, 1.0, 1.0)
+        assert based.cancel.tolist() == [1.0] * order
+        assert based.pole == pytest.approx(math.exp(-0.1))
+
+
+@pytest.mark.parametrize("name", FORMS)
 def test_the_response_of_an_observer_is_its_update_as_matrices(
     name: str, rng: np.random.Generator
 ) -> None:
@@ -527,6 +573,30 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
         (lambda: ESO.model_free(2, 1.0, 10.0, 0.01, half_gain=1), "half_gain = 1"),  # type: ignore
         (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, levels=0), "levels = 0"),
         (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, ratio=0.0), "ratio = 0.0"),
+        (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, ratio=0.5), "ratio = 0.5: must be above 1"),
+        (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, ratio=1.0), "ratio = 1.0: must be above 1"),
+        (lambda: ESO.cascade(2, 1.0, 10.0, 0.01, levels=9), "levels = 9: must be .* from 1 to 8"),
+        *(
+            (
+                lambda change=change: ESO.kalman(
+                    **{"order": 2, "b0": 1.0, "dt": 0.01, "noise_variance": 1e-6, "drift": 1.0}
+                    | change
+                ),
+                message,
+            )
+            for change, message in (
+                ({"order": 0}, "order = 0: must be a whole number from 1 to 8"),
+                ({"order": 9}, "order = 9: must be a whole number from 1 to 8"),
+                ({"dt": 0.0}, "dt = 0.0"),
+                ({"drift": 0.0}, "drift = 0.0"),
+                ({"jitter": -1.0}, "jitter = -1.0"),
+                ({"form": "reduced"}, "form = 'reduced': must be one of current, predictor$"),
+            )
+        ),
+        (
+            lambda: ESO.model_based(([1.0], 1.0), 10.0, 0.01, keep_zeros=1),  # type: ignore
+            "keep_zeros = 1",
+        ),
         (lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=0.0, drift=1.0), "noise_variance = 0.0"),
         (
             lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-30, drift=1e30),
@@ -537,7 +607,14 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
             r"no steady-state gain is found; they ask for about 1e\+08 rad/s",
         ),
         (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.0), "delta = 0.0"),
-        (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.1, alpha=(1.0, 0.5, 1.5)), "alpha = "),
+        *(
+            (
+                lambda alpha=alpha: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.1, alpha=alpha),
+                "alpha = .*: each entry must be above 0 and at most 1",
+            )
+            for alpha in ((1.0, 0.5, 1.5), (1.0, 0.5, 0.0), (1.0, -0.5, 0.5))
+        ),
+        (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.1, alpha=(1.0, 0.5)), "alpha has shape"),
         (lambda: ql.plants.delayed(PLANT, 0.0, 0.01), "delay = 0.0"),
         (lambda: ql.plants.delayed(PLANT, 0.02, 0.01).sampled(0.005), "dt = 0.005"),
         (lambda: ql.plants.delayed(3, 0.02, 0.01), "plant = 3"),  # type: ignore[arg-type]
