@@ -16,6 +16,7 @@ import quell as ql
 from quell import controllers as room
 from quell.controllers import baselines as baseline_room
 from quell.controllers.base import bumpless_transfer
+from quell.controllers.linear.form import linear_form
 from quell.controllers.stateful import named_arrays
 from quell.observers.base import expected_measurement
 
@@ -70,6 +71,25 @@ def test_every_controller_has_an_example() -> None:
 def test_a_controller_runs_the_same_again_and_interpreted(name: str) -> None:
     """Same seed, same output; no second compilation; interpreted = compiled."""
     check_run(PLANTS.get(name, CHAIN), CONTROLLERS[name], SCENARIO)
+
+
+# Those that are no linear law with limits: batches over lanes leave them to the exact loop.
+NOT_LINEAR = {name for name in CONTROLLERS if name.startswith("Prefiltered") or "Han" in name}
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_batch_over_lanes_is_the_exact_one(name: str) -> None:
+    """To 1e-9 of each channel's range if the controller has a linear form, else bit for bit."""
+    plant, controller = PLANTS.get(name, CHAIN), CONTROLLERS[name]
+    assert (linear_form(controller.parameters) is None) == (name in NOT_LINEAR)
+    exact = ql.simulate(plant, controller, SCENARIO)
+    lanes = ql.simulate([plant] * 2, controller, SCENARIO, record="all", exact=False)
+    tolerance = 0.0 if name in NOT_LINEAR else 1e-9
+    for channel in exact.names:
+        size = tolerance * np.max(np.abs(exact[channel]))
+        for run in lanes[channel]:
+            np.testing.assert_allclose(run, exact[channel], rtol=0.0, atol=size)
+    assert np.all(lanes.status == exact.status)
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

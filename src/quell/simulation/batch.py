@@ -159,6 +159,8 @@ def _members(
     if "plant" in lengths and not isinstance(plants, PlantBatch):
         plants = PlantBatch(plants)
     for i, other in enumerate(controllers):
+        if other is controllers[0]:
+            continue
         for what in ("dt", "channels", "features"):
             value, first = getattr(other, what), getattr(controllers[0], what)
             if value != first:

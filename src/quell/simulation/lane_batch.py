@@ -95,12 +95,22 @@ def _run_group(
     """Take a group through a segment, in a thread; return the place in the log to go on at."""
     _start(group, first)
     inputs = _over_lanes(group.runs, shared, first, last)
-    collected = np.empty((COLLECTED, log.shape[0], LANES))
-    indices = np.array([run.place for run in group.runs])
-    row, until_next = run_lanes(
-        group.lanes, inputs, first, log, group.channels, indices, collected, *place, every
+    rows, (row, until_next) = group.lanes.rows, place
+    # Columns of the inputs by the row that they are copied to; recorded inputs are written here.
+    columns = {rows.w + j: j for j in range(rows.u_plant - rows.w)} | {
+        rows.v: rows.u_plant - rows.w
+    }
+    targets = np.array([c for c, r in enumerate(group.channels) if r not in columns], np.int64)
+    collected = np.empty((COLLECTED, targets.size, LANES))
+    runs = np.array([run.place for run in group.runs], np.int64)
+    channels = group.channels[targets]
+    end, after = run_lanes(
+        group.lanes, inputs, first, log, channels, targets, runs, collected, *place, every
     )
-    return int(row), int(until_next)
+    for c, r in enumerate(group.channels.tolist()):
+        if r in columns:
+            log[c, runs, row:end] = inputs[until_next::every, columns[r], : len(runs)].T
+    return int(end), int(after)
 
 
 def _over_lanes(

@@ -194,11 +194,11 @@ def _advance(lanes: Lanes) -> None:
 
 
 @kernel
-def _write(collected: Any, log: Any, runs: Any, row: int, count: int) -> None:
+def _write(collected: Any, log: Any, targets: Any, runs: Any, row: int, count: int) -> None:
     """Write the collected samples into the log, from ``row`` on."""
-    for c in range(log.shape[0]):
+    for c in range(targets.size):
         for i in range(runs.size):
-            target = log[c, runs[i]]
+            target = log[targets[c], runs[i]]
             for k in range(count):
                 target[row + k] = collected[k, c, i]
 
@@ -231,6 +231,7 @@ def run_lanes(
     first: int,
     log: NDArray[np.float64],
     channels: NDArray[np.int64],
+    targets: NDArray[np.int64],
     runs: NDArray[np.int64],
     collected: NDArray[np.float64],
     row: int,
@@ -240,9 +241,9 @@ def run_lanes(
     """Run all lanes through ``inputs`` from the sample ``first`` on.
 
     ``inputs`` are w, r, its derivatives and noise (samples, …), for all lanes or for each. Every
-    ``every``-th sample is logged: ``log[c, runs[i], row]`` gets the row ``channels[c]`` of lane i.
-    ``collected`` (COLLECTED, channels, LANES) is memory. Returns the next row, and the number of
-    samples until it is written.
+    ``every``-th sample is logged: ``log[targets[c], runs[i], row]`` gets the row ``channels[c]`` of
+    lane i. ``collected`` (COLLECTED, channels, LANES) is memory. Returns the next row, and the
+    number of samples until it is written.
     """
     values, rows, count = lanes.values, lanes.rows, 0
     disturbances = rows.u_plant - rows.w
@@ -257,10 +258,10 @@ def run_lanes(
             _collect(lanes, channels, collected[count])
             count += 1
             if count == COLLECTED:
-                _write(collected, log, runs, row, count)
+                _write(collected, log, targets, runs, row, count)
                 row, count = row + count, 0
             until_next = every
         until_next -= 1
         _advance(lanes)
-    _write(collected, log, runs, row, count)
+    _write(collected, log, targets, runs, row, count)
     return row + count, until_next
