@@ -3,13 +3,15 @@
 Numba's types of arrays do not contain shapes, so LLVM can neither unroll a loop over four states
 nor keep them in registers: the same loop in C takes 1.4 times as long if its sizes are variables.
 Here the type of an array that is a field of a NamedTuple contains its shape, and the type of an
-integer that is annotated with ``Size`` or ``Flag`` contains its value:
+integer that is annotated with ``Size`` or ``Flag`` contains its value. An array that is annotated
+with ``Buffer`` has a type without shape, because each length would be compiled for:
 
 ::
 
     class Design(NamedTuple):
         a: Matrix
         order: Size
+        past: Buffer
 
 Kernels do not see any of it. Such an array is passed as one pointer instead of seven words or more,
 which makes compilation quicker, too. Numba does not know these types of values by itself: call an
@@ -19,8 +21,9 @@ entry point by ``specialised`` (``kernels/dispatch.py``).
 from __future__ import annotations
 
 import functools
+from itertools import repeat
 from math import prod
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numba
 import numpy as np
@@ -28,12 +31,16 @@ from llvmlite import ir
 from numba.core import types as nb_types
 from numba.core.datamodel import models
 from numba.extending import NativeValue, lower_cast, register_model, unbox
+from numpy.typing import NDArray
 
 Size: TypeAlias = Annotated[int, "constant"]
 """Annotates an integer field of a NamedTuple that is a constant in compiled code."""
 
 Flag: TypeAlias = Annotated[bool, "constant"]
 """Annotates a flag in a NamedTuple that is a constant in compiled code."""
+
+Buffer: TypeAlias = Annotated[NDArray[np.float64], "variable"]
+"""Annotates an array in a NamedTuple whose length is a parameter: its shape is no constant."""
 
 # Larger arrays are passed in Numba's own way: loops over them are not unrolled, and buffers of
 # many lengths would each be compiled for. 16 × 16 is a Kalman learner with 16 features.
@@ -153,48 +160,50 @@ def _words(numbers: tuple[int, ...]) -> Any:
     return ir.Constant(ir.ArrayType(word, len(numbers)), [ir.Constant(word, n) for n in numbers])
 
 
-def layout_of(value: Any, inside: bool = False) -> Any:
+def layout_of(value: Any, sized: bool = False) -> Any:
     """Return, hashable, what the type of an argument depends on; quicker than to make the type.
 
-    ``inside`` a NamedTuple arrays have known shapes.
+    Arrays have known shapes if they are ``sized``, which those in a NamedTuple are.
     """
     kind: Any = type(value)
     if kind in _PLAIN:
         return kind
     if kind is np.ndarray:
         flags = value.flags
-        if inside and value.size <= _MOST_ELEMENTS:
+        if sized and value.size <= _MOST_ELEMENTS:
             return value.shape, value.strides, value.dtype, flags.aligned, flags.writeable
         order = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
         return value.ndim, order, value.dtype, flags.aligned, flags.writeable
     if isinstance(value, tuple):
-        constants = tuple((type(value[i]), value[i]) for i in constant_fields(kind))
-        return kind, constants, tuple(layout_of(part, True) for part in value)
+        notes = _annotations(kind)
+        constants = tuple((type(value[i]), value[i]) for i in notes.constants)
+        parts = zip(value, notes.sized or repeat(True), strict=False)
+        return kind, constants, tuple(layout_of(part, sized) for part, sized in parts)
     return numba.typeof(value)
 
 
-def type_of(value: Any, inside: bool = False) -> nb_types.Type:
+def type_of(value: Any, sized: bool = False) -> nb_types.Type:
     """Return the type of an argument; see ``layout_of``."""
-    layout = layout_of(value, inside)
+    layout = layout_of(value, sized)
     found = _types.get(layout)
     if found is None:
-        found = _types[layout] = _make_type(value, inside)
+        found = _types[layout] = _make_type(value, sized)
     return found
 
 
-def _make_type(value: Any, inside: bool) -> nb_types.Type:
-    if isinstance(value, np.ndarray) and inside and value.size <= _MOST_ELEMENTS:
+def _make_type(value: Any, sized: bool) -> nb_types.Type:
+    if isinstance(value, np.ndarray) and sized and value.size <= _MOST_ELEMENTS:
         return SizedArray(value)
     if not isinstance(value, tuple):
         return numba.typeof(value)
-    constants = constant_fields(type(value))
+    notes = _annotations(type(value))
     parts = [
-        _constant_type(part) if i in constants else type_of(part, True)
-        for i, part in enumerate(value)
+        _constant_type(part) if i in notes.constants else type_of(part, sized)
+        for i, (part, sized) in enumerate(zip(value, notes.sized or repeat(True), strict=False))
     ]
     if not hasattr(value, "_fields"):
         return nb_types.BaseTuple.from_types(parts)
-    if parts and not constants and parts.count(parts[0]) == len(parts):
+    if parts and not notes.constants and parts.count(parts[0]) == len(parts):
         return nb_types.NamedUniTuple(parts[0], len(parts), type(value))
     return nb_types.NamedTuple(parts, type(value))
 
@@ -203,14 +212,17 @@ def _constant_type(value: Any) -> nb_types.Type:
     return ConstantFlag(value) if isinstance(value, bool) else Constant(int(value))
 
 
+class _Annotations(NamedTuple):
+    """What the annotations of a NamedTuple say about its fields."""
+
+    constants: tuple[int, ...]  # indices of constants
+    sized: tuple[bool, ...]  # for each field, whether an array in it has a known shape
+
+
 @functools.cache
-def constant_fields(kind: Any) -> tuple[int, ...]:
-    """Return the indices of the fields of a NamedTuple that are annotated as constants."""
+def _annotations(kind: Any) -> _Annotations:
     notes = getattr(kind, "__annotations__", {})
     fields = [notes.get(name) for name in getattr(kind, "_fields", ())]
-    return tuple(i for i, note in enumerate(fields) if _is_constant(note))
-
-
-def _is_constant(note: Any) -> bool:
-    postponed = getattr(note, "__forward_arg__", None)
-    return note in (Size, Flag) or postponed in ("Size", "Flag")
+    names = [getattr(note, "__forward_arg__", note) for note in fields]
+    constants = tuple(i for i, name in enumerate(names) if name in ("Size", "Flag", Size, Flag))
+    return _Annotations(constants, tuple(name not in ("Buffer", Buffer) for name in names))

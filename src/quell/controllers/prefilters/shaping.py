@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.controllers.prefilters.prefilter import prefilter, settle
+from quell.kernels.sized import Buffer
 from quell.types import Vector
 
 # Limit on memory: 80 MB. Chosen by hand.
@@ -42,7 +43,7 @@ class ShaperDesign(NamedTuple):
 class ShaperMemory(NamedTuple):
     """The references of the last samples, as a ring."""
 
-    past: Vector
+    past: Buffer
     at: Vector  # (1,): index of the newest
 
 

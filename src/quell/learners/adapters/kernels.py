@@ -11,12 +11,13 @@ import numpy as np
 
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.function_pointers import call
+from quell.kernels.sized import Buffer
 from quell.learners.adapters.instances import COUNTDOWN, DISABLED, PREDICTION, STATUS
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart, trouble
 from quell.learners.feature_learner import write_features
 from quell.learners.online.learner import OnlineDesign, OnlineMemory, has_pairs
 from quell.learners.online.model import infer, learn
-from quell.types import Matrix, Status, Vector
+from quell.types import Status, Vector
 
 _FAILED = int(Status.LEARNER_FAILED)
 
@@ -31,8 +32,8 @@ class PairsDesign(NamedTuple):
 class PairsMemory(NamedTuple):
     """State of a model that only collects its pairs."""
 
-    features: Matrix  # (size, p)
-    targets: Vector  # (size,)
+    features: Buffer  # (size, p)
+    targets: Buffer  # (size,)
     filled: Vector  # (1,): number of pairs
 
 

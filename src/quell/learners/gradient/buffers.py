@@ -23,15 +23,16 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.kernels.dispatch import is_finite, kernel
-from quell.types import Matrix, Vector
+from quell.kernels.sized import Buffer
+from quell.types import Vector
 
 
 class Buffers(NamedTuple):
     """State of Algorithm 1 with p features and buffers of size n."""
 
     theta: Vector  # (p,)
-    features: Matrix  # I (n, p), a ring
-    residuals: Vector  # ΔF (n,), a ring
+    features: Buffer  # I (n, p), a ring
+    residuals: Buffer  # ΔF (n,), a ring
     total: Vector  # Σ Δf̂ I over the ring (p,)
     fresh: Vector  # the same over the entries written since the ring last wrapped around (p,)
     current: Vector  # work space for the newest features (p,)

@@ -25,11 +25,11 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
-from quell.kernels.sized import Size
+from quell.kernels.sized import Buffer, Size
 from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
 from quell.observers.eso import ESO
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
 # Least γ² of a new point; also bounds rounding errors of Q. Chosen by hand, not tuned further.
 _LEAST_NOVELTY = 1e-2
@@ -51,15 +51,15 @@ class ProcessDesign(NamedTuple):
 class ProcessMemory(NamedTuple):
     """State for m features; one row more than the budget, for the point that is added last."""
 
-    points: Matrix  # c (M + 1, m)
-    kernel: Matrix  # K (M + 1, M + 1)
-    inverse: Matrix  # Q (M + 1, M + 1)
-    covariance: Matrix  # Σ (M + 1, M + 1)
-    mean: Vector  # μ (M + 1,)
-    weights: Vector  # Qμ (M + 1,)
-    k: Vector  # work space (M + 1,)
-    q: Vector  # work space (M + 1,)
-    h: Vector  # work space (M + 1,)
+    points: Buffer  # c (M + 1, m)
+    kernel: Buffer  # K (M + 1, M + 1)
+    inverse: Buffer  # Q (M + 1, M + 1)
+    covariance: Buffer  # Σ (M + 1, M + 1)
+    mean: Buffer  # μ (M + 1,)
+    weights: Buffer  # Qμ (M + 1,)
+    k: Buffer  # work space (M + 1,)
+    q: Buffer  # work space (M + 1,)
+    h: Buffer  # work space (M + 1,)
     counters: Vector  # (2,): number of points; pairs since the last one that was learned from
 
 

@@ -26,6 +26,7 @@ from quell.features import Features
 from quell.features.scaling import reset_scale, update_scale
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
+from quell.kernels.sized import Buffer
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.feature_learner import FeatureLearner, Inputs, write_features
 from quell.learners.lag import group_delay
@@ -38,7 +39,7 @@ from quell.learners.noise_gate import (
 )
 from quell.learners.online.model import Model, checked_design, infer, learn, packed
 from quell.observers.eso import ESO
-from quell.types import Matrix, Vector
+from quell.types import Vector
 
 # Least confidence in f with which a model learns: at least half of f² is not noise. Chosen by hand.
 _LEAST_CONFIDENCE = 0.5
@@ -68,12 +69,12 @@ class OnlineMemory(NamedTuple):
     scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
     scaled: Vector  # work space for the scaled state (n,)
     features: Vector  # work space for the features of a prediction (p,)
-    ring: Matrix  # the last features (D + 1, p)
+    ring: Buffer  # the last features (D + 1, p)
     loop: NDArray[OnlineLoop]
     gate: NoiseGateMemory
     model: Any
-    flat: Vector  # all arrays of ``model``, end to end: the same memory
-    initial: Vector  # ``flat`` before anything was learned
+    flat: Buffer  # all arrays of ``model``, end to end: the same memory
+    initial: Buffer  # ``flat`` before anything was learned
 
 
 @kernel
