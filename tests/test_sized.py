@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -131,3 +134,31 @@ def test_new_parameters_of_a_loop_are_not_compiled_for() -> None:
     first, step = run(1, 2.0)
     assert run(1, 3.0) == (first, step)
     assert run(2, 2.0)[1] != step
+
+
+def test_loops_are_compiled_once_for_all_that_share_code(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A second process takes some of several; the second study finds all in the disk cache."""
+    script = """
+import quell as ql
+from quell.kernels.dispatch import compilations
+from quell.simulation.driver import run_block
+from quell.simulation.precompile import precompile
+
+if __name__ == "__main__":
+    plant = ql.plants.LinearPlant.of(([1.0], [1.0, 1.0]))
+    pids = [ql.baselines.PID(gain, dt=0.01) for gain in (1.0, 2.0)]
+    loops = [(plant, pid) for pid in pids]
+    loops.append((plant, ql.ADRC(ql.ESO.model_free(1, 1.0, 10.0, 0.01), 1.0)))
+    print(precompile(loops), len(run_block.signatures), compilations(run_block) <= 2)
+"""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    file = tmp_path / "study.py"
+    file.write_text(script)
+
+    def study() -> str:
+        command = [sys.executable, str(file)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert [study(), study()] == ["2 2 True", "0 2 True"]

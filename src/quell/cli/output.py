@@ -103,16 +103,12 @@ def check_outputs(outputs: T, figures: Sequence[str], recordings: Sequence[Path]
 
 def compile_loops(console: Console, loops: Sequence[tuple[Plant, Controller]]) -> None:
     """Compile the loops of a study, or load them from the cache; print how long compiling took."""
-    from quell.kernels.dispatch import compilations
-    from quell.simulation import Scenario, simulate
-    from quell.simulation.driver import run_block
+    from quell.simulation.precompile import precompile
 
     began = time.perf_counter()
     with console.status("Compiling what is not in the cache: some ten seconds, once."):
-        for plant, controller in loops:
-            dt = controller.dt
-            simulate(plant, controller, Scenario(duration=10 * dt, rest_at=(5 * dt,)))
-    if compiled := compilations(run_block):
+        compiled = precompile(loops)
+    if compiled:
         took = time.perf_counter() - began
         console.print(f"Compiled {compiled} loops in {took:.1f} s; later runs use them.")
 

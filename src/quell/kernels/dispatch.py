@@ -169,15 +169,28 @@ def specialised(entry: Any, *arguments: Any) -> Any:
     See ``kernels/sized.py``. It does not check the types of its arguments: call it with arguments
     of the same types, shapes and constants only.
     """
-    if hasattr(entry, "with_overlaps") and overlap(arguments, entry.written):
-        entry = entry.with_overlaps
-    dispatcher = dispatcher_for(entry, *arguments)
+    dispatcher = _matching(entry, arguments)
     layouts = tuple(map(layout_of, arguments))
     found = dispatcher.specialised.get(layouts)
     if found is None:
         found = dispatcher.compile(tuple(map(type_of, arguments)))
         dispatcher.specialised[layouts] = found
     return found
+
+
+def is_available(entry: Any, *arguments: Any) -> bool:
+    """Return whether ``specialised`` has no need to compile: its code is here, or on the disk."""
+    dispatcher = _matching(entry, arguments)
+    types = tuple(map(type_of, arguments))
+    on_disk = dispatcher._cache.load_overload(types, dispatcher.targetctx)
+    return types in dispatcher.overloads or on_disk is not None
+
+
+def _matching(entry: Any, arguments: tuple[Any, ...]) -> Any:
+    """Return the dispatcher of an entry point whose assumptions hold for ``arguments``."""
+    if hasattr(entry, "with_overlaps") and overlap(arguments, entry.written):
+        entry = entry.with_overlaps
+    return dispatcher_for(entry, *arguments)
 
 
 def call(entry: Any, *arguments: Any) -> Any:

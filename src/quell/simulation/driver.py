@@ -14,7 +14,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.kernels.dispatch import compiled, compiled_loop, interpreted, specialised
+from quell.kernels.dispatch import compiled, compiled_loop, interpreted, is_available, specialised
 from quell.kernels.user_types import explain_compile_errors
 from quell.plants.base import Plant, advance, measure
 from quell.simulation.integration import IntegrationCheck, Samples
@@ -131,9 +131,8 @@ class Loop:
 
     def run(self, segment: Segment, log: Matrix, row: int, every: int) -> int:
         """Run a segment, log every ``every``-th sample from ``row`` on, and return the next row."""
-        first, dt, from_rest, *signals = segment
+        first, dt, from_rest = segment[:3]
         from_row, from_sample = row, first + self.until_next
-        loop = (self.model, self.x, self.scratch, self.design, self.state, first * dt, dt)
         # An interpreted loop that diverges would warn of every overflow; the status reports it
         # once.
         with (
@@ -144,7 +143,7 @@ class Loop:
                 self.x[:] = self.x0
                 start = (self.design, self.state)
                 self._entry(start_from_rest, *start)(*start)
-            arguments = (*loop, *signals, log, row, every, self.until_next, self.limit)
+            arguments = self._arguments(segment, log, row, every)
             if self._run_block is None:
                 self._run_block = self._entry(run_block, *arguments)
             samples, row, self.until_next, flags = self._run_block(*arguments)
@@ -153,6 +152,17 @@ class Loop:
         if self.integration.needed:
             self._check_integration(log[from_row:row], from_sample, every, dt)
         return int(row)
+
+    def is_compiled(self, segment: Segment) -> bool:
+        """Return whether its code is in this process, or in the disk cache."""
+        log = np.empty((1, self.width))
+        return self._as_python or is_available(run_block, *self._arguments(segment, log, 0, 1))
+
+    def _arguments(self, segment: Segment, log: Matrix, row: int, every: int) -> tuple[Any, ...]:
+        """Return the arguments of ``run_block``."""
+        first, dt, _, *signals = segment
+        loop = (self.model, self.x, self.scratch, self.design, self.state, first * dt, dt)
+        return (*loop, *signals, log, row, every, self.until_next, self.limit)
 
     def _check_integration(self, log: Matrix, first: int, every: int, dt: float) -> None:
         """Check the plant's integration at rows of the log, ``every`` samples apart.

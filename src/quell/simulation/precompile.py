@@ -1,0 +1,94 @@
+"""Compile the loops of a study before it runs, in two processes if there are several."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, suppress
+from multiprocessing import get_context
+from threading import Thread
+from typing import TypeAlias
+
+from quell.controllers.base import Controller
+from quell.kernels.cache import cache_path
+from quell.kernels.sized import layout_of
+from quell.plants.base import Plant
+from quell.simulation.driver import Loop
+from quell.simulation.sampled_scenario import SampledScenario
+from quell.simulation.scenario import Scenario
+from quell.simulation.simulate import simulate
+
+Parts: TypeAlias = tuple[Plant, Controller]
+
+
+def precompile(loops: Sequence[Parts]) -> int:
+    """Compile loops, or load them from the disk cache; return how many were compiled.
+
+    If there are several to compile, a second process takes some of them, and this one loads their
+    code from the disk cache then. As always with ``multiprocessing``, that process imports the main
+    module: a script needs ``if __name__ == "__main__"``.
+    """
+    missing = [parts for parts in _distinct(loops) if not _is_compiled(parts)]
+    todo = deque(missing)
+    with ExitStack() as stack:
+        if len(missing) > 1 and cache_path() is not None and (os.cpu_count() or 1) > 1:
+            stack.enter_context(_SecondProcess(todo))
+        with suppress(IndexError):  # the other process has taken the last one
+            while True:
+                _compile(todo.popleft())
+    for parts in loops:
+        _compile(parts)
+    return len(missing)
+
+
+def _compile(parts: Parts) -> None:
+    plant, controller = parts
+    simulate(plant, controller, _short(controller))
+
+
+def _short(controller: Controller) -> Scenario:
+    dt = controller.dt
+    return Scenario(duration=10 * dt, rest_at=(5 * dt,))
+
+
+def _distinct(loops: Sequence[Parts]) -> list[Parts]:
+    """Return the loops without those whose code is that of an earlier one."""
+    found: dict[object, Parts] = {}
+    for plant, controller in loops:
+        model, state = plant.sampled(controller.dt), controller.initial_state()
+        found.setdefault(layout_of((model, controller.parameters, state)), (plant, controller))
+    return list(found.values())
+
+
+def _is_compiled(parts: Parts) -> bool:
+    plant, controller = parts
+    scenario = SampledScenario.of(_short(controller), plant, controller, None)
+    loop = Loop(plant, plant.sampled(controller.dt), controller, scenario, interpret=False)
+    return loop.is_compiled(scenario.segment(0, 1))
+
+
+class _SecondProcess:
+    """A context in which another process compiles the last of ``todo``, until it is empty."""
+
+    def __init__(self, todo: deque[Parts]) -> None:
+        self._todo = todo
+        self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+        self._thread = Thread(target=self._take, daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *error: object) -> None:
+        self._todo.clear()
+        if error[0] is None:
+            self._thread.join()
+        self._pool.shutdown(wait=error[0] is None, cancel_futures=True)
+
+    def _take(self) -> None:
+        # This ends when nothing is left to do. What can't be sent to another process, or fails
+        # there, this process compiles in the end, and reports why it can't.
+        with suppress(Exception):
+            while True:
+                self._pool.submit(_compile, self._todo.pop()).result()
