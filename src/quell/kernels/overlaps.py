@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,15 +16,16 @@ def overlap(arguments: Sequence[Any], written: Sequence[int]) -> bool:
 
     NamedTuples are searched at any depth.
     """
-    by_owner: dict[int | None, list[_Use]] = defaultdict(list)
-    for i, argument in enumerate(arguments):
-        for array in _arrays(argument):
-            owner = array if array.base is None else array.base
-            # Arrays with different owners are apart. What memory other objects own is unknown.
-            key = id(owner) if isinstance(owner, np.ndarray) else None
-            by_owner[key].append((array, i in written))
-    if None in by_owner:
-        by_owner = {None: [use for group in by_owner.values() for use in group]}
+    arrays = _arrays(arguments, [])
+    owners = [array if array.base is None else array.base for array in arrays]
+    # Arrays with different owners are apart. What memory other objects own is unknown.
+    known = all(isinstance(owner, np.ndarray) for owner in owners)
+    if known and len(set(map(id, owners))) == len(owners):
+        return False
+    by_owner: dict[int, list[_Use]] = defaultdict(list)
+    changed = {id(array) for array in _arrays([arguments[i] for i in written], [])}
+    for array, owner in zip(arrays, owners, strict=True):
+        by_owner[id(owner) if known else 0].append((array, id(array) in changed))
     return any(_overlap(group) for group in by_owner.values() if len(group) > 1)
 
 
@@ -40,10 +41,11 @@ def _overlap(uses: list[_Use]) -> bool:
     return False
 
 
-def _arrays(value: Any) -> Iterator[np.ndarray]:
-    if isinstance(value, np.ndarray):
-        if value.size:
-            yield value
-    elif isinstance(value, tuple):
-        for part in value:
-            yield from _arrays(part)
+def _arrays(values: Iterable[Any], found: list[np.ndarray]) -> list[np.ndarray]:
+    """Append the arrays that are not empty to ``found``, and return it."""
+    for value in values:
+        if isinstance(value, tuple):
+            _arrays(value, found)
+        elif isinstance(value, np.ndarray) and value.size:
+            found.append(value)
+    return found

@@ -63,10 +63,9 @@ class BandLimitedNoise(Signal):
                 values[which == block] = self.evaluate(t[which == block])
             return values
         blocks = [_draws(self.seed, block) for block in range(first, last + 1)]
+        draws = blocks[0] if first == last else np.concatenate(blocks)
         index -= 1 + first * _BLOCK
-        values = (blocks[0] if first == last else np.concatenate(blocks))[index]
-        values *= math.sqrt(self.power / self.sample_time)
-        return values
+        return (math.sqrt(self.power / self.sample_time) * draws)[index]
 
     def seeded(self, seed: int) -> Signal:
         """Return the same noise from another seed."""

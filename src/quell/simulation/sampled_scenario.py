@@ -14,7 +14,7 @@ from quell import checks
 from quell.controllers.base import Controller
 from quell.plants.base import Plant
 from quell.records.sample_times import first_sample_at, in_steps
-from quell.signals import Signal
+from quell.signals import Constant, Signal
 from quell.simulation.scenario import Scenario
 from quell.types import Matrix, Vector
 
@@ -26,6 +26,7 @@ _SEGMENT = 8192
 _DIVERGED = 1e6
 # Times the same: |y| beyond it is outside of the usual range. Chosen by hand.
 _UNUSUAL = 10.0
+_NOTHING = Constant(0.0)  # what inputs without a signal get
 # Up to here time in steps of dt is exact to a thousandth of a step (2e-16 · 1e12).
 _MOST_SAMPLES = 10**12
 
@@ -97,9 +98,10 @@ def segment_bounds(samples: int, rest_samples: Iterable[int]) -> list[tuple[int,
 
 def _columns(signals: tuple[Signal, ...], t: Vector) -> Matrix:
     """Return signals at the times ``t`` as the columns of a matrix."""
-    columns = np.empty((t.size, len(signals)))
+    columns = np.zeros((t.size, len(signals)))
     for j, signal in enumerate(signals):
-        columns[:, j] = signal(t)
+        if signal != _NOTHING:
+            columns[:, j] = signal(t)
     return columns
 
 
