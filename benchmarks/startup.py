@@ -1,4 +1,4 @@
-"""Start-up time: import, help, and the second run of the study. Best of several processes.
+"""Start-up time: import, help, first step, second run of the study. Best of several processes.
 
 python benchmarks/startup.py
 """
@@ -13,6 +13,16 @@ import time
 from rich.console import Console
 from rich.table import Table
 
+# Prints the time of the first step [s].
+FIRST_STEP = """
+import time
+import quell as ql
+controller = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=0.01), omega_c=2.0)
+began = time.perf_counter()
+controller.step(1.0, 0.0)
+print(time.perf_counter() - began)
+"""
+
 
 def best(command: list[str], trials: int) -> float:
     """Return the shortest time a command took [s]."""
@@ -25,12 +35,19 @@ def best(command: list[str], trials: int) -> float:
     return found
 
 
+def first_step(trials: int) -> float:
+    """Return the shortest time of a first step; only the first process may compile [s]."""
+    command = [sys.executable, "-c", FIRST_STEP]
+    return min(float(subprocess.check_output(command)) for _ in range(trials))
+
+
 def main() -> None:
     """Time all three and print one table."""
     python = [sys.executable, "-c"]
     bare = best([*python, "pass"], 7)
     rows = [
         ("import quell", best([*python, "import quell"], 7) - bare, 0.3),
+        ("first step of an ADRC of order 2, cache warm", first_step(7), 0.3),
         ("quell --help", best([sys.executable, "-m", "quell", "--help"], 7), 0.6),
         (
             "quell reproduce two-mass, cache warm, with figures",
