@@ -58,6 +58,9 @@ class MixedLaw(NamedTuple):
     weights: np.ndarray  # not contiguous
     shift: int
     negative: bool
+    step: np.float32
+    mask: np.uint64
+    nothing: None
 
 
 class MixedState(NamedTuple):
@@ -69,7 +72,7 @@ class MixedState(NamedTuple):
 @control.register(MixedLaw)
 def _control(law: MixedLaw, state: MixedState, r: float, y: float) -> float:
     state.calls[0] += law.shift
-    total = law.shape.side * r
+    total = law.shape.side * r + float(law.step) * y + float(law.mask >> np.uint64(40))
     for i in range(law.weights.shape[0]):
         for j in range(law.weights.shape[1]):
             total += law.weights[i, j] * (y + 10.0 * i + 100.0 * j)
@@ -220,7 +223,8 @@ def test_a_packed_controller_has_the_parameters_and_the_state_of_the_interpreted
     """Nested, negative, true and strided ones; new parameters of the same types need no other code."""
     table = np.arange(24.0).reshape(4, 6)
     weights = table[::2, ::3]
-    law, state = MixedLaw(Square(3.0), weights, -7, True), MixedState(np.zeros(1, np.int64))
+    scalars = (-7, True, np.float32(0.75), np.uint64(2**64 - 5), None)
+    law, state = MixedLaw(Square(3.0), weights, *scalars), MixedState(np.zeros(1, np.int64))
     packed = PackedController(law, state)
     step = entry_point(step_packed.uncached, packed)
     assert step(packed, 2.0, 0.5) == control(law, state, 2.0, 0.5)

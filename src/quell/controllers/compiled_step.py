@@ -88,9 +88,15 @@ def _words(kind: Any, value: Any) -> bytes:
             words.append(value)
         elif isinstance(kind, Constant | ConstantFlag):
             pass  # compiled code knows it
+        elif kind == nb_types.float32:
+            formats.append("f4x")
+            words.append(value)
         elif isinstance(kind, nb_types.Integer | nb_types.Boolean):
+            formats.append("Q")
+            words.append(int(value) % 2**64)
+        elif value is None:
             formats.append("q")
-            words.append(int(value))
+            words.append(0)
         else:
             raise TypeError(
                 f"parameters or state contain {value!r}: must be numbers, arrays, or tuples of them"
