@@ -15,9 +15,11 @@ and arrays) and explicit state (a NamedTuple of arrays), under one of these deco
 from __future__ import annotations
 
 import functools
+import gc
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FunctionType
 from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
@@ -173,9 +175,22 @@ def specialised(entry: Any, *arguments: Any) -> Any:
     layouts = tuple(map(layout_of, arguments))
     found = dispatcher.specialised.get(layouts)
     if found is None:
-        found = dispatcher.compile(tuple(map(type_of, arguments)))
+        with _without_garbage_collection():
+            found = dispatcher.compile(tuple(map(type_of, arguments)))
         dispatcher.specialised[layouts] = found
     return found
+
+
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Spare the garbage collector the objects of the compiler, which live long: 5 % of the time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def is_available(entry: Any, *arguments: Any) -> bool:

@@ -24,9 +24,13 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
+from numba.core import cgutils
+from numba.core import types as nb_types
+from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
-from quell.kernels.dispatch import kernel
+from quell.kernels.dispatch import OPTIONS
+from quell.kernels.linking import KERNEL_OPTIONS
 
 if TYPE_CHECKING:
     _Record = np.generic  # NumPy's stubs forbid subclasses of np.void, NumPy itself does not
@@ -64,9 +68,23 @@ def _field(name: str) -> property:
     return property(itemgetter(name), write)
 
 
-@kernel
 def clear(scalars: NDArray[Any]) -> None:
-    """Set all fields of a record of floats to zero."""
-    values = scalars.view(np.float64)
-    for i in range(values.size):
-        values[i] = 0.0
+    """Set all fields of a record to zero."""
+    scalars.view(np.uint8)[:] = 0
+
+
+# Numba compiles a view of a record as float64 in 0.2 s; this takes a millisecond.
+@overload(clear, strict=False, jit_options=OPTIONS | KERNEL_OPTIONS)
+def _clear(scalars: Any) -> Any:
+    return lambda scalars: _set_to_zero(scalars)
+
+
+@intrinsic
+def _set_to_zero(typing_context: Any, scalars: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        array = context.make_array(scalars)(context, builder, values[0])
+        size = context.get_constant(nb_types.intp, scalars.dtype.size)
+        cgutils.memset(builder, array.data, size, 0)
+        return context.get_dummy_value()
+
+    return nb_types.void(scalars), generate
