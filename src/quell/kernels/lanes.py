@@ -5,7 +5,7 @@ slower than the processor allows (24 instead of 7 ns for a loop of 4 + 5 states)
 keeps the sums in memory: it does not know that they share none with their summands. So this one
 operation is written as vector instructions.
 
-The columns are added in order, and all lanes get the same instructions: the bits of a lane do not
+The last column comes first, and all lanes get the same instructions: the bits of a lane do not
 depend on its place, nor on its neighbours. Interpreted, each product is rounded before it is added;
 processors with fused operations do not round it.
 """
@@ -55,7 +55,7 @@ def set_products(
     """
     for i in range(coefficients.shape[0]):
         total = np.zeros(LANES)
-        for j in range(coefficients.shape[1]):
+        for j in range(coefficients.shape[1] - 1, -1, -1):
             total += coefficients[i, j] * values[first + j]
         target[row + i] = total
 
@@ -98,8 +98,9 @@ def _vector_products(
                 builder.store(ir.Constant(vector, None), total)
             start = builder.mul(rows.index, columns)
             with cgutils.for_range(builder, columns) as inner:
-                a = places(factors.data, builder.add(start, inner.index))
-                b = places(summands.data, builder.add(arguments[4], inner.index))
+                column = builder.sub(builder.sub(columns, number(1)), inner.index)
+                a = places(factors.data, builder.add(start, column))
+                b = places(summands.data, builder.add(arguments[4], column))
                 for total, factor, value in zip(totals, a, b, strict=True):
                     product = builder.fmul(
                         builder.load(factor, align=8), builder.load(value, align=8)

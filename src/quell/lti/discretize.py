@@ -7,9 +7,12 @@ from functools import lru_cache
 from itertools import accumulate, pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.parallel import one_blas_thread
 from quell.types import Matrix
+
+Stack = NDArray[np.float64]  # matrices (models, …, …)
 
 
 def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Matrix, list[Matrix]]:
@@ -29,6 +32,19 @@ def zero_order_hold(A: Matrix, inputs: Sequence[Matrix], dt: float) -> tuple[Mat
         block[:n, part] = B
     sampled = _exponential(edges[-1], (block * dt).tobytes())
     return sampled[:n, :n].copy(), [sampled[:n, part].copy() for part in parts]
+
+
+def zero_order_holds(A: Stack, B: Stack, dt: float) -> tuple[Stack, Stack]:
+    """Return Φ and Γ of many models with the same sizes, by the same method."""
+    from scipy.linalg import expm
+
+    models, n, _ = A.shape
+    size = n + B.shape[2]
+    block = np.zeros((models, size, size))
+    block[:, :n, :n], block[:, :n, n:] = A, B
+    with one_blas_thread():
+        sampled = np.asarray(expm(block * dt))
+    return sampled[:, :n, :n], sampled[:, :n, n:]
 
 
 @lru_cache(maxsize=64)

@@ -18,8 +18,7 @@ import quell.controllers.adrc.linear_form  # noqa: F401  registers the form of a
 from quell.controllers.base import Controller
 from quell.controllers.linear.form import LinearForm, linear_form
 from quell.kernels.lanes import LANES, lane_zeros
-from quell.lti.sampled_stacks import Stack, zero_order_holds
-from quell.parallel import one_blas_thread
+from quell.lti.discretize import Stack, zero_order_holds
 from quell.plants.base import Plant
 from quell.plants.delay import DelayedPlant
 from quell.plants.linear import LinearPlant
@@ -97,7 +96,7 @@ def groups_of(runs: Sequence[LinearRun], recorded: Sequence[tuple[str, int]]) ->
     for (n, w, p, v, *delays), members in alike.items():
         estimates = [(name, j) for name, j in recorded if name in members[0].form.channels]
         rows = Rows(
-            *accumulate((0, n, w, 1, 1, p, 1, v, 1, 1, 1, 1, 1, 1, len(estimates), *delays))
+            *accumulate((0, p, 1, v, 1, n, w, 1, 1, 1, 1, 1, 1, 1, len(estimates), *delays))
         )
         channels = np.array([_row(rows, n, estimates, *channel) for channel in recorded])
         plant, output = _plant_matrices(members)
@@ -128,10 +127,12 @@ def _plant_matrices(runs: Sequence[LinearRun]) -> tuple[Stack, Stack]:
     A, B, C, E = (
         np.array([getattr(plant, name) for plant in distinct.values()]) for name in "ABCE"
     )
-    with one_blas_thread(), np.errstate(over="ignore", invalid="ignore"):
-        phi, gamma = zero_order_holds(A, np.concatenate([E, B], axis=2), runs[0].scenario.dt)
+    # B before E, as a plant alone is sampled: its Φ and Γ then have the same bits.
+    with np.errstate(over="ignore", invalid="ignore"):
+        phi, gamma = zero_order_holds(A, np.concatenate([B, E], axis=2), runs[0].scenario.dt)
+    plant = np.concatenate([phi, gamma[:, :, 1:], gamma[:, :, :1]], axis=2)
     which = [place[id(run.plant)] for run in runs]
-    return np.concatenate([phi, gamma], axis=2)[which], C[which]
+    return plant[which], C[which]
 
 
 def _law_matrices(
@@ -148,7 +149,7 @@ def _law_matrices(
         wish = [*law.C, law.D_y, law.D_r, *form.derivatives[: inputs - 1]]
         shown = [form.channels[name][j] for name, j in estimates]
         stacks[0].append(np.array([wish]))
-        stacks[1].append(np.column_stack([law.B_u, law.A, law.B_y, from_r]))
+        stacks[1].append(np.column_stack([law.A, law.B_y, from_r, law.B_u]))
         stacks[2].append(np.reshape(shown, (len(shown), law.C.size + 1)))
         stacks[3].append(form.start)
         stacks[4].append(np.array([*limits, form.largest_wish, form.predicts]))

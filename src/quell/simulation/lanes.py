@@ -7,10 +7,16 @@ In each lane, with the sampled plant (``plants/linear.py``) and the linear form 
     u_wished = C_p p + D_y e + D_r r + D_d (r', …),      u = limited(u_wished)
     p⁺ = A p + B_y e + B_r r + B_u u(k − d_c),           x⁺ = Φ x + Γ u(k − d_p) + Γ_w w
 
+Loops over lanes are written so that LLVM makes vector code of them: few arrays in each, and their
+length taken from an array, because loops of constant length are unrolled before.
+
 All quantities of a sample are rows of one array over the lanes (``Rows``), ordered so that each
-equation is a product with rows that lie side by side. A lane whose run diverges ends. A lane in
-which something happens that these equations do not have (a reference or measurement that the
-controller would hold, a state that it would reset) is marked as irregular and ends, too.
+equation is a product with rows that lie side by side. Sums begin with the last of them, so that
+small increments are added up before a state is added to them.
+
+A lane whose run diverges ends. A lane in which something happens that these equations do not have
+(a reference or measurement that the controller would hold, a state that it would reset) is marked
+as irregular and ends, too.
 """
 
 from __future__ import annotations
@@ -33,15 +39,15 @@ COLLECTED = 64
 
 
 class Rows(NamedTuple):
-    """First row of each quantity; x, w and u_plant lie side by side, and u_law, p, e and v."""
+    """First row of each quantity; p to u_law lie side by side, and x to u_plant."""
 
-    x: int
-    w: int
-    u_plant: int  # u that reaches the plant
-    u_law: int  # u that reaches the law's state
     p: int
     e: int
     v: int  # r, r', …
+    u_law: int  # u that reaches the law's state
+    x: int
+    w: int
+    u_plant: int  # u that reaches the plant
     noise: int
     y: int
     y_measured: int
@@ -60,7 +66,7 @@ class Lanes(NamedTuple):
     rows: Rows
     output: NDArray[np.float64]  # y from x (1, n)
     wish: NDArray[np.float64]  # u_wished from p, e, v (1, m + 1 + v)
-    law: NDArray[np.float64]  # p⁺ from u_law, p, e, v (m, m + 2 + v)
+    law: NDArray[np.float64]  # p⁺ from p, e, v, u_law (m, m + 2 + v)
     plant: NDArray[np.float64]  # x⁺ from x, w, u_plant (n, n + d + 1)
     estimates: NDArray[np.float64]  # recorded estimates from p, e (k, m + 1)
     predicts: Vector  # 1 if p_1 is the predicted y
@@ -87,10 +93,10 @@ def _spread(values: Matrix, row: int, count: int, samples: Any, k: int, column: 
         target, source = values[row + c], samples[k, column + c]
         if source.size == 1:
             value = source[0]
-            for i in range(LANES):
+            for i in range(target.size):
                 target[i] = value
         else:
-            for i in range(LANES):
+            for i in range(target.size):
                 target[i] = source[i]
 
 
@@ -115,11 +121,11 @@ def _measure(lanes: Lanes, sample: int, row: int) -> None:
     set_products(values, rows.y, lanes.output, values, rows.x)
     y, noise, measured = values[rows.y], values[rows.noise], values[rows.y_measured]
     outside = 0
-    for i in range(LANES):
+    for i in range(lanes.limit.size):
         measured[i] = y[i] + noise[i]
         outside += 0 if abs(y[i]) <= lanes.limit[i] else 1
     if outside > 0:
-        for i in range(LANES):
+        for i in range(lanes.limit.size):
             if lanes.ended[i] < 0 and not abs(y[i]) <= lanes.limit[i]:
                 _end(lanes, i, sample, row)
 
@@ -128,51 +134,73 @@ def _measure(lanes: Lanes, sample: int, row: int) -> None:
 def _control(lanes: Lanes, sample: int, row: int) -> None:
     """Set u and status from the measurement; end irregular lanes."""
     values, rows = lanes.values, lanes.rows
-    error, predicted = values[rows.e], values[rows.p]
-    for i in range(LANES):
-        error[i] = values[rows.y_measured, i] - lanes.predicts[i] * predicted[i]
-    set_products(values, rows.u_wished, lanes.wish, values, rows.p)
     wished, u, status = values[rows.u_wished], values[rows.u], values[rows.status]
-    measured, r = values[rows.y_measured], values[rows.v]
-    unusual = 0
-    for i in range(LANES):
+    error, measured, r = values[rows.e], values[rows.y_measured], values[rows.v]
+    predicted, applied = values[rows.p], lanes.next[0]
+    for i in range(error.size):
+        error[i] = measured[i] - lanes.predicts[i] * predicted[i]
+    set_products(values, rows.u_wished, lanes.wish, values, rows.p)
+    irregular = 0
+    for i in range(u.size):
         usual = (
             (abs(wished[i]) <= lanes.largest_wish[i])
             & (abs(measured[i]) <= LARGEST_SIGNAL)
             & (abs(r[i]) <= LARGEST_SIGNAL)
         )
-        unusual += 0 if usual else 1
+        irregular += 0 if usual else 1
+    if irregular > 0:
+        _end_irregular(lanes, sample, row)
+    for i in range(u.size):
         fastest, slowest = u[i] + lanes.most_change[i], u[i] + lanes.least_change[i]
         limited = fastest if wished[i] > fastest else wished[i]
-        limited = slowest if wished[i] < slowest else limited
-        applied = lanes.high[i] if limited > lanes.high[i] else limited
-        applied = lanes.low[i] if limited < lanes.low[i] else applied
-        rate_limited = _RATE_LIMITED if usual & (limited != wished[i]) else 0.0
-        saturated = _SATURATED if usual & (applied != limited) else 0.0
-        u[i], status[i] = applied, rate_limited + saturated
-        lanes.seen[0, i] = max(lanes.seen[0, i], saturated)
-        lanes.seen[1, i] = max(lanes.seen[1, i], rate_limited)
-    if unusual > 0:
-        for i in range(LANES):
-            usual = (
-                abs(wished[i]) <= lanes.largest_wish[i]
-                and abs(measured[i]) <= LARGEST_SIGNAL
-                and abs(r[i]) <= LARGEST_SIGNAL
-            )
-            if lanes.ended[i] < 0 and not usual:
-                lanes.irregular[i] = 1
-                _end(lanes, i, sample, row)
+        applied[i] = slowest if wished[i] < slowest else limited
+    cut = 0
+    for i in range(u.size):
+        limited = lanes.high[i] if applied[i] > lanes.high[i] else applied[i]
+        u[i] = lanes.low[i] if applied[i] < lanes.low[i] else limited
+        status[i] = 0.0
+        cut += 0 if u[i] == wished[i] else 1
+    if cut > 0:
+        _set_flags(lanes, applied)
+
+
+@kernel
+def _end_irregular(lanes: Lanes, sample: int, row: int) -> None:
+    """End the lanes in which the controller would hold a value or start anew."""
+    values, rows = lanes.values, lanes.rows
+    for i in range(LANES):
+        if lanes.ended[i] < 0 and not (
+            abs(values[rows.u_wished, i]) <= lanes.largest_wish[i]
+            and abs(values[rows.y_measured, i]) <= LARGEST_SIGNAL
+            and abs(values[rows.v, i]) <= LARGEST_SIGNAL
+        ):
+            lanes.irregular[i] = 1
+            _end(lanes, i, sample, row)
+
+
+@kernel
+def _set_flags(lanes: Lanes, within_rates: Vector) -> None:
+    """Set the status of the lanes that have not ended, and keep its largest flags."""
+    values, rows = lanes.values, lanes.rows
+    wished, u, status = values[rows.u_wished], values[rows.u], values[rows.status]
+    for i in range(LANES):
+        if lanes.ended[i] < 0:
+            saturated = _SATURATED if u[i] != within_rates[i] else 0.0
+            rate_limited = _RATE_LIMITED if within_rates[i] != wished[i] else 0.0
+            status[i] = saturated + rate_limited
+            lanes.seen[0, i] = max(lanes.seen[0, i], saturated)
+            lanes.seen[1, i] = max(lanes.seen[1, i], rate_limited)
 
 
 @kernel
 def _arrive(values: Matrix, u: int, target: int, delay: int, count: int) -> None:
     """Write u, or the one of ``count`` samples ago, into the row ``target``."""
     last = u if count == 0 else delay + count - 1
-    for i in range(LANES):
+    for i in range(values.shape[1]):
         values[target, i] = values[last, i]
     for j in range(count - 1, -1, -1):
         source = u if j == 0 else delay + j - 1
-        for i in range(LANES):
+        for i in range(values.shape[1]):
             values[delay + j, i] = values[source, i]
 
 
@@ -184,12 +212,12 @@ def _advance(lanes: Lanes) -> None:
     _arrive(values, rows.u, rows.u_law, rows.law_delay, rows.end - rows.law_delay)
     n, m = lanes.plant.shape[0], lanes.law.shape[0]
     set_products(following, 0, lanes.plant, values, rows.x)
-    set_products(following, n, lanes.law, values, rows.u_law)
+    set_products(following, n, lanes.law, values, rows.p)
     for j in range(n):
-        for i in range(LANES):
+        for i in range(lanes.limit.size):
             values[rows.x + j, i] = following[j, i]
     for j in range(m):
-        for i in range(LANES):
+        for i in range(lanes.limit.size):
             values[rows.p + j, i] = following[n + j, i]
 
 
@@ -210,7 +238,7 @@ def _collect(lanes: Lanes, channels: NDArray[np.int64], sample: Matrix) -> None:
     set_products(values, rows.estimates, lanes.estimates, values, rows.p)
     for c in range(channels.size):
         source, target = values[channels[c]], sample[c]
-        for i in range(LANES):
+        for i in range(lanes.limit.size):
             target[i] = source[i]
 
 
@@ -219,7 +247,7 @@ def _start(lanes: Lanes) -> None:
     """Start the laws of the lanes that are to start, from their first measurement."""
     values, rows = lanes.values, lanes.rows
     for j in range(lanes.start.shape[0]):
-        for i in range(LANES):
+        for i in range(lanes.limit.size):
             if lanes.starting[i] != 0.0:
                 values[rows.p + j, i] = lanes.start[j, i] * values[rows.y_measured, i]
 
@@ -246,10 +274,11 @@ def run_lanes(
     number of samples until it is written.
     """
     values, rows, count = lanes.values, lanes.rows, 0
-    disturbances = rows.u_plant - rows.w
+    disturbances, references = rows.u_plant - rows.w, rows.u_law - rows.v
     for k in range(inputs.shape[0]):
         _spread(values, rows.w, disturbances, inputs, k, 0)
-        _spread(values, rows.v, rows.noise - rows.v + 1, inputs, k, disturbances)
+        _spread(values, rows.v, references, inputs, k, disturbances)
+        _spread(values, rows.noise, 1, inputs, k, disturbances + references)
         _measure(lanes, first + k, row + count)
         if k == 0:
             _start(lanes)
