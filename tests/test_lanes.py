@@ -25,7 +25,7 @@ from quell.types import Vector
 from .contracts.examples import OBSERVERS
 
 DT = 0.01
-# Of a channel's range; the docstring of simulate promises it, benchmarks/lanes.py measures it.
+# Of a channel's range, for the stable loops here; benchmarks/lanes.py has what others deviate by.
 TOLERANCE = 1e-9
 NOISY = ql.Scenario(
     reference=ql.signals.Step(at=0.2),
