@@ -110,15 +110,15 @@ def test_overlapping_arrays_have_code_of_their_own() -> None:
 def test_overlaps_are_found_where_something_is_written() -> None:
     """Also in memory that another object owns; parameters may share theirs."""
     a, b = np.zeros(8), np.zeros(8)
-    written = (1,)
-    assert not overlap((a, Memory(b[:4], b[4:])), written)
-    assert overlap((a, Memory(b[:5], b[4:])), written)
-    assert overlap((a, Memory(b, b)), written)
-    assert overlap((a[2:3], Memory(b, a)), written)
-    assert not overlap(((a, a[2:]), Memory(b, b[:0])), written)
+    assert not overlap([a], [b[:4], b[4:]])
+    assert overlap([a], [b[:5], b[4:]])
+    assert overlap([a], [b, b])
+    assert overlap([a[2:3]], [b, a])
+    assert overlap([a[6:], b], [a[:7]])
+    assert not overlap([a, a[2:]], [b])
     buffer = bytearray(64)
-    assert overlap((np.frombuffer(buffer), Memory(b, np.frombuffer(buffer)[7:])), written)
-    assert not overlap((np.frombuffer(buffer)[:7], Memory(b, np.frombuffer(buffer)[7:])), written)
+    assert overlap([np.frombuffer(buffer)], [b, np.frombuffer(buffer)[7:]])
+    assert not overlap([np.frombuffer(buffer)[:7]], [b, np.frombuffer(buffer)[7:]])
 
 
 def test_new_parameters_of_a_loop_are_not_compiled_for() -> None:

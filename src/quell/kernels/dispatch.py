@@ -143,9 +143,9 @@ def compiled(function: F) -> F:
 def compiled_loop(*read_only: str) -> Callable[[F], F]:
     """Return a decorator as ``compiled``, for a function that runs for many samples.
 
-    It writes to no array in its arguments ``read_only``. If none of the others overlaps another
-    array, ``specialised`` returns code that relies on that, and is quicker; else code that does
-    not.
+    It writes to no array in its arguments ``read_only``, whose shapes must not change. If none of
+    the others overlaps another array, ``specialised`` returns code that relies on that, and is
+    quicker; else code that does not.
     """
 
     def decorate(function: F) -> F:
@@ -154,7 +154,8 @@ def compiled_loop(*read_only: str) -> Callable[[F], F]:
         entry = _dispatcher(function, nogil=True, _nrt=False, pipeline_class=WithoutOverlaps)
         entry.with_overlaps = _dispatcher(plain, nogil=True, _nrt=False)
         names = inspect.signature(function).parameters
-        entry.written = tuple(i for i, name in enumerate(names) if name not in read_only)
+        # By position, the last argument with its layout and its arrays.
+        entry.parameters = {i: (None, None, ()) for i, n in enumerate(names) if n in read_only}
         return cast("F", entry)
 
     return decorate
@@ -171,8 +172,7 @@ def specialised(entry: Any, *arguments: Any) -> Any:
     See ``kernels/sized.py``. It does not check the types of its arguments: call it with arguments
     of the same types, shapes and constants only.
     """
-    dispatcher = _matching(entry, arguments)
-    layouts = tuple(map(layout_of, arguments))
+    dispatcher, layouts = _dispatcher_and_layouts(entry, arguments)
     found = dispatcher.specialised.get(layouts)
     if found is None:
         with _without_garbage_collection():
@@ -195,17 +195,33 @@ def _without_garbage_collection() -> Iterator[None]:
 
 def is_available(entry: Any, *arguments: Any) -> bool:
     """Return whether ``specialised`` has no need to compile: its code is here, or on the disk."""
-    dispatcher = _matching(entry, arguments)
+    dispatcher, _ = _dispatcher_and_layouts(entry, arguments)
     types = tuple(map(type_of, arguments))
     on_disk = dispatcher._cache.load_overload(types, dispatcher.targetctx)
     return types in dispatcher.overloads or on_disk is not None
 
 
-def _matching(entry: Any, arguments: tuple[Any, ...]) -> Any:
-    """Return the dispatcher of an entry point whose assumptions hold for ``arguments``."""
-    if hasattr(entry, "with_overlaps") and overlap(arguments, entry.written):
+def _dispatcher_and_layouts(entry: Any, arguments: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
+    """Return the dispatcher whose assumptions hold for the arguments, and their layouts."""
+    read: list[Any] = []
+    written: list[Any] = []
+    parameters = getattr(entry, "parameters", {})
+    layouts = []
+    for i, argument in enumerate(arguments):
+        if i not in parameters:
+            layouts.append(layout_of(argument, False, written))
+            continue
+        # Many runs have the same parameters, one after the other.
+        last, layout, arrays = parameters[i]
+        if last is not argument:
+            arrays = []
+            layout = layout_of(argument, False, arrays)
+            parameters[i] = argument, layout, arrays
+        layouts.append(layout)
+        read += arrays
+    if parameters and overlap(read, written):
         entry = entry.with_overlaps
-    return dispatcher_for(entry, *arguments)
+    return dispatcher_for(entry, *arguments), tuple(layouts)
 
 
 def call(entry: Any, *arguments: Any) -> Any:

@@ -160,25 +160,29 @@ def _words(numbers: tuple[int, ...]) -> Any:
     return ir.Constant(ir.ArrayType(word, len(numbers)), [ir.Constant(word, n) for n in numbers])
 
 
-def layout_of(value: Any, sized: bool = False) -> Any:
+def layout_of(value: Any, sized: bool = False, arrays: list[NDArray[Any]] | None = None) -> Any:
     """Return, hashable, what the type of an argument depends on; quicker than to make the type.
 
-    Arrays have known shapes if they are ``sized``, which those in a NamedTuple are.
+    Arrays have known shapes if they are ``sized``, which those in a NamedTuple are. Those that are
+    not empty are appended to ``arrays``.
     """
     kind: Any = type(value)
     if kind in _PLAIN:
         return kind
     if kind is np.ndarray:
-        flags = value.flags
-        if sized and value.size <= _MOST_ELEMENTS:
+        flags, size = value.flags, value.size
+        if size and arrays is not None:
+            arrays.append(value)
+        if sized and size <= _MOST_ELEMENTS:
             return value.shape, value.strides, value.dtype, flags.aligned, flags.writeable
         order = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
         return value.ndim, order, value.dtype, flags.aligned, flags.writeable
     if isinstance(value, tuple):
         notes = _annotations(kind)
-        constants = tuple((type(value[i]), value[i]) for i in notes.constants)
-        parts = zip(value, notes.sized or repeat(True), strict=False)
-        return kind, constants, tuple(layout_of(part, sized) for part, sized in parts)
+        constants = [(type(value[i]), value[i]) for i in notes.constants]
+        are_sized = notes.sized or repeat(True)
+        parts = map(layout_of, value, are_sized, repeat(arrays))
+        return kind, *constants, *parts
     return numba.typeof(value)
 
 

@@ -17,7 +17,7 @@ from quell.plants.batch import PlantBatch
 from quell.records.batch_trajectory import BatchTrajectory
 from quell.records.channels import columns_of, readable_names
 from quell.simulation.divergence import judge_integration
-from quell.simulation.driver import Loop, logged_channels
+from quell.simulation.driver import SIGNALS, Loop, logged_channels
 from quell.simulation.lane_batch import Outcome, run_over_lanes
 from quell.simulation.sampled_scenario import SampledScenario, Segment, segment_bounds
 from quell.simulation.scenario import Scenario, check_scenario
@@ -66,6 +66,8 @@ def simulate_batch(
         for i, model in zip(left, models, strict=True)
     }
     progress = part_of(progress, runs - len(left), runs, runs)
+    if max(columns) < len(SIGNALS) and not any(x.integration.needed for x in loops.values()):
+        width = len(SIGNALS)  # states and estimates are not used
     _run_loops(loops, columns, width, every, outcome, progress, workers)
     for i in np.flatnonzero(outcome.lengths < log.shape[2]).tolist():
         log[:, i, outcome.lengths[i] :] = np.nan

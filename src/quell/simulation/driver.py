@@ -21,6 +21,8 @@ from quell.simulation.integration import IntegrationCheck, Samples
 from quell.simulation.sampled_scenario import SampledScenario, Segment
 from quell.types import Channels, Matrix, Status, Vector
 
+SIGNALS = ("r", "y", "y_measured", "u")  # the first columns of a log
+
 
 @compiled_loop("plant", "design", "r", "derivatives", "w", "noise")
 def run_block(
@@ -43,9 +45,9 @@ def run_block(
 ) -> tuple[int, int, int, int]:
     """Run ``r.size`` samples from the time ``t0``; log every ``every``-th from ``row`` on.
 
-    Returns the number of samples that were run (fewer if the loop diverged: ``|y|`` beyond
-    ``limit``, or not finite), the next row, the number of samples until it is written, and all
-    status flags.
+    A log with as many columns as ``SIGNALS`` gets only these. Returns the number of samples that
+    were run (fewer if the loop diverged: ``|y|`` beyond ``limit``, or not finite), the next row,
+    the number of samples until it is written, and all status flags.
     """
     inputs = w.shape[1]
     status = 0
@@ -63,11 +65,12 @@ def run_block(
             log[row, 1] = y
             log[row, 2] = measured
             log[row, 3] = u
-            for j in range(inputs):
-                log[row, 4 + j] = w[k, j]
-            for j in range(x.size):
-                log[row, 4 + inputs + j] = x[j]
-            write_row(design, state, log[row, 4 + inputs + x.size :])
+            if log.shape[1] > len(SIGNALS):
+                for j in range(inputs):
+                    log[row, 4 + j] = w[k, j]
+                for j in range(x.size):
+                    log[row, 4 + inputs + j] = x[j]
+                write_row(design, state, log[row, 4 + inputs + x.size :])
             row += 1
             until_next = every
         until_next -= 1
@@ -180,5 +183,5 @@ class Loop:
 
 def logged_channels(plant: Plant, controller: Controller) -> Channels:
     """Return name and width of the columns that ``run_block`` logs, in order."""
-    scalars = tuple((name, 1) for name in ("r", "y", "y_measured", "u"))
+    scalars = tuple((name, 1) for name in SIGNALS)
     return (*scalars, ("w", plant.disturbances), ("x", plant.order), *controller.channels)
