@@ -101,22 +101,23 @@ def _spread(values: Matrix, row: int, count: int, samples: Any, k: int, column: 
 
 
 @kernel
-def _end(lanes: Lanes, lane: int, sample: int, row: int) -> None:
-    """End a lane: from now on all its values are zero."""
-    lanes.ended[lane], lanes.lengths[lane] = sample, row
-    for coefficients in (lanes.output, lanes.wish, lanes.law, lanes.plant, lanes.estimates):
-        for i in range(coefficients.shape[0]):
-            for j in range(coefficients.shape[1]):
-                coefficients[i, j, lane] = 0.0
-    for i in range(lanes.values.shape[0]):
-        lanes.values[i, lane] = 0.0
-    lanes.low[lane] = lanes.least_change[lane] = -np.inf
-    lanes.high[lane] = lanes.most_change[lane] = np.inf
+def _clear_ended(lanes: Lanes) -> None:
+    """Set all that belongs to lanes that have ended to zero, and their limits to infinity."""
+    for lane in range(LANES):
+        if lanes.ended[lane] >= 0:
+            for coefficients in (lanes.output, lanes.wish, lanes.law, lanes.plant, lanes.estimates):
+                for i in range(coefficients.shape[0]):
+                    for j in range(coefficients.shape[1]):
+                        coefficients[i, j, lane] = 0.0
+            for i in range(lanes.values.shape[0]):
+                lanes.values[i, lane] = 0.0
+            lanes.low[lane] = lanes.least_change[lane] = -np.inf
+            lanes.high[lane] = lanes.most_change[lane] = np.inf
 
 
 @kernel
-def _measure(lanes: Lanes, sample: int, row: int) -> None:
-    """Set y and the measurement; end the lanes that have diverged."""
+def _measure(lanes: Lanes, sample: int, row: int) -> int:
+    """Set y and the measurement; return how many lanes have diverged in this sample."""
     values, rows = lanes.values, lanes.rows
     set_products(values, rows.y, lanes.output, values, rows.x)
     y, noise, measured = values[rows.y], values[rows.noise], values[rows.y_measured]
@@ -124,15 +125,18 @@ def _measure(lanes: Lanes, sample: int, row: int) -> None:
     for i in range(lanes.limit.size):
         measured[i] = y[i] + noise[i]
         outside += 0 if abs(y[i]) <= lanes.limit[i] else 1
+    ended = 0
     if outside > 0:
-        for i in range(lanes.limit.size):
+        for i in range(LANES):
             if lanes.ended[i] < 0 and not abs(y[i]) <= lanes.limit[i]:
-                _end(lanes, i, sample, row)
+                lanes.ended[i], lanes.lengths[i] = sample, row
+                ended += 1
+    return ended
 
 
 @kernel
-def _control(lanes: Lanes, sample: int, row: int) -> None:
-    """Set u and status from the measurement; end irregular lanes."""
+def _control(lanes: Lanes, sample: int) -> int:
+    """Set u and status from the measurement; return how many lanes are irregular."""
     values, rows = lanes.values, lanes.rows
     wished, u, status = values[rows.u_wished], values[rows.u], values[rows.status]
     error, measured, r = values[rows.e], values[rows.y_measured], values[rows.v]
@@ -149,7 +153,7 @@ def _control(lanes: Lanes, sample: int, row: int) -> None:
         )
         irregular += 0 if usual else 1
     if irregular > 0:
-        _end_irregular(lanes, sample, row)
+        irregular = _end_irregular(lanes, sample)
     for i in range(u.size):
         fastest, slowest = u[i] + lanes.most_change[i], u[i] + lanes.least_change[i]
         limited = fastest if wished[i] > fastest else wished[i]
@@ -162,20 +166,22 @@ def _control(lanes: Lanes, sample: int, row: int) -> None:
         cut += 0 if u[i] == wished[i] else 1
     if cut > 0:
         _set_flags(lanes, applied)
+    return irregular
 
 
 @kernel
-def _end_irregular(lanes: Lanes, sample: int, row: int) -> None:
-    """End the lanes in which the controller would hold a value or start anew."""
-    values, rows = lanes.values, lanes.rows
+def _end_irregular(lanes: Lanes, sample: int) -> int:
+    """End the lanes in which the controller would hold a value or start anew; count them."""
+    values, rows, count = lanes.values, lanes.rows, 0
     for i in range(LANES):
         if lanes.ended[i] < 0 and not (
             abs(values[rows.u_wished, i]) <= lanes.largest_wish[i]
             and abs(values[rows.y_measured, i]) <= LARGEST_SIGNAL
             and abs(values[rows.v, i]) <= LARGEST_SIGNAL
         ):
-            lanes.irregular[i] = 1
-            _end(lanes, i, sample, row)
+            lanes.ended[i], lanes.irregular[i] = sample, 1
+            count += 1
+    return count
 
 
 @kernel
@@ -279,10 +285,12 @@ def run_lanes(
         _spread(values, rows.w, disturbances, inputs, k, 0)
         _spread(values, rows.v, references, inputs, k, disturbances)
         _spread(values, rows.noise, 1, inputs, k, disturbances + references)
-        _measure(lanes, first + k, row + count)
+        ended = _measure(lanes, first + k, row + count)
         if k == 0:
             _start(lanes)
-        _control(lanes, first + k, row + count)
+        ended += _control(lanes, first + k)
+        if ended > 0:
+            _clear_ended(lanes)
         if until_next == 0:
             _collect(lanes, channels, collected[count])
             count += 1
