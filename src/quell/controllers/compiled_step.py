@@ -13,6 +13,7 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from numba.core import types as nb_types
 from numba.extending import NativeValue, intrinsic, models, register_model, unbox
 
@@ -72,23 +73,24 @@ def _words(kind: Any, value: Any) -> bytes:
     words: list[float] = []
 
     def add(kind: Any, value: Any) -> None:
-        if isinstance(kind, nb_types.BaseTuple):
+        # Questions about a Numba type are slow; those about the value come first.
+        if isinstance(value, tuple):
             for part, entry in zip(kind, value, strict=True):
                 add(part, entry)
-        elif isinstance(kind, SizedArray):
+        elif type(kind) in (Constant, ConstantFlag):
+            pass  # compiled code knows it
+        elif type(kind) is SizedArray:
             formats.append("q")
             words.append(value.ctypes.data)
-        elif isinstance(kind, nb_types.Array):
+        elif isinstance(value, np.ndarray):
             formats.append("qqqqq" + 2 * value.ndim * "q")
             owners = (0, 0)  # nothing is counted
             words.extend((*owners, value.size, value.itemsize, value.ctypes.data))
             words.extend((*value.shape, *value.strides))
-        elif kind == nb_types.float64:
+        elif kind is nb_types.float64:
             formats.append("d")
             words.append(value)
-        elif isinstance(kind, Constant | ConstantFlag):
-            pass  # compiled code knows it
-        elif kind == nb_types.float32:
+        elif kind is nb_types.float32:
             formats.append("f4x")
             words.append(value)
         elif isinstance(kind, nb_types.Integer | nb_types.Boolean):
