@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 from typing import Any
@@ -34,6 +35,14 @@ NOISY = ql.Scenario(
     duration=8.0,
     seed=3,
 )
+
+
+class BegunBefore(ql.ADRC):
+    """A controller that does not begin from rest."""
+
+    def initial_state(self) -> Any:
+        """Return the state of a loop that has run already."""
+        return copy.deepcopy(self._state)
 
 
 @dataclass(frozen=True)
@@ -203,11 +212,14 @@ def test_runs_with_missing_samples_are_exact(signal: str) -> None:
 
 
 def test_what_is_not_linear_is_left_to_the_exact_loop() -> None:
-    """Learners, guards, nonlinear laws, observers and plants, encoders, prefilters."""
+    """Learners, guards, nonlinear laws, observers and plants, encoders, prefilters, other starts."""
     plant, han = two_mass_spring(), ql.controllers.NonlinearFeedback((0.5,) * 4, 0.1)
     nonlinear = ql.ESO.nonlinear(4, 1.0, 10.0, DT, delta=0.1)
+    own = controller()
+    own.__class__ = BegunBefore
     pairs = [
         (plant, controller()),
+        (plant, own),
         (plant, controller(learner=ql.learners.Kalman())),
         (plant, controller(guard=ql.Guard())),
         (plant, controller(feedback=han)),

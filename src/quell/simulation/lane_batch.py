@@ -94,7 +94,7 @@ def _run_group(
 ) -> tuple[int, int]:
     """Take a group through a segment, in a thread; return the place in the log to go on at."""
     _start(group, first)
-    inputs = _over_lanes(group.runs, shared, first, last)
+    inputs = _inputs_of_lanes(group.runs, shared, first, last)
     rows, (row, until_next) = group.lanes.rows, place
     # Columns of the inputs by the row that they are copied to; recorded inputs are written here.
     columns = {rows.w + j: j for j in range(rows.u_plant - rows.w)} | {
@@ -113,7 +113,7 @@ def _run_group(
     return int(end), int(after)
 
 
-def _over_lanes(
+def _inputs_of_lanes(
     runs: Sequence[LinearRun], shared: Mapping[int, Inputs], first: int, last: int
 ) -> Inputs:
     """Return the inputs (samples, …, lanes), with one lane if they are the same for all runs."""

@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import quell.controllers.adrc.linear_form  # noqa: F401  registers the form of an ADRC
+from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
 from quell.controllers.linear.form import LinearForm, linear_form
+from quell.controllers.linear.linear import LinearController
 from quell.kernels.lanes import LANES, lane_zeros
 from quell.lti.discretize import Stack, zero_order_holds
 from quell.plants.base import Plant
@@ -25,6 +27,9 @@ from quell.plants.linear import LinearPlant
 from quell.simulation.lanes import Lanes, Rows
 from quell.simulation.sampled_scenario import SampledScenario
 from quell.types import Matrix
+
+# A form begins from rest. A subclass of these controllers may begin otherwise.
+_FROM_REST = (ADRC.initial_state, LinearController.initial_state)
 
 
 class LinearRun(NamedTuple):
@@ -59,7 +64,10 @@ def linear_runs(
 ) -> list[LinearRun]:
     """Return the runs that qualify."""
     distinct = {id(controller): controller for controller in controllers}
-    forms = {key: linear_form(each.parameters) for key, each in distinct.items()}
+    forms = {
+        key: linear_form(each.parameters) if type(each).initial_state in _FROM_REST else None
+        for key, each in distinct.items()
+    }
     numbers: dict[Hashable, int] = {}
     keys = {
         key: numbers.setdefault(_signals_key(scenario), len(numbers))
