@@ -254,11 +254,11 @@ FORMULAS = {
 
 
 @pytest.mark.parametrize("kind", FORMULAS)
-@pytest.mark.parametrize("size", [1, 7, 4096, 8192, 10**6])
+@pytest.mark.parametrize("size", [1, 7, 512, 10**6])
 def test_a_signal_has_the_bits_of_its_formula_in_blocks_of_any_size(kind: str, size: int) -> None:
     """From −1 s on, over edges and blocks of draws, and in any order of times."""
     signal, formula = FORMULAS[kind]
-    t = np.arange(-1000, 100 if size == 1 else 40_000) * 1e-3
+    t = np.arange(-100, 4000) * 1e-2
     expected = formula(t)
     blocks = [signal(t[first : first + size]) for first in range(0, t.size, size)]
     np.testing.assert_array_equal(np.concatenate(blocks), expected)
