@@ -11,6 +11,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import Controller, check_controller
+from quell.kernels.sized import layout_of
 from quell.parallel import in_parallel, one_blas_thread, part_of
 from quell.plants.base import Plant, check_plant
 from quell.plants.batch import PlantBatch
@@ -61,10 +62,14 @@ def simulate_batch(
         parts = plants, controllers, sampled, recorded
         left = run_over_lanes(*parts, every, outcome, progress, workers)
     models = _models([plants[i] for i in left], dt, interpret)
-    loops = {
-        i: Loop(plants[i], model, controllers[i], sampled[i], interpret)
-        for i, model in zip(left, models, strict=True)
-    }
+    loops: dict[int, Loop] = {}
+    first: dict[Any, Loop] = {}
+    for i, model in zip(left, models, strict=True):
+        compiled = plants[i].compiled and not interpret
+        structure = (id(controllers[i]), layout_of(model)) if compiled else i
+        like = first.get(structure)
+        loops[i] = Loop(plants[i], model, controllers[i], sampled[i], interpret, like)
+        first.setdefault(structure, loops[i])
     progress = part_of(progress, runs - len(left), runs, runs)
     if max(columns) < len(SIGNALS) and not any(x.integration.needed for x in loops.values()):
         width = len(SIGNALS)  # states and estimates are not used

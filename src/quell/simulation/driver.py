@@ -85,7 +85,11 @@ def start_from_rest(design: Any, state: Any) -> None:
 
 
 class Loop:
-    """A plant and a controller during a run; ``run`` takes them through a segment."""
+    """A plant and a controller during a run; ``run`` takes them through a segment.
+
+    ``like`` is a loop with the same controller and a model of the same layout, which runs the same
+    code.
+    """
 
     def __init__(
         self,
@@ -94,6 +98,7 @@ class Loop:
         controller: Controller,
         scenario: SampledScenario,
         interpret: bool,
+        like: Loop | None = None,
     ) -> None:
         self.plant, self.controller, self.interpret = plant, controller, interpret
         self.model, self.design = model, controller.parameters
@@ -105,6 +110,7 @@ class Loop:
         self.integration = IntegrationCheck(model, as_python)
         self.scenario = scenario
         self._as_python = as_python
+        self._like = like
         self._run_block: Any = None  # the compiled function, from the first segment on
 
     def _entry(self, function: Any, *arguments: Any) -> Any:
@@ -148,7 +154,8 @@ class Loop:
                 self._entry(start_from_rest, *start)(*start)
             arguments = self._arguments(segment, log, row, every)
             if self._run_block is None:
-                self._run_block = self._entry(run_block, *arguments)
+                other = None if self._like is None else self._like._run_block
+                self._run_block = other or self._entry(run_block, *arguments)
             samples, row, self.until_next, flags = self._run_block(*arguments)
         self.done = first + samples
         self.status |= flags if samples == segment.r.size else flags | Status.DIVERGED
