@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from quell.cli.options import OUTPUTS, MaxSize, Outputs, WholeOrNone
-from quell.cli.output import check_outputs, progress_bar, table, write_results
+from quell.cli.output import check_outputs, compile_loops, progress_bar, table, write_results
 from quell.reading import MAX_SIZE
 
 if TYPE_CHECKING:
@@ -58,10 +59,8 @@ def acc(
         plants, source = plant_samples.read(samples, max_size), samples.name
     outputs = check_outputs(outputs, figures.NAMES)
     console = Console()
-    with console.status("Compiling what is not in the cache: about 20 seconds, once."):
-        for controller in designs(DT).values():
-            for cubic in (False, True):
-                study.judge_sampled(controller, plants[:1], cubic)
+    first = [plant_samples.plant(plants[0], cubic) for cubic in (False, True)]
+    compile_loops(console, list(product(first, designs(DT).values())))
     with progress_bar(console, width=28) as report:
         result = study.run(plants, source, report)
         paths = []
