@@ -7,9 +7,11 @@ left to the exact loop.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +25,10 @@ from quell.simulation.lane_groups import Group, LinearRun, groups_of, linear_run
 from quell.simulation.lanes import COLLECTED, run_lanes
 from quell.simulation.sampled_scenario import SampledScenario, segment_bounds
 from quell.types import Status
+
+# Few enough that handing out jobs takes little of a thread's time, enough that all threads end at
+# about the same time. Chosen by hand.
+_JOBS_PER_THREAD = 4
 
 Inputs = NDArray[np.float64]  # w, r and its derivatives, noise (samples, …)
 
@@ -57,17 +63,23 @@ def run_over_lanes(
     for first, last in segment_bounds(samples, rests) if groups else ():
         live = [i for i, group in enumerate(groups) if np.any(group.lanes.ended < 0)]
         shared = _shared_inputs([groups[i] for i in live], first, last)
-        jobs = [
+        steps = [
             partial(_run_group, groups[i], shared, first, last, outcome.log, every, places[i])
             for i in live
         ]
+        size = max(1, len(steps) // (_JOBS_PER_THREAD * (workers or os.cpu_count() or 1)))
+        jobs = [partial(_run_all, steps[k : k + size]) for k in range(0, len(steps), size)]
         done = part_of(progress, first * len(runs), last * len(runs), samples * len(plants))
-        for i, place in zip(live, in_parallel(jobs, done, workers), strict=True):
+        for i, place in zip(live, chain(*in_parallel(jobs, done, workers)), strict=True):
             places[i] = place
     left = set(range(len(plants)))
     for group, (row, _) in zip(groups, places, strict=True):
         left -= set(_conclude(group, row, samples, outcome))
     return sorted(left)
+
+
+def _run_all(steps: Sequence[Callable[[], tuple[int, int]]]) -> list[tuple[int, int]]:
+    return [step() for step in steps]
 
 
 def _shared_inputs(groups: Sequence[Group], first: int, last: int) -> Mapping[int, Inputs]:
