@@ -124,12 +124,12 @@ def test_one_run_and_a_choice_of_channels() -> None:
 
 
 def test_limits_act_over_lanes_as_in_the_exact_loop() -> None:
-    """Of size and rate, different ones in each lane, with their flags in every sample."""
+    """Of size and rate, different ones in each lane, with their flags in every sample, and from rest."""
     laws = [
         controller(u_min=-high, u_max=high, rate_limit=rate)
         for high, rate in ((0.2, math.inf), (0.3, 1.0), (math.inf, (-0.5, 2.0)), (0.05, 0.1))
     ]
-    lanes = compare(masses(4), laws, replace(NOISY, duration=3.0))
+    lanes = compare(masses(4), laws, replace(NOISY, duration=3.0, rest_at=(1.5,)))
     saturated, slow = int(ql.Status.SATURATED), int(ql.Status.RATE_LIMITED)
     assert [int(s) & (saturated | slow) for s in lanes.status] == [
         saturated, saturated | slow, slow, saturated | slow
