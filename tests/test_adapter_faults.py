@@ -115,8 +115,10 @@ def test_where_warnings_are_errors_a_failure_still_stays_inside(
 def test_an_interrupted_model_interrupts_the_simulation() -> None:
     """Control-C while the model runs comes out of ``simulate``, once the loop can be left."""
     script = """
-import time, warnings
+import signal, time, warnings
 import quell as ql
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it in the background
 
 class Model:
     calls = 0

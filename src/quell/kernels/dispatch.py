@@ -51,11 +51,12 @@ class Generic(Protocol[P, R_co]):
         """Return a decorator that makes a function the implementation for ``cls``."""
 
 
-# Fused multiply-add and re-ordered sums are allowed, but NaN and Inf keep their meaning: guards
-# test for them. Inlining is forced because a NamedTuple of arrays is passed as some eighty words,
+# Fused multiply-add is allowed. Re-ordered sums are not: the order would depend on what a kernel is
+# inlined into, and a rig would no longer be its simulation to the last bit. So write sums with what
+# is known late at their end, for the processor works on the rest meanwhile. Inlining is forced because a NamedTuple of arrays is passed as some eighty words,
 # which costs more than most kernels do.
 OPTIONS: dict[str, Any] = {
-    "fastmath": {"contract", "reassoc", "nsz"},
+    "fastmath": {"contract", "nsz"},
     "error_model": "numpy",
     "forceinline": True,
 }
@@ -172,6 +173,8 @@ def specialised(entry: Any, *arguments: Any) -> Any:
     See ``kernels/sized.py``. It does not check the types of its arguments: call it with arguments
     of the same types, shapes and constants only.
     """
+    if numba.config.DISABLE_JIT:
+        return entry
     dispatcher, layouts = _dispatcher_and_layouts(entry, arguments)
     found = dispatcher.specialised.get(layouts)
     if found is None:

@@ -52,7 +52,7 @@ def acting_control(model: Any, z: Vector, u: float) -> float:
 def predict_state(model: Any, z: Vector, predicted: Vector, u: float, f: float) -> None:
     """Write ``Φ z + Γ_u u + Γ_f f`` into ``predicted`` (N,)."""
     for i in range(z.size):
-        total = model.input[i] * u + model.feed[i] * f
+        total = 0.0
         for j in range(z.size):
             total += model.transition[i, j] * z[j]
-        predicted[i] = total
+        predicted[i] = total + model.feed[i] * f + model.input[i] * u

@@ -35,12 +35,12 @@ def _measure(plant: LinearModel, x: Vector) -> float:
 def _advance(plant: LinearModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
     size = x.size
     for i in range(size):
-        total = plant.input[i] * u
+        total = 0.0
         for j in range(w.size):
             total += plant.disturbance[i, j] * w[j]
         for j in range(size):
             total += plant.transition[i, j] * x[j]
-        scratch[i] = total
+        scratch[i] = total + plant.input[i] * u  # u last: it is calculated meanwhile
     for i in range(size):
         x[i] = scratch[i]
 

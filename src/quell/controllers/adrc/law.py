@@ -242,13 +242,14 @@ def reset_lag_filters(design: AdrcDesign, state: AdrcState) -> None:
 def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slope: float) -> float:
     """Return the control signal before limits for ``f_L = constant + slope · u``."""
     seen, reference, order = state.seen, state.reference, design.law.size
-    unlimited = design.law[0] * state.loop[0].r - design.cancel_f * (seen[order] + constant)
+    unlimited = design.law[0] * state.loop[0].r
     if reference.size > 0:
         for i in range(1, reference.size):
             unlimited += design.law[i] * reference[i - 1]
         unlimited += reference[reference.size - 1]
     for i in range(order):
         unlimited += (design.cancel[i] - design.law[i]) * seen[i]
+    unlimited -= design.cancel_f * (seen[order] + constant)
     r = state.loop[0].r
     unlimited = nonlinear_part(design.feedback, design.law, seen, r, reference, unlimited)
     return unlimited / (design.b0 + design.cancel_f * slope)

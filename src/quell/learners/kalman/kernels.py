@@ -117,9 +117,10 @@ def _adapt(
     regressor, averages = memory.regressor, memory.averages[0]
     size = theta.size
     # Loops, because at this size a call of BLAS takes longer than the arithmetic.
-    innovation = f_plain
+    explained = 0.0
     for i in range(size):
-        innovation -= theta[i] * memory.filtered[i]
+        explained += theta[i] * memory.filtered[i]
+    innovation = f_plain - explained
     noise, deviation = _update_averages(learner, averages, y, y - seen[0], innovation, f_plain)
     if not is_finite(deviation):  # for example after a measurement near the largest float
         restart(learner, memory)
