@@ -51,10 +51,10 @@ class Generic(Protocol[P, R_co]):
         """Return a decorator that makes a function the implementation for ``cls``."""
 
 
-# Fused multiply-add is allowed. Re-ordered sums are not: the order would depend on what a kernel is
-# inlined into, and a rig would no longer be its simulation to the last bit. So write sums with what
-# is known late at their end, for the processor works on the rest meanwhile. Inlining is forced because a NamedTuple of arrays is passed as some eighty words,
-# which costs more than most kernels do.
+# Fused multiply-add is allowed. Sums are not re-ordered: the order would depend on what a kernel is
+# inlined into, and a rig would no longer be its simulation to the last bit. (Write what is known
+# late at the end of a sum: the processor works on the rest meanwhile.) Inlining is forced because a
+# NamedTuple of arrays is passed as some forty words, which costs more than most kernels do.
 OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "nsz"},
     "error_model": "numpy",
