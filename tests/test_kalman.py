@@ -287,6 +287,19 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
         np.testing.assert_array_equal(array, fresh)
 
 
+def test_a_sample_whose_square_overflows_leaves_a_learner_as_before_the_first() -> None:
+    """Its averages would stay infinite, and nothing would be learned any more."""
+    learner = ql.learners.Kalman(u=True)
+    design = learner.design(ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2), 1.0)
+    memory = learner.memory(design)
+    for huge in (1e200, -1e300):
+        commit(design, memory, np.array([1.0, 2.0, 3.0]), 0.4, 0.0)
+        with np.errstate(over="ignore"):
+            adapt(design, memory, np.zeros(3), huge, 0.0, huge)
+        for array, fresh in zip(memory, learner.memory(design), strict=True):
+            np.testing.assert_array_equal(array, fresh)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -132,6 +132,40 @@ def test_an_output_that_grows_without_bound_is_found_in_the_sample() -> None:
     assert not has_escaped(watched(1.0), 1e12, 2000.0)
     assert not has_escaped(watched(1.0), 1.2e12, 1000.0)
     assert not has_escaped(watched(0.0), 1.2e12, 2000.0)  # the first window
+    assert not has_escaped(watched(1.0), 2.0**40, 2000.0)
+    assert not has_escaped(watched(1.0), 1.2e12, 1024.0)
+    assert has_escaped(watched(0.5), 1.2e12, 1025.0)
+
+
+def test_at_the_very_limits_nothing_is_lost() -> None:
+    """Each comparison is strict; powers of two are exact."""
+
+    def ones(k: int) -> float:
+        return 1.0
+
+    assert verdicts(wave, ones, lambda k: 1024.0, lambda k: 2000.0) == []
+    assert verdicts(wave, ones, lambda k: 1025.0, lambda k: 1024.0) == []
+    assert verdicts(wave, ones, lambda k: 1025.0, lambda k: 1025.0, samples=21) == [19]
+    # 2⁻⁴⁰ of the largest f, and half of the f of the window before.
+    for shock, found in ((2.0**40, []), (2.0**40 + 4096.0, [79])):
+        assert verdicts(wave, lambda k, shock=shock: shock if k == 30 else 1.0, samples=99) == found
+    for later, found in ((0.5, [59]), (0.499, [79])):
+        jump = {0: 2.0**41}
+
+        def fading(k: int, later: float = later, jump: dict[int, float] = jump) -> float:
+            return jump.get(k, 1.0 if k < 40 else later)
+
+        assert verdicts(wave, fading, samples=80)[-1:] == found
+    # y moves by 1e-8 of its size, or by a little more.
+    for step, found in ((1.0, []), (1.25, [59])):
+        assert (
+            verdicts(
+                lambda k, step=step: 1e8 - step * (k % 2),
+                lambda k: 1e13 if k == 0 else 1.0,
+                samples=60,
+            )
+            == found
+        )
 
 
 def test_coefficients_that_overflow_are_forgotten() -> None:
