@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.learners.base import adapt, commit, forget, predict
+from quell.learners.base import adapt, coefficients, commit, forget, predict
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.learners.noise_gate import relative_noise
 
@@ -144,6 +144,9 @@ def test_the_kalman_learner_follows_its_equations(name: str, rng: np.random.Gene
         np.testing.assert_allclose(memory.omega, reference.omega, rtol=1e-9)
         np.testing.assert_allclose(memory.phase, reference.psi, atol=1e-9)
     assert np.all(memory.theta != 0.0)
+    shown = np.zeros(reference.p)
+    coefficients(design, memory, shown)
+    np.testing.assert_allclose(shown, reference.theta * reference.scale, rtol=1e-6, atol=1e-8)
     forget(design, memory)
     for array, fresh in zip(memory, learner.memory(design), strict=True):
         np.testing.assert_array_equal(array, fresh)

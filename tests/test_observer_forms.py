@@ -606,6 +606,10 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
             lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-20, drift=1e-20, jitter=1e10),
             r"no steady-state gain is found; they ask for about 1e\+08 rad/s",
         ),
+        (  # stable, but faster than the samples
+            lambda: ESO.kalman(1, 1.0, 0.01, noise_variance=1e-8, drift=100.0),
+            r"no steady-state gain is found; they ask for about 1e\+03 rad/s",
+        ),
         (lambda: ESO.nonlinear(2, 1.0, 10.0, 0.01, delta=0.0), "delta = 0.0"),
         *(
             (

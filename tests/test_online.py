@@ -150,6 +150,22 @@ def test_noise_in_the_targets_counts_for_as_many_pairs_as_it_lasts() -> None:
             assert 1.0 - found.forget == pytest.approx(math.exp(-every * dt / 3.0), rel=1e-12)
 
 
+def test_models_take_their_times_from_controller_and_observer() -> None:
+    """They remember 100/omega_c or 1000/omega_c by default; noise lasts as long as the observer's lag."""
+    for make, name, lags in (
+        (ql.learners.MLP, "rule", 100.0),
+        (ql.learners.GaussianProcess, "", 1000.0),
+    ):
+        for memory_time in (None, 7.0):
+            learner = make(every=2, noise=0.2, memory_time=memory_time)
+            found = learner.design(OBSERVER, 4.0).model
+            found = getattr(found, name) if name else found
+            rate = 2 * OBSERVER.dt / (memory_time or lags / 4.0)
+            assert -math.log1p(-found.forget) == pytest.approx(rate, rel=1e-9)
+            lasts = 3 / 20.0 / (2 * OBSERVER.dt)
+            assert found.noise == pytest.approx(0.04 * lasts, rel=1e-12)
+
+
 def test_a_network_says_nothing_before_it_has_learned() -> None:
     """And the seed decides about its first weights."""
     design = Network(8, 3, 1, 1.0, 0.1, 1.0).design(2, 1.0)
