@@ -602,9 +602,17 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
             lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-30, drift=1e30),
             r"no steady-state gain is found; they ask for about 2.15e\+10 rad/s",
         ),
+        (  # beyond what SciPy scales without a warning
+            lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-30, drift=1e-30, jitter=1e30),
+            r"no steady-state gain is found; they ask for about 3.16e\+15 rad/s",
+        ),
         (
             lambda: ESO.kalman(2, 1.0, 0.01, noise_variance=1e-20, drift=1e-20, jitter=1e10),
             r"no steady-state gain is found; they ask for about 1e\+08 rad/s",
+        ),
+        (  # so slow that no correction is left
+            lambda: ESO.kalman(1, 1.0, 0.01, noise_variance=1e20, drift=1e-20),
+            r"no steady-state gain is found; they ask for about 3.16e-10 rad/s",
         ),
         (  # stable, but faster than the samples
             lambda: ESO.kalman(1, 1.0, 0.01, noise_variance=1e-8, drift=100.0),

@@ -212,6 +212,12 @@ def memory(**fields: float) -> Any:
         ({"y": 10.063, "u": 0.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
         ({"y": 10.063, "u": 1.0, "watching": SUSPECT}, 10.5, OFF),  # the right way after all
         ({"y": 10.062, "u": 1.0, "watching": SUSPECT}, 10.5, SUSPECT),
+        ({"y": 10.0625, "u": 1.0, "watching": SUSPECT}, 10.5, SUSPECT),  # at the very limit
+        (
+            {"y": -0.025, "y_began": 0.0, "y_rest_low": 0.0, "y_rest_high": 0.0, "u": 1.0},
+            0.5,
+            ARMED,
+        ),
         ({"y": 10.063, "u": -1.0, "pushed": 5.0, "watching": SUSPECT}, 10.5, SUSPECT),
     ],
 )

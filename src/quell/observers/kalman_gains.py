@@ -44,7 +44,8 @@ def kalman_gain(
     phi, _ = zero_order_hold(scaled, [], step)
     C, R = np.eye(1, size), np.array([[1.0 / step]])
     try:
-        P = solve_discrete_are(phi.T, C.T, gramian(scaled, drive, step), R)
+        with np.errstate(invalid="ignore"):  # what overflows is found below
+            P = solve_discrete_are(phi.T, C.T, gramian(scaled, drive, step), R)
     except (np.linalg.LinAlgError, ValueError):
         P = np.full((size, size), np.nan)
     gain = P[:, 0] / (P[0, 0] + R[0, 0])
