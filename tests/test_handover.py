@@ -223,6 +223,20 @@ def test_a_model_that_comes_later_changes_nothing_at_rest() -> None:
         assert controller.estimate.f == pytest.approx(f, abs=1e-9)
 
 
+def test_retuning_before_the_first_measurement_changes_no_state() -> None:
+    """There is no u to continue from: the first sample is that of a controller made so."""
+    controller = ql.ADRC(OBSERVER, omega_c=3.0)
+    made = ql.ADRC(ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=DT), omega_c=6.0)
+    for each in (controller, made):
+        assert control(each.parameters, each._state, 1.0, math.nan) == 0.0
+    before = controller.state
+    controller.retune(omega_c=6.0, observer=made.observer)
+    for name, array in controller.state.items():
+        np.testing.assert_array_equal(array, before[name])
+    first = control(controller.parameters, controller._state, 1.0, 0.25)
+    assert first == control(made.parameters, made._state, 1.0, 0.25) == pytest.approx(27.0)
+
+
 def test_gains_may_be_scheduled_every_sample() -> None:
     """Retuned to what it is in each sample, the loop is the loop that is left alone."""
     ys = {}

@@ -611,8 +611,17 @@ def test_a_nonlinear_observer_takes_no_learner_and_no_guard(extra: dict[str, Any
             r"no steady-state gain is found; they ask for about 1e\+08 rad/s",
         ),
         (  # so slow that no correction is left
-            lambda: ESO.kalman(1, 1.0, 0.01, noise_variance=1e20, drift=1e-20),
-            r"no steady-state gain is found; they ask for about 3.16e-10 rad/s",
+            lambda: ESO.kalman(1, 1.0, 0.01, noise_variance=1e12, drift=1e-14),
+            r"no steady-state gain is found; they ask for about 1e-06 rad/s",
+        ),
+        *(
+            (
+                lambda noise=noise, drift=drift: ESO.kalman(
+                    1, 1.0, 0.01, noise_variance=noise, drift=drift
+                ),
+                f"no steady-state gain is found; they ask for about {omega} rad/s",
+            )
+            for noise, drift, omega in ((1e300, 1e-300, "0"), (1e-323, 1.0, "inf"))
         ),
         (  # stable, but faster than the samples
             lambda: ESO.kalman(1, 1.0, 0.01, noise_variance=1e-8, drift=100.0),

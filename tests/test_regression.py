@@ -260,7 +260,12 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
     design = learner.design(OBSERVER, 1.0)
     memory = learner.memory(design)
     memory.theta[:], memory.filtered[:], memory.rule.covariance[0, 0] = 0.25, 1.0, 3.0
+    loop, memory.chain[:], memory.gate.mean[:], memory.gate.noise[:] = memory.loop[0], 2.0, 3.0, 4.0
+    loop.samples, loop.bias, loop.learn_after, loop.has_scale = 9.0, 5.0, 12.0, 1.0
     restart(design, memory)
+    assert (loop.samples, loop.bias, loop.learn_after, loop.has_scale) == (0.0, 0.0, 0.0, 1.0)
+    for filters in (memory.chain, *memory.gate):
+        assert not np.any(filters)
     assert np.all(memory.theta == 0.25)
     assert np.all(memory.filtered == 0.0)
     assert memory.rule.covariance[0, 0] == 3.0

@@ -34,7 +34,16 @@ def kalman_gain(
     # With drift alone q/(r dt) is the bandwidth to the power 2N, with jitter alone to the power
     # 2n. Take the faster one.
     density = noise * dt
-    omega = max((drift / density) ** (0.5 / size), (jitter / density) ** (0.5 / (size - 1)))
+    with np.errstate(all="ignore"):
+        by_drift, by_jitter = np.float64(drift) / density, np.float64(jitter) / density
+        omega = float(max(by_drift ** (0.5 / size), by_jitter ** (0.5 / (size - 1))))
+    refusal = ValueError(
+        f"noise_variance = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with "
+        f"dt = {dt!r} s: no steady-state gain is found; they ask for about {omega:.3g} rad/s, "
+        "which should be between 1e-3/dt and 1/dt"
+    )
+    if not 0.0 < omega < np.inf:
+        raise refusal
     scale = omega ** -np.arange(size, dtype=np.float64)
     scaled = A * scale[:, None] / scale[None, :] / omega
     drive = np.zeros((size, size))
@@ -55,9 +64,5 @@ def kalman_gain(
     with np.errstate(divide="ignore"):
         rate = float(np.exp(np.mean(np.log(np.abs(np.log(poles.astype(complex)))))))
     if not (np.max(np.abs(poles)) < 1.0 and rate < np.pi):
-        raise ValueError(
-            f"noise_variance = {noise!r}, drift = {drift!r}, jitter = {jitter!r} with "
-            f"dt = {dt!r} s: no steady-state gain is found; they ask for about {omega:.3g} rad/s, "
-            "which should be between 1e-3/dt and 1/dt"
-        )
+        raise refusal
     return np.asarray(gain / scale), rate / dt
