@@ -128,8 +128,10 @@ def test_a_gain_margin_may_lie_at_standstill() -> None:
 def test_a_crossing_that_loses_nothing_is_no_gain_margin() -> None:
     """The negative real axis is crossed at −1/2 and at −1/3, −2 and −4, and only the outer ones change stability."""
 
+    sizes = [0.5, 1.0 / 3.0, 2.0, 4.0]
+
     def loop(omega: Any) -> Any:
-        shape = np.interp(omega, [1.0, 2.0, 3.0, 4.0], [0.5, 1.0 / 3.0, 2.0, 4.0])
+        shape = np.interp(omega, [1.0, 2.0, 3.0, 4.0], sizes)
         return -shape * np.exp(1j * (omega - 1.0) * (omega - 2.0) * (omega - 3.0) * (omega - 4.0))
 
     omega = np.linspace(0.95, 4.05, 300)
@@ -137,6 +139,11 @@ def test_a_crossing_that_loses_nothing_is_no_gain_margin() -> None:
     assert m.gain == pytest.approx((0.25, 3.0), rel=1e-9)
     assert m.gain_omega == pytest.approx((4.0, 2.0), rel=1e-9)
     assert margins(loop, omega, 0.1, lambda gain: True).gain == (0.0, math.inf)
+    sizes[:] = [0.8, 2.0 / 3.0, 1.25, 1.5]  # factors near one: 1.25, 1.5, 0.8 and 2/3
+    for low, high in ((0.8, 1.25), (2.0 / 3.0, 1.5), (0.8, 1.5), (2.0 / 3.0, 1.25)):
+        stable = (0.99 * low, 1.01 * high)
+        m = margins(loop, omega, 0.1, lambda gain, stable=stable: stable[0] < gain < stable[1])
+        assert m.gain == pytest.approx((low, high), rel=1e-9)
 
 
 def test_the_lowest_of_several_dips_is_found_between_the_points_of_the_grid() -> None:
