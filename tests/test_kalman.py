@@ -287,6 +287,18 @@ def test_a_learner_that_left_the_range_of_numbers_begins_anew() -> None:
         np.testing.assert_array_equal(array, fresh)
 
 
+def test_with_what_is_no_covariance_nothing_is_learned() -> None:
+    """Rounding may make φ·Pφ negative: θ and P stay, and the learner goes on when it is positive."""
+    learner = ql.learners.Kalman(bias=False)
+    design, memory = kalman_memory(learner, ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=1e-2))
+    memory.filtered[:] = 0.3, -0.4
+    for sign in (-1.0, 1.0):
+        memory.covariance[:] = before = sign * np.eye(2)
+        adapt(design, memory, np.zeros(3), 1.0, 0.0, 1.0)
+        assert np.all(memory.theta == 0.0) == (sign < 0.0)
+        assert np.array_equal(memory.covariance, before) == (sign < 0.0)
+
+
 def test_a_sample_whose_square_overflows_leaves_a_learner_as_before_the_first() -> None:
     """Its averages would stay infinite, and nothing would be learned any more."""
     learner = ql.learners.Kalman(u=True)

@@ -263,6 +263,11 @@ def test_a_network_follows_the_equations_of_its_filter(rng: np.random.Generator)
     # Each unit switches within the range of the features: c_j + W_j φ = 0 for a φ in [−1, 1]².
     assert np.all(np.abs(first[:, 1]) <= np.sum(np.abs(first[:, 2:]), axis=1))
     assert np.std(first[:, 2:]) == pytest.approx(3.0, rel=0.7)
+    many = Network(400, 1, 2, 9.0, 0.3, 4.0)
+    wide = many.memory(many.design(2, 0.5)).theta[:-1].reshape(400, 4)
+    assert np.std(wide[:, 2:]) == pytest.approx(3.0, rel=0.1)
+    assert np.std(wide[:, 1]) == pytest.approx(3.0 * math.sqrt(2.0 / 3.0), rel=0.1)
+    assert abs(np.corrcoef(wide[:, 1], wide[:, 2] + wide[:, 3])[0, 1]) < 0.2
     R, keep, bounded = 0.09 * 4.0, math.exp(-1.0 / 9.0), 0
     for k in range(120):
         x, target = rng.uniform(-1.0, 1.0, 2), 3.0 * rng.normal() if k > 60 else rng.normal()

@@ -102,12 +102,14 @@ def test_the_uncertainty_of_rls_does_not_grow_beyond_that_of_the_prior() -> None
     assert memory.covariance[0, 0] == pytest.approx(9.0 / 0.99, rel=1e-4)
 
 
-@pytest.mark.parametrize("covariance", [-9.0, 1e100, math.nan])
+@pytest.mark.parametrize("covariance", [-9.0, -0.01, 0.0, 1e100, math.nan])
 def test_rls_learns_nothing_with_what_is_no_covariance(covariance: float) -> None:
-    """θ and P stay as they are."""
+    """θ and P stay as they are; without features, too."""
     rule, memory = rls(2, forget=0.01)
-    memory.covariance[:] = before = covariance * np.eye(2)
     theta = np.array([0.5, -0.25])
+    update_theta(rule, memory, theta, np.zeros(2), 3.0, 1.0)
+    np.testing.assert_array_equal(memory.covariance, 9.0 * np.eye(2))
+    memory.covariance[:] = before = covariance * np.eye(2)
     update_theta(rule, memory, theta, np.array([1.0, 2.0]), 3.0, 1.0)
     np.testing.assert_array_equal(memory.covariance, before)
     assert theta.tolist() == [0.5, -0.25]

@@ -129,6 +129,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the verdicts to this file")
     parser.add_argument("--baseline", type=Path, help="folder that keeps the unchanged run")
     options = parser.parse_args()
+    os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # for what is preloaded
     console = Console()
     areas = options.areas.split(",")
     with tempfile.TemporaryDirectory() as folder:
@@ -275,6 +276,7 @@ def _pytest(copy: Path, arguments: list[str]) -> tuple[int, str]:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     output = copy / "output"
+    output.unlink(missing_ok=True)
     process = context.Process(target=_run_pytest, args=(copy, ["-n0", *arguments], output))
     process.start()
     process.join(4.0 * BUDGET)
@@ -282,6 +284,8 @@ def _pytest(copy: Path, arguments: list[str]) -> tuple[int, str]:
         process.kill()
         process.join()
         return TIMED_OUT, ""
+    if not output.exists():
+        raise RuntimeError("a process for tests did not start; its error is above")
     return process.exitcode or 0, output.read_text(encoding="utf-8", errors="replace")
 
 
