@@ -94,7 +94,7 @@ OPTIONS = [
     *("-q", "--tb=no", "-p", "no:cacheprovider", "-p", "interpret_all", f"--cpu-limit={LIMIT}")
 ]
 # CPU time of the tests that one mutant runs [s]; more tests of the same line rarely find more.
-BUDGET = 40.0
+BUDGET = 60.0
 # A statement that fewer tests execute themselves may run in a fixture, at import or in a cache, for
 # tests that come later.
 FEW = 10
