@@ -188,7 +188,7 @@ def test_a_controller_goes_on_without_a_trace(name: str) -> None:
     other.state = one.state
     others = (other, copy.deepcopy(one), pickle.loads(pickle.dumps(one)))
     expected = [one.step(0.5, 1.0 - 0.01 * k) for k in range(100)]
-    attributes = {label for label in vars(one) if not label.startswith("_")}
+    attributes = {label for label in vars(CONTROLLERS[name]) if not label.startswith("_")}
     for copied in others:
         assert {label for label in vars(copied) if not label.startswith("_")} == attributes
         assert [copied.step(0.5, 1.0 - 0.01 * k) for k in range(100)] == expected
