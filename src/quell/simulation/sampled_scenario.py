@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -89,6 +92,29 @@ class SampledScenario:
         derivatives, w = _columns(self.derivatives, t), _columns(disturbances, t)
         r, added = (np.ascontiguousarray(s(t), np.float64) for s in (reference, noise))
         return Segment(first, self.dt, first in self.rest_samples, r, derivatives, w, added)
+
+
+def segments(scenario: SampledScenario) -> Iterator[Segment]:
+    """Return an iterator over all segments, which evaluates the next one in another thread.
+
+    The compiled loop releases the interpreter lock, so the signals then cost no time.
+    """
+    bounds = deque(segment_bounds(scenario.samples, scenario.rest_samples))
+    if len(bounds) == 1:
+        yield scenario.segment(*bounds[0])
+        return
+    context = copy_context()  # with the caller's np.errstate
+
+    def evaluate(samples: tuple[int, int]) -> Segment:
+        return context.run(scenario.segment, *samples)
+
+    with ThreadPoolExecutor(1) as thread:
+        coming = thread.submit(evaluate, bounds.popleft())
+        while bounds:
+            segment = coming.result()
+            coming = thread.submit(evaluate, bounds.popleft())
+            yield segment
+        yield coming.result()
 
 
 def segment_bounds(samples: int, rest_samples: Iterable[int]) -> list[tuple[int, int]]:

@@ -18,7 +18,7 @@ from quell.records.trajectory import Trajectory
 from quell.simulation.batch import simulate_batch
 from quell.simulation.divergence import judge_integration
 from quell.simulation.driver import Loop, logged_channels
-from quell.simulation.sampled_scenario import SampledScenario, segment_bounds
+from quell.simulation.sampled_scenario import SampledScenario, segments
 from quell.simulation.scenario import Scenario, check_scenario
 
 
@@ -141,12 +141,12 @@ def simulate(
     channels = logged_channels(plant, controller)
     log = np.empty(((samples - 1) // every + 1, loop.width))
     row = 0
-    for first, last in segment_bounds(samples, sampled.rest_samples):
-        row = loop.run(sampled.segment(first, last), log, row, every)
+    for segment in segments(sampled):
+        row = loop.run(segment, log, row, every)
         if loop.diverged:
             break
         if progress is not None:
-            progress(last / samples)
+            progress(loop.done / samples)
     judge_integration(plant.name, [loop])
     return Trajectory(
         log=log[:row],
