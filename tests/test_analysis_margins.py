@@ -179,6 +179,8 @@ def test_a_change_of_sign_that_does_not_repeat_is_none() -> None:
             _sign_changes(lambda w, size=size: np.full(w.shape, size), omega, np.array(values))
             == []
         )
+    for values in ([-math.inf, 0.5], [-0.5, math.inf]):
+        assert _sign_changes(lambda w: w - 1.5, omega, np.array(values)) == []
     assert _sign_changes(lambda w: w - 1.5, omega, omega - 1.5) == pytest.approx([1.5], rel=1e-12)
 
 

@@ -276,6 +276,7 @@ def test_algorithm_1_on_scaled_features_follows_its_equations(rng: np.random.Gen
         reference.samples += 1
     assert np.all(theta != 0.0)
     restart(design, memory)
+    assert memory.loop[0].samples == 0.0
     adapt(design, memory, np.array([0.1, 0.2, 9.0]), 0.1, 0.3, 9.0)
     assert np.all(memory.buffers.theta * memory.units * memory.scale[3] == theta)
     forget(design, memory)

@@ -143,7 +143,10 @@ def test_variation_of_a_sinusoid_is_four_amplitudes_a_period() -> None:
         (lambda: metrics.rms(np.zeros(0)), "must be a vector of at least one sample"),
         (lambda: metrics.rms(np.zeros((2, 3))), r"record has shape \(2, 3\): must be a vector"),
         (lambda: metrics.rms(np.float64(1.0)), r"record has shape \(\): must be a vector"),
-        (lambda: metrics.iae(T, T[1:]), "t has 400001 samples, the record 400000"),
+        *(
+            (lambda measure=measure: measure(T, T[1:]), "t has 400001 samples, the record 400000")
+            for measure in (metrics.iae, metrics.ise, metrics.itae)
+        ),
         (lambda: metrics.overshoot(T, 1.0, initial=1.0), "there is no move to overshoot"),
         (
             lambda: metrics.settling_time(T, T, 1.0, band=0.0),
