@@ -103,7 +103,7 @@ def test_what_a_linear_model_learns_has_no_lag_bias(library: str, form: str) -> 
 def test_the_model_is_called_once_a_period_with_all_pairs_since() -> None:
     """The first call has one pair, each other a period's."""
     for period in (1, 7):
-        learner = PythonModel(Counter(), period=period)
+        learner = PythonModel(Counter(), period=period, scale=np.ones(4))  # which does not grow
         run = ql.simulate(
             CHAIN, law(learner), ql.Scenario(reference=ql.signals.Sinusoid(), duration=3.0)
         )
