@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+import warnings
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, suppress
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from threading import Thread
 from typing import TypeAlias
 
@@ -35,12 +37,18 @@ def precompile(loops: Sequence[Parts]) -> int:
     with ExitStack() as stack:
         if len(missing) > 1 and cache_path() is not None and (os.cpu_count() or 1) > 1:
             stack.enter_context(_SecondProcess(todo))
-        with suppress(IndexError):  # the other process has taken the last one
-            while True:
-                _compile(todo.popleft())
+        while (parts := _first(todo)) is not None:
+            _compile(parts)
     for parts in loops:
         _compile(parts)
     return len(missing)
+
+
+def _first(todo: deque[Parts]) -> Parts | None:
+    try:
+        return todo.popleft()
+    except IndexError:  # the other process may have taken the last one in this moment
+        return None
 
 
 def _compile(parts: Parts) -> None:
@@ -73,22 +81,41 @@ class _SecondProcess:
     """A context in which another process compiles the last of ``todo``, until it is empty."""
 
     def __init__(self, todo: deque[Parts]) -> None:
+        context = get_context("spawn")
         self._todo = todo
-        self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+        self._connection, self._other_end = context.Pipe()
+        self._process = context.Process(target=_serve, args=(self._other_end,), daemon=True)
         self._thread = Thread(target=self._take, daemon=True)
 
     def __enter__(self) -> None:
+        self._process.start()
+        self._other_end.close()
         self._thread.start()
 
     def __exit__(self, *error: object) -> None:
         self._todo.clear()
-        if error[0] is None:
-            self._thread.join()
-        self._pool.shutdown(wait=error[0] is None, cancel_futures=True)
+        if error[0] is not None:
+            self._process.terminate()
+        self._thread.join()
+        self._connection.close()
+        self._process.join()
 
     def _take(self) -> None:
-        # This ends when nothing is left to do. What can't be sent to another process, or fails
-        # there, this process compiles in the end, and reports why it can't.
+        # This ends when nothing is left to do. What can't be sent to another process, or ends it,
+        # this process compiles in the end, and reports why it can't.
         with suppress(Exception):
             while True:
-                self._pool.submit(_compile, self._todo.pop()).result()
+                self._connection.send(self._todo.pop())
+                self._connection.recv()
+
+
+def _serve(connection: Connection) -> None:
+    """Compile what comes through the connection, until it is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process deals with it, and warns
+    warnings.simplefilter("ignore")
+    with suppress(EOFError):
+        while True:
+            parts = connection.recv()
+            with suppress(Exception):  # the first process meets it, too
+                _compile(parts)
+            connection.send(None)
