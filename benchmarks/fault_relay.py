@@ -13,12 +13,12 @@ import contextlib
 import os
 import threading
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self
 
 import numpy as np
 
-from quell.kernels.dispatch import compiled, dispatcher_for
+from quell.kernels.dispatch import compiled, specialised
 from quell.realtime.devices.registry import listen
 from quell.realtime.rig.fault_injection import Fault, FaultInjector, Relay
 from quell.realtime.wire import cobs, frames
@@ -107,8 +107,9 @@ class WireRelay:
         self._stop = False
         front, back = self._front.transport, self._back.handle.transport
         ends = {"rig": (front, back), "loop": (back, front)}
+        # Compiled here: the trial forks, and a lock that a compiling thread holds stays closed.
         self._threads = [
-            threading.Thread(target=self._carry, args=(towards, *ends[towards]), daemon=True)
+            threading.Thread(target=self._carrier(towards, *ends[towards]), daemon=True)
             for towards in ends
         ]
         for thread in self._threads:
@@ -119,24 +120,29 @@ class WireRelay:
         """Number of measurements to the loop and of commands to the rig, by direction."""
         return {towards: injector.number for towards, injector in self._injectors.items()}
 
-    def _carry(self, towards: str, source: Any, target: Any) -> None:
+    def _carrier(self, towards: str, source: Any, target: Any) -> Callable[[], None]:
+        """Return a function that carries frames in one direction, until the relay is closed."""
         inbox, outbox = frames.buffer(), frames.buffer()
         coded = np.zeros(256, dtype=np.uint8)
-        take, encode = dispatcher_for(_take, source), dispatcher_for(_encode, coded)
-        put = dispatcher_for(_put, target)
-        while not self._stop:
-            while (size := take(source, inbox, 20_000_000)) >= 0:
-                data = bytes(inbox.bytes[: max(size, 0)])
-                for frame in self._injectors[towards].frames(data):
-                    if self._serial:
-                        values = np.frombuffer(frame, dtype=np.uint8)
-                        length = encode(coded, values.copy())
-                        with contextlib.suppress(OSError):  # the other end is gone
-                            os.write(target.port.fd, coded[:length].tobytes())
-                    else:
-                        fixed = frame[: frames.LENGTH].ljust(frames.LENGTH, b"\0")
-                        outbox.bytes[: frames.LENGTH] = np.frombuffer(fixed, dtype=np.uint8)
-                        put(target, outbox)
+        take, encode = specialised(_take, source, inbox, 0), specialised(_encode, coded, coded)
+        put = specialised(_put, target, outbox)
+
+        def carry() -> None:
+            while not self._stop:
+                while (size := take(source, inbox, 20_000_000)) >= 0:
+                    data = bytes(inbox.bytes[: max(size, 0)])
+                    for frame in self._injectors[towards].frames(data):
+                        if self._serial:
+                            values = np.frombuffer(frame, dtype=np.uint8)
+                            length = encode(coded, values.copy())
+                            with contextlib.suppress(OSError):  # the other end is gone
+                                os.write(target.port.fd, coded[:length].tobytes())
+                        else:
+                            fixed = frame[: frames.LENGTH].ljust(frames.LENGTH, b"\0")
+                            outbox.bytes[: frames.LENGTH] = np.frombuffer(fixed, dtype=np.uint8)
+                            put(target, outbox)
+
+        return carry
 
     def __enter__(self) -> Self:
         return self

@@ -126,8 +126,8 @@ def generic_with_default(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
 def is_finite(value: float) -> bool:
     """Return whether ``value`` is finite.
 
-    ``math.isfinite`` tests in compiled code whether x − x is a number. Where a compiler may re-order
-    sums, and x is one, x − x becomes zero before the test. A comparison is right in any case.
+    ``math.isfinite`` tests in compiled code whether x − x is a number. Where a compiler may
+    re-order sums, and x is one, x − x becomes zero before the test. A comparison is always right.
     """
     return abs(value) <= _LARGEST
 
