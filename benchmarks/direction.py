@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import quell as ql
-from quell.kernels.dispatch import call, compiled
+from quell.kernels.dispatch import call_specialised, compiled
 from quell.realtime import Safety
 from quell.realtime.loop.direction import ARMED, runs_away
 from quell.realtime.loop.state import initial_state
@@ -165,7 +165,7 @@ def trial(draw: Draw, wrong: bool) -> Loop:
     rules, state = Safety().rules(controller, scenario), initial_state()
     rest = y[0] + noise * draw.random.standard_normal(20)  # y in START
     state.memory[0].y_rest_low, state.memory[0].y_rest_high = np.min(rest), np.max(rest)
-    k = call(first_trip, rules, state, y, u, r)
+    k = call_specialised(first_trip, rules, state, y, u, r)
     low, high = min(0.0, float(np.min(r))), max(0.0, float(np.max(r)))
     beyond = max(low - np.min(y), np.max(y) - high, 0.0) / (high - low + rules.reach)
     last = np.abs(r - y)[-y.size // 4 :]

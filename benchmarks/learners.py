@@ -25,7 +25,7 @@ import quell as ql
 from quell.controllers.base import control
 from quell.experiments.two_mass_spring import setup as study
 from quell.features import RBF, Bias, Input, RandomFourier, State
-from quell.kernels.dispatch import call, compiled
+from quell.kernels.dispatch import call_specialised, compiled
 from quell.learners.online.model import infer, learn
 
 TRIALS = 11
@@ -148,7 +148,7 @@ def steps(design: Any, state: Any, r: Any, y: Any) -> float:
 
 def stepping(controller: ql.ADRC, r: np.ndarray, y: np.ndarray) -> Any:
     """Return a function that runs the controller alone."""
-    return lambda: call(steps, controller.parameters, controller.initial_state(), r, y)
+    return lambda: call_specialised(steps, controller.parameters, controller.initial_state(), r, y)
 
 
 def nanoseconds(*runs: float, of: str) -> str:

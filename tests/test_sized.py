@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.kernels.dispatch import call, compiled, compiled_loop, interpreted, specialised
+from quell.kernels.dispatch import (
+    call_specialised,
+    compiled,
+    compiled_loop,
+    interpreted,
+    specialised,
+)
 from quell.kernels.overlaps import overlap
 from quell.kernels.sized import Constant, ConstantFlag, Flag, Size, SizedArray, layout_of, type_of
 from quell.simulation.driver import run_block
@@ -54,7 +60,7 @@ def output(design: Filter) -> float:
 )
 def test_compiled_and_interpreted_code_agree(design: Filter) -> None:
     """Of any shape, contiguous or not, small or large."""
-    assert call(output, design) == interpreted(output)(design)
+    assert call_specialised(output, design) == interpreted(output)(design)
 
 
 def test_other_values_are_not_compiled_for_but_other_shapes_and_constants_are() -> None:
@@ -99,7 +105,7 @@ def test_overlapping_arrays_have_code_of_their_own() -> None:
     """It gives what the interpreted function gives."""
     for make in (lambda a: Memory(a[:4], a[4:]), lambda a: Memory(a[:4], a[1:5])):
         found = []
-        for run in (call, lambda function, *args: interpreted(function)(*args)):
+        for run in (call_specialised, lambda function, *args: interpreted(function)(*args)):
             values = np.arange(1.0, 9.0)
             run(shift, np.full(4, 3.0), make(values))
             found.append(values)

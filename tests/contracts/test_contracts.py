@@ -15,7 +15,7 @@ import quell as ql
 from quell import plants as plant_room
 from quell.controllers.base import control
 from quell.controllers.stateful import named_arrays as _named_arrays
-from quell.kernels.dispatch import call, compiled, dispatcher_for, interpreted
+from quell.kernels.dispatch import call_specialised, compiled, dispatcher_for, interpreted
 from quell.learners.base import adapt, coefficients, commit, forget, predict
 from quell.observers.base import begin, observe
 from quell.observers.delay import without_delay
@@ -229,7 +229,7 @@ def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.
     for _ in range(2):
         memory = learner.memory(design)
         said.append(np.empty((samples, 2)))
-        call(drive, design, memory, seen, y, u, f, said[-1])
+        call_specialised(drive, design, memory, seen, y, u, f, said[-1])
         for label, array in _named_arrays(memory).items():
             assert np.all(np.abs(array) < 1e30), label
     assert np.all(np.abs(said[0]) < 1e20)

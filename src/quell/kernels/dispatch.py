@@ -144,9 +144,9 @@ def compiled(function: F) -> F:
 def compiled_loop(*read_only: str) -> Callable[[F], F]:
     """Return a decorator as ``compiled``, for a function that runs for many samples.
 
-    It writes to no array in its arguments ``read_only``, whose shapes must not change. If none of
-    the others overlaps another array, ``specialised`` returns code that relies on that, and is
-    quicker; else code that does not.
+    It writes to no array in its arguments ``read_only``. If none of the others overlaps another
+    array, ``specialised`` returns code that relies on that, and is quicker; else code that does
+    not.
     """
 
     def decorate(function: F) -> F:
@@ -155,8 +155,7 @@ def compiled_loop(*read_only: str) -> Callable[[F], F]:
         entry = _dispatcher(function, nogil=True, _nrt=False, pipeline_class=WithoutOverlaps)
         entry.with_overlaps = _dispatcher(plain, nogil=True, _nrt=False)
         names = inspect.signature(function).parameters
-        # By position, the last argument with its layout and its arrays.
-        entry.parameters = {i: (None, None, ()) for i, n in enumerate(names) if n in read_only}
+        entry.read_only = {i for i, name in enumerate(names) if name in read_only}
         return cast("F", entry)
 
     return decorate
@@ -200,34 +199,26 @@ def is_available(entry: Any, *arguments: Any) -> bool:
     """Return whether ``specialised`` has no need to compile: its code is here, or on the disk."""
     dispatcher, _ = _dispatcher_and_layouts(entry, arguments)
     types = tuple(map(type_of, arguments))
-    on_disk = dispatcher._cache.load_overload(types, dispatcher.targetctx)
-    return types in dispatcher.overloads or on_disk is not None
+    if types in dispatcher.overloads:
+        return True
+    return dispatcher._cache.load_overload(types, dispatcher.targetctx) is not None
 
 
 def _dispatcher_and_layouts(entry: Any, arguments: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
     """Return the dispatcher whose assumptions hold for the arguments, and their layouts."""
     read: list[Any] = []
     written: list[Any] = []
-    parameters = getattr(entry, "parameters", {})
-    layouts = []
-    for i, argument in enumerate(arguments):
-        if i not in parameters:
-            layouts.append(layout_of(argument, False, written))
-            continue
-        # Many runs have the same parameters, one after the other.
-        last, layout, arrays = parameters[i]
-        if last is not argument:
-            arrays = []
-            layout = layout_of(argument, False, arrays)
-            parameters[i] = argument, layout, arrays
-        layouts.append(layout)
-        read += arrays
-    if parameters and overlap(read, written):
+    read_only = getattr(entry, "read_only", ())
+    layouts = tuple(
+        layout_of(argument, False, read if i in read_only else written)
+        for i, argument in enumerate(arguments)
+    )
+    if read_only and overlap(read, written):
         entry = entry.with_overlaps
-    return dispatcher_for(entry, *arguments), tuple(layouts)
+    return dispatcher_for(entry, *arguments), layouts
 
 
-def call(entry: Any, *arguments: Any) -> Any:
+def call_specialised(entry: Any, *arguments: Any) -> Any:
     """Call an entry point, ``specialised`` for its arguments."""
     return specialised(entry, *arguments)(*arguments)
 

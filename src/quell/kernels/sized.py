@@ -170,10 +170,10 @@ def layout_of(value: Any, sized: bool = False, arrays: list[NDArray[Any]] | None
     if kind in _PLAIN:
         return kind
     if kind is np.ndarray:
-        flags, size = value.flags, value.size
-        if size and arrays is not None:
+        flags = value.flags
+        if value.size and arrays is not None:
             arrays.append(value)
-        if sized and size <= _MOST_ELEMENTS:
+        if _has_known_shape(value, sized):
             return value.shape, value.strides, value.dtype, flags.aligned, flags.writeable
         order = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
         return value.ndim, order, value.dtype, flags.aligned, flags.writeable
@@ -186,6 +186,10 @@ def layout_of(value: Any, sized: bool = False, arrays: list[NDArray[Any]] | None
     return numba.typeof(value)
 
 
+def _has_known_shape(array: NDArray[Any], sized: bool) -> bool:
+    return sized and array.size <= _MOST_ELEMENTS
+
+
 def type_of(value: Any, sized: bool = False) -> nb_types.Type:
     """Return the type of an argument; see ``layout_of``."""
     layout = layout_of(value, sized)
@@ -196,7 +200,7 @@ def type_of(value: Any, sized: bool = False) -> nb_types.Type:
 
 
 def _make_type(value: Any, sized: bool) -> nb_types.Type:
-    if isinstance(value, np.ndarray) and sized and value.size <= _MOST_ELEMENTS:
+    if isinstance(value, np.ndarray) and _has_known_shape(value, sized):
         return SizedArray(value)
     if not isinstance(value, tuple):
         return numba.typeof(value)

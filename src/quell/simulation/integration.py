@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.kernels.dispatch import call, compiled, interpreted
+from quell.kernels.dispatch import call_specialised, compiled, interpreted
 from quell.plants.base import advance
 from quell.plants.delay import DelayedPlantModel
 from quell.plants.encoder import EncodedPlantModel
@@ -78,7 +78,9 @@ class IntegrationCheck:
         self.needed = isinstance(model, CompiledNonlinear | PythonNonlinear)
         self.model, self.error, self.enough = model, 0.0, 0
         self._step_differences = (
-            interpreted(step_differences) if as_python else partial(call, step_differences)
+            interpreted(step_differences)
+            if as_python
+            else partial(call_specialised, step_differences)
         )
 
     def acquit(self) -> None:

@@ -146,12 +146,8 @@ def _control(lanes: Lanes, sample: int) -> int:
     set_products(values, rows.u_wished, lanes.wish, values, rows.p)
     irregular = 0
     for i in range(u.size):
-        usual = (
-            (abs(wished[i]) <= lanes.largest_wish[i])
-            & (abs(measured[i]) <= LARGEST_SIGNAL)
-            & (abs(r[i]) <= LARGEST_SIGNAL)
-        )
-        irregular += 0 if usual else 1
+        regular = _is_regular(wished[i], lanes.largest_wish[i], measured[i], r[i])
+        irregular += 0 if regular else 1
     if irregular > 0:
         irregular = _end_irregular(lanes, sample)
     for i in range(u.size):
@@ -170,15 +166,20 @@ def _control(lanes: Lanes, sample: int) -> int:
 
 
 @kernel
+def _is_regular(wished: float, largest_wish: float, measured: float, r: float) -> bool:
+    """Return whether the controller neither holds a value nor starts anew; without branches."""
+    small = (abs(measured) <= LARGEST_SIGNAL) & (abs(r) <= LARGEST_SIGNAL)
+    return (abs(wished) <= largest_wish) & small
+
+
+@kernel
 def _end_irregular(lanes: Lanes, sample: int) -> int:
     """End the lanes in which the controller would hold a value or start anew; count them."""
     values, rows, count = lanes.values, lanes.rows, 0
+    wished, measured, r = values[rows.u_wished], values[rows.y_measured], values[rows.v]
     for i in range(LANES):
-        if lanes.ended[i] < 0 and not (
-            abs(values[rows.u_wished, i]) <= lanes.largest_wish[i]
-            and abs(values[rows.y_measured, i]) <= LARGEST_SIGNAL
-            and abs(values[rows.v, i]) <= LARGEST_SIGNAL
-        ):
+        regular = _is_regular(wished[i], lanes.largest_wish[i], measured[i], r[i])
+        if lanes.ended[i] < 0 and not regular:
             lanes.ended[i], lanes.irregular[i] = sample, 1
             count += 1
     return count

@@ -20,7 +20,7 @@ import numpy as np
 from quell.controllers.adrc.law import AdrcDesign, AdrcState, unlimited_control
 from quell.controllers.base import reset_loop
 from quell.guard import limit
-from quell.kernels.dispatch import call, compiled
+from quell.kernels.dispatch import call_specialised, compiled
 from quell.learners.base import predict
 from quell.observers.base import acting_control, begin, observe
 from quell.observers.delay import without_delay
@@ -43,9 +43,11 @@ def start_at_rest(
     _start_loop(design, state, y, u, r)
     begin(design.eso, state.z, state.seen, y)
     loop = state.loop[0]
-    call(_observe_at_rest, design.eso, state.z, state.seen, y, u, 0.0, samples)
+    call_specialised(_observe_at_rest, design.eso, state.z, state.seen, y, u, 0.0, samples)
     _feed_forward(design, state, u)
-    call(_observe_at_rest, design.eso, state.z, state.seen, y, u, float(loop.f_learned), samples)
+    call_specialised(
+        _observe_at_rest, design.eso, state.z, state.seen, y, u, float(loop.f_learned), samples
+    )
     loop.bumpless = 1.0
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quell import checks
-from quell.kernels.dispatch import call, compiled
+from quell.kernels.dispatch import call_specialised, compiled
 from quell.plants.base import Plant, advance, check_plant, measure
 from quell.plants.destroyed import is_destroyed
 from quell.plants.registry import named_plant
@@ -98,14 +98,14 @@ class TwinDevice:
         """Return y [y-unit]."""
         if self.handle is None:
             return float(measure(self._handle.plant, self._handle.x))
-        return float(call(_read, self.handle))
+        return float(call_specialised(_read, self.handle))
 
     def write(self, u: float) -> None:
         """Apply u [u-unit] for a sample."""
         if self.handle is None:
             write_command(self._handle, float(u))
         else:
-            call(_write, self.handle, float(u))
+            call_specialised(_write, self.handle, float(u))
 
     def close(self) -> None:
         """Put a plant whose state is destroyed back to ``x0``, so that the device can be reused."""

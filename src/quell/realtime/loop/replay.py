@@ -24,7 +24,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.kernels.dispatch import call, compiled
+from quell.kernels.dispatch import call_specialised, compiled
 from quell.kernels.user_types import explain_compile_errors
 from quell.realtime.loop.modes import Mode
 from quell.records.trajectory import Trajectory
@@ -96,7 +96,7 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     log[:, : len(_RECORDED)] = recorded
     began = int(np.argmax(run["mode"] == Mode.RUN)) if "mode" in run.names else 0
     with np.errstate(over="ignore", invalid="ignore"), explain_compile_errors(design):
-        status = call(_follow, design, state, _NO_DERIVATIVES, began, log)
+        status = call_specialised(_follow, design, state, _NO_DERIVATIVES, began, log)
     return Trajectory(
         log=log,
         channels=channels,

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.files import check_writable
-from quell.kernels.dispatch import call
+from quell.kernels.dispatch import call_specialised
 from quell.plants.base import Plant, check_plant
 from quell.realtime.devices.base import Listener
 from quell.realtime.rig import kernel as kernels
@@ -272,7 +272,7 @@ class Rig:
         model.counts[kernels.STATE] = kernels.IDLE
 
     def _serve(self, most: int, paced: bool) -> None:
-        call(serve, self.model, self._clock, most, paced)
+        call_specialised(serve, self.model, self._clock, most, paced)
 
     def _write_log(self) -> None:
         if self._file is None or self._file.closed:

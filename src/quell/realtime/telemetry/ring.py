@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.kernels.dispatch import call, compiled, kernel
+from quell.kernels.dispatch import call_specialised, compiled, kernel
 from quell.realtime.system.atomics import load_acquire, store_release
 from quell.types import Matrix, Vector
 
@@ -59,7 +59,7 @@ def push(ring: Ring, row: Vector) -> bool:
 def drain(ring: Ring) -> Matrix:
     """Remove all rows, on the consumer's thread, and return a copy (rows, width), oldest first."""
     out = np.empty((waiting(ring), ring.rows.shape[1]))
-    call(_read_rows, ring, out)
+    call_specialised(_read_rows, ring, out)
     return out
 
 

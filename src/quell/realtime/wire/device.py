@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any, Self
 
 from quell import checks
-from quell.kernels.dispatch import call, compiled, specialised
+from quell.kernels.dispatch import call_specialised, compiled, specialised
 from quell.realtime.devices.base import ask, read_measurement, write_command
 from quell.realtime.system.clock import SystemClock, system_clock
 from quell.realtime.wire import frames
@@ -123,7 +123,7 @@ class WireDevice:
             or it has ended the session.
         """
         self._check_open()
-        fault = call(_write, self.handle, float(u))
+        fault = call_specialised(_write, self.handle, float(u))
         if fault:
             raise ConnectionError(f"{self.url}: {_FAULTS[fault]}")
 
