@@ -75,7 +75,7 @@ class Regression:
 
     @property
     def units(self) -> np.ndarray:
-        """What a feature is multiplied by when it is scaled."""
+        """Return the factor of a feature when it is scaled."""
         out = np.zeros(self.p)
         unit(self.design.inputs.features, self.scale, out)
         return out

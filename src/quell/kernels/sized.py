@@ -68,12 +68,12 @@ class SizedArray(nb_types.Array):
 
     @property
     def key(self) -> Any:
-        """What makes the type equal to another."""
+        """Values in which equal types agree."""
         return (*super().key, self.lengths, self.steps)
 
     @property
     def mangling_args(self) -> Any:
-        """What makes the name of a function compiled for it unique."""
+        """Parts of the name of a function that is compiled for it."""
         name, arguments = super().mangling_args
         return name, [*arguments, *self.lengths, *self.steps]
 
@@ -221,7 +221,7 @@ def _constant_type(value: Any) -> nb_types.Type:
 
 
 class _Annotations(NamedTuple):
-    """What the annotations of a NamedTuple say about its fields."""
+    """Roles of the fields of a NamedTuple, by their annotations."""
 
     constants: tuple[int, ...]  # indices of constants
     sized: tuple[bool, ...]  # for each field, whether an array in it has a known shape

@@ -34,7 +34,7 @@ Inputs = NDArray[np.float64]  # w, r and its derivatives, noise (samples, …)
 
 
 class Outcome(NamedTuple):
-    """What a batch writes; the runs are the last axis but that of the samples."""
+    """Arrays that a batch writes; the runs are the last axis but that of the samples."""
 
     log: NDArray[np.float64]  # (rows, runs, samples)
     lengths: NDArray[np.int64]  # recorded samples (runs,)
