@@ -17,6 +17,7 @@ import numpy as np
 from quell import checks
 from quell.experiments.stress.turncoat import Turncoat
 from quell.kernels.dispatch import kernel
+from quell.kernels.sized import Buffer
 from quell.learners import BatchGradient, Harmonic, Kalman, Learner
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.observers.eso import ESO
@@ -40,7 +41,7 @@ class AdversaryDesign(NamedTuple):
 class AdversaryMemory(NamedTuple):
     """State of an adversary."""
 
-    past: Vector  # ring buffer of the last estimates f̂ (delay + 1,)
+    past: Buffer  # ring buffer of the last estimates f̂ (delay + 1,)
     now: Vector
     """(5,): place in ``past``, number of samples, f_L, f̂ of an ESO without learner, sign."""
     seed: Vector  # (1,): state of the random numbers
@@ -159,7 +160,8 @@ class Adversary:
         """Return the parameters."""
         n = observer.order
         weights = np.zeros(n + 2)
-        weights[: len(self.weights)] = self.weights
+        given = self.weights[: weights.size]
+        weights[: len(given)] = given
         size = self.size * (observer.b0 if self.kind == MINUS_U else 1.0)
         return AdversaryDesign(self.kind, size, self.time / observer.dt, weights, self.delay)
 

@@ -1,0 +1,110 @@
+"""The trial in general loops: hostile and honest learners, each beside MF-ESO on the same seed.
+
+Errors are those of y against the response that the loop is designed for. A run's ratios are its
+measures (``measures``) over those of MF-ESO. A run is *lost* if it diverges, or leaves |y| = 100,
+where MF-ESO does not. Bars hold for loops whose modulus margin is at least ``HEALTHY``.
+
+Seeds below 10 000 are for tuning; seeds from 1 000 000 on are for judging, and are looked at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from quell.experiments.stress.adversaries import KINDS, draw_adversary
+from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
+from quell.experiments.stress.general.measures import WINDOW_LAGS, Measures, measures
+from quell.experiments.stress.general.references import ideal
+from quell.guard import Guard
+from quell.learners import Harmonic, Kalman, Learner
+from quell.parallel import in_parallel
+from quell.simulation.simulate import simulate
+
+HEALTHY = 0.35
+"""Least modulus margin of the loops for which the bars hold."""
+HONEST: dict[str, Learner] = {"Harmonic": Harmonic(), "Kalman": Kalman()}
+# A loop whose reference is within 2 counts as lost beyond this |y|.
+_LIMIT = 100.0
+# Recorded samples in a lag of the observer: the error changes little between them.
+_RECORDS_PER_LAG = 20.0
+
+
+@dataclass(frozen=True)
+class GeneralOutcome:
+    """The result of one run; ratios are NaN if one of the two loops is lost."""
+
+    kind: str
+    index: int  #: number of the run in the trial
+    learner: str
+    loop: str
+    family: str
+    order: int
+    load: str
+    margin: float
+    plain_lost: bool
+    lost: bool
+    rms: float
+    peak: float
+    window: float
+    late: float
+
+
+def error_of(loop: GeneralLoop, learner: Learner | None, guard: Guard | None) -> Measures | None:
+    """Return the measures of a run, None if it is lost."""
+    every = max(int(loop.lag / _RECORDS_PER_LAG / loop.dt), 1)
+    controller = loop.controller(learner, guard)
+    run = simulate(loop.plant, controller, loop.scenario, record_every=every, limit=_LIMIT)
+    if run.diverged:
+        return None
+    wanted = ideal(loop.tables[0], loop.dt, loop.order)[::every]
+    return measures(run["y"] - wanted, round(WINDOW_LAGS * loop.lag / (every * loop.dt)))
+
+
+def run_one(
+    seed: int, index: int, kind: str, guard: Guard | None, honest: bool = False
+) -> GeneralOutcome:
+    """Run the loop with this number, with a learner and without."""
+    rng = np.random.default_rng([seed, index, int(honest)])
+    loop = draw_loop(rng)
+    learner = HONEST[kind] if honest else draw_adversary(kind, rng)
+    plain = error_of(loop, None, None)
+    learned = None if plain is None else error_of(loop, learner, guard)
+    ratios = Measures(*[np.nan] * 4)
+    if plain is not None and learned is not None:
+        ratios = learned.over(plain)
+    return GeneralOutcome(
+        kind=kind,
+        index=index,
+        learner=repr(learner),
+        loop=loop.describe(),
+        family=loop.family,
+        order=loop.order,
+        load=loop.load,
+        margin=loop.margin,
+        plain_lost=plain is None,
+        lost=learned is None and plain is not None,
+        rms=ratios.rms,
+        peak=ratios.peak,
+        window=ratios.window,
+        late=ratios.late,
+    )
+
+
+def run_general(
+    runs: int,
+    honest: int,
+    seed: int,
+    *,
+    guard: Guard | None,
+    kinds: Sequence[str] = KINDS,
+    progress: Callable[[float], None] | None = None,
+) -> list[GeneralOutcome]:
+    """Run ``runs`` hostile and ``honest`` honest learners, all kinds in turn."""
+    good = tuple(HONEST)
+    jobs = [partial(run_one, seed, i, kinds[i % len(kinds)], guard) for i in range(runs)]
+    jobs += [partial(run_one, seed, i, good[i % len(good)], guard, True) for i in range(honest)]
+    return in_parallel(jobs, progress)
