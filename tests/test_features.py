@@ -12,8 +12,20 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.features import RBF, Bias, Custom, Friction, Input, Polynomial, RandomFourier, State
-from quell.features.base import unit, write
+from quell.features import (
+    RBF,
+    Bias,
+    Custom,
+    Friction,
+    Input,
+    Periodic,
+    Polynomial,
+    RandomFourier,
+    State,
+)
+from quell.features.base import unit, write, write_physical
+from quell.learners.base import adapt, coefficients, commit, predict
+from quell.learners.lag import lag_push
 
 STATE, U = np.array([0.3, -0.7, 0.5]), 0.2
 
@@ -36,7 +48,8 @@ BLOCKS: dict[str, Any] = {
     "rbf": RBF(),
     "rbf around centres": RBF(centers=[[0.0], [0.5]], states=(2,)),
     "custom": Custom(halves, ("half", "product")),
-    "joined": State() + Polynomial() + RBF(9) + Bias() + Input(),
+    "periodic": Periodic(period=0.7, orders=(1, 2, 5), state=2),
+    "joined": State() + Polynomial() + Periodic(highest=3) + RBF(9) + Bias() + Input(),
 }
 
 
@@ -45,7 +58,8 @@ def written(block: Any, x: np.ndarray = STATE, u: float = U) -> np.ndarray:
     width = len(block.names(x.size))
     room = np.full(width + 2, np.nan)
     before = x.copy()
-    write(block.design(x.size), x, u, room[1:-1])
+    for function in (write, write_physical):
+        function(block.design(x.size), x, u, room[1:-1])
     np.testing.assert_array_equal(np.isnan(room), [True, *[False] * width, True])
     np.testing.assert_array_equal(x, before)
     return room[1:-1]
@@ -55,6 +69,7 @@ def written(block: Any, x: np.ndarray = STATE, u: float = U) -> np.ndarray:
 def compiled_write(design: Any, x: np.ndarray, u: float, out: np.ndarray) -> None:
     """Compiled, with allocation counted, as a part of a kernel."""
     write(design, x, u, out)
+    write_physical(design, x, u, out)
 
 
 @pytest.mark.parametrize("name", BLOCKS)
@@ -108,6 +123,82 @@ def test_friction_reverses_with_the_velocity() -> None:
         np.testing.assert_allclose(
             written(block, np.array([9.0, velocity])), [np.tanh(velocity / 0.1), np.sign(velocity)]
         )
+
+
+def test_periodic_features_are_waves_in_position() -> None:
+    """By the formula, at any distance; all orders up to the highest, by addition, without drift."""
+    for position in (0.0, 0.123, -7.5, 1e4):
+        block = Periodic(period=0.8, orders=(9, 2), state=3)
+        angles = math.tau * np.array([2, 9]) * position / 0.8
+        values = written(block, np.array([1.0, 2.0, position]))
+        expected = np.stack([np.sin(angles), np.cos(angles)], axis=1).ravel()
+        np.testing.assert_allclose(values, expected, atol=1e-9)
+    assert Periodic(orders=(9, 2)).names(2) == ("sin 2 x1", "cos 2 x1", "sin 9 x1", "cos 9 x1")
+    every = written(Periodic(highest=500), np.array([1.234]))
+    angles = 1.234 * np.arange(1, 501)
+    np.testing.assert_allclose(every[::2], np.sin(angles), atol=1e-12)
+    np.testing.assert_allclose(every[1::2], np.cos(angles), atol=1e-12)
+    assert len(Periodic().names(1)) == 24
+
+
+def learned(
+    features: Any, force: Any, amplitude: float = 5.0, u_of: Any = math.sin, seconds: float = 12.0
+) -> tuple[dict[str, float], list[float]]:
+    """Coefficients and outputs of ``RLS`` on perfect estimates of a sweep and of ``force(x)``."""
+    dt = 5e-3
+    observer = ql.ESO.model_free(2, 1.0, 40.0, dt)
+    learner = ql.learners.RLS(features, frequency=2.0, memory_time=math.inf, bias_bandwidth=0.0)
+    design = learner.design(observer, 4.0)
+    memory, z = learner.memory(design), np.zeros(3)
+    outputs, filtered = [], 0.0
+    chain = np.zeros((1, 3))
+    for k in range(round(seconds / dt)):
+        t = k * dt
+        x = amplitude * np.array([math.sin(t + 0.1 * t * t), 0.0])
+        x[1] = amplitude * (1.0 + 0.2 * t) * math.cos(t + 0.1 * t * t)
+        u = u_of(3.0 * t)
+        z[:2] = x
+        adapt(design, memory, z, x[0], u, filtered)
+        outputs.append(predict(design, memory, z, u)[0])
+        commit(design, memory, z, u, 0.0)
+        filtered = lag_push(design.lag, chain, 0, force(x))
+    theta = np.zeros(len(learner.feature_names(2)))
+    coefficients(design, memory, theta)
+    return dict(zip(learner.feature_names(2), theta.tolist(), strict=True)), outputs
+
+
+def test_a_custom_feature_is_a_function_of_y_in_its_unit() -> None:
+    """The coefficient of sin(3 y) is found, whatever the amplitude of y is."""
+    block = Custom(lambda x, u: (math.sin(3.0 * x[0]), x[1] * abs(x[1])), names=("sin", "drag"))
+    for amplitude in (5.0, 0.3):
+        found, _ = learned(
+            block, lambda x: 7.0 * math.sin(3.0 * x[0]) - 0.2 * x[1] * abs(x[1]), amplitude
+        )
+        assert found == pytest.approx({"sin": 7.0, "drag": -0.2}, rel=1e-3)
+
+
+def test_the_size_of_a_custom_feature_changes_nothing_but_its_coefficient() -> None:
+    """A factor of 2⁶⁰ gives the same output, to the last bit, through all growing scales."""
+    force = lambda x: 0.3 * x[0] ** 3 - x[0]  # noqa: E731
+    plain, outputs = learned(Custom(lambda x, u: (x[0] ** 3, u * x[0]), names=("a", "b")), force)
+    large, same = learned(
+        Custom(lambda x, u: (2.0**60 * x[0] ** 3, u * x[0]), names=("a", "b")), force
+    )
+    assert same == outputs
+    assert large["a"] * 2.0**60 == plain["a"]
+    assert plain["a"] != 0.0
+
+
+def test_periodic_features_learn_a_force_once_for_all_speeds() -> None:
+    """Its sines and cosines, in the plant's units, while the speed changes all the time."""
+    block = Periodic(period=1.6, orders=(1, 3))
+    angle = math.tau / 1.6
+    found, _ = learned(
+        block + Friction(),
+        lambda x: 4.0 * math.sin(angle * x[0]) - 9.0 * math.cos(3.0 * angle * x[0]),
+    )
+    expected = {"sin 1 x1": 4.0, "cos 1 x1": 0.0, "sin 3 x1": 0.0, "cos 3 x1": -9.0}
+    assert {name: found[name] for name in expected} == pytest.approx(expected, abs=0.02)
 
 
 def test_random_fourier_features_approximate_a_gaussian_kernel(rng: np.random.Generator) -> None:
@@ -212,6 +303,14 @@ class Callable:
             lambda: Custom(lambda x, u: (float(str(x[0])),), ("a",)).design(2),
             "function can't be compiled by Numba",
         ),
+        (lambda: Periodic(0.0), "period = 0.0: must be finite and greater than zero"),
+        (lambda: Periodic(orders=()), r"orders = \(\): must be a tuple of 1 to 500 whole numbers"),
+        (lambda: Periodic(orders=(0,)), r"orders\[0\] = 0: must be a whole number from 1"),
+        (lambda: Periodic(orders=(1.5,)), r"orders\[0\] = 1.5: must be a whole number"),
+        (lambda: Periodic(orders=(2, 2)), r"orders = \(2, 2\): must not repeat an order"),
+        (lambda: Periodic(orders=(2,), highest=3), "orders and highest: give one of them"),
+        (lambda: Periodic(highest=501), "highest = 501: must be a whole number from 1 to 500"),
+        (lambda: Periodic(state=3).design(2), "state = 3: a plant of order 2 has no state 3"),
         (lambda: Input() + State(), r"Input\(\) must be the last block"),
     ],
 )

@@ -9,6 +9,7 @@ from quell.features.custom import Custom
 from quell.features.fourier import RandomFourier
 from quell.features.friction import Friction
 from quell.features.linear import Bias, Input, State
+from quell.features.periodic import Periodic
 from quell.features.polynomial import Polynomial
 from quell.features.radial import RBF
 
@@ -20,6 +21,7 @@ __all__ = [
     "Friction",
     "Input",
     "Joined",
+    "Periodic",
     "Polynomial",
     "RandomFourier",
     "State",

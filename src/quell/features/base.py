@@ -2,8 +2,11 @@
 
 A block (``State()``, ``Bias()``, …) is an immutable description; blocks are joined by ``+``.
 ``design(order)`` returns its parameters, a NamedTuple, for whose type ``write`` and ``unit`` are
-registered. All blocks get *scaled* inputs, which lie in about [−1, 1] whatever the plant's units
-(``scaling.py``), so that all features are O(1).
+registered. ``write`` gets *scaled* inputs, which lie in about [−1, 1] whatever the plant's units
+(``scaling.py``), so that all features are O(1). A block whose functions have a meaning only in the
+plant's units, a period for example, registers ``write_physical`` too, and ``write_nothing`` for
+``write``. Features of unknown size, for which ``unscaled`` is true, are divided by their largest
+value so far (``sizes.py``).
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.kernels import validation
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, generic_with_default
 from quell.kernels.sized import Size
 from quell.types import Vector
 
@@ -24,6 +27,11 @@ def write(features: Any, x: Vector, u: float, out: Vector) -> None:
     raise TypeError
 
 
+@generic_with_default
+def write_physical(features: Any, x: Vector, u: float, out: Vector) -> None:
+    """Write the features of ``x`` (n,) and ``u`` in the plant's units to ``out`` (p,)."""
+
+
 @generic
 def unit(features: Any, scale: Vector, out: Vector) -> None:
     """Write to ``out`` (p,) the factors that convert coefficients to the plant's units.
@@ -31,6 +39,10 @@ def unit(features: Any, scale: Vector, out: Vector) -> None:
     ``scale`` (n + 2,) has the scales of x_1 … x_n, u, f. A factor is 1 if a feature has no unit.
     """
     raise TypeError
+
+
+def write_nothing(features: Any, x: Vector, u: float, out: Vector) -> None:
+    """Write nothing: ``write`` of a block with ``write_physical``."""
 
 
 def dimensionless(features: Any, scale: Vector, out: Vector) -> None:
@@ -64,6 +76,10 @@ class Features:
     def constant(self, order: int) -> int:
         """Return the index of the constant feature 1, or −1 if there is none."""
         return -1
+
+    def unscaled(self, order: int) -> tuple[bool, ...]:
+        """Return for each feature whether its size is unknown, so that learners must scale it."""
+        return (False,) * len(self.names(order))
 
     def __add__(self, other: Features) -> Joined:
         if not isinstance(other, Features):
@@ -107,6 +123,10 @@ class Joined(Features):
         first, second = self.first.constant(order), self.second.constant(order)
         return first if first >= 0 or second < 0 else len(self.first.names(order)) + second
 
+    def unscaled(self, order: int) -> tuple[bool, ...]:
+        """Return for each feature whether its size is unknown."""
+        return self.first.unscaled(order) + self.second.unscaled(order)
+
     def __repr__(self) -> str:
         return f"{self.first!r} + {self.second!r}"
 
@@ -123,6 +143,12 @@ class JoinedDesign(NamedTuple):
 def _write(features: JoinedDesign, x: Vector, u: float, out: Vector) -> None:
     write(features.first, x, u, out[: features.split])
     write(features.second, x, u, out[features.split :])
+
+
+@write_physical.register(JoinedDesign)
+def _write_physical(features: JoinedDesign, x: Vector, u: float, out: Vector) -> None:
+    write_physical(features.first, x, u, out[: features.split])
+    write_physical(features.second, x, u, out[features.split :])
 
 
 @unit.register(JoinedDesign)
@@ -155,12 +181,16 @@ def _check_block(block: Features, order: int) -> None:
     validation.check_registered(name, parameters, write, unit)
     rule = f"it gets x ({order},), u, and room for {len(names)} features, one for each name"
     ones, marks = np.ones(order + 2), (7e77, -7e77)
-    for function, arguments in ((write, (validation.sample_values(order), 0.5)), (unit, (ones,))):
-        what, written = f"{name}: {function.__name__}", []
+    sample = (validation.sample_values(order), 0.5)
+    for functions, arguments in (((write, write_physical), sample), ((unit,), (ones,))):
+        written: list[Any] = []
         for mark in marks:
             out = np.full(len(names), mark)
-            validation.attempt_kernel(what, rule, function, parameters, *arguments, out)
+            for function in functions:
+                what = f"{name}: {function.__name__}"
+                validation.attempt_kernel(what, rule, function, parameters, *arguments, out)
             written.append(out != mark)
         if not np.all(written):
             missing = np.flatnonzero(~np.all(written, axis=0)).tolist()
+            what = f"{name}: {functions[0].__name__}"
             raise ValueError(f"{what} does not write features {missing}; {rule}")

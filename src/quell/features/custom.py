@@ -10,7 +10,14 @@ import numba
 import numpy as np
 from numba.core import types as nb_types
 
-from quell.features.base import Features, dimensionless, unit, write
+from quell.features.base import (
+    Features,
+    dimensionless,
+    unit,
+    write,
+    write_nothing,
+    write_physical,
+)
 from quell.kernels.function_pointers import (
     POINTER,
     NotCompilableError,
@@ -30,7 +37,11 @@ class CustomDesign(NamedTuple):
 
 
 class Custom(Features):
-    """The values of ``function(x, u)`` at the scaled state x (n,) and control signal u.
+    """The values of ``function(x, u)`` at the estimated state x (n,) and the control signal u.
+
+    x_1 is in the units of y, x_2 … x_n are its derivatives by time [y-unit/s …], and u is in its
+    own unit. The values may have any size: learners divide them by powers of two, so that they are
+    O(1), and show the coefficients in the plant's units.
 
     Parameters
     ----------
@@ -89,6 +100,10 @@ class Custom(Features):
         """Return ``names``."""
         return self.labels
 
+    def unscaled(self, order: int) -> tuple[bool, ...]:
+        """Return True for each feature: a function's values may have any size."""
+        return (True,) * len(self.labels)
+
 
 @cache  # keeps the code for ever, because designs hold its address
 def _machine_code(function: Callable[..., Any], order: int, count: int) -> Any:
@@ -107,9 +122,10 @@ def _machine_code(function: Callable[..., Any], order: int, count: int) -> Any:
         ) from error
 
 
-@write.register(CustomDesign)
+@write_physical.register(CustomDesign)
 def _write(features: CustomDesign, x: Vector, u: float, out: Vector) -> None:
     call(features.address, x, u, out)
 
 
+write.register(CustomDesign)(write_nothing)
 unit.register(CustomDesign)(dimensionless)

@@ -20,7 +20,7 @@ from quell.observers.eso import ESO
 from quell.types import Vector
 
 # Avoids division by zero and the logarithm of zero; far below any signal.
-_LEAST = 1e-100
+LEAST = 1e-100
 # Least scale of a derivative, as a share of the one in a motion of x_1 at the frequency ω. Chosen
 # by hand; not tuned further.
 _FLOOR = 1.0 / 8.0
@@ -42,7 +42,7 @@ def scaling(observer: ESO, frequency: float, fixed: bool) -> Scaling:
 
 def initial_scale(scaling: Scaling) -> Vector:
     """Return the scales before the first sample (n + 2,)."""
-    return np.full(scaling.floors.size, _LEAST)
+    return np.full(scaling.floors.size, LEAST)
 
 
 @kernel
@@ -51,7 +51,7 @@ def reset_scale(scaling: Scaling, scale: Vector) -> None:
     if scaling.fixed:
         return
     for i in range(scale.size):
-        scale[i] = _LEAST
+        scale[i] = LEAST
 
 
 @kernel
@@ -62,6 +62,6 @@ def update_scale(scaling: Scaling, scale: Vector, estimate: Vector, u: float, f:
     order = scale.size - 2
     for i in range(scale.size):
         size = abs(estimate[i]) if i < order else (abs(u) if i == order else abs(f))
-        size = max(size, scaling.floors[i] * scale[0], _LEAST)
+        size = max(size, scaling.floors[i] * scale[0], LEAST)
         if size > scale[i] and is_finite(size):
             scale[i] = 2.0 ** math.ceil(math.log2(size))

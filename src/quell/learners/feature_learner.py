@@ -6,8 +6,15 @@ from typing import Any, NamedTuple
 
 from quell import checks
 from quell.features import Bias, Features, State
-from quell.features.base import checked_design, write
+from quell.features.base import checked_design, write, write_physical
 from quell.features.scaling import Scaling, initial_scale, scaling
+from quell.features.sizes import (
+    Indices,
+    initial_sizes,
+    scale_by_sizes,
+    unscaled_indices,
+    update_sizes,
+)
 from quell.kernels.dispatch import kernel
 from quell.learners.lag import startup_samples
 from quell.learners.noise_gate import NoiseGate, gated, noise_gate
@@ -19,6 +26,7 @@ class Inputs(NamedTuple):
     """Parameters that all learners on features share, for a plant of order n."""
 
     features: Any
+    unscaled: Indices  # of the features whose size is unknown (k,)
     scaling: Scaling
     gate: NoiseGate
     bias_gain: float  # λ dt, at most 1
@@ -35,13 +43,38 @@ def write_features(inputs: Inputs, memory: Any, seen: Vector, u: float, out: Vec
     """Write the features of the estimates ``seen`` (n + 1,) and ``u`` into ``out`` (p,).
 
     A signal that does not move is replaced by its mean. ``memory`` is the learner's, with ``gate``,
-    ``scale`` (n + 2,), which divides x_1 … x_n, u and f, and the work space ``scaled`` (n,).
+    ``scale`` (n + 2,), which divides x_1 … x_n, u and f, ``sizes`` (k,), which divides the features
+    of unknown size, and the work space ``scaled`` (n,).
     """
-    gate, scale, scaled = memory.gate, memory.scale, memory.scaled
+    scale, scaled = memory.scale, memory.scaled
+    moving_u = _write_physical(inputs, memory, seen, u, out)
+    scale_by_sizes(inputs.unscaled, memory.sizes, out)
     for i in range(scaled.size):
-        scaled[i] = gated(inputs.gate, gate, i, seen[i]) / scale[i]
-    scaled_u = gated(inputs.gate, gate, scaled.size, u) / scale[scaled.size]
-    write(inputs.features, scaled, scaled_u, out)
+        scaled[i] /= scale[i]
+    write(inputs.features, scaled, moving_u / scale[scaled.size], out)
+
+
+@kernel
+def _write_physical(inputs: Inputs, memory: Any, seen: Vector, u: float, out: Vector) -> float:
+    """Write the features of signals in the plant's units, and these signals into ``scaled``.
+
+    Return the control signal, or its mean if it does not move.
+    """
+    gate, scaled = memory.gate, memory.scaled
+    for i in range(scaled.size):
+        scaled[i] = gated(inputs.gate, gate, i, seen[i])
+    moving_u = gated(inputs.gate, gate, scaled.size, u)
+    write_physical(inputs.features, scaled, moving_u, out)
+    return moving_u
+
+
+@kernel
+def update_feature_sizes(inputs: Inputs, memory: Any, seen: Vector, u: float) -> bool:
+    """Let ``memory.sizes`` cover the features of a sample; return whether one grew."""
+    if inputs.unscaled.size == 0:
+        return False
+    _write_physical(inputs, memory, seen, u, memory.features)
+    return update_sizes(inputs.unscaled, memory.sizes, memory.features)
 
 
 class FeatureLearner:
@@ -86,6 +119,7 @@ class FeatureLearner:
         bandwidth = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
         return Inputs(
             features=checked_design(self.features, order),
+            unscaled=unscaled_indices(self.features, order),
             scaling=scaling(observer, frequency, self.scale is not None),
             gate=noise_gate(observer, frequency),
             bias_gain=min(bandwidth * observer.dt, 1.0),
@@ -94,3 +128,6 @@ class FeatureLearner:
 
     def _initial_scale(self, inputs: Inputs) -> Vector:
         return initial_scale(inputs.scaling) if self.scale is None else self.scale.copy()
+
+    def _initial_sizes(self, inputs: Inputs) -> Vector:
+        return initial_sizes(inputs.unscaled)

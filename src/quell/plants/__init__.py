@@ -7,6 +7,7 @@ in ``registry.py`` and, if it is public, its name here.
 from quell.plants.base import Plant
 from quell.plants.batch import PlantBatch, batch
 from quell.plants.cubic_spring import CubicSpringPlant, lagged_two_mass_spring
+from quell.plants.dc_motor import DcMotor, dc_motor
 from quell.plants.delay import delayed
 from quell.plants.encoder import encoded
 from quell.plants.linear import LinearPlant
@@ -16,7 +17,7 @@ from quell.plants.torsional import TorsionalPlant, torsional, torsional_identifi
 from quell.plants.two_mass_spring import two_mass_spring
 
 __all__ = [
-    "CubicSpringPlant", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch", "TorsionalPlant",
-    "batch", "delayed", "encoded", "lagged_two_mass_spring", "linearised", "torsional",
-    "torsional_identified", "two_mass_spring",
+    "CubicSpringPlant", "DcMotor", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch",
+    "TorsionalPlant", "batch", "dc_motor", "delayed", "encoded", "lagged_two_mass_spring",
+    "linearised", "torsional", "torsional_identified", "two_mass_spring",
 ]  # fmt: skip

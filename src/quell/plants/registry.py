@@ -8,6 +8,7 @@ from typing import Any
 from quell import checks
 from quell.plants.base import Plant
 from quell.plants.cubic_spring import lagged_two_mass_spring
+from quell.plants.dc_motor import dc_motor
 from quell.plants.delay import delayed
 from quell.plants.encoder import encoded
 from quell.plants.linear import LinearPlant
@@ -47,6 +48,7 @@ TESTBEDS: Mapping[str, Callable[[], Plant]] = {
 
 PLANTS: Mapping[str, Callable[..., Plant]] = {
     **TESTBEDS,
+    "dc-motor": dc_motor,
     "lagged-two-mass": lagged_two_mass_spring,
     "linear": linear,
     "delayed": delayed,

@@ -14,6 +14,7 @@ from quell import checks
 from quell.features import Features
 from quell.features.base import checked_design
 from quell.features.scaling import initial_scale, scaling
+from quell.features.sizes import initial_sizes, unscaled_indices
 from quell.kernels.sized import Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.gradient.buffers import (
@@ -127,6 +128,7 @@ class BatchGradient:
             rate=rate,
             batch=self.batch,
             features=checked_design(self.features, order),
+            unscaled=unscaled_indices(self.features, order),
             scaling=scaling(observer, omega_c, False),
             startup=startup_samples(observer),
         )
@@ -142,6 +144,7 @@ class BatchGradient:
             buffers=empty_buffers(parameters.batch, p),
             loop=ScaledLoop.zeros(),
             scale=scale,
+            sizes=initial_sizes(parameters.unscaled),
             scaled=np.zeros(order),
             units=np.ones(p),
         )

@@ -12,8 +12,15 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from quell.features.base import unit, write
+from quell.features.base import unit, write, write_physical
 from quell.features.scaling import Scaling, reset_scale, update_scale
+from quell.features.sizes import (
+    Indices,
+    reset_sizes,
+    scale_by_sizes,
+    scale_units,
+    update_sizes,
+)
 from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars, clear
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
@@ -33,6 +40,7 @@ class ScaledDesign(NamedTuple):
     rate: float  # α, per sample
     batch: int  # n
     features: Any
+    unscaled: Indices  # of the features whose size is unknown (k,)
     scaling: Scaling
     startup: int  # samples after a start from rest in which nothing is learned
 
@@ -50,6 +58,7 @@ class ScaledMemory(NamedTuple):
     buffers: Buffers  # all scaled
     loop: NDArray[ScaledLoop]
     scale: Vector  # (m + 2,): what x_1 … x_m, u and Δf̂ are divided by
+    sizes: Vector  # (k,): what features of unknown size are divided by
     scaled: Vector  # work space for the scaled state (m,)
     units: Vector  # (p,): ``unit`` of the features for ``scale``
 
@@ -82,9 +91,11 @@ def _rescale(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float
     update_scale(learner.scaling, scale, seen, u, f)
     for i in range(scale.size):
         after += scale[i]
-    if after == before:
+    write_physical(learner.features, seen[: memory.scaled.size], u, current)
+    if not update_sizes(learner.unscaled, memory.sizes, current) and after == before:
         return
     unit(learner.features, scale, current)
+    scale_units(learner.unscaled, memory.sizes, current)
     for i in range(theta.size):
         ratio = current[i] / memory.units[i]
         if memory.loop[0].has_scale > 0.0 and 0.0 < ratio <= 1.0:
@@ -97,10 +108,12 @@ def _rescale(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float
 @kernel
 def _write(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float) -> None:
     """Write the scaled features into the buffers' ``current``."""
-    scale, scaled = memory.scale, memory.scaled
+    scale, scaled, current = memory.scale, memory.scaled, memory.buffers.current
+    write_physical(learner.features, seen[: scaled.size], u, current)
+    scale_by_sizes(learner.unscaled, memory.sizes, current)
     for i in range(scaled.size):
         scaled[i] = seen[i] / scale[i]
-    write(learner.features, scaled, u / scale[scaled.size], memory.buffers.current)
+    write(learner.features, scaled, u / scale[scaled.size], current)
 
 
 @predict.register(ScaledDesign)
@@ -134,6 +147,7 @@ def _forget(learner: ScaledDesign, memory: ScaledMemory) -> None:
     forget_buffers(memory.buffers)
     clear(memory.loop)
     reset_scale(learner.scaling, memory.scale)
+    reset_sizes(memory.sizes)
     for i in range(memory.units.size):
         memory.units[i] = 1.0
 

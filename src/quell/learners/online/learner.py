@@ -24,11 +24,17 @@ from numpy.typing import NDArray
 
 from quell.features import Features
 from quell.features.scaling import reset_scale, update_scale
+from quell.features.sizes import reset_sizes
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Buffer
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
-from quell.learners.feature_learner import FeatureLearner, Inputs, write_features
+from quell.learners.feature_learner import (
+    FeatureLearner,
+    Inputs,
+    update_feature_sizes,
+    write_features,
+)
 from quell.learners.lag import group_delay
 from quell.learners.noise_gate import (
     NoiseGateMemory,
@@ -67,6 +73,7 @@ class OnlineMemory(NamedTuple):
     """State of a learner around a model."""
 
     scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
+    sizes: Vector  # (k,): what features of unknown size are divided by
     scaled: Vector  # work space for the scaled state (n,)
     features: Vector  # work space for the features of a prediction (p,)
     ring: Buffer  # the last features (D + 1, p)
@@ -102,6 +109,7 @@ def _adapt(
     if loop.samples <= inputs.startup:
         return
     update_scale(inputs.scaling, scale, seen, u_before, f_plain)
+    update_feature_sizes(inputs, memory, seen, u_before)
     if not has_pairs(learner, memory):
         return
     # The next row to be written is the oldest of the D + 1 rows: D samples older than the newest.
@@ -157,6 +165,7 @@ def _forget(learner: OnlineDesign, memory: OnlineMemory) -> None:
     restart(learner, memory)
     _forget_model(memory)
     reset_scale(learner.inputs.scaling, memory.scale)
+    reset_sizes(memory.sizes)
 
 
 @coefficients.register(OnlineDesign)
@@ -218,6 +227,7 @@ class Online(FeatureLearner):
         model, flat = packed(self.model.memory(parameters.model))
         return OnlineMemory(
             scale=self._initial_scale(parameters.inputs),
+            sizes=self._initial_sizes(parameters.inputs),
             scaled=np.zeros(n),
             features=np.zeros(p),
             ring=np.zeros((parameters.delay + 1, p)),

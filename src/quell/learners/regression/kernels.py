@@ -9,8 +9,10 @@ type ``update_theta`` and ``reset_uncertainty`` are registered (``nlms.py``, ``r
 
 *Scaling.* States, u and f are divided by powers of two (``features/scaling.py``). When a scale
 grows, θ and the filters are converted; for features that are products of signals this is exact, and
-nothing jumps. A nonlinear feature of the signal becomes another function, so its coefficient is
-learned again. This happens in the first motions, and when a motion is larger than all before.
+nothing jumps; so it is for functions of signals in the plant's units, which are divided by their
+own sizes (``features/sizes.py``). A nonlinear feature of the scaled signal becomes another
+function, so its coefficient is learned again. This happens in the first motions, and when a motion
+is larger than all before.
 
 *Rest.* A signal that does not move is replaced by its mean, and θ is not updated while nothing
 moves (``noise_gate.py``): a load that comes at rest carries no information on the features.
@@ -32,11 +34,12 @@ from numpy.typing import NDArray
 
 from quell.features.base import unit
 from quell.features.scaling import reset_scale, update_scale
+from quell.features.sizes import reset_sizes, scale_units
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
-from quell.learners.feature_learner import Inputs, write_features
+from quell.learners.feature_learner import Inputs, update_feature_sizes, write_features
 from quell.learners.lag import lag_push
 from quell.learners.noise_gate import NoiseGateMemory, confidence, reset_gate, update_gate
 from quell.types import Matrix, Vector
@@ -90,6 +93,7 @@ class LinearMemory(NamedTuple):
 
     theta: Vector  # (p,), scaled
     scale: Vector  # (n + 2,): what x_1 … x_n, u and f are divided by
+    sizes: Vector  # (k,): what features of unknown size are divided by
     old_scale: Vector  # work space (n + 2,)
     scaled: Vector  # work space for the scaled state (n,)
     features: Vector  # work space (p,)
@@ -143,24 +147,26 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
     for i in range(scale.size):
         old[i] = scale[i]
     update_scale(inputs.scaling, scale, seen, u, f)
+    grown = update_feature_sizes(inputs, memory, seen, u)
     if loop.has_scale == 0.0:
         # There were no features before this sample: the filters have to settle once more.
         loop.has_scale = 1.0
         loop.samples = 0.0
         unit(inputs.features, scale, units)
+        scale_units(inputs.unscaled, memory.sizes, units)
         return
     if scale[last] != old[last]:
         for i in range(theta.size):
             theta[i] *= old[last] / scale[last]
-    grown = False
     for j in range(last):
         grown = grown or scale[j] != old[j]
     if not grown:
         return
     unit(inputs.features, scale, memory.features)
+    scale_units(inputs.unscaled, memory.sizes, memory.features)
     converted = False
     for i in range(theta.size):
-        affected = False
+        affected = memory.features[i] != units[i]
         for j in range(last):
             affected = affected or (scale[j] != old[j] and learner.depends[i, j] > 0.0)
         if not affected:
@@ -240,6 +246,7 @@ def _forget(learner: LinearDesign, memory: LinearMemory) -> None:
     clear(memory.loop)
     _forget_theta(learner, memory)
     reset_scale(learner.inputs.scaling, memory.scale)
+    reset_sizes(memory.sizes)
     for i in range(memory.units.size):
         memory.units[i] = 1.0
 

@@ -70,6 +70,7 @@ class Linear(FeatureLearner):
         return LinearMemory(
             theta=np.zeros(p),
             scale=self._initial_scale(parameters.inputs),
+            sizes=self._initial_sizes(parameters.inputs),
             old_scale=np.zeros(n + 2),
             scaled=np.zeros(n),
             features=np.zeros(p),

@@ -1,0 +1,63 @@
+"""Sizes of features that are functions of signals in the plant's units.
+
+Nothing is known of their size beforehand. So each is divided by the smallest power of two that is
+at least its largest absolute value so far, as signals are (``scaling.py``).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.features.base import Features
+from quell.features.scaling import LEAST
+from quell.kernels.dispatch import is_finite, kernel
+from quell.types import Vector
+
+Indices = NDArray[np.int64]
+
+
+def unscaled_indices(features: Features, order: int) -> Indices:
+    """Return the indices (k,) of the features whose size is unknown, for a plant of order n."""
+    return np.flatnonzero(features.unscaled(order))
+
+
+def initial_sizes(unscaled: Indices) -> Vector:
+    """Return the sizes (k,) before the first sample."""
+    return np.full(unscaled.size, LEAST)
+
+
+@kernel
+def reset_sizes(sizes: Vector) -> None:
+    """Go back to the sizes before the first sample."""
+    for k in range(sizes.size):
+        sizes[k] = LEAST
+
+
+@kernel
+def update_sizes(unscaled: Indices, sizes: Vector, values: Vector) -> bool:
+    """Let ``sizes`` (k,) cover features with these unscaled ``values`` (p,); return if one grew."""
+    grown = False
+    for k in range(sizes.size):
+        size = abs(values[unscaled[k]])
+        if size > sizes[k] and is_finite(size):
+            sizes[k] = 2.0 ** math.ceil(math.log2(size))
+            grown = True
+    return grown
+
+
+@kernel
+def scale_by_sizes(unscaled: Indices, sizes: Vector, values: Vector) -> None:
+    """Divide features by their sizes; one that was always zero remains so until it has a size."""
+    for k in range(sizes.size):
+        known = sizes[k] > LEAST
+        values[unscaled[k]] = values[unscaled[k]] / sizes[k] if known else 0.0
+
+
+@kernel
+def scale_units(unscaled: Indices, sizes: Vector, units: Vector) -> None:
+    """Divide the units of features by their sizes."""
+    for k in range(sizes.size):
+        units[unscaled[k]] /= sizes[k]
