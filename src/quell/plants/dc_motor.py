@@ -86,7 +86,7 @@ def _advance(
 
 @kernel
 def cogging_torque(table: Vector, angle: float) -> float:
-    """Return the torque at an ``angle`` [rad] by cubic interpolation in a ``table`` of a revolution.
+    """Return the torque at an ``angle`` [rad]: cubic interpolation in a revolution's ``table``.
 
     Keys, *Cubic convolution interpolation for digital image processing*, IEEE Trans. Acoustics,
     Speech and Signal Processing 29 (1981), eq. (15) with a = −1/2.
@@ -270,11 +270,10 @@ def _table(cogging: Any, cogging_map: Any) -> Vector:
     waves = []
     for i, wave in enumerate(cogging):
         row = checks.vector(f"cogging[{i}]", wave)
-        if row.size not in (2, 3) or not (
-            row[0] == round(row[0]) and 1 <= row[0] <= _HIGHEST_ORDER
-        ):
-            rule = f"must be (order, amplitude) or (order, amplitude, phase), order 1 to {_HIGHEST_ORDER}"
-            raise ValueError(f"cogging[{i}] = {wave!r}: {rule}")
+        whole = row.size in (2, 3) and row[0] == round(row[0])
+        if not (whole and 1 <= row[0] <= _HIGHEST_ORDER):
+            rule = "must be (order, amplitude) or (order, amplitude, phase), order a whole number"
+            raise ValueError(f"cogging[{i}] = {wave!r}: {rule} from 1 to {_HIGHEST_ORDER}")
         waves.append([*row.tolist(), 0.0][:3])
     if not waves:
         return np.zeros(4)
