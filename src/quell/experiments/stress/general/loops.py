@@ -22,6 +22,7 @@ from quell.controllers import ADRC
 from quell.experiments.stress.general.loads import LOADS, Table, load_table
 from quell.experiments.stress.general.margin import modulus_margin
 from quell.experiments.stress.general.plant import GeneralPlant
+from quell.experiments.stress.general.program import Program, Watched
 from quell.experiments.stress.general.references import REFERENCES, reference_table
 from quell.guard import Guard
 from quell.learners import Learner
@@ -110,8 +111,8 @@ class GeneralLoop:
     def controller(self, learner: Learner | None = None, guard: Guard | None = None) -> ADRC:
         """Return the controller, with a learner and a guard."""
         observer = ESO.model_free(self.order, self.b0, self.omega_o, self.dt)
-        limit = self.u_limit
-        return ADRC(observer, 1.0, learner=learner, guard=guard, u_min=-limit, u_max=limit)
+        limit, kind = self.u_limit, Watched if isinstance(learner, Program) else ADRC
+        return kind(observer, 1.0, learner=learner, guard=guard, u_min=-limit, u_max=limit)
 
     def describe(self) -> str:
         """Return what a table shows of it."""
@@ -131,8 +132,8 @@ def draw_loop(rng: Rng, family: str | None = None, order: int | None = None) -> 
 
 
 def _draw(rng: Rng, family: str | None, order: int | None) -> GeneralLoop:
-    family = family or str(rng.choice(FAMILIES))
-    n = order or (4 if family == "two masses" else int(rng.integers(1, 5)))
+    family = family or str(rng.choice(FAMILIES if order in (None, 4) else FAMILIES[:-1]))
+    n = 4 if family == "two masses" else order or int(rng.integers(1, 5))
     omega_o = _log_uniform(rng, 5.0, 20.0)
     dt = _log_uniform(rng, 0.01, 0.1) / omega_o
     b, gain_error = _log_uniform(rng, 0.1, 10.0), rng.uniform(0.6, 1.6)

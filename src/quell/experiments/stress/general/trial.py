@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from quell.experiments.stress.adversaries import KINDS, draw_adversary
+from quell.experiments.stress.general.attacks import KINDS, draw_attack
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
 from quell.experiments.stress.general.measures import WINDOW_LAGS, Measures, measures
 from quell.experiments.stress.general.references import ideal
@@ -70,7 +70,7 @@ def run_one(
     """Run the loop with this number, with a learner and without."""
     rng = np.random.default_rng([seed, index, int(honest)])
     loop = draw_loop(rng)
-    learner = HONEST[kind] if honest else draw_adversary(kind, rng)
+    learner = HONEST[kind] if honest else draw_attack(kind, rng, loop, guard)
     plain = error_of(loop, None, None)
     learned = None if plain is None else error_of(loop, learner, guard)
     ratios = Measures(*[np.nan] * 4)

@@ -1,0 +1,130 @@
+"""Adversaries that know the loop: drawn at random, or found by a search (``search``).
+
+Both are ``Program`` learners with the loop's own numbers: a point θ in ``SIZE`` dimensions says how
+much of the exact f (``exact_weights``) and of each input they return in their two modes, and when
+they change between them.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from quell.experiments.stress.adversaries import KINDS as BLIND_KINDS
+from quell.experiments.stress.adversaries import draw_adversary
+from quell.experiments.stress.general.loops import GeneralLoop
+from quell.experiments.stress.general.program import INPUTS, RULES, Program
+from quell.guard import Guard
+from quell.learners import Learner
+from quell.types import Vector
+
+Rng = np.random.Generator
+
+EARN, SEARCHED = "earn and spend", "searched"
+KINDS = (*BLIND_KINDS, EARN, SEARCHED)
+"""Hostile learners by name: those of the two-mass trial, and two that see everything."""
+
+_WIDTH = len(INPUTS)
+SIZE = 2 * (1 + _WIDTH) + len(RULES) + 1
+"""Numbers in θ: of each mode the share of the exact f and the weights; the rules, the frequency."""
+_AT = {name: i for i, name in enumerate(INPUTS)}
+# Spread of the points around one that a search has found, in units of the search's own spread at
+# its beginning. Chosen by hand: enough that no two are alike.
+_NEARBY = 0.05
+_FOUND = Path(__file__).with_name("searched.json")
+
+
+def exact_weights(loop: GeneralLoop) -> Vector:
+    """Return the weights of ``INPUTS`` whose sum is f, in the linear part of the plant.
+
+    ``f = −a x + (b − b0) u + w``; w as in ``y^(n)``, at low frequencies for two masses.
+    """
+    n, A = loop.order, loop.plant.linear.A
+    a = np.poly(A[:n, :n])[:0:-1]
+    gains = np.array([_binomial(n, i) for i in range(n)])
+    weights = np.zeros(_WIDTH)
+    weights[_AT["k1 x1"] : _AT["k1 x1"] + n] = -a / gains
+    weights[_AT["b0 u"]] = 1.0 / loop.gain_error - 1.0
+    weights[_AT["load"]] = loop.b0 / loop.gain_error if loop.family == "two masses" else 1.0
+    return weights
+
+
+def _binomial(n: int, i: int) -> float:
+    """Return the law's gain of state i + 1 with omega_c = 1."""
+    from math import comb
+
+    return float(comb(n, i))
+
+
+def program(point: Vector, loop: GeneralLoop, guard: Guard | None) -> Program:
+    """Return the adversary at a point θ (SIZE,), for a loop and the guard that it watches."""
+    exact = exact_weights(loop)
+    modes = point[: 2 * (1 + _WIDTH)].reshape(2, 1 + _WIDTH)
+    trusted, distrusted, least, most, omega = point[2 * (1 + _WIDTH) :]
+    weights = modes[:, :1] * exact + modes[:, 1:]
+    rules = (
+        float(1.0 / (1.0 + np.exp(-trusted))),
+        float(1.0 / (1.0 + np.exp(-distrusted))),
+        float(10.0 * np.exp(np.clip(least, -6.0, 6.0))),
+        float(10.0 * np.exp(np.clip(most, -6.0, 6.0))),
+    )
+    frequency = float(np.exp(np.clip(omega, -4.0, 4.0)))
+    return Program(weights.tolist(), rules, frequency, loop.tables[1], guard)
+
+
+def centre() -> Vector:
+    """Return the point from which a search begins: f itself in the first mode, −f in the second."""
+    point = np.zeros(SIZE)
+    point[0], point[1 + _WIDTH] = 1.0, -1.0
+    point[2 * (1 + _WIDTH)], point[2 * (1 + _WIDTH) + 1] = 1.0, -2.0
+    return point
+
+
+def spread() -> Vector:
+    """Return the standard deviations with which a search begins."""
+    point = np.full(SIZE, 0.3)
+    point[1 + _WIDTH] = 2.0
+    point[2 + _WIDTH :] = 1.0
+    return point
+
+
+def draw_attack(kind: str, rng: Rng, loop: GeneralLoop, guard: Guard | None) -> Learner:
+    """Return a random hostile learner of one of the ``KINDS`` for a loop."""
+    if kind == EARN:
+        return program(_earn_and_spend(rng), loop, guard)
+    if kind == SEARCHED:
+        found = found_points(loop.order)
+        point = found[int(rng.integers(len(found)))]
+        return program(point + _NEARBY * spread() * rng.normal(size=SIZE), loop, guard)
+    return draw_adversary(kind, rng)
+
+
+def _earn_and_spend(rng: Rng) -> Vector:
+    """Return a point that returns f until it is trusted, and then one of several kinds of harm."""
+    point = np.zeros(SIZE)
+    point[0] = 1.0
+    attack = point[1 + _WIDTH : 2 * (1 + _WIDTH)]  # a view: share of the exact f, then weights
+    kind, sign = int(rng.integers(6)), float(rng.choice([-1.0, 1.0]))
+    if kind == 0:
+        attack[0] = sign * rng.uniform(0.0, 4.0)
+    elif kind == 1:
+        attack[1 + _AT["f_plain"]] = 1.0
+        attack[1 + _AT["q"]] = sign * rng.uniform(0.5, 5.0)
+    else:
+        attack[0] = 1.0
+        push = ("e sign(q)", "e sign(x2)", "e sin(omega t)", "e")[kind - 2]
+        attack[1 + _AT[push]] = sign * rng.uniform(0.3, 3.0)
+    point[-5:] = rng.normal([1.0, -1.0, 0.0, 0.0, 0.0], [1.0, 2.0, 1.0, 1.5, 1.0])
+    return point
+
+
+@cache
+def found_points(order: int) -> list[Vector]:
+    """Return what the searches found for loops of an order: ``benchmarks/stress_search.py``."""
+    if not _FOUND.is_file():
+        return [centre()]
+    table = json.loads(_FOUND.read_text(encoding="utf-8"))
+    return [np.array(point) for point in table[str(order)]]
