@@ -15,6 +15,7 @@ from quell.learners.least_squares import RlsRule
 from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.nlms import NlmsRule
 from quell.learners.regression.rls import RlsMemory
+from quell.learners.regression.selection import SelectionRule, selection_memory
 
 OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=20.0, dt=5e-3)
 
@@ -72,6 +73,39 @@ def test_the_rules_take_their_times_from_the_controllers_bandwidth() -> None:
         -math.expm1(-5e-3 / 2.0), rel=1e-12
     )
     assert ql.learners.NLMS().rule(OBSERVER, 4.0, 3).gain == pytest.approx(5e-3 * 4.0, rel=1e-12)
+
+
+def test_the_strongest_features_are_found_and_the_others_have_no_coefficient() -> None:
+    """Four of 60 waves in position, at a speed that changes; later one is gone and one is new."""
+    rule = SelectionRule(RlsRule(2.0, 1e-2, 9.0), 0.1, 50)
+    theta, memory = np.zeros(60), selection_memory(rule, 6, 60)
+    angle = np.cumsum(0.01 + 0.005 * np.sin(np.arange(12_000) / 3000.0))
+    orders = np.arange(1, 31)
+    for k, position in enumerate(angle):
+        features = np.concatenate([np.sin(orders * position), np.cos(orders * position)])
+        target = 0.9 * features[6] - 0.5 * features[27] + 0.3 * features[35]
+        target += 0.4 * (features[50] if k < 6000 else features[11])
+        update_theta(rule, memory, theta, features, target - theta @ features, 1.0)
+        if k in (5999, 11_999):
+            last = 50 if k < 6000 else 11
+            expected = np.zeros(60)
+            expected[[6, 27, 35, last]] = 0.9, -0.5, 0.3, 0.4
+            np.testing.assert_allclose(theta, expected, atol=0.02)
+            assert np.count_nonzero(theta) <= 6
+            assert {6.0, 27.0, 35.0, float(last)} <= set(memory.active.tolist())
+    reset_uncertainty(rule, memory)
+    np.testing.assert_array_equal(memory.covariance, 9.0 * np.eye(6))
+    assert not np.any(memory.weak)
+
+
+def test_a_selection_of_all_features_is_plain_least_squares() -> None:
+    """``strongest`` that is not below the number of features changes nothing."""
+    assert ql.learners.RLS(strongest=3).rule(OBSERVER, 4.0, 3) == ql.learners.RLS().rule(
+        OBSERVER, 4.0, 3
+    )
+    assert isinstance(ql.learners.RLS(strongest=2).rule(OBSERVER, 4.0, 3), SelectionRule)
+    with pytest.raises(ValueError, match="strongest = 0: must be a whole number of at least 1"):
+        ql.learners.RLS(strongest=0)
 
 
 def test_rls_forgets_along_what_it_sees_and_nowhere_else() -> None:

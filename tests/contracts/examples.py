@@ -14,7 +14,7 @@ import numpy as np
 
 import quell as ql
 from quell import learners as learner_room
-from quell.features import RBF, Bias, Input, Polynomial, RandomFourier, State
+from quell.features import RBF, Bias, Input, Periodic, Polynomial, RandomFourier, State
 from quell.learners.online.model import infer, learn
 from quell.observers.design import FORMS
 from quell.observers.eso import ESO
@@ -102,7 +102,9 @@ LEARNERS: dict[str, Any] = (
         "Kalman with u": ql.learners.Kalman(u=True),
         "a model of one's own": ql.learners.Online(OwnModel(), State() + Input()),
         "RLS with u": ql.learners.RLS(State() + Polynomial() + Bias() + Input()),
-        "RLS on radial features": ql.learners.RLS(State() + RBF(16) + Bias()),
+        "RLS on the strongest": ql.learners.RLS(
+            State() + RBF(8) + Periodic(highest=4) + Bias(), strongest=9
+        ),
         "NLMS on random features": ql.learners.NLMS(features=RandomFourier(20)),
         "gradient on radial features": ql.learners.BatchGradient(
             features=RBF(16, states=(1,)) + Bias()

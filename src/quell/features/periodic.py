@@ -53,8 +53,9 @@ class Periodic(Features):
     orders
         numbers m of waves in a period, whole numbers from 1.
     highest
-        in place of ``orders``, all orders from 1 to this one; by default 12. With ``RLS(...,
-        strongest=k)`` the learner finds those k features that matter.
+        in place of ``orders``, if they are not known: all orders from 1 to this one; 12 by default.
+        ``RLS`` finds all coefficients, or with ``RLS(..., strongest=k)`` the k strongest alone,
+        which takes less time a sample and more revolutions.
     state
         number of the state x, from 1; the output y by default.
 

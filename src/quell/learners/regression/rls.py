@@ -17,6 +17,12 @@ from quell.features import Features
 from quell.learners.least_squares import RlsRule, least_squares_gain
 from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.linear import Linear
+from quell.learners.regression.selection import (
+    EXCHANGE_LAGS,
+    SelectionMemory,
+    SelectionRule,
+    selection_memory,
+)
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
 
@@ -63,6 +69,10 @@ class RLS(Linear):
         ``100/omega_c`` by default.
     prior
         standard deviation of θ before anything is known; features and f are O(1).
+    strongest
+        number of features that are used at once, the strongest of all that are given; all by
+        default. With many features it saves time and noise (``selection.py``); others have the
+        coefficient zero.
 
     The other parameters are described in the base classes ``Linear`` and ``FeatureLearner``.
 
@@ -70,10 +80,6 @@ class RLS(Linear):
     ------
     ValueError
         for an argument out of range.
-
-    References ---------- Kulhavý & Kárný, *Tracking of slowly varying parameters by directional
-    forgetting*, IFAC World Congress 1984; Ljung & Söderström, *Theory and Practice of Recursive
-    Identification*, MIT Press 1983.
 
     References
     ----------
@@ -88,6 +94,7 @@ class RLS(Linear):
         *,
         memory_time: float | None = None,
         prior: float = 10.0,
+        strongest: int | None = None,
         frequency: float | None = None,
         scale: Any = None,
         gain_interval: tuple[float, float] = (0.5, 2.0),
@@ -96,15 +103,22 @@ class RLS(Linear):
         super().__init__(features, frequency, scale, gain_interval, bias_bandwidth)
         self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
         self.prior = checks.positive("prior", prior)
+        self.strongest = checks.optional(checks.whole, "strongest", strongest, 1)
 
-    def rule(self, observer: ESO, omega_c: float, features: int) -> RlsRule:
-        """Return noise, forgetting and prior."""
-        return RlsRule(
+    def rule(self, observer: ESO, omega_c: float, features: int) -> RlsRule | SelectionRule:
+        """Return noise, forgetting and prior, and how features are selected."""
+        rule = RlsRule(
             observer.lag_time / observer.dt,
             -math.expm1(-observer.dt / (self.memory_time or _MEMORY / omega_c)),
             self.prior**2,
         )
+        if self.strongest is None or self.strongest >= features:
+            return rule
+        interval = round(EXCHANGE_LAGS * observer.lag_time / observer.dt)
+        return SelectionRule(rule, min(omega_c * observer.dt, 1.0), max(interval, 1))
 
-    def rule_memory(self, rule: RlsRule, features: int) -> RlsMemory:
+    def rule_memory(self, rule: Any, features: int) -> RlsMemory | SelectionMemory:
         """Return the prior covariance and work space."""
+        if isinstance(rule, SelectionRule):
+            return selection_memory(rule, self.strongest or features, features)
         return RlsMemory(rule.prior * np.eye(features), np.zeros(features))
