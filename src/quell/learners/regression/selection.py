@@ -28,8 +28,8 @@ from quell.types import Matrix, Vector
 # An inactive feature must be so many times stronger than the active one that it replaces: less, and
 # features that are equally strong would change places all the time. Chosen by hand.
 _STRONGER = 2.0
-# Interval of exchanges in lags of the observer: in it least squares finds a new coefficient. Of 3, 10
-# and 50 lags the best for 16 of 180 waves of cogging at 0.03 to 1 rev/s, with ``omega_c`` as rate.
+# Interval of exchanges in lags of the observer: in it least squares finds a new coefficient. Of 3,
+# 10 and 50 lags the best for 16 of 180 waves of cogging at 0.03 to 1 rev/s (benchmarks/cogging.py).
 EXCHANGE_LAGS = 50.0
 # ρ: far below φ·φ of many features of O(1).
 _FLOOR = 1e-3
