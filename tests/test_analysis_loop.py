@@ -13,8 +13,8 @@ import pytest
 
 import quell as ql
 from quell import analysis
-from quell.analysis.sampled_plant import sampled_plant
 from quell.analysis.subsystems import subsystem
+from quell.plants.sampled import sampled_plant
 from tests.analysed_loops import PLANT, TRAINING, adrc, chain
 
 

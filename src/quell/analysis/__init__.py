@@ -4,6 +4,7 @@ May import ``simulation``, ``records``, ``controllers`` and what they import.
 """
 
 from quell.analysis.advice import advise
+from quell.analysis.certificate import Certificate, certify
 from quell.analysis.frozen_learner import Frozen, frozen
 from quell.analysis.linearise import linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
@@ -18,12 +19,14 @@ from quell.analysis.sweeps import loops_over_omega_o, loops_over_time
 from quell.controllers.design_checks import Finding
 
 __all__ = [
+    "Certificate",
     "Finding",
     "Frozen",
     "LoopAnalysis",
     "Margins",
     "advise",
     "analyse",
+    "certify",
     "frozen",
     "linear_law",
     "loops_over_omega_o",

@@ -9,12 +9,13 @@ the difference of two numbers near one. A dead time is a power of z (``pure_dela
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quell.analysis.pure_delays import delayed_parts, without_delays
+from quell.lti.system import System
 from quell.types import Matrix, Vector
 
 Complex = NDArray[np.complex128]
@@ -29,25 +30,6 @@ _BESIDE_UNDAMPED = np.logspace(-6.0, -1.0, 11)
 # Numbers in the matrices of the frequencies that are solved together: 16 MB. Chosen by hand; larger
 # blocks are not quicker.
 _BLOCK = 1_000_000
-
-
-class System(NamedTuple):
-    """A sampled system of one input and one output: ``x⁺ − x = N x + B u``, ``y = C x + D u``."""
-
-    N: Matrix
-    B: Vector
-    C: Vector
-    D: float
-
-    @classmethod
-    def balanced(cls, N: Matrix, B: Vector, C: Vector, D: float) -> System:
-        """Return the system with states scaled to similar size by powers of two, which is exact."""
-        from scipy.linalg import matrix_balance
-
-        if N.shape[0] == 0:
-            return cls(N, B, C, D)
-        scaled, (scale, _) = matrix_balance(N, permute=False, separate=True)
-        return cls(scaled, B / scale, C * scale, D)
 
 
 class Response:

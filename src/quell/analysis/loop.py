@@ -12,23 +12,29 @@ so that the responses are ``r → y: P C_r S``, ``d → y: P S``, ``n → u: −
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from quell import checks
-from quell.analysis.frequency_response import Complex, Response, System, frequencies, in_s_plane
-from quell.analysis.linear_part import linear_part
+from quell.analysis.certificate import Certificate, certify
+from quell.analysis.frequency_response import Complex, Response, frequencies, in_s_plane
 from quell.analysis.linearise import linear_law
 from quell.analysis.margins import Margins, least, margins
 from quell.analysis.pure_delays import eigenvalues
 from quell.analysis.python_control import state_space, transfer_function
-from quell.analysis.sampled_plant import SampledPlant, sampled_plant
 from quell.analysis.subsystems import closed_loop, closed_loop_matrix, law_matrix, subsystem
+from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
 from quell.controllers.linear.law import LinearLaw
 from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.learners.base import NoLearner
+from quell.lti.norms import h2_squared
+from quell.lti.system import System
+from quell.plants.linear_part import linear_part
+from quell.plants.sampled import SampledPlant, sampled_plant
 from quell.types import Matrix, Vector
 
 
@@ -71,13 +77,17 @@ def analyse(
     if not (hasattr(controller, "law") or hasattr(controller, "observer")):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     dt = float(controller.dt)
-    plant, own_delay = linear_part(plant, dt, operating_point)
-    sampled = sampled_plant(plant, dt, own_delay + delay, actuator_lag)
+    linear, own_delay = linear_part(plant, dt, operating_point)
+    sampled = sampled_plant(linear, dt, own_delay + delay, actuator_lag)
     observer = getattr(controller, "observer", None)
     b_over_b0 = None
     if observer is not None and observer.degree in sampled.b:  # gains to the same derivative of y
         b_over_b0 = sampled.b[observer.degree] / float(observer.b0)
-    return LoopAnalysis(sampled, linear_law(controller, at), dt, b_over_b0)
+    certified = None
+    if _is_guarded(controller):
+        how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
+        certified = partial(certify, plant, controller, operating_point=operating_point, **how)
+    return LoopAnalysis(sampled, linear_law(controller, at), dt, b_over_b0, certified)
 
 
 class LoopAnalysis:
@@ -95,12 +105,20 @@ class LoopAnalysis:
         the plant's gain over the b0 of the controller; None without b0, for a plant that was given
         sampled, and if the first derivative of y that u reaches is not the one that the controller
         assumes.
+    certified : callable or None
+        returns the ``Certificate`` of the guarded learner; None without one.
     """
 
     def __init__(
-        self, plant: SampledPlant, law: LinearLaw, dt: float, b_over_b0: float | None = None
+        self,
+        plant: SampledPlant,
+        law: LinearLaw,
+        dt: float,
+        b_over_b0: float | None = None,
+        certified: Callable[[], Certificate] | None = None,
     ) -> None:
         self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
+        self.certified = certified
         self._N = law_matrix(law)
         names = ("P", "C_r", "C_y")
         self._open = {name: Response(subsystem(plant, law, name)) for name in names}
@@ -110,7 +128,7 @@ class LoopAnalysis:
         return f"LoopAnalysis of {states} at dt = {self.dt:g} s:\n{self.summary()}"
 
     def summary(self) -> str:
-        """Return margins and noise gain in a few lines."""
+        """Return margins, noise gain and the certificate of a guarded learner in a few lines."""
         if not self.stable:
             return f"unstable: a pole at |z| = {np.max(np.abs(self.poles)):.6g}"
         m, (noise, peak) = self.margins, (self.noise_to_control, self.noise_to_control_peak)
@@ -126,8 +144,16 @@ class LoopAnalysis:
             f"or phase ±{m.disk_phase:.1f}°, or some of both\n"
             f"stable for {what} from {low:.3g} to {high:.3g}{unit}\n"
             f"white noise of 1 in y makes u move by {noise:.3g} RMS, "
-            f"at most by a factor of {peak:.3g} at one frequency"
+            f"at most by a factor of {peak:.3g} at one frequency" + self._certificate_lines()
         )
+
+    def _certificate_lines(self) -> str:
+        if self.certified is None:
+            return ""
+        try:
+            return f"\n{self.certified()}"
+        except ValueError as error:
+            return f"\nno certificate: {error}"
 
     # ---- poles
 
@@ -232,7 +258,7 @@ class LoopAnalysis:
         """RMS of u for white measurement noise of RMS 1; infinite for an unstable loop."""
         if not self.stable:
             return math.inf
-        return math.sqrt(_h2_squared(System.balanced(*self.closed_loop("n", "u"))))
+        return math.sqrt(h2_squared(self.closed_loop("n", "u")))
 
     @cached_property
     def noise_to_control_peak(self) -> float:
@@ -291,24 +317,14 @@ class LoopAnalysis:
         return transfer_function(subsystem(self.plant, self.law, name), self.dt)
 
 
+def _is_guarded(controller: Controller) -> bool:
+    if not isinstance(controller, ADRC) or controller.guard is None:
+        return False
+    return not isinstance(controller.learner, NoLearner)
+
+
 def duration(time: float) -> str:
     """Return a time as text, in ms or, from 1 s on, in s."""
     if math.isinf(time):
         return "infinite"
     return f"{time:.3g} s" if time >= 1.0 else f"{1e3 * time:.3g} ms"
-
-
-def _h2_squared(system: System) -> float:
-    """Return the sum of the squared impulse response.
-
-    By doubling, ``X ← X + M X Mᵀ``, ``M ← M²`` (Smith 1968): only positive terms are added, so
-    nothing cancels; after k rounds 2ᵏ samples are summed.
-    """
-    M, X = system.N + np.eye(system.N.shape[0]), np.outer(system.B, system.B)
-    for _ in range(64):  # 2⁶⁴ samples: no stable loop in double precision is slower
-        more = M @ X @ M.T
-        X = X + more
-        if np.max(np.abs(more)) <= 1e-16 * np.max(np.abs(X)):  # below the unit roundoff
-            break
-        M = M @ M
-    return float(system.C @ X @ system.C) + system.D**2

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.analysis.frequency_response import System
+from quell.lti.system import System
 from quell.optional import import_extra
 
 # Trailing coefficients below this share of the largest one count as rounding errors of a zero, some

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from quell import checks
-from quell.analysis.frequency_response import System
-from quell.analysis.sampled_plant import SampledPlant
 from quell.controllers.linear.law import LinearLaw
+from quell.lti.system import System
+from quell.plants.sampled import SampledPlant
 from quell.types import Matrix
 
 # Source and target, a letter each, of the closed-loop responses that have a name.

@@ -52,6 +52,7 @@ from quell.guard.base import (
     start_again,
     write_channels,
 )
+from quell.guard.certified import certified_bound
 from quell.guard.reason import Reason
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
@@ -273,6 +274,10 @@ class Guard:
     time
         time T [s] over which a learner's output is averaged; by default 30 lags
         ``(n + 1)/omega_o`` of the observer.
+    certified_for
+        a linear plant, a list of plants or ``{name: plant}``, for which κ is made small enough that
+        no learner can make q larger than ten times what it is without learner: κΓ ≤ 0.9, see
+        ``quell.analysis.certify``. None by default.
 
     Raises
     ------
@@ -282,14 +287,28 @@ class Guard:
 
     bound: float = 1.2
     time: float | None = None
+    certified_for: Any = None
 
     def __post_init__(self) -> None:
         checks.positive("bound", self.bound)
         if self.time is not None:
             checks.positive("time", self.time, "s")
 
-    def design(self, observer: ESO) -> GuardDesign:
-        """Return the parameters for an observer."""
+    def design(self, observer: ESO, law: Vector | None = None) -> GuardDesign:
+        """Return the parameters for an observer and the gains k of the law (n,).
+
+        Only ``certified_for`` needs the gains.
+
+        Raises
+        ------
+        ValueError
+            for a loop of ``certified_for`` that is unstable without learner, or without gains.
+        """
+        bound = float(self.bound)
+        if self.certified_for is not None:
+            if law is None:
+                raise ValueError("law = None: certified_for needs the gains k of the law")
+            bound = certified_bound(bound, self.certified_for, observer, law)
         dt, lag_time = observer.dt, observer.lag_time
         time = _AVERAGING_LAGS * lag_time if self.time is None else self.time
         # b0 + ∂f_L/∂u stays between b0/2 and 2 b0, as with the default gain_interval of Kalman.
@@ -299,7 +318,7 @@ class Guard:
             forget=-math.expm1(-dt / time),
             rise=-math.expm1(-dt / (_RISE_LAGS * lag_time)),
             decay=-math.expm1(-dt / (_DECAY_LAGS * lag_time)),
-            bound=float(self.bound),
+            bound=bound,
             fastest=_FASTEST * observer.omega_o * dt,
             least_slope=least_slope,
             largest_slope=largest_slope,

@@ -14,7 +14,7 @@ from quell.setup.schema import CallTable
 from quell.signals.base import Signal
 
 # Keys whose plant is a model: only its linear part is used.
-_MODELS = ("observer.plant", "controller.plant")
+_MODELS = ("observer.plant", "controller.plant", "guard.certified_for")
 
 
 def linear_part(plant: Any) -> Any:
@@ -63,7 +63,7 @@ class Builder:
         """Build the tables in a value; add up the features or signals of a list if ``add_up``."""
         if isinstance(value, CallTable):
             built = self.build(value, path, **context)
-            return linear_part(built) if path in _MODELS else built
+            return linear_part(built) if path.partition("[")[0] in _MODELS else built
         if not isinstance(value, tuple):
             return value
         entries = enumerate(value)

@@ -146,7 +146,8 @@ PREFILTERS = _call_tables(
 )
 Observer, Learner, Prefilter = one_of(OBSERVERS), one_of(LEARNERS), one_of(PREFILTERS)
 Controller = one_of(CONTROLLERS, default="adrc")
-Guard = call_table("guard", guard.Guard, only=True)
+_CERTIFIED = {"certified_for": one_of(PLANTS, many=Plant) | None}
+Guard = call_table("guard", guard.Guard, only=True, types=_CERTIFIED)
 _SIGNALS = {"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)}
 Scenario = call_table("scenario", SimulationScenario, only=True, types=_SIGNALS)
 Metrics = call_table("metrics", Trajectory.metrics, only=True)

@@ -123,10 +123,11 @@ class ADRC(StatefulController):
 
     def _design(self, observer: ESO, omega_c: float) -> AdrcDesign:
         learns = not isinstance(self.learner, NoLearner)
-        law = law_gains(observer.degree, omega_c) * (0.5 if self.half_gain else 1.0)
+        gains = law_gains(observer.degree, omega_c) * (0.5 if self.half_gain else 1.0)
+        law = np.append(gains, np.zeros(observer.order - observer.degree))
         return AdrcDesign(
             eso=observer.model,
-            law=np.append(law, np.zeros(observer.order - observer.degree)),
+            law=law,
             cancel=observer.cancel,
             cancel_f=observer.cancel_f,
             feedback=feedback_design(self.feedback, observer.degree, omega_c),
@@ -135,7 +136,7 @@ class ADRC(StatefulController):
             limits=self._limits,
             learner=checked_design(self.learner, observer, self._learner_omega_c),
             lag=lag_of(observer) if learns else NO_LAG,
-            guard=UnguardedDesign() if self.guard is None else self.guard.design(observer),
+            guard=UnguardedDesign() if self.guard is None else self.guard.design(observer, law),
             window=window_samples(observer) if learns else 0,
         )
 

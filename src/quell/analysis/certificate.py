@@ -1,0 +1,202 @@
+"""What is proved of a guarded loop, for any learner.
+
+A guard limits the correction to ``|e_L| ≤ κ e``, where e never exceeds the largest |q| so far. With
+the peak-to-peak gains Γ from e_L to q and Γ_y from e_L to y of the loop without learner, by the
+small-gain theorem::
+
+    sup |q| ≤ sup |q_0| / (1 − κΓ)  if κΓ < 1,        sup |y − y_0| ≤ Γ_y κ sup |q_0| / (1 − κΓ)
+
+q_0 and y_0 are those of the same loop, loads and noise without learner. docs/theory has the proof
+and its assumptions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from quell import checks
+from quell.controllers.adrc.adrc import ADRC
+from quell.controllers.adrc.feedback import LinearFeedback
+from quell.controllers.base import Controller
+from quell.controllers.limits import Limits
+from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.files import nonfinite_to_none
+from quell.guard import Guard, UnguardedDesign
+from quell.guard.certified import gains_of, named_plants
+from quell.guard.correction import CorrectionGains
+from quell.plants.cubic_spring import CubicSpringPlant
+from quell.plants.delay import DelayedPlant
+from quell.plants.encoder import EncodedPlant
+from quell.plants.linear_part import linear_part
+from quell.plants.nonlinear import NonlinearPlant
+from quell.plants.sampled import sampled_plant
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is proved of the loops of a guarded controller and a set of plants, for any learner."""
+
+    kappa: float  #: κ of the guard
+    gains: dict[str, CorrectionGains]  #: Γ and Γ_y [s^n], by name of the plant
+    excluded: tuple[str, ...] = ()  #: what the bounds do not cover
+
+    @property
+    def worst(self) -> str:
+        """Name of the plant with the largest Γ."""
+        return max(self.gains, key=lambda name: self.gains[name].error)
+
+    @property
+    def gain(self) -> float:
+        """Γ, the largest of all plants."""
+        return self.gains[self.worst].error
+
+    @property
+    def output_gain(self) -> float:
+        """Γ_y, the largest of all plants [s^n]."""
+        return max(gains.output for gains in self.gains.values())
+
+    @property
+    def certified(self) -> bool:
+        """Whether κΓ < 1 for all plants."""
+        return self.kappa * self.gain < 1.0
+
+    @property
+    def largest_kappa(self) -> float:
+        """Limit 1/Γ below which κ is certified."""
+        return math.inf if self.gain == 0.0 else 1.0 / self.gain
+
+    @property
+    def error_factor(self) -> float:
+        """Bound on sup |q| over sup |q_0|: 1/(1 − κΓ); infinite if there is none."""
+        return 1.0 / (1.0 - self.kappa * self.gain) if self.certified else math.inf
+
+    @property
+    def output_factor(self) -> float:
+        """Bound on sup |y − y_0| over sup |q_0| [s^n], the largest of all plants."""
+        if not self.certified:
+            return math.inf
+        return max(
+            gains.output * self.kappa / (1.0 - self.kappa * gains.error)
+            for gains in self.gains.values()
+        )
+
+    def error_bound(self, q_0: float) -> float:
+        """Return the bound on sup |q| for sup |q_0| = ``q_0`` [y-unit/s^n]."""
+        return checks.non_negative("q_0", q_0) * self.error_factor
+
+    def output_bound(self, q_0: float) -> float:
+        """Return the bound on sup |y − y_0| [y-unit] for sup |q_0| = ``q_0`` [y-unit/s^n]."""
+        return checks.non_negative("q_0", q_0) * self.output_factor
+
+    def __str__(self) -> str:
+        several = f" (the worst of {len(self.gains)} plants: {self.worst})"
+        lines = [
+            f"{'' if self.certified else 'not '}certified for every learner: κΓ = {self.kappa:.3g} "
+            f"· {self.gain:.3g} = {self.kappa * self.gain:.3g}{several * (len(self.gains) > 1)}; "
+            f"needs κ below {self.largest_kappa:.3g}"
+        ]
+        if self.certified:
+            lines.append(
+                f"sup |q| at most {self.error_factor:.3g} sup |q_0|, "
+                f"sup |y − y_0| at most {self.output_factor:.3g} sup |q_0|"
+            )
+        if self.excluded:
+            lines.append(f"not covered: {'; '.join(self.excluded)}")
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain dictionaries for ``json.dump``; None for what is infinite."""
+        found = {
+            "certified": self.certified,
+            "kappa": self.kappa,
+            "gain": self.gain,
+            "output_gain": self.output_gain,
+            "largest_kappa": self.largest_kappa,
+            "error_factor": self.error_factor,
+            "output_factor": self.output_factor,
+            "worst": self.worst,
+            "plants": {name: gains._asdict() for name, gains in self.gains.items()},
+            "excluded": list(self.excluded),
+        }
+        return dict(nonfinite_to_none(found))
+
+
+def certify(
+    plants: Any,
+    controller: Controller,
+    *,
+    delay: float = 0.0,
+    actuator_lag: float = 0.0,
+    operating_point: Any = None,
+) -> Certificate:
+    """Compute what a guard guarantees for the loops of linear plants, whatever the learner does.
+
+    The loop is the sampled one, with the form of its observer, delays and lag. Raises
+    ``ValueError`` for a loop that is unstable without learner, another controller than an ADRC, a
+    nonlinear law or observer, a nonlinear plant without operating point.
+
+    Parameters
+    ----------
+    plants
+        a plant as for ``analyse``, or a list of plants, or ``{name: plant}``. The bounds hold for
+        these plants, not for those between them.
+    controller
+        an ``ADRC``; κ is that of its guard, or of ``Guard()`` if it has none.
+    delay
+        additional dead time of the loops [s].
+    actuator_lag
+        time constant of a first-order lag between u and the plants [s].
+    operating_point
+        state and control signal ``(x, u)`` about which nonlinear plants are linearised.
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=0.005)
+    >>> controller = ql.ADRC(observer, omega_c=1.0, learner=ql.learners.Kalman(), guard=ql.Guard())
+    >>> plants = {f"b = {b}": ([b], [1.0, 0.0, 0.0]) for b in (0.7, 1.0, 1.3)}
+    >>> found = certify(plants, controller)
+    >>> found.certified, found.worst, round(found.gain, 2)
+    (True, 'b = 0.7', 0.52)
+    """
+    adrc = _adrc_of(controller)
+    gains: dict[str, CorrectionGains] = {}
+    excluded: list[str] = []
+    for name, plant in named_plants(plants).items():
+        linear, own_delay = linear_part(plant, adrc.dt, operating_point)
+        sampled = sampled_plant(linear, adrc.dt, own_delay + delay, actuator_lag)
+        gains[name] = gains_of(name, sampled, adrc.observer, adrc.parameters.law)
+        excluded += _not_covered(plant, adrc.parameters.limits)
+    return Certificate(_kappa(adrc), gains, tuple(dict.fromkeys(excluded)))
+
+
+def _adrc_of(controller: Controller) -> ADRC:
+    while isinstance(controller, Prefiltered):
+        controller = controller.controller
+    if not isinstance(controller, ADRC):
+        raise ValueError(f"controller = {controller!r}: must be an ADRC, which may have a guard")
+    if not isinstance(controller.parameters.feedback, LinearFeedback):
+        raise ValueError(
+            f"controller = {controller!r}: its law is nonlinear; "
+            "only loops with a linear law can be certified, without feedback="
+        )
+    return controller
+
+
+def _kappa(controller: ADRC) -> float:
+    design = controller.parameters.guard
+    return Guard().bound if isinstance(design, UnguardedDesign) else float(design.bound)
+
+
+def _not_covered(plant: Any, limits: Limits) -> list[str]:
+    """Return what of the loop of ``plant``, as the user gave it, is not covered."""
+    found = [] if all(map(math.isinf, limits)) else ["times when u is limited"]
+    while isinstance(plant, DelayedPlant | EncodedPlant):
+        if isinstance(plant, EncodedPlant):
+            found.append("the encoder's steps (they count as noise, the same in both loops)")
+        plant = plant.plant
+    if isinstance(plant, NonlinearPlant | CubicSpringPlant):
+        found.append("large motions (the plant is linearised)")
+    return found
