@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.markup import escape
 
 from quell.cli.options import OUTPUTS, Outputs, Whole
-from quell.cli.output import check_outputs, number, progress_bar, table, write_results
+from quell.cli.output import check_outputs, number, progress_bar, table, write_results, yes_or_no
 
 if TYPE_CHECKING:
+    from quell.experiments.stress.general.result import GeneralResult
     from quell.experiments.stress.study import Result
 
 _HEADINGS = (
     *("learner", "runs", "lost"),
     *("whole\n50 %", "\n99 %", "\nmost"),
     *("load\n50 %", "\n99 %", "\nmost", "late\n50 %"),
+)
+_GENERAL_HEADINGS = (
+    *("learner", "runs", "lost"),
+    *("RMS\n50 %", "\n99 %", "\nmost"),
+    *("window\n99 %", "\nmost", "peak\n99 %", "\nmost", "worse\nby 5%"),
 )
 
 
@@ -27,6 +33,7 @@ def stress(
     honest: Whole = 100,
     seed: Whole = 0,
     guard: bool = True,
+    loops: Literal["two-mass", "all"] = "two-mass",
     outputs: Outputs = OUTPUTS,
 ) -> None:
     """Test the guard: hostile learners and an honest one in random loops, each beside plain MF-ESO.
@@ -41,20 +48,27 @@ def stress(
         Seed of all that is random.
     guard
         With the guard, or without it, for comparison.
+    loops
+        The loops: two masses on a spring, all alike; or all kinds of plants, orders, references and
+        loads, with named cases and the bars that a guard has to meet. For these, seeds below 10000
+        are for tuning, and seeds from 1000000 on for judging: look at each of them once.
     """
     from rich.progress import TextColumn, TimeRemainingColumn
 
     from quell.experiments.stress import figures, study
+    from quell.experiments.stress.general import study as general
     from quell.guard import Guard
 
     outputs = check_outputs(outputs, ["stress"])
     console = Console()
-    first = "simulating (the first run compiles for half a minute)"
+    minutes = "half a minute" if loops == "two-mass" else "some minutes"
+    first = f"simulating (the first run compiles for {minutes})"
     columns = (TextColumn("{task.percentage:>3.0f} %"), TimeRemainingColumn())
     with progress_bar(console, first, *columns) as report:
         used, progress = Guard() if guard else None, partial(report, "simulating")
-        result = study.run(runs, honest, seed, guard=used, progress=progress)
-    _print(console, result, guard)
+        trial: Any = study if loops == "two-mass" else general
+        result = trial.run(runs, honest, seed, guard=used, progress=progress)
+    (_print if loops == "two-mass" else _print_general)(console, result, guard)
     paths = figures.save(result, outputs.figures, outputs.overwrite) if outputs.figures else []
     write_results(console, result.to_json(), outputs, paths)
 
@@ -88,4 +102,37 @@ def _print(console: Console, result: Result, guarded: bool) -> None:
     console.print(
         "Whole run: 150 s. Load: from 90 s on. Late: from 140 s on. Errors are against the "
         "response the design asks for.\n"
+    )
+
+
+def _print_general(console: Console, result: GeneralResult, guarded: bool) -> None:
+    from quell.experiments.stress.general.result import summary
+    from quell.experiments.stress.general.trial import HEALTHY
+
+    how = "with guard" if guarded else "WITHOUT guard"
+    title = f"Over MF-ESO in the same loop, {how}; loops with a modulus margin of {HEALTHY}"
+    rows = table(title, *_GENERAL_HEADINGS, padding=(0, 1, 0, 0), pad_edge=False)
+    kinds = result.grouped(result.healthy, "kind")
+    totals = {"all adversaries": result.hostile, "all honest": result.honest}
+    for label, outcomes in {**kinds, **totals}.items():
+        if label == "all adversaries":
+            rows.add_section()
+        found = summary(outcomes)
+        keys = (("rms", "median"), ("rms", "p99"), ("rms", "max"), ("window", "p99"))
+        more = (("window", "max"), ("peak", "p99"), ("peak", "max"))
+        cells = [number(found[name][key], ".2f") for name, key in (*keys, *more)]
+        lost = f"[red]{found['lost']}[/]" if found["lost"] else "0"
+        worse = number(found["worse"], ".3f")
+        rows.add_row(escape(label), str(found["runs"]), lost, *cells, worse)
+    console.print(rows)
+    bars = table("Bars", "over", "measure", "figure", "bar", "met", left=2)
+    for bar in result.bars():
+        figure = number(bar.figure, ".4g")
+        bars.add_row(
+            escape(bar.over), escape(bar.measure), figure, f"{bar.bar:g}", yes_or_no(bar.met)
+        )
+    console.print(bars)
+    left_out = len(result.outcomes) - len(result.healthy)
+    console.print(
+        f"{left_out} of {len(result.outcomes)} runs have a lower margin and do not count.\n"
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from functools import cache
+from math import comb
 from pathlib import Path
 
 import numpy as np
@@ -44,19 +45,12 @@ def exact_weights(loop: GeneralLoop) -> Vector:
     """
     n, A = loop.order, loop.plant.linear.A
     a = np.poly(A[:n, :n])[:0:-1]
-    gains = np.array([_binomial(n, i) for i in range(n)])
+    gains = np.array([comb(n, i) for i in range(n)])  # of the law, with omega_c = 1
     weights = np.zeros(_WIDTH)
     weights[_AT["k1 x1"] : _AT["k1 x1"] + n] = -a / gains
     weights[_AT["b0 u"]] = 1.0 / loop.gain_error - 1.0
     weights[_AT["load"]] = loop.b0 / loop.gain_error if loop.family == "two masses" else 1.0
     return weights
-
-
-def _binomial(n: int, i: int) -> float:
-    """Return the law's gain of state i + 1 with omega_c = 1."""
-    from math import comb
-
-    return float(comb(n, i))
 
 
 def program(point: Vector, loop: GeneralLoop, guard: Guard | None) -> Program:
@@ -94,7 +88,7 @@ def spread() -> Vector:
 def draw_attack(kind: str, rng: Rng, loop: GeneralLoop, guard: Guard | None) -> Learner:
     """Return a random hostile learner of one of the ``KINDS`` for a loop."""
     if kind == EARN:
-        return program(_earn_and_spend(rng), loop, guard)
+        return program(earn_and_spend(rng), loop, guard)
     if kind == SEARCHED:
         found = found_points(loop.order)
         point = found[int(rng.integers(len(found)))]
@@ -102,7 +96,7 @@ def draw_attack(kind: str, rng: Rng, loop: GeneralLoop, guard: Guard | None) -> 
     return draw_adversary(kind, rng)
 
 
-def _earn_and_spend(rng: Rng) -> Vector:
+def earn_and_spend(rng: Rng) -> Vector:
     """Return a point that returns f until it is trusted, and then one of several kinds of harm."""
     point = np.zeros(SIZE)
     point[0] = 1.0

@@ -2,7 +2,8 @@
 
 Rubinstein & Kroese, *The Cross-Entropy Method*, 2004, section 5.1: points are drawn from a normal
 distribution with independent entries, scored, and mean and standard deviation move to those of the
-best, smoothed (their section 5.1.2), until the generations are used up.
+best, smoothed (their section 5.1.2), until the generations are used up. The first generation are
+random draws of "earn and spend", and the best of them is the first mean.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.experiments.stress.general.attacks import SIZE, centre, program, spread
+from quell.experiments.stress.general.attacks import SIZE, centre, earn_and_spend, program, spread
 from quell.experiments.stress.general.loops import GeneralLoop
 from quell.experiments.stress.general.measures import Measures
 from quell.experiments.stress.general.trial import error_of
@@ -23,15 +24,22 @@ from quell.types import Matrix, Vector
 
 # Share of the points that is the best, and weight of the new mean and deviation: usual values.
 _ELITE, _SMOOTHING = 0.15, 0.7
-# Score of a lost loop: as a hundredfold error.
-_LOST = 100.0
+# Score of a lost loop: above that of an error a hundredfold.
+_LOST = 30.0
 
 Score = Callable[[Measures], float]
 
 
+# Ratios that are equally bad: the trial's bars for the largest of all runs.
+_BAR_RMS, _BAR_WINDOW = 1.2, 2.5
+# Weight of the worst loop against the mean of all: what is sought is the worst. Chosen by hand.
+_WORST = 0.5
+
+
 def harm(ratios: Measures) -> float:
-    """Return how bad ratios are: the mean logarithm of RMS error and worst window."""
-    return 0.5 * float(np.log(ratios.rms) + np.log(ratios.window))
+    """Return how bad ratios are: 0 for those of MF-ESO, 1 at the trial's bars."""
+    rms, window = np.log(ratios.rms) / np.log(_BAR_RMS), np.log(ratios.window) / np.log(_BAR_WINDOW)
+    return float(max(rms, window))
 
 
 class Found(NamedTuple):
@@ -67,39 +75,37 @@ def search(
     score
         what a point is judged by, from the ratios of a run to MF-ESO's.
     """
-    mean, deviation = centre(), spread()
-    best, history = Found(mean, -np.inf, []), []
+    first = np.array([centre()] + [earn_and_spend(rng) for _ in range(population - 1)])
+    best, history = Found(first[0], -np.inf, []), []
+    mean, deviation = first[0], spread()
     for generation in range(generations):
-        points = mean + deviation * rng.normal(size=(population, SIZE))
-        points[0] = mean
-        loops = list(draw(generation))
-        scores = judge(points, loops, guard, score)
+        points = mean + deviation * rng.normal(size=(population, SIZE)) if generation else first
+        points[0] = best.point if generation else first[0]
+        scores = judge(points, list(draw(generation)), guard, score)
         order = np.argsort(-scores)
+        history.append(float(scores[order[0]]))
+        best = Found(points[order[0]], history[-1], history)
+        if generation == 0:
+            mean = best.point
+            continue
         elite = points[order[: max(round(_ELITE * population), 2)]]
         mean = (1.0 - _SMOOTHING) * mean + _SMOOTHING * elite.mean(axis=0)
         deviation = (1.0 - _SMOOTHING) * deviation + _SMOOTHING * elite.std(axis=0)
-        history.append(float(scores[order[0]]))
-        if scores[order[0]] > best.score:
-            best = Found(points[order[0]], float(scores[order[0]]), history)
-    return (
-        Found(mean, best.score, history)
-        if best.score < history[-1]
-        else best._replace(history=history)
-    )
+    return best
 
 
 def judge(
     points: Matrix, loops: Sequence[GeneralLoop], guard: Guard | None, score: Score = harm
 ) -> Vector:
-    """Return the mean score of each point (points, SIZE) over loops; a lost one counts as 100."""
+    """Return the score of each point (points, SIZE): the mean of that over loops and the worst."""
     plain = in_parallel([partial(error_of, loop, None, None) for loop in loops])
     kept = [(loop, base) for loop, base in zip(loops, plain, strict=True) if base is not None]
 
     def one(point: Vector) -> float:
-        total = 0.0
+        scores = [0.0]
         for loop, base in kept:
             run = error_of(loop, program(point, loop, guard), guard)
-            total += float(np.log(_LOST)) if run is None else score(run.over(base))
-        return total / max(len(kept), 1)
+            scores.append(_LOST if run is None else score(run.over(base)))
+        return float((1.0 - _WORST) * np.mean(scores) + _WORST * np.max(scores))
 
     return np.array(in_parallel([partial(one, point) for point in points]))

@@ -38,12 +38,15 @@ class GeneralOutcome:
     """The result of one run; ratios are NaN if one of the two loops is lost."""
 
     kind: str
-    index: int  #: number of the run in the trial
+    honest: bool
+    index: int  #: number of the run in the trial, apart for hostile and honest learners
     learner: str
     loop: str
     family: str
     order: int
     load: str
+    reference: str
+    level: float  #: constant part of the load
     margin: float
     plain_lost: bool
     lost: bool
@@ -78,12 +81,15 @@ def run_one(
         ratios = learned.over(plain)
     return GeneralOutcome(
         kind=kind,
+        honest=honest,
         index=index,
         learner=repr(learner),
         loop=loop.describe(),
         family=loop.family,
         order=loop.order,
         load=loop.load,
+        reference=loop.reference,
+        level=loop.level,
         margin=loop.margin,
         plain_lost=plain is None,
         lost=learned is None and plain is not None,
@@ -94,7 +100,7 @@ def run_one(
     )
 
 
-def run_general(
+def run_all(
     runs: int,
     honest: int,
     seed: int,
@@ -103,7 +109,7 @@ def run_general(
     kinds: Sequence[str] = KINDS,
     progress: Callable[[float], None] | None = None,
 ) -> list[GeneralOutcome]:
-    """Run ``runs`` hostile and ``honest`` honest learners, all kinds in turn."""
+    """Run ``runs`` hostile and ``honest`` honest learners, the kinds of each in turn."""
     good = tuple(HONEST)
     jobs = [partial(run_one, seed, i, kinds[i % len(kinds)], guard) for i in range(runs)]
     jobs += [partial(run_one, seed, i, good[i % len(good)], guard, True) for i in range(honest)]

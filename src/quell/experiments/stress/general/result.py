@@ -1,0 +1,141 @@
+"""The result of the trial in general loops, and whether it meets the bars."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quell.experiments.stress.general.measures import Measures
+from quell.experiments.stress.general.named import Case
+from quell.experiments.stress.general.trial import HEALTHY, GeneralOutcome
+from quell.files import nonfinite_to_none
+
+# A run counts as worse from this ratio of the RMS errors on.
+_WORSE = 1.05
+_WORST_LISTED = 10
+_SHARES = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
+
+
+class Bar(NamedTuple):
+    """What a figure must not exceed."""
+
+    over: str
+    measure: str
+    figure: float | None  # None without runs
+    bar: float
+
+    @property
+    def met(self) -> bool:
+        """Whether the figure is within the bar."""
+        return self.figure is not None and self.figure <= self.bar
+
+
+@dataclass(frozen=True)
+class GeneralResult:
+    """All runs of a trial in general loops, and the named cases."""
+
+    settings: Mapping[str, Any]
+    outcomes: Sequence[GeneralOutcome]
+    cases: Sequence[Case]
+
+    @property
+    def healthy(self) -> list[GeneralOutcome]:
+        """The outcomes for which the bars hold."""
+        return [o for o in self.outcomes if o.margin >= HEALTHY and not o.plain_lost]
+
+    @property
+    def hostile(self) -> list[GeneralOutcome]:
+        """Those of them with a hostile learner."""
+        return [o for o in self.healthy if not o.honest]
+
+    @property
+    def honest(self) -> list[GeneralOutcome]:
+        """Those of them with an honest learner."""
+        return [o for o in self.healthy if o.honest]
+
+    def grouped(self, outcomes: Sequence[GeneralOutcome], by: str) -> dict[str, Any]:
+        """Return outcomes by one of their fields, in the order of the field's first values."""
+        groups: dict[str, list[GeneralOutcome]] = {}
+        for outcome in outcomes:
+            groups.setdefault(str(getattr(outcome, by)), []).append(outcome)
+        return groups
+
+    def bars(self) -> list[Bar]:
+        """Return the figures that have a bar; those of cases that were not run are left out."""
+        hostile, honest = summary(self.hostile), summary(self.honest)
+        lost = float(hostile["lost"] + honest["lost"])
+        found = [
+            Bar("all", "lost where MF-ESO has a modulus margin of 0.35", lost, 0.0),
+            Bar("hostile", "RMS of the run, 99 %", hostile["rms"]["p99"], 1.05),
+            Bar("hostile", "RMS of the run, largest", hostile["rms"]["max"], 1.2),
+            Bar("hostile", "worst window, 99 %", hostile["window"]["p99"], 1.5),
+            Bar("hostile", "worst window, largest", hostile["window"]["max"], 2.5),
+            Bar("honest", "RMS of the run, largest", honest["rms"]["max"], 1.2),
+            Bar("honest", "share worse by more than 5 %", honest["worse"], 0.003),
+            Bar("honest", "largest error, 99 %", honest["peak"]["p99"], 1.1),
+            Bar("honest", "largest error, largest", honest["peak"]["max"], 1.5),
+        ]
+        return found + [bar for bar in self._case_bars() if bar.figure is not None]
+
+    def _case_bars(self) -> list[Bar]:
+        def worst(begins: str, figure: Callable[[Case], float], without: str = "") -> float | None:
+            chosen = [c for c in self.cases if c.case.startswith(begins)]
+            kept = [c for c in chosen if not (without and without in c.case)]
+            return max((figure(c) for c in kept), default=None)
+
+        def over_unguarded(case: Case) -> float:
+            return case.over_unguarded
+
+        def over_plain(case: Case) -> float:
+            return case.over_plain
+
+        def lost_share(case: Case) -> float:
+            return case.lost_share
+
+        return [
+            Bar("level", "late RMS, guarded over unguarded", worst("level", over_unguarded), 1.1),
+            Bar("slow process", "overshoot, load peak", worst("slow", over_plain), 1.0),
+            Bar("perfect", "share of benefit lost", worst("perfect", lost_share, "steps"), 0.05),
+            Bar("perfect, rare steps", "share of benefit lost", self._on_steps(), 0.05),
+        ]
+
+    def _on_steps(self) -> float | None:
+        shares = [c.lost_share for c in self.cases if "perfect" in c.case and "steps" in c.case]
+        return max(shares, default=None)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain dictionaries and lists for ``json.dump``."""
+        worst = sorted(self.healthy, key=lambda o: -(o.rms if np.isfinite(o.rms) else np.inf))
+        groups = {"hostile": self.hostile, "honest": self.honest}
+        return {
+            "settings": dict(self.settings),
+            "bars": [{**bar._asdict(), "met": bar.met} for bar in self.bars()],
+            **{name: summary(group) for name, group in groups.items()},
+            **{
+                f"{name}_by_{by}": {
+                    key: summary(some) for key, some in self.grouped(group, by).items()
+                }
+                for name, group in groups.items()
+                for by in ("kind", "family", "load", "reference", "order")
+            },
+            "worst": [nonfinite_to_none(asdict(outcome)) for outcome in worst[:_WORST_LISTED]],
+            "cases": [nonfinite_to_none(asdict(case)) for case in self.cases],
+        }
+
+
+def summary(outcomes: Sequence[GeneralOutcome]) -> dict[str, Any]:
+    """Return counts and quantiles of the ratios to MF-ESO; None for the quantiles of no numbers."""
+    found: dict[str, Any] = {"runs": len(outcomes), "lost": sum(o.lost for o in outcomes)}
+    for name in Measures._fields:
+        values = np.array([getattr(o, name) for o in outcomes])
+        values = values[np.isfinite(values)]
+        found[name] = {
+            key: float(np.quantile(values, share)) if values.size else None
+            for key, share in _SHARES.items()
+        }
+        if name == "rms":
+            found["worse"] = float(np.mean(values > _WORSE)) if values.size else None
+    return found
