@@ -92,16 +92,17 @@ class Certificate:
 
     def __str__(self) -> str:
         several = f" (the worst of {len(self.gains)} plants: {self.worst})"
-        lines = [
-            f"{'' if self.certified else 'not '}certified for every learner: κΓ = {self.kappa:.3g} "
-            f"· {self.gain:.3g} = {self.kappa * self.gain:.3g}{several * (len(self.gains) > 1)}; "
-            f"needs κ below {self.largest_kappa:.3g}"
-        ]
+        product = (
+            f"κΓ = {self.kappa:.3g} · {self.gain:.3g} = {self.kappa * self.gain:.3g}"
+            f"{several * (len(self.gains) > 1)}"
+        )
+        lines = [f"not certified: {product} must be below 1, so κ below {self.largest_kappa:.3g}"]
         if self.certified:
-            lines.append(
-                f"sup |q| at most {self.error_factor:.3g} sup |q_0|, "
-                f"sup |y − y_0| at most {self.output_factor:.3g} sup |q_0|"
-            )
+            lines = [
+                f"certified: {product}; κ may be up to {self.largest_kappa:.3g}",
+                f"with any learner |q| stays below {self.error_factor:.3g} max |q_0|, "
+                f"and |y − y_0| below {self.output_factor:.3g} max |q_0|",
+            ]
         if self.excluded:
             lines.append(f"not covered: {'; '.join(self.excluded)}")
         return "\n".join(lines)

@@ -83,11 +83,11 @@ def analyse(
     b_over_b0 = None
     if observer is not None and observer.degree in sampled.b:  # gains to the same derivative of y
         b_over_b0 = sampled.b[observer.degree] / float(observer.b0)
-    certified = None
+    certificate = None
     if _is_guarded(controller):
         how: dict[str, Any] = {"delay": delay, "actuator_lag": actuator_lag}
-        certified = partial(certify, plant, controller, operating_point=operating_point, **how)
-    return LoopAnalysis(sampled, linear_law(controller, at), dt, b_over_b0, certified)
+        certificate = partial(certify, plant, controller, operating_point=operating_point, **how)
+    return LoopAnalysis(sampled, linear_law(controller, at), dt, b_over_b0, certificate)
 
 
 class LoopAnalysis:
@@ -105,8 +105,6 @@ class LoopAnalysis:
         the plant's gain over the b0 of the controller; None without b0, for a plant that was given
         sampled, and if the first derivative of y that u reaches is not the one that the controller
         assumes.
-    certified : callable or None
-        returns the ``Certificate`` of the guarded learner; None without one.
     """
 
     def __init__(
@@ -115,10 +113,10 @@ class LoopAnalysis:
         law: LinearLaw,
         dt: float,
         b_over_b0: float | None = None,
-        certified: Callable[[], Certificate] | None = None,
+        certify: Callable[[], Certificate] | None = None,
     ) -> None:
         self.plant, self.law, self.dt, self.b_over_b0 = plant, law, dt, b_over_b0
-        self.certified = certified
+        self._certify = certify
         self._N = law_matrix(law)
         names = ("P", "C_r", "C_y")
         self._open = {name: Response(subsystem(plant, law, name)) for name in names}
@@ -147,11 +145,18 @@ class LoopAnalysis:
             f"at most by a factor of {peak:.3g} at one frequency" + self._certificate_lines()
         )
 
+    @cached_property
+    def certificate(self) -> Certificate | None:
+        """What the guard guarantees (``certify``); None without a guarded learner.
+
+        Raises ``ValueError`` for a loop that cannot be certified: nonlinear, or unstable without
+        learner.
+        """
+        return None if self._certify is None else self._certify()
+
     def _certificate_lines(self) -> str:
-        if self.certified is None:
-            return ""
         try:
-            return f"\n{self.certified()}"
+            return "" if self.certificate is None else f"\n{self.certificate}"
         except ValueError as error:
             return f"\nno certificate: {error}"
 

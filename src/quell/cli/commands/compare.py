@@ -13,6 +13,7 @@ from quell.cli.options import OUTPUTS, Outputs, Whole
 from quell.cli.output import COMPILING, check_outputs, progress_bar, table, write_results
 
 if TYPE_CHECKING:
+    from quell.analysis import Certificate
     from quell.controllers import Controller
     from quell.experiments.compare import Benchmark, Comparison
 
@@ -30,7 +31,7 @@ _WIDTH = 6
 
 def compare(
     *,
-    controllers: str = "mf-eso,mb-eso,l-eso,pid,pi-notch,lqg,resonance-ratio",
+    controllers: str = "mf-eso,mb-eso,l-eso,guarded-l-eso,pid,pi-notch,lqg,resonance-ratio",
     m1: float = 1.0,
     m2: float = 1.0,
     k: float = 1.0,
@@ -68,20 +69,33 @@ def compare(
     if not names:
         known = ", ".join(benchmark.NAMES)
         raise ValueError(f"controllers = {controllers!r}: must be names with commas, of {known}")
-    stable = {name: _is_stable(benchmark.controller(name, dt, u_max), settings) for name in names}
+    designs = {name: benchmark.controller(name, dt, u_max) for name in names}
+    stable = {name: _is_stable(design, settings) for name, design in designs.items()}
+    guarded = [name for name in names if getattr(_inner(designs[name]), "guard", None) is not None]
+    proofs = {name: _certificate(designs[name], settings) for name in guarded}
     outputs = check_outputs(outputs, ["compare"])
     console = Console()
     with progress_bar(console, COMPILING) as report:
         result = benchmark.two_mass(settings, names, partial(report, COMPILING))
     _print(console, result, settings, stable)
+    for name, proof in proofs.items():
+        console.print(f"{name}: {proof}", soft_wrap=True, highlight=False)
     paths = figures.save(result, outputs.figures, outputs.overwrite) if outputs.figures else []
     about = {"m1": m1, "m2": m2, "k": k, "dt": dt, "seed": seed}
     limit = {} if u_max == inf else {"u_max": u_max}
     results = result.to_json()
     for name, scores in results["controllers"].items():
         scores["stable"] = stable[name]
+        if name in proofs:
+            proof = proofs[name]
+            scores["certificate"] = proof if isinstance(proof, str) else proof.to_json()
     write_results(console, {"settings": about | limit, **results}, outputs, paths)
     exit_if_diverged(result.runs.values())
+
+
+def _inner(controller: Controller) -> Any:
+    """Return the controller behind a prefilter, which is outside of the loop."""
+    return getattr(controller, "controller", controller)
 
 
 def _is_stable(controller: Controller, settings: Benchmark) -> bool | None:
@@ -89,10 +103,21 @@ def _is_stable(controller: Controller, settings: Benchmark) -> bool | None:
     from quell.analysis import analyse
     from quell.plants import two_mass_spring
 
-    inner: Any = getattr(controller, "controller", controller)  # a prefilter is outside of the loop
+    inner = _inner(controller)
     if inner.features:
         return None
     return bool(analyse(two_mass_spring(settings.m1, settings.m2, settings.k), inner).stable)
+
+
+def _certificate(controller: Controller, settings: Benchmark) -> Certificate | str:
+    """Return what is proved of a guarded learner on the real plant, or why nothing is."""
+    from quell.analysis import certify
+    from quell.plants import two_mass_spring
+
+    try:
+        return certify(two_mass_spring(settings.m1, settings.m2, settings.k), controller)
+    except ValueError as error:
+        return f"no certificate: {error}"
 
 
 def _print(

@@ -21,6 +21,7 @@ from quell import checks
 from quell.controllers import ADRC, Controller, Prefiltered
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio
 from quell.experiments.compare.study import Comparison, compare
+from quell.guard import Guard
 from quell.learners import Kalman
 from quell.observers import ESO
 from quell.plants import two_mass_spring
@@ -128,6 +129,9 @@ _DESIGNS: Mapping[str, Callable[[float, dict[str, Any]], Controller]] = {
         ESO.model_based(two_mass_spring(), OMEGA_O, dt), OMEGA_C, **limits
     ),
     "l-eso": lambda dt, limits: ADRC(_model_free(dt), OMEGA_C, learner=Kalman(), **limits),
+    "guarded-l-eso": lambda dt, limits: ADRC(
+        _model_free(dt), OMEGA_C, learner=Kalman(), guard=Guard(), **limits
+    ),
     "pid": _pid,
     "pi-notch": _notch_pid,
     "lqg": lambda dt, limits: LQG(two_mass_spring(), OMEGA_C, OMEGA_O, dt, **limits),
