@@ -35,7 +35,8 @@ _AT = {name: i for i, name in enumerate(INPUTS)}
 # Spread of the points around one that a search has found, in units of the search's own spread at
 # its beginning. Chosen by hand: enough that no two are alike.
 _NEARBY = 0.05
-_FOUND = Path(__file__).with_name("searched.json")
+FOUND = Path(__file__).with_name("searched.json")
+"""What the searches found for each order: made by ``benchmarks/stress_search.py``."""
 
 
 def exact_weights(loop: GeneralLoop) -> Vector:
@@ -118,7 +119,7 @@ def earn_and_spend(rng: Rng) -> Vector:
 @cache
 def found_points(order: int) -> list[Vector]:
     """Return what the searches found for loops of an order: ``benchmarks/stress_search.py``."""
-    if not _FOUND.is_file():
+    if not FOUND.is_file():
         return [centre()]
-    table = json.loads(_FOUND.read_text(encoding="utf-8"))
+    table = json.loads(FOUND.read_text(encoding="utf-8"))
     return [np.array(point) for point in table[str(order)]]

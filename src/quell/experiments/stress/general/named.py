@@ -24,6 +24,7 @@ import numpy as np
 
 from quell.controllers import ADRC
 from quell.experiments.stress.general.loads import LOADS, Table
+from quell.experiments.stress.general.plant import GeneralPlant
 from quell.experiments.stress.general.program import INPUTS, Program, Watched
 from quell.guard import Guard
 from quell.learners import Harmonic, Kalman, Learner
@@ -151,7 +152,7 @@ def perfect_case(order: int, kind: str, guard: Guard, seed: int) -> Case:
     noise = Table(1e-4 / omega_o**order * rng.standard_normal(t.size), dt)
     scenario = Scenario(0.0, float(t[-1]), (Table(w, dt),), noise)
     A, B, C = np.diag(np.ones(order - 1), 1), np.eye(order)[-1:].T, np.eye(order)[:1]
-    plant = LinearPlant(A, B, C)
+    plant = GeneralPlant(LinearPlant(A, B, C))
     observer = ESO.model_free(order, 1.0, omega_o, dt)
     weights = np.zeros((2, len(INPUTS)))
     weights[:, INPUTS.index("load")] = 1.0

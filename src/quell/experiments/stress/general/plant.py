@@ -10,7 +10,7 @@ controller does not know, friction, gravity and a quantised output, each of whic
 The linear part is exact for forces that are held over a sample. Gravity is taken in the middle of
 the sample. Friction is what brings v to zero within the sample, or ``±friction`` if that is too
 little (Moreau's time stepping: Acary & Brogliato, *Numerical Methods for Nonsmooth Dynamical
-Systems*, 2008, section 10.1), so a plant at rest stays exactly at rest.
+Systems*, 2008, section 10.1), so a plant at rest stays there, to rounding.
 """
 
 from __future__ import annotations
