@@ -1,4 +1,4 @@
-"""A learner that makes its correction e_L equal to a given sequence, and records the error q."""
+"""A learner whose correction e_L is given, or as large as a guard may let it be; it records q."""
 
 from __future__ import annotations
 
@@ -13,32 +13,37 @@ from quell.types import Matrix, Vector
 
 
 class InjectedDesign(NamedTuple):
-    """Parameters: the observer's lag filter and e_L of each sample."""
+    """Parameters."""
 
-    lag: Any
-    sequence: Vector
+    lag: Any  # of the observer
+    sequence: Vector  # e_L of each sample, or what it is multiplied by
+    kappa: float  # zero if the sequence is e_L itself
 
 
 class InjectedMemory(NamedTuple):
     """State: the filters of f_plain and of f_L."""
 
     chain: Matrix  # (2, …)
-    now: Vector  # (5,): f_plain^F, f_L^F, number of samples, q, e_L
+    now: Vector  # (6,): f_plain^F, f_L^F, number of samples, q, e_L, e
 
 
 class Injected:
-    """A learner whose f_L is e_L + f_L^F; beyond its sequence e_L is zero. Its θ are q and e_L."""
+    """A learner whose f_L is e_L + f_L^F; beyond its sequence e_L is zero. Its θ are q and e_L.
 
-    def __init__(self, sequence: Any) -> None:
-        self.sequence = np.array(sequence, dtype=np.float64)
+    With ``kappa``, e_L is the sequence times κ e, with e the largest |q| so far: whatever a guard
+    with the bound κ could let pass, if the sequence stays within ±1.
+    """
+
+    def __init__(self, sequence: Any, kappa: float = 0.0) -> None:
+        self.sequence, self.kappa = np.array(sequence, dtype=np.float64), kappa
 
     def design(self, observer: ql.ESO, omega_c: float) -> InjectedDesign:
         """Return the parameters."""
-        return InjectedDesign(lag_of(observer), self.sequence)
+        return InjectedDesign(lag_of(observer), self.sequence, self.kappa)
 
     def memory(self, parameters: InjectedDesign) -> InjectedMemory:
         """Return the state at rest."""
-        return InjectedMemory(lag_memory(parameters.lag, 2), np.zeros(5))
+        return InjectedMemory(lag_memory(parameters.lag, 2), np.zeros(6))
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return the names of what is recorded."""
@@ -56,6 +61,7 @@ def _adapt(
 ) -> None:
     now = memory.now
     now[3] = f_plain - now[0]
+    now[5] = max(now[5], abs(now[3]))
     now[0] = lag_push(learner.lag, memory.chain, 0, f_plain)
 
 
@@ -66,6 +72,8 @@ def _predict(
     now = memory.now
     place = int(now[2])
     now[4] = learner.sequence[place] if place < learner.sequence.size else 0.0
+    if learner.kappa > 0.0:
+        now[4] *= learner.kappa * now[5]
     return now[1] + now[4], 0.0
 
 

@@ -87,6 +87,59 @@ def test_the_worst_correction_attains_the_gain() -> None:
     assert np.max(np.abs(run["theta"][:, 0])) <= gain
 
 
+def staged(pulse: Any, length: int, stages: int) -> Any:
+    """Return the signs that are worst for q at the end of each stage, of ``length`` samples."""
+    return np.tile(np.sign(pulse[:length][::-1]), stages)
+
+
+def attacked(
+    order: int, plant: Any, kappa: float, *, length: int, stages: int
+) -> tuple[ql.Trajectory, ql.Trajectory]:
+    """Return the run of the worst learner under a load that grows steadily, and that without."""
+    observer = ql.ESO.model_free(order, 1.0, 10.0, DT)
+    pulse = correcting(observer, plant, [1.0] + [0.0] * length)["theta"][1:, 0]
+    load = ql.Scenario(duration=length * stages * DT, disturbances=(ql.signals.Ramp(1.0),))
+    runs = [
+        ql.simulate(
+            ql.plants.LinearPlant.of(plant),
+            ql.ADRC(observer, omega_c=1.0, learner=Injected(signs, kappa)),
+            load,
+            interpret=True,
+            limit=1e30,
+        )
+        for signs in ([0.0], staged(pulse, length, stages))
+    ]
+    return runs[1], runs[0]
+
+
+def largest_q(run: ql.Trajectory) -> float:
+    """Return sup |q|."""
+    return float(np.max(np.abs(run["theta"][:, 0])))
+
+
+def test_the_worst_learner_attains_the_bound_and_none_exceeds_it() -> None:
+    """Whatever stays within κ e: with a constant q_0 it comes within 5 % of the bound on q, so no smaller one holds."""
+    plant = ([1.6], [1.0, 0.0, 0.0])
+    found = certify(plant, ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, DT), omega_c=1.0))
+    kappa = 0.7 / found.gain
+    run, plain = attacked(2, plant, kappa, length=300, stages=10)
+    bound = largest_q(plain) / 0.3
+    assert 0.95 * bound < largest_q(run) <= bound
+    deviation = np.max(np.abs(run["y"] - plain["y"]))
+    assert 0.5 * found.output_gain * kappa * bound < deviation
+    assert deviation <= found.output_gain * kappa * bound
+
+
+def test_a_loop_without_certificate_can_be_lost() -> None:
+    """At order 4 with b 60 % too large κΓ is 2 for κ = 1.2: the error grows without end."""
+    plant = ([1.6], [1.0, 0.0, 0.0, 0.0, 0.0])
+    found = certify(plant, ql.ADRC(ql.ESO.model_free(4, 1.0, 10.0, DT), omega_c=1.0))
+    assert not found.certified
+    run, plain = attacked(4, plant, 1.2, length=300, stages=12)
+    assert largest_q(run) > 100.0 * largest_q(plain)
+    assert np.max(np.abs(run["y"])) > 20.0 * np.max(np.abs(plain["y"]))
+
+
 def test_the_peak_gain_of_first_and_second_order_is_the_closed_form() -> None:
     """``Σ |b a^k|`` of one pole, and of two complex ones, where the sign changes; never less, and more by 2e-6 at most."""
     for pole in (0.9, -0.5, 0.999999):
