@@ -2,7 +2,7 @@
 
     python benchmarks/stress_search.py [--write] [--searches 3] [--generations 12]
 
-For each order a few searches by the cross-entropy method (``experiments.stress.general.search``)
+For each order a few searches by the cross-entropy method (``stress.general.cross_entropy``)
 over learners that see everything. Each generation has new random loops of that order, drawn from
 seeds for tuning. A score of 1 is that of the trial's bars for the largest of all runs: RMS error
 1.2 or worst window 2.5 times MF-ESO's; half of it is the mean over the loops, half the worst of
@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 from quell.experiments.stress.general.attacks import FOUND
+from quell.experiments.stress.general.cross_entropy import judge, search
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
-from quell.experiments.stress.general.search import judge, search
 from quell.experiments.stress.general.trial import HEALTHY
 from quell.guard import Guard
 

@@ -14,12 +14,12 @@ import pytest
 import quell as ql
 from quell.analysis import analyse
 from quell.experiments.stress.general import attacks, loads, measures, references, trial
+from quell.experiments.stress.general.cross_entropy import search
 from quell.experiments.stress.general.loops import FAMILIES, GeneralLoop, draw_loop
 from quell.experiments.stress.general.named import Case, perfect_case
 from quell.experiments.stress.general.plant import GeneralPlant
 from quell.experiments.stress.general.program import INPUTS, Program, Watched
 from quell.experiments.stress.general.result import GeneralResult
-from quell.experiments.stress.general.search import search
 from quell.experiments.stress.general.trial import GeneralOutcome
 from quell.plants import LinearPlant
 from quell.plants.base import advance, measure
@@ -144,7 +144,7 @@ def test_measures_of_an_error_that_is_known() -> None:
     """A burst of ten samples of size 2 in a hundred of zeros."""
     error = np.zeros(100)
     error[20:30] = -2.0
-    found = measures.measures(error, 20)
+    found = measures.measure_error(error, 20)
     assert found.peak == 2.0
     assert found.rms == pytest.approx(2.0 * math.sqrt(0.1))
     assert found.window == pytest.approx(2.0 * math.sqrt(0.5))

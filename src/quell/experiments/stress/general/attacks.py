@@ -1,4 +1,4 @@
-"""Adversaries that know the loop: drawn at random, or found by a search (``search``).
+"""Adversaries that know the loop: drawn at random, or found by a search (``cross_entropy``).
 
 Both are ``Program`` learners with the loop's own numbers: a point θ in ``SIZE`` dimensions says how
 much of the exact f (``exact_weights``) and of each input they return in their two modes, and when
@@ -54,7 +54,7 @@ def exact_weights(loop: GeneralLoop) -> Vector:
     return weights
 
 
-def program(point: Vector, loop: GeneralLoop, guard: Guard | None) -> Program:
+def adversary_at(point: Vector, loop: GeneralLoop, guard: Guard | None) -> Program:
     """Return the adversary at a point θ (SIZE,), for a loop and the guard that it watches."""
     exact = exact_weights(loop)
     modes = point[: 2 * (1 + _WIDTH)].reshape(2, 1 + _WIDTH)
@@ -89,11 +89,11 @@ def spread() -> Vector:
 def draw_attack(kind: str, rng: Rng, loop: GeneralLoop, guard: Guard | None) -> Learner:
     """Return a random hostile learner of one of the ``KINDS`` for a loop."""
     if kind == EARN:
-        return program(earn_and_spend(rng), loop, guard)
+        return adversary_at(earn_and_spend(rng), loop, guard)
     if kind == SEARCHED:
         found = found_points(loop.order)
         point = found[int(rng.integers(len(found)))]
-        return program(point + _NEARBY * spread() * rng.normal(size=SIZE), loop, guard)
+        return adversary_at(point + _NEARBY * spread() * rng.normal(size=SIZE), loop, guard)
     return draw_adversary(kind, rng)
 
 

@@ -27,7 +27,7 @@ class Measures(NamedTuple):
         return Measures(*(a / max(b, 1e-300) for a, b in zip(self, other, strict=True)))
 
 
-def measures(error: Vector, window: int) -> Measures:
+def measure_error(error: Vector, window: int) -> Measures:
     """Return the measures of an error, for windows of so many of its samples."""
     square = error**2
     total = np.concatenate([[0.0], np.cumsum(square)])

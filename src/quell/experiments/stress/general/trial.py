@@ -17,7 +17,7 @@ import numpy as np
 
 from quell.experiments.stress.general.attacks import KINDS, draw_attack
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
-from quell.experiments.stress.general.measures import WINDOW_LAGS, Measures, measures
+from quell.experiments.stress.general.measures import WINDOW_LAGS, Measures, measure_error
 from quell.experiments.stress.general.references import ideal
 from quell.guard import Guard
 from quell.learners import Harmonic, Kalman, Learner
@@ -64,7 +64,7 @@ def error_of(loop: GeneralLoop, learner: Learner | None, guard: Guard | None) ->
     if run.diverged:
         return None
     wanted = ideal(loop.tables[0], loop.dt, loop.order)[::every]
-    return measures(run["y"] - wanted, round(WINDOW_LAGS * loop.lag / (every * loop.dt)))
+    return measure_error(run["y"] - wanted, round(WINDOW_LAGS * loop.lag / (every * loop.dt)))
 
 
 def run_one(

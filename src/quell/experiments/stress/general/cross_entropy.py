@@ -14,7 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.experiments.stress.general.attacks import SIZE, centre, earn_and_spend, program, spread
+from quell.experiments.stress.general.attacks import (
+    SIZE,
+    adversary_at,
+    centre,
+    earn_and_spend,
+    spread,
+)
 from quell.experiments.stress.general.loops import GeneralLoop
 from quell.experiments.stress.general.measures import Measures
 from quell.experiments.stress.general.trial import error_of
@@ -104,7 +110,7 @@ def judge(
     def one(point: Vector) -> float:
         scores = [0.0]
         for loop, base in kept:
-            run = error_of(loop, program(point, loop, guard), guard)
+            run = error_of(loop, adversary_at(point, loop, guard), guard)
             scores.append(_LOST if run is None else score(run.over(base)))
         return float((1.0 - _WORST) * np.mean(scores) + _WORST * np.max(scores))
 
