@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.analysis import analyse, certify
+from quell.analysis import analyse, certify, observer_error
 from quell.lti.norms import peak_gain
 from quell.lti.system import System
 from tests.injected import Injected
@@ -75,6 +76,19 @@ def test_the_gains_are_those_of_the_simulated_loop(form: str) -> None:
     found = certify(plant, ql.ADRC(observer, omega_c=1.0), **options)
     assert np.sum(np.abs(run["theta"][:, 0])) == pytest.approx(found.gain, rel=1e-5)
     assert np.sum(np.abs(run["y"])) == pytest.approx(found.output_gain, rel=1e-5)
+
+
+@pytest.mark.parametrize("form", ["predictor", "delay", "order 4"])
+def test_the_error_of_a_record_is_the_one_that_the_controller_knows(form: str) -> None:
+    """Computed from y and u alone, whatever the learner did."""
+    observer, plant, options = observed(form)
+    push = np.random.default_rng(0).normal(size=400)
+    run = correcting(observer, plant, push, **options)
+    q = observer_error(ql.ADRC(observer, omega_c=1.0), run)
+    np.testing.assert_allclose(q, run["theta"][:, 0], atol=1e-9 * np.max(np.abs(q)))
+    thin = dataclasses.replace(run, every=2)
+    with pytest.raises(ValueError, match="run has every = 2: all samples must be recorded"):
+        observer_error(ql.ADRC(observer, omega_c=1.0), thin)
 
 
 def test_the_worst_correction_attains_the_gain() -> None:

@@ -9,6 +9,7 @@ from quell.analysis.frozen_learner import Frozen, frozen
 from quell.analysis.linearise import linear_law
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
+from quell.analysis.observer_error import observer_error
 from quell.analysis.plots import (
     plot_bode,
     plot_gang_of_four,
@@ -31,6 +32,7 @@ __all__ = [
     "linear_law",
     "loops_over_omega_o",
     "loops_over_time",
+    "observer_error",
     "plot_bode",
     "plot_gang_of_four",
     "plot_margins_against_omega_o",
