@@ -1,12 +1,11 @@
 """Search for the learners that harm guarded loops most, for the trial's kind "searched".
 
-    python benchmarks/stress_search.py [--write] [--searches 3] [--generations 12]
+    python benchmarks/stress_search.py [--write] [--searches 2] [--generations 16]
 
 For each order a few searches by the cross-entropy method (``stress.general.cross_entropy``)
-over learners that see everything. Each generation has new random loops of that order, drawn from
-seeds for tuning. A score of 1 is that of the trial's bars for the largest of all runs: RMS error
-1.2 or worst window 2.5 times MF-ESO's; half of it is the mean over the loops, half the worst of
-them.
+over learners that see everything, each in its own random loops of that order, drawn from seeds for
+tuning. A score of 1 is that of the trial's bars for the largest of all runs: RMS error 1.2 or worst
+window 2.5 times MF-ESO's; half of it is the mean over the loops, half the worst of them.
 The last column is the score in loops that the search has not seen. ``--write`` replaces the file
 that the trial reads; do that for each new guard, and then judge with seeds that were not used.
 """
@@ -47,8 +46,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--write", action="store_true", help="replace the file of the trial")
-    parser.add_argument("--searches", type=int, default=3, help="searches for each order")
-    parser.add_argument("--generations", type=int, default=12)
+    parser.add_argument("--searches", type=int, default=2, help="searches for each order")
+    parser.add_argument("--generations", type=int, default=16)
     parser.add_argument("--population", type=int, default=40)
     arguments = parser.parse_args()
     guard, points = Guard(), {}
@@ -59,9 +58,7 @@ def main() -> None:
         for seed in range(arguments.searches):
             began = time.process_time()
             found = search(
-                lambda generation, seed=seed, order=order: healthy_loops(  # type: ignore[misc]
-                    order, LOOPS, seed, generation
-                ),
+                healthy_loops(order, LOOPS, seed),
                 guard,
                 np.random.default_rng([seed, order]),
                 generations=arguments.generations,

@@ -15,10 +15,11 @@ import quell as ql
 from quell.analysis import analyse
 from quell.experiments.stress.general import attacks, loads, measures, references, trial
 from quell.experiments.stress.general.cross_entropy import search
-from quell.experiments.stress.general.loops import FAMILIES, GeneralLoop, draw_loop
+from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
 from quell.experiments.stress.general.named import Case, perfect_case
 from quell.experiments.stress.general.plant import GeneralPlant
 from quell.experiments.stress.general.program import INPUTS, Program, Watched
+from quell.experiments.stress.general.random_plants import FAMILIES
 from quell.experiments.stress.general.result import GeneralResult
 from quell.experiments.stress.general.trial import GeneralOutcome
 from quell.plants import LinearPlant
@@ -200,9 +201,7 @@ def test_a_perfect_learner_removes_the_load() -> None:
 def test_a_search_finds_learners_that_do_harm() -> None:
     """Without guard they lose loops, so the trial can fail."""
     loop = one("stable", 1)
-    found = search(
-        lambda generation: [loop], None, np.random.default_rng(0), generations=2, population=8
-    )
+    found = search([loop], None, np.random.default_rng(0), generations=2, population=8)
     assert len(found.history) == 2
     assert found.score > 1.0
     assert found.point.shape == (attacks.SIZE,)

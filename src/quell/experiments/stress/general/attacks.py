@@ -18,6 +18,7 @@ from quell.experiments.stress.adversaries import KINDS as BLIND_KINDS
 from quell.experiments.stress.adversaries import draw_adversary
 from quell.experiments.stress.general.loops import GeneralLoop
 from quell.experiments.stress.general.program import INPUTS, RULES, Program
+from quell.experiments.stress.general.random_plants import load_gain
 from quell.guard import Guard
 from quell.learners import Learner
 from quell.types import Vector
@@ -42,7 +43,8 @@ FOUND = Path(__file__).with_name("searched.json")
 def exact_weights(loop: GeneralLoop) -> Vector:
     """Return the weights of ``INPUTS`` whose sum is f, in the linear part of the plant.
 
-    ``f = −a x + (b − b0) u + w``; w as in ``y^(n)``, at low frequencies for two masses.
+    ``f = −a x + (b − b0) u + w``; a load that does not enter where u does counts as it acts at low
+    frequencies.
     """
     n, A = loop.order, loop.plant.linear.A
     a = np.poly(A[:n, :n])[:0:-1]
@@ -50,7 +52,7 @@ def exact_weights(loop: GeneralLoop) -> Vector:
     weights = np.zeros(_WIDTH)
     weights[_AT["k1 x1"] : _AT["k1 x1"] + n] = -a / gains
     weights[_AT["b0 u"]] = 1.0 / loop.gain_error - 1.0
-    weights[_AT["load"]] = loop.b0 / loop.gain_error if loop.family == "two masses" else 1.0
+    weights[_AT["load"]] = load_gain(loop.plant.linear, n)
     return weights
 
 

@@ -185,16 +185,16 @@ class Program:
 
     def design(self, observer: ESO, omega_c: float) -> ProgramDesign:
         """Return the parameters."""
-        scale = np.append(law_gains(observer.order, omega_c), 1.0)
+        law = law_gains(observer.order, omega_c)
         lag = observer.lag_time / observer.dt
-        guard = UnguardedDesign() if self.guard is None else self.guard.design(observer)
+        guard = UnguardedDesign() if self.guard is None else self.guard.design(observer, law)
         return ProgramDesign(
             weights=np.array(self.weights, dtype=np.float64),
             trusted=self.rules[0],
             distrusted=self.rules[1],
             least_time=self.rules[2] * lag,
             most_time=self.rules[3] * lag,
-            scale=scale,
+            scale=np.append(law, 1.0),
             b0=observer.b0,
             rate=1.0 / (observer.omega_o * observer.dt),
             omega=self.omega * observer.dt,
