@@ -159,6 +159,25 @@ def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     }
 
 
+def test_what_is_proved_of_a_guarded_learner_is_told_for_the_real_plant(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As text and in the JSON; on a plant that is unstable without learner it says why there is no proof."""
+    where = ["--json", str(tmp_path / "out.json"), "--no-figures", "--overwrite"]
+    told = []
+    for k in ("1", "2"):
+        with pytest.raises(SystemExit, match="0"):
+            app(["compare", "--k", k, "--dt", "0.005", "--controllers", "guarded-l-eso", *where])
+        told.append(json.loads((tmp_path / "out.json").read_text())["controllers"]["guarded-l-eso"])
+    proof = told[0]["certificate"]
+    assert proof["certified"] is (proof["kappa"] * proof["gain"] < 1.0)
+    assert proof["gain"] == pytest.approx(0.713, abs=0.001)
+    assert told[1]["certificate"].startswith("no certificate: plant: the loop without learner is")
+    shown = capsys.readouterr().out
+    assert "guarded-l-eso: certified: κΓ = 1.2 · 0.713 = 0.855" in shown
+    assert "guarded-l-eso: no certificate" in shown
+
+
 def test_the_comparison_is_printed_written_and_drawn(tmp_path: Path) -> None:
     """A table a line a controller, JSON, a figure as PNG and SVG; a mistake is one line, and nothing is written."""
     shown = quell(

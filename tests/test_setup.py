@@ -302,6 +302,19 @@ def test_a_model_is_the_files_plant_or_its_own() -> None:
     assert sorted(np.linalg.eigvals(linear.A).real) == [-3.0, 0.0]
 
 
+def test_a_guard_is_certified_for_plants_of_the_file() -> None:
+    """One or several; of one with friction the linear part counts."""
+    learner = "learner = 'kalman'\n"
+    two = "certified_for = [{kind = 'two-mass'}, {kind = 'two-mass', k = 1.2}]"
+    bounds = [
+        setup(learner + "[guard]\n" + line).controller.parameters.guard.bound
+        for line in ("", "certified_for = 'two-mass'", two)
+    ]
+    assert bounds[0] == 1.2
+    assert bounds[1] >= bounds[2] > 0.0
+    assert bounds[2] < 1.2
+
+
 def test_none_stands_for_no_value() -> None:
     """TOML has no word for it: an encoder that is none, a learner that is none."""
     assert setup("[plant]\nkind = 'torsional'\ncounts = 'none'").plant.resolution == 0.0
