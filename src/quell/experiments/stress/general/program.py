@@ -206,10 +206,12 @@ class Program:
     def memory(self, parameters: ProgramDesign) -> ProgramMemory:
         """Return the state at the start; ``Watched`` puts the guard's memory in."""
         nothing = UnguardedMemory(np.zeros(0))
+        channels = np.zeros(sum(width for _, width in GUARD_CHANNELS))
+        channels[0] = float(self.guard is None)  # full authority, until a guard writes another
         return ProgramMemory(
             now=np.zeros(8),
             chain=lag_memory(parameters.lag, 2),
-            channels=np.zeros(sum(width for _, width in GUARD_CHANNELS)),
+            channels=channels,
             inputs=np.zeros(len(INPUTS)),
             guard=nothing if self.guard is None else self.guard.memory(parameters.guard),
         )
