@@ -44,6 +44,7 @@ BLOCKS: dict[str, Any] = {
     "polynomial of some": Polynomial(4, states=(3, 1)),
     "friction": Friction(),
     "friction of all": Friction(sign=True, states=(2, 3)),
+    "friction at a speed": Friction(sign=True, speed=0.4),
     "fourier": RandomFourier(20),
     "rbf": RBF(),
     "rbf around centres": RBF(centers=[[0.0], [0.5]], states=(2,)),
@@ -194,10 +195,15 @@ def test_periodic_features_learn_a_force_once_for_all_speeds() -> None:
     block = Periodic(period=1.6, orders=(1, 3))
     angle = math.tau / 1.6
     found, _ = learned(
-        block + Friction(),
-        lambda x: 4.0 * math.sin(angle * x[0]) - 9.0 * math.cos(3.0 * angle * x[0]),
+        block + Friction(speed=0.2),
+        lambda x: (
+            4.0 * math.sin(angle * x[0])
+            - 9.0 * math.cos(3.0 * angle * x[0])
+            - 2.0 * math.tanh(x[1] / 0.2)
+        ),
     )
     expected = {"sin 1 x1": 4.0, "cos 1 x1": 0.0, "sin 3 x1": 0.0, "cos 3 x1": -9.0}
+    expected["tanh(x2/0.2)"] = -2.0
     assert {name: found[name] for name in expected} == pytest.approx(expected, abs=0.02)
 
 
@@ -272,6 +278,7 @@ class Callable:
             r"states = \(3,\): a plant of order 2 has no state 3",
         ),
         (lambda: Friction(width=0.0), "width = 0.0: must be finite and greater than zero"),
+        (lambda: Friction(speed=-1.0), "speed = -1.0: must be finite and greater than zero"),
         (lambda: Friction(sign=1), "sign = 1: must be True or False"),
         (lambda: Friction().design(1), r"states = \(2,\): a plant of order 1 has no state 2"),
         (lambda: RandomFourier(0), "count = 0: must be a whole number of at least 1"),

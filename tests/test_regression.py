@@ -14,6 +14,11 @@ from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.least_squares import RlsRule
 from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.nlms import NlmsRule
+from quell.learners.regression.relearning import (
+    RelearningLoop,
+    RelearningMemory,
+    relearning_rule,
+)
 from quell.learners.regression.rls import RlsMemory
 from quell.learners.regression.selection import SelectionRule, selection_memory
 
@@ -96,6 +101,38 @@ def test_the_strongest_features_are_found_and_the_others_have_no_coefficient() -
     reset_uncertainty(rule, memory)
     np.testing.assert_array_equal(memory.covariance, 9.0 * np.eye(6))
     assert not np.any(memory.weak)
+
+
+def test_what_has_changed_abruptly_is_learned_again_at_once(rng: np.random.Generator) -> None:
+    """After the change the error is gone in as few samples as at the start; noise restarts nothing."""
+    left = {}
+    for relearn in (False, True):
+        inner, memory = rls(8, noise=2.0, forget=1e-4)
+        rule: Any = inner
+        if relearn:
+            rule = relearning_rule(inner, 4.0, dt=1.0, lag_time=2.0, omega_c=2.0)
+            state: Any = RelearningMemory(memory, RelearningLoop.zeros())
+        theta, truth, starts = np.zeros(8), rng.normal(size=8), 0
+        for k in range(3000):
+            features = rng.normal(size=8)
+            if k == 2000:
+                truth = -truth
+            before = memory.covariance[0, 0]
+            error = (truth - theta) @ features + 0.05 * rng.normal()
+            update_theta(rule, state if relearn else memory, theta, features, error, 1.0)
+            starts += k > 50 and memory.covariance[0, 0] > 10.0 * before
+            if k == 2150:
+                left[relearn] = float(np.linalg.norm(theta - truth) / np.linalg.norm(truth))
+        assert starts == relearn
+    assert left[True] < 0.1 < 0.5 < left[False]
+    with pytest.raises(ValueError, match="relearn = 1.0: must be greater than 1"):
+        ql.learners.RLS(relearn=1.0)
+    rule = ql.learners.RLS(strongest=2, relearn=3.0).rule(OBSERVER, 4.0, 5)
+    memory = ql.learners.RLS(strongest=2, relearn=3.0).rule_memory(rule, 5)
+    memory.inner.weak[:] = memory.loop[0].usual = 1.0
+    reset_uncertainty(rule, memory)
+    assert not np.any(memory.inner.weak)
+    assert memory.loop[0].usual == 0.0
 
 
 def test_a_selection_of_all_features_is_plain_least_squares() -> None:

@@ -17,6 +17,12 @@ from quell.features import Features
 from quell.learners.least_squares import RlsRule, least_squares_gain
 from quell.learners.regression.kernels import reset_uncertainty, update_theta
 from quell.learners.regression.linear import Linear
+from quell.learners.regression.relearning import (
+    RelearningLoop,
+    RelearningMemory,
+    RelearningRule,
+    relearning_rule,
+)
 from quell.learners.regression.selection import (
     EXCHANGE_LAGS,
     SelectionMemory,
@@ -73,6 +79,10 @@ class RLS(Linear):
         number of features that are used at once, the strongest of all that are given; all by
         default. With many features it saves time and noise (``selection.py``); others have the
         coefficient zero.
+    relearn
+        ratio of the RMS error to its usual size from which the plant counts as changed: then θ is
+        learned again as quickly as at the start (``relearning.py``), for example 4; by default
+        never.
 
     The other parameters are described in the base classes ``Linear`` and ``FeatureLearner``.
 
@@ -95,6 +105,7 @@ class RLS(Linear):
         memory_time: float | None = None,
         prior: float = 10.0,
         strongest: int | None = None,
+        relearn: float | None = None,
         frequency: float | None = None,
         scale: Any = None,
         gain_interval: tuple[float, float] = (0.5, 2.0),
@@ -104,21 +115,29 @@ class RLS(Linear):
         self.memory_time = checks.optional(checks.time_constant, "memory_time", memory_time)
         self.prior = checks.positive("prior", prior)
         self.strongest = checks.optional(checks.whole, "strongest", strongest, 1)
+        self.relearn = checks.optional(checks.positive, "relearn", relearn)
+        if self.relearn is not None and self.relearn <= 1.0:
+            raise ValueError(f"relearn = {relearn!r}: must be greater than 1, the usual error")
 
-    def rule(self, observer: ESO, omega_c: float, features: int) -> RlsRule | SelectionRule:
-        """Return noise, forgetting and prior, and how features are selected."""
-        rule = RlsRule(
-            observer.lag_time / observer.dt,
-            -math.expm1(-observer.dt / (self.memory_time or _MEMORY / omega_c)),
-            self.prior**2,
-        )
-        if self.strongest is None or self.strongest >= features:
+    def rule(self, observer: ESO, omega_c: float, features: int) -> Any:
+        """Return noise, forgetting and prior, and how features are selected and learned again."""
+        dt, lag_time = observer.dt, observer.lag_time
+        forget = -math.expm1(-dt / (self.memory_time or _MEMORY / omega_c))
+        rule: Any = RlsRule(lag_time / dt, forget, self.prior**2)
+        if self.strongest is not None and self.strongest < features:
+            interval = round(EXCHANGE_LAGS * lag_time / dt)
+            rule = SelectionRule(rule, min(omega_c * dt, 1.0), max(interval, 1))
+        if self.relearn is None:
             return rule
-        interval = round(EXCHANGE_LAGS * observer.lag_time / observer.dt)
-        return SelectionRule(rule, min(omega_c * observer.dt, 1.0), max(interval, 1))
+        return relearning_rule(rule, self.relearn, dt, lag_time, omega_c)
 
-    def rule_memory(self, rule: Any, features: int) -> RlsMemory | SelectionMemory:
+    def rule_memory(
+        self, rule: Any, features: int
+    ) -> RlsMemory | SelectionMemory | RelearningMemory:
         """Return the prior covariance and work space."""
+        if isinstance(rule, RelearningRule):
+            inner = self.rule_memory(rule.inner, features)
+            return RelearningMemory(inner, RelearningLoop.zeros())
         if isinstance(rule, SelectionRule):
             return selection_memory(rule, self.strongest or features, features)
         return RlsMemory(rule.prior * np.eye(features), np.zeros(features))
