@@ -33,6 +33,8 @@ from quell.analysis import certify
 from quell.experiments.stress.general.loops import draw_loop
 from quell.guard import Guard
 from quell.guard.correction import plain_loop, state_path
+from quell.lti.norms import pulse_response
+from quell.lti.system import System
 from quell.plants.sampled import sampled_plant
 
 FAMILIES = ("stable", "unstable", "lagged", "delayed", "two masses")
@@ -63,16 +65,6 @@ def largest(A, B, C_q, C_y, q_0, signs, feedback, kappa):
             after[i] = total
         x, after = after, x
     return e, most_y
-
-
-@njit(cache=True)
-def pulse_response(A, B, C, samples):
-    """Return C A^k B (samples,)."""
-    x, h = B.copy(), np.zeros(samples)
-    for k in range(samples):
-        h[k] = np.dot(C, x)
-        x = A @ x
-    return h
 
 
 def staged(h: Any, samples: int, stage: int, sign: float, turn: float) -> Any:
@@ -134,7 +126,8 @@ class Attacked:
         """Return the largest max |q| and max |y − y_0| that the searches find."""
         best = [1.0, 0.0]
         for row, C in ((0, self.C_q), (1, self.C_y)):
-            h = pulse_response(self.A, self.B, C, self.samples)
+            system = System(self.A - np.eye(self.B.size), self.B, C, 0.0)
+            h = pulse_response(system, self.samples + 1)[1:]
             for share in (0.05, 0.1, 0.2, 0.5, 1.0):
                 for sign in (1.0, -1.0):
                     for turn in (1.0, -1.0):

@@ -277,7 +277,7 @@ class Guard:
     certified_for
         a linear plant, a list of plants or ``{name: plant}``, for which κ is made small enough that
         no learner can make q larger than ten times what it is without learner: κΓ ≤ 0.9, see
-        ``quell.analysis.certify``. None by default.
+        ``quell.analysis.certify``. A retune computes it again, in about 50 ms a plant.
 
     Raises
     ------

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from quell.lti.system import System
-from quell.types import Matrix
+from quell.types import Matrix, Vector
 
 # Share of the sum at which the bound on the rest is small enough; chosen by hand.
 _SMALL = 1e-6
@@ -58,6 +58,17 @@ def peak_gain(system: System) -> float:
         f"the impulse response does not decay within {2**_MOST_DOUBLINGS} samples: the largest "
         f"pole is at |z| = {system.largest_pole:.9g}; take a longer sample time if it is below 1"
     )
+
+
+def pulse_response(system: System, samples: int) -> Vector:
+    """Return ``D, C B, C A B, …`` (samples,)."""
+    N, B, C, D = System.balanced(*system)
+    found, x = np.zeros(samples), B.copy()
+    found[:1] = D
+    for k in range(1, samples):
+        found[k] = C @ x
+        x = x + N @ x
+    return found
 
 
 def h2_squared(system: System) -> float:
