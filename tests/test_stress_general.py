@@ -169,9 +169,11 @@ def test_a_program_earns_trust_with_the_load_itself_and_then_spends_it() -> None
     controller = watched(weights, (0.9, -1.0, 0.0, 1e9), load)
     state = controller.initial_state()
     assert state.learner.guard is state.guard
-    plant = LinearPlant.of(([1.0], [1.0, 0.0]))
+    plant = GeneralPlant(LinearPlant.of(([1.0], [1.0, 0.0])))
     scenario = ql.Scenario(0.0, t[-1], (loads.Table(load, DT),))
     run = ql.simulate(plant, controller, scenario, interpret=True)
+    compiled = ql.simulate(plant, controller, scenario)
+    assert compiled["authority"] == pytest.approx(run["authority"], abs=1e-6)
     trusted = run["authority"] >= 0.9
     assert trusted.any()
     turned = int(np.argmax(trusted))
