@@ -18,6 +18,8 @@ import pytest
 from hypothesis import settings
 
 import quell as ql
+from quell.kernels import dispatch
+from quell.simulation.driver import Loop
 
 # The same examples in every run, and no stop-watch: the machines that test are shared.
 settings.register_profile("quell", deadline=None, derandomize=True)
@@ -40,12 +42,36 @@ def _unfreeze_and_note() -> None:
 gc.unfreeze = _unfreeze_and_note  # a real-time loop calls it at its end
 
 
-def pytest_runtest_setup() -> None:
-    """Spare the garbage collector all that was imported: going through it takes half a second.
+def pytest_configure(config: pytest.Config) -> None:
+    """Declare the marker."""
+    config.addinivalue_line(
+        "markers", "compiled: what it runs is compiled; all other tests run it as plain Python"
+    )
 
-    To ask the collector whether it is spared takes a tenth of a second: it counts the objects.
+
+# To compile a loop takes as long as 20 000 to 60 000 samples of it take as Python.
+_MOST_SAMPLES = 30_000
+_run = Loop.run
+
+
+def _run_short(loop: Loop, *arguments: Any) -> int:
+    """Run a segment; say so where a test that is not compiled runs too many samples."""
+    if dispatch.interpret_all and loop.done >= _MOST_SAMPLES:
+        pytest.fail(f"more than {_MOST_SAMPLES} samples as plain Python: mark the test compiled")
+    return _run(loop, *arguments)
+
+
+Loop.run = _run_short  # type: ignore[method-assign]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Let entry points run as plain Python, unless the test is marked ``compiled``.
+
+    Spare the garbage collector all that was imported: going through it takes half a second. To ask the collector whether it is spared takes a tenth of a second: it counts the objects.
     """
     global _frozen
+    dispatch.interpret_all = item.get_closest_marker("compiled") is None
     if not _frozen:
         gc.freeze()
         _frozen = True

@@ -225,6 +225,7 @@ def test_every_controller_of_the_benchmark_has_margins() -> None:
         assert 0.1 < low < 1.0 < high
 
 
+@pytest.mark.compiled
 def test_ours_fail_less_than_the_published_on_drawn_plants_without_and_with_the_cubic_spring() -> (
     None
 ):
@@ -247,6 +248,7 @@ def cases() -> dict[str, CaseResult]:
     return study_cases()
 
 
+@pytest.mark.compiled
 def test_the_original_design_cases_are_met(cases: dict[str, CaseResult]) -> None:
     """Stable for all 0.5 < k < 2 (MB-ESO from 0.59 only), settled by 15 s at k = 1; the sinusoid fades under the learner."""
     for name in (MF, MB, L):
@@ -273,6 +275,7 @@ def test_a_case_that_is_lost_is_called_unstable_and_one_that_does_not_settle_nev
     assert "3never" not in told
 
 
+@pytest.mark.compiled
 def test_the_command_writes_what_programs_read(
     cases: dict[str, CaseResult],
     tmp_path: Path,

@@ -51,7 +51,7 @@ def test_a_late_model_is_told_of_and_not_waited_for() -> None:
     assert controller.estimate.f_learned != 0.0
 
 
-@pytest.mark.parametrize("interpret", [False, True])
+@pytest.mark.parametrize("interpret", [pytest.param(False, marks=pytest.mark.compiled), True])
 @pytest.mark.parametrize("budget", [None, 30.0])
 @pytest.mark.parametrize(
     ("then", "says"),

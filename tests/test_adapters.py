@@ -31,6 +31,8 @@ from .contracts.python_models import (
     torch_mlp,
 )
 
+pytestmark = pytest.mark.compiled
+
 PythonModel = ql.learners.PythonModel
 LEARNERS = python_learners()
 

@@ -93,6 +93,7 @@ def test_a_slow_sample_time_is_warned_of_with_its_number() -> None:
     assert sampling_findings(adrc(30.0, 10.0, 0.01, form="predictor").observer, 10.0) == []
 
 
+@pytest.mark.compiled
 def test_noise_is_judged_by_the_range_of_u() -> None:
     """By the RMS that a simulation shows; the omega_o it names passes, and without a range there is nothing to judge by."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])

@@ -117,6 +117,7 @@ def test_plants_of_every_kind_are_the_same_plant() -> None:
         np.testing.assert_allclose(np.hstack([*found]), np.hstack([*expected]), rtol=1e-6)
 
 
+@pytest.mark.compiled
 def test_noise_moves_u_as_much_as_is_said(rng: np.random.Generator) -> None:
     """White noise in each of 200 000 samples, RMS to 1 %; and no sinusoid is amplified more than the peak says."""
     controller = adrc(2)

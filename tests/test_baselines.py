@@ -115,6 +115,7 @@ def test_a_linear_adrc_is_a_filtered_pid_controller(order: int) -> None:
         assert at(pid, omega) == pytest.approx((gains[0] + from_r, from_y), rel=1e-12)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("order", [1, 2])
 def test_sampled_adrc_and_its_pid_controller_approach_each_other(order: int) -> None:
     """In a loop with step and load: their difference halves with dt, and is a thousandth at 1 ms."""
@@ -196,6 +197,7 @@ def test_the_bandwidths_of_lqg_are_its_poles_radii_on_a_chain_of_integrators() -
     np.testing.assert_allclose(radii, [2.0] * 3 + [15.0] * 4, rtol=2e-2)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     "make",
     [
@@ -239,6 +241,7 @@ def test_the_load_sees_a_motor_of_another_inertia() -> None:
     assert np.max(poles.imag) == pytest.approx(3.0 * math.sqrt(6.0), rel=1e-6)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("measured", ["load", "motor"])
 def test_either_mass_may_be_measured(measured: str) -> None:
     """What is measured goes to the reference under a force on the load, and the loop has the poles it should."""
@@ -258,6 +261,7 @@ def test_either_mass_may_be_measured(measured: str) -> None:
 # --------------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(("omega", "zeta"), [(1.4, 0.0), (5.0, 0.05), (2.0, 0.4)])
 @pytest.mark.parametrize("shaper", [ZV, ZVD])
 def test_a_shaper_leaves_no_vibration_of_its_mode(
@@ -276,6 +280,7 @@ def test_a_shaper_leaves_no_vibration_of_its_mode(
     assert np.max(np.abs(run["y"][run.t > made.times[-1] + 2e-3] - 1.0)) < 1e-5
 
 
+@pytest.mark.compiled
 def test_how_much_a_wrong_frequency_leaves_is_as_published() -> None:
     """Undamped, at 10 % off: |cos(π/2 · 1.1)| = 15.6 % for ZV, its square, 2.4 %, for ZVD; measured in a driven mode."""
     omega, off = 2.0, 1.1

@@ -16,6 +16,8 @@ from quell.parallel import in_parallel, one_blas_thread
 from quell.plants import PlantBatch, batch, two_mass_spring
 from quell.simulation import sampled_scenario
 
+pytestmark = pytest.mark.compiled
+
 MASSES = np.array([0.9, 1.0, 1.1])
 PLANTS = batch(two_mass_spring, m1=MASSES, k=1.0)
 SHORT = ql.Scenario(1.0, duration=1.0)

@@ -17,6 +17,8 @@ from numba.core.caching import IndexDataCacheFile
 import quell
 from quell.kernels import cache, dispatch
 
+pytestmark = pytest.mark.compiled
+
 PACKAGE = Path(quell.__file__).parent
 # One step of a controller; prints u, and whether Numba compiled anything for it.
 STEP = """

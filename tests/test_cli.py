@@ -63,6 +63,7 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.compiled
 def test_the_torsional_experiment_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -113,6 +114,7 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(
     )
 
 
+@pytest.mark.compiled
 def test_the_guards_trial_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -231,6 +233,7 @@ def test_two_outputs_have_two_files(quell: Callable[..., Shown], tmp_path: Path)
     assert "out': must be a file for one output, is for two" in shown.err
 
 
+@pytest.mark.compiled
 def test_a_command_can_be_run_twice_and_replaces_where_asked(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:

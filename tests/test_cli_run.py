@@ -23,6 +23,7 @@ from quell.realtime import CsvSink
 from quell.realtime import load as load_recording
 from quell.realtime.loop.modes import Cause, Mode
 from quell.realtime.loop.result import ModeChange, RigRun
+from quell.realtime.telemetry.channels import Event
 from quell.records.measures import MEASURES, STEP_MEASURES
 from quell.setup import EXAMPLES, load
 
@@ -232,6 +233,7 @@ duration = 0.5
 """
 
 
+@pytest.mark.compiled
 def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """From a twin in this process to tables, JSON, figures and a recording, and from that through the controller once more."""
     (tmp_path / "rig.toml").write_text(RIG)
@@ -283,6 +285,7 @@ def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_pat
     )
 
 
+@pytest.mark.compiled
 def test_a_full_disk_is_told_once_and_ends_neither_run_nor_exit_code(
     quell: Callable[..., Shown],
     tmp_path: Path,
@@ -301,7 +304,9 @@ def test_a_full_disk_is_told_once_and_ends_neither_run_nor_exit_code(
     assert shown.code == 0, shown.err
     assert (shown.out + shown.err + caplog.text).count("No space left on device") == 1
     cycles = json.loads((tmp_path / "out.json").read_text())["tally"]["cycles"]
-    assert len(load_recording(tmp_path / "run.mcap")) == cycles
+    events = load_recording(tmp_path / "run.mcap")["events"].astype(int)
+    # On a busy machine deadlines are skipped; their samples are filled in.
+    assert np.count_nonzero(events & Event.GAP == 0) == cycles
     (tmp_path / "trip.toml").write_text(
         RIG.replace("settle = 10", "most_error = 0.05, settle = 10")
     )

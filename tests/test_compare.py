@@ -16,6 +16,8 @@ from quell.cli.app import app
 from quell.experiments import compare
 from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
 
+pytestmark = pytest.mark.compiled
+
 LAG = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
 
 

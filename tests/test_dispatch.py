@@ -16,6 +16,8 @@ from quell.controllers.base import control
 from quell.controllers.compiled_step import PackedController, entry_point, step_packed
 from quell.kernels import dispatch
 
+pytestmark = pytest.mark.compiled
+
 
 class Circle(NamedTuple):
     """A shape."""

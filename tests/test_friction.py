@@ -13,6 +13,8 @@ from scipy import signal
 import quell as ql
 from quell.features import RBF, Bias, Friction, Polynomial, State
 
+pytestmark = pytest.mark.compiled
+
 OMEGA_C = 5.0
 LEARNERS: dict[str, Any] = {
     "none": None,

@@ -11,6 +11,8 @@ import pytest
 from quell.kernels import dispatch
 from quell.kernels.function_pointers import call, evaluate
 
+pytestmark = pytest.mark.compiled
+
 _POINTER = ctypes.POINTER(ctypes.c_double)
 SEEN: list[tuple[int, float]] = []
 

@@ -59,6 +59,7 @@ def error(run: ql.Trajectory) -> float:
     return float(np.sqrt(np.mean((run["y"][part] - 1.0) ** 2)))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_learner_does_no_harm(name: str) -> None:
     """The loop is about as good as MF-ESO under load, whatever the learner says."""
@@ -71,6 +72,7 @@ def test_a_hostile_learner_does_no_harm(name: str) -> None:
     assert error(run) <= 1.1 * error(plain)
 
 
+@pytest.mark.compiled
 def test_an_honest_learner_is_heard() -> None:
     """It has full authority once it has proved itself, and nothing is lost to having no guard."""
     every = round(0.02 / LOOP.dt)
@@ -401,6 +403,7 @@ def test_a_measurement_beyond_all_numbers_is_got_over(bad: float, learner: objec
         assert np.all(np.isfinite(array))
 
 
+@pytest.mark.compiled
 def test_a_bad_measurement_does_not_open_the_bounds() -> None:
     """A learner that turns after one sample that was off by a kilometre does little more harm than MF-ESO suffers itself."""
     errors = []

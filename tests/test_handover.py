@@ -322,6 +322,7 @@ def test_derivatives_are_fed_forward_in_manual_operation_too() -> None:
     )
 
 
+@pytest.mark.compiled
 def test_retuning_does_not_compile_again() -> None:
     """The types stay, so the step stays."""
     from quell.controllers.compiled_step import step_packed

@@ -10,6 +10,8 @@ import pytest
 import quell as ql
 from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
 
+pytestmark = pytest.mark.compiled
+
 
 def test_a_turning_pair_retunes_its_oscillator_by_how_much_it_turns() -> None:
     """In the closed form: with nothing unexplained, ω̂ grows by κ ω̂ times the angle; with much unexplained, by little."""

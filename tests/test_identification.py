@@ -22,6 +22,8 @@ from quell.identification.search.output_error import refine
 
 from .commands import Shown
 
+pytestmark = pytest.mark.compiled
+
 DT = 1e-3
 TESTBED = ([4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032])
 QUANTUM = 2.0 * np.pi / 16_000

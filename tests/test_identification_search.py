@@ -23,6 +23,8 @@ from quell.identification.validation import residuals
 
 from .test_identification import answer
 
+pytestmark = pytest.mark.compiled
+
 RECORDS = Path("/work/shared/data")
 
 

@@ -11,6 +11,8 @@ import quell as ql
 from quell.learners.base import adapt, commit, predict, restart
 from quell.observers.eso import ESO
 
+pytestmark = pytest.mark.compiled
+
 
 def kalman_memory(learner: ql.learners.Kalman, observer: ESO) -> tuple[object, object]:
     """Return a Kalman learner past its start, to which every feature teaches."""

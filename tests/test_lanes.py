@@ -25,6 +25,8 @@ from quell.types import Vector
 
 from .contracts.examples import OBSERVERS
 
+pytestmark = pytest.mark.compiled
+
 DT = 0.01
 # Of a channel's range, for the stable loops here; benchmarks/lanes.py has what others deviate by.
 TOLERANCE = 1e-9

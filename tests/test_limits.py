@@ -56,6 +56,7 @@ def test_a_rate_may_differ_by_direction() -> None:
             checked_limits(-1.0, 1.0, wrong, 0.1)
 
 
+@pytest.mark.compiled
 def test_limits_change_while_the_loop_runs_and_nothing_is_compiled_again() -> None:
     """From then on every u is that of a controller made with the new limits and the same state; a copy and a retuned one keep them."""
     rng = np.random.default_rng(3)

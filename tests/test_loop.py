@@ -128,11 +128,11 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
 def test_the_grid_follows_a_devices_clock(drift: float) -> None:
     """For slower and faster clocks each cycle gets the next tick, and none is old."""
     device = TickingDevice(SAMPLE * (1.0 + drift))
-    found, loop = ticks(device, 100.0)
+    found, loop = ticks(device, 40.0)
     assert device.handle.seen[1] <= SAMPLE // 5_000
     y = found[:, LOOP_WIDTH - 2]
     np.testing.assert_array_equal(np.diff(y), 1.0)
-    assert len(y) > 10_000
+    assert len(y) > 3_900
     assert loop.controller.supervisor.counters[0].overruns == 0
 
 
@@ -286,6 +286,7 @@ CONTROLLERS = {
 }
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_controller_is_stepped_compiled_though_the_device_is_python(name: str) -> None:
     """Plain Python and a compiled step agree; errors of the driver count as missed samples."""
@@ -303,6 +304,7 @@ def test_a_controller_is_stepped_compiled_though_the_device_is_python(name: str)
     assert int(half["EVENTS"][90]) & Event.UNSENT
 
 
+@pytest.mark.compiled
 def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> None:
     """No cycle runs, a second loop compiles nothing, the controller's own state is unchanged."""
     controller = adrc()

@@ -21,6 +21,8 @@ from quell.observers.noise import noise_gains
 from quell.observers.placement import place_poles
 from quell.observers.response import scaled_response
 
+pytestmark = pytest.mark.compiled
+
 
 def hidden(num: Any, den: Any, seed: int = 1) -> ql.plants.LinearPlant:
     """Return the transfer function ``num/den`` as a plant in badly scaled, rotated coordinates."""

@@ -223,6 +223,7 @@ def rejection_and_noise(observer: ESO) -> tuple[float, float]:
     )
 
 
+@pytest.mark.compiled
 def test_a_cascade_rejects_the_same_load_with_half_the_noise_in_u() -> None:
     """The claim of Łakomy & Madonski: ratio 3 against the plain ESO of the same bandwidth."""
     plain, cascade = ESO.model_free(2, 1.5, 30.0, 1e-3), ESO.cascade(2, 1.5, 30.0, 1e-3, ratio=3.0)
@@ -234,6 +235,7 @@ def test_a_cascade_rejects_the_same_load_with_half_the_noise_in_u() -> None:
     assert cascade_noise < 0.6 * noise
 
 
+@pytest.mark.compiled
 def test_half_gain_in_observer_rejects_the_same_load_with_less_noise_in_u() -> None:
     """The claim of Herbst et al., measured: the load's effect within 2 %, noise three quarters."""
     full, half = (ESO.model_free(2, 1.5, 30.0, 1e-3, half_gain=half) for half in (False, True))

@@ -17,6 +17,8 @@ import quell as ql
 from quell.plants.base import advance, measure
 from quell.plants.nonlinear import CompiledNonlinear, PythonNonlinear
 
+pytestmark = pytest.mark.compiled
+
 
 def stepped(
     plant: object, dt: float, samples: int, x0: object, u: float = 0.0, w: object = ()

@@ -37,6 +37,7 @@ def check_same_estimates(again: ql.Trajectory, run: ql.Trajectory, tolerance: fl
         )
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("options", [{}, {"u_min": -0.3, "u_max": 0.4}], ids=["free", "limited"])
 def test_the_controller_that_made_a_run_gives_the_same_estimates(options: dict[str, Any]) -> None:
     """Estimates and u are equal to the last bit."""

@@ -9,6 +9,8 @@ import pytest
 from quell.kernels.dispatch import compiled, interpreted
 from quell.realtime.telemetry.ring import drain, dropped, push, ring, waiting
 
+pytestmark = pytest.mark.compiled
+
 WIDTH = 7
 
 

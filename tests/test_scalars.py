@@ -7,11 +7,14 @@ import pickle
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compiled, interpreted
 from quell.kernels.scalars import Scalars, clear
+
+pytestmark = pytest.mark.compiled
 
 
 class Motion(Scalars):

@@ -45,6 +45,7 @@ def setup(more: str = "", *, without: tuple[str, ...] = ()) -> Any:
     return made("rig.toml", data)
 
 
+@pytest.mark.compiled
 def test_the_example_is_the_python_of_the_first_example() -> None:
     """The same run, bit for bit, as from the objects of examples/01_step.py."""
     read = load(EXAMPLES / "two_mass.toml")

@@ -188,6 +188,7 @@ def test_a_truncated_mailbox_counts_as_empty(ends: Ends, size: int) -> None:
     assert ends.received()[-1] == 3
 
 
+@pytest.mark.compiled
 def test_a_session_goes_on_after_its_files_were_truncated(bench: Callable[..., Bench]) -> None:
     """Both files lose their contents in compiled code of both sides; nothing dies."""
     here = bench("shm")

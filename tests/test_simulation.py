@@ -24,6 +24,7 @@ def controller(dt: float = 5e-3, **options: object) -> ql.ADRC:
     return ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=dt), omega_c=1.0, **options)
 
 
+@pytest.mark.compiled
 def test_the_same_seed_gives_the_same_bits(two_mass_scenario: ql.Scenario) -> None:
     """And another seed gives others."""
     runs = [ql.simulate(PLANT, controller(), two_mass_scenario) for _ in range(2)]
@@ -32,6 +33,7 @@ def test_the_same_seed_gives_the_same_bits(two_mass_scenario: ql.Scenario) -> No
     assert np.any(ql.simulate(PLANT, controller(), other)["y_measured"] != runs[0]["y_measured"])
 
 
+@pytest.mark.compiled
 def test_the_segment_length_changes_nothing(
     two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -43,6 +45,7 @@ def test_the_segment_length_changes_nothing(
     )
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("every", [2, 10, 333])
 def test_a_thinned_record_holds_every_so_many_th_sample(
     two_mass_scenario: ql.Scenario, every: int
@@ -273,6 +276,7 @@ def test_disturbances_that_are_not_given_are_zero_and_the_rest_are_in_order() ->
     np.testing.assert_array_equal(run["w"], np.tile([2.0, 0.0], (len(run), 1)))
 
 
+@pytest.mark.compiled
 def test_progress_is_told_and_ends_at_one() -> None:
     """Shares grow."""
     shares: list[float] = []
@@ -281,6 +285,7 @@ def test_progress_is_told_and_ends_at_one() -> None:
     assert shares[-1] == 1.0
 
 
+@pytest.mark.compiled
 def test_a_run_of_ten_million_samples_needs_the_memory_of_its_record() -> None:
     """``record_every`` thins it: a hundred rows here, whatever the length."""
     run = ql.simulate(PLANT, controller(), ql.Scenario(duration=10_000.0), record_every=20_000)

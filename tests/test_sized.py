@@ -22,6 +22,8 @@ from quell.kernels.overlaps import overlap
 from quell.kernels.sized import Constant, ConstantFlag, Flag, Size, SizedArray, layout_of, type_of
 from quell.simulation.driver import run_block
 
+pytestmark = pytest.mark.compiled
+
 
 class Filter(NamedTuple):
     """Parameters: an array, constants and a number."""

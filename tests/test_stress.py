@@ -12,6 +12,7 @@ import quell as ql
 from quell.experiments import stress
 
 
+@pytest.mark.compiled
 def test_without_a_guard_the_trial_is_lost() -> None:
     """What does harm is in it: most kinds wreck some loop."""
     found = stress.run(36, 0, seed=0, guard=None)
@@ -19,6 +20,7 @@ def test_without_a_guard_the_trial_is_lost() -> None:
     assert all(math.isnan(outcome.ratio) == outcome.unstable for outcome in found.outcomes)
 
 
+@pytest.mark.compiled
 def test_the_same_seed_gives_the_same_trial() -> None:
     """All that is random is drawn from it."""
     one, again, other = (stress.run(12, 2, seed, guard=ql.Guard()) for seed in (1, 1, 2))
@@ -27,6 +29,7 @@ def test_the_same_seed_gives_the_same_trial() -> None:
     assert one.kinds == [*stress.KINDS, stress.HONEST]
 
 
+@pytest.mark.compiled
 def test_results_are_plain_data() -> None:
     """For ``json.dump``, with counts for each kind and quantiles of the ratios."""
     shares: list[float] = []

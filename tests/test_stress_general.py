@@ -193,6 +193,7 @@ def test_exact_weights_are_those_of_f() -> None:
     assert weights["load"] == 1.0
 
 
+@pytest.mark.compiled
 def test_a_perfect_learner_removes_the_load() -> None:
     """All but a thousandth without guard; with it, more than half."""
     case = perfect_case(1, "sine", ql.Guard(), 0)
@@ -200,6 +201,7 @@ def test_a_perfect_learner_removes_the_load() -> None:
     assert case.lost_share < 0.5
 
 
+@pytest.mark.compiled
 def test_a_search_finds_learners_that_do_harm() -> None:
     """Without guard they lose loops, so the trial can fail."""
     loop = one("stable", 1)
@@ -241,6 +243,7 @@ def test_bars_count_healthy_loops_only() -> None:
     assert not GeneralResult({}, [lost], []).bars()[0].met
 
 
+@pytest.mark.compiled
 def test_the_command_runs_all_loops(quell: Callable[..., Any], tmp_path: Path) -> None:
     """With its own table and its own JSON."""
     counts = ("--runs", "1", "--honest", "0", "--seed", "3")

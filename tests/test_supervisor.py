@@ -72,6 +72,7 @@ def test_nothing_happens_where_nothing_goes_wrong() -> None:
     assert not outcome["EVENTS"][outcome["EVENTS"] != Event.CHANGED].any()
 
 
+@pytest.mark.compiled
 def test_plain_python_does_what_compiled_code_does() -> None:
     """Missed samples, a stall, an unsent command and a trip: same modes, same numbers."""
     scripts: dict[str, Any] = {

@@ -22,6 +22,8 @@ from quell.observers.base import expected_measurement
 
 from .test_contracts import CHAIN, SCENARIO, check_run
 
+pytestmark = pytest.mark.compiled
+
 DT = 0.01
 ESO = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT)
 LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}

@@ -174,6 +174,7 @@ def test_it_is_a_device_and_opened_by_its_url(example: Any) -> None:
     assert example.sample(device, 0.0) == 0.0
 
 
+@pytest.mark.compiled
 @every
 def test_it_measures_the_plant_that_u_moves(example: Any) -> None:
     """Bit for bit as a twin, delayed by a sample over a wire; to the quanta of the card."""

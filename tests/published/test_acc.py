@@ -15,9 +15,10 @@ from quell.experiments import acc
 from quell.experiments.acc import PUBLISHED, designs, judge_published
 
 SAMPLES = Path(__file__).resolve().parents[3] / "shared" / "benchmarks" / "acc" / "theta_small.csv"
-pytestmark = pytest.mark.skipif(
-    not SAMPLES.is_file(), reason=f"the published samples are not at {SAMPLES}"
-)
+pytestmark = [
+    pytest.mark.compiled,
+    pytest.mark.skipif(not SAMPLES.is_file(), reason=f"the published samples are not at {SAMPLES}"),
+]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ from quell.experiments import stress
 from quell.experiments.two_mass_spring import setup as study
 from quell.parallel import in_parallel
 
+pytestmark = pytest.mark.compiled
+
 SETTINGS = study.Settings()
 SINE = ql.signals.Sinusoid
 

@@ -9,6 +9,8 @@ import quell as ql
 from quell.identification import excitation
 from tests.test_identification import answer
 
+pytestmark = pytest.mark.compiled
+
 DT = 0.02
 PLANT = ([2.0], [1.0, 0.6, 9.0])
 POLE = -0.3 + np.sqrt(9.0 - 0.09) * 1j

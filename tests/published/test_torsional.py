@@ -10,6 +10,8 @@ import pytest
 from quell.experiments.torsional import setup as study
 from quell.simulation.simulate import simulate
 
+pytestmark = pytest.mark.compiled
+
 SEEDS = range(2)
 SLOW = (20.0, 90.0)
 

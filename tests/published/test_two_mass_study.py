@@ -13,6 +13,8 @@ import pytest
 
 from quell.experiments.two_mass_spring import setup as study
 
+pytestmark = pytest.mark.compiled
+
 DTS = (1e-3, 2e-3, 5e-3, 1e-2)
 SEEDS = range(10)
 

@@ -18,6 +18,7 @@ from numba.core import types as nb_types
 from numba.extending import NativeValue, intrinsic, models, register_model, unbox
 
 from quell.controllers.base import control
+from quell.kernels import dispatch
 from quell.kernels.dispatch import compiled_call
 from quell.kernels.sized import Constant, ConstantFlag, SizedArray, type_of
 
@@ -141,7 +142,15 @@ def entry_point(dispatcher: Any, packed: PackedController) -> Callable[[Any, flo
     It checks its arguments less than the dispatcher: pass only packed controllers of this type, and
     numbers.
     """
+    if dispatch.interpret_all:
+        return _step_as_python
     compiled: Callable[[Any, float, float], float] = dispatcher.compile(
         (packed.type, nb_types.float64, nb_types.float64)
     )
     return compiled
+
+
+def _step_as_python(packed: Any, r: float, y: float) -> float:
+    design, state = packed.arrays
+    with np.errstate(all="ignore"):  # compiled code does not warn
+        return float(control(design, state, r, y))

@@ -24,6 +24,7 @@ from types import FunctionType
 from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import types as nb_types
 from numba.extending import overload, register_jitable
 
@@ -62,6 +63,10 @@ OPTIONS: dict[str, Any] = {
 }
 
 _LARGEST = sys.float_info.max
+
+interpret_all = bool(numba.config.DISABLE_JIT)
+"""Whether entry points run as plain Python wherever they are called by ``specialised``: for tests
+that are not about compiled code, and with ``NUMBA_DISABLE_JIT=1``."""
 
 
 def kernel(function: F) -> F:
@@ -172,8 +177,8 @@ def specialised(entry: Any, *arguments: Any) -> Any:
     See ``kernels/sized.py``. It does not check the types of its arguments: call it with arguments
     of the same types, shapes and constants only.
     """
-    if numba.config.DISABLE_JIT:
-        return entry
+    if interpret_all:
+        return entry.plain
     dispatcher, layouts = _dispatcher_and_layouts(entry, arguments)
     found = dispatcher.specialised.get(layouts)
     if found is None:
@@ -197,6 +202,8 @@ def _without_garbage_collection() -> Iterator[None]:
 
 def is_available(entry: Any, *arguments: Any) -> bool:
     """Return whether ``specialised`` has no need to compile: its code is here, or on the disk."""
+    if interpret_all:
+        return True
     dispatcher, _ = _dispatcher_and_layouts(entry, arguments)
     types = tuple(map(type_of, arguments))
     if types in dispatcher.overloads:
@@ -242,11 +249,23 @@ def interpreted(function: Any) -> Any:
     return getattr(function, "py_func", function)
 
 
+def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that runs as Python and, like compiled code, without NumPy's warnings."""
+
+    @functools.wraps(function)
+    def run(*arguments: Any) -> Any:
+        with np.errstate(all="ignore"):
+            return function(*arguments)
+
+    return run
+
+
 def _dispatcher(function: Any, **options: Any) -> Any:
     """Return a dispatcher with a disk cache if possible; its ``uncached`` is one without."""
     options |= OPTIONS
     dispatcher = numba.njit(function, **options)
     dispatcher.uncached, dispatcher.specialised = dispatcher, {}
+    dispatcher.plain = _plain(function)
     cache = code_cache(function)
     if cache is not None:
         dispatcher.uncached = numba.njit(function, **options)

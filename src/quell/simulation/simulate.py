@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.base import Controller, check_controller
+from quell.kernels import dispatch
 from quell.lti.models import is_linear_model
 from quell.plants.base import Plant, check_plant
 from quell.plants.linear import LinearPlant
@@ -118,6 +119,7 @@ def simulate(
         if a nonlinear plant has too few sub-steps; the status then has ``POORLY_INTEGRATED``. A run
         that diverged is repeated with enough of them, to find out whether they were the cause.
     """
+    interpret = interpret or dispatch.interpret_all
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
