@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -23,8 +24,8 @@ SETTINGS = {"dt": DT, "watchdog": 20, "u_max": 1.0, "rest": True}
 
 
 @contextmanager
-def rig(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start a rig; yield it and what it says when it is ready."""
+def rig(*arguments: str, compiled: bool = False) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start a rig, compiled or as plain Python; yield it and what it says when it is ready."""
     command = [
         sys.executable,
         "-m",
@@ -38,8 +39,9 @@ def rig(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         "0",
         *arguments,
     ]
+    env = os.environ | {"NUMBA_DISABLE_JIT": str(int(not compiled))}
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env
     ) as process:
         try:
             yield process, str(process.stdout and process.stdout.readline())
@@ -59,9 +61,8 @@ def exchanged(device: Any, count: int) -> list[float]:
 def test_a_rig_runs_until_it_is_told_to_end_and_says_how_it_went(tmp_path: Path) -> None:
     """One line when it is ready, its counts at the end, exit code 0; and each tick in the log."""
     log = tmp_path / "wire.csv"
-    with rig(
-        "--device", "udp://127.0.0.1:0", "--log", str(log), "--u-max", "0.5", "--watchdog", "200"
-    ) as (process, ready):
+    settings = ("--log", str(log), "--u-max", "0.5", "--watchdog", "200")
+    with rig("--device", "udp://127.0.0.1:0", *settings, compiled=True) as (process, ready):
         assert ready.startswith("two-mass at udp://127.0.0.1:")
         url = ready.split()[2].rstrip(":")
         with open_device(url, DT) as device:

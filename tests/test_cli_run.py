@@ -285,7 +285,6 @@ def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_pat
     )
 
 
-@pytest.mark.compiled
 def test_a_full_disk_is_told_once_and_ends_neither_run_nor_exit_code(
     quell: Callable[..., Shown],
     tmp_path: Path,
