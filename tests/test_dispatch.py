@@ -197,6 +197,33 @@ print(abs(runs[0]["y"] - runs[1]["y"]).max() < 1e-9, runs[0]["y"][-1])
     assert shown[0][1] != shown[1][1]
 
 
+def test_without_numbas_compiler_a_controller_steps_and_simulates_as_python(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With ``NUMBA_DISABLE_JIT=1``: a step, a run and a batch of it, with the bits of an interpreted run."""
+    script = """
+import quell as ql
+controller = ql.baselines.PID(1.0, 0.5, dt=0.01)
+plant = ql.plants.LinearPlant([[-1.0]], [1.5], [1.0])
+run = ql.simulate(plant, controller, ql.Scenario(1.0, 0.5))
+assert (ql.simulate([plant], controller, ql.Scenario(1.0, 0.5))["y"][0] == run["y"]).all()
+found = float(run["y"][-1]), controller.step(1.0, 0.25)
+"""
+    given: dict[str, Any] = {}
+    with monkeypatch.context() as patch:
+        patch.setattr(dispatch, "interpret_all", True)
+        exec(script, given)
+    shown = subprocess.run(
+        [sys.executable, "-c", script + "print(*found)"],
+        cwd=tmp_path,
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert tuple(map(float, shown.split())) == given["found"]
+
+
 @dispatch.kernel
 def _checked(value: float) -> float:
     print("it was", value)

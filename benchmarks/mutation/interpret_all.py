@@ -31,37 +31,12 @@ def _plain(function: Callable[..., Any], **options: Any) -> Any:
         with np.errstate(all="ignore"):  # compiled code does not warn
             return function(*args)
 
-    vars(entry).update(py_func=function, uncached=entry, overloads={})
+    vars(entry).update(py_func=function, plain=entry, uncached=entry, overloads={})
     vars(entry).update(stats=SimpleNamespace(cache_misses={}))
     return entry
 
 
-def _not_specialised(entry: Any, *arguments: Any) -> Any:
-    return entry
-
-
-dispatch._dispatcher = _plain
-dispatch.specialised = _not_specialised
-
-# Only now, because they use the entry points.
-from quell.controllers import compiled_step, stateful  # noqa: E402
-from quell.controllers.base import control  # noqa: E402
-
-
-def _step(packed: Any, r: float, y: float) -> float:
-    return float(control(packed.design, packed.state, float(r), float(y)))
-
-
-def _pack(design: Any, state: Any, before: Any = None) -> SimpleNamespace:
-    return SimpleNamespace(design=design, state=state)
-
-
-for module in (compiled_step, stateful):
-    vars(module).update(
-        PackedController=_pack,
-        step_packed=_plain(_step),
-        entry_point=lambda dispatcher, packed: dispatcher,
-    )
+dispatch._dispatcher = _plain  # for tests that call an entry point directly
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -94,6 +69,7 @@ def _limited(config: pytest.Config) -> Iterator[None]:
             frame = frame.f_back
         raise OutOfTime
 
+    dispatch.interpret_all = True  # for tests that are marked ``compiled``, too
     limit = config.getoption("--cpu-limit")
     for number, timer, seconds in (
         (signal.SIGVTALRM, signal.ITIMER_VIRTUAL, limit),
