@@ -14,7 +14,7 @@ import quell as ql
 from quell.plants.base import advance, measure
 from quell.plants.dc_motor import cogging_torque
 
-RECORD = Path("/work/shared/data/cogging_a.csv")
+RECORD = Path(__file__).resolve().parents[2] / "shared" / "data" / "cogging_a.csv"
 K, R, J, C = 0.05, 0.5, 2e-4, 1e-4
 IDEAL: dict[str, Any] = {"coulomb": 0.0, "counts": None}
 

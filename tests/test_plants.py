@@ -153,10 +153,13 @@ def test_a_function_numba_cannot_compile_runs_as_python_and_says_so() -> None:
 
 
 def test_a_division_by_zero_in_compiled_code_ends_the_run() -> None:
-    """It gives inf, as in numpy, and the run says that it diverged; nothing is swallowed."""
+    """It gives inf, as in numpy; the run diverged, and a warning says where; nothing is swallowed."""
     plant = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - 1.0 / (x[0] - 0.5)), order=2)
     controller = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01), omega_c=4.0)
-    run = ql.simulate(plant, controller, ql.Scenario(0.5, 5.0, x0=[0.5, 0.0]))
+    with pytest.warns(
+        ql.DesignWarning, match=r"not finite; .* t = 0.01 s. .* state was \[0.5, 0.0"
+    ):
+        run = ql.simulate(plant, controller, ql.Scenario(0.5, 5.0, x0=[0.5, 0.0]))
     assert run.diverged
     assert run.ended == 0.01
 

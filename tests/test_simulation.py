@@ -319,15 +319,41 @@ def test_a_plant_that_varies_in_time_gets_the_time_of_each_sample(
 
 
 def test_an_output_that_is_no_number_ends_the_run_at_its_sample() -> None:
-    """``√(0.25 − t)`` from 0.3 s on; what is recorded is finite, and the end is that sample's time."""
+    """``√(0.25 − t)`` from 0.3 s on; what is recorded is finite; a warning names time and state."""
     plant = ql.plants.NonlinearPlant(
         lambda t, x, u, w: (1.0,), order=1, output=lambda x: np.sqrt(0.25 - x[0])
     )
     law = ql.ADRC(ql.ESO.model_free(order=1, b0=1.0, omega_o=1.0, dt=0.1), omega_c=1.0)
-    run = ql.simulate(plant, law, ql.Scenario(duration=1.0), interpret=True)
+    message = r"f or output returns a number that is not finite; .* t = 0.3 s.* state was \[0.2\]"
+    with pytest.warns(ql.DesignWarning, match=message):
+        run = ql.simulate(plant, law, ql.Scenario(duration=1.0), interpret=True)
     assert run.diverged
     assert (len(run), run.ended) == (3, pytest.approx(0.3))
     assert np.all(np.isfinite(run.log))
+
+
+def test_a_duration_between_two_samples_is_reported() -> None:
+    """The run ends at the sample before; a duration that is a multiple but for rounding is fine."""
+    law = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=0.03), omega_c=1.0)
+    with pytest.warns(ql.DesignWarning, match=r"duration = 0.1 s with dt = 0.03 .* 0.12 s is the"):
+        run = ql.simulate(PLANT, law, ql.Scenario(duration=0.1), interpret=True)
+    assert run.t[-1] == pytest.approx(0.09)
+    assert len(ql.simulate(PLANT, law, ql.Scenario(duration=0.03 * 7), interpret=True)) == 8
+
+
+def test_noise_far_quicker_than_the_samples_is_reported() -> None:
+    """Wherever it is in a sum; noise that is twice as quick, or has no power, is not."""
+    law = ql.ADRC(ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=0.01), omega_c=1.0)
+    quick = ql.signals.BandLimitedNoise(1e-12, 1e-5)
+    for signals, name in (
+        ({"noise": quick + ql.signals.Sinusoid()}, "noise"),
+        ({"disturbances": (0.0, 2.0 * quick)}, "disturbances"),
+    ):
+        message = f"{name}: sample_time = 1e-05 s is far below dt = 0.01 s"
+        with pytest.warns(ql.DesignWarning, match=message):
+            ql.simulate(PLANT, law, ql.Scenario(duration=0.02, **signals), interpret=True)
+    for fine in (ql.signals.BandLimitedNoise(1e-12, 5e-3), ql.signals.BandLimitedNoise(0.0, 1e-5)):
+        ql.simulate(PLANT, law, ql.Scenario(duration=0.02, noise=fine), interpret=True)
 
 
 class Gap(ql.signals.Signal):

@@ -1,8 +1,9 @@
-"""Verdict on the integration of finished runs: whether it is poor, or why a run diverged.
+"""Verdict on finished runs: whether their integration is poor, or why a run diverged.
 
 A loop that diverges for its own reasons often becomes too fast for its sub-steps at last. So a run
 that diverged is repeated with enough sub-steps: only if it does not diverge then, the integration
-was the cause.
+was the cause. A run whose state is suddenly no number has met a function of the user that is not
+defined there.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from quell.plants.base import measure
 from quell.simulation.driver import Loop
 from quell.simulation.integration import LARGEST_ERROR, with_substeps
 from quell.simulation.sampled_scenario import segment_bounds
@@ -26,6 +28,7 @@ def judge_integration(plant: str, loops: Sequence[Loop]) -> None:
     the plants' name.
     """
     for loop in loops:
+        _warn_of_undefined_functions(plant, loop)
         if loop.integration.poor and loop.diverged and _diverges_anyway(loop):
             loop.integration.acquit()
     poor = [loop.integration for loop in loops if loop.integration.poor]
@@ -44,6 +47,27 @@ def judge_integration(plant: str, loops: Sequence[Loop]) -> None:
         f"{100.0 * LARGEST_ERROR:g} %: {remedy}",
         DesignWarning,
         stacklevel=3,
+    )
+
+
+def _warn_of_undefined_functions(plant: str, loop: Loop) -> None:
+    """Warn if a function of the user returned NaN or infinity while y was in its usual range."""
+    if not (loop.diverged and loop.integration.needed):
+        return
+    row, first = loop.last_row, 4 + loop.plant.disturbances
+    before = loop.x0 if row is None else row[first : first + loop.x.size]
+    usual = loop.ended == 0 if row is None else abs(row[1]) <= loop.scenario.range
+    with np.errstate(all="ignore"):
+        defined = bool(np.all(np.isfinite([*loop.x, measure(loop.model, loop.x)])))
+    if defined or not usual:
+        return
+    warnings.warn(
+        f"{plant}: f or output returns a number that is not finite; the run ended at t = "
+        f"{loop.ended * loop.scenario.dt:.9g} s. The last recorded state was "
+        f"{[float(f'{value:.4g}') for value in before]}: both must be defined wherever the "
+        "plant goes",
+        DesignWarning,
+        stacklevel=4,
     )
 
 

@@ -111,6 +111,7 @@ class Loop:
         self.scenario = scenario
         self._as_python = as_python
         self._like = like
+        self.last_row: Vector | None = None  # of the log, if the run diverged after it
         self._run_block: Any = None  # the compiled function, from the first segment on
 
     def _entry(self, function: Any, *arguments: Any) -> Any:
@@ -158,6 +159,8 @@ class Loop:
                 self._run_block = other or self._entry(run_block, *arguments)
             samples, row, self.until_next, flags = self._run_block(*arguments)
         self.done = first + samples
+        if samples < segment.r.size and row > 0:
+            self.last_row = log[row - 1].copy()
         self.status |= flags if samples == segment.r.size else flags | Status.DIVERGED
         if self.integration.needed:
             self._check_integration(log[from_row:row], from_sample, every, dt)

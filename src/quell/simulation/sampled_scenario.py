@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,9 +18,9 @@ from quell import checks
 from quell.controllers.base import Controller
 from quell.plants.base import Plant
 from quell.records.sample_times import first_sample_at, in_steps
-from quell.signals import Constant, Signal
+from quell.signals import BandLimitedNoise, Constant, Signal
 from quell.simulation.scenario import Scenario
-from quell.types import Matrix, Vector
+from quell.types import DesignWarning, Matrix, Vector
 
 # Samples for which signals are evaluated at once: enough that Python's share of the time is small,
 # few enough to stay in the processor's cache. Chosen by hand.
@@ -30,6 +31,9 @@ _DIVERGED = 1e6
 # Times the same: |y| beyond it is outside of the usual range. Chosen by hand.
 _UNUSUAL = 10.0
 _NOTHING = Constant(0.0)  # what inputs without a signal get
+# Noise with a shorter sample time, in units of dt, was not meant so. Chosen by hand: a sensor that
+# is sampled twice as quickly as the loop is usual.
+_QUICKEST_NOISE = 0.1
 # Up to here time in steps of dt is exact to a thousandth of a step (2e-16 · 1e12).
 _MOST_SAMPLES = 10**12
 
@@ -71,6 +75,7 @@ class SampledScenario:
                 f"{_MOST_SAMPLES:.0e} samples"
             )
         samples = math.floor(in_steps(duration, dt)) + 1
+        _warn_of_times(scenario, dt, samples)
         given = scenario.x0
         x0 = np.zeros(plant.order) if given is None else checks.vector("x0", given, plant.order)
         signals = scenario.seeded_signals(plant.disturbances)
@@ -120,6 +125,41 @@ def segments(scenario: SampledScenario) -> Iterator[Segment]:
 def segment_bounds(samples: int, rest_samples: Iterable[int]) -> list[tuple[int, int]]:
     """Return begin and end of segments; starts from rest are only at the beginning of one."""
     return list(pairwise(sorted({*range(0, samples, _SEGMENT), *rest_samples, samples})))
+
+
+def _warn_of_times(scenario: Scenario, dt: float, samples: int) -> None:
+    """Warn of a duration between two samples, and of noise that is far quicker than the samples."""
+    last = (samples - 1) * dt
+    if in_steps(scenario.duration, dt) != samples - 1:
+        warnings.warn(
+            f"duration = {scenario.duration!r} s with dt = {dt!r} s: is no whole number of "
+            f"samples, so the run ends at {last:.9g} s; {last + dt:.9g} s is the next one",
+            DesignWarning,
+            stacklevel=4,
+        )
+    for name, value in (("noise", scenario.noise), ("disturbances", scenario.disturbances)):
+        for noise in _noises(value):
+            if noise.power > 0.0 and noise.sample_time < _QUICKEST_NOISE * dt:
+                warnings.warn(
+                    f"{name}: sample_time = {noise.sample_time!r} s is far below dt = {dt!r} s: "
+                    "each sample sees one draw, whose variance power/sample_time = "
+                    f"{noise.power / noise.sample_time:.3g} is that of a much wider band; "
+                    "give sample_time = dt, or the power for it",
+                    DesignWarning,
+                    stacklevel=4,
+                )
+
+
+def _noises(value: Any) -> Iterator[BandLimitedNoise]:
+    """Return an iterator over all noises in a signal, or in a sequence of signals."""
+    if isinstance(value, BandLimitedNoise):
+        yield value
+    elif isinstance(value, Signal) and is_dataclass(value):
+        for field in fields(value):
+            yield from _noises(getattr(value, field.name))
+    elif checks.is_sequence(value):
+        for part in value:
+            yield from _noises(part)
 
 
 def _columns(signals: tuple[Signal, ...], t: Vector) -> Matrix:
