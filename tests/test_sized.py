@@ -158,7 +158,7 @@ if __name__ == "__main__":
     plant = ql.plants.LinearPlant.of(([1.0], [1.0, 1.0]))
     pids = [ql.baselines.PID(gain, dt=0.01) for gain in (1.0, 2.0)]
     loops = [(plant, pid) for pid in pids]
-    loops.append((plant, ql.ADRC(ql.ESO.model_free(1, 1.0, 10.0, 0.01), 1.0)))
+    loops.append((plant, ql.baselines.PID(1.0, 1.0, 0.1, tf=0.05, dt=0.01)))
     print(precompile(loops), len(run_block.signatures), compilations(run_block) <= 2)
 """
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))

@@ -183,8 +183,8 @@ def test_an_observer_runs_the_same_again(name: str) -> None:
     assert np.all(np.isfinite(first.log))
 
 
-# Other features for the same learner: tested below without a loop, which takes long to compile.
-OTHER_FEATURES = ("RLS with u", "radial features", "random features")
+# The same learners with other features: tested below without a loop, which takes long to compile.
+OTHER_FEATURES = ("with u", "on the strongest", "radial features", "random features")
 IN_LOOPS = [name for name in LEARNERS if not name.endswith(OTHER_FEATURES)]
 
 
@@ -263,6 +263,25 @@ def drive(
         adapt(design, memory, sample.seen, y[k], u[k], f[k])
         said[k, 0], said[k, 1] = predict(design, memory, sample.seen, u[k])
         commit(design, memory, sample.seen, u[k], 0.0)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_learner_says_the_same_interpreted(name: str, rng: np.random.Generator) -> None:
+    """Of a motion and its f, for a while after it has begun to learn: interpreted = compiled."""
+    design = LEARNERS[name].design(OBSERVERS["model-free, order 2, current"], 1.0)
+    t = 0.01 * np.arange(400)
+    seen = np.column_stack([np.sin(3.0 * t), 3.0 * np.cos(3.0 * t), -2.0 * np.sin(3.0 * t)])
+    y, u = seen[:, 0] + 1e-3 * rng.normal(size=t.size), np.sin(5.0 * t)
+    said = np.empty((2, t.size, 2))
+    for found, entry in zip(
+        said, (partial(call_specialised, drive), interpreted(drive)), strict=True
+    ):
+        memory = LEARNERS[name].memory(design)
+        entry(design, memory, Sample(np.zeros(3)), seen, y, u, seen[:, 2].copy(), found)
+    assert name == "NoLearner" or np.any(said[0] != 0.0)
+    # Fused multiply-add rounds otherwise, and a learner remembers it.
+    np.testing.assert_allclose(said[1], said[0], rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.compiled
