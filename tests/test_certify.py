@@ -11,8 +11,10 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse, certify, observer_error
+from quell.guard.correction import is_invertible
 from quell.lti.norms import peak_gain
 from quell.lti.system import System
+from quell.observers.base import observe
 from tests.injected import Injected
 
 DT = 0.02
@@ -240,6 +242,32 @@ def test_an_analysis_has_a_certificate_where_a_guarded_learner_is() -> None:
         feedback=ql.controllers.NonlinearFeedback((0.75, 1.25), delta=0.1),
     )
     assert "no certificate: controller" in analyse(plant, curved).summary()
+
+
+@pytest.mark.parametrize(
+    ("observer", "invertible"),
+    [
+        (ql.ESO.model_free(8, 1.0, 10.0, 1e-2), True),
+        (ql.ESO.model_free(4, 1.0, 10.0, 0.1, form="predictor"), True),
+        (ql.ESO.model_free(3, 1.0, 10.0, 0.02, half_gain=True), True),
+        (ql.ESO.model_free(5, 1.0, 10.0, 0.1, half_gain=True), False),
+        (ql.ESO.cascade(2, 1.0, 10.0, 1e-2), False),
+        (ql.ESO.model_based(([2.0, 2.0], [1.0, 0.9, 1.5]), 10.0, 5e-3), False),
+        (ql.ESO.model_based(([2.0, 2.0], [1.0, 0.9, 1.5]), 10.0, 5e-3, keep_zeros=True), True),
+    ],
+)
+def test_which_observers_answer_a_bounded_correction_with_bounded_states(
+    observer: ql.ESO, invertible: bool
+) -> None:
+    """Simulated: with e_L = 1 for 60 lags the estimates stay bounded, or grow without end."""
+    assert is_invertible(observer) is invertible
+    z, seen = np.zeros(observer.states), np.zeros(observer.order + 1)
+    largest = []
+    for _ in range(2):
+        for _ in range(round(30.0 * observer.lag_time / observer.dt)):
+            observe(observer.model, z, seen, 0.0, 0.0, 1.0 - seen[-1])
+        largest.append(float(np.max(np.abs(seen[:-1]))))
+    assert (largest[1] < 1.5 * largest[0]) is invertible
 
 
 UNSTABLE = ([3.0], [1.0, 0.0, 0.0, 0.0, 0.0])

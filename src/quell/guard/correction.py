@@ -34,6 +34,9 @@ from quell.types import Vector
 # Largest length of the state of an observer with a delay; the computation costs its cube. As for
 # the plant, chosen by hand.
 _MOST_STATES = 250
+# A pole that is closer to the unit circle counts as on it: the cascade has two at z = 1, which
+# rounding moves by its square root. Slower poles than 0.03 per million samples do not occur.
+_MARGINAL = 3e-8
 
 
 class CorrectionGains(NamedTuple):
@@ -68,6 +71,17 @@ def _check_stable(system: System, what: str) -> None:
     pole = system.largest_pole
     if pole >= 1.0:
         raise ValueError(f"{what} is unstable, with a pole at |z| = {pole:.9g}: nothing is certain")
+
+
+def is_invertible(observer: ESO) -> bool:
+    """Return whether a bounded e_L moves the states by a bounded amount.
+
+    That is, whether ``(1 − F)⁻¹`` is stable but for its free constant. Of the designs of ``ESO``
+    these are all with coincident poles or Kalman gains, except for ``half_gain`` at high order and
+    low sampling rate; not a cascade, and not an observer of a plant with slow zeros that does not
+    keep them.
+    """
+    return state_path(observer, np.zeros(observer.order)).largest_pole < 1.0 - _MARGINAL
 
 
 def plain_loop(plant: SampledPlant, observer: ESO, law: Vector) -> tuple[System, System]:
