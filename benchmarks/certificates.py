@@ -17,11 +17,13 @@ Printed are the bound of the theorem over the largest |q| found, and the same fo
 with the largest |q_0| of that run: 1 if the bound is attained.
 
 python benchmarks/certificates.py [--loops 60] [--seed 1]
+python benchmarks/certificates.py --honest 100
 """
 
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,10 +33,14 @@ from rich.table import Table
 
 from quell.analysis import certify
 from quell.experiments.stress.general.loops import draw_loop
+from quell.experiments.stress.random_loops import draw_loops
+from quell.experiments.stress.study import errors
 from quell.guard import Guard
 from quell.guard.correction import plain_loop, state_path
+from quell.learners import Harmonic
 from quell.lti.norms import pulse_response
 from quell.lti.system import System
+from quell.parallel import in_parallel
 from quell.plants.sampled import sampled_plant
 
 FAMILIES = ("stable", "unstable", "lagged", "delayed", "two masses")
@@ -161,7 +167,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--loops", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--honest", type=int, help="only what certificates cost, in so many loops")
     options = parser.parse_args()
+    if options.honest:
+        honest(options.honest)
+        return
     rng = np.random.default_rng(options.seed)
     rows = []
     while len({row[0] for row in rows}) < options.loops:
@@ -178,6 +188,38 @@ def main() -> None:
                 (loop.seed, loop.order, load, attacked.kappa, growth, growth / q, bound_y / y)
             )
     show(rows)
+
+
+def honest(count: int) -> None:
+    """Print what a certificate costs an honest learner in random two-mass loops."""
+    loops = draw_loops(count, np.random.default_rng(21))
+    plain = np.array(in_parallel([partial(errors, loop, None, None) for loop in loops]))
+    table = Table(title=f"Harmonic() in {count} two-mass loops, RMS errors over MF-ESO's")
+    for heading in ("guard", "κ: least, median", "run: median, most", "load: median, 99 %, most"):
+        table.add_column(heading)
+    table.add_column("late: median")
+    certified = [Guard(certified_for=loop.plant) for loop in loops]
+    for name, guards in (
+        ("none", [None] * count),
+        ("Guard()", [Guard()] * count),
+        ("certified_for=plant", certified),
+    ):
+        pairs = list(zip(loops, guards, strict=True))
+        runs = in_parallel([partial(errors, loop, Harmonic(), guard) for loop, guard in pairs])
+        ratios = np.array([[np.nan] * 3 if run is None else run for run in runs]) / plain
+        kappas = [
+            np.inf if guard is None else loop.controller(None, guard).parameters.guard.bound
+            for loop, guard in pairs
+        ]
+        run, load, late = ratios.T
+        table.add_row(
+            name,
+            f"{np.min(kappas):.2f}, {np.median(kappas):.2f}",
+            f"{np.nanmedian(run):.3f}, {np.nanmax(run):.3f}",
+            f"{np.nanmedian(load):.3f}, {np.nanquantile(load, 0.99):.3f}, {np.nanmax(load):.3f}",
+            f"{np.nanmedian(late):.4f}",
+        )
+    Console(width=110).print(table)
 
 
 def show(rows: list[Any]) -> None:
