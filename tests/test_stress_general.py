@@ -216,7 +216,7 @@ def outcome(**fields: Any) -> GeneralOutcome:
     usual: dict[str, Any] = {
         **{"kind": "constant", "honest": False, "index": 0, "learner": "", "loop": ""},
         **{"family": "stable", "order": 2, "load": "sine", "reference": "steps", "level": 0.0},
-        **{"margin": 0.5, "plain_lost": False, "lost": False},
+        **{"margin": 0.5, "plain_lost": False, "fragile": False, "lost": False},
         **{"rms": 1.0, "peak": 1.0, "window": 1.0, "late": 1.0},
     }
     return GeneralOutcome(**(usual | fields))
@@ -225,6 +225,7 @@ def outcome(**fields: Any) -> GeneralOutcome:
 def test_bars_count_healthy_loops_only() -> None:
     """And name what is not met."""
     runs = [outcome(), outcome(rms=9.0, margin=0.3), outcome(window=3.0)]
+    runs += [outcome(lost=True, fragile=True), outcome(plain_lost=True)]
     runs += [outcome(kind="Kalman", honest=True, rms=1.1, peak=1.2)]
     cases = [Case("level 30, sine", "Kalman", "late RMS", 1.0, 0.5, 0.6)]
     result = GeneralResult({"seed": 0}, runs, cases)
@@ -239,6 +240,7 @@ def test_bars_count_healthy_loops_only() -> None:
     found = result.to_json()
     assert json.loads(json.dumps(found)) == found
     assert found["hostile"]["runs"] == 2
+    assert found["left_out"] == {"low_margin": 1, "plain_lost": 1, "fragile": 1, "lost": 1}
     lost = outcome(lost=True, rms=math.nan, peak=math.nan, window=math.nan, late=math.nan)
     assert not GeneralResult({}, [lost], []).bars()[0].met
 

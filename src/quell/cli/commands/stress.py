@@ -132,7 +132,9 @@ def _print_general(console: Console, result: GeneralResult, guarded: bool) -> No
             escape(bar.over), escape(bar.measure), figure, f"{bar.bar:g}", yes_or_no(bar.met)
         )
     console.print(bars)
-    left_out = len(result.outcomes) - len(result.healthy)
+    why = result.left_out
     console.print(
-        f"{left_out} of {len(result.outcomes)} runs have a lower margin and do not count.\n"
+        f"Not counted: {why['low_margin']} runs with a lower margin, {why['plain_lost']} in which "
+        f"MF-ESO is lost, {why['fragile']} in which it hardly holds within the limits of u; "
+        f"{why['lost']} of these are lost.\n"
     )

@@ -44,7 +44,19 @@ class GeneralResult:
     @property
     def healthy(self) -> list[GeneralOutcome]:
         """The outcomes for which the bars hold."""
-        return [o for o in self.outcomes if o.margin >= HEALTHY and not o.plain_lost]
+        return [o for o in self.outcomes if o.healthy]
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """How many runs do not count, by the reason, and how many of these are lost."""
+        low = [o for o in self.outcomes if o.margin < HEALTHY]
+        rest = [o for o in self.outcomes if o.margin >= HEALTHY and not o.healthy]
+        return {
+            "low_margin": len(low),
+            "plain_lost": sum(o.plain_lost for o in rest),
+            "fragile": sum(o.fragile for o in rest),
+            "lost": sum(o.lost for o in (*low, *rest)),
+        }
 
     @property
     def hostile(self) -> list[GeneralOutcome]:
@@ -112,6 +124,7 @@ class GeneralResult:
         groups = {"hostile": self.hostile, "honest": self.honest}
         return {
             "settings": dict(self.settings),
+            "left_out": self.left_out,
             "bars": [{**bar._asdict(), "met": bar.met} for bar in self.bars()],
             **{name: summary(group) for name, group in groups.items()},
             **{

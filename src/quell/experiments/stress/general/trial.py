@@ -2,15 +2,19 @@
 
 Errors are those of y against the response that the loop is designed for. A run's ratios are its
 measures (``measures``) over those of MF-ESO. A run is *lost* if it diverges, or leaves |y| = 100,
-where MF-ESO does not. Bars hold for loops whose modulus margin is at least ``HEALTHY``.
+where MF-ESO does not. Bars hold for loops whose modulus margin is at least ``HEALTHY``. With limits
+of u the margin of the linear part says little: a loop in which MF-ESO itself hardly holds is
+*fragile*, and does not count: with limits that are 20 % lower it is lost, or has measures 1.5 times
+as large.
 
 Seeds below 10 000 are for tuning; seeds from 1 000 000 on are for judging, and are looked at once.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -27,6 +31,9 @@ from quell.simulation.simulate import simulate
 HEALTHY = 0.35
 """Least modulus margin of the loops for which the bars hold."""
 HONEST: dict[str, Learner] = {"Harmonic": Harmonic(), "Kalman": Kalman()}
+# What tells fragile loops: share of the limits, and ratio to the measures with the full limits.
+# Chosen by hand; with the first guard all saturated loops with ratios above 8 were fragile.
+_LOWER_LIMITS, _FRAGILE = 0.8, 1.5
 # A loop whose reference is within 2 counts as lost beyond this |y|.
 _LIMIT = 100.0
 # Recorded samples in a lag of the observer: the error changes little between them.
@@ -49,11 +56,17 @@ class GeneralOutcome:
     level: float  #: constant part of the load
     margin: float
     plain_lost: bool
+    fragile: bool  #: whether MF-ESO hardly holds within the limits of u
     lost: bool
     rms: float
     peak: float
     window: float
     late: float
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the bars hold for its loop."""
+        return self.margin >= HEALTHY and not (self.plain_lost or self.fragile)
 
 
 def error_of(loop: GeneralLoop, learner: Learner | None, guard: Guard | None) -> Measures | None:
@@ -65,6 +78,15 @@ def error_of(loop: GeneralLoop, learner: Learner | None, guard: Guard | None) ->
         return None
     wanted = ideal(loop.tables[0], loop.dt, loop.order)[::every]
     return measure_error(run["y"] - wanted, round(WINDOW_LAGS * loop.lag / (every * loop.dt)))
+
+
+def is_fragile(loop: GeneralLoop, plain: Measures) -> bool:
+    """Return whether MF-ESO, which has these measures, hardly holds within the limits of u."""
+    if min(loop.u_limit, loop.plant.limit) == math.inf:
+        return False
+    lower = replace(loop.plant, limit=_LOWER_LIMITS * loop.plant.limit)
+    found = error_of(replace(loop, plant=lower, u_limit=_LOWER_LIMITS * loop.u_limit), None, None)
+    return found is None or max(found.over(plain)[:3]) > _FRAGILE
 
 
 def run_one(
@@ -92,6 +114,7 @@ def run_one(
         level=loop.level,
         margin=loop.margin,
         plain_lost=plain is None,
+        fragile=plain is not None and is_fragile(loop, plain),
         lost=learned is None and plain is not None,
         rms=ratios.rms,
         peak=ratios.peak,
