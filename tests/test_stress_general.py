@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -209,6 +210,17 @@ def test_a_search_finds_learners_that_do_harm() -> None:
     assert len(found.history) == 2
     assert found.score > 1.0
     assert found.point.shape == (attacks.SIZE,)
+
+
+def test_a_loop_is_fragile_if_u_hardly_suffices_for_the_load() -> None:
+    """With limits at the load itself, not with twice as much, and never without limits."""
+    loop = one("stable", 1)
+    enough = float(np.max(np.abs(loop.tables[1]))) * loop.gain_error / loop.b0
+    for limit, fragile in ((enough, True), (2.0 * enough, False), (math.inf, False)):
+        limited = replace(loop, u_limit=limit)
+        plain = trial.error_of(limited, None, None)
+        assert plain is not None
+        assert trial.is_fragile(limited, plain) == fragile
 
 
 def outcome(**fields: Any) -> GeneralOutcome:
