@@ -10,6 +10,7 @@ import pytest
 
 import quell as ql
 from quell.experiments import stress
+from quell.kernels.sized import layout_of
 
 
 @pytest.mark.compiled
@@ -78,6 +79,17 @@ def test_mistakes_are_named(arguments: tuple[int, int, int], message: str) -> No
     """Argument, value, rule."""
     with pytest.raises(ValueError, match=message):
         stress.run(*arguments, guard=None)
+
+
+def test_delays_of_all_lengths_run_the_same_code() -> None:
+    """Else the trial compiles for each of them; and features of a lower order are the first ones."""
+    observer = ql.ESO.model_free(order=1, b0=1.0, omega_o=10.0, dt=0.01)
+    delayed = [stress.Adversary(kind=4, delay=delay) for delay in (3, 7)]
+    memories = [learner.memory(learner.design(observer, 1.0)) for learner in delayed]
+    assert [memory.past.size for memory in memories] == [4, 8]
+    assert layout_of(memories[0]) == layout_of(memories[1])
+    features = stress.Adversary(kind=9, weights=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+    assert features.design(observer, 1.0).weights.tolist() == [1.0, 2.0, 3.0]
 
 
 def test_an_unknown_kind_is_refused(rng: np.random.Generator) -> None:
