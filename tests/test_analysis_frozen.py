@@ -107,9 +107,10 @@ def test_margins_over_time_are_those_of_each_instant() -> None:
     assert modulus[0] != pytest.approx(modulus[2], rel=1e-3)
 
 
-def test_a_feature_that_is_not_linear_needs_more_than_its_coefficient() -> None:
+@pytest.mark.parametrize("block", [ql.features.Polynomial(2), ql.features.Periodic(orders=(3,))])
+def test_a_feature_that_is_not_linear_needs_more_than_its_coefficient(block: Any) -> None:
     """The record of θ does not do; the state at the end of a run does."""
-    controller = adrc(2, learner=ql.learners.RLS(ql.features.Polynomial(2)))
+    controller = adrc(2, learner=ql.learners.RLS(block))
     run = ql.simulate(chain(2), controller, replace(TRAINING, duration=4.0), interpret=True)
     with pytest.raises(ValueError, match=r"is not linear.*pass the scenario to loops_over_time,"):
         analysis.frozen(controller, run, 3.0)

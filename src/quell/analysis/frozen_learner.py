@@ -16,6 +16,7 @@ A guard multiplies all of it by the learner's authority β. When it clips the ou
 from __future__ import annotations
 
 import math
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,7 +42,8 @@ from quell.types import Vector
 # Step of the central differences, relative to the size of a signal; their relative error is of the
 # order of its square, 1e-8.
 _STEP = 1e-4
-_FEEDFORWARD = ("bias", "sin", "cos")
+# Features of time alone, by their names in ``Bias`` and ``Harmonic``.
+_FEEDFORWARD = re.compile(r"bias|(sin|cos)\d+")
 _USE_STATE = "pass the scenario to loops_over_time, or the final_state of a run that ends then"
 
 
@@ -116,7 +118,7 @@ def _from_record(controller: ADRC, run: Trajectory, t: float) -> Frozen:
             gain[states[name]] += theta
         elif name == "u":
             slope += float(theta)
-        elif not name.startswith(_FEEDFORWARD):
+        elif not _FEEDFORWARD.fullmatch(name):
             raise ValueError(f"t = {t!r}: the feature {name!r} is not linear; {_USE_STATE}")
     authority = float(run["authority"][row]) if "authority" in run.names else 1.0
     return _with_authority(controller, gain, 0.0, slope, authority)
