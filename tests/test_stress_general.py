@@ -14,13 +14,13 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse
-from quell.experiments.stress.general import attacks, loads, measures, references, trial
+from quell.experiments.stress.general import attacks, measures, trial
 from quell.experiments.stress.general.cross_entropy import search
-from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
+from quell.experiments.stress.general.loops import GeneralLoop, draw_loop, loads, references
+from quell.experiments.stress.general.loops.plant import GeneralPlant
+from quell.experiments.stress.general.loops.random_plants import FAMILIES
 from quell.experiments.stress.general.named import Case, perfect_case
-from quell.experiments.stress.general.plant import GeneralPlant
 from quell.experiments.stress.general.program import INPUTS, Program, Watched
-from quell.experiments.stress.general.random_plants import FAMILIES
 from quell.experiments.stress.general.result import GeneralResult
 from quell.experiments.stress.general.trial import GeneralOutcome
 from quell.plants import LinearPlant
@@ -101,7 +101,7 @@ def test_a_loop_states_its_modulus_margin(family: str) -> None:
 
 def test_an_unstable_loop_has_no_margin() -> None:
     """A gain of the wrong sign."""
-    from quell.experiments.stress.general.margin import modulus_margin
+    from quell.experiments.stress.general.loops.margin import modulus_margin
 
     loop = one("stable", 2)
     wrong = LinearPlant(loop.plant.linear.A, -loop.plant.linear.B, loop.plant.linear.C)

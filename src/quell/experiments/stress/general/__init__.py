@@ -13,11 +13,11 @@ from quell.experiments.stress.general.attacks import (
 )
 from quell.experiments.stress.general.cross_entropy import Found, harm, judge, search
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
+from quell.experiments.stress.general.loops.plant import GeneralPlant
+from quell.experiments.stress.general.loops.random_plants import FAMILIES
 from quell.experiments.stress.general.measures import Measures, measure_error
 from quell.experiments.stress.general.named import Case, run_named
-from quell.experiments.stress.general.plant import GeneralPlant
 from quell.experiments.stress.general.program import INPUTS, Program, Watched
-from quell.experiments.stress.general.random_plants import FAMILIES
 from quell.experiments.stress.general.result import Bar, GeneralResult, summary
 from quell.experiments.stress.general.study import run
 from quell.experiments.stress.general.trial import GeneralOutcome, error_of, run_one

@@ -17,8 +17,8 @@ import numpy as np
 from quell.experiments.stress.adversaries import KINDS as BLIND_KINDS
 from quell.experiments.stress.adversaries import draw_adversary
 from quell.experiments.stress.general.loops import GeneralLoop
+from quell.experiments.stress.general.loops.random_plants import load_gain
 from quell.experiments.stress.general.program import INPUTS, RULES, Program
-from quell.experiments.stress.general.random_plants import load_gain
 from quell.guard import Guard
 from quell.learners import Learner
 from quell.types import Vector

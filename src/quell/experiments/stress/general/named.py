@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from quell.controllers import ADRC
-from quell.experiments.stress.general.loads import LOADS, Table
-from quell.experiments.stress.general.plant import GeneralPlant
+from quell.experiments.stress.general.loops.loads import LOADS, Table
+from quell.experiments.stress.general.loops.plant import GeneralPlant
 from quell.experiments.stress.general.program import INPUTS, Program, Watched
 from quell.guard import Guard
 from quell.learners import Harmonic, Kalman, Learner

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from quell import checks
-from quell.experiments.stress.general import loops, trial
+from quell.experiments.stress.general import trial
+from quell.experiments.stress.general.loops import loop as loops
 from quell.experiments.stress.general.named import run_named
 from quell.experiments.stress.general.result import GeneralResult
 from quell.guard import Guard

@@ -21,8 +21,8 @@ import numpy as np
 
 from quell.experiments.stress.general.attacks import KINDS, draw_attack
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
+from quell.experiments.stress.general.loops.references import ideal
 from quell.experiments.stress.general.measures import WINDOW_LAGS, Measures, measure_error
-from quell.experiments.stress.general.references import ideal
 from quell.guard import Guard
 from quell.learners import Harmonic, Kalman, Learner
 from quell.parallel import in_parallel

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.experiments.stress.general.plant import GeneralPlant
+from quell.experiments.stress.general.loops.plant import GeneralPlant
 from quell.plants import LinearPlant, two_mass_spring
 from quell.types import Vector
 
