@@ -11,6 +11,7 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse, certify, observer_error
+from quell.experiments.stress.spender import Spender
 from quell.guard.correction import is_invertible
 from quell.lti.norms import peak_gain
 from quell.lti.system import System
@@ -268,6 +269,22 @@ def test_which_observers_answer_a_bounded_correction_with_bounded_states(
             observe(observer.model, z, seen, 0.0, 0.0, 1.0 - seen[-1])
         largest.append(float(np.max(np.abs(seen[:-1]))))
     assert (largest[1] < 1.5 * largest[0]) is invertible
+
+
+def test_a_clipped_learner_does_not_run_away_where_the_states_would() -> None:
+    """An observer that does not keep the plant's zero: a learner that was trusted, then pushes to both sides, moves y by little."""
+    plant = ([2.0, 2.0], [1.0, 0.9, 1.5])
+    observer, load = ql.ESO.model_based(plant, 10.0, DT), ql.signals.Sinusoid(1.0, 1.0)
+    assert not is_invertible(observer)
+    scenario = ql.Scenario(duration=40.0, disturbances=(load,))
+    t = DT * np.arange(2001)
+    push = np.where(t < 25.0, np.nan, np.sign(np.sin(5.0 * t)))
+    learner = Spender(2.0 * load.evaluate(t), push, 0.0)
+    alone = ql.simulate(plant, ql.ADRC(observer, omega_c=1.0), scenario)
+    hostile = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=ql.Guard())
+    run = ql.simulate(plant, hostile, scenario, limit=1e6)
+    assert np.max(run["authority"]) > 0.5
+    assert np.max(np.abs(run["y"])) < 10.0 * np.max(np.abs(alone["y"]))
 
 
 UNSTABLE = ([3.0], [1.0, 0.0, 0.0, 0.0, 0.0])
