@@ -11,7 +11,7 @@ import pytest
 from scipy import signal
 
 import quell as ql
-from quell.features import RBF, Bias, Friction, Polynomial, State
+from quell.features import Bias, Friction, Polynomial, State
 
 pytestmark = pytest.mark.compiled
 
@@ -20,7 +20,6 @@ LEARNERS: dict[str, Any] = {
     "none": None,
     "linear": ql.learners.Kalman(),
     "MLP": ql.learners.MLP(),
-    "RBF": ql.learners.RLS(State() + RBF(40) + Bias()),
     "friction": ql.learners.RLS(State() + Polynomial() + Friction() + Bias()),
 }
 
@@ -51,7 +50,7 @@ def error(name: str) -> float:
     return float(np.sqrt(np.mean((run["y"] - ideal)[run.t >= 20.0] ** 2)))
 
 
-@pytest.mark.parametrize(("name", "at_most"), [("MLP", 0.7), ("RBF", 0.7), ("friction", 0.25)])
+@pytest.mark.parametrize(("name", "at_most"), [("MLP", 0.7), ("friction", 0.25)])
 def test_a_nonlinear_learner_rejects_friction_better_than_a_linear_one(
     name: str, at_most: float
 ) -> None:

@@ -341,6 +341,7 @@ def test_without_a_guard_nothing_is_said_of_it() -> None:
     assert law(ql.learners.Kalman()).estimate.authority == 1.0
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_the_unit_of_y_does_not_matter_to_the_guard(unit: float) -> None:
     """In micrometres or megametres the same authority is given."""
