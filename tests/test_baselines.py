@@ -261,7 +261,6 @@ def test_either_mass_may_be_measured(measured: str) -> None:
 # --------------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize(("omega", "zeta"), [(1.4, 0.0), (5.0, 0.05), (2.0, 0.4)])
 @pytest.mark.parametrize("shaper", [ZV, ZVD])
 def test_a_shaper_leaves_no_vibration_of_its_mode(

@@ -65,9 +65,13 @@ def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
 
 @pytest.mark.compiled
 def test_the_torsional_experiment_is_printed_written_and_drawn(
-    quell: Callable[..., Shown], tmp_path: Path
+    quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tables, JSON in the study's form with one entry a pair of bandwidths, figures; without a terminal."""
+    """Tables, JSON in the study's form with one entry a pair of bandwidths, figures; without a terminal.
+
+    From one start, where the experiment has five.
+    """
+    monkeypatch.setattr("quell.experiments.torsional.setup.STARTS", 1)
     shown = quell(
         "reproduce",
         "torsional",

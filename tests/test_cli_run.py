@@ -233,7 +233,6 @@ duration = 0.5
 """
 
 
-@pytest.mark.compiled
 def test_a_rig_is_run_recorded_and_replayed(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """From a twin in this process to tables, JSON, figures and a recording, and from that through the controller once more."""
     (tmp_path / "rig.toml").write_text(RIG)

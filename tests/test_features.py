@@ -241,7 +241,6 @@ def test_blocks_are_joined_in_order() -> None:
     assert (RBF(2) + RBF(1)).names(2) == ("rbf1", "rbf2", "rbf1 (2)")
 
 
-@pytest.mark.compiled
 def test_a_custom_feature_runs_in_the_loop_and_through_a_copy() -> None:
     """Its address is made anew where a controller is copied or sent."""
     features = Custom(halves, ("half", "product")) + Bias()

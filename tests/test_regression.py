@@ -252,7 +252,7 @@ def loop(
     return run, controller.read(run.final_state).theta
 
 
-@pytest.mark.parametrize("unit", [2.0**-17, 1.0, 2.0**17])  # scales are powers of two
+@pytest.mark.parametrize("unit", [2.0**-17, 2.0**17])  # scales are powers of two
 def test_coefficients_are_in_the_plants_units(unit: float) -> None:
     """What is learned is the plant, whatever the unit of y."""
     _, theta = loop(
