@@ -274,7 +274,9 @@ def test_a_shaper_leaves_no_vibration_of_its_mode(
         [[0.0, 1.0], [-(omega**2), -2.0 * zeta * omega]], [0.0, omega**2], [1.0, 0.0]
     )
     follow = Prefiltered(PID(0.0, setpoint=[0.0, 1.0, 0.0], dt=1e-3), made)  # u = r_shaped
-    run = ql.simulate(mode, follow, ql.Scenario(reference=1.0, duration=made.times[-1] + 3.0))
+    run = ql.simulate(
+        mode, follow, ql.Scenario(reference=1.0, duration=round(made.times[-1] + 3.0, 3))
+    )
     assert run["r_shaped"][-1] == pytest.approx(1.0)
     assert np.max(np.abs(run["y"][run.t > made.times[-1] + 2e-3] - 1.0)) < 1e-5
 
