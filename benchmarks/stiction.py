@@ -72,12 +72,16 @@ TWINS: dict[str, Any] = {
 
 def learners(speed: float) -> dict[str, Any]:
     """Return the learners by name; ``speed`` is that of the friction features."""
+    smooth = State() + Friction(speed=speed) + Bias()
+    abrupt = State() + Friction(speed=speed, sign=True) + Bias()
     return {
         "none": None,
         "Kalman": Kalman(),
         "RLS": RLS(),
-        "RLS, tanh": RLS(State() + Friction(speed=speed) + Bias()),
-        "RLS, tanh and sign": RLS(State() + Friction(speed=speed, sign=True) + Bias()),
+        "RLS, tanh": RLS(smooth),
+        "RLS, tanh and sign": RLS(abrupt),
+        "RLS, tanh, bias_bandwidth=0": RLS(smooth, bias_bandwidth=0.0),
+        "RLS, tanh and sign, bias_bandwidth=0": RLS(abrupt, bias_bandwidth=0.0),
     }
 
 
