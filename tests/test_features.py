@@ -190,6 +190,14 @@ def test_the_size_of_a_custom_feature_changes_nothing_but_its_coefficient() -> N
     assert plain["a"] != 0.0
 
 
+def test_a_custom_feature_that_is_not_defined_everywhere_is_zero_elsewhere() -> None:
+    """√y, where y is negative: what is learned stays finite, and right."""
+    root = Custom(lambda x, u: (math.sqrt(x[0]) if x[0] > 0.0 else math.nan,), names=("root",))
+    found, outputs = learned(root, lambda x: 3.0 * math.sqrt(max(x[0], 0.0)))
+    assert np.all(np.isfinite(outputs))
+    assert found["root"] == pytest.approx(3.0, rel=1e-3)
+
+
 def test_periodic_features_learn_a_force_once_for_all_speeds() -> None:
     """Its sines and cosines, in the plant's units, while the speed changes all the time."""
     block = Periodic(period=1.6, orders=(1, 3))

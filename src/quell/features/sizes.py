@@ -50,10 +50,15 @@ def update_sizes(unscaled: Indices, sizes: Vector, values: Vector) -> bool:
 
 @kernel
 def scale_by_sizes(unscaled: Indices, sizes: Vector, values: Vector) -> None:
-    """Divide features by their sizes; one that was always zero remains so until it has a size."""
+    """Divide features by their sizes.
+
+    One that was always zero remains so until it has a size, and one that is not finite is zero:
+    where a function of the user is not defined, it explains nothing.
+    """
     for k in range(sizes.size):
-        known = sizes[k] > LEAST
-        values[unscaled[k]] = values[unscaled[k]] / sizes[k] if known else 0.0
+        value = values[unscaled[k]]
+        known = sizes[k] > LEAST and is_finite(value)
+        values[unscaled[k]] = value / sizes[k] if known else 0.0
 
 
 @kernel
