@@ -10,7 +10,7 @@ central differences of its own ``predict``. The constant, and autonomous feature
 a feedforward: they move the loop but do not close it, so no margin depends on them.
 
 A guard multiplies all of it by the learner's authority β. When it clips the output
-(``Reason.OUT_OF_BOUNDS``, ``TOO_FAST``), the true feedback is smaller than the one computed here.
+(``Reason.OUT_OF_BOUNDS``), the true feedback is smaller than the one computed here.
 """
 
 from __future__ import annotations

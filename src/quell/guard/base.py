@@ -1,7 +1,7 @@
 """Functions of a guard, registered for the type of its parameters; their defaults limit nothing.
 
 In each sample the controller calls ``assess`` before the learner adapts, ``limit`` after it has
-predicted, and ``record_output`` when the applied u is known.
+predicted, ``confine`` for each u that it tries, and ``record_output`` when the applied u is known.
 """
 
 from __future__ import annotations
@@ -32,13 +32,26 @@ def assess(guard: Any, memory: Any, f_plain: float) -> None:
 
 @generic_with_default
 def limit(
-    guard: Any, memory: Any, f_plain: float, constant: float, slope: float, u_before: float
+    guard: Any,
+    memory: Any,
+    f_plain: float,
+    f_shown: float,
+    constant: float,
+    slope: float,
+    u_before: float,
 ) -> tuple[float, float, bool]:
     """Return the permitted ``(constant, slope)`` of the output ``constant + slope · u``.
 
-    The third value is true if the output is not finite: then the learner has to be restarted.
+    ``f_shown`` is f_L^F. The third value is true if the output is not finite: then the learner has
+    to be restarted.
     """
     return constant, slope, False
+
+
+@generic_with_default
+def confine(guard: Any, memory: Any, f_learned: float) -> float:
+    """Return the permitted f_L next to ``f_learned``, after ``limit``."""
+    return f_learned
 
 
 @generic_with_default

@@ -12,7 +12,6 @@ class Reason(IntEnum):
     UNPROVEN = 1
     TOO_LOUD = 2
     OUT_OF_BOUNDS = 3
-    TOO_FAST = 4
     EXPLODED = 5
     NOT_FINITE = 6
 
@@ -26,8 +25,7 @@ _MESSAGES = {
     Reason.TRUSTED: "The learner explains what the observer would have missed; full authority.",
     Reason.UNPROVEN: "The learner has so far explained too little of what the observer misses.",
     Reason.TOO_LOUD: "The learner's output is larger than what it should explain; scaled down.",
-    Reason.OUT_OF_BOUNDS: "The learner's output is further from f than its bound; clipped or zero.",
-    Reason.TOO_FAST: "The learner's output changes faster than f can; its rate is limited.",
+    Reason.OUT_OF_BOUNDS: "The learner would change the estimate by more than its bound; clipped.",
     Reason.EXPLODED: "The learner's output is a hundred times larger than f; "
     "it was cut off and starts again without authority.",
     Reason.NOT_FINITE: "The learner's output is not finite; "

@@ -20,7 +20,6 @@ _ESTIMATES = {"f_hat": "estimate of f", "f_learned": "learned share", "f_residua
 _MARKED = (
     Reason.TOO_LOUD,
     Reason.OUT_OF_BOUNDS,
-    Reason.TOO_FAST,
     Reason.EXPLODED,
     Reason.NOT_FINITE,
 )

@@ -73,7 +73,7 @@ def _feed_forward(design: AdrcDesign, state: AdrcState, u: float) -> None:
     """Set the learner's share of f for the estimates in ``state`` under u."""
     loop = state.loop[0]
     constant, slope = predict(design.learner, state.learner, state.seen, u)
-    constant, slope, _ = limit(design.guard, state.guard, 0.0, constant, slope, u)
+    constant, slope, _ = limit(design.guard, state.guard, 0.0, 0.0, constant, slope, u)
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * u
 

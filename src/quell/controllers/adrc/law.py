@@ -35,6 +35,7 @@ from quell.controllers.base import (
 from quell.controllers.limits import Limits, apply_limits, largest_magnitude
 from quell.guard import (
     assess,
+    confine,
     limit,
     record_output,
     reset_filters,
@@ -149,11 +150,20 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
             status |= trouble(design.learner, state.learner)
     constant, slope = predict(design.learner, state.learner, seen, u_acting)
     output = constant + slope * u_acting
-    constant, slope, was_cut = limit(design.guard, state.guard, f_plain, constant, slope, u_acting)
+    constant, slope, was_cut = limit(
+        design.guard, state.guard, f_plain, loop.f_learned_shown, constant, slope, u_acting
+    )
     if was_cut:
         status |= _LEARNER_CUT
         restart(design.learner, state.learner)
     unlimited = unlimited_control(design, state, constant, slope)
+    if slope != 0.0:
+        # The guard's bound holds for the new u, too: beyond it the output counts as a constant.
+        f_learned = constant + slope * acting_control(design.eso, state.z, unlimited)
+        permitted = confine(design.guard, state.guard, f_learned)
+        if permitted != f_learned:
+            constant, slope = permitted, 0.0
+            unlimited = unlimited_control(design, state, constant, slope)
     if not is_finite(unlimited):
         status |= _OVERFLOWED
         # Else a finite θ that is out of all proportion overflows again in the next sample.
@@ -223,6 +233,8 @@ def _finish_sample(design: AdrcDesign, state: AdrcState, u_acting: float) -> Non
     """
     loop = state.loop[0]
     f_learned = loop.constant + loop.slope * u_acting
+    if loop.slope != 0.0:
+        f_learned = confine(design.guard, state.guard, f_learned)
     loop.f_learned = f_learned
     loop.f_learned_shown = lag_push(design.lag, state.shadow, 0, f_learned)
     commit(design.learner, state.learner, state.seen, u_acting, f_learned)
