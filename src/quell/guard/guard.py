@@ -30,6 +30,9 @@ and what the bound took is made up for while the target is still near:
     target ← target + β (g − g_before),        e_L = clip( target − f_L^F, ±β κ e ),
     f_L = f_L^F + e_L,        target ← target + dt/(20 lags) (f_L − target)
 
+For observers with which that recursion is unstable (``correction.is_invertible``), F is here the
+filter of a chain of integrators with the same omega_o; for them nothing is certified.
+
 An output that is not finite, or a hundred times larger than f, is cut off within the sample.
 
 docs/theory, "The guard", gives theorem, proof and measurements.
@@ -55,6 +58,7 @@ from quell.guard.base import (
     write_channels,
 )
 from quell.guard.certified import certified_bound
+from quell.guard.correction import is_invertible
 from quell.guard.reason import Reason
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
@@ -114,6 +118,8 @@ class GuardDesign(NamedTuple):
     leak: float  # share of its distance to f_L that the target loses in a sample
     home: float  # share of its distance to βg that the target loses in a sample, at most that of e
     settling: float  # samples in which q is wrong after the filters were emptied
+    invertible: bool  # whether f_L = f_L^F + e_L is stable with the filter of the observer
+    chain: Any  # lag filter of f_L where it is not
     least_slope: float  # least ∂f_L/∂u that is used; beyond it the output counts as a constant
     largest_slope: float  # largest ∂f_L/∂u that is used
 
@@ -148,13 +154,14 @@ class GuardMemory(NamedTuple):
     """State of the guard."""
 
     chain: Matrix  # lag filters of f_plain, g and v (3, …)
-    shown: Vector  # their outputs: f_plain^F, g^F and p (3,)
+    fed: Matrix  # lag filter of f_L, if it is not that of the observer (1, …)
+    shown: Vector  # their outputs: f_plain^F, g^F, p and f_L^F (4,)
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
 
 
-# Rows of GuardMemory.chain and entries of GuardMemory.shown.
-_F_PLAIN, _G, _V = range(3)
+# Rows of GuardMemory.chain and, with the last, entries of GuardMemory.shown.
+_F_PLAIN, _G, _V, _F_L = range(4)
 
 
 @assess.register(GuardDesign)
@@ -219,6 +226,8 @@ def _limit(
     sample = memory.sample[0]
     output = constant + slope * u_before
     most = _CUT_OFF * max(abs(f_plain), sample.peak)
+    if not guard.invertible:
+        f_shown = memory.shown[_F_L]
     sample.shown = f_shown
     if not (abs(output) <= most and is_finite(slope)):
         finite = is_finite(output) and is_finite(slope)
@@ -274,6 +283,8 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
     v = sample.output - shown[_G]
     shown[_G] = lag_push(guard.lag, memory.chain, _G, sample.output)
     shown[_V] = lag_push(guard.lag, memory.chain, _V, v)
+    if not guard.invertible:
+        shown[_F_L] = lag_push(guard.chain, memory.fed, 0, f_learned)
     sample.own_peak = max(abs(f_learned - sample.shown), guard.own_decay * sample.own_peak)
     if sample.limit > 0.0:
         sample.target += guard.leak * (f_learned - sample.target)
@@ -300,6 +311,9 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
         memory.shown[i] = 0.0
         for j in range(memory.chain.shape[1]):
             memory.chain[i, j] = 0.0
+    memory.shown[_F_L] = 0.0
+    for j in range(memory.fed.shape[1]):
+        memory.fed[0, j] = 0.0
     sample.output = sample.begun = sample.target = sample.shown = 0.0
     sample.limit = sample.own_peak = sample.unsettled = 0.0
 
@@ -385,13 +399,15 @@ class Guard:
             leak=share(_LEAK_LAGS),
             home=share(_HOME_LAGS),
             settling=_SETTLING_LAGS * lag_time / dt,
+            invertible=is_invertible(observer),
+            chain=lag_of(ESO.model_free(observer.order, observer.b0, observer.omega_o, dt)),
             least_slope=least_slope,
             largest_slope=largest_slope,
         )
 
     def memory(self, parameters: GuardDesign) -> GuardMemory:
         """Return the state before the first sample, without authority."""
-        chain = lag_memory(parameters.lag, 3)
-        memory = GuardMemory(chain, np.zeros(3), GuardAverages.zeros(), GuardSample.zeros())
+        filters = lag_memory(parameters.lag, 3), lag_memory(parameters.chain, 1), np.zeros(4)
+        memory = GuardMemory(*filters, GuardAverages.zeros(), GuardSample.zeros())
         _withdraw_authority(memory)
         return memory
