@@ -17,6 +17,8 @@ new speeds     ±0.03 to 0.3 rev/s, another one every five seconds: 120 s, from 
 shift          0.1 rev/s, the map shifted by half a turn at 60 s: the worst window of ten observer
                lags after it, over MF-ESO's; and the revolutions until the RMS of the last
                revolution is within 10 % of that before
+restart        the same, by a restart: at 60 s the motor stands at angle zero, where the encoder
+               now shows half a turn; the controller starts from rest with what it has learned
 =============  ====================================================================================
 
 All figures are RMS errors of the position over that of MF-ESO (learner none, in mrad), with and
@@ -107,8 +109,10 @@ def motor(file: Path | str, **parameters: Any) -> Any:
     return ql.plants.dc_motor(cogging_map=cogging, torque_constant=TORQUE_CONSTANT, **parameters)
 
 
-def error(plant: Any, learner: Any, guard: Any, reference: Any, seconds: float, w: Any) -> Vector:
-    """Return the error of the position in each sample [rad], after the run."""
+def error(
+    plant: Any, learner: Any, guard: Any, reference: Any, seconds: float, w: Any, **scenario: Any
+) -> Vector:
+    """Return the error of the measured position in each sample [rad], after the run."""
     b0 = float(plant.linear.B[1, 0])
     controller = ql.ADRC(
         ql.ESO.model_free(order=2, b0=b0, omega_o=OMEGA_O, dt=DT),
@@ -117,10 +121,10 @@ def error(plant: Any, learner: Any, guard: Any, reference: Any, seconds: float, 
         guard=guard,
         feedforward=True,
     )
-    run = ql.simulate(plant, controller, ql.Scenario(reference, seconds, w))
+    run = ql.simulate(plant, controller, ql.Scenario(reference, seconds, w, **scenario))
     if run.diverged:
         return np.full(round(seconds / DT) + 1, np.inf)
-    return np.asarray(run["r"] - run["y"])
+    return np.asarray(run["r"] - run["y_measured"])
 
 
 def rms(values: Vector) -> float:
@@ -150,18 +154,29 @@ def steady(plant: Any, learner: Any, guard: Any, name: str) -> float:
     return rms(error(plant, learner, guard, reference, seconds, ())[round(since / DT) :])
 
 
-def shifted(plant: Any, learner: Any, guard: Any) -> tuple[float, float]:
+def shifted(plant: Any, learner: Any, guard: Any, restart: bool) -> tuple[float, float]:
     """Return the worst window after the shift [rad], and the revolutions until as good as before.
 
     These are infinite if it is never as good within the run.
     """
-    moved = ql.signals.Step(math.pi, at=SHIFT_AT)
-    e = error(plant, learner, guard, turning(SHIFT_SPEED), END, (0.0, moved))
+    moved, reference = ql.signals.Step(math.pi, at=SHIFT_AT), turning(SHIFT_SPEED)
+    if restart:
+        again = ql.signals.Ramp(slope=math.tau * SHIFT_SPEED, start=SHIFT_AT)
+        reference = reference.until(SHIFT_AT, then=math.pi + again)
+        options: dict[str, Any] = {"noise": moved, "rest_at": (SHIFT_AT,)}
+        e = error(plant, learner, guard, reference, END, (), **options)
+    else:
+        e = error(plant, learner, guard, reference, END, (0.0, moved))
     first, revolution = round(SHIFT_AT / DT), 1.0 / SHIFT_SPEED
     worst = float(np.max(moving_rms(e, 10.0 * LAG)[first:]))
     last = moving_rms(e, revolution)
     good = np.flatnonzero(last[first + round(revolution / DT) :] <= 1.1 * last[first - 1])
     return worst, 1.0 + good[0] * DT / revolution if good.size else math.inf
+
+
+def shown(value: float, plain: float, learner: Any) -> str:
+    """Return an error over that of MF-ESO; without learner, in mrad."""
+    return f"{1e3 * value:.1f}" if learner is None else f"{value / plain:.3f}"
 
 
 def main() -> None:
@@ -172,21 +187,22 @@ def main() -> None:
     options = parser.parse_args()
     plant = motor(options.file)
     title = "RMS error over MF-ESO's; for it, in mrad"
-    table = Table("learner", "guard", *STEADY, "shift: worst", "revolutions", title=title)
+    shifts = {"shift": False, "restart": True}
+    columns = [name for shift in shifts for name in (f"{shift}: worst", "revolutions")]
+    table = Table("learner", "guard", *STEADY, *columns, title=title)
     plain: dict[str, float] = {}
     for label, learner in LEARNERS.items():
         if options.only and label not in ("none", options.only):
             continue
         for guard in (None, ql.Guard()) if learner is not None else (None,):
             found = {name: steady(plant, learner, guard, name) for name in STEADY}
-            found["shift"], revolutions = shifted(plant, learner, guard)
-            plain = plain or found
-            if learner is None:
-                cells = [f"{1e3 * value:.1f}" for value in found.values()]
-            else:
-                cells = [f"{value / plain[name]:.3f}" for name, value in found.items()]
-            table.add_row(label, "yes" if guard else "no", *cells, f"{revolutions:.1f}")
-    Console(width=140).print(table)
+            worst = {n: shifted(plant, learner, guard, restart) for n, restart in shifts.items()}
+            plain = plain or found | {n: value for n, (value, _) in worst.items()}
+            cells = [shown(value, plain[name], learner) for name, value in found.items()]
+            for name, (value, revolutions) in worst.items():
+                cells += [shown(value, plain[name], learner), f"{revolutions:.1f}"]
+            table.add_row(label, "yes" if guard else "no", *cells)
+    Console(width=170).print(table)
 
 
 if __name__ == "__main__":
