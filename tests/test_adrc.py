@@ -52,7 +52,12 @@ def test_a_known_plant_answers_a_step_as_the_ideal_loop_does() -> None:
 
 
 @pytest.mark.parametrize(
-    "learner", [None, ql.learners.Kalman(), ql.learners.BatchGradient(rate=1e-5)]
+    "learner",
+    [
+        None,
+        pytest.param(ql.learners.Kalman(), marks=pytest.mark.compiled),
+        ql.learners.BatchGradient(rate=1e-5),
+    ],
 )
 def test_a_loop_of_ones_own_is_the_simulated_loop(learner: object) -> None:
     """``step`` sample by sample gives the trajectory of ``simulate``, to the rounding of the plant's own arithmetic."""

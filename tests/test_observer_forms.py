@@ -537,6 +537,7 @@ def test_time_scales_are_those_of_the_poles() -> None:
     assert FORMS["cascade"].lag_time == pytest.approx(3 / 20.0 + 3 / 10.0, rel=0.02)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", ["half gain", "cascade", "Kalman", "delay", "nonlinear"])
 def test_a_hand_over_is_bumpless_in_every_form(name: str) -> None:
     """From somebody else's u at rest, with a load: u goes on from there, and y stays."""

@@ -18,6 +18,7 @@ from quell.controllers.base import control
 from quell.controllers.stateful import named_arrays as _named_arrays
 from quell.kernels.dispatch import call_specialised, compiled, dispatcher_for, interpreted
 from quell.learners.base import adapt, coefficients, commit, forget, predict
+from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.observers.delay import without_delay
 from quell.plants import registry
@@ -135,16 +136,19 @@ def test_an_observer_estimates_a_constant_disturbance_and_changes_only_its_state
 
 
 @compiled
-def estimate(model: Any, z: Any, sample: Sample, y: Any, u: Any, found: Any) -> None:
-    """Show an observer what is given, as a control law does, with no loop around it."""
+def estimate(
+    model: Any, z: Any, sample: Sample, lag: Any, shadow: Any, y: Any, u: Any, found: Any
+) -> None:
+    """Show an observer and its lag filter what is given, as a law does, with no loop around it."""
     begin(model, z, sample.seen, y[0])
     for k in range(1, y.size):
         f_learned = 0.1 * u[k]
         found[k, 0] = expected_measurement(model, z, u[k - 1], f_learned)
         found[k, 1] = acting_control(model, z, u[k - 1])
         observe(model, z, sample.seen, y[k], u[k - 1], f_learned)
+        found[k, 2] = lag_push(lag, shadow, 0, f_learned)
         for i in range(sample.seen.size):
-            found[k, 2 + i] = sample.seen[i]
+            found[k, 3 + i] = sample.seen[i]
 
 
 @pytest.mark.compiled
@@ -155,11 +159,13 @@ def test_an_observer_estimates_the_same_again_and_interpreted(
     """Same samples, same estimates, to the last bit; interpreted = compiled."""
     observer = OBSERVERS[name]
     y, u = 0.01 * rng.normal(size=(2, 300)).cumsum(axis=1)
+    # A nonlinear observer has no lag filter; any will do.
+    lag = lag_of(OBSERVERS["half gain" if name == "nonlinear" else name])
 
     def estimates(entry: Any) -> Any:
         z, sample = np.zeros(observer.states), Sample(np.zeros(observer.order + 1))
-        found = np.zeros((y.size, 3 + observer.order))
-        entry(observer.model, z, sample, y, u, found)
+        found = np.zeros((y.size, 4 + observer.order))
+        entry(observer.model, z, sample, lag, lag_memory(lag, 1), y, u, found)
         return found
 
     first = estimates(partial(call_specialised, estimate))
