@@ -17,10 +17,11 @@ that; and while the learner acts, e grows by a factor of 2.7 in five lags at mos
     c_L ← max(|e_L|, λ c_L),        e → |q| − γ c_L  where that is larger,        e ≤ P
 
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
-each in which it would have increased it costs credit; M is the mean of q² over T:
+each in which it would have increased it costs credit; M is the mean of q² over
+T, which bursts raise slowly:
 
     p̄ = clip(p, ±κe),        C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
-    β = min( clip(2 C, 0, 1),  (1 − S)/S ),        S: mean share of p² in p² + q² over T
+    β = min( clip(2 C, 0, 1),  1.1 (1 − S)/S ),        S: mean share of p² in p² + q² over T
 
 C starts at −1. The second term of β scales down an output that is larger than what it explains.
 
@@ -73,6 +74,8 @@ _AVERAGING_LAGS = 15.0
 _CREDIT_TIME = 2.0 / 3.0
 # Credit from which the authority is full; between that and 1 a learner may err for a while.
 _FULL_CREDIT = 0.5
+# Largest energy of p in units of that of q: p of a good learner is at most a little too large.
+_LOUDEST = 1.1
 # A single sample costs at most this many times what a perfect one earns.
 _WORST_SAMPLE = 3.0
 # M counts so many times: a sinusoid then earns half of what the best sample earns.
@@ -128,7 +131,8 @@ class GuardAverages(Scalars):
     """Averages over past samples."""
 
     loudness: float  # S
-    error_plain: float  # M, mean square of q [(y-unit/s^n)²]
+    square: float  # M, mean of q² that grows by a factor of 2.7 in two lags at most
+    error_plain: float  # mean square of q [(y-unit/s^n)²]
     error_learned: float  # mean square of q − p [(y-unit/s^n)²]
 
 
@@ -184,6 +188,10 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     energy = qq + pp
     if energy < _TINY:
         return
+    # A burst, for example after an outlier, must not let everything else count for nothing.
+    more = guard.forget * (qq - averages.square)
+    is_new = sample.samples * guard.forget < 1.0
+    averages.square += more if is_new else min(more, guard.rise * averages.square)
     averages.error_plain += guard.forget * (qq - averages.error_plain)
     averages.error_learned += guard.forget * ((q - p) * (q - p) - averages.error_learned)
     averages.loudness += (
@@ -194,7 +202,7 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     most = guard.bound * sample.typical_error
     bounded = min(max(p, -most), most)
     reduced = (2.0 * q - bounded) * bounded
-    earned = reduced / max(qq, _MEAN_SQUARES * averages.error_plain, _TINY)
+    earned = reduced / max(qq, _MEAN_SQUARES * averages.square, _TINY)
     sample.credit = min(max(sample.credit + guard.earn * max(earned, -_WORST_SAMPLE), -1.0), 1.0)
 
 
@@ -264,7 +272,7 @@ def _authority(memory: GuardMemory) -> tuple[float, int]:
     earned = credit / _FULL_CREDIT
     if earned <= 0.0:
         return 0.0, _UNPROVEN
-    scaled = (1.0 - loudness) / max(loudness, _TINY)
+    scaled = _LOUDEST * (1.0 - loudness) / max(loudness, _TINY)
     if scaled < min(earned, 1.0):
         return scaled, _TOO_LOUD
     return (earned, _UNPROVEN) if earned < 1.0 else (1.0, _TRUSTED)
