@@ -162,15 +162,15 @@ def test_no_learner_that_a_search_finds_exceeds_the_bound_of_its_guard() -> None
     plant = ([1.6], [1.0, 0.0, 0.0])
     observer, guard = ql.ESO.model_free(2, 1.0, 10.0, DT), ql.Guard()
     load = ql.signals.Ramp(1.0)
-    scenario = ql.Scenario(duration=60.0, disturbances=(load,))
+    scenario = ql.Scenario(duration=40.0, disturbances=(load,))
     pulse = correcting(observer, plant, [1.0] + [0.0] * 600)["theta"][1:, 0]
-    lag, samples = observer.lag_time / DT, round(60.0 / DT) + 1
+    lag, samples = observer.lag_time / DT, round(40.0 / DT) + 1
     without = ql.ADRC(observer, omega_c=1.0)
     plain = ql.simulate(plant, without, scenario)
     alone = np.max(np.abs(observer_error(without, plain)))
     found = certify(plant, ql.ADRC(observer, omega_c=1.0, guard=guard))
     trusted = 0
-    for seed in range(8):
+    for seed in range(4):
         push = draw_push(np.random.default_rng(seed), pulse, samples, lag)
         learner = Spender(1.6 * load.evaluate(DT * np.arange(samples)), push, 0.6)
         hostile = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard)
@@ -178,7 +178,7 @@ def test_no_learner_that_a_search_finds_exceeds_the_bound_of_its_guard() -> None
         trusted += np.max(run["authority"]) > 0.5
         assert np.max(np.abs(observer_error(hostile, run))) <= found.error_bound(alone)
         assert np.max(np.abs(run["y"] - plain["y"])) <= found.output_bound(alone)
-    assert trusted >= 6
+    assert trusted >= 3
 
 
 def test_the_peak_gain_of_first_and_second_order_is_the_closed_form() -> None:
