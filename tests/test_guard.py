@@ -239,7 +239,7 @@ def test_an_output_is_cut_off_where_it_is_a_hundred_times_larger_than_f() -> Non
         (0.25, 0.5, 0.5, ql.Reason.UNPROVEN),
         (0.5, 0.5, 1.0, ql.Reason.TRUSTED),
         (1.0, 0.2, 1.0, ql.Reason.TRUSTED),
-        (1.0, 0.8, 0.275, ql.Reason.TOO_LOUD),
+        (1.0, 0.8, 0.3, ql.Reason.TOO_LOUD),
         (0.1, 0.8, 0.2, ql.Reason.UNPROVEN),
         (0.1, 0.0, 0.2, ql.Reason.UNPROVEN),
     ],
@@ -247,7 +247,7 @@ def test_an_output_is_cut_off_where_it_is_a_hundred_times_larger_than_f() -> Non
 def test_the_authority_is_what_a_learner_has_earned(
     credit: float, loudness: float, authority: float, reason: ql.Reason
 ) -> None:
-    """``β = min(clip(2 C, 0, 1), 1.1 (1 − S)/S)``, and why."""
+    """``β = min(clip(2 C, 0, 1), 1.2 (1 − S)/S)``, and why."""
     design, memory = trusted()
     memory.sample[0].credit, memory.averages[0].loudness = credit, loudness
     limit(design, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
@@ -260,7 +260,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
     guard = ql.Guard(time=0.4)
     design, memory = guard.design(OBSERVER), guard.memory(guard.design(OBSERVER))
     forget, lag = -math.expm1(-5e-3 / 0.4), 5 / 10.0
-    rise, decay, growth = (-math.expm1(-5e-3 / (lags * lag)) for lags in (2.0, 200.0, 5.0))
+    rise, decay, growth = (-math.expm1(-5e-3 / (lags * lag)) for lags in (0.7, 200.0, 5.0))
     m, s, credit, peak, e, own, f_shown = 0.0, 0.5, -1.0, 0.0, 0.0, 0.0, 0.0
     shadow, square, spared = np.zeros((1, 5)), 0.0, 0
     for k in range(600):
@@ -340,7 +340,7 @@ def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
 
 
 def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() -> None:
-    """After a NaN it is unheard for as long as at the start, though it is right all the time."""
+    """After a NaN it is unheard for at least half as long as at the start, though it is right."""
     design = ql.Guard(time=2.0).design(OBSERVER)
     memory = ql.Guard(time=2.0).memory(design)
     chain, shown, heard = np.zeros((1, 5)), 0.0, []
@@ -358,7 +358,7 @@ def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() 
         shown = lag_push(design.lag, chain, 0, f)
     again = heard[3001:].index(True)
     assert heard[2999]
-    assert 0.5 < again / heard.index(True) < 2.0
+    assert 0.5 < again / heard.index(True) < 4.0
 
 
 def test_status_and_reason_say_what_happened() -> None:

@@ -481,19 +481,19 @@ def test_what_was_learned_forbids_another_nominal_gain() -> None:
 
 
 @pytest.mark.parametrize("said", [0.9, -0.9])
-def test_a_guard_limits_what_a_learner_says_at_the_start(said: float) -> None:
-    """As in a sample with f_plain = 0: no faster than 2 omega_o e from zero, which both lie within."""
+def test_a_guard_starts_with_no_correction(said: float) -> None:
+    """What a trusted learner says at the start is a constant: the observer's estimate has it all."""
     learner, guard = ql.learners.Kalman(state=False), ql.Guard()
     controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=learner, guard=guard)
     state = controller._state
     state.learner.theta[0] = said
-    state.guard.averages.view(float)[:3] = 0.5  # the record of one that is always right
-    state.guard.sample[0].typical_error = 1.0
+    state.guard.sample[0].credit = 1.0
+    state.guard.sample[0].typical_error = state.guard.sample[0].peak = 1.0
     controller.start_at([0.5, 0.0], 2.0)
-    change = 2.0 * 20.0 * DT
-    assert state.loop[0].f_learned == pytest.approx(math.copysign(change, said), rel=1e-12)
+    assert state.loop[0].f_learned == 0.0
     assert controller.estimate.f == pytest.approx(2.0, rel=1e-12)
-    assert state.seen[2] == pytest.approx(2.0 - math.copysign(change, said), rel=1e-12)
+    assert state.seen[2] == pytest.approx(2.0, rel=1e-12)
+    assert state.guard.sample[0].output == said
 
 
 def test_without_a_reference_a_started_loop_keeps_the_one_it_was_started_with() -> None:

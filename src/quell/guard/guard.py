@@ -10,7 +10,7 @@ of the observer later it is known what the plain ESO has missed, and what g woul
 
     q = F (f − f^F) = f_plain − f_plain^F,        p = F v,        v = g − g^F
 
-**The bound e.** P, the peak of |q|, rises within two lags and decays over 200. The learner's own
+**The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. The learner's own
 share of q is at most Γ times its largest recent correction, so e counts only what exceeds γ times
 that; and while the learner acts, e grows by a factor of 2.7 in five lags at most (METHOD 8):
 
@@ -21,7 +21,7 @@ each in which it would have increased it costs credit; M is the mean of q² over
 T, which bursts raise slowly:
 
     p̄ = clip(p, ±κe),        C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
-    β = min( clip(2 C, 0, 1),  1.1 (1 − S)/S ),        S: mean share of p² in p² + q² over T
+    β = min( clip(2 C, 0, 1),  1.2 (1 − S)/S ),        S: mean share of p² in p² + q² over T
 
 C starts at −1. The second term of β scales down an output that is larger than what it explains.
 
@@ -63,6 +63,7 @@ from quell.guard.correction import is_invertible
 from quell.guard.reason import Reason
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
+from quell.kernels.sized import Flag
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -75,13 +76,13 @@ _CREDIT_TIME = 2.0 / 3.0
 # Credit from which the authority is full; between that and 1 a learner may err for a while.
 _FULL_CREDIT = 0.5
 # Largest energy of p in units of that of q: p of a good learner is at most a little too large.
-_LOUDEST = 1.1
+_LOUDEST = 1.2
 # A single sample costs at most this many times what a perfect one earns.
 _WORST_SAMPLE = 3.0
 # M counts so many times: a sinusoid then earns half of what the best sample earns.
 _MEAN_SQUARES = 4.0
 # P follows a growing |q| within this many lags, and decays over this many.
-_RISE_LAGS, _DECAY_LAGS = 2.0, 200.0
+_RISE_LAGS, _DECAY_LAGS = 0.7, 200.0
 # e grows by a factor of 2.7 in this time while the learner acts.
 _GROWTH_LAGS = 5.0
 # Samples below this share of P count less for S, because q at rest is noise.
@@ -93,7 +94,7 @@ _OWN_SHARE, _OWN_LAGS = 0.2, 10.0
 # The target returns to f_L over this time, where the bound keeps them apart.
 _LEAK_LAGS = 20.0
 # The target approaches βg over this time, by at most e in it: a slow drift has almost no effect.
-_HOME_LAGS = 100.0
+_HOME_LAGS = 1000.0
 # After the filters were emptied in mid-run, q is wrong for this time.
 _SETTLING_LAGS = 3.0
 # An output that is so many times larger than f is cut off.
@@ -121,7 +122,7 @@ class GuardDesign(NamedTuple):
     leak: float  # share of its distance to f_L that the target loses in a sample
     home: float  # share of its distance to βg that the target loses in a sample, at most that of e
     settling: float  # samples in which q is wrong after the filters were emptied
-    invertible: bool  # whether f_L = f_L^F + e_L is stable with the filter of the observer
+    invertible: Flag  # whether f_L = f_L^F + e_L is stable with the filter of the observer
     chain: Any  # lag filter of f_L where it is not
     least_slope: float  # least ∂f_L/∂u that is used; beyond it the output counts as a constant
     largest_slope: float  # largest ∂f_L/∂u that is used
@@ -131,7 +132,7 @@ class GuardAverages(Scalars):
     """Averages over past samples."""
 
     loudness: float  # S
-    square: float  # M, mean of q² that grows by a factor of 2.7 in two lags at most
+    square: float  # M, mean of q² that grows by a factor of 2.7 in 0.7 lags at most
     error_plain: float  # mean square of q [(y-unit/s^n)²]
     error_learned: float  # mean square of q − p [(y-unit/s^n)²]
 
