@@ -69,12 +69,12 @@ class Certificate:
 
     @property
     def error_factor(self) -> float:
-        """Bound on sup |q| over sup |q_0|: 1/(1 − κΓ); infinite if there is none."""
+        """Bound on ``sup |q|`` over ``sup |q_0|``, 1/(1 − κΓ); infinite if there is none."""
         return 1.0 / (1.0 - self.kappa * self.gain) if self.certified else math.inf
 
     @property
     def output_factor(self) -> float:
-        """Bound on sup |y − y_0| over sup |q_0| [s^n], the largest of all plants."""
+        """Bound on ``sup |y − y_0|`` over ``sup |q_0|`` [s^n], the largest of all plants."""
         if not self.certified:
             return math.inf
         return max(
@@ -83,11 +83,11 @@ class Certificate:
         )
 
     def error_bound(self, q_0: float) -> float:
-        """Return the bound on sup |q| for sup |q_0| = ``q_0`` [y-unit/s^n]."""
+        """Return the bound on ``sup |q|`` for ``sup |q_0| = q_0`` [y-unit/s^n]."""
         return checks.non_negative("q_0", q_0) * self.error_factor
 
     def output_bound(self, q_0: float) -> float:
-        """Return the bound on sup |y − y_0| [y-unit] for sup |q_0| = ``q_0`` [y-unit/s^n]."""
+        """Return the bound on ``sup |y − y_0|`` [y-unit] for ``sup |q_0| = q_0`` [y-unit/s^n]."""
         return checks.non_negative("q_0", q_0) * self.output_factor
 
     def __str__(self) -> str:

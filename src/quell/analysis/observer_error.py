@@ -18,7 +18,7 @@ def observer_error(controller: Controller, run: Trajectory) -> Vector:
     """Return ``q = f_plain − f_plain^F`` (samples,) [y-unit/s^n] of a run, from its y and u alone.
 
     f_plain is what the observer would estimate without learner. Of a run without learner the
-    largest |q| is the ``q_0`` of a ``Certificate``.
+    largest ``|q|`` is the ``q_0`` of a ``Certificate``.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ class Measures(NamedTuple):
     """Measures of an error e(t), all in its unit."""
 
     rms: float  #: RMS of the whole run
-    peak: float  #: largest |e|
+    peak: float  #: largest ``|e|``
     window: float  #: largest RMS over a window of ``WINDOW_LAGS``
     late: float  #: RMS of the second half
 

@@ -55,7 +55,7 @@ class GeneralLoop:
     dt: float
     gain_error: float  #: b0 / b
     b0: float
-    u_limit: float  #: limit of |u| that the controller knows
+    u_limit: float  #: limit of ``|u|`` that the controller knows
     plant: GeneralPlant
     margin: float  #: modulus margin of the linear part; the least over its operating points
     noise: float  #: standard deviation of the measurement noise
