@@ -48,7 +48,7 @@ def part(label: str, start: float, end: float) -> np.ndarray:
 
 @pytest.mark.compiled
 def test_waves_in_position_and_friction_are_learned_under_the_guard() -> None:
-    """At 0.1 rev/s, from 15 s on: a fifth of the error of MF-ESO at most; it is 0.09 today."""
+    """At 0.1 rev/s, from 15 s on: a fifth of the error of MF-ESO at most; it is 0.07 today."""
     rms = trial().rms
     learned = rms(part("the same, relearn=4", 15.0, 30.0))
     assert learned <= 0.2 * rms(part("none", 15.0, 30.0))
