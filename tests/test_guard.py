@@ -134,7 +134,7 @@ def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
     observer = ql.ESO.model_free(order=4, b0=b0, omega_o=10.0, dt=5e-3)
     design = ql.Guard().design(observer)
     memory = ql.Guard().memory(design)
-    memory.sample[0].credit = memory.sample[0].begun = 1.0
+    memory.sample[0].credit = memory.sample[0].begun = memory.sample[0].share = 1.0
     memory.sample[0].typical_error = memory.sample[0].peak = e
     return design, memory
 
@@ -148,6 +148,7 @@ def test_a_correction_beyond_its_bound_is_clipped(side: float, e: float) -> None
         for share, inside in ((0.99, True), (1.01, False), (20.0, False)):
             design, memory = trusted(e)
             memory.sample[0].credit, memory.sample[0].target = credit, 3.0 * e
+            memory.sample[0].share = authority
             g = side * share * bound
             permitted, slope, cut = limit(design, memory, 5.0 * e, 3.0 * e, g, 0.0, 0.0)
             expected = 3.0 * e + authority * (g if inside else side * bound)
@@ -263,7 +264,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
     rise, decay, growth = (-math.expm1(-5e-3 / (lags * lag)) for lags in (0.7, 200.0, 5.0))
     m, s, credit, peak, e, own, f_shown = 0.0, 0.5, -1.0, 0.0, 0.0, 0.0, 0.0
     shadow, square, spared = np.zeros((1, 5)), 0.0, 0
-    for k in range(600):
+    for k in range(1500):
         f, g = rng.normal(), rng.normal()
         f *= 100.0 if k % 50 == 20 else 0.01 if 60 <= k < 70 else 1.0
         q, p = f - memory.shown[0], memory.shown[2]

@@ -25,11 +25,14 @@ T, which bursts raise slowly:
 
 C starts at −1. The second term of β scales down an output that is larger than what it explains.
 
-**Output.** The target changes by ``β Δg``, so that a change of β over a constant g does nothing,
+**Output.** The target changes by ``β̄ Δg``, so that a change of β over a constant g does nothing,
 and what the bound took is made up for while the target is still near:
 
-    target ← target + β (g − g_before),        e_L = clip( target − f_L^F, ±β κ e ),
+    target ← target + β̄ (g − g_before),        e_L = clip( target − f_L^F, ±β κ e ),
     f_L = f_L^F + e_L,        target ← target + dt/(20 lags) (f_L − target)
+
+β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
+what is constant in e_L.
 
 For observers with which that recursion is unstable (``correction.is_invertible``), F is here the
 filter of a chain of integrators with the same omega_o; for them nothing is certified.
@@ -91,9 +94,11 @@ _NOISE = 0.4
 _OUTLIER = 5.0
 # γ, and the memory of c_L: the learner's own share of q.
 _OWN_SHARE, _OWN_LAGS = 0.2, 10.0
+# β̄ follows β over this time.
+_SMOOTHING_LAGS = 30.0
 # The target returns to f_L over this time, where the bound keeps them apart.
 _LEAK_LAGS = 20.0
-# The target approaches βg over this time, by at most e in it: a slow drift has almost no effect.
+# The target approaches β̄g over this time, by at most e in it: a slow drift has almost no effect.
 _HOME_LAGS = 1000.0
 # After the filters were emptied in mid-run, q is wrong for this time.
 _SETTLING_LAGS = 3.0
@@ -119,8 +124,9 @@ class GuardDesign(NamedTuple):
     bound: float  # κ
     own: float  # γ
     own_decay: float  # λ
+    smooth: float  # share by which β̄ follows β in a sample
     leak: float  # share of its distance to f_L that the target loses in a sample
-    home: float  # share of its distance to βg that the target loses in a sample, at most that of e
+    home: float  # share of its distance to β̄g that the target loses in a sample, at most that of e
     settling: float  # samples in which q is wrong after the filters were emptied
     invertible: Flag  # whether f_L = f_L^F + e_L is stable with the filter of the observer
     chain: Any  # lag filter of f_L where it is not
@@ -142,6 +148,7 @@ class GuardSample(Scalars):
 
     credit: float  # C
     authority: float  # β
+    share: float  # β̄: β, smoothed
     peak: float  # P [y-unit/s^n]
     typical_error: float  # e [y-unit/s^n]
     own_peak: float  # c_L [y-unit/s^n]
@@ -251,12 +258,13 @@ def _limit(
     authority, sample.reason = _authority(memory)
     sample.authority = authority
     sample.limit = authority * guard.bound * sample.typical_error
-    base = sample.target - authority * before
-    sample.target = base + authority * output
+    sample.share += guard.smooth * (authority - sample.share)
+    base = sample.target - sample.share * before
+    sample.target = base + sample.share * output
     if abs(sample.target - f_shown) > sample.limit:
         sample.reason = _OUT_OF_BOUNDS if authority > 0.0 else sample.reason
-    elif guard.least_slope <= authority * slope <= guard.largest_slope:
-        return base + authority * constant, authority * slope, False
+    elif guard.least_slope <= sample.share * slope <= guard.largest_slope:
+        return base + sample.share * constant, sample.share * slope, False
     return confine(guard, memory, sample.target), 0.0, False
 
 
@@ -298,7 +306,7 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
     if sample.limit > 0.0:
         sample.target += guard.leak * (f_learned - sample.target)
         step = guard.home * sample.typical_error
-        distance = sample.authority * sample.output - sample.target
+        distance = sample.share * sample.output - sample.target
         sample.target += min(max(guard.home * distance, -step), step)
     else:
         sample.target = f_learned
@@ -405,6 +413,7 @@ class Guard:
             bound=bound,
             own=_OWN_SHARE,
             own_decay=1.0 - share(_OWN_LAGS),
+            smooth=share(_SMOOTHING_LAGS),
             leak=share(_LEAK_LAGS),
             home=share(_HOME_LAGS),
             settling=_SETTLING_LAGS * lag_time / dt,
