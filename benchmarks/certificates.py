@@ -97,7 +97,7 @@ class Attacked:
     """The loop of a certificate, as a system with the input e_L and the outputs q and y."""
 
     def __init__(self, loop: Any) -> None:
-        controller = loop.controller(guard=Guard())
+        controller = loop.controller(learner=Harmonic(), guard=Guard())
         observer, law = controller.observer, controller.parameters.law
         delay = loop.plant.delay * loop.dt
         self.gains = certify(loop.plant.linear, controller, delay=delay)

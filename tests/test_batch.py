@@ -50,7 +50,7 @@ def test_each_run_of_a_batch_is_the_run_alone(
     learner: object, two_mass_scenario: ql.Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bit for bit, in all channels, with rests, noise, a thinned record, and segments of any length."""
-    law = controller(learner=learner, guard=ql.Guard())
+    law = controller(learner=learner, guard=ql.Guard() if learner else None)
     monkeypatch.setattr(sampled_scenario, "_SEGMENT", 1001)
     runs = ql.simulate(PLANTS, law, two_mass_scenario, record="all", record_every=7, workers=2)
     monkeypatch.undo()

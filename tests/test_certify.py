@@ -168,12 +168,13 @@ def test_no_learner_that_a_search_finds_exceeds_the_bound_of_its_guard() -> None
     without = ql.ADRC(observer, omega_c=1.0)
     plain = ql.simulate(plant, without, scenario)
     alone = np.max(np.abs(observer_error(without, plain)))
-    found = certify(plant, ql.ADRC(observer, omega_c=1.0, guard=guard))
+    learner = ql.learners.Kalman()
+    found = certify(plant, ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard))
     trusted = 0
     for seed in range(4):
         push = draw_push(np.random.default_rng(seed), pulse, samples, lag)
-        learner = Spender(1.6 * load.evaluate(DT * np.arange(samples)), push, 0.6)
-        hostile = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard)
+        spender = Spender(1.6 * load.evaluate(DT * np.arange(samples)), push, 0.6)
+        hostile = ql.ADRC(observer, omega_c=1.0, learner=spender, guard=guard)
         run = ql.simulate(plant, hostile, scenario)
         trusted += np.max(run["authority"]) > 0.5
         assert np.max(np.abs(observer_error(hostile, run))) <= found.error_bound(alone)
@@ -200,7 +201,9 @@ def test_a_response_that_does_not_decay_has_no_peak_gain() -> None:
 
 
 def controller(order: int = 2, **options: Any) -> ql.ADRC:
-    """Return a controller with omega_o = 10, omega_c = 1."""
+    """Return a controller with omega_o = 10, omega_c = 1; a guard gets a learner."""
+    if "guard" in options:
+        options.setdefault("learner", ql.learners.Kalman())
     return ql.ADRC(ql.ESO.model_free(order, 1.0, 10.0, 0.005), omega_c=1.0, **options)
 
 

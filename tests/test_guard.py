@@ -411,13 +411,13 @@ def test_the_unit_of_y_does_not_matter_to_the_guard(unit: float) -> None:
     assert found[0][-1] == 1.0
 
 
-def test_a_guard_counts_for_nothing_where_there_is_no_learner() -> None:
-    """It has nothing to guard: the same loop."""
+def test_a_guard_without_a_learner_is_reported() -> None:
+    """It has nothing to guard: the same loop, and a warning."""
     scenario = ql.Scenario(1.0, 5.0)
-    plain, guarded = (
-        ql.simulate(PLANT, law(None, guard), scenario) for guard in (None, ql.Guard())
-    )
-    np.testing.assert_array_equal(plain["u"], guarded["u"])
+    with pytest.warns(ql.DesignWarning, match=r"guard = Guard\(.*no effect without a learner"):
+        guarded = law(None, ql.Guard())
+    plain, same = (ql.simulate(PLANT, loop, scenario) for loop in (law(None), guarded))
+    np.testing.assert_array_equal(plain["u"], same["u"])
 
 
 @pytest.mark.parametrize(
@@ -435,7 +435,7 @@ def test_mistakes_are_named(make: object, message: str) -> None:
 
 
 @pytest.mark.parametrize("bad", [1.7e308, 1e160])
-@pytest.mark.parametrize("learner", [None, ql.learners.Kalman(), ql.learners.Harmonic(state=False)])
+@pytest.mark.parametrize("learner", [ql.learners.Kalman(), ql.learners.Harmonic(state=False)])
 def test_a_measurement_beyond_all_numbers_is_got_over(bad: float, learner: object) -> None:
     """After it the guarded loop goes on as the one without a guard does."""
     controllers = [

@@ -223,7 +223,7 @@ def test_what_is_not_linear_is_left_to_the_exact_loop() -> None:
         (plant, controller()),
         (plant, own),
         (plant, controller(learner=ql.learners.Kalman())),
-        (plant, controller(guard=ql.Guard())),
+        (plant, controller(learner=ql.learners.Kalman(), guard=ql.Guard())),
         (plant, controller(feedback=han)),
         (plant, ql.ADRC(nonlinear, 1.0)),
         (plant, ql.controllers.Prefiltered(controller(), baselines.ZV(1.4))),

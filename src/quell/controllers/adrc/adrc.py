@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,7 +31,7 @@ from quell.learners.base import Learner, NoLearner, checked_design
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.learners.recovery import LearnerWatch, window_samples
 from quell.observers.eso import ESO
-from quell.types import Channels
+from quell.types import Channels, DesignWarning
 
 
 class ADRC(StatefulController):
@@ -116,6 +117,9 @@ class ADRC(StatefulController):
         self._limits = checked_limits(u_min, u_max, rate_limit, observer.dt)
         self._initialise()
         warn_if_unwise(observer, self.omega_c)
+        if guard is not None and isinstance(self.learner, NoLearner):
+            message = f"guard = {guard!r} has no effect without a learner; give one, or no guard"
+            warnings.warn(message, DesignWarning, stacklevel=2)
 
     def _update_parameters(self) -> None:
         self.parameters = self._design(self.observer, self.omega_c)
