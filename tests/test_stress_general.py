@@ -178,7 +178,8 @@ def test_a_program_earns_trust_with_the_load_itself_and_then_spends_it() -> None
     trusted = run["authority"] >= 0.9
     assert trusted.any()
     turned = int(np.argmax(trusted))
-    assert run["f_learned"][turned] == pytest.approx(load[turned], rel=0.2)
+    earned = slice(int(np.argmax(run["authority"] > 0.3)), turned)
+    assert np.corrcoef(run["f_learned"][earned], load[earned])[0, 1] > 0.9
     assert run["authority"][-1] < 0.5
 
 
