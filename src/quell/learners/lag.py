@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, kernel
 from quell.kernels.sized import Flag
 from quell.observers.delay import without_delay
 from quell.observers.eso import ESO
@@ -72,6 +72,14 @@ def startup_samples(observer: ESO) -> int:
 def lag_memory(lag: Lag | DenseLag, count: int) -> Matrix:
     """Return the state of the lag filters for ``count`` inputs, at rest."""
     return np.zeros((count, lag.width))
+
+
+@kernel
+def reset_lag(memory: Matrix) -> None:
+    """Return lag filters, all of ``memory``, to rest."""
+    for i in range(memory.shape[0]):
+        for j in range(memory.shape[1]):
+            memory[i, j] = 0.0
 
 
 def lag_of(observer: ESO) -> Lag | DenseLag:

@@ -53,7 +53,7 @@ from quell.learners.base import (
     restart,
     trouble,
 )
-from quell.learners.lag import lag_push
+from quell.learners.lag import lag_push, reset_lag
 from quell.learners.recovery import LearnerWatch, has_escaped, has_lost_range, is_in_proportion
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Matrix, Status, Vector
@@ -246,8 +246,7 @@ def reset_lag_filters(design: AdrcDesign, state: AdrcState) -> None:
     """Set the lag filters of f_L and of the guard to zero."""
     reset_filters(design.guard, state.guard)
     state.loop[0].f_learned_shown = 0.0
-    for i in range(state.shadow.shape[1]):
-        state.shadow[0, i] = 0.0
+    reset_lag(state.shadow)
 
 
 @kernel

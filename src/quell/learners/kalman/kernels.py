@@ -46,7 +46,7 @@ from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
-from quell.learners.lag import STARTUP_LAGS, lag_push
+from quell.learners.lag import STARTUP_LAGS, lag_push, reset_lag
 from quell.learners.noise_gate import RESOLUTION
 from quell.types import Matrix, Vector
 
@@ -254,10 +254,9 @@ def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
 
 @kernel
 def _reset_filters(memory: KalmanMemory) -> None:
+    reset_lag(memory.chain)
     for i in range(memory.filtered.size):
         memory.filtered[i] = 0.0
-        for j in range(memory.chain.shape[1]):
-            memory.chain[i, j] = 0.0
 
 
 @kernel

@@ -40,7 +40,7 @@ from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.feature_learner import Inputs, update_feature_sizes, write_features
-from quell.learners.lag import lag_push
+from quell.learners.lag import lag_push, reset_lag
 from quell.learners.noise_gate import NoiseGateMemory, confidence, reset_gate, update_gate
 from quell.types import Matrix, Vector
 
@@ -221,10 +221,9 @@ def _commit(
 def _restart(learner: LinearDesign, memory: LinearMemory) -> None:
     loop = memory.loop[0]
     loop.samples = loop.bias = loop.learn_after = 0.0
+    reset_lag(memory.chain)
     for i in range(memory.filtered.size):
         memory.filtered[i] = 0.0
-        for j in range(memory.chain.shape[1]):
-            memory.chain[i, j] = 0.0
     reset_gate(memory.gate)
     finite = True
     for i in range(memory.theta.size):
