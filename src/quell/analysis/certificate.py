@@ -21,7 +21,7 @@ from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.feedback import LinearFeedback
 from quell.controllers.base import Controller
 from quell.controllers.limits import Limits
-from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.controllers.prefilters.prefilter import without_prefilters
 from quell.files import nonfinite_to_none
 from quell.guard import Guard, UnguardedDesign
 from quell.guard.certified import gains_of, named_plants
@@ -174,8 +174,7 @@ def certify(
 
 
 def _adrc_of(controller: Controller) -> ADRC:
-    while isinstance(controller, Prefiltered):
-        controller = controller.controller
+    controller = without_prefilters(controller)
     if not isinstance(controller, ADRC):
         raise ValueError(f"controller = {controller!r}: must be an ADRC, which may have a guard")
     if not isinstance(controller.parameters.feedback, LinearFeedback):

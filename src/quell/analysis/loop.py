@@ -29,7 +29,7 @@ from quell.analysis.subsystems import closed_loop, closed_loop_matrix, law_matri
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
 from quell.controllers.linear.law import LinearLaw
-from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.controllers.prefilters.prefilter import without_prefilters
 from quell.learners.base import NoLearner
 from quell.lti.norms import h2_squared
 from quell.lti.system import System
@@ -72,8 +72,7 @@ def analyse(
         state and control signal ``(x, u)`` about which a nonlinear plant is linearised; see
         ``quell.plants.linearised``.
     """
-    while isinstance(controller, Prefiltered):
-        controller = controller.controller
+    controller = without_prefilters(controller)
     if not (hasattr(controller, "law") or hasattr(controller, "observer")):
         raise ValueError(f"controller = {controller!r}: must be an ADRC or a linear controller")
     dt = float(controller.dt)

@@ -6,7 +6,7 @@ import numpy as np
 
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
-from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.controllers.prefilters.prefilter import without_prefilters
 from quell.observers.delay import without_delay
 from quell.observers.response import f_learned_response, response
 from quell.observers.start import state_for
@@ -32,8 +32,7 @@ def observer_error(controller: Controller, run: Trajectory) -> Vector:
     ValueError
         for another controller, a nonlinear observer, a record that lacks samples.
     """
-    while isinstance(controller, Prefiltered):
-        controller = controller.controller
+    controller = without_prefilters(controller)
     if not isinstance(controller, ADRC):
         raise ValueError(f"controller = {controller!r}: must be an ADRC")
     y, u = run["y_measured"], run["u"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -62,6 +62,7 @@ def compare(
     seed
         Seed of the measurement noise.
     """
+    from quell.controllers.prefilters.prefilter import without_prefilters
     from quell.experiments.compare import benchmark, figures
 
     settings = benchmark.Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
@@ -71,8 +72,11 @@ def compare(
         raise ValueError(f"controllers = {controllers!r}: must be names with commas, of {known}")
     designs = {name: benchmark.controller(name, dt, u_max) for name in names}
     stable = {name: _is_stable(design, settings) for name, design in designs.items()}
-    guarded = [name for name in names if getattr(_inner(designs[name]), "guard", None) is not None]
-    proofs = {name: _certificate(designs[name], settings) for name in guarded}
+    proofs = {
+        name: _certificate(design, settings)
+        for name, design in designs.items()
+        if getattr(without_prefilters(design), "guard", None) is not None
+    }
     outputs = check_outputs(outputs, ["compare"])
     console = Console()
     with progress_bar(console, COMPILING) as report:
@@ -93,17 +97,13 @@ def compare(
     exit_if_diverged(result.runs.values())
 
 
-def _inner(controller: Controller) -> Any:
-    """Return the controller behind a prefilter, which is outside of the loop."""
-    return getattr(controller, "controller", controller)
-
-
 def _is_stable(controller: Controller, settings: Benchmark) -> bool | None:
     """Return whether the loop is stable; None for a controller that learns, as it is not linear."""
     from quell.analysis import analyse
+    from quell.controllers.prefilters.prefilter import without_prefilters
     from quell.plants import two_mass_spring
 
-    inner = _inner(controller)
+    inner = without_prefilters(controller)
     if inner.features:
         return None
     return bool(analyse(two_mass_spring(settings.m1, settings.m2, settings.k), inner).stable)

@@ -323,3 +323,10 @@ class Prefiltered(StatefulController):
     def _restore_external(self, state: PrefilteredState, snapshots: Mapping[str, Any]) -> None:
         inner = {name.removeprefix("controller."): value for name, value in snapshots.items()}
         self.controller._restore_external(state.controller, inner)
+
+
+def without_prefilters(controller: Controller) -> Controller:
+    """Return the controller behind all prefilters, which are outside of the loop."""
+    while isinstance(controller, Prefiltered):
+        controller = controller.controller
+    return controller
