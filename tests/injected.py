@@ -7,7 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import quell as ql
-from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    nothing_to_restart,
+    predict,
+    restart,
+)
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.types import Matrix, Vector
 
@@ -85,9 +92,7 @@ def _commit(
     memory.now[2] += 1.0
 
 
-@restart.register(InjectedDesign)
-def _restart(learner: InjectedDesign, memory: InjectedMemory) -> None:
-    pass
+restart.register(InjectedDesign)(nothing_to_restart)
 
 
 @coefficients.register(InjectedDesign)

@@ -191,11 +191,13 @@ def _commit(
     pass
 
 
-@restart.register(NoLearnerDesign)
-def _restart(learner: NoLearnerDesign, memory: NoLearnerMemory) -> None:
-    pass
+def nothing_to_restart(learner: Any, memory: Any) -> None:
+    """Do nothing: ``restart`` of a learner that keeps nothing of a run."""
 
 
-@coefficients.register(NoLearnerDesign)
-def _coefficients(learner: NoLearnerDesign, memory: NoLearnerMemory, theta: Vector) -> None:
-    pass
+def no_coefficients(learner: Any, memory: Any, theta: Vector) -> None:
+    """Write nothing: ``coefficients`` of a learner without features."""
+
+
+restart.register(NoLearnerDesign)(nothing_to_restart)
+coefficients.register(NoLearnerDesign)(no_coefficients)

@@ -19,7 +19,15 @@ from quell.experiments.stress.turncoat import Turncoat
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Buffer
 from quell.learners import BatchGradient, Harmonic, Kalman, Learner
-from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    no_coefficients,
+    nothing_to_restart,
+    predict,
+    restart,
+)
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -124,14 +132,8 @@ def _commit(
     memory.now[_F_L] = f_learned
 
 
-@restart.register(AdversaryDesign)
-def _restart(learner: AdversaryDesign, memory: AdversaryMemory) -> None:
-    pass
-
-
-@coefficients.register(AdversaryDesign)
-def _coefficients(learner: AdversaryDesign, memory: AdversaryMemory, theta: Vector) -> None:
-    pass
+restart.register(AdversaryDesign)(nothing_to_restart)
+coefficients.register(AdversaryDesign)(no_coefficients)
 
 
 @dataclass(frozen=True)
@@ -178,34 +180,34 @@ class Adversary:
 # Hostile learners by name. Ranges are chosen by hand: from harmless to far beyond the size of f in
 # these loops.
 _DRAWS: dict[str, Callable[[np.random.Generator], Learner]] = {
-    "opposite sign": lambda rng: Adversary(MULTIPLE, -_log_uniform(rng, 0.1, 10.0)),
+    "opposite sign": lambda rng: Adversary(MULTIPLE, -log_uniform(rng, 0.1, 10.0)),
     "over-prediction": lambda rng: Adversary(_one_of(rng, MULTIPLE, PLAIN), rng.uniform(1.5, 10.0)),
-    "white noise": lambda rng: Adversary(WHITE, _log_uniform(rng, 1e-2, 1e3), seed=_seed(rng)),
-    "constant": lambda rng: Adversary(CONSTANT, _sign(rng) * _log_uniform(rng, 0.1, 1e3)),
+    "white noise": lambda rng: Adversary(WHITE, log_uniform(rng, 1e-2, 1e3), seed=_seed(rng)),
+    "constant": lambda rng: Adversary(CONSTANT, _sign(rng) * log_uniform(rng, 0.1, 1e3)),
     "exponential": lambda rng: Adversary(
-        EXPONENTIAL, _sign(rng) * _log_uniform(rng, 1e-3, 1.0), rng.uniform(1.0, 30.0)
+        EXPONENTIAL, _sign(rng) * log_uniform(rng, 1e-3, 1.0), rng.uniform(1.0, 30.0)
     ),
     "delay": lambda rng: Adversary(
-        DELAYED, rng.uniform(0.5, 1.5), delay=round(_log_uniform(rng, 1.0, 5000.0))
+        DELAYED, rng.uniform(0.5, 1.5), delay=round(log_uniform(rng, 1.0, 5000.0))
     ),
     "minus u": lambda rng: Adversary(MINUS_U, rng.uniform(0.3, 2.0)),
     "sign flips": lambda rng: Adversary(
-        FLIPPING, rng.uniform(0.5, 2.0), _log_uniform(rng, 0.1, 20.0), seed=_seed(rng)
+        FLIPPING, rng.uniform(0.5, 2.0), log_uniform(rng, 0.1, 20.0), seed=_seed(rng)
     ),
     "NaN and Inf": lambda rng: Adversary(
         _one_of(rng, NAN, INF),
         rng.uniform(0.5, 1.2),
-        _log_uniform(rng, 0.05, 30.0),
+        log_uniform(rng, 0.05, 30.0),
         seed=_seed(rng),
     ),
-    "Algorithm 1": lambda rng: BatchGradient(_log_uniform(rng, 1e-7, 1.0)),
+    "Algorithm 1": lambda rng: BatchGradient(log_uniform(rng, 1e-7, 1.0)),
     "turncoat": lambda rng: Turncoat(
         Kalman() if rng.random() < 0.5 else Harmonic(),
         rng.uniform(20.0, 130.0),
         float(rng.choice([-3.0, -1.0, 1.5, 3.0, 10.0])),
     ),
     "random features": lambda rng: Adversary(
-        FEATURES, weights=tuple((rng.normal(size=6) * _log_uniform(rng, 0.1, 10.0)).tolist())
+        FEATURES, weights=tuple((rng.normal(size=6) * log_uniform(rng, 0.1, 10.0)).tolist())
     ),
 }
 KINDS = tuple(_DRAWS)
@@ -216,7 +218,8 @@ def draw_adversary(kind: str, rng: np.random.Generator) -> Learner:
     return _DRAWS[checks.one_of("kind", kind, KINDS)](rng)
 
 
-def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Return a number whose logarithm is uniform."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 

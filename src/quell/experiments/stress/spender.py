@@ -7,7 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.kernels.sized import Buffer
-from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    no_coefficients,
+    nothing_to_restart,
+    predict,
+    restart,
+)
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -128,11 +136,5 @@ def _commit(
     now[4] += 1.0
 
 
-@restart.register(SpenderDesign)
-def _restart(learner: SpenderDesign, memory: SpenderMemory) -> None:
-    pass
-
-
-@coefficients.register(SpenderDesign)
-def _coefficients(learner: SpenderDesign, memory: SpenderMemory, theta: Vector) -> None:
-    pass
+restart.register(SpenderDesign)(nothing_to_restart)
+coefficients.register(SpenderDesign)(no_coefficients)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.learners import Learner
-from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.base import adapt, coefficients, commit, no_coefficients, predict, restart
 from quell.observers.eso import ESO
 from quell.types import Vector
 
@@ -61,9 +61,7 @@ def _restart_turncoat(learner: TurncoatDesign, memory: TurncoatMemory) -> None:
     restart(learner.honest, memory.honest)
 
 
-@coefficients.register(TurncoatDesign)
-def _coefficients_turncoat(learner: TurncoatDesign, memory: TurncoatMemory, theta: Vector) -> None:
-    pass
+coefficients.register(TurncoatDesign)(no_coefficients)
 
 
 @dataclass(frozen=True)

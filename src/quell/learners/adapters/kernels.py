@@ -13,7 +13,16 @@ from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.function_pointers import call
 from quell.kernels.sized import Buffer
 from quell.learners.adapters.instances import COUNTDOWN, DISABLED, PREDICTION, STATUS
-from quell.learners.base import adapt, coefficients, commit, forget, predict, restart, trouble
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    forget,
+    no_coefficients,
+    predict,
+    restart,
+    trouble,
+)
 from quell.learners.feature_learner import write_features
 from quell.learners.online.learner import OnlineDesign, OnlineMemory, has_pairs
 from quell.learners.online.model import infer, learn
@@ -162,6 +171,4 @@ def _trouble(learner: PythonDesign, memory: PythonMemory) -> int:
     return int(memory.answer[STATUS])
 
 
-@coefficients.register(PythonDesign)
-def _coefficients(learner: PythonDesign, memory: PythonMemory, theta: Vector) -> None:
-    pass
+coefficients.register(PythonDesign)(no_coefficients)

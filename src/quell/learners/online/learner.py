@@ -28,7 +28,15 @@ from quell.features.sizes import reset_sizes
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Buffer
-from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    forget,
+    no_coefficients,
+    predict,
+    restart,
+)
 from quell.learners.feature_learner import (
     FeatureLearner,
     Inputs,
@@ -168,9 +176,7 @@ def _forget(learner: OnlineDesign, memory: OnlineMemory) -> None:
     reset_sizes(memory.sizes)
 
 
-@coefficients.register(OnlineDesign)
-def _coefficients(learner: OnlineDesign, memory: OnlineMemory, theta: Vector) -> None:
-    pass
+coefficients.register(OnlineDesign)(no_coefficients)
 
 
 class Online(FeatureLearner):

@@ -26,7 +26,15 @@ from quell.guard import (
 )
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Buffer
-from quell.learners.base import adapt, coefficients, commit, predict, restart
+from quell.learners.base import (
+    adapt,
+    coefficients,
+    commit,
+    no_coefficients,
+    nothing_to_restart,
+    predict,
+    restart,
+)
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.eso import ESO
 from quell.types import Matrix, Vector
@@ -144,14 +152,8 @@ def _commit(
     memory.now[_F_L] = f_learned
 
 
-@restart.register(ProgramDesign)
-def _restart(learner: ProgramDesign, memory: ProgramMemory) -> None:
-    pass
-
-
-@coefficients.register(ProgramDesign)
-def _coefficients(learner: ProgramDesign, memory: ProgramMemory, theta: Vector) -> None:
-    pass
+restart.register(ProgramDesign)(nothing_to_restart)
+coefficients.register(ProgramDesign)(no_coefficients)
 
 
 @dataclass(frozen=True, eq=False)
