@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
+
+import numpy as np
 
 from quell.records import metrics
 from quell.records.trajectory import Trajectory
@@ -26,6 +28,16 @@ def step_scores(t: Vector, y: Vector, target: float, band: float, initial: float
         "overshoot": metrics.overshoot(y, target, initial),
         "settling_time": None if math.isnan(settling) else settling,
     }
+
+
+def quantiles(values: Iterable[float]) -> Scores:
+    """Return median, 90 %, 99 % and maximum of the finite values; None for those of no numbers."""
+    array = np.array(list(values))
+    finite = array[np.isfinite(array)]
+    shares = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
+    if finite.size == 0:
+        return dict.fromkeys(shares)
+    return {key: float(np.quantile(finite, share)) for key, share in shares.items()}
 
 
 def ended_early(runs: Mapping[str, Trajectory]) -> dict[str, dict[str, Any]]:

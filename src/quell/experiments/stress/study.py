@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.experiments.common.scores import quantiles
 from quell.experiments.stress import random_loops
 from quell.experiments.stress.adversaries import KINDS, draw_adversary
 from quell.experiments.stress.random_loops import END, LOAD_AT, REFERENCE, Loop, draw_loops
@@ -32,7 +33,7 @@ _LATE_AT = LOAD_AT + 50.0
 _LIMIT = 100.0
 # Time between recorded samples [s]: a multiple of all sample times.
 _RECORD_DT = 0.02
-# Chosen by hand: a trial of a million runs takes days.
+# Chosen by hand: a trial of a million runs takes hours or days.
 _MOST_RUNS = 1_000_000
 
 
@@ -94,14 +95,8 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "plain_unstable": sum(o.plain_unstable for o in outcomes),
         "unstable_where_plain_is_stable": len(lost),
     }
-    shares = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
     for name in ("ratio", "load_ratio", "late_ratio"):
-        values = np.array([getattr(o, name) for o in outcomes])
-        values = values[np.isfinite(values)]
-        found[name] = {
-            key: float(np.quantile(values, share)) if values.size else None
-            for key, share in shares.items()
-        }
+        found[name] = quantiles(getattr(outcome, name) for outcome in outcomes)
     return found
 
 
@@ -119,11 +114,7 @@ def run(
     There are ``runs`` runs with hostile learners, all kinds in turn, and ``honest`` runs with
     ``learner``, ``Harmonic()`` by default. ``progress`` is called with the finished share, 0 to 1.
     """
-    checks.whole("runs", runs, 0, _MOST_RUNS)
-    checks.whole("honest", honest, 0, _MOST_RUNS)
-    checks.whole("seed", seed, 0)
-    if runs + honest == 0:
-        raise ValueError("runs = 0, honest = 0: at least one must be positive")
+    check_numbers(runs, honest, seed)
     rng = np.random.default_rng(seed)
     kinds = [KINDS[i % len(KINDS)] for i in range(runs)]
     jobs = [
@@ -136,6 +127,15 @@ def run(
     parts = {"guard": None if guard is None else asdict(guard), "learner": repr(good)}
     about = {"loops": random_loops.__doc__, "ratios": __doc__}
     return Result(counts | parts | about, in_parallel(jobs, progress))
+
+
+def check_numbers(runs: int, honest: int, seed: int) -> None:
+    """Raise a ``ValueError`` unless these are numbers of runs of a trial and its seed."""
+    checks.whole("runs", runs, 0, _MOST_RUNS)
+    checks.whole("honest", honest, 0, _MOST_RUNS)
+    checks.whole("seed", seed, 0)
+    if runs + honest == 0:
+        raise ValueError("runs = 0, honest = 0: at least one must be positive")
 
 
 def run_one(kind: str, loop: Loop, learner: Learner, guard: Guard | None) -> Outcome:

@@ -16,6 +16,7 @@ benefit is what it takes from the RMS error of MF-ESO after 100 lags; the guard 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -62,8 +63,8 @@ class Case:
 
     @property
     def over_unguarded(self) -> float:
-        """Guarded over unguarded."""
-        return self.guarded / self.unguarded
+        """Guarded over unguarded; infinite where unguarded has no error."""
+        return self.guarded / self.unguarded if self.unguarded > 0.0 else math.inf
 
     @property
     def over_plain(self) -> float:

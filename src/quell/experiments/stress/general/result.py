@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell.experiments.common.scores import quantiles
 from quell.experiments.stress.general.measures import Measures
 from quell.experiments.stress.general.named import Case
 from quell.experiments.stress.general.trial import HEALTHY, GeneralOutcome
@@ -16,7 +18,6 @@ from quell.files import nonfinite_to_none
 # A run counts as worse from this ratio of the RMS errors on.
 _WORSE = 1.05
 _WORST_LISTED = 10
-_SHARES = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
 
 
 class Bar(NamedTuple):
@@ -93,30 +94,20 @@ class GeneralResult:
         return found + [bar for bar in self._case_bars() if bar.figure is not None]
 
     def _case_bars(self) -> list[Bar]:
-        def worst(begins: str, figure: Callable[[Case], float], without: str = "") -> float | None:
-            chosen = [c for c in self.cases if c.case.startswith(begins)]
-            kept = [c for c in chosen if not (without and without in c.case)]
-            return max((figure(c) for c in kept), default=None)
-
-        def over_unguarded(case: Case) -> float:
-            return case.over_unguarded
-
-        def over_plain(case: Case) -> float:
-            return case.over_plain
-
-        def lost_share(case: Case) -> float:
-            return case.lost_share
-
+        levels, slow, perfect = (
+            [case for case in self.cases if case.case.startswith(begins)]
+            for begins in ("level", "slow process", "perfect")
+        )
+        over_unguarded = max((case.over_unguarded for case in levels), default=None)
+        over_plain = max((case.over_plain for case in slow), default=None)
+        on_steps = [case.lost_share for case in perfect if "steps" in case.case]
+        on_others = [case.lost_share for case in perfect if "steps" not in case.case]
         return [
-            Bar("level", "late RMS, guarded over unguarded", worst("level", over_unguarded), 1.1),
-            Bar("slow process", "overshoot, load peak", worst("slow", over_plain), 1.0),
-            Bar("perfect", "share of benefit lost", worst("perfect", lost_share, "steps"), 0.05),
-            Bar("perfect, rare steps", "share of benefit lost", self._on_steps(), 0.05),
+            Bar("level", "late RMS, guarded over unguarded", over_unguarded, 1.1),
+            Bar("slow process", "overshoot, load peak", over_plain, 1.0),
+            Bar("perfect", "share of benefit lost", max(on_others, default=None), 0.05),
+            Bar("perfect, rare steps", "share of benefit lost", max(on_steps, default=None), 0.05),
         ]
-
-    def _on_steps(self) -> float | None:
-        shares = [c.lost_share for c in self.cases if "perfect" in c.case and "steps" in c.case]
-        return max(shares, default=None)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries and lists for ``json.dump``."""
@@ -143,12 +134,7 @@ def summary(outcomes: Sequence[GeneralOutcome]) -> dict[str, Any]:
     """Return counts and quantiles of the ratios to MF-ESO; None for the quantiles of no numbers."""
     found: dict[str, Any] = {"runs": len(outcomes), "lost": sum(o.lost for o in outcomes)}
     for name in Measures._fields:
-        values = np.array([getattr(o, name) for o in outcomes])
-        values = values[np.isfinite(values)]
-        found[name] = {
-            key: float(np.quantile(values, share)) if values.size else None
-            for key, share in _SHARES.items()
-        }
-        if name == "rms":
-            found["worse"] = float(np.mean(values > _WORSE)) if values.size else None
+        found[name] = quantiles(getattr(o, name) for o in outcomes)
+    rms = [o.rms for o in outcomes if math.isfinite(o.rms)]
+    found["worse"] = float(np.mean([ratio > _WORSE for ratio in rms])) if rms else None
     return found

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 
-from quell import checks
 from quell.experiments.stress.general import trial
 from quell.experiments.stress.general.loops import loop as loops
 from quell.experiments.stress.general.named import run_named
 from quell.experiments.stress.general.result import GeneralResult
+from quell.experiments.stress.study import check_numbers
 from quell.guard import Guard
 from quell.parallel import part_of
-
-# Chosen by hand: a trial of a million runs takes hours.
-_MOST_RUNS = 1_000_000
 
 
 def run(
@@ -31,11 +28,7 @@ def run(
     turn. Seeds below 10 000 are for tuning, from 1 000 000 on for judging. The named cases compare
     with the loop without guard, so they need one. ``progress`` is called with the finished share.
     """
-    checks.whole("runs", runs, 0, _MOST_RUNS)
-    checks.whole("honest", honest, 0, _MOST_RUNS)
-    checks.whole("seed", seed, 0)
-    if runs + honest == 0:
-        raise ValueError("runs = 0, honest = 0: at least one must be positive")
+    check_numbers(runs, honest, seed)
     outcomes = trial.run_all(runs, honest, seed, guard=guard, progress=part_of(progress, 0, 9, 10))
     cases = [] if guard is None else run_named(guard, seed)
     if progress is not None:

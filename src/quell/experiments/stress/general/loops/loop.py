@@ -19,10 +19,11 @@ from functools import cached_property
 import numpy as np
 
 from quell.controllers import ADRC
+from quell.experiments.stress.adversaries import log_uniform
 from quell.experiments.stress.general.loops.loads import LOADS, Table, load_table
 from quell.experiments.stress.general.loops.margin import modulus_margin
 from quell.experiments.stress.general.loops.plant import GeneralPlant
-from quell.experiments.stress.general.loops.random_plants import FAMILIES, draw_plant, log_uniform
+from quell.experiments.stress.general.loops.random_plants import FAMILIES, draw_plant
 from quell.experiments.stress.general.loops.references import REFERENCES, reference_table
 from quell.experiments.stress.general.program import Program, Watched
 from quell.guard import Guard

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell.experiments.stress.adversaries import log_uniform
 from quell.experiments.stress.general.loops.plant import GeneralPlant
 from quell.plants import LinearPlant, two_mass_spring
 from quell.types import Vector
@@ -129,8 +130,3 @@ def _coefficients(n: int, unstable: bool, rng: Rng) -> Vector:
         else:
             poles[-1] = log_uniform(rng, 0.05, 1.0)
     return np.asarray(np.real(np.poly(poles))[:0:-1])
-
-
-def log_uniform(rng: Rng, low: float, high: float) -> float:
-    """Return a number whose logarithm is uniform."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from quell.experiments.stress.adversaries import log_uniform
 from quell.types import Vector
 
 Rng = np.random.Generator
@@ -41,7 +42,7 @@ def _moves(t: Vector, rng: Rng) -> Vector:
 
 
 def _sine(t: Vector, rng: Rng) -> Vector:
-    return np.sin(np.exp(rng.uniform(np.log(0.1), np.log(1.0))) * t)
+    return np.sin(log_uniform(rng, 0.1, 1.0) * t)
 
 
 def _trained(t: Vector, rng: Rng) -> Vector:
