@@ -482,7 +482,7 @@ def test_what_was_learned_forbids_another_nominal_gain() -> None:
 
 @pytest.mark.parametrize("said", [0.9, -0.9])
 def test_a_guard_starts_with_no_correction(said: float) -> None:
-    """What a trusted learner says at the start is a constant: the observer's estimate has it all."""
+    """A trusted learner's first output is a constant: the observer's estimate has it all."""
     learner, guard = ql.learners.Kalman(state=False), ql.Guard()
     controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=learner, guard=guard)
     state = controller._state

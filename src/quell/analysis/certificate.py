@@ -1,4 +1,4 @@
-"""What is proved of a guarded loop, for any learner.
+"""Bounds on a guarded loop that are proved for any learner.
 
 A guard limits the correction to ``|e_L| ≤ κ e``, where e never exceeds the largest |q| so far. With
 the peak-to-peak gains Γ from e_L to q and Γ_y from e_L to y of the loop without learner, by the
@@ -36,7 +36,7 @@ from quell.plants.sampled import sampled_plant
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is proved of the loops of a guarded controller and a set of plants, for any learner."""
+    """Bounds that are proved for a guarded controller and a set of plants, for any learner."""
 
     kappa: float  #: κ of the guard
     gains: dict[str, CorrectionGains]  #: Γ and Γ_y [s^n], by name of the plant

@@ -146,7 +146,7 @@ class LoopAnalysis:
 
     @cached_property
     def certificate(self) -> Certificate | None:
-        """What the guard guarantees (``certify``); None without a guarded learner.
+        """Bounds that the guard guarantees (``certify``); None without a guarded learner.
 
         Raises ``ValueError`` for a loop that cannot be certified: nonlinear, or unstable without
         learner.

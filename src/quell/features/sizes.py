@@ -7,11 +7,12 @@ at least its largest absolute value so far, as signals are (``scaling.py``).
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.features.base import Features
+from quell.features.base import Features, unit
 from quell.features.scaling import LEAST
 from quell.kernels.dispatch import is_finite, kernel
 from quell.types import Vector
@@ -62,7 +63,10 @@ def scale_by_sizes(unscaled: Indices, sizes: Vector, values: Vector) -> None:
 
 
 @kernel
-def scale_units(unscaled: Indices, sizes: Vector, units: Vector) -> None:
-    """Divide the units of features by their sizes."""
+def write_units(
+    features: Any, unscaled: Indices, scale: Vector, sizes: Vector, out: Vector
+) -> None:
+    """Write the ``unit`` of features to ``out`` (p,), divided by their sizes."""
+    unit(features, scale, out)
     for k in range(sizes.size):
-        units[unscaled[k]] /= sizes[k]
+        out[unscaled[k]] /= sizes[k]

@@ -1,8 +1,8 @@
-"""What a learner's correction does to the loop of a linear plant and the plain observer.
+"""Effect of a learner's correction on the loop of a linear plant and the plain observer.
 
 A learner's feedforward f_L changes the estimates of the observer by the shadow s, its response to
-f_L (``learners/lag.py``); without f_L, the same y and u give the plain estimates x̂, f_plain. In the
-law the learner changes ``b0 u`` by −w,
+f_L (``learners/lag.py``); without f_L, the same y and u give the plain estimates x̂, f_plain. In
+the law the learner changes ``b0 u`` by −w,
 
     w = c_f (f_L + s_N) + Σ (k_i − a_i) s_i = c_f e_L + Σ (k_i − a_i) s_i,      e_L = f_L − f_L^F
 

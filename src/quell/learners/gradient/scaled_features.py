@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from quell.features.base import unit, write, write_physical
+from quell.features.base import write, write_physical
 from quell.features.scaling import Scaling, reset_scale, update_scale
 from quell.features.sizes import (
     Indices,
     reset_sizes,
     scale_by_sizes,
-    scale_units,
     update_sizes,
+    write_units,
 )
 from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars, clear
@@ -91,11 +91,13 @@ def _rescale(learner: ScaledDesign, memory: ScaledMemory, seen: Vector, u: float
     update_scale(learner.scaling, scale, seen, u, f)
     for i in range(scale.size):
         after += scale[i]
-    write_physical(learner.features, seen[: memory.scaled.size], u, current)
-    if not update_sizes(learner.unscaled, memory.sizes, current) and after == before:
+    grown = after != before
+    if learner.unscaled.size > 0:
+        write_physical(learner.features, seen[: memory.scaled.size], u, current)
+        grown = update_sizes(learner.unscaled, memory.sizes, current) or grown
+    if not grown:
         return
-    unit(learner.features, scale, current)
-    scale_units(learner.unscaled, memory.sizes, current)
+    write_units(learner.features, learner.unscaled, scale, memory.sizes, current)
     for i in range(theta.size):
         ratio = current[i] / memory.units[i]
         if memory.loop[0].has_scale > 0.0 and 0.0 < ratio <= 1.0:

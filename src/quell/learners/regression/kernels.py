@@ -32,9 +32,8 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from quell.features.base import unit
 from quell.features.scaling import reset_scale, update_scale
-from quell.features.sizes import reset_sizes, scale_units
+from quell.features.sizes import reset_sizes, write_units
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
@@ -152,8 +151,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
         # There were no features before this sample: the filters have to settle once more.
         loop.has_scale = 1.0
         loop.samples = 0.0
-        unit(inputs.features, scale, units)
-        scale_units(inputs.unscaled, memory.sizes, units)
+        write_units(inputs.features, inputs.unscaled, scale, memory.sizes, units)
         return
     if scale[last] != old[last]:
         for i in range(theta.size):
@@ -162,8 +160,7 @@ def _rescale(learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float
         grown = grown or scale[j] != old[j]
     if not grown:
         return
-    unit(inputs.features, scale, memory.features)
-    scale_units(inputs.unscaled, memory.sizes, memory.features)
+    write_units(inputs.features, inputs.unscaled, scale, memory.sizes, memory.features)
     converted = False
     for i in range(theta.size):
         affected = memory.features[i] != units[i]

@@ -37,7 +37,7 @@ _AT = {name: i for i, name in enumerate(INPUTS)}
 # its beginning. Chosen by hand: enough that no two are alike.
 _NEARBY = 0.05
 FOUND = Path(__file__).with_name("searched.json")
-"""What the searches found for each order: made by ``benchmarks/stress_search.py``."""
+"""Points that the searches found for each order: made by ``benchmarks/stress_search.py``."""
 
 
 def exact_weights(loop: GeneralLoop) -> Vector:

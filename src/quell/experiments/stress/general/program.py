@@ -56,7 +56,7 @@ INPUTS = (
     "f_L",  # of the sample before
     "f_plain'/omega_o",
 )
-"""What the two modes weigh, all in the unit of f."""
+"""Signals that the two modes weigh, all in the unit of f."""
 RULES = ("trusted", "distrusted", "least_time", "most_time")
 """Authority from which it attacks, and at which it stops; least time [lags] in the first mode, and
 longest time in the second."""

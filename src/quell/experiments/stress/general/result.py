@@ -21,7 +21,7 @@ _WORST_LISTED = 10
 
 
 class Bar(NamedTuple):
-    """What a figure must not exceed."""
+    """A limit that a figure must not exceed."""
 
     over: str
     measure: str
