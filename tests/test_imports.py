@@ -13,7 +13,7 @@ import pytest
 # the file that gathers the public names of folder x and its subfolders. A new folder needs an entry
 # here.
 ROWS = (
-    ("types", "checks", "files", "reading", "parallel", "optional", "kernels"),
+    ("types", "checks", "files", "reading", "parallel", "optional", "executors", "kernels"),
     ("lti", "signals", "observers", "plants", "features"),
     ("learners", "learners.kalman", "learners.regression", "learners.gradient", "learners.online"),
     ("learners.adapters", "learners.__init__", "guard"),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.setup import EXAMPLES, SetupError, load, made
+from quell.setup import EXAMPLES, SetupError, load, made, varied
 from quell.setup.reference import keys, markdown
 from quell.setup.registry import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
 
@@ -331,3 +331,37 @@ def test_the_page_of_all_keys_has_a_row_for_each_and_says_what_it_means() -> Non
             assert [key for key, *_, words in keys(table) if not words] == []
         assert page.count("\n| `") == sum(len(keys(table)) for table in tables.values())
     assert "| `omega_o` | number | **needed** | observer bandwidth [rad/s]" in markdown(OBSERVERS)
+
+
+def test_a_setup_with_other_values_is_that_of_a_file_with_them(tmp_path: Path) -> None:
+    """Paths go through tables and lists; the setup itself stays as it was."""
+    text = (EXAMPLES / "two_mass.toml").read_text(encoding="utf-8")
+    setup = load(EXAMPLES / "two_mass.toml")
+    path = tmp_path / "two_mass.toml"
+    path.write_text(text.replace("m1 = 1.0", "m1 = 0.7").replace("height = 0.5", "height = 2.0"))
+    other = varied(setup, {"plant.m1": 0.7, "scenario.disturbances[1].height": 2.0})
+    assert other.description == load(path).description
+    assert np.array_equal(other.plant.A, load(path).plant.A)
+    assert varied(setup, {}).description == setup.description
+    assert varied(setup, {"learner": None}).controller.features == ()
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("plant.m3", 1.0, "plant.m3: unknown; must be one of kind, m1"),
+        ("plant.m1", -1.0, "plant.m1 = -1.0: must be finite and greater"),
+        ("plnt.m1", 1.0, "plnt: unknown; did you mean plant?"),
+        ("dt.x", 1.0, "dt.x: x is no key here, but in 0.002"),
+        ("scenario.disturbances[7]", 1.0, r"\[7\] is beyond the list's 2 entries"),
+        ("plant[0]", 1.0, r"plant\[0\]: \[0\] is no place in a list"),
+        ("plant..m1", 1.0, "must be a path of keys"),
+    ],
+)
+def test_a_change_that_a_setup_does_not_have_is_named(
+    path: str, value: float, message: str
+) -> None:
+    """With the file, the path and the rule."""
+    setup = load(EXAMPLES / "two_mass.toml")
+    with pytest.raises(SetupError, match=f"^two_mass.toml: .*{message}"):
+        varied(setup, {path: value})

@@ -6,5 +6,6 @@ May import every folder below; only ``cli`` imports this one.
 from quell.setup.description import Description, read
 from quell.setup.errors import SetupError
 from quell.setup.load import EXAMPLES, Setup, load, made
+from quell.setup.vary import varied
 
-__all__ = ["EXAMPLES", "Description", "Setup", "SetupError", "load", "made", "read"]
+__all__ = ["EXAMPLES", "Description", "Setup", "SetupError", "load", "made", "read", "varied"]

@@ -40,9 +40,13 @@ class Setup:
     windows: tuple[dict[str, Any], ...]  #: arguments of ``Trajectory.metrics`` for each window
     description: Description  #: the file's own tables
 
+    def tables(self) -> dict[str, Any]:
+        """Return the file's tables and keys as dictionaries, which ``made`` accepts."""
+        return self.description.model_dump(exclude_unset=True)
+
     def as_json(self) -> dict[str, Any]:
         """Return the file's tables for ``quell.files.write_json``; infinite numbers become None."""
-        tables: dict[str, Any] = nonfinite_to_none(self.description.model_dump(exclude_unset=True))
+        tables: dict[str, Any] = nonfinite_to_none(self.tables())
         return tables
 
     def needed(self, table: str) -> Any:
