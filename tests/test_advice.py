@@ -151,7 +151,8 @@ def test_a_thin_margin_and_a_lost_loop_are_found_with_the_true_plant() -> None:
     controller = adrc(20.0, 4.0, 1e-3)
     assert analysis.advise(controller) == []
     findings = [analysis.advise(controller, ([gain], [1.0, 0.0, 0.0])) for gain in (5.0, -1.0)]
-    assert [finding.subject for found in findings for finding in found] == ["margin", "stability"]
+    subjects = [finding.subject for found in findings for finding in found]
+    assert subjects == ["margin", "lag", "stability"]  # the lag: one sample takes the delay margin
     with pytest.raises(ValueError, match="does not know its plant"):
         analysis.advise(SimpleNamespace(law=None, dt=0.1))
 
@@ -325,3 +326,50 @@ def test_the_summary_of_a_loop_that_needs_no_phase_margin_says_so() -> None:
     assert "delay margin infinite" in loop.summary()
     assert "nan" not in loop.summary()
     assert loop.margins.phase == math.inf
+
+
+def test_a_law_that_is_faster_than_its_observer_is_found() -> None:
+    """At ten times omega_o the loop keeps its margins, but a wrong b0 makes it ten times as slow as the law says."""
+    (finding,) = analysis.advise(adrc(20.0, 200.0, 1e-3))
+    assert (finding.subject, finding.value, finding.limit) == ("bandwidth", 10.0, 1.0)
+    assert "lower omega_c to 20 rad/s or less, or raise omega_o to 200 rad/s or more" in str(
+        finding
+    )
+    assert analysis.advise(adrc(20.0, 20.0, 1e-3)) == []
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 0.8], [1.0, 0.0])
+    slow, fast = (
+        ql.simulate(
+            plant, adrc(20.0, omega_c, 1e-3), ql.Scenario(reference=1.0, duration=3.0)
+        ).metrics(target=1.0, band=0.02)["settling_time"]
+        for omega_c in (20.0 / 3.0, 200.0)
+    )
+    ideal = 5.83  # omega_c times the settling time of two poles at −omega_c, to 2 %
+    assert slow * 20.0 / 3.0 < 1.2 * ideal
+    assert fast * 200.0 > 5.0 * ideal
+
+
+def test_a_delay_that_nobody_stated_is_found_where_it_loses_the_loop() -> None:
+    """The one of a sample that the calculation takes, and the plant's own that the observer does not know."""
+    hasty = adrc(60.0, 20.0, 0.01, order=3)
+    finding = analysis.advise(hasty)[-1]
+    margin = analysis.analyse(ideal(3), hasty).margins.delay
+    assert (finding.subject, finding.value, finding.limit) == ("lag", pytest.approx(margin), 0.01)
+    assert not analysis.analyse(ideal(3), hasty, delay=0.01).stable
+    assert f"the delay margin of {1e3 * margin:.3g} ms is below one sample of 10 ms" in str(finding)
+    assert analysis.advise(hasty, delay=0.01)[-1].subject == "stability"  # now it is stated
+    double = ql.plants.LinearPlant([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 0.0])
+    unaware = adrc(40.0, 4.0, 0.01)
+    (finding,) = analysis.advise(unaware, ql.plants.delayed(double, 0.5, 0.01))
+    margin = analysis.analyse(ideal(2), unaware).margins.delay
+    assert finding.subject == "stability"
+    assert str(finding).startswith("the loop is unstable with the plant's delay of 500 ms")
+    assert f"stable up to {1e3 * margin:.3g} ms; let the observer know of the delay" in str(finding)
+
+
+def test_times_in_one_message_have_one_unit() -> None:
+    """A delay of a second beside a delay margin and a lag below it: all in seconds."""
+    findings = analysis.advise(adrc(40.0, 4.0, 0.01), actuator_lag=1e-3, delay=1.0)
+    (finding,) = findings
+    assert "an actuator lag of 0.001 s and a delay of 1 s" in str(finding)
+    assert "its delay margin is 0." in str(finding)
+    assert " ms" not in str(finding)

@@ -1,4 +1,4 @@
-"""Findings about a design, with numbers: sampling, noise, lags, and too little margin."""
+"""Findings about a design, with numbers: sampling, bandwidths, lags, noise, too little margin."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.loop import LoopAnalysis, analyse, duration
+from quell.analysis.loop import LoopAnalysis, analyse, durations
 from quell.analysis.pure_delays import eigenvalues
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
 from quell.controllers.design_checks import Finding, known_samples, sampling_findings
 from quell.observers.eso import ESO
 from quell.plants.linear import LinearPlant
+from quell.plants.linear_part import linear_part
 
 # RMS of u as a share of its range: six standard deviations are then 30 % of it. Chosen by hand.
 _NOISE = 0.05
@@ -27,6 +28,13 @@ _WRONG_GAIN = 1.3
 _RUNS_AWAY = 1.0 + 1e-5
 # Share of the modulus margin that a lag must leave. Chosen by hand.
 _LAG_LEAVES = 0.8
+# Largest omega_c over omega_o. On chains of 1 to 3 integrators whose gain is 20 % below b0 the step
+# settles at a ratio of 1/3 in 0.8 to 1.1 times the law's time, of 1 in 1.9 to 2.3, of 10 in 5.6 to
+# 11: from 1 on it is the observer's time.
+_FASTEST_LAW = 1.0
+# Unstated delay that every loop must survive [samples]: a controller that reads, calculates and
+# then writes acts a sample late (``realtime``).
+_CALCULATION = 1
 
 
 def advise(
@@ -41,8 +49,9 @@ def advise(
 ) -> list[Finding]:
     """Return the weak points of a design, each with its number, the limit, and what to do.
 
-    They are in the order sampling, margin, lag, noise. Raises ``ValueError`` as ``analyse``
-    does, and without a plant for a controller that assumes none.
+    They are in the order sampling, bandwidth, margin, lag, noise. Times within one message have the
+    same unit. Raises ``ValueError`` as ``analyse`` does, and without a plant for a controller that
+    assumes none.
 
     Parameters
     ----------
@@ -58,7 +67,8 @@ def advise(
         time constant of the actuator [s], if the plant does not include it.
     delay
         dead time of actuator, transport and calculation [s]; without a plant it adds to the one
-        that the observer assumes.
+        that the observer assumes. If none is stated, a loop that a delay of one sample makes
+        unstable is a finding.
     at
         instant at which the learner is frozen; see ``analyse``.
     operating_point
@@ -74,16 +84,22 @@ def advise(
     delay = checks.non_negative("delay", delay, "s")
     if isinstance(controller, ADRC):
         found = sampling_findings(controller.observer, controller.omega_c)
+        found += _judge_bandwidths(controller)
     options = {"at": at, "operating_point": operating_point}
     loop = analyse(plant, controller, delay=known_delay, **options)
     if not loop.stable:
-        return [*found, _unstable(loop, "with this plant", _remedy(loop, controller, found))]
+        lost = _lost_by_delay(loop, plant, controller, known_delay, options)
+        if lost is None:
+            lost = _unstable(loop, "with this plant", _remedy(loop, controller, found))
+        return [*found, lost]
     found += _judge_margin(loop, controller, found)
     if actuator_lag > 0.0 or delay > 0.0:
         lags: dict[str, Any] = {"delay": known_delay + delay, "actuator_lag": actuator_lag}
         late = analyse(plant, controller, **lags, **options)
         found += _judge_lag(loop, late, actuator_lag, delay, observer)
         loop = late
+    if delay == 0.0 and loop.stable:
+        found += _judge_calculation(loop, observer)
     if noise_std is not None and loop.stable:
         found += _judge_noise(loop, controller, checks.non_negative("noise_std", noise_std))
     return found
@@ -131,6 +147,57 @@ def _remedy(loop: LoopAnalysis, controller: Controller, found: list[Finding]) ->
     return "raise omega_o (noise permitting) or lower omega_c"
 
 
+def _lost_by_delay(
+    loop: LoopAnalysis, plant: Any, controller: Controller, delay: float, options: dict[str, Any]
+) -> Finding | None:
+    """Return the finding about a plant whose own delay the observer does not know and must."""
+    if not isinstance(controller, ADRC):
+        return None
+    linear, own = linear_part(plant, loop.dt, options["operating_point"])
+    stated = loop.dt * known_samples(controller.observer)
+    if own + delay <= stated + 0.5 * loop.dt:
+        return None
+    prompt = analyse(linear, controller, delay=stated, at=options["at"])
+    if not prompt.stable:
+        return None
+    late, margin, known = durations(own + delay, stated + prompt.margins.delay, stated)
+    assumed = f"a delay of {known}" if stated > 0.0 else "none"
+    what_to_do = (
+        f"the observer assumes {assumed}, and the loop is stable up to {margin}; "
+        f"let the observer know of the delay, and {_slower(controller.observer)}"
+    )
+    return _unstable(loop, f"with the plant's delay of {late}", what_to_do)
+
+
+def _judge_bandwidths(controller: ADRC) -> list[Finding]:
+    omega_c, omega_o = controller.omega_c, controller.observer.omega_o
+    ratio = omega_c / omega_o
+    if ratio <= _FASTEST_LAW:
+        return []
+    message = (
+        f"omega_c = {omega_c:.3g} rad/s is {ratio:.3g} times omega_o = {omega_o:.3g} rad/s: the "
+        "law is faster than the observer, so with a load or a gain other than b0 the loop settles "
+        "in the observer's time, with more noise in u; "
+        f"lower omega_c to {_FASTEST_LAW * omega_o:.3g} rad/s or less, or raise omega_o to "
+        f"{omega_c / _FASTEST_LAW:.3g} rad/s or more"
+    )
+    return [Finding("bandwidth", ratio, _FASTEST_LAW, message)]
+
+
+def _judge_calculation(loop: LoopAnalysis, observer: ESO | None) -> list[Finding]:
+    """Judge a delay that was not stated: the calculation alone may take a sample."""
+    unstated = _CALCULATION * loop.dt
+    if loop.margins.delay > unstated:
+        return []
+    margin, late = durations(loop.margins.delay, unstated)
+    message = (
+        f"the delay margin of {margin} is below one sample of {late}, which the calculation of u "
+        "takes on most rigs; the loop would be unstable: state the delay, and "
+        f"{_slower(observer)}"
+    )
+    return [Finding("lag", loop.margins.delay, unstated, message)]
+
+
 def _judge_margin(
     loop: LoopAnalysis, controller: Controller, found: list[Finding]
 ) -> list[Finding]:
@@ -152,15 +219,15 @@ def _judge_lag(
     delay: float,
     observer: ESO | None,
 ) -> list[Finding]:
-    parts = (("an actuator lag", actuator_lag), ("a delay", delay))
-    cause = " and ".join(f"{what} of {duration(time)}" for what, time in parts if time > 0.0)
+    *times, margin = durations(actuator_lag, delay, loop.margins.delay)
+    parts = zip(("an actuator lag", "a delay"), times, (actuator_lag, delay), strict=True)
+    cause = " and ".join(f"{what} of {text}" for what, text, time in parts if time > 0.0)
     shorter = "shorten it"
     if observer is not None and delay > 0.0 and known_samples(observer) == 0:
         shorter += ", let the observer know of the delay"
     before, after = loop.margins, late.margins
     if not late.stable:
-        margin = f"its delay margin is {duration(before.delay)}"
-        what_to_do = f"{margin}; {shorter}, or {_slower(observer)}"
+        what_to_do = f"its delay margin is {margin}; {shorter}, or {_slower(observer)}"
         return [_unstable(late, f"with {cause}", what_to_do)]
     if after.modulus >= _LAG_LEAVES * before.modulus:
         return []

@@ -329,6 +329,11 @@ def _is_guarded(controller: Controller) -> bool:
 
 def duration(time: float) -> str:
     """Return a time as text, in ms or, from 1 s on, in s."""
-    if math.isinf(time):
-        return "infinite"
-    return f"{time:.3g} s" if time >= 1.0 else f"{1e3 * time:.3g} ms"
+    return durations(time)[0]
+
+
+def durations(*times: float) -> list[str]:
+    """Return times as text, all in ms or, if the largest finite one is from 1 s on, all in s."""
+    largest = max((abs(time) for time in times if math.isfinite(time)), default=0.0)
+    factor, unit = (1.0, "s") if largest >= 1.0 else (1e3, "ms")
+    return [f"{factor * time:.3g} {unit}" if math.isfinite(time) else "infinite" for time in times]
