@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         realtime,
         setup,
         signals,
+        tuning,
     )
     from quell.controllers import baselines
     from quell.controllers.adrc.adrc import ADRC
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
     from quell.records.trajectory import Trajectory
     from quell.simulation.scenario import Scenario
     from quell.simulation.simulate import simulate
+    from quell.tuning.tune import tune
+    from quell.tuning.tuned import Tuned
     from quell.types import DesignWarning, Status
 
 __version__ = "0.1.0"
@@ -59,18 +62,20 @@ _HOME = {
     "Scenario": "quell.simulation.scenario",
     "Status": "quell.types",
     "Trajectory": "quell.records.trajectory",
+    "Tuned": "quell.tuning.tuned",
     "canonical": "quell.lti.canonical",
     "identify": "quell.identification.identify",
     "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation.simulate",
+    "tune": "quell.tuning.tune",
 }
 _MODULES = {"baselines": "quell.controllers.baselines", "metrics": "quell.records.metrics"}
 
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Guard", "Reason", "Scenario",
-    "Status", "Trajectory", "analysis", "baselines", "canonical", "controllers", "experiments",
-    "features", "identification", "identify", "learners", "metrics", "observers", "omega_c_for",
-    "plants", "realtime", "setup", "signals", "simulate",
+    "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers",
+    "experiments", "features", "identification", "identify", "learners", "metrics", "observers",
+    "omega_c_for", "plants", "realtime", "setup", "signals", "simulate", "tune", "tuning",
 ]  # fmt: skip
 
 

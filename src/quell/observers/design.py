@@ -8,7 +8,8 @@ For a plant with zeros, the observable canonical form ``z' = Ā z + B̄ u + Ē (
 ``lti/canonical.py`` replaces the first two. It is sampled exactly with zero-order hold.
 
 All eigenvalues of ``(I − L C) Φ`` lie at ``exp(−omega_o dt)`` (the bandwidth parametrisation of
-Gao, ACC 2003, in the z-plane as in Miklosovic, Radke & Gao, ACC 2006). The *reduced* form is the
+Gao, ACC 2003, in the z-plane as in Miklosovic, Radke & Gao, ACC 2006), or at ``exp(p_i omega_o
+dt)`` with a pattern of poles p of its own. The *reduced* form is the
 current form with one pole at z = 0: ``L_1 = 1`` and ``x̂_1 = y``; the other n poles are those of
 the reduced-order observer, at ``exp(−omega_o dt)``.
 
@@ -20,12 +21,15 @@ Hempel, Göhrt & Streif, IFAC World Congress 2020, arXiv 2003.03986; Herbst & Ma
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell import checks
 from quell.lti.canonical import Canonical, format_roots
 from quell.lti.discretize import zero_order_hold
+from quell.lti.pole_pattern import pole_pattern
 from quell.observers.linear import EsoModel
 from quell.observers.placement import place_poles, sampled_zeros
 from quell.types import Vector
@@ -45,9 +49,21 @@ def design_model(
     form: str,
     half_gain: bool,
     keep_zeros: bool,
+    poles: Any = None,
 ) -> EsoModel:
-    """Return the update of the observer of ``plant`` with the bandwidth ``omega_o``."""
+    """Return the update of the observer of ``plant`` with the bandwidth ``omega_o``.
+
+    ``poles`` are those of the observer in units of omega_o, all at −1 by default; the reduced form
+    has one less than the others.
+    """
     checks.one_of("form", form, FORMS)
+    pattern = None
+    if poles is not None:
+        if keep_zeros:
+            raise ValueError(
+                "poles with keep_zeros = True: they exclude each other; put poles at the zeros"
+            )
+        pattern = pole_pattern("poles", poles, plant.a.size + (form != "reduced"))
     if checks.flag("half_gain", half_gain) and form == "reduced":
         raise ValueError(
             "half_gain = True with form = 'reduced': they exclude each other; use form='current'"
@@ -55,12 +71,18 @@ def design_model(
     kept = np.zeros(0)
     if keep_zeros and plant.matched:
         kept = plant.zeros[(plant.zeros.real > -omega_o) & (plant.zeros.real < 0.0)]
-    model = _sampled_design(plant, b0, omega_o, dt, form, kept)
+    model = _sampled_design(plant, b0, omega_o, dt, form, kept, pattern)
     return model._replace(gain=0.5 * model.gain) if half_gain else model
 
 
 def _sampled_design(
-    plant: Canonical, b0: float, omega_o: float, dt: float, form: str, kept: Vector
+    plant: Canonical,
+    b0: float,
+    omega_o: float,
+    dt: float,
+    form: str,
+    kept: Vector,
+    pattern: NDArray[np.complex128] | None,
 ) -> EsoModel:
     """Sample the extended model and place the poles; ``kept`` are plant zeros that keep a pole.
 
@@ -85,6 +107,8 @@ def _sampled_design(
             difference *= step ** (power[None, :] - power[:, None])
             offsets = np.full(size, -math.expm1(-step), dtype=complex)
             offsets[: kept.size] = sampled_zeros(difference, kept, dt)
+            if pattern is not None:
+                offsets[: pattern.size] = -np.expm1(step * pattern)
             if form == "reduced":
                 offsets[-1] = 1.0
             gain = place_poles(difference, offsets) * step**power

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,6 +44,8 @@ class ESO:
     has_one_pole : bool
         whether all poles of the response of f̂ to f lie at ``pole``: designed by the bandwidth, at
         full order and gain. Poles kept at zeros do not count, because f does not excite them.
+    poles
+        the pattern of poles in units of omega_o, or None for one pole.
 
     Examples
     --------
@@ -58,6 +61,7 @@ class ESO:
     form: str
     model: Any
     has_one_pole: bool = True
+    poles: Any = None
 
     @classmethod
     def model_free(
@@ -70,6 +74,7 @@ class ESO:
         form: str = "current",
         half_gain: bool = False,
         delay: float = 0.0,
+        poles: Sequence[float | tuple[float, float]] | None = None,
     ) -> ESO:
         """Design an ESO from the order and nominal gain of the plant only (paper eq. (mfplant)).
 
@@ -92,6 +97,9 @@ class ESO:
             at order 1, by 20 % at order 3, and not at all from order 5 on.
         delay
             time after which u reaches the plant [s], a whole number of samples.
+        poles
+            poles in units of omega_o, instead of all at −1: negative numbers, and pairs (real,
+            imaginary) for two conjugate ones; order + 1 in all, or order for the reduced form.
 
         Raises
         ------
@@ -99,7 +107,7 @@ class ESO:
             naming the argument, its value and the rule.
         """
         chain = canonical((np.zeros(checks.whole("order", order, 1, 8)), 1.0))
-        return cls._design(chain, b0, omega_o, dt, form, half_gain, False, delay)
+        return cls._design(chain, b0, omega_o, dt, form, half_gain, False, delay, poles)
 
     @classmethod
     def model_based(
@@ -114,6 +122,7 @@ class ESO:
         keep_zeros: bool = False,
         half_gain: bool = False,
         delay: float = 0.0,
+        poles: Sequence[float | tuple[float, float]] | None = None,
     ) -> ESO:
         """Design an ESO from a model of the plant (paper eq. (mbplant)), which may have zeros.
 
@@ -125,7 +134,7 @@ class ESO:
         plant, E
             a linear plant, ``control.StateSpace``, ``control.TransferFunction``, matrices,
             coefficients; see ``canonical``.
-        omega_o, dt, form, half_gain, delay
+        omega_o, dt, form, half_gain, delay, poles
             as for ``model_free``.
         b0
             nominal control gain, from u to y^(relative degree); the model's own by default.
@@ -150,7 +159,7 @@ class ESO:
             )
         b0 = found.b if b0 is None else b0
         keep_zeros = checks.flag("keep_zeros", keep_zeros)
-        return cls._design(found, b0, omega_o, dt, form, half_gain, keep_zeros, delay)
+        return cls._design(found, b0, omega_o, dt, form, half_gain, keep_zeros, delay, poles)
 
     @classmethod
     def cascade(
@@ -264,15 +273,16 @@ class ESO:
         half_gain: bool,
         keep_zeros: bool,
         delay: float,
+        poles: Any,
     ) -> ESO:
         reason = "it is the gain from u to the first derivative of y that u moves"
         b0 = checks.nonzero("b0", b0, reason)
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
-        model = design_model(
-            plant, b0, omega_o, dt, form=form, half_gain=half_gain, keep_zeros=keep_zeros
-        )
-        has_one_pole = form != "reduced" and not half_gain
-        return cls(plant, b0, omega_o, dt, form, delayed_model(model, delay, dt), has_one_pole)
+        options: dict[str, Any] = {"half_gain": half_gain, "keep_zeros": keep_zeros}
+        model = design_model(plant, b0, omega_o, dt, form=form, poles=poles, **options)
+        has_one_pole = form != "reduced" and not half_gain and poles is None
+        model = delayed_model(model, delay, dt)
+        return cls(plant, b0, omega_o, dt, form, model, has_one_pole, poles)
 
     def _with_model(self, model: Any, delay: float) -> ESO:
         model = delayed_model(model, delay, self.dt)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,9 @@ class ADRC(StatefulController):
         times the time for orders 1 to 4 (Herbst, Hempel, Göhrt & Streif 2020, arXiv 2003.03986).
     feedback
         Han's nonlinear law of the errors; the linear law by default.
+    law_poles
+        poles of the ideal loop in units of omega_c, instead of all at −1: negative numbers, and
+        pairs (real, imaginary) for two conjugate ones; as many as the relative degree.
 
     Raises
     ------
@@ -95,6 +98,7 @@ class ADRC(StatefulController):
         rate_limit: RateLimit = math.inf,
         half_gain: bool = False,
         feedback: NonlinearFeedback | None = None,
+        law_poles: Sequence[float | tuple[float, float]] | None = None,
     ) -> None:
         if not isinstance(observer, ESO):
             raise ValueError(f"observer = {observer!r}: must be an ESO, as from ESO.model_free")
@@ -113,6 +117,7 @@ class ADRC(StatefulController):
         self.feedforward = checks.flag("feedforward", feedforward)
         self.half_gain = checks.flag("half_gain", half_gain)
         self.feedback = checked_feedback(feedback)
+        self.law_poles = law_poles
         self._learner_omega_c = self.omega_c  # the learner keeps its scales when omega_c is retuned
         self._limits = checked_limits(u_min, u_max, rate_limit, observer.dt)
         self._initialise()
@@ -127,7 +132,8 @@ class ADRC(StatefulController):
 
     def _design(self, observer: ESO, omega_c: float) -> AdrcDesign:
         learns = not isinstance(self.learner, NoLearner)
-        gains = law_gains(observer.degree, omega_c) * (0.5 if self.half_gain else 1.0)
+        gains = law_gains(observer.degree, omega_c, self.law_poles)
+        gains = gains * (0.5 if self.half_gain else 1.0)
         law = np.append(gains, np.zeros(observer.order - observer.degree))
         return AdrcDesign(
             eso=observer.model,

@@ -55,6 +55,7 @@ from quell.learners.base import (
 )
 from quell.learners.lag import lag_push, reset_lag
 from quell.learners.recovery import LearnerWatch, has_escaped, has_lost_range, is_in_proportion
+from quell.lti.pole_pattern import pole_pattern
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Matrix, Status, Vector
 
@@ -311,14 +312,19 @@ def _bumpless_transfer(design: AdrcDesign, state: AdrcState) -> None:
         loop.offset = loop.u - unlimited_control(design, state, loop.constant, loop.slope)
 
 
-def law_gains(order: int, omega_c: float) -> Vector:
-    """Return the gains ``k_i = C(n, i−1) omega_c^(n−i+1)`` (n,) of order n.
+def law_gains(order: int, omega_c: float, poles: Any = None) -> Vector:
+    """Return the gains (n,) of order n: the coefficients of ``s^n + k_n s^(n−1) + … + k_1``.
 
-    All poles of ``s^n + k_n s^(n−1) + … + k_1`` lie at −omega_c.
+    By default all its roots lie at −omega_c, ``k_i = C(n, i−1) omega_c^(n−i+1)``; ``poles`` are
+    others, in units of omega_c (``quell.lti.pole_pattern``).
     """
+    weights = np.array([float(math.comb(order, i)) for i in range(order)])
+    if poles is not None:
+        pattern = pole_pattern("law_poles", poles, order)
+        weights = np.real(np.poly(pattern))[:0:-1]
     with np.errstate(over="ignore"):
         powers = [np.float64(omega_c) ** (order - i) for i in range(order)]
-        gains = np.array([math.comb(order, i) * power for i, power in enumerate(powers)])
+        gains = np.array([weight * power for weight, power in zip(weights, powers, strict=True)])
     if not np.all(np.isfinite(gains)):
         raise ValueError(f"omega_c = {omega_c!r} rad/s: its power {order} must be finite; lower it")
     return gains

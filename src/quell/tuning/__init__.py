@@ -1,0 +1,14 @@
+"""Tuning: the controller of a structure with the best objective under constraints.
+
+May import ``identification`` and what stands before it. ``constraints`` and ``objectives`` say what
+is asked for, ``structures`` has the families of controllers and their free parameters, ``loops``
+the frequency responses of a set of plants, ``search`` the optimiser; ``tune`` puts them together
+and returns a ``Tuned``.
+"""
+
+from quell.tuning.constraints import Constraints
+from quell.tuning.structures import STRUCTURES
+from quell.tuning.tune import tune
+from quell.tuning.tuned import Tuned
+
+__all__ = ["STRUCTURES", "Constraints", "Tuned", "tune"]

@@ -1,0 +1,201 @@
+"""The loops of many controllers with a set of plants: responses, stability, peaks.
+
+All plants of a set are sampled with the controller's dt, dead time and lag included, and have their
+responses at the same frequencies. The responses are exact (``analysis.frequency_response``). The
+grid only brackets: ``peaks`` finds the largest values between its points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.analysis.frequency_response import Complex, Response, frequencies, in_s_plane
+from quell.analysis.pure_delays import eigenvalues
+from quell.lti.system import System
+from quell.plants.sampled import SampledPlant
+from quell.types import Matrix, Vector
+
+# The lowest frequency of the grid, in units of the phase crossover; a pole below a tenth of it
+# counts as an integrator.
+_BOTTOM = 1e-4
+# Points per decade of the grid, and phase of the longest dead time between points of its even part
+# [rad], which ends after so many turns: above, the gain of a loop with a dead time is small.
+# Doubling the points changes the optima of the test batch by less than 1e-4.
+_POINTS_PER_DECADE, _TURN, _TURNS = 24, 0.3, 12.0
+# Half the sampling rate itself is a pole of Tustin's rule.
+_BELOW_HALF = 1.0 - 1e-6
+# Points between the neighbours of a maximum, and how often they are placed anew: an interval of
+# 0.1 shrinks to 1e-5.
+_ZOOM, _ZOOMS = 17, 3
+
+
+class Peak(NamedTuple):
+    """A local maximum over frequency."""
+
+    value: float
+    omega: float
+    plant: int
+
+
+class PlantSet:
+    """Sampled plants with factors of their gain, on a common grid of frequencies.
+
+    Attributes
+    ----------
+    plants, factors
+        the plants (J,) and the factors of their gain (J,).
+    omega : array
+        the grid (G,) [rad/s].
+    P : array
+        the responses (J, G).
+    crossover : float
+        frequency at which the first plant's phase lag is half a turn, or its scale [rad/s].
+    """
+
+    def __init__(self, plants: Sequence[SampledPlant], factors: Vector, dt: float) -> None:
+        self.plants, self.factors, self.dt = tuple(plants), factors, dt
+        distinct = {id(plant): plant for plant in plants}
+        self._responses = {
+            key: Response(System(plant.N, plant.B, plant.C, 0.0)) for key, plant in distinct.items()
+        }
+        self._poles = {key: eigenvalues(plant.N) for key, plant in distinct.items()}
+        self.crossover = self._crossover()
+        self.omega = self._grid()
+        self.P = self.responses(self.omega)
+        self._open = [self._open_poles(self._poles[id(plant)]) for plant in self.plants]
+
+    def responses(self, omega: Vector) -> Complex:
+        """Return P (J, k)."""
+        found = {key: response(omega, self.dt) for key, response in self._responses.items()}
+        rows = [found[id(plant)] for plant in self.plants]
+        P: Complex = np.array(rows) * self.factors[:, None]
+        return P
+
+    def _s_poles(self, plant: SampledPlant) -> Complex:
+        poles = in_s_plane(self._poles[id(plant)], self.dt)
+        kept: Complex = poles[np.isfinite(poles)]
+        return kept
+
+    def _crossover(self) -> float:
+        top = math.pi / self.dt
+        first = self.plants[0]
+        sizes = np.abs(self._s_poles(first))
+        sizes = sizes[(sizes > 1e-7 * top) & (sizes < top)]
+        low = 1e-2 * float(np.min(sizes, initial=1e-2 * top))
+        omega = np.geomspace(low, top * _BELOW_HALF, 600)
+        response = self._responses[id(first)](omega, self.dt)
+        phase = np.unwrap(np.angle(response))
+        phase += -2.0 * np.pi * np.round((phase[0] + 0.5 * np.pi) / (2.0 * np.pi))
+        late = np.flatnonzero(phase <= -np.pi)
+        if late.size and late[0] > 0:
+            return float(omega[late[0]])
+        return float(np.exp(np.mean(np.log(sizes)))) if sizes.size else 0.1 * top
+
+    def _grid(self) -> Vector:
+        top = math.pi / self.dt * _BELOW_HALF
+        bottom = min(_BOTTOM * self.crossover, 0.01 * top)
+        count = math.ceil(_POINTS_PER_DECADE * math.log10(top / bottom)) + 1
+        parts = [np.geomspace(bottom, top, count)]
+        longest = max(_dead_samples(plant) for plant in self.plants) * self.dt
+        if longest > 0.0:
+            end = min(2.0 * math.pi * _TURNS / longest, top)
+            parts.append(np.arange(1.0, end * longest / _TURN) * (_TURN / longest))
+        for plant in self.plants:
+            poles = self._s_poles(plant)
+            poles = poles[poles.imag > 0.0]
+            resonant = poles[-poles.real < 0.5 * poles.imag]
+            if resonant.size:
+                near = frequencies(resonant, self.dt)
+                parts.append(near[_beside(near, resonant)])
+        grid = np.unique(np.concatenate(parts))
+        kept: Vector = grid[(grid >= bottom) & (grid <= top)]
+        return kept
+
+    def _open_poles(self, shifted: Complex) -> tuple[float, float, Vector]:
+        """Return unstable poles, integrators, and the frequencies of undamped ones [rad/s]."""
+        s = in_s_plane(shifted, self.dt)
+        s = s[np.isfinite(s)]
+        zero = np.abs(s) < 0.1 * float(self.omega[0])
+        undamped = ~zero & (np.abs(s.real) <= 1e-6 * np.abs(s.imag))
+        unstable = ~zero & ~undamped & (s.real > 0.0)
+        on_axis = s[undamped & (s.imag > 0.0)].imag
+        return float(np.sum(unstable)), float(np.sum(zero)), np.sort(on_axis)
+
+    # ---- loops
+
+    def unstable_loops(self, C: Complex, controller: Vector) -> Matrix:
+        """Return the number (m, J) of unstable closed-loop poles, by the argument principle.
+
+        ``1 + L`` is the closed loop's polynomial over the open loop's. Over the upper half circle
+        each root inside adds π to the argument of a polynomial, one outside nothing, one at z = 1
+        π/2. So the argument of 1 + L grows by ``π (open unstable + open at one / 2 − closed
+        unstable)``. A pole on the circle counts as inside: at it the argument falls by π.
+
+        Parameters
+        ----------
+        C
+            responses (m, G) of controllers with one pole at z = 1, on the grid.
+        controller
+            their numbers of unstable poles (m,).
+        """
+        count = np.empty((C.shape[0], len(self.plants)))
+        for j, (unstable, integrators, on_axis) in enumerate(self._open):
+            angle = np.angle(1.0 + self.P[j] * C)
+            steps = np.remainder(np.diff(angle, axis=1) + np.pi, 2.0 * np.pi) - np.pi
+            at = np.searchsorted(self.omega, on_axis) - 1
+            at = at[(at >= 0) & (at < steps.shape[1])]
+            steps[:, at] -= 2.0 * np.pi * (steps[:, at] > 0.0)
+            expected = unstable + controller + 0.5 * (integrators + 1.0)
+            count[:, j] = np.round(expected - np.sum(steps, axis=1) / np.pi)
+        return np.abs(count)
+
+
+def peaks(
+    function: Callable[[Vector], NDArray[np.float64]], omega: Vector, values: Matrix, least: float
+) -> list[Peak]:
+    """Return the local maxima (refined between grid points) above ``least``.
+
+    ``function`` returns values (J, k) at frequencies (k,); ``values`` are those at ``omega``.
+    """
+    found = []
+    padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
+    middle = padded[:, 1:-1]
+    is_peak = (middle >= padded[:, :-2]) & (middle >= padded[:, 2:]) & (middle > least)
+    plants, places = np.nonzero(is_peak)
+    if plants.size == 0:
+        return []
+    x = np.log(omega)
+    low, high = x[np.maximum(places - 1, 0)], x[np.minimum(places + 1, x.size - 1)]
+    best, at = values[plants, places].copy(), x[places].copy()
+    share = np.linspace(0.0, 1.0, _ZOOM)
+    rows = np.arange(plants.size)
+    for _ in range(_ZOOMS):
+        points = low[:, None] + (high - low)[:, None] * share
+        each = function(np.exp(points.ravel())).reshape(values.shape[0], plants.size, _ZOOM)
+        own = each[plants, rows]
+        top = np.argmax(own, axis=1)
+        better = own[rows, top] > best
+        best = np.where(better, own[rows, top], best)
+        at = np.where(better, points[rows, top], at)
+        width = (high - low) / (_ZOOM - 1)
+        low, high = np.maximum(at - width, low), np.minimum(at + width, high)
+    for value, place, plant in zip(best, at, plants, strict=True):
+        found.append(Peak(float(value), math.exp(place), int(plant)))
+    return found
+
+
+def _dead_samples(plant: SampledPlant) -> int:
+    """Return the number of samples that a plant's control signal waits."""
+    return int(np.count_nonzero(np.diag(plant.N) == -1.0))
+
+
+def _beside(omega: Vector, poles: Complex) -> NDArray[np.bool_]:
+    """Return which frequencies lie within a fifth of a resonance."""
+    distance = np.abs(omega[:, None] / poles.imag[None, :] - 1.0)
+    near: NDArray[np.bool_] = np.any(distance < 0.2, axis=1)
+    return near

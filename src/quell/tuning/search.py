@@ -1,0 +1,262 @@
+"""The optimiser: several starts, sequential quadratic programming, exchange of frequencies.
+
+The problem ``max k_i`` subject to bounds at *all* frequencies has infinitely many constraints. It
+is solved as a sequence of problems with finitely many (exchange, Hettich & Kortanek, *SIAM Review*
+35, 1993): the points of the grid with values near their bounds, and the peaks between them. Each is
+solved by sequential quadratic programming (Kraft 1988, SciPy's SLSQP) in the logarithms of the
+parameters, within a box around the present point. Stability is checked after each, by the argument
+principle, and at the end by the closed loop's poles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.tuning.loops import PlantSet
+from quell.tuning.requirements import (
+    Active,
+    Bound,
+    Points,
+    all_peaks,
+    sizes,
+    slack_and_slope,
+    worst_ratio,
+)
+from quell.tuning.structures.base import Structure
+from quell.types import Matrix, Vector
+
+# Step of the differences in the logarithms: between the rounding error of C_y, some 1e-12, and its
+# curvature.
+_DIFFERENCE = 1e-6
+# Points with a ratio above the first are in the problem; peaks above the second are refined.
+_NEAR, _PEAK = 0.7, 0.93
+# Half width of the box of a round in the logarithms, and how it shrinks after an unstable result.
+_BOX, _SHRINK = 0.7, 0.3
+_ROUNDS, _ITERATIONS = 12, 25
+# A result is good if no bound is exceeded by more; a tenth of what is promised.
+_VIOLATION = 1e-4
+# Rounds end when the objective changes by less.
+_SETTLED = 1e-5
+
+
+class Extra(NamedTuple):
+    """A constraint that is no bound of a frequency response."""
+
+    name: str
+    limit: float
+    ratio: Callable[[Structure, Matrix], Vector]  # values (m, p) → value over limit (m,)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is searched for."""
+
+    plants: PlantSet
+    bounds: tuple[Bound, ...]
+    extras: tuple[Extra, ...]
+    cost: Callable[[Structure, Matrix], Vector]  # values (m, p) → cost (m,), its logarithm
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The best values of a structure."""
+
+    structure: Structure
+    values: Vector
+    cost: float
+    violation: float  # the largest ratio to a bound, less one
+    active: tuple[Active, ...]
+
+    @property
+    def feasible(self) -> bool:
+        """Whether all constraints hold."""
+        return self.violation <= 10.0 * _VIOLATION
+
+
+def starts(problem: Problem, structure: Structure, more: Matrix, count: int) -> Matrix:
+    """Return the ``count`` best starts (k, p) of the structure's shapes and ``more`` values.
+
+    Each shape is tried with gains that put the crossover at frequencies all over the grid.
+    """
+    shapes = np.vstack([structure.shapes(), more])
+    shapes = np.clip(shapes, *_limits(structure))
+    plants = problem.plants
+    C = structure.response(shapes, plants.omega) * shapes[:, :1] ** -structure.gain_power
+    unstable = structure.unstable_poles(shapes)
+    found: list[tuple[float, float, Vector]] = []
+    for row, response, poles in zip(shapes, C, unstable, strict=True):
+        loop = np.max(np.abs(plants.P * response), axis=0)
+        gains = 1.0 / loop[:: max(loop.size // 40, 1)]
+        gains = gains[np.isfinite(gains) & (gains > 0.0)]
+        tried = gains[:, None] * response
+        ratio = worst_ratio(problem.bounds, plants, tried)
+        stable = np.all(
+            plants.unstable_loops(tried, np.full(gains.size, poles)) < 0.5, axis=1
+        ) & np.isfinite(ratio)
+        if not np.any(stable):
+            continue
+        values = np.repeat(row[None, :], gains.size, axis=0)
+        values[:, 0] = gains**structure.gain_power
+        values = np.clip(values, *_limits(structure))
+        cost = np.where(stable, np.log(np.maximum(ratio, 1.0)) * 10.0, np.inf)
+        good = np.flatnonzero(stable)
+        cost[good] += problem.cost(structure, values[good])
+        best = int(np.argmin(cost))
+        found.append((float(cost[best]), float(ratio[best]), values[best]))
+    found.sort(key=lambda entry: entry[0])
+    return np.array([row for _, _, row in found[:count]]).reshape(-1, shapes.shape[1])
+
+
+def _limits(structure: Structure) -> tuple[Vector, Vector]:
+    low = np.array([parameter.low for parameter in structure.parameters])
+    return low, np.array([parameter.high for parameter in structure.parameters])
+
+
+def search(problem: Problem, structure: Structure, start: Vector) -> Solution | None:
+    """Return the optimum that is reached from a start; None if all rounds end unstable."""
+    low, high = (np.log(limit) for limit in _limits(structure))
+    x, box = np.clip(np.log(start), low, high), _BOX
+    best: tuple[float, float, Vector] | None = None
+    extra_points: list[tuple[int, int, float]] = []
+    last = math.inf
+    for _ in range(_ROUNDS):
+        found, violation, refined = _judged(problem, structure, x)
+        cost = found
+        if best is None or _better(cost, violation, best):
+            best = (cost, violation, x)
+        if violation <= _VIOLATION and abs(last - cost) < _SETTLED:
+            break
+        last = cost
+        extra_points = (extra_points + refined)[-400:]
+        points = _points(problem, structure, x, extra_points)
+        bounds = list(zip(np.maximum(low, x - box), np.minimum(high, x + box), strict=True))
+        after = _quadratic_programming(problem, structure, x, points, bounds)
+        if after is None or not _stable(problem, structure, after):
+            box *= _SHRINK
+            if box < 1e-3:
+                break
+            continue
+        x = after
+    if best is None:
+        return None
+    cost, violation, x = best
+    values = np.exp(x)
+    return Solution(structure, values, cost, violation, _active(problem, structure, values))
+
+
+def _better(cost: float, violation: float, best: tuple[float, float, Vector]) -> bool:
+    if max(violation, best[1]) <= _VIOLATION:
+        return cost < best[0]
+    return violation < best[1]
+
+
+def _judged(
+    problem: Problem, structure: Structure, x: Vector
+) -> tuple[float, float, list[tuple[int, int, float]]]:
+    """Return cost, violation, and the refined peaks (bound, plant, frequency)."""
+    values = np.exp(x)[None, :]
+    C = structure.response(values, problem.plants.omega)[0]
+
+    def controller(omega: Vector) -> NDArray[np.complex128]:
+        return structure.response(values, omega)[0]
+
+    found = all_peaks(problem.bounds, problem.plants, controller, C, _PEAK)
+    ratios = [peak.value for _, peak in found]
+    ratios += [float(extra.ratio(structure, values)[0]) for extra in problem.extras]
+    ratios += (1.0 - structure.rules(values)[0]).tolist()
+    violation = max([ratio - 1.0 for ratio in ratios], default=0.0)
+    cost = float(problem.cost(structure, values)[0])
+    return cost, max(violation, 0.0), [(i, peak.plant, peak.omega) for i, peak in found]
+
+
+def _stable(problem: Problem, structure: Structure, x: Vector) -> bool:
+    values = np.exp(x)[None, :]
+    C = structure.response(values, problem.plants.omega)
+    unstable = problem.plants.unstable_loops(C, structure.unstable_poles(values))
+    return bool(np.all(unstable < 0.5))
+
+
+def _points(
+    problem: Problem, structure: Structure, x: Vector, refined: list[tuple[int, int, float]]
+) -> Points:
+    """Return the points of the grid near their bounds, and the refined peaks."""
+    plants = problem.plants
+    C = structure.response(np.exp(x)[None, :], plants.omega)[0]
+    kinds, members, places = [], [], []
+    for number, (response, limit) in enumerate(problem.bounds):
+        near = sizes(response, plants.P, C) > _NEAR * limit
+        j, i = np.nonzero(near)
+        kinds.append(np.full(j.size, number))
+        members.append(j)
+        places.append(plants.omega[i])
+    kinds.append(np.array([i for i, _, _ in refined], dtype=int))
+    members.append(np.array([j for _, j, _ in refined], dtype=int))
+    places.append(np.array([omega for _, _, omega in refined]))
+    kind, member = np.concatenate(kinds), np.concatenate(members)
+    omega, at = np.unique(np.concatenate(places), return_inverse=True)
+    if omega.size == 0:  # far from all bounds
+        omega, at = plants.omega[:1], np.zeros(1, dtype=int)
+        kind, member = np.zeros(1, dtype=int), np.zeros(1, dtype=int)
+    P = plants.responses(omega)[member, at]
+    return Points(kind.astype(np.intp), P, at.astype(np.intp), omega)
+
+
+def _quadratic_programming(
+    problem: Problem, structure: Structure, x: Vector, points: Points, bounds: list[Any]
+) -> Vector | None:
+    from scipy.optimize import minimize
+
+    size = x.size
+    steps = np.vstack([np.zeros(size), _DIFFERENCE * np.eye(size)])
+    memo: dict[bytes, Any] = {}
+
+    def at(x: Vector) -> Any:
+        key = x.tobytes()
+        if key not in memo:
+            memo.clear()
+            values = np.exp(x + steps)
+            C = structure.response(values, points.omega)
+            g, slope = slack_and_slope(problem.bounds, points, C[0], (C[1:] - C[0]) / _DIFFERENCE)
+            parts, slopes = [g], [slope]
+            for extra in problem.extras:
+                ratio = 1.0 - extra.ratio(structure, values)
+                parts.append(ratio[:1])
+                slopes.append(((ratio[1:] - ratio[0]) / _DIFFERENCE)[None, :])
+            rules = structure.rules(values)
+            parts.append(rules[0])
+            slopes.append((rules[1:] - rules[0]).T / _DIFFERENCE)
+            cost = problem.cost(structure, values)
+            memo[key] = (
+                cost[0],
+                (cost[1:] - cost[0]) / _DIFFERENCE,
+                np.concatenate(parts),
+                np.vstack(slopes),
+            )
+        return memo[key]
+
+    try:
+        found = minimize(
+            lambda x: at(x)[0],
+            x,
+            jac=lambda x: at(x)[1],
+            bounds=bounds,
+            constraints={"type": "ineq", "fun": lambda x: at(x)[2], "jac": lambda x: at(x)[3]},
+            method="SLSQP",
+            options={"maxiter": _ITERATIONS, "ftol": 1e-9},
+        )
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    if not np.all(np.isfinite(found.x)):
+        return None
+    return np.clip(found.x, [low for low, _ in bounds], [high for _, high in bounds])
+
+
+def _active(problem: Problem, structure: Structure, values: Vector) -> tuple[Active, ...]:
+    """Return the constraints within a percent of their bounds."""
+    return ()

@@ -1,0 +1,258 @@
+"""ADRC by bandwidths, with poles of its own, at half gain, of reduced order, with a model.
+
+The poles of the law and of the observer are each one number, the bandwidth, or *freed*: a factor
+``s² + 2 ζ ω s + ω²`` for each two of them, real or complex, and a real pole if their number is odd.
+A freed ADRC of order 1 has the feedback of a PI controller with a filter of first order, one of
+order 2 that of a PID controller with a filter of second order (``baselines/equivalent.py``), as
+long as the loop with its own nominal plant is stable; ``equivalent.py`` finds these as starts.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.analysis.frequency_response import Complex
+from quell.controllers.adrc.adrc import ADRC
+from quell.lti.canonical import Canonical, canonical
+from quell.observers.eso import ESO
+from quell.tuning.structures import sampled_adrc
+from quell.tuning.structures.base import Model, Parameter
+from quell.types import Matrix, Vector
+
+# Bounds of a pole in units of the plant's phase crossover, and of the damping of a pair. Below the
+# least damping a pole of its own would ring. Chosen by hand.
+_SLOWEST = 1e-3
+_DAMPING = (0.1, 20.0)
+# Bandwidths to start from: of the law in units of the plant's phase crossover, and of the observer
+# in units of the law's.
+_LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
+_OBSERVER_STARTS = (0.3, 1.0, 3.0, 10.0, 30.0)
+
+
+@dataclass(frozen=True)
+class Form:
+    """Which kind of ADRC a structure has."""
+
+    freed: bool = False
+    reduced: bool = False
+    half_observer: bool = False
+    half_law: bool = False
+    based: bool = False
+    knows_delay: bool = False
+
+
+class AdrcStructure:
+    """An ADRC of one form and order."""
+
+    gain_power = -1
+
+    def __init__(self, model: Model, name: str, order: int, form: Form) -> None:
+        self.name, self.model, self.form = name, model, form
+        self.plant: Canonical = (
+            canonical(model.plant) if form.based else canonical((np.zeros(order), 1.0))
+        )
+        if form.based and self.plant.unstable_zeros.size:
+            raise ValueError("the plant has zeros outside of the left half plane, which it inverts")
+        self.order, self.degree = self.plant.a.size, self.plant.degree
+        self._chain = sampled_adrc.sampled_chain(self.plant, model.dt)
+        self._delay = round(model.delay / model.dt) if form.knows_delay else 0
+        self._fastest = model.constraints.omega_o_dt / model.dt
+        self._observed = self.order + (0 if form.reduced else 1)
+        unit = model.gain * model.omega**self.degree
+        self.parameters = (
+            Parameter("b0", f"y-unit/u-unit/s^{self.degree}", 1e-10 * unit, 1e10 * unit),
+            *self._pole_parameters("c", self.degree),
+            *self._pole_parameters("o", self._observed),
+        )
+
+    def _pole_parameters(self, which: str, count: int) -> list[Parameter]:
+        bounds = (min(_SLOWEST * self.model.omega, 0.1 * self._fastest), self._fastest)
+        if not self.form.freed:
+            return [Parameter(f"omega_{which}", "rad/s", *bounds)]
+        found = []
+        for i in range(count // 2):
+            found.append(Parameter(f"omega_{which}{i + 1}", "rad/s", *bounds))
+            found.append(Parameter(f"damping_{which}{i + 1}", "", *_DAMPING))
+        if count % 2:
+            found.append(Parameter(f"pole_{which}", "rad/s", *bounds))
+        return found
+
+    # ---- poles from the parameters
+
+    def _columns(self) -> int:
+        return 1 + (self.degree if self.form.freed else 1)
+
+    def poles(self, values: Matrix) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Return the poles of the law (m, r) and of the observer (m, N) [rad/s]."""
+        split = self._columns()
+        parts = ((values[:, 1:split], self.degree), (values[:, split:], self._observed))
+        law, observer = (self._roots(part, count) for part, count in parts)
+        return law, observer
+
+    def _roots(self, values: Matrix, count: int) -> NDArray[np.complex128]:
+        if not self.form.freed:
+            return np.repeat(-values[:, :1].astype(complex), count, axis=1)
+        columns = []
+        for i in range(count // 2):
+            omega, damping = values[:, 2 * i], values[:, 2 * i + 1].astype(complex)
+            root = np.sqrt(damping**2 - 1.0)
+            columns += [-omega * (damping - root), -omega * (damping + root)]
+        if count % 2:
+            columns.append(-values[:, count - 1].astype(complex))
+        return np.stack(columns, axis=1)
+
+    def rows_of(self, b0: float, law: Any, observer: Any) -> Vector | None:
+        """Return the values with these poles; None if they cannot be put into pairs."""
+        row = [b0]
+        for poles in (law, observer):
+            factors = _factors(np.asarray(poles, dtype=complex))
+            if factors is None:
+                return None
+            row += factors
+        return np.array(row)
+
+    # ---- the structure
+
+    def shapes(self) -> Matrix:
+        """Return bandwidths in wide ranges; freed poles start in one place, or in two."""
+        omega, rows = self.model.omega, []
+        for law, ratio in itertools.product(_LAW_STARTS, _OBSERVER_STARTS):
+            pair = (law * omega, law * ratio * omega)
+            if max(pair) > 0.999 * self._fastest:
+                pair = (min(pair[0], 0.9 * self._fastest), 0.99 * self._fastest)
+            if not self.form.freed:
+                rows.append(np.array([1.0, *pair]))
+                continue
+            counts = (self.degree, self._observed)
+            poles = [np.full(n, -p) for n, p in zip(counts, pair, strict=True)]
+            found = self.rows_of(1.0, *poles)
+            if found is not None:
+                rows.append(found)
+        return np.array(rows)
+
+    def _designs(self, values: Matrix) -> sampled_adrc.Designs:
+        law, observer = self.poles(values)
+        gains = np.array([np.real(np.poly(row))[:0:-1] for row in law])
+        gains = gains * (0.5 if self.form.half_law else 1.0)
+        return sampled_adrc.designs(
+            self._chain,
+            gains,
+            observer,
+            reduced=self.form.reduced,
+            half_gain=self.form.half_observer,
+            delay=self._delay,
+        )
+
+    def response(self, values: Matrix, omega: Vector) -> Complex:
+        """Return C_y (m, k)."""
+        found = self._designs(values)
+        factor = self.model.sign * found.factor / values[:, 0]
+        response: Complex = factor[:, None] * sampled_adrc.feedback(found, omega)
+        return response
+
+    def integral_gain(self, values: Matrix) -> Vector:
+        """Return k_i (m,)."""
+        found = self._designs(values)
+        return np.abs(sampled_adrc.integral_gain(found)) * found.factor / values[:, 0]
+
+    def unstable_poles(self, values: Matrix) -> Vector:
+        """Return how many poles of C_y are unstable (m,)."""
+        return sampled_adrc.unstable_poles(self._designs(values))
+
+    def rules(self, values: Matrix) -> Matrix:
+        """Return ``1 − 2 ζ ω/R + (ω/R)²`` of each pair: negative if one real pole is beyond R.
+
+        The bounds of the parameters keep ω below R.
+        """
+        columns, split = [], self._columns()
+        if self.form.freed:
+            for first, count in ((1, self.degree), (split, self._observed)):
+                for i in range(count // 2):
+                    share = values[:, first + 2 * i] / self._fastest
+                    damping = values[:, first + 2 * i + 1]
+                    columns.append(1.0 - 2.0 * damping * share + share**2)
+        return np.stack(columns, axis=1) if columns else np.zeros((values.shape[0], 0))
+
+    # ---- what comes of it
+
+    def _patterns(self, values: Vector) -> tuple[float, float, Any, Any]:
+        """Return omega_c, omega_o and the patterns of poles in units of them."""
+        law, observer = (poles[0] for poles in self.poles(values[None, :]))
+        if not self.form.freed:
+            return float(-law[0].real), float(-observer[0].real), None, None
+        omega_c, omega_o = (float(np.exp(np.mean(np.log(np.abs(p))))) for p in (law, observer))
+        return omega_c, omega_o, _pattern(law / omega_c), _pattern(observer / omega_o)
+
+    def controller(self, values: Vector, **limits: Any) -> ADRC:
+        """Return the controller."""
+        omega_c, omega_o, law, observer = self._patterns(values)
+        b0, dt = self.model.sign * float(values[0]), self.model.dt
+        options: dict[str, Any] = {
+            "form": "reduced" if self.form.reduced else "current",
+            "half_gain": self.form.half_observer,
+            "delay": self._delay * dt,
+            "poles": observer,
+        }
+        if self.form.based:
+            eso = ESO.model_based(self.model.plant, omega_o, dt, b0=b0, **options)
+        else:
+            eso = ESO.model_free(self.order, b0, omega_o, dt, **options)
+        return ADRC(eso, omega_c, half_gain=self.form.half_law, law_poles=law, **limits)
+
+    def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
+        """Return the tables of observer and controller."""
+        omega_c, omega_o, law, poles = self._patterns(values)
+        b0 = self.model.sign * float(values[0])
+        observer: dict[str, Any] = {"kind": "model-based" if self.form.based else "model-free"}
+        if not self.form.based:
+            observer["order"] = self.order
+        observer |= {"b0": b0, "omega_o": omega_o}
+        if poles is not None:
+            observer["poles"] = _listed(poles)
+        if self.form.reduced:
+            observer["form"] = "reduced"
+        if self.form.half_observer:
+            observer["half_gain"] = True
+        if self._delay:
+            observer["delay"] = self._delay * self.model.dt
+        controller: dict[str, Any] = {"kind": "adrc", "omega_c": omega_c}
+        if law is not None:
+            controller["law_poles"] = _listed(law)
+        if self.form.half_law:
+            controller["half_gain"] = True
+        return {"observer": observer, "controller": controller}
+
+
+def _pattern(poles: NDArray[np.complex128]) -> tuple[Any, ...]:
+    """Return poles as numbers, and pairs (real, imaginary) for two conjugate ones."""
+    real = [float(p.real) for p in poles if p.imag == 0.0]
+    pairs = [(float(p.real), float(p.imag)) for p in poles if p.imag > 0.0]
+    return (*real, *pairs)
+
+
+def _listed(pattern: tuple[Any, ...]) -> list[Any]:
+    return [list(entry) if isinstance(entry, tuple) else entry for entry in pattern]
+
+
+def _factors(poles: NDArray[np.complex128]) -> list[float] | None:
+    """Return (ω, ζ) of pairs of poles, and the size of a single one; None for unstable ones."""
+    if not np.all(poles.real < 0.0):
+        return None
+    tiny = 1e-9 * np.abs(poles)
+    pairs = list(poles[poles.imag > tiny])
+    real = sorted(-poles.real[np.abs(poles.imag) <= tiny])
+    found: list[float] = []
+    for p in pairs:
+        found += [float(abs(p)), float(-p.real / abs(p))]
+    # Of real poles the fastest ones form pairs; a single one is the slowest.
+    single = [real.pop(0)] if len(real) % 2 else []
+    while real:
+        slow, fast = real.pop(0), real.pop(0)
+        omega = float(np.sqrt(slow * fast))
+        found += [omega, 0.5 * float(slow + fast) / omega]
+    return found + [float(p) for p in single]

@@ -1,0 +1,73 @@
+"""What a structure is: a family of controllers with free parameters.
+
+All parameters are searched as logarithms. The first one is a gain: the whole controller is
+multiplied by its inverse or by itself (``gain_power``), while the others, the *shape*, stay. The
+response of many parameter vectors at many frequencies is one call, without controllers being built.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+from quell.analysis.frequency_response import Complex
+from quell.controllers.base import Controller
+from quell.tuning.constraints import Constraints
+from quell.types import Matrix, Vector
+
+
+class Parameter(NamedTuple):
+    """A free number of a structure, positive; ``low`` and ``high`` bound it."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+class Model(NamedTuple):
+    """What a structure may know of the loop it is for."""
+
+    plant: Any  # nominal linear plant, as given; None for plants known by their response only
+    delay: float  # dead time of the nominal plant [s]
+    dt: float  # sample time [s]
+    sign: float  # sign of the gain that integral action needs, +1 or −1
+    degree: int  # relative degree
+    omega: float  # frequency at which the plant's phase lag is that of two integrators [rad/s]
+    gain: float  # |P| there
+    constraints: Constraints
+
+
+class Structure(Protocol):
+    """A family of controllers of one form."""
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    gain_power: int  # 1 if C_y is proportional to the first parameter, −1 if to its inverse
+
+    def shapes(self) -> Matrix:
+        """Return values (k, p) of the parameters to start from; their first one is replaced."""
+        ...
+
+    def response(self, values: Matrix, omega: Vector) -> Complex:
+        """Return C_y (m, k), from −y to u, for values (m, p) at frequencies (k,) [rad/s]."""
+        ...
+
+    def integral_gain(self, values: Matrix) -> Vector:
+        """Return the integral gains k_i (m,) [u-unit/(y-unit s)]."""
+        ...
+
+    def unstable_poles(self, values: Matrix) -> Vector:
+        """Return the number (m,) of poles of C_y outside of the unit circle."""
+        ...
+
+    def rules(self, values: Matrix) -> Matrix:
+        """Return further constraints (m, k), which must not be negative."""
+        ...
+
+    def controller(self, values: Vector, **limits: Any) -> Controller:
+        """Return the controller with values (p,); ``limits`` as for ``ADRC``."""
+        ...
+
+    def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
+        """Return the tables of a setup file that describe the controller."""
+        ...

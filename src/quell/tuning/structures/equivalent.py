@@ -1,0 +1,66 @@
+"""The freed ADRC whose feedback is that of a given PI or PID controller with a filter.
+
+In continuous time, with ``C = B(s)/(s A(s))``, A monic of degree n, and the nominal plant
+``b0/s^n``, the poles of the law and of the observer are together the poles of the loop::
+
+    s^(n+1) A(s) + b0 B(s) = p_law(s) p_observer(s)
+
+This generalises the formulas of ``controllers/baselines/equivalent.py`` (Zhong, Huang & Guo,
+*Science China Information Sciences* 63, 2020) to any poles. b0 is free: of its values, those are
+taken for which all poles are damped. The sampled controllers agree to first order in dt.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from quell.tuning.structures.adrc import AdrcStructure
+from quell.tuning.structures.pid import FilteredPID
+from quell.types import Matrix, Vector
+
+# Values of b0 that are tried, over this range around the one that makes the slowest terms equal.
+_GAINS = np.logspace(-4.0, 4.0, 161)
+
+
+def equivalents(pid: FilteredPID, values: Vector, adrc: AdrcStructure, most: int = 3) -> Matrix:
+    """Return values (k, p) of a freed ADRC of order 1 or 2 with the same feedback, k ≤ ``most``.
+
+    There are none for a PID controller that stabilises no nominal plant ``b0/s^n``, and for a
+    structure with another order or form.
+    """
+    rows: list[tuple[float, Vector]] = []
+    order = 2 if pid.derivative else 1
+    usable = adrc.form.freed and not adrc.form.based and not adrc.form.reduced
+    if not usable or adrc.order != order or not pid.filtered:
+        return np.zeros((0, len(adrc.parameters)))
+    kp, ki, kd, f1, f2 = (float(part[0]) for part in pid.parts(values[None, :]))
+    filters, numerator = ([f2, f1, 1.0], [kd, kp, ki]) if order == 2 else ([f1, 1.0], [kp, ki])
+    A, B = np.array(filters) / filters[0], np.array(numerator) / filters[0]
+    unit = adrc.parameters[0]
+    center = np.sqrt(unit.low * unit.high)
+    for b0 in center * _GAINS:
+        whole = np.concatenate([A, np.zeros(order + 1)])
+        whole[-order - 1 :] += b0 * B
+        poles = np.roots(whole)
+        damping = float(np.min(-poles.real / np.abs(poles)))
+        if damping > 0.0:
+            split = _split(poles, order)
+            row = None if split is None else adrc.rows_of(b0, *split)
+            if row is not None:
+                rows.append((damping, row))
+    rows.sort(key=lambda entry: -entry[0])
+    kept = rows[:: max(len(rows) // most, 1)][:most]
+    return np.array([row for _, row in kept]).reshape(-1, len(adrc.parameters))
+
+
+def _split(poles: Any, order: int) -> tuple[Any, Any] | None:
+    """Return the slowest ``order`` poles, conjugates together, and the others."""
+    by_size = sorted(range(poles.size), key=lambda i: float(abs(poles[i])))
+    for chosen in itertools.combinations(by_size, order):
+        law = poles[list(chosen)]
+        if abs(np.sum(law.imag)) < 1e-9 * np.max(np.abs(law)):
+            return law, np.delete(poles, list(chosen))
+    return None

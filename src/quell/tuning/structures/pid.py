@@ -1,0 +1,119 @@
+"""PI and PID controllers with their filters, as the references of every tuning.
+
+The response is exact for the sampled controller, because Tustin's rule maps each frequency to one:
+``C(s)`` at ``s = 2j tan(ω dt/2)/dt`` (Franklin, Powell & Workman, *Digital Control of Dynamic
+Systems*, 1998, section 6.1). The integral gain k_i is that of C(s).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from quell.analysis.frequency_response import Complex
+from quell.controllers.baselines.pid import PID
+from quell.tuning.structures.base import Model, Parameter
+from quell.types import Matrix, Vector
+
+# Bounds of the times, in units of the time of one radian at the plant's phase crossover.
+_TIMES = (1e-4, 1e4)
+# Least damping of a filter of second order; below, the filter has a resonance of its own.
+_LEAST_DAMPING = 0.3
+
+
+class FilteredPID:
+    """``u = K (1 + 1/(T_i s) + T_d s) / F(s) · (r − y)``, with F of first or second order.
+
+    A PI controller has ``F = 1 + T_f s`` or none; a PID controller the general
+    ``F = 1 + 2 ζ T_f s + (T_f s)²``, as an ADRC of order 2 has (``baselines/equivalent.py``).
+    """
+
+    gain_power = 1
+
+    def __init__(self, model: Model, *, derivative: bool, filtered: bool) -> None:
+        self.name = ("pid" if derivative else "pi") + ("" if filtered else "-unfiltered")
+        self.model, self.derivative, self.filtered = model, derivative, filtered
+        unit, dt = 1.0 / model.omega, model.dt
+        times = (_TIMES[0] * unit, _TIMES[1] * unit)
+        self._shortest = dt / model.constraints.omega_o_dt
+        K = 1.0 / model.gain
+        self.parameters = (
+            Parameter("K", "u-unit/y-unit", 1e-8 * K, 1e8 * K),
+            Parameter("T_i", "s", *times),
+            *([Parameter("T_d", "s", *times)] if derivative else []),
+            *([Parameter("T_f", "s", self._shortest, max(10.0 * unit, 20.0 * dt))] * filtered),
+            *([Parameter("damping", "", _LEAST_DAMPING, 3.0)] * (derivative and filtered)),
+        )
+
+    def shapes(self) -> Matrix:
+        """Return times around those of common rules, with slow to fast filters."""
+        unit, rows = 1.0 / self.model.omega, []
+        for Ti in (0.6, 1.5, 4.0, 12.0, 60.0):
+            for ratio in (0.1, 0.25, 0.5) if self.derivative else (0.0,):
+                for tf in (0.02, 0.1, 0.4) if self.filtered else (0.0,):
+                    Tf = max(tf * unit * min(Ti, 2.0), 1.05 * self._shortest)
+                    row = [1.0, Ti * unit]
+                    row += [ratio * Ti * unit] if self.derivative else []
+                    row += [Tf] if self.filtered else []
+                    rows.append(row + ([0.8] if self.derivative and self.filtered else []))
+        return np.array(rows)
+
+    def parts(self, values: Matrix) -> tuple[Vector, ...]:
+        """Return k_p, k_i, k_d, f_1, f_2, each (m,)."""
+        K, Ti = values[:, 0], values[:, 1]
+        kd, f1, f2 = np.zeros_like(K), np.zeros_like(K), np.zeros_like(K)
+        if self.derivative:
+            kd = K * values[:, 2]
+        if self.filtered and self.derivative:
+            f1, f2 = 2.0 * values[:, 4] * values[:, 3], values[:, 3] ** 2
+        elif self.filtered:
+            f1 = values[:, 2]
+        return K, K / Ti, kd, f1, f2
+
+    def response(self, values: Matrix, omega: Vector) -> Complex:
+        """Return C_y (m, k)."""
+        kp, ki, kd, f1, f2 = (part[:, None] for part in self.parts(values))
+        # At half the sampling rate s is infinite: the frequencies of the search stay just below.
+        s = 2j / self.model.dt * np.tan(0.5 * self.model.dt * omega)[None, :]
+        found: Complex = self.model.sign * (kp + ki / s + kd * s) / (1.0 + f1 * s + f2 * s**2)
+        return found
+
+    def integral_gain(self, values: Matrix) -> Vector:
+        """Return K/T_i."""
+        found: Vector = values[:, 0] / values[:, 1]
+        return found
+
+    def unstable_poles(self, values: Matrix) -> Vector:
+        """Return zeros: filters are stable."""
+        return np.zeros(values.shape[0])
+
+    def rules(self, values: Matrix) -> Matrix:
+        """Return what is negative if the faster of two real poles of the filter is too fast."""
+        if not (self.derivative and self.filtered):
+            return np.zeros((values.shape[0], 0))
+        share = self._shortest / values[:, 3]
+        found: Matrix = (1.0 - 2.0 * values[:, 4] * share + share**2)[:, None]
+        return found
+
+    def _arguments(self, values: Vector) -> dict[str, Any]:
+        kp, ki, kd, f1, f2 = (float(part[0]) for part in self.parts(values[None, :]))
+        sign = self.model.sign
+        arguments: dict[str, Any] = {"kp": sign * kp, "ki": sign * ki}
+        if self.derivative:
+            arguments["kd"] = sign * kd
+        if self.filtered:
+            arguments["tf"] = (f1, f2)
+        return arguments
+
+    def controller(self, values: Vector, **limits: Any) -> PID:
+        """Return the PID controller."""
+        name = "PID" if self.derivative else "PI"
+        return PID(**self._arguments(values), dt=self.model.dt, name=name, **limits)
+
+    def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
+        """Return the table of the controller."""
+        arguments = self._arguments(values)
+        if "tf" in arguments:
+            arguments["tf"] = list(arguments["tf"])
+        return {"controller": {"kind": "pid"} | arguments}

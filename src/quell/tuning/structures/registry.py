@@ -1,0 +1,53 @@
+"""The names of the structures."""
+
+from __future__ import annotations
+
+from quell import checks
+from quell.tuning.structures.adrc import AdrcStructure, Form
+from quell.tuning.structures.base import Model, Structure
+from quell.tuning.structures.pid import FilteredPID
+
+_PID = {
+    "pi": (False, True),
+    "pi-unfiltered": (False, False),
+    "pid": (True, True),
+}
+_ADRC = {
+    "bandwidths": Form(),
+    "freed": Form(freed=True),
+    "half-gain": Form(half_observer=True),
+    "half-gain-law": Form(half_law=True),
+    "reduced": Form(reduced=True),
+    "model-based": Form(based=True),
+    "model-based-freed": Form(based=True, freed=True),
+    "delay": Form(knows_delay=True),
+    "delay-freed": Form(knows_delay=True, freed=True),
+}
+STRUCTURES = (*_ADRC, *_PID)
+"""Names of the structures: forms of ADRC by bandwidths or freed poles, and PI and PID."""
+
+
+def orders_of(name: str, model: Model, order: int | None) -> tuple[int, ...]:
+    """Return the orders to search: of a free ADRC 1 and 2, unless the plant or user says one."""
+    if name in _PID or _ADRC[name].based:
+        return (0,)
+    if order is not None:
+        return (checks.whole("order", order, 1, 8),)
+    return (1,) if model.degree == 1 and model.delay == 0.0 else (1, 2)
+
+
+def make_structure(name: str, model: Model, order: int = 0) -> Structure:
+    """Return a structure for a loop; ``order`` is that of an ADRC without model.
+
+    Raises
+    ------
+    ValueError
+        for an unknown name, or a structure that the plant does not allow.
+    """
+    checks.one_of("structure", name, STRUCTURES)
+    if name in _PID:
+        derivative, filtered = _PID[name]
+        return FilteredPID(model, derivative=derivative, filtered=filtered)
+    form = _ADRC[name]
+    label = name if form.based else f"{name} of order {order}"
+    return AdrcStructure(model, label, order, form)

@@ -1,0 +1,191 @@
+"""The feedback of many sampled ADRC designs at many frequencies, without building controllers.
+
+With the observer in its current form, c = (1, 0, …) and the law ``u = −K ẑ`` (``observers/linear``,
+``controllers/adrc/law``), z⁻ the prediction and d the samples by which u is delayed::
+
+    ẑ = z⁻ + L (y − c z⁻),     z z⁻ = (Φ − z^(−d) Γ K) ẑ
+    C_y = z K ( z I − (I − L c) (Φ − z^(−d) Γ K) )⁻¹ L
+
+and with ``ζ = z − 1``, ``Δ = Φ − I`` nothing is a small difference of large numbers::
+
+    z I − (I − L c) (Φ − z^(−d) Γ K) = ζ I + L c − (I − L c) (Δ − z^(−d) Γ K)
+
+C_y has a pole at z = 1. With v and w the right and left null vectors of that matrix M at ζ = 0, its
+residue is ``K v · w L / (w M'(0) v)``, from which the integral gain follows. All is in coordinates
+``x_i/ω^(i−1)``, ``f/ω^q`` with ω the geometric mean of the observer's poles; then C_y is
+``ω^r/b0`` times a function of the poles alone.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell.analysis.frequency_response import Complex
+from quell.lti.canonical import Canonical
+from quell.lti.discretize import zero_order_hold
+from quell.types import Matrix, Vector
+
+Stack = NDArray[np.float64]
+
+# A pole of the controller beyond is unstable; the integrator, to rounding, is not.
+_OUTSIDE = 1e-7
+
+
+class SampledChain(NamedTuple):
+    """The extended model of a plant, sampled in the coordinates ``x_i dt^(i−1)``, ``f dt^q``."""
+
+    difference: Matrix  # Φ − I (N, N)
+    input: Vector  # Γ for b0 = 1 and u in units of dt^−r (N,)
+    power: Vector  # 0 … n − 1, q
+    cancel: Vector  # (n,)
+    cancel_f: float
+    degree: int
+    dt: float
+
+
+def sampled_chain(plant: Canonical, dt: float) -> SampledChain:
+    """Sample the extended model of ``plant`` as ``observers/design`` does."""
+    n, q = plant.a.size, plant.f_degree
+    A = np.diag(np.ones(n), 1)
+    A[-2, :-1] -= plant.a * dt ** (n - np.arange(n))
+    A[:-1, -1] = plant.E * dt ** (np.arange(n) + 1.0 - q)
+    column = np.zeros((n + 1, 1))
+    column[:-1, 0] = plant.B / plant.b * dt ** (np.arange(n) + 1.0 - plant.degree)
+    _, (difference, gamma) = zero_order_hold(A, [A, column], 1.0)
+    cancel = plant.a if plant.degree == n else -np.eye(n)[plant.degree]
+    power = np.append(np.arange(float(n)), float(q))
+    matched = 1.0 if plant.matched else 0.0
+    return SampledChain(difference, gamma[:, 0], power, cancel, matched, plant.degree, dt)
+
+
+class Designs(NamedTuple):
+    """m designs in coordinates of similar size."""
+
+    difference: Stack  # Δ (m, N, N)
+    input: Matrix  # Γ (m, N)
+    gain: Matrix  # L (m, N)
+    law: Matrix  # K (m, N)
+    factor: Vector  # ω^r (m,); C_y = factor / b0 times the response of these
+    delay: int
+    dt: float
+
+
+def designs(
+    chain: SampledChain,
+    law: Matrix,
+    poles: NDArray[np.complex128],
+    *,
+    reduced: bool = False,
+    half_gain: bool = False,
+    delay: int = 0,
+) -> Designs:
+    """Return designs with law gains k (m, r) and observer poles (m, N), or (m, N − 1) if reduced.
+
+    ``delay`` is the known delay of u [samples].
+    """
+    count, size = law.shape[0], chain.power.size
+    omega = np.exp(np.mean(np.log(np.abs(poles)), axis=1))
+    step = omega * chain.dt
+    power = chain.power
+    difference = chain.difference * step[:, None, None] ** (power[None, :] - power[:, None])
+    offsets = -np.expm1(poles * chain.dt)
+    if reduced:
+        offsets = np.hstack([offsets, np.ones((count, 1))])
+    gain = _placed(difference, offsets)
+    if reduced:
+        gain[:, 0] = 1.0
+    if half_gain:
+        gain = 0.5 * gain
+    K = np.zeros((count, size))
+    K[:, : law.shape[1]] = law
+    K[:, :-1] -= chain.cancel
+    K[:, -1] = chain.cancel_f
+    K *= omega[:, None] ** (power - chain.degree)
+    column = chain.input * step[:, None] ** (chain.degree - power)
+    return Designs(difference, column, gain, K, omega**chain.degree, delay, chain.dt)
+
+
+def _placed(difference: Stack, offsets: NDArray[np.complex128]) -> Matrix:
+    """Return L (m, N) as ``observers.placement.place_poles`` does, for many designs."""
+    count, size, _ = difference.shape
+    unit = np.max(np.abs(offsets), axis=1)
+    rate = difference / unit[:, None, None]
+    rows = np.empty_like(difference)
+    rows[:, 0] = difference[:, 0]
+    rows[:, 0, 0] += 1.0
+    for i in range(1, size):
+        rows[:, i] = np.matmul(rows[:, i - 1, None], rate)[:, 0]
+    last = np.zeros((count, size, 1))
+    last[:, -1] = 1.0
+    vector = np.linalg.solve(rows, last).astype(complex)
+    for i in range(offsets.shape[1]):
+        vector = rate @ vector + (offsets[:, i] / unit)[:, None, None] * vector
+    gain: Matrix = unit[:, None] * vector[:, :, 0].real
+    return gain
+
+
+def _open(found: Designs) -> tuple[Stack, Stack]:
+    """Return ``L c − (I − L c) Δ`` and ``(I − L c) Γ K`` (m, N, N)."""
+    Lc = np.zeros_like(found.difference)
+    Lc[:, :, 0] = found.gain
+    correct = np.eye(found.gain.shape[1]) - Lc
+    closing = (correct @ found.input[:, :, None]) * found.law[:, None, :]
+    return Lc - correct @ found.difference, closing
+
+
+def feedback(found: Designs, omega: Vector) -> Complex:
+    """Return ``C_y b0 / ω^r`` (m, k) at frequencies (k,) [rad/s]."""
+    matrix, late = _matrices(found, omega)
+    right = np.broadcast_to(found.gain[:, None, :, None], (*matrix.shape[:3], 1))
+    solved = np.linalg.solve(matrix, right)[..., 0]
+    product: Complex = np.einsum("mkn,mn->mk", solved, found.law) * late
+    return product
+
+
+def _matrices(found: Designs, omega: Vector) -> tuple[Complex, Complex]:
+    """Return M (m, k, N, N) and z (k,)."""
+    base, closing = _open(found)
+    zeta = np.expm1(1j * omega * found.dt)
+    z = 1.0 + zeta
+    unit = np.eye(found.gain.shape[1])
+    matrix = zeta[None, :, None, None] * unit + base[:, None]
+    if found.delay:
+        matrix = matrix + z[None, :, None, None] ** -float(found.delay) * closing[:, None]
+    else:
+        matrix = matrix + closing[:, None]
+    return matrix, z
+
+
+def integral_gain(found: Designs) -> Vector:
+    """Return ``k_i b0 / ω^r`` (m,)."""
+    base, closing = _open(found)
+    left, _, right = np.linalg.svd(base + closing)
+    v, w = right[:, -1, :], left[:, :, -1]
+    slope = np.eye(v.shape[1]) - found.delay * closing
+    inner = np.einsum("mi,mij,mj->m", w, slope, v)
+    through = np.sum(found.law * v, axis=1) * np.sum(w * found.gain, axis=1)
+    gain: Vector = through / inner / found.dt
+    return gain
+
+
+def unstable_poles(found: Designs) -> Vector:
+    """Return the number (m,) of poles of C_y outside of the unit circle.
+
+    With a delay the poles are counted by the argument of det M(z) over the upper half circle, which
+    is ``π (N − unstable − 1/2)`` with the integrator's pole at z = 1.
+    """
+    base, closing = _open(found)
+    if found.delay == 0:
+        shifted = np.linalg.eigvals(-(base + closing))
+        outside = np.abs(1.0 + shifted) > 1.0 + _OUTSIDE
+        return np.sum(outside, axis=1).astype(np.float64)
+    top, size = np.pi / found.dt, base.shape[1]
+    even = np.linspace(0.0, top, 24 * (found.delay + size) + 2)[1:]
+    omega = np.unique(np.concatenate([np.geomspace(1e-5 * top, top, 200), even]))
+    angle = np.angle(np.linalg.det(_matrices(found, omega)[0]))
+    steps = np.remainder(np.diff(angle, axis=1) + np.pi, 2.0 * np.pi) - np.pi
+    count: Vector = np.maximum(np.round(size - 0.5 - np.sum(steps, axis=1) / np.pi), 0.0)
+    return count
