@@ -22,7 +22,7 @@ ROWS = (
     ("records", "simulation", "analysis"),
     ("identification.experiment", "identification.model", "identification.search"),
     ("identification",),
-    ("tuning.constraints", "tuning.loops", "tuning.structures", "tuning"),
+    ("tuning.constraints", "tuning.loops", "tuning.structures", "tuning.simulated", "tuning"),
     ("realtime.system", "realtime.telemetry", "realtime.devices", "realtime.wire"),
     ("realtime.loop", "realtime.rig", "realtime.__init__", "setup"),
     ("experiments.common", "experiments.two_mass_spring", "experiments.torsional"),
