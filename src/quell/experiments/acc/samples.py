@@ -24,6 +24,9 @@ COLUMNS = ("m1", "m2", "k_lin", "k_nonlin", "lambda", "tau")
 NOMINAL = np.array([1.0, 1.0, 1.0, 0.0, 1.0, 0.0065])
 """The nominal plant; the lag is about the least published one, as uncertainty only adds to it."""
 
+BOX = ((0.6, 1.4), (0.6, 1.4), (0.5, 2.0))
+"""Ranges of m1, m2 [kg] and k [N/m] in ``boxed``."""
+
 # Largest value (and the inverse of the smallest), and least lag [s]: far beyond real plants; chosen
 # by hand, as the poles of such loops are lost in rounding.
 _MOST, _LEAST_LAG = 1e6, 1e-9
@@ -65,6 +68,20 @@ def generated(count: int, spread: float = 1.0, seed: int = 0) -> Matrix:
     ranks = norm.cdf(scores)
     small = [np.interp(ranks[:, j], _LEVELS, row) for j, row in enumerate(_QUANTILES)]
     return widened(np.column_stack(small), spread)
+
+
+def boxed(count: int, seed: int = 0) -> Matrix:
+    """Draw samples (count, 6) whose masses and stiffness fill a box, independent of each other.
+
+    m1 and m2 are uniform in [0.6, 1.4], k in [0.5, 2]; cubic part, effectiveness and lag are those
+    of ``generated`` with a spread of 3.
+    """
+    found = generated(count, 3.0, seed)
+    # A stream of its own: that of ``generated`` with this seed has drawn the other columns.
+    random = np.random.default_rng([seed, len(BOX)])
+    for j, (low, high) in enumerate(BOX):
+        found[:, j] = random.uniform(low, high, count)
+    return found
 
 
 def widened(samples: Matrix, spread: float) -> Matrix:

@@ -15,6 +15,7 @@ import numpy as np
 from quell import checks
 from quell.controllers.base import Controller
 from quell.executors import Where, completed, executor_on
+from quell.tuning.simulated.cma import Generations
 from quell.tuning.simulated.problem import Problem
 from quell.tuning.simulated.result import Candidate, Search
 from quell.tuning.simulated.space import Space, checked_space, checked_start
@@ -23,6 +24,7 @@ from quell.tuning.simulated.study import (
     begun_trial,
     open_study,
     sampler_for,
+    seed_of,
     tell,
     was_given_up,
 )
@@ -61,9 +63,10 @@ def search(
     problem: Problem,
     *,
     trials: int = 200,
-    sampler: Any = "tpe",
+    sampler: Any = None,
     pruner: Any = "median",
     storage: str | os.PathLike[str] | None = None,
+    name: str = "quell",
     seed: int = 0,
     starts: Iterable[Mapping[str, float]] = (),
     violation: Callable[[Controller], float] | None = None,
@@ -89,17 +92,20 @@ def search(
     trials
         number of candidates, those of an interrupted search in ``storage`` included.
     sampler
-        ``"tpe"`` (tree-structured Parzen estimator), ``"nsga2"``, ``"qmc"``, ``"random"``, or a
-        sampler of Optuna.
+        ``"cma"`` (covariance matrix adaptation), ``"tpe"`` (tree-structured Parzen estimator),
+        ``"nsga2"``, ``"qmc"``, ``"random"``, or a sampler of Optuna. By default ``"cma"``, with one
+        parameter ``"tpe"``, with several objectives ``"nsga2"``.
     pruner
         what gives candidates up after an eighth, a quarter and half of the samples: ``"median"``,
         ``"halving"``, ``"none"``, or a pruner of Optuna. With several objectives there is none.
     storage
         Optuna's journal file, created if missing; a search in it continues.
+    name
+        name of the search in the file, which may hold several.
     seed
         seed of the sampler.
     starts
-        values that are tried first.
+        values that are tried first; CMA-ES begins around the first of them.
     violation
         a function of the controller: zero or less if it meets all constraints, else by how much it
         does not. Such candidates are not simulated.
@@ -123,8 +129,11 @@ def search(
     checks.whole("trials", trials, 1)
     checks.whole("at_once", at_once, 1)
     checks.whole("seed", seed, 0)
-    study = open_study(storage, len(problem.statistics), _about(space, problem, seed), pruner)
+    about = _about(space, problem, seed)
+    study = open_study(storage, name, len(problem.statistics), about, pruner)
     evaluate = partial(_evaluate, build, problem, violation)
+    sampler = _default_sampler(space, problem) if sampler is None else sampler
+    generations = Generations(space, first[0] if first else None) if sampler == "cma" else None
     if executor == "processes":
         _check_picklable(evaluate)
     with executor_on(executor, workers) as pool, warnings.catch_warnings():
@@ -140,14 +149,22 @@ def search(
             # Groups begin at multiples of at_once, also after an interruption within one.
             begin = min((trial.number for trial in left), default=done)
             end = min((begin // at_once + 1) * at_once, trials)
-            group = []
+            group, strategy = [], generations.after(study) if generations else None
             for number in [*(trial.number for trial in left), *range(len(known), end)]:
                 fixed = first[number] if number < len(first) else None
+                if fixed is None and generations is not None:
+                    fixed = generations.suggested(strategy, seed_of(seed, number))
                 study.sampler = sampler_for(sampler, seed, number, fixed)
                 trial = study.ask() if number >= len(known) else begun_trial(study, number)
                 group.append((trial, {n: r.suggested(trial, n) for n, r in space.items()}))
             _run(study, group, problem, lambda tasks: completed(pool, evaluate, tasks))
     return Search(tuple(problem.statistics), space, _candidates(study, space, problem))
+
+
+def _default_sampler(space: Space, problem: Problem) -> str:
+    if len(problem.statistics) > 1:
+        return "nsga2"
+    return "cma" if len(space) > 1 else "tpe"
 
 
 def _check_picklable(evaluate: Any) -> None:
@@ -211,8 +228,8 @@ def _run(
 
 
 def _rungs(samples: int) -> list[int]:
-    ends = [math.ceil(share * samples) for share in _RUNGS]
-    return [end for end in ends if end >= min(_FIRST_RUNG, samples)]
+    ends = {math.ceil(share * samples) for share in _RUNGS}
+    return sorted(end for end in ends if end >= min(_FIRST_RUNG, samples))
 
 
 def _evaluate(

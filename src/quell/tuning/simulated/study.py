@@ -16,9 +16,7 @@ from typing import Any
 from quell import checks
 from quell.optional import import_extra
 
-STUDY = "quell"
-"""Name of the study in the journal file."""
-SAMPLERS = ("tpe", "nsga2", "qmc", "random")
+SAMPLERS = ("cma", "tpe", "nsga2", "qmc", "random")
 PRUNERS = ("median", "halving", "none")
 _ABOUT = "quell: problem"  # attribute of the study: what is searched
 VIOLATION = "quell: violation"  # attribute of a trial: by how much it violates constraints
@@ -32,9 +30,13 @@ def optuna() -> Any:
 
 
 def open_study(
-    storage: str | os.PathLike[str] | None, objectives: int, about: Mapping[str, Any], pruner: Any
+    storage: str | os.PathLike[str] | None,
+    name: str,
+    objectives: int,
+    about: Mapping[str, Any],
+    pruner: Any,
 ) -> Any:
-    """Return a new study, or the one in the journal file ``storage`` if it is of this problem.
+    """Return a new study, or the one of this name in the journal file ``storage``.
 
     Raises ``ValueError`` for a file that is no journal, or the journal of another problem.
     """
@@ -44,8 +46,8 @@ def open_study(
     if storage is not None:
         backend = _journal(module, Path(storage))
         # create_study would write to the file of another search, too.
-        if backend.get_all_studies():
-            study = module.load_study(storage=backend, study_name=None, pruner=chosen)
+        if name in {each.study_name for each in backend.get_all_studies()}:
+            study = module.load_study(storage=backend, study_name=name, pruner=chosen)
             stored = study.user_attrs.get(_ABOUT, {})
             if stored != mine:
                 parts = sorted(key for key in mine if stored.get(key) != mine[key])
@@ -55,7 +57,7 @@ def open_study(
                 )
             return study
     study = module.create_study(
-        storage=backend, study_name=STUDY, directions=["minimize"] * objectives, pruner=chosen
+        storage=backend, study_name=name, directions=["minimize"] * objectives, pruner=chosen
     )
     study.set_user_attr(_ABOUT, mine)
     return study
@@ -71,9 +73,8 @@ def sampler_for(sampler: Any, seed: int, trial: int, fixed: Mapping[str, float] 
     made = sampler
     if isinstance(sampler, str):
         name = checks.one_of("sampler", sampler, SAMPLERS)
-        # NumPy's generators take 32 bits, and make independent streams of consecutive seeds.
-        options: dict[str, Any] = {"seed": (seed * 1_000_003 + trial) % 2**32}
-        if name == "random":
+        options: dict[str, Any] = {"seed": seed_of(seed, trial)}
+        if name in ("random", "cma"):  # the values of "cma" are ``fixed``
             made = samplers.RandomSampler(**options)
         elif name == "qmc":
             made = _quietly(samplers.QMCSampler, scramble=True, seed=seed)
@@ -85,6 +86,12 @@ def sampler_for(sampler: Any, seed: int, trial: int, fixed: Mapping[str, float] 
     if fixed is None:
         return made
     return _quietly(samplers.PartialFixedSampler, fixed_params=dict(fixed), base_sampler=made)
+
+
+def seed_of(seed: int, trial: int) -> int:
+    """Return the seed of a trial; those of searches with other seeds differ."""
+    # NumPy's generators take 32 bits, and make independent streams of consecutive seeds.
+    return (seed * 1_000_003 + trial) % 2**32
 
 
 def begun_trial(study: Any, number: int) -> Any:

@@ -1,0 +1,59 @@
+"""The ACC benchmark on a box of plants: tune by simulation, judge on fresh plants.
+
+python benchmarks/acc_box.py                      # judges the designs on 4000 fresh plants
+python benchmarks/acc_box.py --tune 1000          # repeats the search, then judges its result
+python benchmarks/acc_box.py --tune 1000 --storage box.log   # continues if it is interrupted
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from quell.experiments.acc import DT, SPRINGS, box, designs, interval, judge_sampled
+from quell.experiments.acc.controllers import OURS
+from quell.experiments.acc.samples import boxed
+
+# Seeds of the plants for the search, and of the fresh ones, which nothing else uses.
+SEARCHED, FRESH = 301, 1_000_000
+
+
+def main() -> None:
+    """Judge, after a search if there is to be one."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--tune", type=int, metavar="TRIALS", help="candidates of a search")
+    parser.add_argument("--plants", type=int, default=500, help="plants of the search")
+    parser.add_argument("--storage", help="Optuna's journal file")
+    parser.add_argument("--executor", default="threads", help="threads, processes, tcp://…")
+    parser.add_argument("--count", type=int, default=4000, help="fresh plants")
+    options = parser.parse_args()
+    chosen = {name: controller for name, controller in designs(DT).items() if name in OURS}
+    if options.tune:
+        began = time.perf_counter()
+        samples = boxed(options.plants, SEARCHED)
+        where = {"storage": options.storage, "executor": options.executor}
+        found, controller = box.tune(samples, trials=options.tune, **where)
+        best, made = found.best, box.build()
+        print(
+            f"{len(found.candidates)} candidates in {time.perf_counter() - began:.0f} s;", end=" "
+        )
+        print(f"number {best.number} is the best one, {best.values}")
+        print(made.structure.tables(made.vector(best.parameters)))
+        chosen = {"as found": controller}
+    samples = boxed(options.count, FRESH)
+    print(
+        f"{options.count} fresh plants of the box, failures [%] (95 % interval); noise gain [N/m]"
+    )
+    for name, controller in chosen.items():
+        row = f"{name:24}"
+        for spring, cubic in SPRINGS.items():
+            judged = judge_sampled(controller, samples, cubic)
+            failures = int(judged.fails.sum())
+            low, high = interval(failures, options.count)
+            rate = 100.0 * failures / options.count
+            row += f"  {spring} {rate:5.1f} ({100.0 * low:.1f}–{100.0 * high:.1f})"
+        print(f"{row}  {box.noise_gain(controller):9.0f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
