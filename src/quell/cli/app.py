@@ -10,6 +10,7 @@ from cyclopts import App, CycloptsError
 
 from quell import __version__
 from quell.cli.commands.acc import acc
+from quell.cli.commands.b0 import b0
 from quell.cli.commands.compare import compare
 from quell.cli.commands.excite import excite
 from quell.cli.commands.identify import identify
@@ -34,7 +35,7 @@ reproduce = App(name="reproduce", help="Run a published experiment again and jud
 app.command(reproduce)
 for _command in (two_mass, torsional, acc):
     reproduce.command(_command)
-for _each in (stress, compare, identify, excite, rig, run, run_rig, replay):
+for _each in (stress, compare, identify, b0, excite, rig, run, run_rig, replay):
     app.command(_each)
 
 

@@ -3,7 +3,8 @@
 May import ``controllers``, ``plants``, ``simulation`` and what they import.
 
 ``experiment`` has excitations and records, ``model`` the model and its gradient, ``search`` the
-search for its parameters; the files here put them together.
+search for its parameters, ``running_loop`` the same for the gain in records of running loops; the
+files here put them together.
 """
 
 from quell.identification.experiment.excitation import Excitation, excitation
@@ -11,6 +12,7 @@ from quell.identification.experiment.frequency_response import FrequencyResponse
 from quell.identification.experiment.measured import Measured, excited
 from quell.identification.experiment.record_file import read_record
 from quell.identification.identify import identify
+from quell.identification.input_gain import InputGain, identify_b0
 from quell.identification.model.roots import Root
 from quell.identification.result import Identified
 from quell.identification.validation import Residuals
@@ -19,6 +21,7 @@ __all__ = [
     "Excitation",
     "FrequencyResponse",
     "Identified",
+    "InputGain",
     "Measured",
     "Residuals",
     "Root",
@@ -26,5 +29,6 @@ __all__ = [
     "excited",
     "frequency_response",
     "identify",
+    "identify_b0",
     "read_record",
 ]

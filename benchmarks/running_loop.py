@@ -1,0 +1,191 @@
+"""b0 from records of running loops: errors, and how often the stated interval holds the true b0.
+
+    python benchmarks/running_loop.py [--draws N] [--seed S] [--snr DB] [--json FILE]
+
+Each draw has a plant of order 1 or 2 (integrating, damped or oscillating) behind a lag, a delay of
+eighths of a sample, both or neither; an ADRC whose b0 is wrong by up to a factor of 1.6, or a PID;
+a logarithmic chirp of 20 s as reference, or added to u; white noise in y, alone or with a load that
+drifts (a random walk, or one that forgets in 0.2 to 2 s) and has half of the power. The noise's
+power in y is that of y divided by the given ratio. The loop is simulated apart from the package's
+own models: by scipy at eight steps per sample.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import signal
+
+import quell as ql
+from quell.controllers.baselines import PID
+from quell.identification import identify_b0
+from quell.types import Vector
+
+DURATION, STEPS = 20.0, 8
+
+
+class Loop(NamedTuple):
+    """A plant and its controller."""
+
+    den: Vector
+    b: float
+    lag: float  # [s]
+    delay: float  # [s]
+    dt: float
+    omega: float  # speed of the loop [rad/s]
+    controller: Any
+    text: str
+
+
+def drawn_loop(rng: np.random.Generator) -> Loop:
+    """Return a stable loop with a phase margin of at least 25 degrees."""
+    while True:
+        order, dt = int(rng.integers(1, 3)), float(rng.choice([0.001, 0.002, 0.005, 0.01]))
+        omega = float(np.exp(rng.uniform(np.log(0.008), np.log(0.03)))) / dt
+        kind = rng.choice(["integrating", "damped", "oscillating"])
+        slow = omega * float(rng.uniform(0.05, 0.6))
+        if order == 1:
+            den, kind = np.array([1.0, 0.0 if kind == "integrating" else slow]), "lag"
+        elif kind == "integrating":
+            den = np.array([1.0, slow, 0.0])
+        else:
+            damping = 1.0 if kind == "damped" else float(rng.uniform(0.05, 0.4))
+            den = np.array([1.0, 2.0 * damping * slow, slow**2])
+        b = float(np.exp(rng.uniform(-3.0, 6.0))) * float(rng.choice([-1.0, 1.0]))
+        lag = float(rng.choice([0.0, rng.uniform(0.5, 8.0)])) * dt
+        delay = float(rng.choice([0.0, rng.integers(1, 6 * STEPS) / STEPS])) * dt
+        wrong = float(np.exp(rng.uniform(np.log(0.625), np.log(1.6))))
+        if rng.random() < 0.6:
+            observer = ql.ESO.model_free(order, wrong * b, 4.0 * omega, dt)
+            controller: Any = ql.ADRC(observer, omega_c=omega)
+        else:
+            k = wrong * omega**order / b
+            terms = {"ki": 0.3 * omega * k, "kd": 1.4 * k / omega if order == 2 else 0.0}
+            tf = 0.1 / omega if order == 2 else 0.0
+            controller = PID(k * (1.4 if order == 1 else 1.0), tf=tf, dt=dt, **terms)
+        loop = ql.analysis.analyse(([b], den), controller, delay=delay, actuator_lag=lag)
+        if loop.stable and loop.margins.phase > 25.0:
+            name = type(controller).__name__
+            text = f"{name:4} order {order} {kind:11} lag {lag / dt:4.1f} delay {delay / dt:5.2f}"
+            return Loop(den, b, lag, delay, dt, omega, controller, text)
+
+
+def simulated(
+    loop: Loop, r: Vector, added: Vector, noise: Vector, load: Vector
+) -> tuple[Vector, Vector]:
+    """Return u and y without its noise; the controller measures both together."""
+    den = np.polymul(loop.den, [loop.lag, 1.0]) if loop.lag else loop.den
+    system = signal.cont2discrete(signal.tf2ss([loop.b], den), loop.dt / STEPS)
+    A, B, C = system[0], system[1][:, 0], system[2][0]
+    whole, part = divmod(round(loop.delay / loop.dt * STEPS), STEPS)
+    powers, sums = [np.eye(B.size)], [np.zeros(B.size)]
+    for _ in range(STEPS):
+        sums.append(A @ sums[-1] + B)
+        powers.append(A @ powers[-1])
+    old, new = powers[STEPS - part] @ sums[part], sums[STEPS - part]
+    x, u, y = np.zeros(B.size), np.zeros(r.size + whole + 1), np.zeros(r.size)
+    at = whole + 1  # u has zeros before the record
+    loop.controller.reset()
+    step = loop.controller.step
+    for k in range(r.size):
+        y[k] = C @ x
+        u[k + at] = step(r[k], y[k] + noise[k]) + added[k]
+        x = powers[STEPS] @ x + new * u[k + at - whole] + old * u[k + at - whole - 1]
+        x = x + sums[STEPS] * load[k]
+    return u[at:], y
+
+
+def drawn_record(seed: int, snr: float) -> tuple[Loop, Vector, Vector, str]:
+    """Return a loop, u, the measured y, and what was drawn."""
+    rng = np.random.default_rng(seed)
+    loop = drawn_loop(rng)
+    t = np.arange(round(DURATION / loop.dt)) * loop.dt
+    ends = np.array([0.1, rng.uniform(1.5, 4.0)]) * loop.omega / (2.0 * np.pi)
+    chirp = signal.chirp(t, ends[0], DURATION, ends[1], method="logarithmic", phi=-90.0)
+    zero, at_u = np.zeros(t.size), rng.random() < 0.3
+    parts = (zero, chirp) if at_u else (chirp, zero)
+    _, clean = simulated(loop, *parts, zero, zero)
+    share = float(rng.choice([0.0, 0.5]))
+    target = 10.0 ** (-snr / 20.0) * float(np.std(clean))
+    noise = np.sqrt(1.0 - share) * target * rng.standard_normal(t.size)
+    load, text = zero, "noise"
+    if share:
+        memory = float(rng.choice([np.inf, rng.uniform(0.2, 2.0)]))
+        pole = np.exp(-loop.dt / memory)
+        load = signal.lfilter([1.0], [1.0, -pole], rng.standard_normal(t.size))
+        _, moved = simulated(loop, zero, zero, zero, load)
+        load *= np.sqrt(share) * target / np.std(moved)
+        text = f"load {memory:4.2f} s"
+    u, y = simulated(loop, *parts, noise, load)
+    where = "u" if at_u else "r"
+    return loop, u, y + noise, f"{loop.text} {1e3 * loop.dt:3.0f} ms, chirp in {where}, {text}"
+
+
+def main() -> None:
+    """Run the draws; print those that are far off, and the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=40000, help="seed of the first draw")
+    parser.add_argument("--snr", type=float, default=30.0, help="signal-to-noise ratio of y [dB]")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore", ql.DesignWarning)
+    rows: list[dict[str, Any]] = []
+    for seed in range(arguments.seed, arguments.seed + arguments.draws):
+        loop, u, y, text = drawn_record(seed, arguments.snr)
+        began = time.process_time()
+        found = identify_b0(u, y, loop.dt, loop.den.size - 1)
+        taken = time.process_time() - began
+        low, high = found.interval
+        row = {
+            "seed": seed,
+            "text": text,
+            "error": found.b0 / loop.b - 1.0,
+            "std": found.b0_std / abs(loop.b),
+            "covered": low <= loop.b <= high,
+            "total": loop.lag + loop.delay,
+            "total_error": found.total_delay - loop.lag - loop.delay,
+            "total_std": found.total_delay_std,
+            "dt": loop.dt,
+            "good": not found.shortcomings,
+            "seconds": taken,
+        }
+        rows.append(row)
+        if not row["covered"] or abs(row["error"]) > 0.05:
+            said = "; ".join(found.shortcomings)
+            print(f"{seed} {text}: b0 off by {row['error']:+.2%} ± {row['std']:.2%} {said}")
+    for name, part in (
+        ("all", rows),
+        ("noise alone", [row for row in rows if row["text"].endswith("noise")]),
+        ("with a load", [row for row in rows if not row["text"].endswith("noise")]),
+        ("ADRC", [row for row in rows if row["text"].startswith("ADRC")]),
+        ("PID", [row for row in rows if row["text"].startswith("PID")]),
+        ("order 1", [row for row in rows if "order 1" in row["text"]]),
+        ("order 2", [row for row in rows if "order 2" in row["text"]]),
+    ):
+        if not part:
+            continue
+        off = np.abs([row["error"] for row in part])
+        delays = np.abs([row["total_error"] / row["dt"] for row in part])
+        print(
+            f"{name:12} {len(part):4} draws: within 5 % {np.mean(off <= 0.05):6.1%}, covered "
+            f"{np.mean([row['covered'] for row in part]):6.1%}; b0 off by {np.median(off):.2%} "
+            f"(median), {np.quantile(off, 0.9):.2%} (90 %); lag and delay off by "
+            f"{np.median(delays):.2f} samples; no reservation "
+            f"{np.mean([row['good'] for row in part]):.0%}; "
+            f"CPU {np.median([row['seconds'] for row in part]):.1f} s"
+        )
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2, default=float) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,305 @@
+"""b0, lag and delay of a plant from a record of its running loop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.identification.running_loop.average import (
+    gain,
+    mean,
+    physical,
+    total_delay,
+    visible_up_to,
+)
+from quell.identification.running_loop.bandwidth import bandwidth
+from quell.identification.running_loop.fit import LoopFit
+from quell.identification.running_loop.search import fits
+from quell.identification.validation import residuals
+from quell.parallel import one_blas_thread
+from quell.types import Matrix, Vector
+
+# Least number of samples for each parameter, as in ``identify``.
+_SAMPLES_PER_PARAMETER = 10
+# Longest delay and lag at the start by default [samples], and as a share of the record.
+_MOST_DELAY, _MOST_SHARE = 20, 0.05
+# A relative deviation from here on says nothing for a design: its 95 % interval is ±30 %, as far as
+# b0 may be off with little loss (Herbst, *Electronics* 2, 2013, sec. 3).
+_POOR = 0.15
+# Deviations within which the interval of 95 % lies, and within which a lag or delay may be zero
+# (99.7 %).
+_WITHIN_95, _WITHIN_99 = 1.96, 3.0
+# omega_o over omega_c by default: in the usual range of 3 to 10 (Gao 2003; Herbst 2013).
+RATIO = 5.0
+# Share of the largest difference of AIC whose model still has a weight: exp(−20/2) = 5e-5.
+_MOST_DIFFERENCE = 20.0
+# Numbers of the result in JSON.
+_IN_JSON = (
+    *("order", "b0", "b0_std", "lag", "lag_std", "delay", "delay_std", "total_delay"),
+    *("total_delay_std", "dt", "samples", "noise", "omega_max", "white", "independent"),
+    "converged",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class InputGain:
+    """The gain of a plant ``y^(n) = f + b0 u`` with its deviation, its lag and its delay.
+
+    ``str()`` gives the report; ``omega_c`` the bandwidth that keeps a phase margin.
+    """
+
+    order: int  #: n
+    b0: float  #: [y-unit/u-unit/s^n]
+    b0_std: float  #: its standard deviation
+    den: Vector  #: ``s^n + a_{n−1} s^(n−1) + … + a_0``, descending
+    lag: float  #: time constant of the actuator [s]; 0.0 if the best model has none
+    lag_std: float  #: its standard deviation [s]; 0.0 if the best model has none
+    delay: float  #: delay of u [s]; 0.0 if the best model has none
+    delay_std: float  #: its standard deviation [s]; 0.0 if the best model has none
+    total_delay: float  #: lag and delay together [s], which is known better than its parts
+    total_delay_std: float  #: its standard deviation [s]
+    dt: float  #: sample time of the record [s]
+    samples: int  #: number of samples of the record
+    noise: float  #: root mean square of the error of the prediction one sample ahead [y-unit]
+    omega_max: float  #: frequency up to which the record shows the plant [rad/s]
+    white: bool  #: whether the error of the prediction is white, at 99 %
+    independent: bool  #: whether it is independent of the u before, at 99 %
+    converged: bool  #: whether the search ended at a minimum
+    covariance: Matrix  #: of ``den`` without its 1, b0, lag and delay, of the best model
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Interval in which b0 lies with a probability of 95 %."""
+        half = _WITHIN_95 * self.b0_std
+        return self.b0 - half, self.b0 + half
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether the excitation is too poor: the interval of b0 is wider than ±30 %."""
+        return not self.b0_std < _POOR * abs(self.b0)
+
+    @property
+    def shortcomings(self) -> tuple[str, ...]:
+        """Reasons not to rely on the result; empty for a good one."""
+        found = []
+        if self.is_poor:
+            low, high = self.interval
+            found.append(
+                f"the excitation is too poor: b0 may be anything from {low:.4g} to {high:.4g}; "
+                "record a reference or a u that moves faster and farther, or for a longer time"
+            )
+        if not self.converged:
+            found.append("the search did not converge; record longer, or check the order")
+        if not self.independent:
+            found.append(
+                "the error depends on past u, so the plant is not of this form (order, zeros, "
+                "friction, limits that the recorded u does not have): the deviations are too small"
+            )
+        elif not self.white:
+            found.append("the error is not white: the deviations may be too small")
+        return tuple(found)
+
+    def omega_c(self, phase_margin: float = 60.0, ratio: float = RATIO) -> tuple[float, float]:
+        """Return the largest omega_c that keeps a phase margin, and its deviation [rad/s].
+
+        It is that of the exactly sampled loop of the fitted plant, with lag and delay, and an ADRC
+        with a model-free ESO and this b0. The deviation follows from those of all parameters, to
+        first order.
+
+        Parameters
+        ----------
+        phase_margin
+            [degrees], above 0 and below 90.
+        ratio
+            omega_o over omega_c.
+
+        Raises
+        ------
+        ValueError
+            for an argument out of range, a b0 of zero, or a plant with which no omega_c keeps it.
+        """
+        margin = checks.positive("phase_margin", phase_margin, "degrees")
+        if margin >= 90.0:
+            raise ValueError(f"phase_margin = {phase_margin!r}: must be below 90 degrees")
+        ratio = checks.positive("ratio", ratio)
+        n = self.order
+        at = np.concatenate([self.den[1:], [self.b0, self.lag, self.delay]])
+
+        def largest(values: Vector) -> float:
+            # The gain that the observer assumes stays b0 where the plant's gain changes.
+            den, times = np.append(1.0, values[:n]), np.maximum(values[n + 1 :], 0.0).tolist()
+            how = {"b0": self.b0, "dt": self.dt, "margin": margin, "ratio": ratio}
+            return bandwidth(float(values[n]), den, *times, **how)
+
+        found = largest(at)
+        if math.isnan(found):
+            rule = "no omega_c keeps it with this plant and ratio"
+            raise ValueError(f"phase_margin = {phase_margin!r} degrees: {rule}; ask for less")
+        slope = np.zeros(at.size)
+        for i, spread in enumerate(np.sqrt(np.diag(self.covariance)).tolist()):
+            if spread > 0.0:
+                slope[i] = (largest(at + spread * np.eye(at.size)[i]) - found) / spread
+        variance = float(slope @ self.covariance @ slope)
+        return found, math.sqrt(variance) if variance >= 0.0 else math.nan
+
+    def describe(self) -> str:
+        """Return the report as text."""
+        low, high = self.interval
+        unit = f"y-unit/u-unit/s^{self.order}" if self.order > 1 else "y-unit/u-unit/s"
+        lines = [
+            f"b0 = {self.b0:.5g} ± {self.b0_std:.2g} {unit}, 95 %: {low:.5g} to {high:.5g}",
+            _time_line("actuator's lag", self.lag, self.lag_std),
+            _time_line("delay", self.delay, self.delay_std),
+            f"both together {1e3 * self.total_delay:.4g} ± {1e3 * self.total_delay_std:.2g} ms",
+            f"the record shows the plant up to {self.omega_max:.4g} rad/s; "
+            f"error of the prediction: RMS {self.noise:.3g}",
+            *(f"NOT: {text}" for text in self.shortcomings),
+        ]
+        return "\n".join(lines)
+
+    __str__ = describe
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the results for JSON; None for numbers that are not finite."""
+        from quell.files import nonfinite_to_none
+
+        value = {name: getattr(self, name) for name in _IN_JSON}
+        value |= {"interval_95": self.interval, "den": self.den.tolist()}
+        value |= {"shortcomings": self.shortcomings}
+        return dict(nonfinite_to_none(value))
+
+
+def identify_b0(
+    u: Any, y: Any, dt: float, order: int, *, max_delay: float | None = None
+) -> InputGain:
+    """Find b0, the actuator's lag and the delay in a record of a running loop.
+
+    The plant is ``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = b0 u_l + load``, where u_l is u behind a
+    lag and a delay, under a drifting load and noise in y (``quell.identification.running_loop``
+    has the equations). The controller need not be known: the prediction-error method is consistent
+    in a loop of any controller, as long as u is what reached the plant. All eight forms of the
+    model, with or without lag, delay and load, are fitted; b0 is their mean with Akaike's weights,
+    and its deviation has their differences in it (Buckland, Burnham & Augustin, *Biometrics* 53,
+    1997, eqs. (2), (9))::
+
+        w_i ∝ exp(−AIC_i/2),    b0 = Σ w_i b_i,    std = Σ w_i √(var_i + (b_i − b0)²)
+
+    Parameters
+    ----------
+    u
+        input of the plant as it was applied, behind limits (N,) [u-unit]; held between samples.
+    y
+        measured output (N,) [y-unit], each at the time when its u began to act.
+    dt
+        sample time [s].
+    order
+        n, the order of the plant for ADRC, 1 to 4: u acts on the n-th derivative of y. With a lag,
+        order 1 is not distinguished from order 2 by the record: give that of the controller.
+    max_delay
+        longest delay or lag to start the search at [s]; 20 samples by default, at most a twentieth
+        of the record.
+
+    Raises
+    ------
+    ValueError
+        for an argument out of range, a record that is too short or constant, or a plant for which
+        no model was found.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import quell as ql
+    >>> t = np.arange(2000) * 0.01
+    >>> r = np.sin(0.3 * t**1.7)
+    >>> observer = ql.ESO.model_free(order=1, b0=2.0, omega_o=20.0, dt=0.01)
+    >>> controller, y, u = ql.ADRC(observer, omega_c=4.0), np.zeros(t.size), np.zeros(t.size)
+    >>> for k in range(t.size - 1):
+    ...     u[k] = controller.step(r[k], y[k])
+    ...     y[k + 1] = np.exp(-0.01) * y[k] + 3.0 * (1.0 - np.exp(-0.01)) * u[k]
+    >>> round(ql.identification.identify_b0(u[:-1], y[:-1], 0.01, order=1).b0, 4)
+    3.0
+    """
+    u, y = checks.vector("u", u), checks.vector("y", y)
+    checks.vector("y", y, u.size)
+    dt, order = checks.positive("dt", dt, "s"), checks.whole("order", order, 1, 4)
+    least = _SAMPLES_PER_PARAMETER * (3 * order + 6)
+    if u.size < least:
+        rule = f"must have at least {least} for order {order}; record longer"
+        raise ValueError(f"u has {u.size} samples: {rule}")
+    for name, value in (("u", u), ("y", y)):
+        if np.ptp(value) == 0.0:
+            raise ValueError(f"{name} is {value[0]:g} all through: must move")
+    most = min(float(_MOST_DELAY), _MOST_SHARE * u.size)
+    if max_delay is not None:
+        most = checks.non_negative("max_delay", max_delay, "s") / dt
+        if most > 0.25 * u.size:
+            raise ValueError(
+                f"max_delay = {max_delay!r} s: must be at most a quarter of the record"
+            )
+    scale_u, scale_y = float(np.std(u)), float(np.std(y))
+    with one_blas_thread():
+        found = fits(order, most, u / scale_u, y / scale_y)
+    usable = [one for one in found if _is_usable(one)]
+    if not usable:
+        raise ValueError(
+            f"order = {order}: no model was found; check the order, and that u belongs to y"
+        )
+    return _result(usable, u, y, dt, scale_u, scale_y)
+
+
+def _is_usable(one: LoopFit) -> bool:
+    return bool(np.isfinite(one.aic) and np.all(np.isfinite(one.covariance)))
+
+
+def _result(
+    found: list[LoopFit], u: Vector, y: Vector, dt: float, scale_u: float, scale_y: float
+) -> InputGain:
+    """Return the mean of the models, and what the best of them has besides b0."""
+    best = min(found, key=lambda one: one.aic)
+    # A fit that did not converge has no valid deviation; it counts if no other comes near to it.
+    settled = [one for one in found if one.converged and one.aic <= best.aic + _MOST_DIFFERENCE]
+    settled = settled or found
+    best = min(settled, key=lambda one: one.aic)
+    form, n = best.form, best.form.order
+    near = [one for one in settled if one.aic - best.aic <= _MOST_DIFFERENCE]
+    weights = np.exp(-0.5 * np.array([one.aic - best.aic for one in near]))
+    weights /= np.sum(weights)
+    unit = scale_y / scale_u / dt**n
+    b0, b0_std = mean([gain(one) for one in near], weights)
+    total, total_std = mean([total_delay(one) for one in near], weights)
+    scale, covariance = physical(best, unit, dt)
+    spreads = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    lags = min(50, y.size // 4)
+    # In a loop u depends on the error of its own sample: only u before it counts.
+    tests = residuals(best.error[1:], u[:-1], lags)
+    return InputGain(
+        order=n,
+        b0=unit * b0,
+        b0_std=unit * b0_std,
+        den=np.append(1.0, (best.phi[:n] * scale[:n])[::-1]),
+        lag=form.lag_of(best.phi) * dt,
+        lag_std=spreads[n + 1],
+        delay=form.delay_of(best.phi) * dt,
+        delay_std=spreads[n + 2],
+        total_delay=total * dt,
+        total_delay_std=total_std * dt,
+        dt=dt,
+        samples=y.size,
+        noise=scale_y * float(np.sqrt(np.mean(best.error**2))),
+        omega_max=visible_up_to(best, u / scale_u, y / scale_y, dt),
+        white=tests.white,
+        independent=tests.independent,
+        converged=best.converged,
+        covariance=covariance,
+    )
+
+
+def _time_line(name: str, value: float, spread: float) -> str:
+    if value == 0.0:
+        return f"{name}: none is visible"
+    text = f"{name} {1e3 * value:.4g} ± {1e3 * spread:.2g} ms"
+    return text if value > _WITHIN_99 * spread else f"{text}: hardly visible"

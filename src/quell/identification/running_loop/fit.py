@@ -1,0 +1,163 @@
+"""Prediction-error fits of the plant behind a lag and a delay.
+
+In a running loop u reacts to noise and loads. The *direct method* needs no knowledge of the
+controller: the parameters minimise the error of the prediction one sample ahead (Ljung, *System
+Identification*, 2nd ed. 1999, eq. (7.12))::
+
+    min Σ e_k²,      e = y − ŷ(φ, β)
+
+It is consistent in any loop, also with limits or a nonlinear controller, if u reaches y a sample
+later at the earliest (it is held) and the model of the noise is true (Ljung 1999, th. 8.3 and sec.
+13.4). The output error alone, a model without loads, is biased by them. For given φ the best β is
+solved for; φ takes steps of Gauss and Newton, damped by Levenberg and Marquardt's method. In a loop
+the errors of plant and noise model depend on each other, so the covariance is that of all
+parameters together::
+
+    cov = σ² (Σ ψ ψᵀ)⁻¹,     ψ = ∂ŷ/∂(φ, β)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from quell.identification.model.structure import nonzero_lengths
+from quell.identification.running_loop.model import Form, derivatives, is_stable, linear_columns
+from quell.types import Matrix, Vector
+
+# First, least and last μ, and the relative gain that a step without damping must predict: as in
+# ``output_error``, chosen by hand. Steps are few, because a start is near.
+_MU, _LEAST_MU, _MOST_MU, _CONVERGED, _STEPS = 1e-3, 1e-8, 1e8, 1e-7, 60
+# Relative mean square that counts as zero: rounding of long simulations.
+_ROUNDING = 1e-20
+# Relative singular value that counts as zero, as in ``output_error``.
+_RANK = 1e-12
+
+
+class LoopFit(NamedTuple):
+    """A model of the plant and its noise."""
+
+    form: Form
+    phi: Vector  # a, l, τ, T in units of a sample
+    beta: Vector  # b, initial state
+    covariance: Matrix  # of phi and beta
+    error: Vector  # e (N,)
+    aic: float  # N log Σ e² + 2 (number of parameters)
+    converged: bool
+
+
+class _Point(NamedTuple):
+    """A model with the best β for its φ."""
+
+    phi: Vector
+    beta: Vector
+    error: Vector
+    columns: Matrix
+    power: float  # Σ e²
+
+
+def power(form: Form, phi: Vector, u: Vector, y: Vector) -> float:
+    """Return Σ e² with the best β for φ."""
+    return _solved(form, phi, u, y).power
+
+
+def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
+    """Return the model of least prediction error near ``phi``."""
+    at, converged = _descend(form, _solved(form, phi, u, y), u, y)
+    psi, size = _gradient(form, at, u, y)
+    first, count = at.beta.size, at.beta.size + form.size
+    # τ and T at zero, their limit, do not vary.
+    times = first + np.arange(form.size)[form.times]
+    psi[:, times[at.phi[form.times] <= 0.0]] = 0.0
+    R: Matrix = np.asarray(np.linalg.qr(psi, mode="r"))
+    inverse = np.linalg.pinv(R, rcond=_RANK)
+    variance = at.power / max(at.error.size - count, 1)
+    order = np.r_[first:count, :first]  # φ before β
+    rows = inverse[order] / size[order, None]
+    aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
+    return LoopFit(form, at.phi, at.beta, variance * rows @ rows.T, at.error, aic, converged)
+
+
+def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:
+    """Return the model with the best β for φ; its power is infinite if it has none."""
+    with np.errstate(all="ignore"):
+        columns, of_y = linear_columns(form, phi, u, y)
+        size, target = nonzero_lengths(columns), y - of_y
+        stable = is_stable(form, phi)
+        if not (stable and np.all(np.isfinite(size)) and np.all(np.isfinite(target))):
+            return _Point(phi, np.zeros(size.size), y, columns, math.inf)
+        scaled = columns / size
+        R: Matrix = np.asarray(np.linalg.qr(np.column_stack([scaled, target]), mode="r"))
+        beta = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=_RANK)[0]
+        error = target - scaled @ beta
+    return _Point(phi, beta / size, error, columns, float(error @ error))
+
+
+def _gradient(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
+    """Return the columns ψ of β and φ (N, all), scaled to length 1, and their lengths."""
+    psi = np.hstack([at.columns, derivatives(form, at.phi, at.beta, u, y)])
+    size = nonzero_lengths(psi)
+    psi /= size
+    return psi, size
+
+
+def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool]:
+    """Return the model of least prediction error near ``at``, and whether the search converged."""
+    mu, floor = _MU, _ROUNDING * float(y @ y)
+    for _ in range(_STEPS):
+        if not math.isfinite(at.power):
+            return at, False
+        if at.power <= floor:
+            return at, True
+        psi, size = _gradient(form, at, u, y)
+        if not np.all(np.isfinite(psi)):
+            return at, False
+        R: Matrix = np.asarray(np.linalg.qr(np.column_stack([psi, at.error]), mode="r"))
+        first = at.beta.size
+        inner, right = R[first:-1, first:-1], R[first:-1, -1]
+        inner, step = _within_limits(form, at.phi, inner, right)
+        gain = float(right @ right - np.sum((right - inner @ step) ** 2))
+        if gain <= _CONVERGED * at.power:
+            return at, True
+        moved, mu = _damped_step(form, at, inner, right, size[first:], mu, u, y)
+        if moved is None:
+            return at, False
+        at = moved
+    return at, False
+
+
+def _within_limits(form: Form, phi: Vector, inner: Matrix, right: Vector) -> tuple[Matrix, Vector]:
+    """Return the equations and their solution without τ or T that would leave zero downwards."""
+    step: Vector = np.linalg.lstsq(inner, right, rcond=_RANK)[0].astype(np.float64)
+    stuck = np.zeros(step.size, dtype=bool)
+    stuck[form.times] = (phi[form.times] <= 0.0) & (step[form.times] <= 0.0)
+    if np.any(stuck):
+        inner = np.where(stuck, 0.0, inner)
+        step = np.linalg.lstsq(inner, right, rcond=_RANK)[0].astype(np.float64)
+    return inner, step
+
+
+def _damped_step(
+    form: Form,
+    at: _Point,
+    inner: Matrix,
+    right: Vector,
+    size: Vector,
+    mu: float,
+    u: Vector,
+    y: Vector,
+) -> tuple[_Point | None, float]:
+    """Return a better model by a damped step, None if there is none, and the next μ."""
+    count = right.size
+    while mu <= _MOST_MU:
+        left = np.vstack([inner, math.sqrt(mu) * np.eye(count)])
+        step = np.linalg.lstsq(left, np.append(right, np.zeros(count)), rcond=None)[0]
+        phi = at.phi + step / size
+        phi[form.times] = np.maximum(phi[form.times], 0.0)
+        trial = _solved(form, phi, u, y)
+        if trial.power < at.power:
+            return trial, max(0.1 * mu, _LEAST_MU)
+        mu = max(10.0 * mu, 1e-6)
+    return None, mu

@@ -1,0 +1,163 @@
+"""The predictor of a plant behind a lag and a delay, under a drifting load: sampled exactly.
+
+    y^(n) + a_{n−1} y^(n−1) + … + a_0 y = b u_l + d + w,     d' = w_d,     τ u_l' + u_l = u(t − T)
+
+This is the model that ADRC has, y^(n) = f + b u, with the part of f that is linear. For white w,
+w_d and white noise in y the best prediction of y from the samples before is that of a Kalman
+filter, in the innovation form (Ljung, *System Identification*, 2nd ed. 1999, eqs. (4.91), (4.92))::
+
+    x⁺ = Φ x + Γ u + K e,      e = y − ŷ,      ŷ = x_1
+
+with ``x = (x_1 … x_n, d, u_l)`` and free gains K, so that the noises' intensities need not be
+known. K is Φ's integral over the sample times ``(l_1 … l_{n+1})``. The predictor's matrix ``Φ − K
+C`` has to be stable; the plant's need not be.
+
+A sample is a unit of time, as in ``sampling``. u is held between samples, and T need not be a whole
+number of them: in a sample the u before acts for the part ``T − ⌊T⌋``, then the next one for the
+rest. For given a, l, τ and T, ŷ is linear in b and the initial state.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from quell.identification.model.sampling import Sampled, observable, states
+from quell.identification.search.delay import delayed
+from quell.lti.discretize import zero_order_hold
+from quell.types import Matrix, Vector
+
+# Step of the differences that stand for derivatives, relative to the size of the parameters:
+# between rounding of the simulation (1e-12) and curvature (second order).
+_STEP = 1e-4
+# Largest |z| of a stable predictor: one, and rounding of multiple eigenvalues at z = 1.
+_LIMIT = 1.0 + 1e-6
+# Least time constant of the lag [samples], so that 1/τ is finite.
+_LEAST_LAG = 1e-6
+
+
+class Form(NamedTuple):
+    """The parameters of a model: a, l, τ and T are *nonlinear*, b and the initial state linear."""
+
+    order: int  #: n
+    lag: bool  #: whether τ is free; else it is 0
+    delay: bool  #: whether T is free; else it is 0
+    drift: bool  #: whether l are free; else they are 0, and only y is noisy
+
+    @property
+    def gains(self) -> slice:
+        """Places of l."""
+        return slice(self.order, self.order + self.drift * (self.order + 1))
+
+    @property
+    def times(self) -> slice:
+        """Places of τ and T."""
+        return slice(self.gains.stop, self.size)
+
+    @property
+    def size(self) -> int:
+        """Number of nonlinear parameters."""
+        return self.gains.stop + self.lag + self.delay
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return self.order + 1 + self.lag
+
+    def lag_of(self, phi: Vector) -> float:
+        """Return τ [samples]."""
+        return float(phi[self.times][0]) if self.lag else 0.0
+
+    def delay_of(self, phi: Vector) -> float:
+        """Return T [samples]."""
+        return float(phi[-1]) if self.delay else 0.0
+
+
+def placed(a: Vector, omega: float) -> Vector:
+    """Return a and the gains l that put all poles of ``s^(n+1) + …`` at −omega [1/sample]."""
+    target = np.poly(np.full(a.size + 1, -omega)).real[1:]
+    return np.concatenate([a, target - np.append(a[::-1], 0.0)])
+
+
+def is_stable(form: Form, phi: Vector) -> bool:
+    """Return whether the predictor is stable, or at its limit; one without gains always counts."""
+    if not form.drift:
+        return True
+    closed = _predictor(form, phi).phi
+    return bool(np.all(np.isfinite(closed)) and np.max(np.abs(np.linalg.eigvals(closed))) <= _LIMIT)
+
+
+def linear_columns(form: Form, phi: Vector, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
+    """Return ŷ by b and by each initial state (N, 1 + states), and its part from y (N,)."""
+    system, v = _predictor(form, phi), _inputs(form, phi, u, y)
+    nothing = np.zeros((u.size, 1))
+    of_u, of_y, of_none = (_with(system, part) for part in (slice(0, 2), slice(2, 3), slice(2, 3)))
+    parts = [states(of_u, v[:, :2])[:, 0]]
+    parts += [states(of_none, nothing, start)[:, 0] for start in np.eye(form.states)]
+    return np.column_stack(parts), states(of_y, v[:, 2:])[:, 0]
+
+
+def predicted(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Vector:
+    """Return ŷ (N,) for the linear parameters ``beta``: b, and the initial state."""
+    system = _predictor(form, phi)
+    system = system._replace(gamma=system.gamma * np.array([beta[0], beta[0], 1.0]))
+    return states(system, _inputs(form, phi, u, y), beta[1:])[:, 0]
+
+
+def derivatives(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Matrix:
+    """Return the derivatives (N, size) of ŷ by a, l, τ and T, by central differences."""
+    found = np.empty((u.size, form.size))
+    for i, step in enumerate(_steps(form, y)):
+        above, below = phi.copy(), phi.copy()
+        above[i] += step
+        # τ and T are not negative; at zero the difference is one-sided.
+        below[i] -= step if i < form.times.start or phi[i] >= step else 0.0
+        change = predicted(form, above, beta, u, y) - predicted(form, below, beta, u, y)
+        found[:, i] = change / (above[i] - below[i])
+    return found
+
+
+def _steps(form: Form, y: Vector) -> Vector:
+    """Return steps of the parameters, small in relation to the speed of y's motion."""
+    n = form.order
+    slow = 2.0 * math.pi / y.size
+    spread = float(np.std(y)) or 1.0
+    rate = float(np.clip(np.std(y[n:] - y[:-n]) / (n * spread), 10.0 * slow, 0.3))
+    powers = np.append(n - np.arange(float(n)), np.arange(1.0, n + 2.0))[: form.times.start]
+    return _STEP * np.append(rate**powers, np.full(form.lag + form.delay, 1.0 / rate))
+
+
+def _with(system: Sampled, inputs: slice) -> Sampled:
+    gamma = np.ascontiguousarray(system.gamma[:, inputs])
+    return system._replace(gamma=gamma, slope=np.zeros_like(gamma))
+
+
+def _predictor(form: Form, phi: Vector) -> Sampled:
+    """Return the predictor, for the inputs u before, u after the delay's change, y."""
+    n, size = form.order, form.states
+    A, B = np.zeros((size, size)), np.zeros((size, 2))
+    A[:n, :n] = observable(phi[:n])
+    A[n - 1, n] = 1.0
+    if form.drift:
+        B[: n + 1, 1] = phi[form.gains]
+    if form.lag:
+        tau = max(form.lag_of(phi), _LEAST_LAG)
+        A[n - 1, n + 1], A[n + 1, n + 1], B[n + 1, 0] = 1.0, -1.0 / tau, 1.0 / tau
+    else:
+        B[n - 1, 0] = 1.0
+    late = math.modf(form.delay_of(phi))[0]
+    with np.errstate(all="ignore"):
+        whole, (gamma,) = zero_order_hold(A, [B], 1.0)
+        _, (rest,) = zero_order_hold(A, [B[:, :1]], 1.0 - late)
+    K = gamma[:, 1]
+    whole[:, 0] -= K
+    gammas = np.column_stack([gamma[:, 0] - rest[:, 0], rest[:, 0], K])
+    return Sampled(whole, gammas, np.zeros_like(gammas))
+
+
+def _inputs(form: Form, phi: Vector, u: Vector, y: Vector) -> Matrix:
+    """Return u before and after the delay's change in each sample, and y (N, 3)."""
+    whole = math.floor(form.delay_of(phi))
+    return np.column_stack([delayed(u, whole + 1), delayed(u, whole), y])
