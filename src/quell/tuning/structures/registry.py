@@ -5,6 +5,7 @@ from __future__ import annotations
 from quell import checks
 from quell.tuning.structures.adrc import AdrcStructure, Form
 from quell.tuning.structures.base import Model, Structure
+from quell.tuning.structures.lqg import LqgStructure
 from quell.tuning.structures.pid import FilteredPID
 
 _PID = {
@@ -23,13 +24,14 @@ _ADRC = {
     "delay": Form(knows_delay=True),
     "delay-freed": Form(knows_delay=True, freed=True),
 }
-STRUCTURES = (*_ADRC, *_PID)
-"""Names of the structures: forms of ADRC by bandwidths or freed poles, and PI and PID."""
+LQG = "lqg"
+STRUCTURES = (*_ADRC, *_PID, LQG)
+"""Names of the structures: forms of ADRC by bandwidths or freed poles, PI and PID, and LQG."""
 
 
 def orders_of(name: str, model: Model, order: int | None) -> tuple[int, ...]:
     """Return the orders to search: of a free ADRC 1 and 2, unless the plant or user says one."""
-    if name in _PID or _ADRC[name].based:
+    if name in _PID or name == LQG or _ADRC[name].based:
         return (0,)
     if order is not None:
         return (checks.whole("order", order, 1, 8),)
@@ -48,6 +50,8 @@ def make_structure(name: str, model: Model, order: int = 0) -> Structure:
     if name in _PID:
         derivative, filtered = _PID[name]
         return FilteredPID(model, derivative=derivative, filtered=filtered)
+    if name == LQG:
+        return LqgStructure(model)
     form = _ADRC[name]
     label = name if form.based else f"{name} of order {order}"
     return AdrcStructure(model, label, order, form)
