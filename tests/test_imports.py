@@ -23,6 +23,7 @@ ROWS = (
     ("identification.experiment", "identification.model", "identification.search"),
     ("identification.running_loop",),
     ("identification",),
+    ("sweeping",),
     ("tuning.constraints", "tuning.loops", "tuning.structures", "tuning.simulated", "tuning"),
     ("realtime.system", "realtime.telemetry", "realtime.devices", "realtime.wire"),
     ("realtime.loop", "realtime.rig", "realtime.__init__", "setup"),

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         realtime,
         setup,
         signals,
+        sweeping,
         tuning,
     )
     from quell.controllers import baselines
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from quell.records.trajectory import Trajectory
     from quell.simulation.scenario import Scenario
     from quell.simulation.simulate import simulate
+    from quell.sweeping.sweep import sweep
     from quell.tuning.tune import tune
     from quell.tuning.tuned import Tuned
     from quell.types import DesignWarning, Status
@@ -67,6 +69,7 @@ _HOME = {
     "identify": "quell.identification.identify",
     "omega_c_for": "quell.controllers.bandwidth",
     "simulate": "quell.simulation.simulate",
+    "sweep": "quell.sweeping.sweep",
     "tune": "quell.tuning.tune",
 }
 _MODULES = {"baselines": "quell.controllers.baselines", "metrics": "quell.records.metrics"}
@@ -75,7 +78,8 @@ __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Guard", "Reason", "Scenario",
     "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers",
     "experiments", "features", "identification", "identify", "learners", "metrics", "observers",
-    "omega_c_for", "plants", "realtime", "setup", "signals", "simulate", "tune", "tuning",
+    "omega_c_for", "plants", "realtime", "setup", "signals", "simulate", "sweep", "sweeping",
+    "tune", "tuning",
 ]  # fmt: skip
 
 

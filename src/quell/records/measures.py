@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -64,44 +65,66 @@ class Window(NamedTuple):
     u_before: float  # the u before the window, zero at the start of the record
 
 
-def measured(window: Window, target: float | None, band: float, incomplete: str | None) -> Metrics:
-    """Return the measures of a window; ``incomplete`` says why it is not all there, if so."""
+def measured(
+    window: Window,
+    target: float | None,
+    band: float,
+    incomplete: str | None,
+    names: Collection[str] = MEASURES,
+) -> Metrics:
+    """Return measures of a window, by default all; ``incomplete`` says why not all of it is there.
+
+    ``incomplete`` is None for a window that is complete.
+    """
     t, r, y, u, r_before, u_before = window
     error = r - y
     goal = float(r[-1]) if target is None else checks.finite("target", target)
     band, initial = checks.positive("band", band), float(y[0])
-    fault = incomplete or _no_step(t, r, r_before, goal, initial, target is not None)
-    values, missing = {}, dict.fromkeys(STEP_MEASURES, fault) if fault else {}
-    if not fault:
-        values = {
-            "overshoot": metrics.overshoot(y, goal, initial),
-            "settling_time": metrics.settling_time(t, y, goal, band, initial),
-            "rise_time": metrics.rise_time(t, y, goal, initial),
-        }
-        if math.isnan(values["settling_time"]):
-            share = f"±{100.0 * band:g} % of the step"
-            missing["settling_time"] = f"at the end of the window y is not within {share}"
-        if math.isnan(values["rise_time"]):
-            missing["rise_time"] = "y does not reach 90 % of the step in the window"
+    values, missing = {}, dict[str, str]()
+    step = [name for name in STEP_MEASURES if name in names]
+    if step:
+        fault = incomplete or _no_step(t, r, r_before, goal, initial, target is not None)
+        missing = dict.fromkeys(step, fault) if fault else {}
+        if not fault:
+            values = _step_measures(step, t, y, goal, band, initial)
+            times = [name for name in step if name != "overshoot"]
+            missing = {name: _never(name, band) for name in times if math.isnan(values[name])}
     with np.errstate(over="ignore", invalid="ignore"):
-        values |= _errors(t, error)
-    values |= {
-        "control_variation": metrics.control_variation(u),
-        "total_variation": metrics.total_variation(u, u_before),
-    }
+        values |= {name: of(t, error) for name, of in _OF_ERROR.items() if name in names}
+    if "control_variation" in names:
+        values["control_variation"] = metrics.control_variation(u)
+    if "total_variation" in names:
+        values["total_variation"] = metrics.total_variation(u, u_before)
     unexplained = values.keys() - missing.keys()
     missing |= {name: _TOO_LARGE for name in unexplained if not math.isfinite(values[name])}
     return Metrics(values, missing, band)
 
 
-def _errors(t: Vector, error: Vector) -> dict[str, float]:
-    return {
-        "peak_error": metrics.peak(error),
-        "rms": metrics.rms(error),
-        "iae": metrics.iae(t, error),
-        "ise": metrics.ise(t, error),
-        "itae": metrics.itae(t, error),
+_OF_ERROR: Mapping[str, Callable[[Vector, Vector], float]] = {
+    "peak_error": lambda t, error: metrics.peak(error),
+    "rms": lambda t, error: metrics.rms(error),
+    "iae": metrics.iae,
+    "ise": metrics.ise,
+    "itae": metrics.itae,
+}
+
+
+def _step_measures(
+    names: Collection[str], t: Vector, y: Vector, goal: float, band: float, initial: float
+) -> dict[str, float]:
+    of = {
+        "overshoot": lambda: metrics.overshoot(y, goal, initial),
+        "settling_time": lambda: metrics.settling_time(t, y, goal, band, initial),
+        "rise_time": lambda: metrics.rise_time(t, y, goal, initial),
     }
+    return {name: of[name]() for name in names}
+
+
+def _never(name: str, band: float) -> str:
+    """Return why a time of a step that there is does not exist."""
+    if name == "rise_time":
+        return "y does not reach 90 % of the step in the window"
+    return f"at the end of the window y is not within ±{100.0 * band:g} % of the step"
 
 
 def _no_step(

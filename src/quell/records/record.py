@@ -59,7 +59,7 @@ class Record:
         A ``ValueError`` says that the file exists, unless ``overwrite`` allows to replace it.
         """
         check_writable(path, overwrite)
-        image = _netcdf(self.to_xarray())
+        image = netcdf_image(self.to_xarray())
         with written_atomically(path, overwrite) as part:
             part.write_bytes(image)
 
@@ -83,7 +83,7 @@ class Record:
         return xarray.Dataset(variables, coordinates, attrs=attributes)
 
 
-def _netcdf(dataset: xarray.Dataset) -> bytes:
+def netcdf_image(dataset: xarray.Dataset) -> bytes:
     """Return a dataset as a NetCDF file in memory.
 
     HDF5 must not write to the disk itself: when that is full, it leaves objects behind that end the

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from quell.reading import MAX_SIZE
-from quell.records.measures import Metrics, Window, measured
+from quell.records.measures import MEASURES, Metrics, Window, measured
 from quell.records.metrics import SETTLING_BAND
 from quell.records.netcdf import Stored, load_record
 from quell.records.record import Record
@@ -110,6 +111,17 @@ class Trajectory(Record):
         ValueError
             if the window has no sample, for instance because the run ended before it.
         """
+        return self.metrics_of(MEASURES, start, stop, target, band)
+
+    def metrics_of(
+        self,
+        names: Collection[str],
+        start: float = 0.0,
+        stop: float | None = None,
+        target: float | None = None,
+        band: float = SETTLING_BAND,
+    ) -> Metrics:
+        """Return some of the measures of ``metrics``, which has all of them."""
         part = self._part(start, stop)
         before = slice(max(part.start - 2, 0), part.start)
         r, u = self["r"], self["u"]
@@ -123,7 +135,7 @@ class Trajectory(Record):
         )
         cut_off = self.diverged and (stop is None or stop > self.ended)
         fault = f"the run diverged at {self.ended:.6g} s, in the window" if cut_off else None
-        return measured(window, target, band, fault)
+        return measured(window, target, band, fault, names)
 
     def _part(self, start: float, stop: float | None) -> slice:
         """Return the samples in ``[start, stop)``; raise a ``ValueError`` if there are none."""

@@ -1,0 +1,108 @@
+"""Figures of a sweep: failure rate and quantiles of the measures over a parameter."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+
+if TYPE_CHECKING:
+    from quell.sweeping.result import Sweep
+
+QUANTILES = (0.05, 0.5, 0.95)
+# Groups of values of a parameter: enough to show a shape, few enough that each has runs. By hand.
+_MOST_GROUPS = 20
+# 97.5 % quantile of the normal distribution, for intervals of 95 %.
+_Z = 1.959963984540054
+
+
+class Groups(NamedTuple):
+    """Runs in groups of near values of a parameter."""
+
+    centres: NDArray[np.float64]  # (groups,)
+    texts: list[str] | None  # of values that are no numbers
+    members: list[NDArray[np.int64]]
+
+
+def groups_of(sweep: Sweep, parameter: str) -> Groups:
+    """Return the runs that are done by the value of a parameter.
+
+    Values of which there are many form groups of about as many runs each.
+    """
+    names = {str(c.attrs["parameter"]): c for c in sweep.dataset.coords.values()}
+    checks.one_of("parameter", parameter, tuple(names))
+    values, runs = names[parameter].values, np.flatnonzero(sweep.done)
+    texts = sweep.store.labels[parameter]
+    if texts is not None:
+        members = [runs[values[runs] == text] for text in texts]
+        return Groups(np.arange(len(texts), dtype=np.float64), texts, members)
+    order = runs[np.argsort(values[runs], kind="stable")]
+    distinct = np.unique(values[runs])
+    if distinct.size <= _MOST_GROUPS:
+        return Groups(distinct, None, [runs[values[runs] == each] for each in distinct])
+    members = [each for each in np.array_split(order, _MOST_GROUPS) if each.size]
+    return Groups(np.array([np.median(values[each]) for each in members]), None, members)
+
+
+def wilson(failures: int, runs: int) -> tuple[float, float]:
+    """Return the 95 % interval of a failure rate (Wilson, *J. Am. Stat. Assoc.* 22, 1927)."""
+    if runs == 0:
+        return 0.0, 1.0
+    rate, z2 = failures / runs, _Z**2 / runs
+    centre = rate + 0.5 * z2
+    half = _Z * np.sqrt(rate * (1.0 - rate) / runs + 0.25 * z2 / runs)
+    return max((centre - half) / (1.0 + z2), 0.0), min((centre + half) / (1.0 + z2), 1.0)
+
+
+def plot_over(sweep: Sweep, parameter: str, figure: Any = None) -> Any:
+    """Draw failure rate and quantiles of each measure over a parameter."""
+    from matplotlib.figure import Figure
+
+    groups = groups_of(sweep, parameter)
+    measures = list(sweep.store.measures)
+    columns = min(3, 1 + len(measures))
+    rows = -(-(1 + len(measures)) // columns)
+    if figure is None:
+        figure = Figure(figsize=(3.6 * columns, 2.7 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    _plot_failures(axes[0], sweep.failed, groups)
+    for axis, name in zip(axes[1:], measures, strict=False):
+        _plot_quantiles(axis, sweep.dataset[name].values, groups)
+        unit = sweep.store.measures[name].get("units", "")
+        axis.set_title(f"{name} [{unit}]" if unit not in ("", "1") else name)
+    for axis in axes[1 + len(measures) :]:
+        axis.set_axis_off()
+    for axis in axes[: 1 + len(measures)]:
+        axis.set_xlabel(parameter)
+        axis.grid(alpha=0.3)
+        if groups.texts is not None:
+            axis.set_xticks(groups.centres, groups.texts)
+    return figure
+
+
+def _plot_failures(axis: Any, failed: NDArray[np.bool_], groups: Groups) -> None:
+    counts = [(int(np.sum(failed[each])), each.size) for each in groups.members]
+    rates = np.array([100.0 * failures / max(runs, 1) for failures, runs in counts])
+    low, high = 100.0 * np.array([wilson(*each) for each in counts]).T
+    reach = np.maximum([rates - low, high - rates], 0.0)
+    axis.errorbar(groups.centres, rates, reach, fmt="o", markersize=3, capsize=2, color="#c1440e")
+    axis.set_title("failure rate [%], 95 % interval")
+    axis.set_ylim(bottom=0.0)
+
+
+def _plot_quantiles(axis: Any, values: NDArray[np.float64], groups: Groups) -> None:
+    found = np.full((len(QUANTILES), len(groups.members)), np.nan)
+    for i, members in enumerate(groups.members):
+        there = values[members][np.isfinite(values[members])]
+        if there.size:
+            found[:, i] = np.quantile(there, QUANTILES)
+    low, median, high = found
+    if groups.texts is None:
+        axis.fill_between(groups.centres, low, high, color="#2a6f97", alpha=0.25, linewidth=0)
+        axis.plot(groups.centres, median, color="#2a6f97")
+    else:
+        reach = np.maximum([median - low, high - median], 0.0)
+        axis.errorbar(groups.centres, median, reach, fmt="o", capsize=3, color="#2a6f97")

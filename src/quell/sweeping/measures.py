@@ -1,0 +1,129 @@
+"""Measures of each run that a sweep stores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from quell import checks
+from quell.records.batch_trajectory import BatchTrajectory
+from quell.records.measures import MEASURES
+from quell.records.metrics import SETTLING_BAND
+from quell.records.trajectory import Trajectory
+from quell.types import Vector
+
+UNITS = {
+    "overshoot": ("overshoot, as a fraction of the step", "1"),
+    "settling_time": ("time after which y stays near the target", "s"),
+    "rise_time": ("time from 10 % to 90 % of the step", "s"),
+    "peak_error": ("largest |r - y|", "y-unit"),
+    "rms": ("root mean square of r - y", "y-unit"),
+    "iae": ("integral of |r - y|", "y-unit s"),
+    "ise": ("integral of (r - y)^2", "y-unit^2 s"),
+    "itae": ("integral of t |r - y|", "y-unit s^2"),
+    "control_variation": ("sum of the moves of u, without the first", "u-unit"),
+    "total_variation": ("sum of the moves of u", "u-unit"),
+}
+"""Description and unit of each measure, in files."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A measure of ``Trajectory.metrics`` in a window of time.
+
+    Parameters
+    ----------
+    name
+        ``peak_error``, ``rms``, ``iae``, ``ise``, ``itae``, ``control_variation``,
+        ``total_variation``, ``overshoot``, ``settling_time`` or ``rise_time``.
+    start, stop, target, band
+        as those of ``Trajectory.metrics``.
+
+    Raises
+    ------
+    ValueError
+        for an unknown measure, or a window that ends before it begins.
+    """
+
+    name: str
+    start: float = 0.0
+    stop: float | None = None
+    target: float | None = None
+    band: float = SETTLING_BAND
+
+    def __post_init__(self) -> None:
+        if self.name not in MEASURES:
+            hint = checks.nearest(str(self.name), MEASURES)
+            raise ValueError(f"metrics: {self.name!r} is unknown, {hint}")
+        checks.finite("start", self.start)
+        if self.stop is not None:
+            checks.interval("start", self.start, "stop", self.stop)
+        checks.optional(checks.finite, "target", self.target)
+        checks.positive("band", self.band)
+
+    @property
+    def window(self) -> tuple[Any, ...]:
+        """Start, stop, target and band."""
+        return self.start, self.stop, self.target, self.band
+
+
+Measures: TypeAlias = Mapping[str, Measure | Callable[[Trajectory], float]]
+
+
+def as_measures(metrics: Any) -> Measures:
+    """Return the measures of a sweep by the name of their variable.
+
+    ``metrics`` has names of measures, or a measure or a function of a run for each name.
+    """
+    if isinstance(metrics, str) or not isinstance(metrics, Mapping | Sequence):
+        raise ValueError(f"metrics = {metrics!r:.60}: must be names, or measures by name")
+    if not isinstance(metrics, Mapping):
+        metrics = {name: Measure(name) for name in metrics}
+    found: dict[str, Any] = {}
+    for name, each in metrics.items():
+        found[name] = Measure(each) if isinstance(each, str) else each
+        if not isinstance(found[name], Measure) and not callable(found[name]):
+            rule = "must be a quell.sweeping.Measure, or a function of a Trajectory"
+            raise ValueError(f"metrics[{name!r}] = {each!r:.60}: {rule}")
+    if not found:
+        raise ValueError("metrics is empty: must name at least one measure")
+    return found
+
+
+def measure_runs(runs: BatchTrajectory, measures: Measures) -> tuple[dict[str, Vector], list[str]]:
+    """Return each measure (runs,), NaN where there is none, and the error of each run, if any."""
+    values = {name: np.full(len(runs), np.nan) for name in measures}
+    windows: dict[tuple[Any, ...], list[str]] = {}
+    own = {name: each for name, each in measures.items() if not isinstance(each, Measure)}
+    for name, each in measures.items():
+        if isinstance(each, Measure):
+            windows.setdefault(each.window, []).append(name)
+    errors = [""] * len(runs)
+    for i in range(len(runs)):
+        run = runs.run(i)
+        try:
+            for window, names in windows.items():
+                _in_window(run, window, {k: measures[k].name for k in names}, values, i)  # type: ignore[union-attr]
+            for name, function in own.items():
+                values[name][i] = float(function(run))
+        except Exception as error:  # a function of the user's may raise anything
+            errors[i] = f"{type(error).__name__}: {error}"
+    return values, errors
+
+
+def _in_window(
+    run: Trajectory,
+    window: tuple[Any, ...],
+    wanted: Mapping[str, str],
+    values: Mapping[str, Vector],
+    i: int,
+) -> None:
+    start, stop, target, band = window
+    if run.diverged and run.window(start, np.inf).start >= len(run):
+        return  # it ended before the window
+    found = run.metrics_of(tuple(wanted.values()), start, stop, target, band)
+    for name, measure in wanted.items():
+        values[name][i] = found.get(measure, np.nan)

@@ -1,0 +1,139 @@
+"""The results of a sweep."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quell import checks
+from quell.records.trajectory import Trajectory
+from quell.simulation.simulate import simulate
+from quell.sweeping.lazy import NOT_DONE, lazy_dataset
+from quell.sweeping.plan import Plan
+from quell.sweeping.runs import ERROR, Job, Parts, built
+from quell.sweeping.store import Store, open_store
+from quell.types import Status
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The results of a sweep, on disk.
+
+    ``dataset`` has a variable over ``run`` for each measure, ``status``, ``ended``, ``seed`` and
+    ``message``; the parameters are its coordinates. Values are read from the disk when they are
+    used. ``Sweep.open(folder)`` gives the results of a sweep that another program ran or runs.
+    """
+
+    store: Store = field(repr=False)
+    plan: Plan | None = field(default=None, repr=False)  #: None if it was opened
+    job: Job | None = field(default=None, repr=False)  #: None if it was opened
+
+    @classmethod
+    def open(cls, folder: str | os.PathLike[str]) -> Sweep:
+        """Return the results in a folder, also of a sweep that is not complete.
+
+        Raises
+        ------
+        ValueError
+            if the folder holds no sweep.
+        """
+        return cls(open_store(folder))
+
+    @cached_property
+    def dataset(self) -> xarray.Dataset:
+        """Measures, status and parameters over ``run``."""
+        return lazy_dataset(self.store)
+
+    @property
+    def limits(self) -> Mapping[str, float]:
+        """Largest value of measures of a run that does not fail."""
+        return dict(self.store.about.get("limits", {}))
+
+    @property
+    def missing(self) -> int:
+        """Number of runs that are not done."""
+        return sum(last - first for first, last in self.store.missing())
+
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """True for runs that are done (runs,)."""
+        return np.asarray(self.dataset["status"].values != NOT_DONE)
+
+    @property
+    def failed(self) -> NDArray[np.bool_]:
+        """True for runs with an error, that diverged, or with a measure beyond its limit (runs,).
+
+        A measure that does not exist is beyond its limit, the settling time of a run that does not
+        settle for example.
+        """
+        status = self.dataset["status"].values
+        found = (status == ERROR) | ((status > 0) & ((status & int(Status.DIVERGED)) != 0))
+        for name, limit in self.limits.items():
+            found |= ~(self.dataset[name].values <= limit)
+        return np.asarray(found & (status != NOT_DONE))
+
+    def worst(self, metric: str | None = None, count: int = 5) -> list[int]:
+        """Return the runs with the largest values of a measure, by default the first one.
+
+        Runs without a value, which ended early or have an error, come before all others.
+        """
+        checks.whole("count", count, 1)
+        name = metric or next(iter(self.store.measures))
+        checks.one_of("metric", name, tuple(self.store.measures))
+        values = np.where(np.isnan(self.dataset[name].values), np.inf, self.dataset[name].values)
+        values[~self.done] = -np.inf
+        first = np.argpartition(-values, min(count, values.size) - 1)[:count]
+        order = first[np.lexsort((first, -values[first]))]
+        return [int(i) for i in order if values[i] > -np.inf]
+
+    def describe(self, run: int) -> str:
+        """Return the name of a run: its number, its parameters, its seed."""
+        checks.whole("run", run, 0, self.store.runs - 1)
+        one = self.dataset.isel(run=run)
+        parts = []
+        for name, texts in self.store.labels.items():
+            value = next(c for c in one.coords.values() if c.attrs["parameter"] == name).item()
+            parts.append(f"{name} = {value:.6g}" if texts is None else f"{name} = {value}")
+        parts.append(f"seed {one['seed'].item()}")
+        return f"run {run}: {', '.join(parts)}"
+
+    def parts(self, run: int) -> Parts:
+        """Return plant, controller and scenario of a run, of a sweep that ``sweep`` returned."""
+        checks.whole("run", run, 0, self.store.runs - 1)
+        if self.plan is None or self.job is None:
+            rule = "an opened sweep can't repeat a run; call sweep again with the same arguments"
+            raise ValueError(f"run = {run}: {rule}, which returns at once if it is complete")
+        return built(self.job, self.plan.part(run, run + 1), run)
+
+    def repeat(self, run: int) -> Trajectory:
+        """Simulate a run again, alone, and return its whole record.
+
+        Raises
+        ------
+        ValueError
+            if the run can't be built or simulated, or the sweep was opened.
+        """
+        return simulate(*self.parts(run))
+
+    def plot(self, parameter: str, figure: Any = None) -> Any:
+        """Draw failure rate and quantiles of each measure over a parameter; return the figure.
+
+        Parameters
+        ----------
+        parameter
+            name of the parameter.
+        figure
+            a matplotlib figure; a new one by default.
+        """
+        from quell.sweeping.figures import plot_over
+
+        return plot_over(self, parameter, figure)
