@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from quell import __version__, checks
+from quell import checks
 from quell.executors import Where, completed, executor_on
 from quell.parallel import one_blas_thread
 from quell.sweeping.measures import as_measures
@@ -194,7 +194,6 @@ def _about(plan: Plan, job: Job, limits: Mapping[str, float]) -> dict[str, Any]:
         "limits": dict(limits),
         "exact": job.exact,
         "build": _identity(job.build),
-        "version of quell": __version__,
     }
     return dict(json.loads(json.dumps(about)))  # as it is read again
 
