@@ -53,7 +53,7 @@ class LqgStructure:
         self.model, self.plant = model, LinearPlant.of(model.plant)
         fastest = min(_BANDWIDTHS[1] * model.omega, model.constraints.omega_o_dt / model.dt)
         bounds = (min(_BANDWIDTHS[0] * model.omega, 0.1 * fastest), fastest)
-        self.parameters = (
+        self.parameters: tuple[Parameter, ...] = (
             Parameter("b_factor", "", *_FACTORS),
             Parameter("omega_c", "rad/s", *bounds),
             Parameter("omega_o", "rad/s", *bounds),
