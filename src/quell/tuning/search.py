@@ -35,14 +35,16 @@ from quell.types import Matrix, Vector
 # curvature.
 _DIFFERENCE = 1e-6
 # Points with a ratio above the first are in the problem; peaks above the second are refined.
-_NEAR, _PEAK = 0.7, 0.93
+_NEAR, _PEAK = 0.5, 0.93
 # Half width of the box of a round in the logarithms, and how it shrinks after an unstable result.
 _BOX, _SHRINK = 0.7, 0.3
-_ROUNDS, _ITERATIONS = 12, 25
+_ITERATIONS = 25
+# Starts, the rounds that each of them takes, those that go on, and their rounds at most.
+_STARTS, _FIRST_ROUNDS, _FINALISTS, _ROUNDS = 5, 3, 2, 25
 # A result is good if no bound is exceeded by more; a tenth of what is promised.
 _VIOLATION = 1e-4
 # Rounds end when the objective changes by less.
-_SETTLED = 1e-5
+_SETTLED = 1e-4
 
 
 class Extra(NamedTuple):
@@ -118,14 +120,47 @@ def _limits(structure: Structure) -> tuple[Vector, Vector]:
     return low, np.array([parameter.high for parameter in structure.parameters])
 
 
-def search(problem: Problem, structure: Structure, start: Vector) -> Solution | None:
+def best_solution(
+    problem: Problem, structure: Structure, more: Matrix | None = None
+) -> Solution | None:
+    """Return the best solution from several starts; None if no start is stable.
+
+    All of them take some rounds, the best go on until they settle. ``more`` (k, p) are values to
+    start from besides those of the structure.
+    """
+    if more is None:
+        more = np.zeros((0, len(structure.parameters)))
+    found = []
+    for start in starts(problem, structure, more, _STARTS):
+        solution = search(problem, structure, start, _FIRST_ROUNDS)
+        if solution is not None:
+            found.append(solution)
+    found.sort(key=_rank)
+    ends: list[Solution] = []
+    for solution in found:
+        if len(ends) == _FINALISTS:
+            break
+        near = (np.max(np.abs(np.log(solution.values / end.values))) < 0.02 for end in ends)
+        if not any(near):
+            end = search(problem, structure, solution.values, _ROUNDS)
+            ends.append(end if end is not None and _rank(end) < _rank(solution) else solution)
+    return min(ends, key=_rank, default=None)
+
+
+def _rank(solution: Solution) -> tuple[float, float]:
+    return max(solution.violation, _VIOLATION), solution.cost
+
+
+def search(
+    problem: Problem, structure: Structure, start: Vector, rounds: int
+) -> Solution | None:
     """Return the optimum that is reached from a start; None if all rounds end unstable."""
     low, high = (np.log(limit) for limit in _limits(structure))
     x, box = np.clip(np.log(start), low, high), _BOX
     best: tuple[float, float, Vector] | None = None
     extra_points: list[tuple[int, int, float]] = []
     last = math.inf
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         found, violation, refined = _judged(problem, structure, x)
         cost = found
         if best is None or _better(cost, violation, best):

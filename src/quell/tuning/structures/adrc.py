@@ -59,6 +59,7 @@ class AdrcStructure:
         if form.based and self.plant.unstable_zeros.size:
             raise ValueError("the plant has zeros outside of the left half plane, which it inverts")
         self.order, self.degree = self.plant.a.size, self.plant.degree
+        self._last: tuple[bytes, Any] = b"", None
         self._chain = sampled_adrc.sampled_chain(self.plant, model.dt)
         self._delay = round(model.delay / model.dt) if form.knows_delay else 0
         self._fastest = model.constraints.omega_o_dt / model.dt
@@ -136,9 +137,14 @@ class AdrcStructure:
         return np.array(rows)
 
     def _designs(self, values: Matrix) -> sampled_adrc.Designs:
+        key = values.tobytes()
+        if key != self._last[0]:  # response and integral gain are asked for in turn
+            self._last = key, self._made(values)
+        return self._last[1]
+
+    def _made(self, values: Matrix) -> sampled_adrc.Designs:
         law, observer = self.poles(values)
-        gains = np.array([np.real(np.poly(row))[:0:-1] for row in law])
-        gains = gains * (0.5 if self.form.half_law else 1.0)
+        gains = sampled_adrc.coefficients(law) * (0.5 if self.form.half_law else 1.0)
         return sampled_adrc.designs(
             self._chain,
             gains,

@@ -7,6 +7,7 @@ Systems*, 1998, section 6.1). The integral gain k_i is that of C(s).
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -18,15 +19,13 @@ from quell.types import Matrix, Vector
 
 # Bounds of the times, in units of the time of one radian at the plant's phase crossover.
 _TIMES = (1e-4, 1e4)
-# Least damping of a filter of second order; below, the filter has a resonance of its own.
-_LEAST_DAMPING = 0.3
 
 
 class FilteredPID:
     """``u = K (1 + 1/(T_i s) + T_d s) / F(s) · (r − y)``, with F of first or second order.
 
-    A PI controller has ``F = 1 + T_f s`` or none; a PID controller the general
-    ``F = 1 + 2 ζ T_f s + (T_f s)²``, as an ADRC of order 2 has (``baselines/equivalent.py``).
+    A PI controller has ``F = 1 + T_f s`` or none, a PID controller ``F = 1 + T_f s + (T_f s)²/2``
+    (Åström & Hägglund, *Advanced PID Control*, ISA 2006, section 3.3).
     """
 
     gain_power = 1
@@ -36,14 +35,14 @@ class FilteredPID:
         self.model, self.derivative, self.filtered = model, derivative, filtered
         unit, dt = 1.0 / model.omega, model.dt
         times = (_TIMES[0] * unit, _TIMES[1] * unit)
-        self._shortest = dt / model.constraints.omega_o_dt
+        # The poles of F are at √2/T_f with a derivative, at 1/T_f without.
+        self._shortest = (math.sqrt(2.0) if derivative else 1.0) * dt / model.constraints.omega_o_dt
         K = 1.0 / model.gain
         self.parameters = (
             Parameter("K", "u-unit/y-unit", 1e-8 * K, 1e8 * K),
             Parameter("T_i", "s", *times),
             *([Parameter("T_d", "s", *times)] if derivative else []),
             *([Parameter("T_f", "s", self._shortest, max(10.0 * unit, 20.0 * dt))] * filtered),
-            *([Parameter("damping", "", _LEAST_DAMPING, 3.0)] * (derivative and filtered)),
         )
 
     def shapes(self) -> Matrix:
@@ -55,8 +54,7 @@ class FilteredPID:
                     Tf = max(tf * unit * min(Ti, 2.0), 1.05 * self._shortest)
                     row = [1.0, Ti * unit]
                     row += [ratio * Ti * unit] if self.derivative else []
-                    row += [Tf] if self.filtered else []
-                    rows.append(row + ([0.8] if self.derivative and self.filtered else []))
+                    rows.append(row + ([Tf] if self.filtered else []))
         return np.array(rows)
 
     def parts(self, values: Matrix) -> tuple[Vector, ...]:
@@ -66,7 +64,7 @@ class FilteredPID:
         if self.derivative:
             kd = K * values[:, 2]
         if self.filtered and self.derivative:
-            f1, f2 = 2.0 * values[:, 4] * values[:, 3], values[:, 3] ** 2
+            f1, f2 = values[:, 3], 0.5 * values[:, 3] ** 2
         elif self.filtered:
             f1 = values[:, 2]
         return K, K / Ti, kd, f1, f2
@@ -89,12 +87,8 @@ class FilteredPID:
         return np.zeros(values.shape[0])
 
     def rules(self, values: Matrix) -> Matrix:
-        """Return what is negative if the faster of two real poles of the filter is too fast."""
-        if not (self.derivative and self.filtered):
-            return np.zeros((values.shape[0], 0))
-        share = self._shortest / values[:, 3]
-        found: Matrix = (1.0 - 2.0 * values[:, 4] * share + share**2)[:, None]
-        return found
+        """Return nothing: the bounds of T_f say all."""
+        return np.zeros((values.shape[0], 0))
 
     def _arguments(self, values: Vector) -> dict[str, Any]:
         kp, ki, kd, f1, f2 = (float(part[0]) for part in self.parts(values[None, :]))

@@ -108,6 +108,16 @@ def designs(
     return Designs(difference, column, gain, K, omega**chain.degree, delay, chain.dt)
 
 
+def coefficients(roots: NDArray[np.complex128]) -> Matrix:
+    """Return ``c_0 … c_(n−1)`` (m, n) of the polynomials ``s^n + … + c_1 s + c_0`` with roots."""
+    count, size = roots.shape
+    found = np.zeros((count, size + 1), dtype=complex)
+    found[:, 0] = 1.0
+    for i in range(size):
+        found[:, 1 : i + 2] -= roots[:, i : i + 1] * found[:, : i + 1]
+    return np.ascontiguousarray(found[:, :0:-1].real)
+
+
 def _placed(difference: Stack, offsets: NDArray[np.complex128]) -> Matrix:
     """Return L (m, N) as ``observers.placement.place_poles`` does, for many designs."""
     count, size, _ = difference.shape
