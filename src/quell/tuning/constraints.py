@@ -35,6 +35,10 @@ class Constraints:
         largest ``|u|`` in the responses of the objective's scenario [u-unit].
     rate_max
         largest rate of u in them [u-unit/s].
+    noise_over_pi
+        without ``m_ks`` and ``u_std``, M_ks is bounded by this multiple of that of the optimal PI
+        controller under the other constraints; None for no bound. Without one, an optimum with a
+        derivative has the fastest filter that ``omega_o_dt`` allows.
     omega_o_dt
         largest ``|p| dt`` of the poles of an observer or of a filter of the measurement; beyond
         0.5 sampling costs margin (docs/design).
@@ -54,12 +58,14 @@ class Constraints:
     delay_margin: float | None = None
     u_max: float | None = None
     rate_max: float | None = None
+    noise_over_pi: float | None = 10.0
     omega_o_dt: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("m_s", "m_t", "m_ks", "u_std", "noise_std", "delay_margin", "u_max"):
             checks.optional(checks.positive, name, getattr(self, name))
-        checks.optional(checks.positive, "rate_max", self.rate_max)
+        for name in ("rate_max", "noise_over_pi"):
+            checks.optional(checks.positive, name, getattr(self, name))
         checks.positive("omega_o_dt", self.omega_o_dt)
         for name in ("m_s", "m_t"):
             value = getattr(self, name)

@@ -13,7 +13,7 @@ from quell.plants.batch import PlantBatch
 from quell.plants.linear_part import linear_part
 from quell.plants.sampled import SampledPlant, sampled_plant
 from quell.tuning.constraints import Constraints
-from quell.tuning.loops import PlantSet
+from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.structures.base import Model
 from quell.types import Vector
 
@@ -30,6 +30,7 @@ class Given(NamedTuple):
     factors: Vector  # factors of the gain, for each plant
     sign: float  # sign of the gain that integral action needs
     degree: int
+    b: float  # gain of the first plant from u to y^(degree)
 
 
 def as_list(plant: Any) -> list[Any]:
@@ -88,7 +89,7 @@ def given_plants(
             )
     linear = tuple(part for part, _ in parts)
     factors = np.unique([low, 1.0, high]) if (low, high) != (1.0, 1.0) else np.ones(1)
-    return Given(linear, delays, actuator_lag, factors, signs[0], forms[0].degree)
+    return Given(linear, delays, actuator_lag, factors, signs[0], forms[0].degree, forms[0].b)
 
 
 def _sign(b: float, zeros: Vector) -> float:
@@ -100,11 +101,16 @@ def _sign(b: float, zeros: Vector) -> float:
     return float(np.sign(b)) * (-1.0) ** right
 
 
-def plant_set(given: Given, dt: float) -> PlantSet:
-    """Return the set: each plant with each factor of the gain; the nominal one is the first."""
+def plant_set(given: Given, dt: float, own: Vector | None = None) -> PlantSet:
+    """Return the set: each plant with each factor of the gain; the nominal one is the first.
+
+    ``own`` has one factor for each plant instead.
+    """
     sampled: list[SampledPlant] = []
     for linear, delay in zip(given.linear, given.delays.tolist(), strict=True):
         sampled.append(sampled_plant(linear, dt, delay, given.actuator_lag))
+    if own is not None:
+        return PlantSet(sampled, own, dt)
     order = np.argsort(np.abs(np.log(given.factors)), kind="stable")  # the factor 1 first
     factors = np.repeat(given.factors[order], len(sampled))
     return PlantSet(sampled * given.factors.size, factors, dt)
@@ -113,13 +119,16 @@ def plant_set(given: Given, dt: float) -> PlantSet:
 def model_of(given: Given, plants: PlantSet, constraints: Constraints) -> Model:
     """Return what structures may know: the first plant."""
     omega = plants.crossover
-    gain = float(np.abs(plants.responses(np.array([omega]))[0, 0]))
+    # Beside the crossover, where an undamped resonance may be.
+    beside = np.abs(plants.responses(omega * np.array([0.8, 1.25]))[0])
+    gain = float(np.sqrt(beside[0] * beside[1]))
     return Model(
         plant=given.linear[0],
         delay=float(given.delays[0]),
         dt=plants.dt,
         sign=given.sign,
         degree=given.degree,
+        b=abs(given.b),
         omega=omega,
         gain=gain,
         constraints=constraints,

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from quell import checks
-from quell.analysis.loop import analyse
+from quell.analysis.loop import LoopAnalysis, analyse
 from quell.parallel import one_blas_thread
+from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints
-from quell.tuning.plants import given_plants, model_of, plant_set
-from quell.tuning.requirements import bounds_of
-from quell.tuning.search import Problem, Solution, search, starts
-from quell.tuning.structures.registry import STRUCTURES, make_structure, orders_of
-from quell.tuning.tuned import Design, Tuned
+from quell.tuning.designs import Task, tradeoff, tuned_designs, with_noise_bound
+from quell.tuning.optimiser.loops import PlantSet
+from quell.tuning.optimiser.objectives import OBJECTIVES
+from quell.tuning.optimiser.time_responses import Inputs
+from quell.tuning.plants import Given, given_plants, model_of, plant_set
+from quell.tuning.result.design import Design
+from quell.tuning.result.setup_file import plant_table
+from quell.tuning.structures.registry import STRUCTURES
+from quell.tuning.tuned import Tuned
+from quell.tuning.uncertain import Check, Uncertain, checked
 from quell.types import Progress
+
+COMPARED = ("pi", "pid", "bandwidths", "freed", "half-gain", "reduced", "model-based")
+"""The structures that a result is compared with by default."""
+
+# Responses last so many radians of the plant's phase crossover, and at most so many samples.
+_LASTS, _MOST_SAMPLES = 150.0, 50_000
 
 
 def tune(
@@ -27,61 +39,199 @@ def tune(
     order: int | None = None,
     objective: str = "load",
     constraints: Constraints | None = None,
-    compare: Sequence[str] = ("pi", "pid", "bandwidths"),
+    compare: Sequence[str] = COMPARED,
+    reference: Any = None,
+    duration: float | None = None,
+    load: float = 1.0,
     delay: Any = 0.0,
     actuator_lag: float = 0.0,
-    b_range: Sequence[float] = (1.0, 1.0),
     operating_point: Any = None,
+    uncertain: Mapping[str, tuple[float, float]] | None = None,
+    b_range: Sequence[float] = (1.0, 1.0),
+    quantile: float = 1.0,
+    samples: int = 20,
+    check_samples: int = 400,
+    seed: int = 0,
+    setup: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     **limits: Any,
 ) -> Tuned:
-    """Return the controller of a structure with the best objective under constraints."""
+    """Return the controller of a structure with the best objective under constraints.
+
+    The loop is linear and sampled exactly; all constraints hold for all plants, at all frequencies
+    within 0.1 %. PI, PID and the other structures of ``compare`` are tuned under the same
+    constraints. The search is deterministic (``optimiser/search.py``).
+
+    Parameters
+    ----------
+    plant
+        a linear plant of any kind that ``analyse`` accepts; a ``PlantBatch`` or a list of plants,
+        of which the first is the nominal one; with ``uncertain``, a function that makes one.
+    dt
+        sample time [s].
+    structure
+        one of ``quell.tuning.STRUCTURES``: ``"freed"`` is an ADRC with poles of its own.
+    order
+        order of an ADRC without model; 1 and 2 are tried by default.
+    objective
+        ``"load"``: largest integral gain, the least integral of y after a step of the load;
+        ``"load-iae"``: least integral of ``|y|``; ``"tracking"``: least RMS of ``r − y``.
+    constraints
+        the bounds; by default M_s = M_t = 1.6 and an M_ks of ten times that of the optimal PI
+        controller.
+    compare
+        names of other structures.
+    reference, duration
+        signal for ``"tracking"`` and the limits of u, and how long it is followed [s].
+    load
+        step of the load at the plant's input [u-unit], without a reference.
+    delay, actuator_lag, operating_point
+        as for ``analyse``; ``delay`` may have a value for each plant.
+    uncertain
+        lowest and highest value of the parameters of ``plant``, which is then called with them.
+    b_range
+        lowest and highest b over that of the plant, around 1.
+    quantile
+        of the objective over the plants, which is minimised; 1 is the worst case.
+    samples, check_samples
+        plants of the set, and fresh ones on which the result is checked.
+    seed
+        of the samples.
+    setup
+        tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default.
+    progress
+        called with the structure and the share that is done.
+    **limits
+        ``u_min``, ``u_max``, ``rate_limit`` of the controllers.
+
+    Returns
+    -------
+    Tuned
+        the controller, its analysis, the references, active constraints, trade-off, figures.
+
+    Raises
+    ------
+    ValueError
+        for arguments out of range, plants with different relative degrees or signs of the gain, a
+        plant that no controller of the structure stabilises, constraints that contradict each
+        other (which, and by how much).
+
+    Examples
+    --------
+    >>> import quell as ql
+    >>> tuned = ql.tune(([1.0], [1.0, 3.0, 3.0, 1.0]), dt=0.02, structure="pi-unfiltered",
+    ...                 constraints=ql.tuning.Constraints(m_s=1.4, m_t=None), compare=())
+    >>> round(tuned.design.values["K"], 2), round(tuned.design.values["T_i"], 2)
+    (0.63, 1.96)
+    """
     dt = checks.positive("dt", dt, "s")
-    checks.one_of("structure", structure, STRUCTURES)
-    constraints = constraints or Constraints()
-    given = given_plants(
-        plant,
-        dt,
-        delay=delay,
-        actuator_lag=actuator_lag,
-        b_range=b_range,
-        operating_point=operating_point,
-    )
+    _check_names(structure, compare, objective)
+    if not 0.0 < checks.finite("quantile", quantile) <= 1.0:
+        raise ValueError(f"quantile = {quantile!r}: must be above 0 and at most 1, the worst case")
+    report = progress or (lambda part, share: None)
+    how: dict[str, Any] = {"actuator_lag": actuator_lag, "b_range": b_range}
+    how |= {"delay": delay, "operating_point": operating_point}
+    box = None if uncertain is None else Uncertain(plant, uncertain)
+    if box is not None:
+        plant = box.plants(box.design_set(checks.whole("samples", samples, 1), seed))
+    given = given_plants(plant, dt, **how)
     plants = plant_set(given, dt)
-    model = model_of(given, plants, constraints)
-    problem = Problem(plants, bounds_of(constraints), (), _load)
-    designs = {}
+    bounds = constraints or Constraints()
+    inputs = _inputs(objective, reference, duration, load, plants)
+    model = model_of(given, plants, bounds)
+    task = Task(plants, model, bounds, objective, inputs, quantile, order, limits)
     with one_blas_thread():
-        for name in dict.fromkeys([*compare, structure]):
-            best: Solution | None = None
-            for each in orders_of(name, model, order):
-                made = make_structure(name, model, each)
-                rows = starts(problem, made, np.zeros((0, len(made.parameters))), 3)
-                for row in rows:
-                    found = search(problem, made, row)
-                    if found is not None and found.feasible:
-                        best = found if best is None or found.cost < best.cost else best
-            if best is None:
-                raise ValueError(f"no {name} controller stabilises the plant under {constraints}")
-            names = [parameter.name for parameter in best.structure.parameters]
-            designs[name] = Design(
-                best.structure.name,
-                best.structure.controller(best.values, **limits),
-                dict(zip(names, best.values.tolist(), strict=True)),
-                float(np.exp(-best.cost)),
-                {"k_i": float(np.exp(-best.cost))},
-                best.structure.tables(best.values),
-            )
-    chosen = designs[structure]
-    assert chosen.controller is not None
-    analysis = analyse(
-        given.linear[0],
-        chosen.controller,
-        delay=float(given.delays[0]),
-        actuator_lag=actuator_lag,
+        task, noise_bound = with_noise_bound(task)
+        designs = tuned_designs(list(dict.fromkeys([*compare, structure])), task, report)
+        chosen = designs[structure]
+        if chosen.controller is None:
+            raise ValueError(f"structure = {structure!r}: {chosen.reason} ({task.constraints})")
+        others = tradeoff(task, chosen)
+        check = None
+        if box is not None or b_range[0] != b_range[1]:
+            report("check", 1.0)
+            check = _check(box, given, how, task, chosen, (check_samples, seed))
+    return Tuned(
+        design=chosen,
+        designs=designs,
+        analysis=_analysis(given, plants, chosen),
+        constraints=task.constraints,
+        objective=objective,
+        tradeoff=others,
+        plants=plants,
+        check=check,
+        setup=_setup(given, dt, plants) if setup is None else setup,
+        noise_bound=noise_bound,
     )
-    return Tuned(chosen, designs, analysis, constraints)
 
 
-def _load(structure: Any, values: Any) -> Any:
-    return -np.log(structure.integral_gain(values))
+def _check_names(structure: str, compare: Sequence[str], objective: str) -> None:
+    checks.one_of("structure", structure, STRUCTURES)
+    for name in compare:
+        checks.one_of("compare", name, STRUCTURES)
+    checks.one_of("objective", objective, OBJECTIVES)
+
+
+def _inputs(
+    objective: str, reference: Any, duration: float | None, load: float, plants: PlantSet
+) -> Inputs:
+    """Return the reference, or without one the step of the load."""
+    if objective == "tracking" and reference is None:
+        raise ValueError("reference = None: objective = 'tracking' needs a signal to follow")
+    last = checks.optional(checks.positive, "duration", duration, "s")
+    count = round((_LASTS / plants.crossover if last is None else last) / plants.dt)
+    count = max(min(count, _MOST_SAMPLES), 10)
+    t = np.arange(count) * plants.dt
+    if reference is None:
+        return Inputs(np.zeros(count), np.full(count, checks.finite("load", load)))
+    if not callable(reference):
+        raise ValueError(f"reference = {reference!r}: must be a signal, as quell.signals.Step()")
+    return Inputs(np.asarray(reference(t), dtype=np.float64), np.zeros(count))
+
+
+def _analysis(given: Given, plants: PlantSet, design: Design) -> LoopAnalysis:
+    assert design.controller is not None
+    delay, lag = float(given.delays[0]), given.actuator_lag
+    return analyse(given.linear[0], design.controller, delay=delay, actuator_lag=lag)
+
+
+def _check(
+    box: Uncertain | None,
+    given: Given,
+    how: Mapping[str, Any],
+    task: Task,
+    design: Design,
+    draws: tuple[int, int],
+) -> Check:
+    """Return the check on fresh parameters and gains."""
+    count, seed = draws
+    checks.whole("check_samples", count, 1)
+    low, high = (float(end) for end in how["b_range"])
+    factors = low + (high - low) * np.random.default_rng([seed, 2]).random(count)
+    if box is None:
+        linear = [given.linear[i % len(given.linear)] for i in range(count)]
+        fresh = given._replace(
+            linear=tuple(linear),
+            delays=np.resize(given.delays, count),
+            factors=np.ones(1),
+        )
+        values, names = factors[:, None], ["b/b0"]
+    else:
+        values, names = box.fresh(count, seed), list(box.ranges)
+        fresh = given_plants(box.plants(values), task.plants.dt, **{**how, "b_range": (1.0, 1.0)})
+    plants = plant_set(fresh, task.plants.dt, factors if low != high else None)
+    assert design.solution is not None
+    return checked(task.problem(), design.solution, plants, values, names)
+
+
+def _setup(given: Given, dt: float, plants: PlantSet) -> dict[str, Any]:
+    """Return the tables of a setup file with the first plant, and a step and a load."""
+    linear, delay = LinearPlant.of(given.linear[0]), float(given.delays[0])
+    last = float(f"{_LASTS / plants.crossover:.2g}")
+    tables: dict[str, Any] = {"title": "Tuned controller", "dt": dt}
+    late = round(delay / dt) * dt
+    tables["plant"] = plant_table(linear, given.actuator_lag, late)
+    scenario: dict[str, Any] = {"duration": last, "reference": {"kind": "step"}}
+    if linear.disturbances == 1:
+        scenario["disturbances"] = [{"kind": "step", "at": 0.5 * last}]
+    return tables | {"scenario": scenario}

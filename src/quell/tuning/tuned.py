@@ -2,71 +2,152 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.base import Controller
+from quell.files import nonfinite_to_none, written_atomically
 from quell.tuning.constraints import Constraints
-from quell.tuning.requirements import Active
-
-
-@dataclass(frozen=True, eq=False)
-class Design:
-    """A structure tuned under the constraints, or why it could not be.
-
-    Attributes
-    ----------
-    name : str
-        name of the structure.
-    controller : Controller or None
-        the controller; None if ``reason`` says why there is none.
-    values : Mapping
-        the free parameters by name.
-    objective : float
-        value of the objective; k_i for load rejection [u-unit/(y-unit s)].
-    measures : Mapping
-        ``M_s``, ``M_t``, ``M_ks``, ``u_std``, ``k_i``, … over all plants.
-    tables : Mapping
-        the tables of a setup file that describe the controller.
-    reason : str
-        why there is no controller; empty otherwise.
-    """
-
-    name: str
-    controller: Controller | None
-    values: Mapping[str, float]
-    objective: float
-    measures: Mapping[str, float]
-    tables: Mapping[str, Mapping[str, Any]]
-    active: tuple[Active, ...] = ()
-    reason: str = ""
+from quell.tuning.optimiser.loops import PlantSet
+from quell.tuning.result import report
+from quell.tuning.result.design import Design
+from quell.tuning.result.plots import draw
+from quell.tuning.result.setup_file import toml_text
+from quell.tuning.uncertain import Check
 
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
-    """The controller of a structure with the best objective under constraints.
+    """The controller of a structure with the best objective under constraints; from ``tune``.
 
     Attributes
     ----------
     design : Design
-        the chosen structure's design.
+        the chosen structure's design; ``controller`` is its controller.
     designs : Mapping
-        all designs by name: the references PI and PID, and the other structures.
+        the designs of all structures by name, the chosen one included.
     analysis : LoopAnalysis
         ``analyse`` of the first plant with the controller.
     constraints : Constraints
-        the bounds.
+        the bounds, M_ks included if it follows from the optimal PI controller's.
+    objective : str
+        what was optimised.
+    tradeoff : list
+        (name, limit, objective) for limits 10 % below and above the active ones.
+    plants : PlantSet
+        the plants, sampled.
+    check : Check or None
+        the result on fresh samples, if the plant has ranges.
+    setup : Mapping
+        tables of the setup file besides those of the controller.
+    search : object or None
+        the trials, if the tuning was by simulation.
     """
 
     design: Design
     designs: Mapping[str, Design]
     analysis: LoopAnalysis
     constraints: Constraints
+    objective: str
+    tradeoff: list[tuple[str, float, float]]
+    plants: PlantSet
+    check: Check | None = None
+    setup: Mapping[str, Any] = field(default_factory=dict)
+    noise_bound: str = ""
+    search: Any = None
 
     @property
     def controller(self) -> Controller:
         """The tuned controller."""
-        assert self.design.controller is not None
-        return self.design.controller
+        controller = self.design.controller
+        assert controller is not None  # ``tune`` raises an error instead
+        return controller
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        """The constraints at their limits, as text."""
+        plants = len(self.plants.plants)
+        return tuple(report.active_text(each, plants) for each in self.design.active)
+
+    @property
+    def costs(self) -> list[str]:
+        """What the chosen structure costs against the best one, PI and PID, as sentences."""
+        return report.costs(self.design, self.designs, self.objective)
+
+    def __repr__(self) -> str:
+        return f"Tuned {self.design.name}:\n{self.summary()}"
+
+    def summary(self) -> str:
+        """Return constraints, measures, costs and trade-off in some lines."""
+        lines = [f"constraints: {self.constraints}"]
+        lines += [self.noise_bound] if self.noise_bound else []
+        for row in report.rows(self.designs, self.objective):
+            name, value, *rest = row
+            lines.append(f"{name}: {report.quantity(self.objective)} {value}; " + _measures(rest))
+        lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
+        lines += report.tradeoff_lines(self.tradeoff, self.objective)
+        lines += [str(self.check)] if self.check is not None else []
+        return "\n".join([*lines, self.analysis.summary()])
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw Bode diagram, sensitivities with their bounds, step and load responses.
+
+        The references are beside the tuned controller. Returns the array of axes; ``axes`` are four
+        to draw into, new ones by default.
+        """
+        named = {name: each for name, each in self.designs.items() if each.controller is not None}
+        chosen = {"tuned": self.design}
+        others = {key: named[key] for key in ("pi", "pid") if key in named}
+        others = {key: each for key, each in others.items() if each is not self.design}
+        return draw(self.plants, chosen | others, self.constraints, axes)
+
+    def toml(self) -> str:
+        """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``."""
+        comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
+        comment += f"active: {', '.join(self.active) or 'none'}"
+        replaced = ("observer", "controller")
+        tables = {key: value for key, value in self.setup.items() if key not in replaced}
+        return toml_text({**tables, **self.design.tables}, comment)
+
+    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""
+        with written_atomically(Path(path), overwrite) as part:
+            part.write_text(self.toml(), encoding="utf-8")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results for ``quell.files.write_json``."""
+        check = None
+        if self.check is not None:
+            check = {**vars(self.check), "interval": list(self.check.interval)}
+            check = {k: dict(v) if isinstance(v, Mapping) else v for k, v in check.items()}
+        found: dict[str, Any] = nonfinite_to_none(
+            {
+                "structure": self.design.name,
+                "objective": self.objective,
+                "constraints": dict(vars(self.constraints)),
+                "noise_bound": self.noise_bound,
+                "design": self.design.to_json(),
+                "designs": {name: each.to_json() for name, each in self.designs.items()},
+                "costs": self.costs,
+                "tradeoff": [
+                    {"constraint": name, "limit": limit, "objective": value}
+                    for name, limit, value in self.tradeoff
+                ],
+                "check": check,
+                "plants": len(self.plants.plants),
+                "dt": self.plants.dt,
+            }
+        )
+        return found
+
+
+def _measures(cells: list[str]) -> str:
+    *numbers, reason = cells
+    if reason:
+        return reason
+    m_s, m_t, m_ks, margin = numbers
+    return f"M_s {m_s}, M_t {m_t}, M_ks {m_ks}, delay margin {margin}"

@@ -117,21 +117,35 @@ class AdrcStructure:
             row += factors
         return np.array(row)
 
+    def from_other(self, other: AdrcStructure, values: Vector) -> Vector | None:
+        """Return the values with the poles of another form of the same order, if there are any."""
+        same = (other.degree, other.order, other.form.based)
+        if other is self or same != (self.degree, self.order, self.form.based):
+            return None
+        law, observer = (poles[0] for poles in other.poles(values[None, :]))
+        if not self.form.freed:
+            sizes = [float(np.exp(np.mean(np.log(np.abs(poles))))) for poles in (law, observer)]
+            return np.array([float(values[0]), *sizes])
+        if observer.size != self._observed:
+            return None
+        return self.rows_of(float(values[0]), law, observer)
+
     # ---- the structure
 
     def shapes(self) -> Matrix:
         """Return bandwidths in wide ranges; freed poles start in one place, or in two."""
         omega, rows = self.model.omega, []
+        b0 = self.model.b if self.degree == self.model.degree else 1.0
         for law, ratio in itertools.product(_LAW_STARTS, _OBSERVER_STARTS):
             pair = (law * omega, law * ratio * omega)
             if max(pair) > 0.999 * self._fastest:
                 pair = (min(pair[0], 0.9 * self._fastest), 0.99 * self._fastest)
             if not self.form.freed:
-                rows.append(np.array([1.0, *pair]))
+                rows.append(np.array([b0, *pair]))
                 continue
             counts = (self.degree, self._observed)
             poles = [np.full(n, -p) for n, p in zip(counts, pair, strict=True)]
-            found = self.rows_of(1.0, *poles)
+            found = self.rows_of(b0, *poles)
             if found is not None:
                 rows.append(found)
         return np.array(rows)

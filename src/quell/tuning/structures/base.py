@@ -32,8 +32,9 @@ class Model(NamedTuple):
     dt: float  # sample time [s]
     sign: float  # sign of the gain that integral action needs, +1 or −1
     degree: int  # relative degree
+    b: float  # |gain| from u to y^(degree)
     omega: float  # frequency at which the plant's phase lag is that of two integrators [rad/s]
-    gain: float  # |P| there
+    gain: float  # |P| around it
     constraints: Constraints
 
 

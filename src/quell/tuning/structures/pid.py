@@ -17,6 +17,8 @@ from quell.controllers.baselines.pid import PID
 from quell.tuning.structures.base import Model, Parameter
 from quell.types import Matrix, Vector
 
+# T_d over T_i of a PID controller that is hardly more than a PI controller.
+_LITTLE = 0.03
 # Bounds of the times, in units of the time of one radian at the plant's phase crossover.
 _TIMES = (1e-4, 1e4)
 
@@ -56,6 +58,17 @@ class FilteredPID:
                     row += [ratio * Ti * unit] if self.derivative else []
                     rows.append(row + ([Tf] if self.filtered else []))
         return np.array(rows)
+
+    def from_other(self, other: FilteredPID, values: Vector) -> Vector | None:
+        """Return values that are close to a controller of another kind of this class."""
+        if other is self or (other.derivative and not self.derivative):
+            return None
+        row = [float(values[0]), float(values[1])]
+        if self.derivative:
+            row.append(float(values[2]) if other.derivative else _LITTLE * float(values[1]))
+        if self.filtered:
+            row.append(float(values[-1]) if other.filtered else self._shortest)
+        return np.array(row)
 
     def parts(self, values: Matrix) -> tuple[Vector, ...]:
         """Return k_p, k_i, k_d, f_1, f_2, each (m,)."""

@@ -64,11 +64,11 @@ def sampled_chain(plant: Canonical, dt: float) -> SampledChain:
 class Designs(NamedTuple):
     """m designs in coordinates of similar size."""
 
-    difference: Stack  # Δ (m, N, N)
-    input: Matrix  # Γ (m, N)
     gain: Matrix  # L (m, N)
     law: Matrix  # K (m, N)
     factor: Vector  # ω^r (m,); C_y = factor / b0 times the response of these
+    base: Stack  # L c − (I − L c) Δ (m, N, N)
+    closing: Stack  # (I − L c) Γ K (m, N, N)
     delay: int
     dt: float
 
@@ -105,7 +105,12 @@ def designs(
     K[:, -1] = chain.cancel_f
     K *= omega[:, None] ** (power - chain.degree)
     column = chain.input * step[:, None] ** (chain.degree - power)
-    return Designs(difference, column, gain, K, omega**chain.degree, delay, chain.dt)
+    Lc = np.zeros_like(difference)
+    Lc[:, :, 0] = gain
+    correct = np.eye(size) - Lc
+    closing = (correct @ column[:, :, None]) * K[:, None, :]
+    base = Lc - correct @ difference
+    return Designs(gain, K, omega**chain.degree, base, closing, delay, chain.dt)
 
 
 def coefficients(roots: NDArray[np.complex128]) -> Matrix:
@@ -137,15 +142,6 @@ def _placed(difference: Stack, offsets: NDArray[np.complex128]) -> Matrix:
     return gain
 
 
-def _open(found: Designs) -> tuple[Stack, Stack]:
-    """Return ``L c − (I − L c) Δ`` and ``(I − L c) Γ K`` (m, N, N)."""
-    Lc = np.zeros_like(found.difference)
-    Lc[:, :, 0] = found.gain
-    correct = np.eye(found.gain.shape[1]) - Lc
-    closing = (correct @ found.input[:, :, None]) * found.law[:, None, :]
-    return Lc - correct @ found.difference, closing
-
-
 def feedback(found: Designs, omega: Vector) -> Complex:
     """Return ``C_y b0 / ω^r`` (m, k) at frequencies (k,) [rad/s]."""
     matrix, late = _matrices(found, omega)
@@ -157,7 +153,7 @@ def feedback(found: Designs, omega: Vector) -> Complex:
 
 def _matrices(found: Designs, omega: Vector) -> tuple[Complex, Complex]:
     """Return M (m, k, N, N) and z (k,)."""
-    base, closing = _open(found)
+    base, closing = found.base, found.closing
     zeta = np.expm1(1j * omega * found.dt)
     z = 1.0 + zeta
     unit = np.eye(found.gain.shape[1])
@@ -171,7 +167,7 @@ def _matrices(found: Designs, omega: Vector) -> tuple[Complex, Complex]:
 
 def integral_gain(found: Designs) -> Vector:
     """Return ``k_i b0 / ω^r`` (m,)."""
-    base, closing = _open(found)
+    base, closing = found.base, found.closing
     left, _, right = np.linalg.svd(base + closing)
     v, w = right[:, -1, :], left[:, :, -1]
     slope = np.eye(v.shape[1]) - found.delay * closing
@@ -187,7 +183,7 @@ def unstable_poles(found: Designs) -> Vector:
     With a delay the poles are counted by the argument of det M(z) over the upper half circle, which
     is ``π (N − unstable − 1/2)`` with the integrator's pole at z = 1.
     """
-    base, closing = _open(found)
+    base, closing = found.base, found.closing
     if found.delay == 0:
         shifted = np.linalg.eigvals(-(base + closing))
         outside = np.abs(1.0 + shifted) > 1.0 + _OUTSIDE

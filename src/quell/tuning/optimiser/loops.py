@@ -23,6 +23,8 @@ from quell.types import Matrix, Vector
 # The lowest frequency of the grid, in units of the phase crossover; a pole below a tenth of it
 # counts as an integrator.
 _BOTTOM = 1e-4
+# With integral action |L| is large at the lowest frequency, if that is below the loop's dynamics.
+_LEAST_BOTTOM = 3.0
 # Points per decade of the grid, and phase of the longest dead time between points of its even part
 # [rad], which ends after so many turns: above, the gain of a loop with a dead time is small.
 # Doubling the points changes the optima of the test batch by less than 1e-4.
@@ -75,6 +77,13 @@ class PlantSet:
         rows = [found[id(plant)] for plant in self.plants]
         P: Complex = np.array(rows) * self.factors[:, None]
         return P
+
+    def scaled(self) -> list[SampledPlant]:
+        """Return the plants with the factors of their gain."""
+        return [
+            plant if factor == 1.0 else plant._replace(B=plant.B * factor, E=plant.E * factor)
+            for plant, factor in zip(self.plants, self.factors.tolist(), strict=True)
+        ]
 
     def _s_poles(self, plant: SampledPlant) -> Complex:
         poles = in_s_plane(self._poles[id(plant)], self.dt)
@@ -152,6 +161,8 @@ class PlantSet:
             steps[:, at] -= 2.0 * np.pi * (steps[:, at] > 0.0)
             expected = unstable + controller + 0.5 * (integrators + 1.0)
             count[:, j] = np.round(expected - np.sum(steps, axis=1) / np.pi)
+            # A loop whose crossover lies below the grid: its slow poles do not show.
+            count[np.abs(self.P[j, 0] * C[:, 0]) < _LEAST_BOTTOM, j] = np.inf
         return np.abs(count)
 
 

@@ -11,113 +11,41 @@ principle, and at the end by the closed loop's poles.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.tuning.loops import PlantSet
-from quell.tuning.requirements import (
-    Active,
-    Bound,
+from quell.tuning.optimiser.problem import Problem, Solution, limits
+from quell.tuning.optimiser.requirements import (
     Points,
     all_peaks,
     sizes,
     slack_and_slope,
-    worst_ratio,
 )
+from quell.tuning.optimiser.starts import starts
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector
 
 # Step of the differences in the logarithms: between the rounding error of C_y, some 1e-12, and its
 # curvature.
 _DIFFERENCE = 1e-6
-# Points with a ratio above the first are in the problem; peaks above the second are refined.
-_NEAR, _PEAK = 0.5, 0.93
+# Points with a ratio above the first are in the problem, in later rounds those above the second;
+# peaks above the third are refined.
+_NEAR, _NEARER, _PEAK = 0.5, 0.85, 0.93
+_EARLY_ROUNDS = 2
 # Half width of the box of a round in the logarithms, and how it shrinks after an unstable result.
 _BOX, _SHRINK = 0.7, 0.3
-_ITERATIONS = 25
+_ITERATIONS, _TOLERANCE = 20, 1e-7
 # Starts, the rounds that each of them takes, those that go on, and their rounds at most.
 _STARTS, _FIRST_ROUNDS, _FINALISTS, _ROUNDS = 5, 3, 2, 25
-# A result is good if no bound is exceeded by more; a tenth of what is promised.
+# Rounds go on while a bound is exceeded by more: a tenth of what is promised.
 _VIOLATION = 1e-4
+# What exceeding a limit by a share costs, in units of the logarithm of the objective: more than a
+# larger limit gains, which is a factor of 1 to 5 in the test batch.
+_EXCESS = 20.0
 # Rounds end when the objective changes by less.
 _SETTLED = 1e-4
-
-
-class Extra(NamedTuple):
-    """A constraint that is no bound of a frequency response."""
-
-    name: str
-    limit: float
-    ratio: Callable[[Structure, Matrix], Vector]  # values (m, p) → value over limit (m,)
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What is searched for."""
-
-    plants: PlantSet
-    bounds: tuple[Bound, ...]
-    extras: tuple[Extra, ...]
-    cost: Callable[[Structure, Matrix], Vector]  # values (m, p) → cost (m,), its logarithm
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """The best values of a structure."""
-
-    structure: Structure
-    values: Vector
-    cost: float
-    violation: float  # the largest ratio to a bound, less one
-    active: tuple[Active, ...]
-
-    @property
-    def feasible(self) -> bool:
-        """Whether all constraints hold."""
-        return self.violation <= 10.0 * _VIOLATION
-
-
-def starts(problem: Problem, structure: Structure, more: Matrix, count: int) -> Matrix:
-    """Return the ``count`` best starts (k, p) of the structure's shapes and ``more`` values.
-
-    Each shape is tried with gains that put the crossover at frequencies all over the grid.
-    """
-    shapes = np.vstack([structure.shapes(), more])
-    shapes = np.clip(shapes, *_limits(structure))
-    plants = problem.plants
-    C = structure.response(shapes, plants.omega) * shapes[:, :1] ** -structure.gain_power
-    unstable = structure.unstable_poles(shapes)
-    found: list[tuple[float, float, Vector]] = []
-    for row, response, poles in zip(shapes, C, unstable, strict=True):
-        loop = np.max(np.abs(plants.P * response), axis=0)
-        gains = 1.0 / loop[:: max(loop.size // 40, 1)]
-        gains = gains[np.isfinite(gains) & (gains > 0.0)]
-        tried = gains[:, None] * response
-        ratio = worst_ratio(problem.bounds, plants, tried)
-        stable = np.all(
-            plants.unstable_loops(tried, np.full(gains.size, poles)) < 0.5, axis=1
-        ) & np.isfinite(ratio)
-        if not np.any(stable):
-            continue
-        values = np.repeat(row[None, :], gains.size, axis=0)
-        values[:, 0] = gains**structure.gain_power
-        values = np.clip(values, *_limits(structure))
-        cost = np.where(stable, np.log(np.maximum(ratio, 1.0)) * 10.0, np.inf)
-        good = np.flatnonzero(stable)
-        cost[good] += problem.cost(structure, values[good])
-        best = int(np.argmin(cost))
-        found.append((float(cost[best]), float(ratio[best]), values[best]))
-    found.sort(key=lambda entry: entry[0])
-    return np.array([row for _, _, row in found[:count]]).reshape(-1, shapes.shape[1])
-
-
-def _limits(structure: Structure) -> tuple[Vector, Vector]:
-    low = np.array([parameter.low for parameter in structure.parameters])
-    return low, np.array([parameter.high for parameter in structure.parameters])
 
 
 def best_solution(
@@ -135,7 +63,7 @@ def best_solution(
         solution = search(problem, structure, start, _FIRST_ROUNDS)
         if solution is not None:
             found.append(solution)
-    found.sort(key=_rank)
+    found.sort(key=lambda solution: _merit(solution.cost, solution.violation))
     ends: list[Solution] = []
     for solution in found:
         if len(ends) == _FINALISTS:
@@ -148,28 +76,32 @@ def best_solution(
 
 
 def _rank(solution: Solution) -> tuple[float, float]:
-    return max(solution.violation, _VIOLATION), solution.cost
+    """Return the key by which results are ordered: those that keep to all limits first."""
+    return 0.0 if solution.feasible else solution.violation, solution.cost
 
 
-def search(
-    problem: Problem, structure: Structure, start: Vector, rounds: int
-) -> Solution | None:
+def _merit(cost: float, violation: float) -> float:
+    """Return the cost of a point that may exceed limits; less is better."""
+    return cost + _EXCESS * max(violation - _VIOLATION, 0.0)
+
+
+def search(problem: Problem, structure: Structure, start: Vector, rounds: int) -> Solution | None:
     """Return the optimum that is reached from a start; None if all rounds end unstable."""
-    low, high = (np.log(limit) for limit in _limits(structure))
+    low, high = (np.log(limit) for limit in limits(structure))
     x, box = np.clip(np.log(start), low, high), _BOX
     best: tuple[float, float, Vector] | None = None
     extra_points: list[tuple[int, int, float]] = []
     last = math.inf
-    for _ in range(rounds):
-        found, violation, refined = _judged(problem, structure, x)
-        cost = found
-        if best is None or _better(cost, violation, best):
+    for i in range(rounds):
+        cost, violation, refined = _judged(problem, structure, x)
+        if best is None or _merit(cost, violation) < _merit(*best[:2]):
             best = (cost, violation, x)
         if violation <= _VIOLATION and abs(last - cost) < _SETTLED:
             break
         last = cost
         extra_points = (extra_points + refined)[-400:]
-        points = _points(problem, structure, x, extra_points)
+        near = _NEAR if i < _EARLY_ROUNDS else _NEARER
+        points = _points(problem, structure, x, extra_points, near)
         bounds = list(zip(np.maximum(low, x - box), np.minimum(high, x + box), strict=True))
         after = _quadratic_programming(problem, structure, x, points, bounds)
         if after is None or not _stable(problem, structure, after):
@@ -181,14 +113,7 @@ def search(
     if best is None:
         return None
     cost, violation, x = best
-    values = np.exp(x)
-    return Solution(structure, values, cost, violation, _active(problem, structure, values))
-
-
-def _better(cost: float, violation: float, best: tuple[float, float, Vector]) -> bool:
-    if max(violation, best[1]) <= _VIOLATION:
-        return cost < best[0]
-    return violation < best[1]
+    return Solution(structure, np.exp(x), cost, violation)
 
 
 def _judged(
@@ -218,14 +143,18 @@ def _stable(problem: Problem, structure: Structure, x: Vector) -> bool:
 
 
 def _points(
-    problem: Problem, structure: Structure, x: Vector, refined: list[tuple[int, int, float]]
+    problem: Problem,
+    structure: Structure,
+    x: Vector,
+    refined: list[tuple[int, int, float]],
+    least: float,
 ) -> Points:
     """Return the points of the grid near their bounds, and the refined peaks."""
     plants = problem.plants
     C = structure.response(np.exp(x)[None, :], plants.omega)[0]
     kinds, members, places = [], [], []
     for number, (response, limit) in enumerate(problem.bounds):
-        near = sizes(response, plants.P, C) > _NEAR * limit
+        near = sizes(response, plants.P, C) > least * limit
         j, i = np.nonzero(near)
         kinds.append(np.full(j.size, number))
         members.append(j)
@@ -283,15 +212,10 @@ def _quadratic_programming(
             bounds=bounds,
             constraints={"type": "ineq", "fun": lambda x: at(x)[2], "jac": lambda x: at(x)[3]},
             method="SLSQP",
-            options={"maxiter": _ITERATIONS, "ftol": 1e-9},
+            options={"maxiter": _ITERATIONS, "ftol": _TOLERANCE},
         )
     except (np.linalg.LinAlgError, ValueError):
         return None
     if not np.all(np.isfinite(found.x)):
         return None
     return np.clip(found.x, [low for low, _ in bounds], [high for _, high in bounds])
-
-
-def _active(problem: Problem, structure: Structure, values: Vector) -> tuple[Active, ...]:
-    """Return the constraints within a percent of their bounds."""
-    return ()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from quell.analysis.frequency_response import Complex
 from quell.tuning.constraints import Constraints
-from quell.tuning.loops import Peak, PlantSet, peaks
+from quell.tuning.optimiser.loops import Peak, PlantSet, peaks
 from quell.types import Matrix, Vector
 
 Stack = NDArray[np.float64]

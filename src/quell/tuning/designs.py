@@ -1,0 +1,208 @@
+"""Several structures tuned for one problem, each with the starts that others give it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from quell.analysis.loop import LoopAnalysis
+from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser.extras import extras_of
+from quell.tuning.optimiser.loops import PlantSet
+from quell.tuning.optimiser.objectives import cost_of
+from quell.tuning.optimiser.problem import Extra, Problem, Solution
+from quell.tuning.optimiser.requirements import Bound, bounds_of
+from quell.tuning.optimiser.search import best_solution, search
+from quell.tuning.optimiser.time_responses import Inputs, law_of
+from quell.tuning.result.design import Design, design_of, impossible, measured
+from quell.tuning.structures.adrc import AdrcStructure
+from quell.tuning.structures.base import Model, Structure
+from quell.tuning.structures.equivalent import equivalents
+from quell.tuning.structures.pid import FilteredPID
+from quell.tuning.structures.registry import make_structure, orders_of
+from quell.types import Matrix, Vector
+
+# Rounds of a search that starts at the optimum for slightly other limits.
+_NEARBY_ROUNDS = 6
+# Factors by which contradicting limits are relaxed, and steps of the bisection between them.
+_RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0), 6
+# References come before what starts at their equivalents.
+_FIRST = ("pi-unfiltered", "pi", "pid", "bandwidths")
+
+
+@dataclass(frozen=True)
+class Task:
+    """What all structures are tuned for."""
+
+    plants: PlantSet
+    model: Model
+    constraints: Constraints
+    objective: str
+    inputs: Inputs
+    quantile: float
+    order: int | None
+    u: Mapping[str, Any]  # limits of the controllers
+
+    def problem(self) -> Problem:
+        """Return the problem of the optimiser."""
+        cost = cost_of(self.objective, self.plants, self.inputs, self.quantile)
+        extras = extras_of(self.constraints, self.plants, self.inputs)
+        return Problem(self.plants, bounds_of(self.constraints), extras, self.objective, cost)
+
+
+def with_noise_bound(task: Task) -> tuple[Task, str]:
+    """Return the task with M_ks bounded by a multiple of the optimal PI's, and how it came."""
+    given = task.constraints
+    if given.noise_over_pi is None or given.m_ks is not None or given.u_std is not None:
+        return task, ""
+    found = _solutions("pi-unfiltered", task, {})
+    usable = [solution for solution in found if solution.feasible]
+    if not usable:
+        return task, "no bound of M_ks: no PI controller meets the other constraints"
+    pi = min(usable, key=lambda solution: solution.cost)
+    reference = design_of("pi", task.problem(), pi, given, {}).measures["M_ks"]
+    bounded = replace(given, m_ks=given.noise_over_pi * reference)
+    model = task.model._replace(constraints=bounded)
+    how = f"M_ks: {given.noise_over_pi:g} times that of the optimal PI controller, {reference:.4g}"
+    return replace(task, constraints=bounded, model=model), how
+
+
+def tuned_designs(
+    names: Sequence[str], task: Task, progress: Callable[[str, float], None]
+) -> dict[str, Design]:
+    """Return a design for each name of a structure, in that order."""
+    problem = task.problem()
+    order = sorted(names, key=lambda name: _FIRST.index(name) if name in _FIRST else len(_FIRST))
+    solved: dict[str, list[Solution]] = {}
+    designs = {}
+    for i, name in enumerate(order):
+        progress(name, i / len(order))
+        try:
+            solved[name] = _solutions(name, task, solved)
+        except ValueError as error:
+            designs[name] = impossible(name, str(error))
+            continue
+        best = min(solved[name], key=_rank, default=None)
+        if best is None:
+            reason = "no controller of this structure was found that stabilises all plants"
+            designs[name] = impossible(name, reason)
+        elif not best.feasible:
+            designs[name] = impossible(name, contradiction(problem, best, task.constraints))
+        else:
+            made = (problem, best, task.constraints, task.u)
+            designs[name] = design_of(best.structure.name, *made)
+    return {name: designs[name] for name in names}
+
+
+def _rank(solution: Solution) -> tuple[bool, float, float]:
+    return not solution.feasible, 0.0 if solution.feasible else solution.violation, solution.cost
+
+
+def _solutions(name: str, task: Task, solved: Mapping[str, Sequence[Solution]]) -> list[Solution]:
+    """Return the best solution for each order of a structure that has any."""
+    problem, found = task.problem(), []
+    for order in orders_of(name, task.model, task.order):
+        structure = make_structure(name, task.model, order)
+        best = best_solution(problem, structure, _known_starts(structure, solved))
+        if best is not None and _is_stable(task.plants, best):
+            found.append(best)
+    return found
+
+
+def _is_stable(plants: PlantSet, solution: Solution) -> bool:
+    """Return whether the poles of all closed loops are inside of the unit circle."""
+    law = law_of(solution.structure.controller(solution.values))
+    return all(LoopAnalysis(plant, law, plants.dt).stable for plant in plants.scaled())
+
+
+def _known_starts(structure: Structure, solved: Mapping[str, Sequence[Solution]]) -> Matrix:
+    """Return values (k, p) that other structures' optima stand for in this one."""
+    rows: list[Any] = []
+    for solution in (each for group in solved.values() for each in group):
+        other, values = solution.structure, solution.values
+        if not isinstance(structure, AdrcStructure):
+            if isinstance(other, FilteredPID) and isinstance(structure, FilteredPID):
+                row = structure.from_other(other, values)
+                rows += [] if row is None else [row]
+        elif isinstance(other, FilteredPID):
+            rows += list(equivalents(other, values, structure))
+        elif isinstance(other, AdrcStructure):
+            row = structure.from_other(other, values)
+            rows += [] if row is None else [row]
+    return np.array(rows).reshape(-1, len(structure.parameters))
+
+
+def contradiction(problem: Problem, solution: Solution, constraints: Constraints) -> str:
+    """Return which constraints contradict each other for a structure, and by how much.
+
+    All limits are relaxed by the same factor, the smallest with which there is a controller; those
+    that it then reaches are the ones that contradict.
+    """
+    structure = solution.structure
+    low, high, found = 1.0, None, None
+    for factor in _RELAXED:
+        found = search(relaxed(problem, factor), structure, solution.values, _NEARBY_ROUNDS)
+        if found is not None and found.feasible:
+            high = factor
+            break
+        low = factor
+    if high is None or found is None:
+        return (
+            "the constraints contradict each other for this structure: no controller was found "
+            f"even with all limits relaxed by a factor of {_RELAXED[-1]:g}"
+        )
+    for _ in range(_BISECTIONS):
+        middle = (low * high) ** 0.5
+        nearer = search(relaxed(problem, middle), structure, found.values, _NEARBY_ROUNDS)
+        if nearer is not None and nearer.feasible:
+            high, found = middle, nearer
+        else:
+            low = middle
+    _, active = measured(relaxed(problem, high), found, constraints)
+    limits = {each.name: each.limit for each in active}
+    reached = ", ".join(f"{name} {limit / high:.4g}" for name, limit in limits.items())
+    return (
+        f"the constraints contradict each other for this structure: {reached or 'all'}; the least "
+        f"excess that was found is {100.0 * (high - 1.0):.3g} % for each"
+    )
+
+
+def relaxed(problem: Problem, factor: float) -> Problem:
+    """Return the problem with all limits larger by a factor."""
+    bounds = tuple(Bound(kind, factor * limit) for kind, limit in problem.bounds)
+    extras = tuple(
+        Extra(extra.name, factor * extra.limit, partial(_share, extra, factor))
+        for extra in problem.extras
+    )
+    return replace(problem, bounds=bounds, extras=extras)
+
+
+def _share(extra: Extra, factor: float, structure: Structure, values: Matrix) -> Vector:
+    return extra.ratio(structure, values) / factor
+
+
+def tradeoff(task: Task, design: Design) -> list[tuple[str, float, float]]:
+    """Return what the objective would be with each active limit 10 % lower and higher."""
+    assert design.solution is not None
+    found = []
+    fields = {"M_s": "m_s", "M_t": "m_t", "M_ks": "m_ks", "delay margin": "delay_margin"}
+    for active in design.active:
+        field = fields.get(active.name, active.name)
+        if getattr(task.constraints, field, None) is None:
+            continue
+        for factor in (0.9, 1.1):
+            limit = factor * active.limit
+            if field in ("m_s", "m_t") and limit <= 1.0:
+                continue
+            near = replace(task, constraints=replace(task.constraints, **{field: limit}))
+            solution = design.solution
+            result = search(near.problem(), solution.structure, solution.values, _NEARBY_ROUNDS)
+            if result is not None and result.feasible:
+                size = float(np.exp(result.cost))
+                value = 1.0 / size if task.objective == "load" else size
+                found.append((active.name, limit, value))
+    return found

@@ -1,0 +1,77 @@
+"""Where the search starts: shapes of a structure, each with the best of many gains."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quell.analysis.frequency_response import Complex
+from quell.tuning.optimiser.objectives import load_cost
+from quell.tuning.optimiser.problem import Problem, limits
+from quell.tuning.optimiser.requirements import worst_ratio
+from quell.tuning.structures.base import Structure
+from quell.types import Matrix, Vector
+
+# Gains that are tried for each shape, and the cost of exceeding a bound by a factor e, in units of
+# the logarithm of the objective.
+_GAINS, _EXCESS = 40, 10.0
+# Gains around the one that comes with a shape: of a plant with a resonance or several integrators a
+# range of a factor of two may be stable.
+_OWN = np.array([0.5, 0.7, 1.0, 1.4, 2.0])
+
+
+def starts(problem: Problem, structure: Structure, more: Matrix, count: int) -> Matrix:
+    """Return ``count`` starts (k, p) from the structure's shapes and ``more`` values.
+
+    Each shape is tried with gains that put the crossover at frequencies all over the grid. Half of
+    the starts are the best that keep to all bounds; the others may exceed them, because the
+    optimum is often near a faster shape.
+    """
+    shapes = np.vstack([structure.shapes(), more])
+    shapes = np.clip(shapes, *limits(structure))
+    C = structure.response(shapes, problem.plants.omega)
+    C = C * shapes[:, :1] ** -structure.gain_power
+    unstable = structure.unstable_poles(shapes)
+    kept: list[tuple[float, Vector]] = []
+    beyond: list[tuple[float, Vector]] = []
+    for row, response, poles in zip(shapes, C, unstable, strict=True):
+        values, cost, ratio = _gains_of(problem, structure, row, response, poles)
+        good = ratio <= 1.0
+        if np.any(good):
+            best = int(np.argmin(np.where(good, cost, np.inf)))
+            kept.append((float(cost[best]), values[best]))
+        merit = cost + _EXCESS * np.log(np.maximum(ratio, 1.0))
+        if merit.size:
+            best = int(np.argmin(merit))
+            beyond.append((float(merit[best]), values[best]))
+    kept.sort(key=lambda entry: entry[0])
+    beyond.sort(key=lambda entry: entry[0])
+    chosen = [row for _, row in kept[: (count + 1) // 2]]
+    for _, row in beyond:
+        if len(chosen) < count and not any(np.array_equal(row, other) for other in chosen):
+            chosen.append(row)
+    return np.array(chosen).reshape(-1, shapes.shape[1])
+
+
+def _gains_of(
+    problem: Problem, structure: Structure, row: Vector, response: Complex, poles: float
+) -> tuple[Matrix, Vector, Vector]:
+    """Return the values with gains for which all loops are stable, their cost and largest ratio.
+
+    ``response`` (G,) is that of the shape with a gain of one, ``poles`` its unstable ones.
+    """
+    plants = problem.plants
+    loop = np.max(np.abs(plants.P * response), axis=0)
+    gains = 1.0 / loop[:: max(loop.size // _GAINS, 1)]
+    gains = np.append(gains, row[0] ** structure.gain_power * _OWN)
+    gains = gains[np.isfinite(gains) & (gains > 0.0)]
+    low, high = limits(structure)
+    first = gains**structure.gain_power
+    gains = gains[(first >= low[0]) & (first <= high[0])]
+    tried = gains[:, None] * response
+    unstable = plants.unstable_loops(tried, np.full(gains.size, poles))
+    ratio = worst_ratio(problem.bounds, plants, tried)
+    good = np.all(unstable < 0.5, axis=1) & np.isfinite(ratio)
+    values = np.repeat(row[None, :], int(np.sum(good)), axis=0)
+    values[:, 0] = gains[good] ** structure.gain_power
+    cost = load_cost(structure, values) if values.size else np.zeros(0)
+    return values, cost, ratio[good]

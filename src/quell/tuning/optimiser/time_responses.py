@@ -1,0 +1,105 @@
+"""Responses of linear loops over time, for objectives and limits of u that are about them.
+
+The closed loop of a sampled plant and a law is linear, so every response is the convolution of a
+pulse response with the input. The pulse response ``D, C B, C A B, …`` is computed in blocks: with
+``R = (C; C A; …; C A^(b−1))`` and ``A^b``, b terms are one product.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from quell.analysis.subsystems import closed_loop
+from quell.controllers.base import Controller
+from quell.controllers.linear.form import linear_form
+from quell.controllers.linear.law import LinearLaw
+from quell.lti.system import System
+from quell.plants.sampled import SampledPlant
+from quell.types import Vector
+
+# Beyond, a response is that of an unstable loop: it would overflow.
+_DIVERGED = 1e100
+
+
+class Inputs(NamedTuple):
+    """What acts on a loop: the reference and the load at the plant's input, sample by sample."""
+
+    r: Vector  # (k,) [y-unit]
+    d: Vector  # (k,) [u-unit]
+
+
+class Responses(NamedTuple):
+    """The responses of a loop from rest."""
+
+    y: Vector  # (k,) [y-unit]
+    u: Vector  # (k,) [u-unit]
+
+
+def law_of(controller: Controller) -> LinearLaw:
+    """Return the law of a linear controller, driven by y and by the applied u without delay.
+
+    Raises ``ValueError`` for a controller that is not linear.
+    """
+    form = linear_form(controller.parameters)
+    if form is None:
+        raise ValueError(f"controller = {controller!r}: must be linear")
+    law = form.law
+    if form.predicts:  # the law is driven by e = y − x_1
+        first = np.eye(law.C.size)[0]
+        law = law._replace(A=law.A - np.outer(law.B_y, first), C=law.C - law.D_y * first)
+    if form.delay:
+        law = _delayed(law, form.delay)
+    return law
+
+
+def _delayed(law: LinearLaw, samples: int) -> LinearLaw:
+    """Return the law with u acting on its state ``samples`` later, as further states."""
+    m = law.C.size
+    A = np.zeros((m + samples, m + samples))
+    A[:m, :m], A[:m, -1] = law.A, law.B_u
+    A[m + 1 :, m:-1] = np.eye(samples - 1)
+    B_u = np.zeros(m + samples)
+    B_u[m] = 1.0
+    none = np.zeros(samples)
+    B_r, B_y = np.append(law.B_r, none), np.append(law.B_y, none)
+    return LinearLaw(A, B_r, B_y, B_u, np.append(law.C, none), law.D_r, law.D_y)
+
+
+def responses(plant: SampledPlant, law: LinearLaw, inputs: Inputs) -> Responses:
+    """Return y and u of a loop from rest; infinite for an unstable one that overflows."""
+    from scipy.signal import fftconvolve
+
+    size = inputs.r.size
+    found = []
+    for target in ("y", "u"):
+        total = np.zeros(size)
+        for source, given in (("r", inputs.r), ("d", inputs.d)):
+            if np.any(given):
+                pulse = _pulse(closed_loop(plant, law, source, target), size)
+                if not np.max(np.abs(pulse)) < _DIVERGED:
+                    return Responses(np.full(size, np.inf), np.full(size, np.inf))
+                total = total + fftconvolve(pulse, given)[:size]
+        found.append(total)
+    return Responses(*found)
+
+
+def _pulse(system: System, size: int) -> Vector:
+    """Return ``D, C B, C A B, …`` (size,)."""
+    N, B, C, D = System.balanced(*system)
+    n = N.shape[0]
+    block = max(math.isqrt(size), 1)
+    rows, x = np.empty((block, n)), B.copy()
+    rows[0] = C
+    for i in range(1, block):
+        rows[i] = rows[i - 1] + rows[i - 1] @ N
+    jump = np.linalg.matrix_power(N + np.eye(n), block)
+    count = -(-(size - 1) // block)
+    parts = np.empty((count, block))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i in range(count):
+            parts[i] = rows @ x
+            x = jump @ x
+    return np.append(D, parts.ravel()[: size - 1])

@@ -1,0 +1,154 @@
+"""A structure tuned under constraints, with what it reaches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from quell.controllers.base import Controller
+from quell.files import nonfinite_to_none
+from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser.extras import delay_margin, noise_gain
+from quell.tuning.optimiser.loops import PlantSet
+from quell.tuning.optimiser.problem import Problem, Solution
+from quell.tuning.optimiser.requirements import Active, Bound, all_peaks, sizes
+from quell.types import Vector
+
+# A constraint within this share of its limit is active.
+_ACTIVE = 5e-3
+_KINDS = ("M_s", "M_t", "M_ks")
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    r"""A structure tuned under constraints, or why it could not be.
+
+    Attributes
+    ----------
+    name : str
+        name of the structure, with its order.
+    controller : Controller or None
+        the controller; None if ``reason`` says why there is none.
+    values : Mapping
+        the free parameters by name.
+    objective : float
+        what was optimised: k_i for load rejection [u-unit/(y-unit s)], which is to be large; else
+        the integral of \|y\| or the RMS of r − y, which are to be small.
+    k_i : float
+        integral gain [u-unit/(y-unit s)].
+    measures : Mapping
+        ``M_s``, ``M_t``, ``M_ks`` [u-unit/y-unit], ``noise_gain`` (RMS of u for white noise of RMS
+        1 in y), ``delay_margin`` [s]: the worst over all plants.
+    active : tuple
+        the constraints at their limits.
+    tables : Mapping
+        the tables of a setup file that describe the controller.
+    solution : Solution or None
+        what the optimiser found.
+    reason : str
+        why there is no controller; empty otherwise.
+    """
+
+    name: str
+    controller: Controller | None
+    values: Mapping[str, float]
+    objective: float
+    k_i: float
+    measures: Mapping[str, float]
+    active: tuple[Active, ...]
+    tables: Mapping[str, Mapping[str, Any]]
+    solution: Solution | None = None
+    reason: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return numbers and texts for a JSON file; infinite numbers become None."""
+        found: dict[str, Any] = nonfinite_to_none(
+            {
+                "name": self.name,
+                "values": dict(self.values),
+                "objective": self.objective,
+                "k_i": self.k_i,
+                "measures": dict(self.measures),
+                "active": [active._asdict() for active in self.active],
+                "tables": {key: dict(table) for key, table in self.tables.items()},
+                "reason": self.reason,
+            }
+        )
+        return found
+
+
+def impossible(name: str, reason: str) -> Design:
+    """Return a design without controller."""
+    nan = math.nan
+    return Design(name, None, {}, nan, nan, {}, (), {}, None, reason)
+
+
+def design_of(
+    name: str, problem: Problem, solution: Solution, constraints: Constraints, u: Mapping[str, Any]
+) -> Design:
+    """Return the design of a solution; ``u`` are the limits of the controller."""
+    structure, values = solution.structure, solution.values
+    measures, active = measured(problem, solution, constraints)
+    k_i = float(structure.integral_gain(values[None, :])[0])
+    size = math.exp(solution.cost)
+    return Design(
+        name=name,
+        controller=structure.controller(values, **u),
+        values={p.name: float(v) for p, v in zip(structure.parameters, values, strict=True)},
+        objective=k_i if problem.objective == "load" else size,
+        k_i=k_i,
+        measures=measures,
+        active=active,
+        tables=structure.tables(values),
+        solution=solution,
+    )
+
+
+def measured(
+    problem: Problem, solution: Solution, constraints: Constraints
+) -> tuple[dict[str, float], tuple[Active, ...]]:
+    """Return the measures and the active constraints."""
+    plants, structure, values = problem.plants, solution.structure, solution.values[None, :]
+    C = structure.response(values, plants.omega)
+
+    def controller(omega: Vector) -> Any:
+        return structure.response(values, omega)[0]
+
+    measures, active = {}, []
+    bounds = dict(problem.bounds)
+    for kind in _KINDS:
+        grid = sizes(kind, plants.P, C[0])
+        largest = float(np.max(grid))
+        found = all_peaks((Bound(kind, 1.0),), plants, controller, C[0], 0.9 * largest)
+        at = max(found, key=lambda entry: entry[1].value)[1]
+        measures[kind] = at.value
+        if kind in bounds and at.value >= (1.0 - _ACTIVE) * bounds[kind]:
+            active.append(Active(kind, at.value, bounds[kind], at.omega, at.plant))
+    measures["noise_gain"] = float(noise_gain(plants, C)[0])
+    measures["delay_margin"] = float(delay_margin(plants, structure, values)[0])
+    for extra in problem.extras:
+        ratio = float(extra.ratio(structure, values)[0])
+        if ratio >= 1.0 - _ACTIVE:
+            value = extra.limit / ratio if extra.name == "delay margin" else extra.limit * ratio
+            active.append(Active(extra.name, value, extra.limit, math.nan, 0))
+    rules = structure.rules(values)[0]
+    fastest = _fastest(solution, constraints, plants)
+    if fastest >= (1.0 - _ACTIVE) * constraints.omega_o_dt or np.any(rules < _ACTIVE):
+        limit = constraints.omega_o_dt
+        active.append(Active("|p| dt", min(fastest, limit), limit, math.nan, 0))
+    return measures, tuple(active)
+
+
+def _fastest(solution: Solution, constraints: Constraints, plants: PlantSet) -> float:
+    """Return the largest ``|p| dt`` of parameters that are bounded by it."""
+    found = 0.0
+    for parameter, value in zip(solution.structure.parameters, solution.values, strict=True):
+        if parameter.unit == "rad/s":
+            found = max(found, float(value) * plants.dt)
+        elif parameter.name == "T_f":
+            found = max(found, constraints.omega_o_dt * parameter.low / float(value))
+    return found

@@ -1,0 +1,84 @@
+"""The result of a tuning as text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from quell.analysis.loop import duration
+from quell.tuning.optimiser.requirements import Active
+from quell.tuning.result.design import Design
+
+_UNITS = {"load": "k_i", "load-iae": "∫|y|", "tracking": "RMS of r − y"}
+
+
+def quantity(objective: str) -> str:
+    """Return the name of what an objective is about."""
+    return _UNITS.get(objective, "objective")
+
+
+def relative(design: Design, other: Design, objective: str) -> float:
+    """Return how many times as good ``design`` is as ``other``."""
+    ratio = design.objective / other.objective
+    return ratio if objective == "load" else 1.0 / ratio
+
+
+def active_text(active: Active, plants: int) -> str:
+    """Return a constraint at its limit as text."""
+    where = "" if math.isnan(active.omega) else f" at {active.omega:.3g} rad/s"
+    which = f" of plant {active.plant}" if plants > 1 and where else ""
+    return f"{active.name} = {active.value:.4g} (limit {active.limit:.4g}){where}{which}"
+
+
+def rows(designs: Mapping[str, Design], objective: str) -> list[tuple[str, ...]]:
+    """Return a row for each design: name, objective, M_s, M_t, M_ks, delay margin, or a reason."""
+    found: list[tuple[str, ...]] = []
+    for design in designs.values():
+        if design.controller is None:
+            found.append((design.name, "–", "–", "–", "–", "–", design.reason))
+            continue
+        m = design.measures
+        numbers = (f"{m[kind]:.3f}" for kind in ("M_s", "M_t"))
+        margin = duration(m["delay_margin"])
+        found.append(
+            (design.name, f"{design.objective:.4g}", *numbers, f"{m['M_ks']:.4g}", margin, "")
+        )
+    return found
+
+
+def costs(chosen: Design, designs: Mapping[str, Design], objective: str) -> list[str]:
+    """Return sentences: what the chosen structure costs against the best one, PI and PID."""
+    usable = {
+        name: design
+        for name, design in designs.items()
+        if design.controller is not None and design is not chosen
+    }
+    what = quantity(objective)
+    lines = []
+    for name in ("pi", "pid"):
+        if name in usable:
+            share = relative(chosen, usable[name], objective)
+            lines.append(
+                f"{chosen.name} against the optimal {name.upper()} controller under the same "
+                f"constraints: {share:.3g} times as good in {what}"
+            )
+    if usable:
+        best = max(usable.values(), key=lambda design: relative(design, chosen, objective))
+        share = relative(best, chosen, objective)
+        if share > 1.0:
+            lines.append(
+                f"{chosen.name} costs {100.0 * (1.0 - 1.0 / share):.3g} % of {what} against the "
+                f"best structure, {best.name}"
+            )
+        else:
+            lines.append(
+                f"{chosen.name} is the best of these structures; the next one, {best.name}, costs "
+                f"{100.0 * (1.0 - share):.3g} %"
+            )
+    return lines
+
+
+def tradeoff_lines(tradeoff: Sequence[tuple[str, float, float]], objective: str) -> list[str]:
+    """Return what other limits would give: (constraint, its limit, objective)."""
+    what = quantity(objective)
+    return [f"{name} {limit:.4g}: {what} {value:.4g}" for name, limit, value in tradeoff]
