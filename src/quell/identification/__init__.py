@@ -7,6 +7,7 @@ search for its parameters, ``running_loop`` the same for the gain in records of 
 files here put them together.
 """
 
+from quell.identification.alternatives import Alternative, alternatives, decided
 from quell.identification.experiment.excitation import Excitation, excitation
 from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
 from quell.identification.experiment.measured import Measured, excited
@@ -18,6 +19,7 @@ from quell.identification.result import Identified
 from quell.identification.validation import Residuals
 
 __all__ = [
+    "Alternative",
     "Excitation",
     "FrequencyResponse",
     "Identified",
@@ -25,6 +27,8 @@ __all__ = [
     "Measured",
     "Residuals",
     "Root",
+    "alternatives",
+    "decided",
     "excitation",
     "excited",
     "frequency_response",

@@ -7,6 +7,12 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.identification.given_record import (
+    delay_range,
+    first_held_out,
+    other_record,
+    resolution_of,
+)
 from quell.identification.model.roots import poles_of, zeros_of
 from quell.identification.model.structure import Structure, free_run
 from quell.identification.result import Identified
@@ -46,6 +52,7 @@ def identify(
     held_out: float = 0.3,
     horizon: int = 10,
     reference: Any = None,
+    validation: tuple[Any, Any] | None = None,
 ) -> Identified:
     """Fit a continuous transfer function to recorded input and output.
 
@@ -90,6 +97,9 @@ def identify(
     reference
         external signal of a closed loop (N,), if it is known: the model is then fitted to the part
         of u and y that follows it (see Notes).
+    validation
+        u and y of another record with the same sample time, on which the model is judged, too; then
+        the tests of the error are those of this record.
 
     Raises
     ------
@@ -135,12 +145,14 @@ def identify(
     if integrators is not None:
         integrators = checks.whole("integrators", integrators, 0, order)
     bias, friction = checks.flag("bias", bias), checks.flag("friction", friction)
-    delays = _delays(delay, dt)
+    delays = delay_range(delay, dt)
     horizon = checks.whole("horizon", horizon, 1)
     least = max(
         _SAMPLES_PER_PARAMETER * (3 * order + zeros + 2), 3 * horizon * (order + 1), 4 * delays[1]
     )
-    held_from = _split(u, y, order, held_out, least, 3 * horizon * (order + 1))
+    least_held = 3 * horizon * (order + 1)
+    held_from = first_held_out(u, y, order, held_out, least, least_held)
+    other = None if validation is None else other_record(*validation, least_held)
     with one_blas_thread():
         fitted = fit(
             u[:held_from], y[:held_from], order, zeros, integrators, delays, bias, friction
@@ -151,11 +163,18 @@ def identify(
             y_fit, r_fit = y[:held_from], reference[:held_from]
             estimate = instrumental_variables(structure, theta, v, y_fit, r_fit)
             fitted = fitted._replace(estimate=estimate)
-        return _validated(fitted, u, y, reference, dt, held_from, horizon)
+        return _validated(fitted, u, y, reference, dt, held_from, horizon, other)
 
 
 def _validated(
-    fitted: Fit, u: Vector, y: Vector, r: Vector | None, dt: float, held_from: int, horizon: int
+    fitted: Fit,
+    u: Vector,
+    y: Vector,
+    r: Vector | None,
+    dt: float,
+    held_from: int,
+    horizon: int,
+    other: tuple[Vector, Vector] | None,
 ) -> Identified:
     """Return the result in seconds, with fits and tests."""
     structure, v = fitted.structure, fitted.inputs(u)
@@ -173,6 +192,14 @@ def _validated(
         fits |= {
             "held out": nrmse(y[last], fresh),
             "held out, predicted": prediction_fit(y[last], error, horizon, weights),
+        }
+    if other is not None:
+        tested_u = other[0]
+        fresh = simulate_fit(fitted, fitted.inputs(tested_u), other[1])
+        error = other[1] - fresh
+        fits |= {
+            "validation": nrmse(other[1], fresh),
+            "validation, predicted": prediction_fit(other[1], error, horizon, weights),
         }
     seconds = 1.0 / structure.powers(dt)
     theta = fitted.estimate.theta * seconds
@@ -197,7 +224,7 @@ def _validated(
         horizon=horizon,
         fits=fits,
         residuals=residuals(error, tested_u, min(_LAGS, error.size // 4)),
-        resolution=_resolution(y),
+        resolution=resolution_of(y),
         held_from=held_from,
         u=u,
         y=y,
@@ -222,62 +249,3 @@ def _numerator(structure: Structure, theta: Vector, covariance: Matrix) -> tuple
     slope[free + structure.integrators : size, :free] = direct * np.eye(free)
     slope[free:size, at], slope[size, at] = a, 1.0
     return np.append(b + direct * a, direct), slope @ covariance @ slope.T
-
-
-def _resolution(y: Vector) -> float:
-    """Return the step that y is rounded to, 0.0 if it is not rounded."""
-    steps = np.abs(np.diff(y))
-    steps = steps[steps > 1e-9 * np.max(np.abs(y))]
-    if steps.size == 0:
-        return 0.0
-    # The mean of the smallest steps, as the last digits in a file are rounded.
-    step = float(np.mean(steps[steps < 1.5 * np.min(steps)]))
-    counts = steps[steps < 50.0 * step] / step
-    # Without rounding the smallest difference is unrelated to the others. Thresholds are chosen by
-    # hand.
-    rounded = counts.size > 0.01 * y.size and np.all(np.abs(counts - np.round(counts)) < 0.1)
-    return step if rounded else 0.0
-
-
-def _delays(delay: Any, dt: float) -> tuple[int, int]:
-    """Return the least and the largest delay [samples]."""
-    if np.ndim(delay) == 0:
-        samples = checks.samples("delay", delay, dt)
-        return samples, samples
-    ends = checks.vector("delay", delay, 2).tolist()
-    low, high = (checks.samples("delay", value, dt) for value in ends)
-    if low > high:
-        raise ValueError(f"delay = {delay!r}: the smallest comes first")
-    return low, high
-
-
-def _split(u: Vector, y: Vector, order: int, held_out: float, least: int, least_held: int) -> int:
-    """Return the index of the first held-out sample, with at least ``least`` samples before it."""
-    share = checks.non_negative("held_out", held_out)
-    if share > 0.9:
-        raise ValueError(
-            f"held_out = {held_out!r}: must be from 0 to 0.9, "
-            "the share of the record that is not used for the fit"
-        )
-    held = int(share * u.size)
-    held_from = u.size - held
-    if held_from < least:
-        raise ValueError(
-            f"u has {u.size} samples, {held_from} of them for the fit: "
-            f"must have at least {least} for order {order}; record longer"
-        )
-    if 0 < held < least_held:
-        raise ValueError(
-            f"held_out = {held_out!r}: of {u.size} samples these are {held}, must be at least "
-            f"{least_held} to be judged on; record longer, lower horizon, or hold none out"
-        )
-    for name, value in (("u", u), ("y", y)):
-        if np.ptp(value[:held_from]) == 0.0:
-            place = "all through the samples for the fit"
-            raise ValueError(f"{name} is {value[0]:g} {place}: must move")
-        if held and np.ptp(value[held_from:]) == 0.0:
-            raise ValueError(
-                f"held_out = {held_out!r}: {name} is {value[-1]:g} all through these samples, must "
-                "move; hold fewer out, or none, or cut the record where it rests"
-            )
-    return held_from

@@ -39,9 +39,10 @@ class Identified:
     friction: float | None  #: Coulomb friction, the |u| for slow motion [u-unit]; None: not fitted
     dt: float  #: sample time of the record [s]
     horizon: int  #: number of samples that the predictions in ``fits`` look ahead
-    #: NRMSE in %: ``"estimation"`` and ``"held out"``, also with ``", predicted"``
+    #: NRMSE in %: ``"estimation"``, ``"held out"`` and ``"validation"``, as far as there are such
+    #: samples, also with ``", predicted"``
     fits: dict[str, float]
-    residuals: Residuals  #: tests of the error, on the held-out samples if there are any
+    residuals: Residuals  #: tests of the error, on the last of the samples in ``fits``
     resolution: float  #: step that y is rounded to, 0.0 if it is not rounded [y-unit]
     held_from: int  #: index of the first held-out sample; N if none was held out
     u: Vector

@@ -12,7 +12,7 @@ from quell.cli.output import check_outputs, print_line, table, write_results
 from quell.reading import MAX_SIZE
 
 if TYPE_CHECKING:
-    from quell.identification import Identified, Root
+    from quell.identification import Alternative, Identified, Root
 
 _HEADINGS = ("real\n[rad/s]", "imag\n[rad/s]", "± real", "± imag", "size\n[rad/s]", "damping")
 
@@ -31,6 +31,8 @@ def identify(
     friction: bool = False,
     held_out: float = 0.3,
     horizon: Whole = 10,
+    validate: Path | None = None,
+    alternatives: bool = True,
     max_size: MaxSize = MAX_SIZE,
     outputs: Outputs = OUTPUTS,
 ) -> None:
@@ -64,7 +66,12 @@ def identify(
         Share of the record, at its end, on which the model is judged.
     horizon
         Number of samples of the prediction ahead.
+    validate
+        CSV file of another record, with the same columns, on which the model is judged, too.
+    alternatives
+        Fit other orders, with and without friction, and say what the record decides.
     """
+    from quell.identification import alternatives as other_structures
     from quell.identification import identify, read_record
 
     names = tuple(name.strip() for name in columns.split(",")) if columns else ("t", "u", "y")
@@ -74,13 +81,26 @@ def identify(
     delays = delay if max_delay is None else (delay, max_delay)
     options: dict[str, Any] = {"friction": friction, "held_out": held_out, "horizon": horizon}
     options |= {"delay": delays, "integrators": integrators, "reference": record.reference}
+    if validate is not None:
+        other = read_record(validate, names, dt, time_unit=time_unit, max_size=max_size)
+        if abs(other.dt - record.dt) > 1e-6 * record.dt:
+            rule = f"must be that of {data.name}, {record.dt:g} s"
+            raise ValueError(f"validate = {str(validate)!r}: dt = {other.dt:g} s: {rule}")
+        options["validation"] = other.u, other.y
     outputs = check_outputs(outputs, ["identified"])
     console = Console()
     with console.status("Searching; the first time, code is compiled for some seconds."):
         model = identify(record.u, record.y, record.dt, order, zeros, **options)
     _print(console, model, data.name)
+    others: tuple[Alternative, ...] = ()
+    if alternatives:
+        with console.status("Fitting other structures."):
+            others = other_structures(model)
+    for line in filter(None, (one.describe(model) for one in others)):
+        print_line(console, line)
     paths = _save_figure(model, outputs.figures, outputs.overwrite) if outputs.figures else []
-    write_results(console, model.to_json(), outputs, paths)
+    results = model.to_json() | {"alternatives": [one.to_json() for one in others]}
+    write_results(console, results, outputs, paths)
 
 
 def _save_figure(model: Identified, folder: Path, overwrite: bool) -> list[Path]:

@@ -30,6 +30,8 @@ from quell.types import Matrix, Vector
 # First, least and last μ, and the relative gain that a step without damping must predict: as in
 # ``output_error``, chosen by hand. Steps are few, because a start is near.
 _MU, _LEAST_MU, _MOST_MU, _CONVERGED, _STEPS = 1e-3, 1e-8, 1e8, 1e-7, 60
+# Longest lag and delay, as a share of the record: chosen by hand.
+_LONGEST = 0.25
 # Relative mean square that counts as zero: rounding of long simulations.
 _ROUNDING = 1e-20
 # Relative singular value that counts as zero, as in ``output_error``.
@@ -155,7 +157,7 @@ def _damped_step(
         left = np.vstack([inner, math.sqrt(mu) * np.eye(count)])
         step = np.linalg.lstsq(left, np.append(right, np.zeros(count)), rcond=None)[0]
         phi = at.phi + step / size
-        phi[form.times] = np.maximum(phi[form.times], 0.0)
+        phi[form.times] = np.clip(phi[form.times], 0.0, _LONGEST * u.size)
         trial = _solved(form, phi, u, y)
         if trial.power < at.power:
             return trial, max(0.1 * mu, _LEAST_MU)
