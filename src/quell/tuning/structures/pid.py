@@ -21,6 +21,9 @@ from quell.types import Matrix, Vector
 _LITTLE = 0.03
 # Bounds of the times, in units of the time of one radian at the plant's phase crossover.
 _TIMES = (1e-4, 1e4)
+# Filter and integral times to start from where only a slow filter stabilises, in the same units: two
+# masses with a spring under SIMC have 2.8 and 34.
+_PHASE_STABILISING, _SLOW = 2.8, (34.0, 120.0, 400.0)
 
 
 class FilteredPID:
@@ -57,6 +60,12 @@ class FilteredPID:
                     row = [1.0, Ti * unit]
                     row += [ratio * Ti * unit] if self.derivative else []
                     rows.append(row + ([Tf] if self.filtered else []))
+        if self.derivative and self.filtered:
+            # A filter below an undamped resonance lags there by more than the derivative leads.
+            slow = max(_PHASE_STABILISING * unit, 1.05 * self._shortest)
+            rows += [
+                [1.0, Ti * unit, share * Ti * unit, slow] for Ti in _SLOW for share in (0.1, 0.25)
+            ]
         return np.array(rows)
 
     def from_other(self, other: FilteredPID, values: Vector) -> Vector | None:
