@@ -37,6 +37,7 @@ ROWS = (
         "cli.output",
         "cli.records",
         "cli.report",
+        "cli.sweep_report",
         "cli.interrupt",
         "cli.commands",
     ),

@@ -19,6 +19,7 @@ from quell.cli.commands.rig import rig
 from quell.cli.commands.run import run
 from quell.cli.commands.run_rig import run_rig
 from quell.cli.commands.stress import stress
+from quell.cli.commands.sweep import sweep
 from quell.cli.commands.torsional import torsional
 from quell.cli.commands.two_mass import two_mass
 from quell.cli.exit_codes import HELP, ExitCode
@@ -35,7 +36,7 @@ reproduce = App(name="reproduce", help="Run a published experiment again and jud
 app.command(reproduce)
 for _command in (two_mass, torsional, acc):
     reproduce.command(_command)
-for _each in (stress, compare, identify, b0, excite, rig, run, run_rig, replay):
+for _each in (stress, compare, identify, b0, excite, rig, run, run_rig, replay, sweep):
     app.command(_each)
 
 

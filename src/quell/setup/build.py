@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import cache, partial, reduce
 from operator import add
 from typing import Any
 
@@ -22,6 +22,12 @@ def linear_part(plant: Any) -> Any:
     return getattr(plant, "linear", plant)
 
 
+@cache
+def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a function by name."""
+    return dict(inspect.signature(function).parameters)
+
+
 class Builder:
     """A builder of the tables of one file, whose ``name`` stands at the beginning of its errors."""
 
@@ -34,7 +40,7 @@ class Builder:
         ``context`` has objects of other tables, None for a missing one. Those that the table's
         function takes, and that the table does not have itself, become arguments.
         """
-        takes = inspect.signature(table.function).parameters
+        takes = parameters_of(table.function)
         arguments = {
             key: value for key, value in context.items() if key in takes and value is not None
         }

@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
     from quell.setup.schema import CallTable as Prefilter
     from quell.setup.schema import CallTable as Rig
     from quell.setup.schema import CallTable as Scenario
+    from quell.setup.schema import CallTable as Sweep
 else:
     from quell.setup.registry import (
         Controller,
@@ -36,6 +37,7 @@ else:
         Prefilter,
         Rig,
         Scenario,
+        Sweep,
     )
 
 
@@ -63,6 +65,7 @@ class Description(Table):
     guard: Guard | None = _optional("the guard of the learner; none by default.")
     prefilter: Prefilter | None = _optional("the prefilter of the reference; none by default.")
     scenario: Scenario | None = _optional("the scenario.")
+    sweep: Sweep | None = _optional("many runs with other values, for `quell sweep`.")
     rig: Rig | None = _optional("the device and its safety limits, for `quell run-rig`.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which the response is judged."
@@ -113,17 +116,17 @@ def _check_depth(data: Any) -> None:
 
 def describe(name: str, data: Mapping[str, Any]) -> Description:
     """Return the tables of ``data``, the content of the file ``name``."""
-    values = _immutable(data)
+    values = immutable(data)
     try:
         return Description.model_validate(values)
     except ValidationError as error:
         raise from_validation(name, error, values) from None
 
 
-def _immutable(value: Any) -> Any:
+def immutable(value: Any) -> Any:
     """Return a value with tuples in place of lists, and None in place of the text ``none``."""
     if isinstance(value, Mapping):
-        return {key: _immutable(part) for key, part in value.items()}
+        return {key: immutable(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return tuple(_immutable(part) for part in value)
+        return tuple(immutable(part) for part in value)
     return None if value == "none" else value

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from quell import checks
 from quell.controllers.base import Controller
@@ -15,10 +15,14 @@ from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.files import nonfinite_to_none
 from quell.plants.base import Plant
 from quell.records.metrics import SETTLING_BAND
-from quell.setup.build import Builder, linear_part
+from quell.setup.build import Builder, linear_part, parameters_of
 from quell.setup.description import Description, describe, read
 from quell.setup.errors import SetupError
+from quell.setup.schema import Table
 from quell.simulation.scenario import Scenario
+
+Known: TypeAlias = dict[str, tuple[tuple[Any, ...], Any]]
+"""Inputs and object of each part that was built, for ``assembled``."""
 
 EXAMPLES = Path(__file__).parent / "examples"
 """The folder of the files that come along: ``two_mass.toml`` and ``torsional_rig.toml``."""
@@ -37,6 +41,7 @@ class Setup:
     plant: Plant | None  #: the plant
     scenario: Scenario | None  #: the scenario
     rig: dict[str, Any] | None  #: arguments of ``run_rig``, and ``live``
+    sweep: dict[str, Any] | None  #: what ``sweep_table`` returns
     windows: tuple[dict[str, Any], ...]  #: arguments of ``Trajectory.metrics`` for each window
     description: Description  #: the file's own tables
 
@@ -87,15 +92,28 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
     SetupError
         as ``load``.
     """
-    tables, builder = describe(name, data), Builder(name)
+    return assembled(name, describe(name, data))
+
+
+def assembled(name: str, tables: Description, known: Known | None = None) -> Setup:
+    """Build the objects of the tables of a file.
+
+    ``known`` has inputs and objects of an earlier call: what is the same is not built again.
+    """
+    builder = Builder(name)
+    made_once = partial(_made_once, {} if known is None else known)
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
 
     def build(key: str, **context: Any) -> Any:
         table = getattr(tables, key)
-        return None if table is None else builder.build(table, key, dt=dt, **context)
+        if table is None:
+            return None
+        context = {each: context[each] for each in parameters_of(table.function) & context.keys()}
+        inputs = table, dt, *context, *context.values()
+        return made_once(key, inputs, partial(builder.build, table, key, dt=dt, **context))
 
     plant = build("plant")
-    model = linear_part(plant)
+    model = None if plant is None else made_once("model", (plant,), partial(linear_part, plant))
     parts = {key: build(key, plant=model) for key in ("observer", "learner", "guard")}
     kind, used = tables.controller.kind_name, tables.controller.context
     unused = [key for key, part in parts.items() if part is not None and key not in used]
@@ -104,15 +122,39 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
         raise SetupError([f"{name}: {key}: {rule}" for key in unused])
     controller = build("controller", plant=model, **parts)
     prefilter, scenario, rig = build("prefilter"), build("scenario"), build("rig")
+    sweep = build("sweep")
     if prefilter is not None:
-        controller = builder.attempt("prefilter", (), Prefiltered, controller, prefilter)
+        join = partial(builder.attempt, "prefilter", (), Prefiltered, controller, prefilter)
+        controller = made_once("joined", (controller, prefilter), join)
     if scenario is not None and plant is not None:
-        builder.attempt("scenario", ("disturbances",), scenario.seeded_signals, plant.disturbances)
+        count = plant.disturbances
+        check = partial(scenario.seeded_signals, count)
+        attempt = partial(builder.attempt, "scenario", ("disturbances",), check)
+        made_once("signals", (scenario, count), attempt)
     windows = tuple(window.written() for window in tables.metrics)
     for i, window in enumerate(windows):
         builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
     title = tables.title or name.removesuffix(".toml").replace("_", " ")
-    return Setup(name, title, controller, plant, scenario, rig, windows, tables)
+    return Setup(name, title, controller, plant, scenario, rig, sweep, windows, tables)
+
+
+def _made_once(known: Known, key: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    """Return the object that was made of the same inputs before, or make it.
+
+    Tables and numbers are the same if they are equal, objects if they are one.
+    """
+    before = known.get(key)
+    if before is None or not _same(before[0], inputs):
+        known[key] = inputs, make()
+    return known[key][1]
+
+
+def _same(before: tuple[Any, ...], now: tuple[Any, ...]) -> bool:
+    by_value = (Table, float, int, str)
+    return len(before) == len(now) and all(
+        one is other or (isinstance(other, by_value) and one == other)
+        for one, other in zip(before, now, strict=True)
+    )
 
 
 def _check_window(

@@ -24,6 +24,7 @@ from quell.realtime.loop.run import run_rig
 from quell.realtime.loop.safety import Safety as RigSafety
 from quell.records.trajectory import Trajectory
 from quell.setup.schema import CallTable, call_table, list_of, one_of
+from quell.setup.sweep_table import sweep_table
 from quell.simulation.scenario import Scenario as SimulationScenario
 
 
@@ -154,4 +155,5 @@ Metrics = call_table("metrics", Trajectory.metrics, only=True)
 Safety = call_table("safety", RigSafety, only=True)
 _RIG = {"safety": Safety | None, "telemetry": list_of(str)}
 _NO_KEYS = ("duration", "on_change", "overwrite")
+Sweep = call_table("sweep", sweep_table, only=True)
 Rig = call_table("rig", rig, only=True, forwards_to=(run_rig,), types=_RIG, without=_NO_KEYS)

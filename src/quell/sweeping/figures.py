@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quell import checks
-
-if TYPE_CHECKING:
-    from quell.sweeping.result import Sweep
+from quell.types import Vector
 
 QUANTILES = (0.05, 0.5, 0.95)
 # Groups of values of a parameter: enough to show a shape, few enough that each has runs. By hand.
@@ -22,20 +20,17 @@ _Z = 1.959963984540054
 class Groups(NamedTuple):
     """Runs in groups of near values of a parameter."""
 
-    centres: NDArray[np.float64]  # (groups,)
+    centres: Vector  # (groups,)
     texts: list[str] | None  # of values that are no numbers
     members: list[NDArray[np.int64]]
 
 
-def groups_of(sweep: Sweep, parameter: str) -> Groups:
-    """Return the runs that are done by the value of a parameter.
+def groups_of(values: NDArray[Any], texts: list[str] | None, done: NDArray[np.bool_]) -> Groups:
+    """Return the runs that are done by the value of a parameter, which may be one of some texts.
 
     Values of which there are many form groups of about as many runs each.
     """
-    names = {str(c.attrs["parameter"]): c for c in sweep.dataset.coords.values()}
-    checks.one_of("parameter", parameter, tuple(names))
-    values, runs = names[parameter].values, np.flatnonzero(sweep.done)
-    texts = sweep.store.labels[parameter]
+    runs = np.flatnonzero(done)
     if texts is not None:
         members = [runs[values[runs] == text] for text in texts]
         return Groups(np.arange(len(texts), dtype=np.float64), texts, members)
@@ -57,22 +52,25 @@ def wilson(failures: int, runs: int) -> tuple[float, float]:
     return max((centre - half) / (1.0 + z2), 0.0), min((centre + half) / (1.0 + z2), 1.0)
 
 
-def plot_over(sweep: Sweep, parameter: str, figure: Any = None) -> Any:
+def plot_over(
+    parameter: str,
+    groups: Groups,
+    failed: NDArray[np.bool_],
+    measures: Mapping[str, Vector],
+    figure: Any = None,
+) -> Any:
     """Draw failure rate and quantiles of each measure over a parameter."""
     from matplotlib.figure import Figure
 
-    groups = groups_of(sweep, parameter)
-    measures = list(sweep.store.measures)
     columns = min(3, 1 + len(measures))
     rows = -(-(1 + len(measures)) // columns)
     if figure is None:
         figure = Figure(figsize=(3.6 * columns, 2.7 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
-    _plot_failures(axes[0], sweep.failed, groups)
-    for axis, name in zip(axes[1:], measures, strict=False):
-        _plot_quantiles(axis, sweep.dataset[name].values, groups)
-        unit = sweep.store.measures[name].get("units", "")
-        axis.set_title(f"{name} [{unit}]" if unit not in ("", "1") else name)
+    _plot_failures(axes[0], failed, groups)
+    for axis, (name, values) in zip(axes[1:], measures.items(), strict=False):
+        _plot_quantiles(axis, values, groups)
+        axis.set_title(name)
     for axis in axes[1 + len(measures) :]:
         axis.set_axis_off()
     for axis in axes[: 1 + len(measures)]:
@@ -93,7 +91,7 @@ def _plot_failures(axis: Any, failed: NDArray[np.bool_], groups: Groups) -> None
     axis.set_ylim(bottom=0.0)
 
 
-def _plot_quantiles(axis: Any, values: NDArray[np.float64], groups: Groups) -> None:
+def _plot_quantiles(axis: Any, values: Vector, groups: Groups) -> None:
     found = np.full((len(QUANTILES), len(groups.members)), np.nan)
     for i, members in enumerate(groups.members):
         there = values[members][np.isfinite(values[members])]

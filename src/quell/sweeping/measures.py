@@ -96,34 +96,28 @@ def as_measures(metrics: Any) -> Measures:
 def measure_runs(runs: BatchTrajectory, measures: Measures) -> tuple[dict[str, Vector], list[str]]:
     """Return each measure (runs,), NaN where there is none, and the error of each run, if any."""
     values = {name: np.full(len(runs), np.nan) for name in measures}
-    windows: dict[tuple[Any, ...], list[str]] = {}
-    own = {name: each for name, each in measures.items() if not isinstance(each, Measure)}
-    for name, each in measures.items():
-        if isinstance(each, Measure):
-            windows.setdefault(each.window, []).append(name)
     errors = [""] * len(runs)
     for i in range(len(runs)):
-        run = runs.run(i)
         try:
-            for window, names in windows.items():
-                _in_window(run, window, {k: measures[k].name for k in names}, values, i)  # type: ignore[union-attr]
-            for name, function in own.items():
-                values[name][i] = float(function(run))
+            for name, value in measure_run(runs.run(i), measures).items():
+                values[name][i] = value
         except Exception as error:  # a function of the user's may raise anything
             errors[i] = f"{type(error).__name__}: {error}"
     return values, errors
 
 
-def _in_window(
-    run: Trajectory,
-    window: tuple[Any, ...],
-    wanted: Mapping[str, str],
-    values: Mapping[str, Vector],
-    i: int,
-) -> None:
-    start, stop, target, band = window
-    if run.diverged and run.window(start, np.inf).start >= len(run):
-        return  # it ended before the window
-    found = run.metrics_of(tuple(wanted.values()), start, stop, target, band)
-    for name, measure in wanted.items():
-        values[name][i] = found.get(measure, np.nan)
+def measure_run(run: Trajectory, measures: Measures) -> dict[str, float]:
+    """Return each measure of a run, NaN where there is none."""
+    windows: dict[tuple[Any, ...], dict[str, str]] = {}
+    for name, each in measures.items():
+        if isinstance(each, Measure):
+            windows.setdefault(each.window, {})[name] = each.name
+    values: dict[str, float] = {}
+    for (start, stop, target, band), wanted in windows.items():
+        if run.diverged and run.window(start, np.inf).start >= len(run):  # ended before it
+            values |= dict.fromkeys(wanted, np.nan)
+            continue
+        found = run.metrics_of(tuple(wanted.values()), start, stop, target, band)
+        values |= {name: found.get(measure, np.nan) for name, measure in wanted.items()}
+    own = {name: each for name, each in measures.items() if not isinstance(each, Measure)}
+    return values | {name: float(function(run)) for name, function in own.items()}

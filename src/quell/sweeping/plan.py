@@ -23,6 +23,15 @@ _MOST_RUNS = 10**9
 _SEEDS_BELOW = 2**63
 
 
+def name_of(run: int, values: Mapping[str, Any], seed: int) -> str:
+    """Return the name of a run from its parameters, numbers or texts."""
+    parts = [
+        f"{name} = {value}" if isinstance(value, str) else f"{name} = {value:.6g}"
+        for name, value in values.items()
+    ]
+    return f"run {run}: {', '.join([*parts, f'seed {seed}'])}"
+
+
 class Part(NamedTuple):
     """The runs of a plan from ``first`` to before ``last``."""
 
@@ -157,6 +166,16 @@ class Plan:
     def values(self, run: int) -> dict[str, Any]:
         """Return the parameters of a run."""
         return self.part(run, run + 1).values(run)
+
+    def describe(self, run: int) -> str:
+        """Return the name of a run: its number, its parameters, its seed."""
+        part = self.part(run, run + 1)
+        values = {}
+        for name, value in part.values(run).items():
+            texts = labels(self._lists.get(name, ()))
+            place = part.places(np.array(run))[1].get(name)
+            values[name] = value if texts is None else texts[int(place)]
+        return name_of(run, {name: values[name] for name in self.parameters}, part.seed(run))
 
     def digest(self) -> str:
         """Return a hash of all values and seeds."""

@@ -15,7 +15,7 @@ from quell import checks
 from quell.records.trajectory import Trajectory
 from quell.simulation.simulate import simulate
 from quell.sweeping.lazy import NOT_DONE, lazy_dataset
-from quell.sweeping.plan import Plan
+from quell.sweeping.plan import Plan, name_of
 from quell.sweeping.runs import ERROR, Job, Parts, built
 from quell.sweeping.store import Store, open_store
 from quell.types import Status
@@ -98,13 +98,14 @@ class Sweep:
     def describe(self, run: int) -> str:
         """Return the name of a run: its number, its parameters, its seed."""
         checks.whole("run", run, 0, self.store.runs - 1)
-        one = self.dataset.isel(run=run)
-        parts = []
-        for name, texts in self.store.labels.items():
-            value = next(c for c in one.coords.values() if c.attrs["parameter"] == name).item()
-            parts.append(f"{name} = {value:.6g}" if texts is None else f"{name} = {value}")
-        parts.append(f"seed {one['seed'].item()}")
-        return f"run {run}: {', '.join(parts)}"
+        values = {name: self.parameter(name)[run].item() for name in self.store.labels}
+        return name_of(run, values, self.dataset["seed"][run].item())
+
+    def parameter(self, name: str) -> xarray.DataArray:
+        """Return a parameter over ``run``, a coordinate of the dataset."""
+        checks.one_of("parameter", name, tuple(self.store.labels))
+        found = (c for c in self.dataset.coords.values() if c.attrs["parameter"] == name)
+        return next(found)
 
     def parts(self, run: int) -> Parts:
         """Return plant, controller and scenario of a run, of a sweep that ``sweep`` returned."""
@@ -134,6 +135,13 @@ class Sweep:
         figure
             a matplotlib figure; a new one by default.
         """
-        from quell.sweeping.figures import plot_over
+        from quell.sweeping.figures import groups_of, plot_over
 
-        return plot_over(self, parameter, figure)
+        values, texts = self.parameter(parameter).values, self.store.labels[parameter]
+        measures = {}
+        for name, about in self.store.measures.items():
+            unit = about.get("units", "1")
+            title = name if unit == "1" else f"{name} [{unit}]"
+            measures[title] = self.dataset[name].values
+        groups = groups_of(values, texts, self.done)
+        return plot_over(parameter, groups, self.failed, measures, figure)

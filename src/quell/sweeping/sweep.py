@@ -22,7 +22,7 @@ from quell.parallel import one_blas_thread
 from quell.sweeping.measures import as_measures
 from quell.sweeping.plan import Plan
 from quell.sweeping.result import Sweep
-from quell.sweeping.runs import Job, Outcome, probe, run_part
+from quell.sweeping.runs import Job, Outcome, Parts, built, probe, run_part
 from quell.sweeping.store import Store, describe_measures, existing_store, hash_of, new_store
 from quell.types import DesignWarning
 
@@ -109,8 +109,8 @@ def sweep(
     plan = Plan(parameters, draws, sampling, seed)
     measures = as_measures(metrics)
     checked = _checked_limits(limits or {}, list(measures))
-    own = _takes_seed(build, plan)
-    job = Job(build, measures, tuple(record), checks.flag("exact", exact), own)
+    takes_seed = _takes_seed(build, plan)
+    job = Job(build, measures, tuple(record), checks.flag("exact", exact), takes_seed)
     checks.optional(checks.whole, "runs_per_file", runs_per_file, 1)
     if executor == "processes":
         _check_picklable(job)
@@ -128,6 +128,15 @@ def sweep(
             _check_unchanged(pool, plan, job, store)
         _do(pool, plan, job, store, progress)
     return Sweep(store, plan, job)
+
+
+def parts_of(run: int, arguments: Mapping[str, Any]) -> tuple[str, Parts]:
+    """Return name and parts of a run; ``arguments`` are those of ``sweep``, without the folder."""
+    plan = Plan(**{key: arguments[key] for key in ("parameters", "draws", "sampling", "seed")})
+    checks.whole("run", run, 0, plan.runs - 1)
+    build = arguments["build"]
+    job = Job(build, {}, (), True, _takes_seed(build, plan))
+    return plan.describe(run), built(job, plan.part(run, run + 1), run)
 
 
 def _do(

@@ -1,0 +1,171 @@
+"""The sweep of a setup: the runs that its table ``[sweep]`` describes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, get_type_hints
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from quell import checks
+from quell.files import nonfinite_to_none
+from quell.setup.description import Description, describe, immutable
+from quell.setup.errors import SetupError
+from quell.setup.load import Setup, assembled
+from quell.setup.sweep_table import CASE
+from quell.setup.vary import changed, steps_of
+from quell.sweeping.measures import Measure
+from quell.sweeping.store import hash_of
+from quell.sweeping.values import as_values
+
+# Tables that a simulated run does not use.
+_NOT_USED = ("sweep", "rig", "metrics", "title")
+
+
+def sweep_of(setup: Setup) -> dict[str, Any]:
+    """Return the arguments of ``quell.sweep`` for a setup, except the folder.
+
+    Raises
+    ------
+    SetupError
+        if the setup has no table ``[sweep]``, plant or scenario, or if a path or value in it is
+        none of the setup's.
+    """
+    for needed in ("plant", "scenario", "sweep"):
+        setup.needed(needed)
+    table: dict[str, Any] = dict(setup.sweep or {})
+    build = Variation(setup.file, setup.tables(), table.pop("cases"))
+    for name in build.cases:
+        _attempt(build, f"sweep.cases.{name}", {CASE: name})
+    for path, given in table["parameters"].items():
+        if path != CASE:
+            _check_parameter(build, path, given)
+    measures = _measures(setup, table.pop("metrics"))
+    table["limits"] = _limits(setup.file, table["limits"], measures)
+    return {"build": build, **table, "metrics": measures}
+
+
+def _check_parameter(build: Variation, path: str, given: Any) -> None:
+    """Check that the setup has a parameter, in one of the cases at least."""
+    where, error = "sweep.parameters", SetupError([])
+    try:
+        values = as_values(path, given)
+    except ValueError as fault:
+        raise SetupError([f"{build.name}: {where}: {fault}"]) from None
+    value = values[0] if isinstance(values, tuple) else float(values.ppf(np.array([0.5]))[0])
+    for case in [{CASE: name} for name in build.cases] or [{}]:
+        try:
+            _attempt(build, where, {**case, path: value})
+            return
+        except SetupError as fault:
+            error = fault
+    raise error
+
+
+def _attempt(build: Variation, where: str, values: Mapping[str, Any]) -> None:
+    """Build a setup; the place in the table stands in front of its errors."""
+    try:
+        build(**values)
+    except SetupError as error:
+        begin = f"{build.name}: "
+        lines = [line.removeprefix(begin) for line in error.mistakes]
+        raise SetupError([f"{begin}{where}: {line}" for line in lines]) from None
+
+
+def _measures(setup: Setup, names: Any) -> dict[str, Measure]:
+    """Return the measures in each window of a setup; of several windows they are numbered."""
+    rests = setup.scenario.rest_at if setup.scenario is not None else ()
+    windows = setup.windows or ({"start": float(rests[-1]) if len(rests) else 0.0},)
+    if not checks.is_sequence(names):
+        raise SetupError([f"{setup.file}: sweep.metrics = {names!r:.60}: must be a list of names"])
+    try:
+        return {
+            name if len(windows) == 1 else f"{name}_{i}": Measure(name, **window)
+            for i, window in enumerate(windows, 1)
+            for name in names
+        }
+    except ValueError as error:
+        raise SetupError([f"{setup.file}: sweep.{error}"]) from None
+
+
+def _limits(file: str, limits: Any, measures: Mapping[str, Measure]) -> dict[str, float]:
+    """Return the limit of each measure; that of a name holds in all windows."""
+    if not isinstance(limits, Mapping):
+        raise SetupError([f"{file}: sweep.limits = {limits!r:.60}: must be a table of numbers"])
+    found: dict[str, float] = {}
+    for name, value in limits.items():
+        which = [key for key, each in measures.items() if name in (key, each.name)]
+        if not which:
+            hint = checks.nearest(name, [*measures])
+            raise SetupError([f"{file}: sweep.limits.{name}: is none of the metrics, {hint}"])
+        try:
+            found |= dict.fromkeys(which, checks.finite(f"sweep.limits.{name}", value))
+        except ValueError as error:
+            raise SetupError([f"{file}: {error}"]) from None
+    return found
+
+
+class Variation:
+    """A function of values by path that returns a setup with these values.
+
+    Parts that are the same as in the last call are not built again.
+    """
+
+    def __init__(
+        self, name: str, data: Mapping[str, Any], cases: Mapping[str, Mapping[str, Any]]
+    ) -> None:
+        self.name, self.cases = name, cases
+        self.data = {key: value for key, value in data.items() if key not in _NOT_USED}
+
+    def __getstate__(self) -> tuple[Any, ...]:
+        return self.name, self.data, self.cases
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.name, self.data, self.cases = state
+
+    @property
+    def identity(self) -> Any:
+        """What makes it this function, for the folder of a sweep."""
+        told = nonfinite_to_none([self.data, self.cases])
+        return {"setup": told[0], "cases": told[1], "hash": hash_of([self.data, self.cases])}
+
+    def __call__(self, **values: Any) -> Setup:
+        """Return the setup; values are by path, and ``case`` is the name of a case."""
+        case = values.pop(CASE, None)
+        changes = {**({} if case is None else self.cases[case]), **values}
+        data = changed(self.name, self.data, changes)
+        tables = self._described(data, {str(steps_of(self.name, path)[0]) for path in changes})
+        return assembled(self.name, tables, self._known)
+
+    def _described(self, data: dict[str, Any], keys: set[str]) -> Description:
+        """Return the tables of ``data``, of which only some keys were changed."""
+        try:
+            found = {key: _READERS[key].validate_python(immutable(data[key])) for key in keys}
+        except (KeyError, ValidationError):
+            return describe(self.name, data)  # which says what is wrong
+        return self._base.model_copy(update=found)
+
+    @cached_property
+    def _base(self) -> Description:
+        return describe(self.name, self.data)
+
+    @cached_property
+    def _local(self) -> threading.local:
+        return threading.local()
+
+    @property
+    def _known(self) -> dict[str, Any]:
+        """Parts of the last call, of this thread."""
+        known: dict[str, Any] = self._local.__dict__.setdefault("known", {})
+        return known
+
+
+# Readers of the tables of a file by their key; other keys are read with all tables.
+_READERS: dict[str, Any] = {
+    key: TypeAdapter(kind)
+    for key, kind in get_type_hints(Description, include_extras=True).items()
+    if key in Description.model_fields and kind not in (float, str)
+}
