@@ -233,37 +233,43 @@ def test_an_output_is_cut_off_where_it_is_a_hundred_times_larger_than_f() -> Non
 
 
 @pytest.mark.parametrize(
-    ("credit", "loudness", "authority", "reason"),
+    ("credit", "effect", "loudness", "authority", "reason"),
     [
-        (-1.0, 0.5, 0.0, ql.Reason.UNPROVEN),
-        (0.0, 0.5, 0.0, ql.Reason.UNPROVEN),
-        (0.25, 0.5, 0.5, ql.Reason.UNPROVEN),
-        (0.5, 0.5, 1.0, ql.Reason.TRUSTED),
-        (1.0, 0.2, 1.0, ql.Reason.TRUSTED),
-        (1.0, 0.8, 0.3, ql.Reason.TOO_LOUD),
-        (0.1, 0.8, 0.2, ql.Reason.UNPROVEN),
-        (0.1, 0.0, 0.2, ql.Reason.UNPROVEN),
+        (-1.0, 0.0, 0.5, 0.0, ql.Reason.UNPROVEN),
+        (0.0, 0.0, 0.5, 0.0, ql.Reason.UNPROVEN),
+        (0.25, 0.0, 0.5, 0.5, ql.Reason.UNPROVEN),
+        (0.5, 0.0, 0.5, 1.0, ql.Reason.TRUSTED),
+        (1.0, 1.0, 0.2, 1.0, ql.Reason.TRUSTED),
+        (1.0, -0.25, 0.2, 0.5, ql.Reason.UNPROVEN),
+        (1.0, -0.6, 0.2, 0.0, ql.Reason.UNPROVEN),
+        (1.0, 0.0, 0.8, 0.3, ql.Reason.TOO_LOUD),
+        (0.1, 0.0, 0.8, 0.2, ql.Reason.UNPROVEN),
+        (0.1, 0.0, 0.0, 0.2, ql.Reason.UNPROVEN),
     ],
 )
 def test_the_authority_is_what_a_learner_has_earned(
-    credit: float, loudness: float, authority: float, reason: ql.Reason
+    credit: float, effect: float, loudness: float, authority: float, reason: ql.Reason
 ) -> None:
-    """``β = min(clip(2 C, 0, 1), 1.2 (1 − S)/S)``, and why."""
+    """``β = min(clip(2 C, 0, 1), clip(1 + 2 C_y, 0, 1), 1.2 (1 − S)/S)``, and why."""
     design, memory = trusted()
     memory.sample[0].credit, memory.averages[0].loudness = credit, loudness
+    memory.sample[0].effect_credit = effect
     limit(design, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
     assert memory.sample[0].authority == pytest.approx(authority)
     assert memory.sample[0].reason == reason
 
 
 def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
-    """M, S, C, P, c_L and e by the equations of the module, with outliers and small samples."""
+    """M, S, C, C_y, P, c_L and e by the module's equations, with outliers and small samples."""
     guard = ql.Guard(time=0.4)
     design, memory = guard.design(OBSERVER), guard.memory(guard.design(OBSERVER))
     forget, lag = -math.expm1(-5e-3 / 0.4), 5 / 10.0
     rise, decay, growth = (-math.expm1(-5e-3 / (lags * lag)) for lags in (0.7, 200.0, 5.0))
     m, s, credit, peak, e, own, f_shown = 0.0, 0.5, -1.0, 0.0, 0.0, 0.0, 0.0
     shadow, square, spared = np.zeros((1, 5)), 0.0, 0
+    # Without the gains of a law, y is taken to respond as f̂ does, within four lags.
+    respond, slowly = -math.expm1(-5e-3 / lag), 5e-3 / (0.4 + 5.0 * 4.0 * lag)
+    stages, effect, veto = np.zeros((2, 4)), 0.0, 0.0
     for k in range(1500):
         f, g = rng.normal(), rng.normal()
         f *= 100.0 if k % 50 == 20 else 0.01 if 60 <= k < 70 else 1.0
@@ -283,11 +289,20 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         square += more if (k + 1) * forget < 1.0 else min(more, rise * square)
         earned = (2.0 * q * bounded - bounded**2) / max(q * q, 4.0 * square)
         credit = np.clip(credit + 5e-3 / (0.4 * 2.0 / 3.0) * max(earned, -3.0), -1.0, 1.0)
+        for i in range(4):
+            stages[:, i] += respond * ([q, bounded] - stages[:, i])
+            q, bounded = stages[:, i]
+        more = slowly * (q * q - effect)
+        effect += more if (k + 1) * forget < 1.0 else min(more, rise * effect)
+        earned = (2.0 * q * bounded - bounded**2) / max(q * q, 4.0 * effect)
+        veto = np.clip(veto + slowly * max(earned, -3.0), -1.0, 1.0)
         if k % 100 == 99:
             credit = memory.sample[0].credit = 1.0
         sample, averages = memory.sample[0], memory.averages[0]
         np.testing.assert_allclose(
-            [sample.peak, sample.typical_error, sample.credit], [peak, e, credit], rtol=1e-9
+            [sample.peak, sample.typical_error, sample.credit, sample.effect_credit],
+            [peak, e, credit, veto],
+            rtol=1e-9,
         )
         np.testing.assert_allclose([averages.error_plain, averages.loudness], [m, s], rtol=1e-9)
         f_learned, _, _ = limit(design, memory, f, f_shown, g, 0.0, 0.0)
@@ -338,6 +353,32 @@ def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
     assert memory.sample[0].peak == pytest.approx(missed, rel=0.1)
     # While the learner acts, e rises to |q| less a fifth of its correction, which is as large.
     assert 0.8 * missed < memory.sample[0].typical_error < 1.01 * missed
+
+
+def test_a_learner_that_adds_to_slow_errors_is_not_heard_however_well_it_explains_quick_ones() -> (
+    None
+):
+    """Y is q through n integrations: what counts in the end is what a learner does to it.
+
+    It explains a sinusoid of 3 rad/s, and adds to one of 0.1 rad/s, which is a fifth of q and 95 %
+    of what is seen in y.
+    """
+    gains = ql.ADRC(OBSERVER, omega_c=1.0).parameters.law
+    guard = ql.Guard(time=2.0)
+    for slow, heard in ((5.0, True), (-5.0, False)):
+        design = guard.design(OBSERVER, gains)
+        memory = guard.memory(design)
+        chain, shown = np.zeros((1, 5)), 0.0
+        for k in range(20_000):
+            t = k * OBSERVER.dt
+            quick, load = math.sin(3.0 * t), math.sin(0.1 * t)
+            assess(design, memory, shown)
+            limit(design, memory, shown, shown, quick + slow * load, 0.0, 0.0)
+            record_output(design, memory, quick + slow * load)
+            shown = lag_push(design.lag, chain, 0, quick + 5.0 * load)
+        assert memory.sample[0].credit == pytest.approx(1.0, abs=0.1)
+        assert (memory.sample[0].authority > 0.9) == heard
+        assert (memory.sample[0].authority == 0.0) != heard
 
 
 def test_a_learner_is_cut_off_within_the_sample_and_has_to_prove_itself_again() -> None:

@@ -40,6 +40,8 @@ _SMOOTHING_LAGS = 30.0
 _LEAK_LAGS = 20.0
 # The target approaches β̄g over this time, by at most e in it: a slow drift has almost no effect.
 _HOME_LAGS = 1000.0
+# What a learner does to y is judged over T and so many times n/ω_c, in which y responds.
+_EFFECT_TIME = 5.0
 # After the filters were emptied in mid-run, q is wrong for this time.
 _SETTLING_LAGS = 3.0
 
@@ -82,7 +84,7 @@ class Guard:
     def design(self, observer: ESO, law: Vector | None = None) -> GuardDesign:
         """Return the parameters for an observer and the gains k of the law (n,).
 
-        Only ``certified_for`` needs the gains.
+        ``certified_for`` needs the gains.
 
         Raises
         ------
@@ -103,11 +105,17 @@ class Guard:
             """Return the share of its distance that a first-order lag covers in a sample."""
             return -math.expm1(-dt / (lags * lag_time))
 
+        # The law's gains are those of its poles; without a law y is taken to be as slow as f̂.
+        stages = observer.order if law is None else len(law)
+        omega_c = 1.0 / lag_time if law is None else float(law[0]) ** (1.0 / stages)
         lag, invertible = lag_of(observer), is_invertible(observer)
         return GuardDesign(
             lag=lag,
             forget=-math.expm1(-dt / time),
             earn=dt / (_CREDIT_TIME * time),
+            stages=stages,
+            respond=-math.expm1(-omega_c * dt),
+            forget_effect=dt / (time + _EFFECT_TIME * stages / omega_c),
             rise=share(_RISE_LAGS),
             decay=share(_DECAY_LAGS),
             growth=share(_GROWTH_LAGS),
@@ -127,7 +135,8 @@ class Guard:
     def memory(self, parameters: GuardDesign) -> GuardMemory:
         """Return the state before the first sample, without authority."""
         filters = lag_memory(parameters.lag, 3), lag_memory(parameters.fed_lag, 1), np.zeros(4)
-        memory = GuardMemory(*filters, GuardAverages.zeros(), GuardSample.zeros())
+        effects = np.zeros((2, parameters.stages))
+        memory = GuardMemory(*filters, effects, GuardAverages.zeros(), GuardSample.zeros())
         withdraw_authority(memory)
         return memory
 

@@ -21,9 +21,12 @@ each in which it would have increased it costs credit; M is the mean of q² over
 raise slowly:
 
     p̄ = clip(p, ±κe),        C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
-    β = min( clip(2 C, 0, 1),  1.2 (1 − S)/S ),        S: mean share of p² in p² + q² over T
+    β = min( clip(2 C, 0, 1),  clip(1 + 2 C_y, 0, 1),  1.2 (1 − S)/S )
 
-C starts at −1. The second term of β scales down an output that is larger than what it explains.
+C starts at −1. S, the mean share of p² in p² + q² over T, scales down an output that is larger than
+what it explains. C_y is a veto: y is q through n integrations, so a learner that explains quick
+changes of f and adds to slow ones earns credit C and harms y. C_y follows the rule of C with what q
+and p̄ do to y, ``(ω_c/(s + ω_c))^n q`` and ``(ω_c/(s + ω_c))^n p̄``, over ``T + 5 n/ω_c``, from 0 on.
 
 **Output.** The target changes by ``β̄ Δg``, so that a change of β over a constant g does nothing,
 and what the bound took is made up for while the target is still near:
@@ -61,7 +64,7 @@ from quell.guard.base import (
 from quell.guard.reason import Reason
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
-from quell.kernels.sized import Flag
+from quell.kernels.sized import Flag, Size
 from quell.learners.lag import lag_push, reset_lag
 from quell.types import Matrix, Vector
 
@@ -95,6 +98,9 @@ class GuardDesign(NamedTuple):
     lag: Any  # lag filter of the observer
     forget: float  # dt/T
     earn: float  # dt/T_C
+    stages: Size  # n: order of the response of y
+    respond: float  # share by which each of its stages follows in a sample
+    forget_effect: float  # dt/(T + 5 n/ω_c)
     rise: float  # share by which P and e follow a larger |q| in a sample
     decay: float  # share by which P decays in a sample
     growth: float  # largest share by which e grows in a sample while the learner acts
@@ -116,6 +122,7 @@ class GuardAverages(Scalars):
 
     loudness: float  # S
     square: float  # M, mean of q² that grows by a factor of 2.7 in 0.7 lags at most
+    effect_square: float  # the same of what q does to y
     error_plain: float  # mean square of q [(y-unit/s^n)²]
     error_learned: float  # mean square of q − p [(y-unit/s^n)²]
 
@@ -124,6 +131,7 @@ class GuardSample(Scalars):
     """Values of the newest sample."""
 
     credit: float  # C
+    effect_credit: float  # C_y
     authority: float  # β
     share: float  # β̄: β, smoothed
     peak: float  # P [y-unit/s^n]
@@ -145,6 +153,7 @@ class GuardMemory(NamedTuple):
     chain: Matrix  # lag filters of f_plain, g and v (3, …)
     fed: Matrix  # lag filter of f_L, if it is not that of the observer (1, …)
     shown: Vector  # their outputs: f_plain^F, g^F, p and f_L^F (4,)
+    effects: Matrix  # what q and p̄ do to y, stage by stage (2, n) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
 
@@ -173,10 +182,8 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     energy = qq + pp
     if energy < _TINY:
         return
-    # A burst, for example after an outlier, must not let everything else count for nothing.
-    more = guard.forget * (qq - averages.square)
     is_new = sample.samples * guard.forget < 1.0
-    averages.square += more if is_new else min(more, guard.rise * averages.square)
+    averages.square = _mean_square(guard, averages.square, qq, guard.forget, is_new)
     averages.error_plain += guard.forget * (qq - averages.error_plain)
     averages.error_learned += guard.forget * ((q - p) * (q - p) - averages.error_learned)
     averages.loudness += (
@@ -186,9 +193,41 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     )
     most = guard.bound * sample.typical_error
     bounded = min(max(p, -most), most)
-    reduced = (2.0 * q - bounded) * bounded
-    earned = reduced / max(qq, _MEAN_SQUARES * averages.square, _TINY)
-    sample.credit = min(max(sample.credit + guard.earn * max(earned, -_WORST_SAMPLE), -1.0), 1.0)
+    earned = _earned(q, bounded, averages.square)
+    sample.credit = min(max(sample.credit + guard.earn * earned, -1.0), 1.0)
+    _judge_effect(guard, memory, q, bounded, is_new)
+
+
+@kernel
+def _judge_effect(
+    guard: GuardDesign, memory: GuardMemory, q: float, bounded: float, is_new: bool
+) -> None:
+    """Update C_y with what the learner, bounded, would have done to y."""
+    effects, averages, sample = memory.effects, memory.averages[0], memory.sample[0]
+    for i in range(guard.stages):
+        effects[0, i] += guard.respond * (q - effects[0, i])
+        effects[1, i] += guard.respond * (bounded - effects[1, i])
+        q, bounded = effects[0, i], effects[1, i]
+    rate = guard.forget_effect
+    averages.effect_square = _mean_square(guard, averages.effect_square, q * q, rate, is_new)
+    earned = _earned(q, bounded, averages.effect_square)
+    sample.effect_credit = min(max(sample.effect_credit + rate * earned, -1.0), 1.0)
+
+
+@kernel
+def _mean_square(
+    guard: GuardDesign, mean: float, square: float, forget: float, is_new: bool
+) -> float:
+    """Return the mean with a new square; a burst does not let everything else count for nothing."""
+    more = forget * (square - mean)
+    return mean + (more if is_new else min(more, guard.rise * mean))
+
+
+@kernel
+def _earned(q: float, p: float, mean_square: float) -> float:
+    """Return what a sample earns in which q − p is left of q."""
+    earned = (2.0 * q - p) * p / max(q * q, _MEAN_SQUARES * mean_square, _TINY)
+    return max(earned, -_WORST_SAMPLE)
 
 
 @kernel
@@ -254,8 +293,8 @@ def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float
 @kernel
 def _authority(memory: GuardMemory) -> tuple[float, int]:
     """Return β and the reason for it."""
-    loudness, credit = memory.averages[0].loudness, memory.sample[0].credit
-    earned = credit / _FULL_CREDIT
+    loudness, sample = memory.averages[0].loudness, memory.sample[0]
+    earned = min(sample.credit, _FULL_CREDIT + sample.effect_credit) / _FULL_CREDIT
     if earned <= 0.0:
         return 0.0, _UNPROVEN
     scaled = _LOUDEST * (1.0 - loudness) / max(loudness, _TINY)
@@ -267,7 +306,7 @@ def _authority(memory: GuardMemory) -> tuple[float, int]:
 @kernel
 def withdraw_authority(memory: GuardMemory) -> None:
     """Set the credit of a learner that has yet to prove itself, and the loudness of one like f."""
-    memory.sample[0].credit = -1.0
+    memory.sample[0].credit, memory.sample[0].effect_credit = -1.0, 0.0
     memory.averages[0].loudness = 0.5
 
 
@@ -303,6 +342,7 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     sample = memory.sample[0]
     reset_lag(memory.chain)
     reset_lag(memory.fed)
+    reset_lag(memory.effects)
     for i in range(memory.shown.size):
         memory.shown[i] = 0.0
     sample.output = sample.begun = sample.target = sample.shown = 0.0
