@@ -135,8 +135,20 @@ def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
     design = ql.Guard().design(observer)
     memory = ql.Guard().memory(design)
     memory.sample[0].credit = memory.sample[0].begun = memory.sample[0].share = 1.0
-    memory.sample[0].typical_error = memory.sample[0].peak = e
+    memory.sample[0].typical_error = memory.sample[0].peak = memory.sample[0].outside = e
     return design, memory
+
+
+def feed(design: object, memory: object, f: np.ndarray, g: np.ndarray) -> None:
+    """Samples in which f does not depend on u, and the learner's output is g."""
+    chain = np.zeros((2, 5))
+    f_plain = f_shown = 0.0
+    for disturbance, output in zip(f, g, strict=True):
+        assess(design, memory, f_plain)
+        f_learned, _, _ = limit(design, memory, f_plain, f_shown, output, 0.0, 0.0)
+        record_output(design, memory, f_learned)
+        f_plain = lag_push(design.lag, chain, 0, disturbance)
+        f_shown = lag_push(design.lag, chain, 1, f_learned)
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
@@ -260,13 +272,13 @@ def test_the_authority_is_what_a_learner_has_earned(
 
 
 def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
-    """M, S, C, C_y, P, c_L and e by the module's equations, with outliers and small samples."""
+    """M, S, C, C_y, P, o, c_L and e by the module's equations, with outliers and small samples."""
     guard = ql.Guard(time=0.4)
     design, memory = guard.design(OBSERVER), guard.memory(guard.design(OBSERVER))
     forget, lag = -math.expm1(-5e-3 / 0.4), 5 / 10.0
     rise, decay, growth = (-math.expm1(-5e-3 / (lags * lag)) for lags in (0.7, 200.0, 5.0))
     m, s, credit, peak, e, own, f_shown = 0.0, 0.5, -1.0, 0.0, 0.0, 0.0, 0.0
-    shadow, square, spared = np.zeros((1, 5)), 0.0, 0
+    shadow, square, spared, outside = np.zeros((1, 5)), 0.0, 0, 0.0
     # Without the gains of a law, y is taken to respond as f̂ does, within four lags.
     respond, slowly = -math.expm1(-5e-3 / lag), 5e-3 / (0.4 + 5.0 * 4.0 * lag)
     stages, effect, veto = np.zeros((2, 4)), 0.0, 0.0
@@ -281,7 +293,9 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         spared += large > e > large - 0.2 * own
         if more > 0.0:
             e += min(more, growth * e) if memory.sample[0].authority > 0.0 else more
-        e = min(e, peak)
+        more = rise * (large - own - outside)
+        outside += more if more > 0.0 else -decay * outside
+        e = min(e, peak, 2.5 * outside)
         m += forget * (q * q - m)
         s += forget * min(1.0, (q * q + p * p) / (0.4 * peak) ** 2) * (p * p / (q * q + p * p) - s)
         bounded = np.clip(p, -1.2 * e, 1.2 * e)
@@ -337,13 +351,8 @@ def test_a_perfect_learner_explains_all_that_would_have_been_missed() -> None:
     guard = ql.Guard(time=2.0)
     design = guard.design(OBSERVER)
     memory = guard.memory(design)
-    chain, shown = np.zeros((1, 5)), 0.0
-    for k in range(12_000):
-        f = math.sin(0.7 * k * OBSERVER.dt)
-        assess(design, memory, shown)
-        limit(design, memory, shown, shown, f, 0.0, 0.0)
-        record_output(design, memory, f)
-        shown = lag_push(design.lag, chain, 0, f)
+    f = np.sin(0.7 * OBSERVER.dt * np.arange(12_000))
+    feed(design, memory, f, f)
     assert memory.sample[0].authority == 1.0
     assert memory.averages[0].loudness == pytest.approx(0.5, abs=1e-3)
     assert memory.averages[0].error_learned == pytest.approx(0.0, abs=1e-9)
@@ -365,17 +374,12 @@ def test_a_learner_that_adds_to_slow_errors_is_not_heard_however_well_it_explain
     """
     gains = ql.ADRC(OBSERVER, omega_c=1.0).parameters.law
     guard = ql.Guard(time=2.0)
-    for slow, heard in ((5.0, True), (-5.0, False)):
+    t = OBSERVER.dt * np.arange(20_000)
+    quick, load = np.sin(3.0 * t), 5.0 * np.sin(0.1 * t)
+    for sign, heard in ((1.0, True), (-1.0, False)):
         design = guard.design(OBSERVER, gains)
         memory = guard.memory(design)
-        chain, shown = np.zeros((1, 5)), 0.0
-        for k in range(20_000):
-            t = k * OBSERVER.dt
-            quick, load = math.sin(3.0 * t), math.sin(0.1 * t)
-            assess(design, memory, shown)
-            limit(design, memory, shown, shown, quick + slow * load, 0.0, 0.0)
-            record_output(design, memory, quick + slow * load)
-            shown = lag_push(design.lag, chain, 0, quick + 5.0 * load)
+        feed(design, memory, quick + load, quick + sign * load)
         assert memory.sample[0].credit == pytest.approx(1.0, abs=0.1)
         assert (memory.sample[0].authority > 0.9) == heard
         assert (memory.sample[0].authority == 0.0) != heard

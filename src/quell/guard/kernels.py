@@ -14,7 +14,10 @@ of the observer later it is known what the plain ESO has missed, and what g woul
 share of q is at most Γ times its largest recent correction, so e counts only what exceeds γ times
 that; and while the learner acts, e grows by a factor of 2.7 in five lags at most (METHOD 8):
 
-    c_L ← max(|e_L|, λ c_L),        e → |q| − γ c_L  where that is larger,        e ≤ P
+    c_L ← max(|e_L|, λ c_L),        e → |q| − γ c_L  where that is larger,        e ≤ min(P, 2.5 o)
+
+o, the error that is certainly not the learner's, follows |q| − c_L as P follows |q|: a learner that
+causes what it then explains enlarges e by a factor of 2.5 at most, and not again and again.
 
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
@@ -82,6 +85,9 @@ _MEAN_SQUARES = 4.0
 _NOISE = 0.4
 # An outlier counts for so many times P.
 _OUTLIER = 5.0
+# e is at most so many times o: twice does more about learners that cause what they explain, three
+# times costs honest ones nothing.
+_OWN_GROWTH = 2.5
 # An output that is so many times larger than f is cut off.
 _CUT_OFF = 100.0
 # Avoids division by zero; squares of f are larger in any unit.
@@ -136,6 +142,7 @@ class GuardSample(Scalars):
     share: float  # β̄: β, smoothed
     peak: float  # P [y-unit/s^n]
     typical_error: float  # e [y-unit/s^n]
+    outside: float  # o [y-unit/s^n]
     own_peak: float  # c_L [y-unit/s^n]
     output: float  # g [y-unit/s^n]
     begun: float  # 1 if there is an output of a sample before, else 0
@@ -232,7 +239,7 @@ def _earned(q: float, p: float, mean_square: float) -> float:
 
 @kernel
 def _update_bound(guard: GuardDesign, sample: GuardSample, error: float) -> None:
-    """Update P and e with |q|."""
+    """Update P, o and e with |q|."""
     peak, size = sample.peak, sample.typical_error
     # After T an outlier counts for 5 P at most: one bad measurement must not open all bounds.
     if sample.samples * guard.forget >= 1.0:
@@ -242,7 +249,10 @@ def _update_bound(guard: GuardDesign, sample: GuardSample, error: float) -> None
     larger = guard.rise * (error - guard.own * sample.own_peak - size)
     if larger > 0.0:
         size += min(larger, guard.growth * size) if sample.authority > 0.0 else larger
-    sample.typical_error = max(min(size, sample.peak), _TINY)
+    more = guard.rise * (error - sample.own_peak - sample.outside)
+    sample.outside += more if more > 0.0 else -guard.decay * sample.outside
+    size = min(size, sample.peak, _OWN_GROWTH * sample.outside)
+    sample.typical_error = max(size, _TINY)
 
 
 @limit.register(GuardDesign)
