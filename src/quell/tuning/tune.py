@@ -12,7 +12,7 @@ from quell.analysis.loop import LoopAnalysis, analyse
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
 from quell.tuning.constraints import Constraints
-from quell.tuning.designs import Task, tradeoff, tuned_designs, with_noise_bound
+from quell.tuning.designs import Task, tuned_designs, with_noise_bound
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import OBJECTIVES
 from quell.tuning.optimiser.time_responses import Inputs
@@ -146,7 +146,6 @@ def tune(
         chosen = designs[structure]
         if chosen.controller is None:
             raise ValueError(f"structure = {structure!r}: {chosen.reason} ({task.constraints})")
-        others = tradeoff(task, chosen)
         check = None
         if box is not None or b_range[0] != b_range[1]:
             report("check", 1.0)
@@ -157,8 +156,7 @@ def tune(
         analysis=_analysis(given, plants, chosen),
         constraints=task.constraints,
         objective=objective,
-        tradeoff=others,
-        plants=plants,
+        task=task,
         check=check,
         setup=_setup(given, dt, plants) if setup is None else setup,
         noise_bound=noise_bound,

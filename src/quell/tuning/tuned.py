@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from quell.analysis.loop import LoopAnalysis
 from quell.controllers.base import Controller
 from quell.files import nonfinite_to_none, written_atomically
+from quell.parallel import one_blas_thread
 from quell.tuning.constraints import Constraints
+from quell.tuning.designs import Task, tradeoff
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.result import report
 from quell.tuning.result.design import Design
@@ -36,10 +39,8 @@ class Tuned:
         the bounds, M_ks included if it follows from the optimal PI controller's.
     objective : str
         what was optimised.
-    tradeoff : list
-        (name, limit, objective) for limits 10 % below and above the active ones.
-    plants : PlantSet
-        the plants, sampled.
+    task : Task
+        what all structures were tuned for.
     check : Check or None
         the result on fresh samples, if the plant has ranges.
     setup : Mapping
@@ -53,8 +54,7 @@ class Tuned:
     analysis: LoopAnalysis
     constraints: Constraints
     objective: str
-    tradeoff: list[tuple[str, float, float]]
-    plants: PlantSet
+    task: Task
     check: Check | None = None
     setup: Mapping[str, Any] = field(default_factory=dict)
     noise_bound: str = ""
@@ -66,6 +66,17 @@ class Tuned:
         controller = self.design.controller
         assert controller is not None  # ``tune`` raises an error instead
         return controller
+
+    @property
+    def plants(self) -> PlantSet:
+        """The plants, sampled."""
+        return self.task.plants
+
+    @cached_property
+    def tradeoff(self) -> list[tuple[str, float, float]]:
+        """Name, limit and objective for limits 10 % below and above the active ones."""
+        with one_blas_thread():
+            return tradeoff(self.task, self.design)
 
     @property
     def active(self) -> tuple[str, ...]:
