@@ -21,6 +21,7 @@ from quell.cli.commands.run_rig import run_rig
 from quell.cli.commands.stress import stress
 from quell.cli.commands.sweep import sweep
 from quell.cli.commands.torsional import torsional
+from quell.cli.commands.tune import tune
 from quell.cli.commands.two_mass import two_mass
 from quell.cli.exit_codes import HELP, ExitCode
 
@@ -36,7 +37,7 @@ reproduce = App(name="reproduce", help="Run a published experiment again and jud
 app.command(reproduce)
 for _command in (two_mass, torsional, acc):
     reproduce.command(_command)
-for _each in (stress, compare, identify, b0, excite, rig, run, run_rig, replay, sweep):
+for _each in (stress, compare, identify, tune, b0, excite, rig, run, run_rig, replay, sweep):
     app.command(_each)
 
 

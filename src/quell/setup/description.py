@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # these types are made at run time, which a type checker cann
     from quell.setup.schema import CallTable as Rig
     from quell.setup.schema import CallTable as Scenario
     from quell.setup.schema import CallTable as Sweep
+    from quell.setup.schema import CallTable as Tune
 else:
     from quell.setup.registry import (
         Controller,
@@ -38,6 +39,7 @@ else:
         Rig,
         Scenario,
         Sweep,
+        Tune,
     )
 
 
@@ -67,6 +69,7 @@ class Description(Table):
     scenario: Scenario | None = _optional("the scenario.")
     sweep: Sweep | None = _optional("many runs with other values, for `quell sweep`.")
     rig: Rig | None = _optional("the device and its safety limits, for `quell run-rig`.")
+    tune: Tune | None = _optional("what `quell tune` optimises, and its constraints.")
     metrics: tuple[Metrics, ...] = Field(
         (), description="[[metrics]]: windows of time in which the response is judged."
     )

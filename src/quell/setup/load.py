@@ -44,6 +44,7 @@ class Setup:
     sweep: dict[str, Any] | None  #: what ``sweep_table`` returns
     windows: tuple[dict[str, Any], ...]  #: arguments of ``Trajectory.metrics`` for each window
     description: Description  #: the file's own tables
+    tune: dict[str, Any] | None = None  #: arguments of ``quell.tune``
 
     def tables(self) -> dict[str, Any]:
         """Return the file's tables and keys as dictionaries, which ``made`` accepts."""
@@ -135,7 +136,8 @@ def assembled(name: str, tables: Description, known: Known | None = None) -> Set
     for i, window in enumerate(windows):
         builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
     title = tables.title or name.removesuffix(".toml").replace("_", " ")
-    return Setup(name, title, controller, plant, scenario, rig, sweep, windows, tables)
+    tune = build("tune")
+    return Setup(name, title, controller, plant, scenario, rig, sweep, windows, tables, tune)
 
 
 def _made_once(known: Known, key: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+from pydantic import Field
+
 from quell import features, guard, learners, signals
 from quell.controllers import (
     ADRC,
@@ -26,6 +28,8 @@ from quell.records.trajectory import Trajectory
 from quell.setup.schema import CallTable, call_table, list_of, one_of
 from quell.setup.sweep_table import sweep_table
 from quell.simulation.scenario import Scenario as SimulationScenario
+from quell.tuning.constraints import Constraints
+from quell.tuning.tune import tune
 
 
 def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
@@ -45,13 +49,20 @@ def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
     return {"device": device, "live": live, **options}
 
 
+def tuning(**options: Any) -> dict[str, Any]:
+    """Return the arguments of ``quell.tune`` for ``quell tune``."""
+    bounds = {name: options.pop(name) for name in (*options,) if name in _BOUNDS}
+    return {"constraints": Constraints(**bounds), **options}
+
+
 def _call_tables(
     functions: Mapping[str, Callable[..., Any]],
     types: Mapping[str, Any] | None = None,
     descriptions: Mapping[str, str] | None = None,
+    beside: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> dict[str, type[CallTable]]:
     return {
-        kind: call_table(kind, function, types=types, descriptions=descriptions)
+        kind: call_table(kind, function, types=types, descriptions=descriptions, beside=beside)
         for kind, function in functions.items()
     }
 
@@ -93,7 +104,9 @@ def _switchable(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
 
 
 # A plant may contain a plant, and a signal a signal: their types are names until all tables exist.
-PLANTS = _call_tables(plants.PLANTS, {"plant": "Plant"})
+_RANGES = Field(None, description="ranges [low, high] of its keys, for `quell tune` and sweeps.")
+_UNCERTAIN = {"uncertain": (dict[str, tuple[float, float]] | None, _RANGES)}
+PLANTS = _call_tables(plants.PLANTS, {"plant": "Plant"}, beside=_UNCERTAIN)
 _SWITCHING = {
     "until": "time at which `then` takes over [s].",
     "then": "signal or number from `until` on.",
@@ -154,6 +167,16 @@ Scenario = call_table("scenario", SimulationScenario, only=True, types=_SIGNALS)
 Metrics = call_table("metrics", Trajectory.metrics, only=True)
 Safety = call_table("safety", RigSafety, only=True)
 _RIG = {"safety": Safety | None, "telemetry": list_of(str)}
+_BOUNDS = tuple(inspect.signature(Constraints).parameters)
+_NOT_IN_FILES = ("constraints", "operating_point", "uncertain", "setup", "progress")
+Tune = call_table(
+    "tune",
+    tuning,
+    only=True,
+    forwards_to=(tune, Constraints),
+    types={"reference": Signal | None},
+    without=_NOT_IN_FILES,
+)
 _NO_KEYS = ("duration", "on_change", "overwrite")
 Sweep = call_table("sweep", sweep_table, only=True)
 Rig = call_table("rig", rig, only=True, forwards_to=(run_rig,), types=_RIG, without=_NO_KEYS)

@@ -58,6 +58,11 @@ class CallTable(Table):
     function: ClassVar[Callable[..., Any]]
     kind_name: ClassVar[str]  # the value of its key ``kind``
     context: ClassVar[tuple[str, ...]]  # the parameters that other tables of the file give
+    beside: ClassVar[tuple[str, ...]] = ()  # keys that are no arguments of the call
+
+    def written(self) -> dict[str, Any]:
+        """Return the arguments of the call that the file has."""
+        return {key: value for key, value in super().written().items() if key not in self.beside}
 
 
 def call_table(
@@ -69,6 +74,7 @@ def call_table(
     types: Mapping[str, Any] | None = None,
     descriptions: Mapping[str, str] | None = None,
     without: Sequence[str] = (),
+    beside: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> type[CallTable]:
     """Return the model of a table whose keys are the parameters of ``function``.
 
@@ -83,6 +89,8 @@ def call_table(
         types of keys that are tables, and descriptions that are not in the docstring, by name.
     without
         parameters that are no keys.
+    beside
+        further keys, which are no arguments of the call: type and field of each.
     """
     fields: dict[str, Any] = {}
     if not only:
@@ -104,10 +112,12 @@ def call_table(
                 kind_of_value = (types or {}).get(key) or _toml_type(_annotation(parameter, called))
                 default = _default(parameter, kind_of_value)
                 fields[key] = (kind_of_value, Field(default, description=known.get(key, "")))
+    fields |= beside or {}
     model = create_model(kind, __base__=CallTable, __doc__=summary(function), **fields)
     model.kind_name = kind
     model.function = staticmethod(function)
     model.context = tuple(context)
+    model.beside = tuple(beside or ())
     return model
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from quell import checks
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Constraints:
     """Bounds for a tuned loop; None and omitted bounds do not hold.
 

@@ -158,7 +158,7 @@ def tune(
         objective=objective,
         task=task,
         check=check,
-        setup=_setup(given, dt, plants) if setup is None else setup,
+        setup=_setup(given, dt, plants, setup),
         noise_bound=noise_bound,
     )
 
@@ -222,13 +222,18 @@ def _check(
     return checked(task.problem(), design.solution, plants, values, names)
 
 
-def _setup(given: Given, dt: float, plants: PlantSet) -> dict[str, Any]:
-    """Return the tables of a setup file with the first plant, and a step and a load."""
+def _setup(
+    given: Given, dt: float, plants: PlantSet, known: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Return the tables of a setup file: ``known``, else the first plant, a step, a load."""
     linear, delay = LinearPlant.of(given.linear[0]), float(given.delays[0])
     last = float(f"{_LASTS / plants.crossover:.2g}")
-    tables: dict[str, Any] = {"title": "Tuned controller", "dt": dt}
-    late = round(delay / dt) * dt
-    tables["plant"] = plant_table(linear, given.actuator_lag, late)
+    tables: dict[str, Any] = {"title": "Tuned controller", "dt": dt} | dict(known or {})
+    if "plant" not in tables:
+        late = round(delay / dt) * dt
+        tables["plant"] = plant_table(linear, given.actuator_lag, late)
+    if "scenario" in tables:
+        return tables
     scenario: dict[str, Any] = {"duration": last, "reference": {"kind": "step"}}
     if linear.disturbances == 1:
         scenario["disturbances"] = [{"kind": "step", "at": 0.5 * last}]

@@ -13,7 +13,7 @@ from quell.types import Matrix, Vector
 
 # Gains that are tried for each shape, and the cost of exceeding a bound by a factor e, in units of
 # the logarithm of the objective.
-_GAINS, _EXCESS = 40, 10.0
+_GAINS, _EXCESS = 80, 10.0
 # Gains around the one that comes with a shape: of a plant with a resonance or several integrators a
 # range of a factor of two may be stable.
 _OWN = np.array([0.5, 0.7, 1.0, 1.4, 2.0])

@@ -95,6 +95,8 @@ def design_of(
     measures, active = measured(problem, solution, constraints)
     k_i = float(structure.integral_gain(values[None, :])[0])
     size = math.exp(solution.cost)
+    tables = structure.tables(values)
+    tables["controller"] |= {name: limit for name, limit in u.items() if limit is not None}
     return Design(
         name=name,
         controller=structure.controller(values, **u),
@@ -103,7 +105,7 @@ def design_of(
         k_i=k_i,
         measures=measures,
         active=active,
-        tables=structure.tables(values),
+        tables=tables,
         solution=solution,
     )
 

@@ -24,10 +24,11 @@ from quell.tuning.structures import sampled_adrc
 from quell.tuning.structures.base import Model, Parameter
 from quell.types import Matrix, Vector
 
-# Bounds of a pole in units of the plant's phase crossover, and of the damping of a pair. Below the
-# least damping a pole of its own would ring. Chosen by hand.
+# Bounds of a pole in units of the plant's phase crossover, and of the damping of a pair. The law's
+# poles are those of the ideal response to the reference: with a damping of 0.6 it overshoots by
+# 9 %. The observer's poles show in no response to the reference.
 _SLOWEST = 1e-3
-_DAMPING = (0.1, 20.0)
+_DAMPING = {"c": (0.6, 20.0), "o": (0.1, 20.0)}
 # Bandwidths to start from: of the law in units of the plant's phase crossover, and of the observer
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
@@ -78,7 +79,7 @@ class AdrcStructure:
         found = []
         for i in range(count // 2):
             found.append(Parameter(f"omega_{which}{i + 1}", "rad/s", *bounds))
-            found.append(Parameter(f"damping_{which}{i + 1}", "", *_DAMPING))
+            found.append(Parameter(f"damping_{which}{i + 1}", "", *_DAMPING[which]))
         if count % 2:
             found.append(Parameter(f"pole_{which}", "rad/s", *bounds))
         return found

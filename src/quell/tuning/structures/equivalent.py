@@ -21,6 +21,8 @@ from quell.tuning.structures.adrc import AdrcStructure
 from quell.tuning.structures.pid import FilteredPID
 from quell.types import Matrix, Vector
 
+# Damping of the law's poles that is enough; it is the least one of the structure.
+_LEAST = 0.6
 # Values of b0 that are tried, over this range around the one that makes the slowest terms equal.
 _GAINS = np.logspace(-4.0, 4.0, 161)
 
@@ -48,19 +50,33 @@ def equivalents(pid: FilteredPID, values: Vector, adrc: AdrcStructure, most: int
         damping = float(np.min(-poles.real / np.abs(poles)))
         if damping > 0.0:
             split = _split(poles, order)
-            row = None if split is None else adrc.rows_of(b0, *split)
+            if split is None:
+                continue
+            row = adrc.rows_of(b0, *split)
             if row is not None:
-                rows.append((damping, row))
+                rows.append((min(damping, _damping(split[0]) / 6.0), row))
     rows.sort(key=lambda entry: -entry[0])
     kept = rows[:: max(len(rows) // most, 1)][:most]
     return np.array([row for _, row in kept]).reshape(-1, len(adrc.parameters))
 
 
 def _split(poles: Any, order: int) -> tuple[Any, Any] | None:
-    """Return the slowest ``order`` poles, conjugates together, and the others."""
+    """Return ``order`` poles for the law, conjugates together, and the others.
+
+    The feedback does not depend on the choice. The response to the reference does: the law gets the
+    slowest poles that are well damped, else the best damped ones.
+    """
+    found = []
     by_size = sorted(range(poles.size), key=lambda i: float(abs(poles[i])))
     for chosen in itertools.combinations(by_size, order):
         law = poles[list(chosen)]
         if abs(np.sum(law.imag)) < 1e-9 * np.max(np.abs(law)):
-            return law, np.delete(poles, list(chosen))
-    return None
+            found.append((law, np.delete(poles, list(chosen))))
+    for law, observer in found:
+        if _damping(law) >= _LEAST:
+            return law, observer
+    return max(found, key=lambda split: _damping(split[0]), default=None)
+
+
+def _damping(poles: Any) -> float:
+    return float(np.min(-poles.real / np.abs(poles)))

@@ -1,0 +1,78 @@
+"""What a setup file gives to ``quell.tune``: the plant, its ranges, constraints."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from quell.setup.build import linear_part
+from quell.setup.description import read
+from quell.setup.errors import SetupError
+from quell.setup.load import Setup, made
+from quell.setup.vary import changed
+
+# What a tuning replaces. A law without effect stands in for the controller.
+_REPLACED = ("observer", "controller", "learner", "guard", "prefilter")
+_NO_CONTROLLER = {"kind": "pid", "kp": 0.0}
+
+
+class TuningTask(NamedTuple):
+    """Arguments of ``quell.tune``."""
+
+    plant: Any  # a linear plant; with ranges, a function that makes it
+    dt: float  # [s]
+    options: dict[str, Any]  # all others
+    setup: Setup
+
+
+def tuning_task(
+    path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None
+) -> TuningTask:
+    """Read a setup file for ``quell.tune``; ``changes`` are values of ``[tune]`` by name.
+
+    Observer, controller, learner, guard and prefilter of the file are left out: they are what is
+    tuned. Dry friction and limits of the plant are left out, too; its limits of u stay.
+
+    Raises
+    ------
+    SetupError
+        as ``load``; for a file without plant, and for ranges that are none of the plant's keys.
+    """
+    name, data = read(path)
+    given = data.get("controller", {})
+    kept = {key: value for key, value in data.items() if key not in _REPLACED}
+    kept["controller"] = _NO_CONTROLLER
+    table = data.get("tune", {})
+    if isinstance(table, Mapping) and changes:
+        kept["tune"] = {**table, **changes}
+    setup = made(name, kept)
+    plant, ranges = setup.needed("plant"), _ranges(setup)
+    options = dict(setup.tune or {})
+    if isinstance(given, Mapping):
+        limits = ("u_min", "u_max", "rate_limit")
+        options = {key: given[key] for key in limits if key in given} | options
+    options["setup"] = {key: value for key, value in data.items() if key not in _REPLACED}
+    if not ranges:
+        return TuningTask(linear_part(plant), setup.controller.dt, options, setup)
+    for key in ranges:
+        _with(setup.file, kept, {key: ranges[key][0]})  # an unknown key is an error now
+
+    def make(**values: float) -> Any:
+        return linear_part(_with(name, kept, values).plant)
+
+    return TuningTask(make, setup.controller.dt, {**options, "uncertain": ranges}, setup)
+
+
+def _with(name: str, data: Mapping[str, Any], values: Mapping[str, float]) -> Setup:
+    changes = {f"plant.{key}": value for key, value in values.items()}
+    return made(name, changed(name, data, changes))
+
+
+def _ranges(setup: Setup) -> dict[str, tuple[float, float]]:
+    found = getattr(setup.description.plant, "uncertain", None)
+    if found == {}:
+        raise SetupError(
+            [f"{setup.file}: plant.uncertain: is empty; give a range, m1 = [0.6, 1.4]"]
+        )
+    return dict(found or {})
