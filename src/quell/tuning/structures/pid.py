@@ -21,8 +21,8 @@ from quell.types import Matrix, Vector
 _LITTLE = 0.03
 # Bounds of the times, in units of the time of one radian at the plant's phase crossover.
 _TIMES = (1e-4, 1e4)
-# Filter and integral times to start from where only a slow filter stabilises, in the same units: two
-# masses with a spring under SIMC have 2.8 and 34.
+# Filter and integral times to start from where only a slow filter stabilises, in the same units:
+# two masses with a spring under SIMC have 2.8 and 34.
 _PHASE_STABILISING, _SLOW = 2.8, (34.0, 120.0, 400.0)
 
 
