@@ -98,7 +98,7 @@ def test_another_record_validates_the_model() -> None:
     other = answer(([5.0], [1.0, 0.3, 2.0]), records[1][0], DT)
     wrong = ql.identify(*records[0], DT, order=2, validation=(records[1][0], other))
     assert wrong.fits["validation"] < 50.0
-    assert not wrong.residuals.independent
+    assert not wrong.residuals.white
     with pytest.raises(ValueError, match="validation: has 5 samples, must have at least"):
         ql.identify(*records[0], DT, order=2, validation=(np.arange(5.0), np.arange(5.0)))
 
