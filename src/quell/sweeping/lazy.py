@@ -69,7 +69,9 @@ def _array(store: Store, name: str, dtype: Any, fill: Any, read: Any) -> Any:
         def _values(self, key: tuple[Any, ...]) -> Any:
             return _read(store, name, dtype, fill, read or _numbers, key[0])
 
-    return indexing.LazilyIndexedArray(OverRuns())
+    # As those of xarray.open_dataset, values that were read stay in memory.
+    cached: Any = indexing.MemoryCachedArray
+    return cached(indexing.LazilyIndexedArray(OverRuns()))
 
 
 def _read(

@@ -170,11 +170,11 @@ class Plan:
     def describe(self, run: int) -> str:
         """Return the name of a run: its number, its parameters, its seed."""
         part = self.part(run, run + 1)
-        values = {}
-        for name, value in part.values(run).items():
-            texts = labels(self._lists.get(name, ()))
-            place = part.places(np.array(run))[1].get(name)
-            values[name] = value if texts is None else texts[int(place)]
+        places = part.places(np.array(run))[1]
+        values = part.values(run)
+        for name, each in self._lists.items():
+            texts = labels(each)
+            values[name] = values[name] if texts is None else texts[int(places[name])]
         return name_of(run, {name: values[name] for name in self.parameters}, part.seed(run))
 
     def digest(self) -> str:

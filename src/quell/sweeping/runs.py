@@ -28,8 +28,8 @@ ERROR = -1
 # Memory for the records of the runs that are simulated at once [bytes]: as quick as more, and many
 # workers fit into a machine. Runs at once: all 32 lanes of several groups are full. By hand.
 _RECORD_BYTES, _MOST_AT_ONCE = 16e6, 256
-# Seconds that the first runs may take to be repeated, without compilation, for their time. By hand.
-_WORTH_REPEATING = 5.0
+# Seconds for which runs are repeated to know their time. By hand.
+_TIMING = 2.0
 
 
 @dataclass(frozen=True)
@@ -85,25 +85,24 @@ def probe(job: Job, parts: Sequence[Part], more: Part) -> tuple[float, Outcome]:
     """Do the first run of each part; return the seconds for a run of many, and the outcome.
 
     This compiles the loops, or loads them from the disk cache, which all workers of a machine have
-    in common. The time is that of the runs in ``more`` if they are quick.
+    in common. The time is that of runs in ``more``.
     """
     outcome = Outcome.empty(job.measures, len(parts))
-    seconds = 0.0
-    for _ in range(2):
-        began = time.perf_counter()
-        for i, part in enumerate(parts):
-            found = run_part(job, part, [part.first])
-            outcome.status[i] = found.status[0]
-            if found.messages:
-                outcome.messages[i] = found.messages[0]
-        seconds = (time.perf_counter() - began) / len(parts)
-        if seconds * len(parts) > _WORTH_REPEATING:
-            return seconds, outcome
-    if seconds * (more.last - more.first) < _WORTH_REPEATING:
-        began = time.perf_counter()
-        run_part(job, more)
-        seconds = (time.perf_counter() - began) / (more.last - more.first)
-    return seconds, outcome
+    for i, part in enumerate(parts):
+        found = run_part(job, part, [part.first])
+        outcome.status[i] = found.status[0]
+        if found.messages:
+            outcome.messages[i] = found.messages[0]
+    seconds = _seconds(job, more, 1)
+    runs = min(int(_TIMING / max(seconds, 1e-9)), more.last - more.first)
+    return _seconds(job, more, runs) / runs if runs > 1 else seconds, outcome
+
+
+def _seconds(job: Job, part: Part, runs: int) -> float:
+    """Return how long the first runs of a part take [s]."""
+    began = time.perf_counter()
+    run_part(job, part, range(part.first, part.first + runs))
+    return time.perf_counter() - began
 
 
 def built(job: Job, part: Part, run: int) -> Parts:

@@ -80,7 +80,8 @@ def sweep(
     varied = [name for name, each in plan["parameters"].items() if _varies(each)]
     figures = {name: f"{setup.stem}-{_slug(name)}" for name in varied}
     outputs = check_outputs(outputs, list(figures.values()))
-    executor = "processes" if dask is None else dask
+    # One process does no more than one thread of this one, and takes longer to start.
+    executor = dask or ("threads" if workers == 1 else "processes")
     with _progress(console) as report:
         try:
             found = run_sweep(
