@@ -8,7 +8,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import cyclopts
 import pytest
+
+from quell.kernels.compile_time import compile_time
 
 from .commands import Shown, in_its_own_process
 
@@ -173,6 +176,23 @@ def test_a_mistake_gives_one_line_and_exit_code_two(
     assert shown.err.startswith("quell: ")
     assert len(shown.err.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("seconds", "lines"), [(12.3, 1), (0.2, 0)])
+def test_a_command_says_how_long_it_compiled(
+    quell: Callable[..., Shown],
+    monkeypatch: pytest.MonkeyPatch,
+    seconds: float,
+    lines: int,
+) -> None:
+    """One line at the end, if it took long enough to be noticed."""
+
+    def compiling(self: object, arguments: list[str]) -> None:
+        compile_time.seconds += seconds
+
+    monkeypatch.setattr(cyclopts.App, "__call__", compiling)
+    shown = quell("run")
+    assert shown.err.count("compiled code for 12.3 s; later runs load it") == lines
 
 
 def test_an_old_result_outlives_a_run_that_fails(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from numba.core.errors import NumbaError
 from quell.controllers.base import control
 from quell.controllers.compiled_step import PackedController, entry_point, step_packed
 from quell.kernels import dispatch
+from quell.kernels.compile_time import compile_time
 
 pytestmark = pytest.mark.compiled
 
@@ -51,6 +53,21 @@ def _square(shape: Square, factor: float) -> float:
 def total(one: Any, other: Any) -> float:
     """Add areas of any shapes."""
     return area(one, 1.0) + area(other, 2.0)
+
+
+def test_the_time_of_compiling_counts_once_for_an_entry_point_and_not_for_calls() -> None:
+    """What an entry point calls is compiled within it; a second call compiles nothing."""
+
+    @dispatch.compiled
+    def doubled(one: Any) -> float:
+        return 2.0 * total(one, one)
+
+    before, began = compile_time.seconds, time.perf_counter()
+    assert doubled(Circle(1.0)) == 18.0
+    took = compile_time.seconds - before
+    assert 0.0 < took < time.perf_counter() - began
+    doubled(Circle(2.0))
+    assert compile_time.seconds == before + took
 
 
 class MixedLaw(NamedTuple):

@@ -25,6 +25,9 @@ from quell.cli.commands.tune import tune
 from quell.cli.commands.two_mass import two_mass
 from quell.cli.exit_codes import HELP, ExitCode
 
+# A shorter time of compiling is not worth a line [s].
+_LONG = 1.0
+
 app = App(
     name="quell",
     help="Disturbance-rejection control that learns.",
@@ -43,7 +46,7 @@ for _each in (stress, compare, identify, tune, b0, excite, rig, run, run_rig, re
 
 def main() -> None:
     """Run the command line; print one line for each error of the user's, and exit with its code."""
-    format_before = warnings.formatwarning
+    format_before, compiled_before = warnings.formatwarning, _compile_time()
     warnings.formatwarning = _warning_line
     try:
         app()
@@ -62,6 +65,14 @@ def main() -> None:
         sys.exit(ExitCode.INTERRUPTED)
     finally:
         warnings.formatwarning = format_before
+        if (seconds := _compile_time() - compiled_before) >= _LONG:
+            print(f"quell: compiled code for {seconds:.1f} s; later runs load it", file=sys.stderr)
+
+
+def _compile_time() -> float:
+    """Return how long this process has compiled [s], without importing what compiles."""
+    module = sys.modules.get("quell.kernels.compile_time")
+    return 0.0 if module is None else float(module.compile_time.seconds)
 
 
 def _warning_line(message: Warning | str, *_: Any, **__: Any) -> str:

@@ -28,6 +28,7 @@ import numpy as np
 from numba.core import types as nb_types
 from numba.extending import overload, register_jitable
 
+import quell.kernels.compile_time  # noqa: F401  (counts from the first compilation on)
 from quell.kernels.cache import code_cache
 from quell.kernels.linking import KERNEL_OPTIONS, WithoutOverlaps
 from quell.kernels.overlaps import overlap
