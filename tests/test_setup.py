@@ -245,6 +245,19 @@ def test_tables_take_what_their_calls_take() -> None:
     assert guarded.controller.guard == ql.Guard(time=5.0)
 
 
+def test_a_cycle_is_a_signal_or_a_sum_of_signals() -> None:
+    """There and back, fifty times."""
+    scenario = setup(
+        "[scenario.reference]\nkind = 'repeated'\nperiod = 6.0\ncount = 50\n"
+        "cycle = [{kind = 'trapezoid'}, {kind = 'trapezoid', distance = -1.0, start = 3.0}]"
+    ).scenario
+    t = np.linspace(0.0, 400.0, 4001)
+    moves = ql.signals.Trapezoid() + ql.signals.Trapezoid(distance=-1.0, start=3.0)
+    np.testing.assert_array_equal(
+        scenario.reference(t), ql.signals.Repeated(moves, 6.0, count=50)(t)
+    )
+
+
 def test_signals_add_up_and_follow_each_other() -> None:
     """A list is a sum, ``until`` and ``then`` are ``Signal.until``, a text is a kind, a number a constant."""
     scenario = setup(

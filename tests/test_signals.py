@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -266,17 +267,51 @@ def test_a_signal_has_the_bits_of_its_formula_in_blocks_of_any_size(kind: str, s
     np.testing.assert_array_equal(signal(t[mixed]), expected[mixed])
 
 
+NEEDED: dict[str, dict[str, Any]] = {
+    "samples": {"times": [0.0, 1.0, 4.0], "values": [1.0, -2.0, 3.0]},
+    "repeated": {"cycle": s.Trapezoid(), "period": 3.0},
+}
+
+
 @pytest.mark.parametrize("kind", s.KINDS)
 def test_a_signal_of_each_kind_has_the_same_bits_in_blocks_and_alone(kind: str) -> None:
     """A run makes its signals in blocks; whoever plots them asks for all times at once."""
-    given = {"samples": {"times": [0.0, 1.0, 4.0], "values": [1.0, -2.0, 3.0]}}
-    signal = s.make(kind, **given.get(kind, {}))
+    signal = s.make(kind, **NEEDED.get(kind, {}))
     t = np.arange(-3, 20_000) * 1e-3
     for size in (1000, 8192):
         blocks = [signal(t[first : first + size]) for first in range(0, t.size, size)]
         np.testing.assert_array_equal(np.concatenate(blocks), signal(t))
     some = range(0, t.size, 777)
     np.testing.assert_array_equal([signal(t[k]) for k in some], signal(t)[some])
+
+
+def test_a_repeated_cycle_starts_again_every_period() -> None:
+    """Also where rounding puts a sample just before it; before the start and after the last it goes on."""
+    move = s.Trapezoid(2.0, 1.0, start=0.5)
+    signal = s.Repeated(move, period=0.7 * 3.0, count=3, start=1.0)
+    t = np.arange(1000) * 0.01
+    k = np.minimum(np.maximum((np.arange(1000) - 100) // 210, 0), 2)
+    np.testing.assert_allclose(
+        signal(t), move((np.arange(1000) - 100 - 210 * k) * 0.01), atol=1e-12
+    )
+    assert signal(0.0) == 0.0
+    assert signal(100.0) == 2.0
+    np.testing.assert_allclose(
+        signal.derivative()(t),
+        move.derivative()((np.arange(1000) - 100 - 210 * k) * 0.01),
+        atol=1e-9,
+    )
+    square = s.Repeated(s.Constant(1.0).until(0.5, then=-1.0), period=1.0)
+    np.testing.assert_array_equal(
+        square([0.0, 0.5, 0.99, 1.0, 1e4, 1e4 + 0.5]), [1, -1, -1, 1, 1, -1]
+    )
+    noise = s.Repeated(s.BandLimitedNoise(1.0, 0.1), period=1.0)
+    np.testing.assert_array_equal(noise(t[:100] + 0.05), noise(t[:100] + 7.05))
+    assert np.any(noise.seeded(1)(t) != noise.seeded(2)(t))
+    assert s.Repeated(3.0, 1.0)(2.5) == 3.0
+    for wrong in ({"period": 0.0}, {"count": 0}, {"count": 1.5}, {"start": np.inf}, {"cycle": "x"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            s.Repeated(**({"cycle": move, "period": 1.0} | wrong))
 
 
 def test_a_seed_gives_the_same_draws_for_ever() -> None:
@@ -319,9 +354,7 @@ def test_every_kind_is_made_by_its_name() -> None:
     """The names of scenario files give the same signals as the classes."""
     assert s.make("sinusoid", omega=2.0) == s.Sinusoid(omega=2.0)
     for kind, cls in s.KINDS.items():
-        assert isinstance(
-            s.make(kind, times=[0.0], values=[1.0]) if kind == "samples" else s.make(kind), cls
-        )
+        assert isinstance(s.make(kind, **NEEDED.get(kind, {})), cls)
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,7 @@ LEARNERS: dict[str, Any] = (
     }
     | {
         "Kalman with u": ql.learners.Kalman(u=True),
+        "Harmonic with search": ql.learners.Harmonic(count=2, orders=(1, 3), search=True),
         "a model of one's own": ql.learners.Online(OwnModel(), State() + Input()),
         "RLS with u": ql.learners.RLS(State() + Polynomial() + Bias() + Input()),
         "RLS on the strongest": ql.learners.RLS(

@@ -112,7 +112,7 @@ _SWITCHING = {
     "then": "signal or number from `until` on.",
 }
 _SWITCHABLE = {kind: _switchable(cls) for kind, cls in signals.KINDS.items()}
-SIGNALS = _call_tables(_SWITCHABLE, {"then": "Signal | None"}, _SWITCHING)
+SIGNALS = _call_tables(_SWITCHABLE, {"then": "Signal | None", "cycle": "Signal"}, _SWITCHING)
 Plant: Any = one_of(PLANTS)
 Signal: Any = one_of(SIGNALS, number=True, many=one_of(SIGNALS, number=True))
 for _model in (*PLANTS.values(), *SIGNALS.values()):

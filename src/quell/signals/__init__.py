@@ -20,12 +20,13 @@ from quell import checks
 from quell.signals.base import Constant, Scaled, Signal, Sum, Switched, as_signal, seeded_apart
 from quell.signals.excitation import PRBS, Multisine
 from quell.signals.noise import BandLimitedNoise
+from quell.signals.repeated import Repeated
 from quell.signals.shapes import Chirp, Ramp, Samples, Sinusoid, SmoothMove, Step, Trapezoid
 
 __all__ = [
-    "KINDS", "PRBS", "BandLimitedNoise", "Chirp", "Constant", "Multisine", "Ramp", "Samples",
-    "Scaled", "Signal", "Sinusoid", "SmoothMove", "Step", "Sum", "Switched", "Trapezoid",
-    "as_signal", "make", "seeded_apart",
+    "KINDS", "PRBS", "BandLimitedNoise", "Chirp", "Constant", "Multisine", "Ramp", "Repeated",
+    "Samples", "Scaled", "Signal", "Sinusoid", "SmoothMove", "Step", "Sum", "Switched",
+    "Trapezoid", "as_signal", "make", "seeded_apart",
 ]  # fmt: skip
 
 KINDS: Mapping[str, type[Signal]] = {
@@ -39,6 +40,7 @@ KINDS: Mapping[str, type[Signal]] = {
     "trapezoid": Trapezoid,
     "move": SmoothMove,
     "samples": Samples,
+    "repeated": Repeated,
     "noise": BandLimitedNoise,
 }
 """The signals that setup files can have, by their ``kind``."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from quell import checks
 from quell.learners.kalman.kalman import Kalman
 from quell.learners.kalman.oscillators import Oscillators
+from quell.learners.kalman.search import NoSearch, frequency_search
 from quell.observers.eso import ESO
 
 # Initial frequencies by default: omega_c, then each this multiple of the one before. This and the
@@ -19,6 +21,8 @@ _SPREAD = 0.3
 _LOWEST, _HIGHEST = 0.02, 0.5
 # Default bandwidth of the pairs as a multiple of the bias's bandwidth.
 _PAIR_BANDWIDTH = 2.5
+# Most sinusoids: the time of a sample grows with the square of their number. And the highest order.
+_MOST_PAIRS, _HIGHEST_ORDER = 16, 1000
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,16 @@ class Harmonic(Kalman):
         initial frequencies [rad/s] within ``limits``, one for each sinusoid; by default ``omega_c``
         of the controller, 0.3 omega_c, 0.09 omega_c …
     limits
-        least and largest frequency [rad/s]; ``0.02 omega_c`` and ``0.5 omega_o`` by default.
+        least and largest frequency [rad/s]; ``0.02 omega_c`` and ``0.5 omega_o`` by default, or the
+        largest with which the highest order is at ``omega_o``.
+    orders
+        multiples of each frequency that a load may contain, different whole numbers from 1, the
+        strongest first: for example (1, 3, 5, 7) for a square wave. Together ``count`` and
+        ``orders`` make 16 sinusoids at most.
+    search
+        whether frequencies are searched in the past (``search.py``), instead of near the initial
+        ones alone. It separates sinusoids whose frequencies differ by a factor of 1.2 within a
+        beat period, and finds loads of several orders.
     pair_bandwidth
         bandwidth λ with which the sinusoids follow [rad/s]; 2.5 times that of the bias by default.
         An oscillator at ω learns at about the rate ``ω · pair_bandwidth / bias_bandwidth``.
@@ -53,11 +66,15 @@ class Harmonic(Kalman):
     count: int = 1
     omegas: Sequence[float] | None = None
     limits: tuple[float, float] | None = None
+    orders: Sequence[int] = (1,)
+    search: bool = False
     pair_bandwidth: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.whole("count", self.count, 1, 8)
+        checks.flag("search", self.search)
+        self._check_orders()
         if self.omegas is not None:
             for omega in checks.vector("omegas", self.omegas, self.count).tolist():
                 checks.positive("omegas", omega, "rad/s")
@@ -69,6 +86,18 @@ class Harmonic(Kalman):
         if self.pair_bandwidth is not None:
             checks.positive("pair_bandwidth", self.pair_bandwidth, "rad/s")
 
+    def _check_orders(self) -> None:
+        if not checks.is_sequence(self.orders) or len(self.orders) == 0:
+            rule = "must be a tuple of whole numbers, for example (1, 3, 5)"
+            raise ValueError(f"orders = {self.orders!r}: {rule}")
+        for i, order in enumerate(self.orders):
+            checks.whole(f"orders[{i}]", order, 1, _HIGHEST_ORDER)
+        if len(set(self.orders)) < len(self.orders):
+            raise ValueError(f"orders = {self.orders!r}: must not repeat an order")
+        if self.count * len(self.orders) > _MOST_PAIRS:
+            rule = f"must make {_MOST_PAIRS} sinusoids at most"
+            raise ValueError(f"count = {self.count}, orders = {self.orders!r}: {rule}")
+
     def oscillators(self, observer: ESO, omega_c: float) -> tuple[Oscillators, float]:
         """Return the parameters of the oscillators, and the bandwidth of their pairs [rad/s].
 
@@ -78,6 +107,8 @@ class Harmonic(Kalman):
             for an initial frequency outside of the limits.
         """
         low, high = _LOWEST * omega_c, _HIGHEST * observer.omega_o
+        if len(self.orders) > 1:
+            high = min(high, observer.omega_o / max(self.orders))
         if self.limits is not None:
             low, high = self.limits
         if self.omegas is None:
@@ -92,11 +123,23 @@ class Harmonic(Kalman):
         if bandwidth is None:
             bias = observer.omega_o if self.bias_bandwidth is None else self.bias_bandwidth
             bandwidth = _PAIR_BANDWIDTH * bias
-        return Oscillators(first, start, float(low), float(high)), bandwidth
+        orders = np.array(self.orders, dtype=np.float64)
+        return Oscillators(first, start, float(low), float(high), orders), bandwidth
+
+    def frequency_search(self, observer: ESO, omega_c: float, oscillators: Oscillators) -> Any:
+        """Return the parameters of the search for frequencies, if there is one."""
+        return frequency_search(observer, omega_c, oscillators) if self.search else NoSearch()
 
     def feature_names(self, order: int) -> tuple[str, ...]:
-        """Return ``("x1", …, "bias", "sin1", "cos1", …, "u")``, as far as they are features."""
+        """Return ``("x1", …, "bias", "sin1", "cos1", …, "u")``, as far as they are features.
+
+        With several orders the sinusoids are ``"sin1 ·1", "cos1 ·1", "sin1 ·3", …``.
+        """
         names = super().feature_names(order)
-        pairs = tuple(f"{wave}{j + 1}" for j in range(self.count) for wave in ("sin", "cos"))
+        several = len(self.orders) > 1
+        labels = [
+            f"{j + 1}" + f" ·{order}" * several for j in range(self.count) for order in self.orders
+        ]
+        pairs = tuple(f"{wave}{label}" for label in labels for wave in ("sin", "cos"))
         split = len(names) - self.u
         return (*names[:split], *pairs, *names[split:])

@@ -12,6 +12,7 @@ import numpy as np
 from quell import checks
 from quell.learners.kalman.kernels import KalmanAverages, KalmanDesign, KalmanMemory
 from quell.learners.kalman.oscillators import Oscillators
+from quell.learners.kalman.search import NoSearch, search_memory
 from quell.learners.lag import lag_memory, lag_of
 from quell.learners.noise_gate import AVERAGING_LAGS, SIGNAL_TO_NOISE, relative_noise
 from quell.observers.eso import ESO
@@ -101,7 +102,7 @@ class Kalman:
         def by_feature(state: Any, bias: float, pair: float, u: float) -> Vector:
             """Return one number for each feature."""
             states = np.broadcast_to(state, n)[: n * self.state]
-            pairs = np.full(2 * oscillators.omega.size, pair)
+            pairs = np.full(2 * oscillators.omega.size * oscillators.orders.size, pair)
             return np.concatenate([states, [bias] * self.bias, pairs, [u] * self.u])
 
         return KalmanDesign(
@@ -115,6 +116,7 @@ class Kalman:
             states=n * self.state,
             bias=self.bias,
             oscillators=oscillators,
+            search=self.frequency_search(observer, omega_c, oscillators),
             with_u=self.u,
             slope_low=self.gain_interval[0] - 1.0,
             slope_high=self.gain_interval[1] - 1.0,
@@ -125,7 +127,12 @@ class Kalman:
 
     def oscillators(self, observer: ESO, omega_c: float) -> tuple[Oscillators, float]:
         """Return the parameters of the oscillators, here none, and the bandwidth of their pairs."""
-        return Oscillators(observer.order * self.state + self.bias, np.zeros(0), 0.0, 0.0), 0.0
+        first, none = observer.order * self.state + self.bias, np.zeros(0)
+        return Oscillators(first, none, 0.0, 0.0, none), 0.0
+
+    def frequency_search(self, observer: ESO, omega_c: float, oscillators: Oscillators) -> Any:
+        """Return the parameters of the search for frequencies, here none."""
+        return NoSearch()
 
     def memory(self, parameters: KalmanDesign) -> KalmanMemory:
         """Return a state with nothing learned."""
@@ -142,6 +149,7 @@ class Kalman:
             phase=np.zeros(parameters.oscillators.omega.size),
             omega=parameters.oscillators.omega.copy(),
             averages=KalmanAverages.zeros(),
+            search=search_memory(parameters.search, parameters.oscillators),
         )
 
     def feature_names(self, order: int) -> tuple[str, ...]:

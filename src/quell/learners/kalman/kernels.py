@@ -45,13 +45,25 @@ from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
-from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
+from quell.learners.kalman.oscillators import (
+    Oscillators,
+    combined,
+    open_pairs,
+    push_pairs,
+    retune,
+    turn_phases,
+)
+from quell.learners.kalman.search import advance_search, is_locked, start_search_again
+from quell.learners.kalman.search_verdict import LEARN_ANEW
 from quell.learners.lag import STARTUP_LAGS, lag_push, reset_lag
 from quell.learners.noise_gate import RESOLUTION
 from quell.types import Matrix, Vector
 
 # Least share of f that counts as unexplained by a linear model; chosen by hand, not tuned further.
 _UNEXPLAINED_SHARE = 0.1
+# Variance of amplitudes that are to be learned anew, in units of R: they may be 10⁴ times what is
+# unexplained. Chosen by hand: a hundred times less delays the result, more changes nothing.
+_UNKNOWN = 1e8
 
 
 class KalmanDesign(NamedTuple):
@@ -71,6 +83,7 @@ class KalmanDesign(NamedTuple):
     states: Size  # n, or 0 without state features
     bias: Flag
     oscillators: Oscillators
+    search: Any  # for the frequencies of the oscillators
     with_u: Flag
     slope_low: float  # least θ_u in scaled units
     slope_high: float  # largest θ_u in scaled units
@@ -102,6 +115,7 @@ class KalmanMemory(NamedTuple):
     phase: Vector  # ψ of each oscillator [rad] (m,)
     omega: Vector  # ω̂ of each oscillator [rad/s] (m,)
     averages: NDArray[KalmanAverages]  # (1,)
+    search: Any
 
 
 @adapt.register(KalmanDesign)
@@ -131,6 +145,10 @@ def _adapt(
     _update_regressor(learner, memory, noise, weight)
     if averages.time <= STARTUP_LAGS * learner.lag_time:
         return
+    result = advance_search(learner.search, memory.search, f_plain, memory.omega)
+    # Many orders that are learned anew at once upset the loop: they explain almost anything.
+    if result == LEARN_ANEW and learner.oscillators.orders.size == 1:
+        open_pairs(learner.oscillators, covariance, _UNKNOWN / learner.lag_time)
     spread = 0.0
     for i in range(size):
         total = 0.0
@@ -160,12 +178,10 @@ def _adapt(
                 covariance[i, i] += (
                     learner.walk[i] * learner.dt * deviation * deviation / memory.variance[i]
                 )
-    step = inverse * innovation
+    step, unexplained = inverse * innovation, averages.unexplained
     for j in range(memory.omega.size):
-        at = learner.oscillators.first + 2 * j
-        change_s, change_c = step * gain[at], step * gain[at + 1]
-        unexplained = averages.unexplained
-        retune(learner.oscillators, memory.omega, j, theta, change_s, change_c, unexplained)
+        if not is_locked(learner.search, memory.search, j):
+            retune(learner.oscillators, memory.omega, j, theta, gain, step, unexplained)
 
 
 @kernel
@@ -211,15 +227,13 @@ def _update_regressor(
 def _predict(
     learner: KalmanDesign, memory: KalmanMemory, seen: Vector, u_before: float
 ) -> tuple[float, float]:
-    theta, phase = memory.theta, memory.phase
+    theta = memory.theta
     constant = 0.0
     for i in range(learner.states):
         constant += theta[i] * learner.scale[i] * seen[i]
     if learner.bias:
         constant += theta[learner.states]
-    for j in range(phase.size):
-        at = learner.oscillators.first + 2 * j
-        constant += theta[at] * math.sin(phase[j]) + theta[at + 1] * math.cos(phase[j])
+    constant = combined(learner.oscillators, memory.phase, theta, constant)
     last = theta.size - 1
     slope = theta[last] * learner.scale[last] if learner.with_u else 0.0
     return constant, slope
@@ -234,10 +248,7 @@ def _commit(
         filtered[i] = lag_push(learner.lag, chain, i, learner.scale[i] * seen[i])
     if learner.bias:
         filtered[learner.states] = lag_push(learner.lag, chain, learner.states, 1.0)
-    for j in range(memory.phase.size):
-        at = learner.oscillators.first + 2 * j
-        filtered[at] = lag_push(learner.lag, chain, at, math.sin(memory.phase[j]))
-        filtered[at + 1] = lag_push(learner.lag, chain, at + 1, math.cos(memory.phase[j]))
+    push_pairs(learner.oscillators, learner.lag, chain, filtered, memory.phase)
     turn_phases(memory.phase, memory.omega, learner.dt)
     if learner.with_u:
         last = filtered.size - 1
@@ -246,15 +257,16 @@ def _commit(
 
 @restart.register(KalmanDesign)
 def _restart(learner: KalmanDesign, memory: KalmanMemory) -> None:
-    _reset_filters(memory)
+    _reset_filters(learner, memory)
     memory.averages[0].time = 0.0
     if not _all_finite(memory):
         forget(learner, memory)
 
 
 @kernel
-def _reset_filters(memory: KalmanMemory) -> None:
+def _reset_filters(learner: KalmanDesign, memory: KalmanMemory) -> None:
     reset_lag(memory.chain)
+    start_search_again(learner.search, memory.search)
     for i in range(memory.filtered.size):
         memory.filtered[i] = 0.0
 
@@ -276,7 +288,7 @@ def _all_finite(memory: KalmanMemory) -> bool:
 
 @forget.register(KalmanDesign)
 def _forget(learner: KalmanDesign, memory: KalmanMemory) -> None:
-    _reset_filters(memory)
+    _reset_filters(learner, memory)
     clear(memory.averages)
     for j in range(memory.omega.size):
         memory.phase[j] = 0.0

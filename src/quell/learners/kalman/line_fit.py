@@ -1,0 +1,190 @@
+"""Least-squares fit of sinusoids of unknown frequency to past samples, a few samples at a time.
+
+In a *pass* over the samples z at the times t = 0, −1, … of a window, the model
+
+    z = c + Σ_j Σ_k a_jk sin(k ω_j t) + b_jk cos(k ω_j t)
+
+with m frequencies ω and p orders k each is linearised in ω, and its normal equations are added up:
+
+    z = c + Σ (a s + b c)_jk + Σ_j δω_j t Σ_k k (a_jk c_jk − b_jk s_jk),    s_jk = sin(k ω_j t), …
+
+At the end of the pass a, b, c and δω are solved for: a step of Gauss and Newton for the least
+squares over all parameters, which for white noise is the most likely answer (Rife & Boorstyn,
+*Multiple tone parameter estimation from discrete-time observations*, Bell System Technical Journal
+55 (1976)). In passes of few samples the work for a sample of the loop is small and constant.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from quell.kernels.dispatch import kernel
+from quell.types import Matrix, Vector
+
+# A column whose part that others do not explain is below this share of its square is left out.
+_DEPENDENT = 1e-11
+# Standard deviation of a frequency of which nothing is known: beyond all frequencies [rad/sample].
+_UNKNOWN = 10.0
+
+
+class LineFit(NamedTuple):
+    """State of a fit of up to m frequencies with p orders; C = 1 + 2mp + m."""
+
+    omega: Vector  # frequencies ω [rad/sample] (m,)
+    amplitude: Vector  # a, b of each pair (2mp,)
+    wave: Vector  # sin and cos of each pair at this row (2mp,)
+    turn: Vector  # sin and cos of the angle from one row to the next (2mp,)
+    column: Vector  # the row of the regression (C,)
+    gram: Matrix  # sums of its squares, then their Cholesky factor (C, C)
+    moment: Vector  # sums of its products with z (C,)
+    solution: Vector  # c, a, b, δω (C,)
+    deviation: Vector  # standard deviation of each frequency [rad/sample] (m,)
+    square: Vector  # sum of z² (1,)
+
+
+def line_fit(count: int, orders: int) -> LineFit:
+    """Return the state of a fit of up to ``count`` frequencies with ``orders`` orders each."""
+    pairs = 2 * count * orders
+    size = 1 + pairs + count
+    return LineFit(
+        omega=np.zeros(count),
+        amplitude=np.zeros(pairs),
+        wave=np.zeros(pairs),
+        turn=np.zeros(pairs),
+        column=np.zeros(size),
+        gram=np.zeros((size, size)),
+        moment=np.zeros(size),
+        solution=np.zeros(size),
+        deviation=np.zeros(count),
+        square=np.zeros(1),
+    )
+
+
+@kernel
+def begin_pass(orders: Vector, fit: LineFit, omega: Vector, scale: float, found: int) -> None:
+    """Begin a pass with the first ``found`` frequencies of ``scale · omega``."""
+    for j in range(found):
+        for k in range(orders.size):
+            at = 2 * (j * orders.size + k)
+            angle = -orders[k] * scale * omega[j]
+            fit.turn[at], fit.turn[at + 1] = math.sin(angle), math.cos(angle)
+            fit.wave[at], fit.wave[at + 1] = 0.0, 1.0
+    fit.square[0] = 0.0
+    for i in range(fit.moment.size):
+        fit.moment[i] = 0.0
+        for j in range(fit.moment.size):
+            fit.gram[i, j] = 0.0
+
+
+@kernel
+def shift_amplitudes(orders: Vector, fit: LineFit, found: int, later: float) -> None:
+    """Let the amplitudes refer to a time that is ``later`` by so many samples."""
+    for j in range(found):
+        for k in range(orders.size):
+            at = 2 * (j * orders.size + k)
+            sine = math.sin(orders[k] * fit.omega[j] * later)
+            cosine = math.cos(orders[k] * fit.omega[j] * later)
+            a, b = fit.amplitude[at], fit.amplitude[at + 1]
+            fit.amplitude[at] = a * cosine - b * sine
+            fit.amplitude[at + 1] = a * sine + b * cosine
+
+
+@kernel
+def fitted(fit: LineFit, pairs: int) -> float:
+    """Return the value of the sinusoids at this row."""
+    total = 0.0
+    for i in range(pairs):
+        total += fit.amplitude[i] * fit.wave[i]
+    return total
+
+
+@kernel
+def next_row(fit: LineFit, pairs: int) -> None:
+    """Turn the waves to the next row."""
+    for at in range(0, pairs, 2):
+        sine, cosine = fit.wave[at], fit.wave[at + 1]
+        fit.wave[at] = sine * fit.turn[at + 1] + cosine * fit.turn[at]
+        fit.wave[at + 1] = cosine * fit.turn[at + 1] - sine * fit.turn[at]
+
+
+@kernel
+def add_row(orders: Vector, fit: LineFit, found: int, time: float, value: float) -> None:
+    """Add ``value``, the sample at ``time``, to the normal equations."""
+    column, pairs = fit.column, 2 * orders.size * found
+    size = 1 + pairs + found
+    column[0] = 1.0
+    for i in range(pairs):
+        column[1 + i] = fit.wave[i]
+    for j in range(found):
+        slope = 0.0
+        for k in range(orders.size):
+            at = 2 * (j * orders.size + k)
+            slope += orders[k] * (
+                fit.amplitude[at] * fit.wave[at + 1] - fit.amplitude[at + 1] * fit.wave[at]
+            )
+        column[1 + pairs + j] = time * slope
+    fit.square[0] += value * value
+    for i in range(size):
+        fit.moment[i] += column[i] * value
+        for j in range(i + 1):
+            fit.gram[i, j] += column[i] * column[j]
+
+
+@kernel
+def solve(fit: LineFit, linear: int, size: int) -> tuple[float, float]:
+    """Solve the first ``size`` normal equations; the first ``linear`` are those of c, a, b.
+
+    Return the sums of squares about the mean, and of what c, a and b do not explain.
+    """
+    gram, moment, solution = fit.gram, fit.moment, fit.solution
+    left = about_mean = unexplained = fit.square[0]
+    for i in range(size):
+        whole = gram[i, i]
+        for j in range(i + 1):
+            total = gram[i, j]
+            for k in range(j):
+                total -= gram[i, k] * gram[j, k]
+            if j < i:
+                gram[i, j] = total / gram[j, j] if gram[j, j] > 0.0 else 0.0
+            else:
+                gram[i, i] = math.sqrt(total) if total > _DEPENDENT * whole else 0.0
+        total = moment[i]
+        for k in range(i):
+            total -= gram[i, k] * moment[k]
+        moment[i] = total / gram[i, i] if gram[i, i] > 0.0 else 0.0
+        left -= moment[i] * moment[i]
+        if i == 0:
+            about_mean = left
+        if i == linear - 1:
+            unexplained = left
+    for back in range(size):
+        i = size - 1 - back
+        total = moment[i]
+        for k in range(i + 1, size):
+            total -= gram[k, i] * solution[k]
+        solution[i] = total / gram[i, i] if gram[i, i] > 0.0 else 0.0
+    return max(about_mean, 0.0), max(unexplained, 0.0)
+
+
+@kernel
+def write_deviations(fit: LineFit, linear: int, size: int, noise: float) -> None:
+    """Write the standard deviations of the frequencies for residuals of variance ``noise``.
+
+    They are the roots of the last diagonal elements of the inverse of the normal matrix, whose
+    Cholesky factor ``solve`` has left; at most 10 rad/sample, for what is not determined.
+    """
+    gram, column = fit.gram, fit.column
+    for j in range(linear, size):
+        total = 0.0
+        for i in range(j, size):
+            value = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                value -= gram[i, k] * column[k]
+            column[i] = value / gram[i, i] if gram[i, i] > 0.0 else 0.0
+            total += column[i] * column[i]
+        determined = gram[j, j] > 0.0
+        deviation = math.sqrt(noise * total) if determined else _UNKNOWN
+        fit.deviation[j - linear] = min(deviation, _UNKNOWN)
