@@ -356,7 +356,7 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
         ({"build": lambda m1: m1}, "none of 1 runs that were tried works: build returned 1.0"),
         (
             {"executor": "processes", "build": lambda m1: build(m1)},
-            "can't be sent to another process",
+            "build and functions in metrics must be functions",
         ),
         ({"executor": "tcp://127.0.0.1"}, "no scheduler answers there"),
         ({"runs_per_file": 0}, "runs_per_file = 0"),

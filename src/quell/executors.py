@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
@@ -19,6 +20,7 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
+from multiprocessing.reduction import ForkingPickler
 from typing import Any, TypeAlias, TypeVar
 from urllib.parse import urlsplit
 
@@ -106,15 +108,42 @@ def completed(
             if not pending:
                 return
             for future in wait(pending, return_when=FIRST_COMPLETED).done:
-                yield pending.pop(future), future.result()
-    except BrokenExecutor:
-        raise ChildProcessError(
-            "a worker process ended before its task was done; the machine may have too little "
-            "memory for so many workers"
-        ) from None
+                yield pending.pop(future), result_of(future)
     finally:
         for future in pending:
             future.cancel()
+
+
+def result_of(future: Future[R]) -> R:
+    """Return the result of a task; errors of its executor are one line.
+
+    Raises
+    ------
+    ChildProcessError
+        if a worker or the scheduler ended.
+    """
+    try:
+        return future.result()
+    except BrokenExecutor:
+        why = "the machine may have too little memory for so many workers"
+    except CancelledError:
+        why = "the scheduler of the cluster does not answer any more"
+    except Exception as error:
+        if type(error).__name__ != "KilledWorker":  # Dask's, after four workers died at one task
+            raise
+        why = "it ended several workers of the cluster; they may have too little memory"
+    raise ChildProcessError(f"a task could not be done: {why}")
+
+
+def check_sendable(what: str, value: Any) -> None:
+    """Raise a ``ValueError`` if ``value`` can't be sent to another process."""
+    try:
+        ForkingPickler.dumps(value)
+    except Exception as error:  # it calls functions of the user's
+        raise ValueError(
+            f"executor = 'processes': {what} must be functions of a module that other "
+            f"processes can import ({' '.join(str(error).split())}); or take executor='threads'"
+        ) from None
 
 
 def _processes(workers: int) -> ProcessPoolExecutor:

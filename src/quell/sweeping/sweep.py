@@ -6,7 +6,6 @@ import hashlib
 import inspect
 import json
 import os
-import pickle
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -17,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.executors import Where, completed, executor_on
+from quell.executors import Where, check_sendable, completed, executor_on, result_of
 from quell.parallel import one_blas_thread
 from quell.sweeping.measures import as_measures
 from quell.sweeping.plan import Plan
 from quell.sweeping.result import Sweep
-from quell.sweeping.runs import Job, Outcome, Parts, built, probe, run_part
+from quell.sweeping.runs import Job, Parts, built, probe, run_part
 from quell.sweeping.store import Store, describe_measures, existing_store, hash_of, new_store
 from quell.types import DesignWarning
 
@@ -113,7 +112,7 @@ def sweep(
     job = Job(build, measures, tuple(record), checks.flag("exact", exact), takes_seed)
     checks.optional(checks.whole, "runs_per_file", runs_per_file, 1)
     if executor == "processes":
-        _check_picklable(job)
+        check_sendable("build and functions in metrics", job)
     about = _about(plan, job, checked)
     store = existing_store(folder, about)
     if store is not None and not store.missing():
@@ -159,7 +158,7 @@ def _runs_per_file(pool: Executor, plan: Plan, job: Job, given: int | None) -> i
     tried = np.unique(np.linspace(0, plan.runs - 1, min(_TRIED, plan.runs)).astype(int)).tolist()
     parts = [plan.part(run, run + 1) for run in tried]
     more = plan.part(0, min(_TIMED, plan.runs))
-    seconds, outcome = pool.submit(probe, job, parts, more).result()
+    seconds, outcome = result_of(pool.submit(probe, job, parts, more))
     if len(outcome.messages) == len(parts):
         raise ValueError(f"none of {len(parts)} runs that were tried works: {outcome.messages[0]}")
     if given is not None:
@@ -177,7 +176,7 @@ def _check_unchanged(pool: Executor, plan: Plan, job: Job, store: Store) -> None
     done = next((first for first, _ in store.parts() if first not in missing), None)
     if done is None:
         return
-    again: Outcome = pool.submit(run_part, job, plan.part(done, done + 1)).result()
+    again = result_of(pool.submit(run_part, job, plan.part(done, done + 1)))
     stored = Sweep(store).dataset.isel(run=done)
     for name, values in again.measures.items():
         if not np.array_equal(values[0], stored[name].item(), equal_nan=True):
@@ -253,16 +252,6 @@ def _checked_limits(limits: Mapping[str, float], names: Sequence[str]) -> dict[s
             raise ValueError(f"limits[{name!r}]: is none of the metrics, {hint}")
         checks.finite(f"limits[{name!r}]", value)
     return {name: float(value) for name, value in limits.items()}
-
-
-def _check_picklable(job: Job) -> None:
-    try:
-        pickle.dumps(job)
-    except Exception as error:  # pickling calls functions of the user's
-        raise ValueError(
-            f"build = {job.build!r:.60}: can't be sent to another process ({error}); define it, "
-            "and functions in metrics, at the top of a module, or use threads"
-        ) from None
 
 
 @contextmanager

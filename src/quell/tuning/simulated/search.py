@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import pickle
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -14,7 +13,7 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import Controller
-from quell.executors import Where, completed, executor_on
+from quell.executors import Where, check_sendable, completed, executor_on
 from quell.tuning.simulated.cma import Generations
 from quell.tuning.simulated.problem import Problem
 from quell.tuning.simulated.result import Candidate, Search
@@ -135,7 +134,7 @@ def search(
     sampler = _default_sampler(space, problem) if sampler is None else sampler
     generations = Generations(space, first[0] if first else None) if sampler == "cma" else None
     if executor == "processes":
-        _check_picklable(evaluate)
+        check_sendable("build, scores and violation", evaluate)
     with executor_on(executor, workers) as pool, warnings.catch_warnings():
         warnings.simplefilter("ignore", DesignWarning)  # a candidate may be unwise: it is judged
         while True:
@@ -165,16 +164,6 @@ def _default_sampler(space: Space, problem: Problem) -> str:
     if len(problem.statistics) > 1:
         return "nsga2"
     return "cma" if len(space) > 1 else "tpe"
-
-
-def _check_picklable(evaluate: Any) -> None:
-    try:
-        pickle.dumps(evaluate)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise ValueError(
-            f"executor = 'processes': build, scores and violation must be functions of a module, "
-            f"which other processes can import ({error}); or take executor='threads'"
-        ) from None
 
 
 def _about(space: Space, problem: Problem, seed: int) -> dict[str, Any]:
