@@ -140,11 +140,10 @@ def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
         app(["compare", "--k", "0.5", "--dt", "0.01", "--controllers", ",".join(names), *where])
     shown = capsys.readouterr().out
     assert "…" not in shown, "a column is cut"
-    lines = {
-        line.split()[0]: line.split()
-        for line in shown.splitlines()
-        if line.split() and line.split()[0] in names
-    }
+    lines: dict[str, list[str]] = {}
+    for line in shown.splitlines():
+        if line.split() and line.split()[0] in names:
+            lines.setdefault(line.split()[0], line.split())  # the table of gains comes second
     assert list(lines) == names
     assert "[%]" in shown
     assert "[m]" in shown, "a unit is taken for markup"
@@ -217,3 +216,84 @@ def test_the_comparison_is_printed_written_and_drawn(tmp_path: Path) -> None:
     assert wrong.stderr.startswith("quell: controllers: 'nonsense' must be one of mf-eso")
     assert len(wrong.stderr.strip().splitlines()) == 1
     assert {p.name for p in tmp_path.iterdir()} == {"out.json", "p"}
+
+
+DOUBLE_LAG = ([2.0], [1.0, 0.5, 0.0])
+
+
+def test_the_gains_of_a_loop_are_the_largest_ones_of_its_responses() -> None:
+    """On a dense grid; k_i is that of the PID controller, by definition."""
+    pid = ql.baselines.PID(3.0, 2.0, 1.0, tf=0.02, dt=0.002)
+    found = compare.sensitivities(DOUBLE_LAG, pid)
+    assert found is not None
+    loop = ql.analysis.analyse(DOUBLE_LAG, pid)
+    omega = np.geomspace(1e-2, np.pi / 0.002 * 0.999, 40_000)
+    for value, name in ((found.m_s, "S"), (found.m_t, "T"), (found.m_ks, "CS")):
+        assert value == pytest.approx(np.max(np.abs(loop.response(name, omega))), rel=1e-5)
+    assert found.k_i == pytest.approx(2.0, rel=1e-3)
+    assert compare.sensitivities(DOUBLE_LAG, ql.baselines.PID(-1.0, dt=0.002)) is None
+
+
+def test_a_reference_model_takes_the_overshoot_out_of_a_step() -> None:
+    """It settles sooner than with half of its bandwidth; a loop without overshoot gets none."""
+    plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, -0.5]], [0.0, 2.0], [1.0, 0.0])
+    pid = ql.baselines.PID(3.0, 2.0, 1.0, tf=0.02, dt=0.002)
+    shaped = compare.shaped(plant, pid)
+    assert isinstance(shaped, ql.controllers.Prefiltered)
+    model = shaped.prefilter
+    slower = ql.controllers.Prefiltered(pid, ql.controllers.ReferenceModel(0.5 * model.omega, 2))
+    step = ql.Scenario(reference=1.0, duration=30.0)
+    plain, best, late = (
+        ql.simulate(plant, each, step).metrics(target=1.0, band=0.02)
+        for each in (pid, shaped, slower)
+    )
+    assert plain["overshoot"] > 0.05
+    assert best["overshoot"] < 0.0205
+    assert best["settling_time"] < late["settling_time"]
+    assert best["settling_time"] < plain["settling_time"]
+    slow = ql.baselines.PID(4.0, 4.0, dt=0.002)  # cancels the lag
+    assert compare.shaped(LAG, slow) is slow
+
+
+SETUP = """dt = 0.005
+plant = { kind = "linear", A = [[0.0, 1.0], [0.0, -0.5]], B = [0.0, 2.0], C = [1.0, 0.0] }
+observer = { kind = "model-free", order = 2, b0 = 2.0, omega_o = 20.0 }
+controller = { omega_c = 3.0, u_min = -50.0, u_max = 50.0 }
+[scenario]
+duration = 8.0
+reference = { kind = "step" }
+disturbances = [{ kind = "step", height = -2.0, at = 4.0 }]
+"""
+
+
+def test_tuned_controllers_keep_to_the_gains_of_the_setups_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """PID, and ADRC by bandwidths, with an integral gain that is not below; the file and the table say so."""
+    file, out = tmp_path / "drive.toml", tmp_path / "out.json"
+    file.write_text(SETUP)
+    names = "setup,tuned-pid,tuned-bandwidths"
+    where = ["--json", str(out), "--no-figures"]
+    with pytest.raises(SystemExit, match="0"):
+        app(["compare", str(file), "--controllers", names, *where])
+    told = json.loads(out.read_text())
+    own, *others = told["controllers"].values()
+    assert told["load_at"] == 4.0
+    assert told["constraints"]["m_s"] == pytest.approx(own["m_s"])
+    for other in others:
+        for name in ("m_s", "m_t", "m_ks"):
+            assert other[name] < 1.01 * own[name]
+        assert other["k_i"] > 0.95 * own["k_i"]
+        assert other["overshoot"] < 0.03
+        assert other["settling_time"] < 4.0
+        assert other["values"]
+    shown = capsys.readouterr().out
+    assert "M_ks" in shown
+    assert "Largest k_i:" in shown
+    for arguments, message in (
+        ([str(file), "--k", "2"], "--k = 2.0: is in the setup itself"),
+        (["--m-s", "2"], "--m-s = 2.0: is for a comparison of a setup"),
+        ([str(file), "--controllers", "lqg"], "'lqg' must be one of setup, tuned-pid"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            app(["compare", *arguments])

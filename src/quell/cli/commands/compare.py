@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from math import inf
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -15,7 +18,8 @@ from quell.cli.output import COMPILING, check_outputs, progress_bar, table, writ
 if TYPE_CHECKING:
     from quell.analysis import Certificate
     from quell.controllers import Controller
-    from quell.experiments.compare import Benchmark, Comparison
+    from quell.experiments.compare import Benchmark, Comparison, Entry
+    from quell.tuning import Constraints
 
 # Key, heading, factor and most decimals.
 _COLUMNS = (
@@ -25,30 +29,41 @@ _COLUMNS = (
     ("rms", "RMS\n[m]", 1.0, 4),
     ("control_variation", "vari-\nation\n[N]", 1.0, 2),
 )
+_GAINS = (("m_s", "M_s", 3), ("m_t", "M_t", 3), ("m_ks", "M_ks", 1), ("k_i", "k_i", 3))
 # Characters of a number, so that the table fits into a terminal of 80 columns.
 _WIDTH = 6
 
 
 def compare(
+    setup: Path | None = None,
     *,
-    controllers: str = "mf-eso,mb-eso,l-eso,guarded-l-eso,pid,pi-notch,lqg,resonance-ratio",
+    controllers: str | None = None,
     m1: float = 1.0,
     m2: float = 1.0,
     k: float = 1.0,
     dt: float = 1e-3,
     u_max: float = inf,
     seed: Whole = 0,
+    m_s: float | None = None,
+    m_t: float | None = None,
+    m_ks: float | None = None,
+    load_at: float | None = None,
     outputs: Outputs = OUTPUTS,
 ) -> None:
-    """Compare controllers on two masses and a spring: a step, a force on the load, noise.
+    """Compare controllers: by published rules, and tuned under the same constraints.
 
-    All are designed for m1 = m2 = k = 1. If a run diverges the exit code is 4.
+    Without a setup: on two masses and a spring, designed for m1 = m2 = k = 1, with a step, a force
+    on the load, and noise. Tuned controllers have the best load rejection (largest integral gain)
+    that M_s, M_t and M_ks of mf-eso allow. With a setup: its own controller, and tuned ones for its
+    plant, in its scenario. If a run diverges the exit code is 4.
 
     Parameters
     ----------
+    setup
+        A setup file in TOML.
     controllers
-        Names of controllers, with commas between; zv+ or zvd+ before a name shapes its reference,
-        as in zv+lqg.
+        Names of controllers, with commas between; by default all. Without a setup zv+ or zvd+
+        before a name that is not tuned shapes its reference, as in zv+lqg.
     m1
         Mass that is pushed, as it really is [kg].
     m2
@@ -61,52 +76,137 @@ def compare(
         Limit of the control force, either way [N].
     seed
         Seed of the measurement noise.
+    m_s
+        With a setup: largest |S| of tuned loops; by default that of its own controller.
+    m_t
+        With a setup: largest |T| of tuned loops; by default that of its own controller.
+    m_ks
+        With a setup: largest gain from y to u of tuned loops; by default that of its own
+        controller.
+    load_at
+        With a setup: time from which on a disturbance is scored [s]; by default the first time at
+        which one of the scenario's begins.
     """
-    from quell.controllers.prefilters.prefilter import without_prefilters
-    from quell.experiments.compare import benchmark, figures
+    if setup is not None:
+        _only_for(setup=False, m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
+        _compare_setup(setup, controllers, (m_s, m_t, m_ks), load_at, outputs)
+        return
+    _only_for(setup=True, m_s=m_s, m_t=m_t, m_ks=m_ks, load_at=load_at)
+    from quell.experiments.compare import STRUCTURES, benchmark, figures, sensitivities
+    from quell.plants import two_mass_spring
 
     settings = benchmark.Benchmark(m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
-    names = list(dict.fromkeys(name.strip() for name in controllers.split(",") if name.strip()))
-    if not names:
-        known = ", ".join(benchmark.NAMES)
-        raise ValueError(f"controllers = {controllers!r}: must be names with commas, of {known}")
-    designs = {name: benchmark.controller(name, dt, u_max) for name in names}
-    stable = {name: _is_stable(design, settings) for name, design in designs.items()}
-    proofs = {
-        name: _certificate(design, settings)
-        for name, design in designs.items()
-        if getattr(without_prefilters(design), "guard", None) is not None
-    }
+    names = _names(controllers, (*benchmark.NAMES, *STRUCTURES))
+    fixed = [name for name in names if name not in STRUCTURES]
+    designs = {name: benchmark.controller(name, dt, u_max) for name in fixed}
     outputs = check_outputs(outputs, ["compare"])
     console = Console()
+    to_tune = [name for name in names if name in STRUCTURES]
+    entries: dict[str, Entry] = {}
+    bounds = None
     with progress_bar(console, COMPILING) as report:
-        result = benchmark.two_mass(settings, names, partial(report, COMPILING))
-    _print(console, result, settings, stable)
+        if to_tune:
+            entries, bounds = benchmark.tuned_controllers(to_tune, dt, u_max, report)
+        more = {name: e.controller for name, e in entries.items() if e.controller is not None}
+        result = benchmark.two_mass(settings, fixed, partial(report, COMPILING), more)
+    designs |= more
+    plant = two_mass_spring(m1, m2, k)
+    gains = {name: sensitivities(plant, design) for name, design in designs.items()}
+    stable = {name: _is_stable(design, plant) for name, design in designs.items()}
+    proofs = {name: _certificate(d, settings) for name, d in designs.items() if _is_guarded(d)}
+    title = f"Designed for m1 = m2 = k = 1, run on {m1:g}, {m2:g}, {k:g}"
+    _print_scores(console, title, result, stable)
+    _print_two_mass(console, settings)
+    _print_gains(console, gains, entries, bounds)
     for name, proof in proofs.items():
         console.print(f"{name}: {proof}", soft_wrap=True, highlight=False)
     paths = figures.save(result, outputs.figures, outputs.overwrite) if outputs.figures else []
     about = {"m1": m1, "m2": m2, "k": k, "dt": dt, "seed": seed}
     limit = {} if u_max == inf else {"u_max": u_max}
-    results = result.to_json()
-    for name, scores in results["controllers"].items():
-        scores["stable"] = stable[name]
-        if name in proofs:
-            proof = proofs[name]
-            scores["certificate"] = proof if isinstance(proof, str) else proof.to_json()
+    results = _json(result, stable, gains, entries, bounds)
+    for name, proof in proofs.items():
+        shown = proof if isinstance(proof, str) else proof.to_json()
+        results["controllers"][name]["certificate"] = shown
     write_results(console, {"settings": about | limit, **results}, outputs, paths)
     exit_if_diverged(result.runs.values())
 
 
-def _is_stable(controller: Controller, settings: Benchmark) -> bool | None:
+def _compare_setup(
+    path: Path,
+    controllers: str | None,
+    limits: tuple[float | None, float | None, float | None],
+    load_at: float | None,
+    outputs: Outputs,
+) -> None:
+    from quell.experiments import compare as experiment
+    from quell.experiments.compare import STRUCTURES, figures, of_setup
+    from quell.setup import SetupError, load
+
+    given = load(path)
+    names = _names(controllers, ("setup", *STRUCTURES))
+    outputs = check_outputs(outputs, [f"{path.stem}-compare"])
+    console = Console()
+    with progress_bar(console, COMPILING) as report:
+        try:
+            run = of_setup(given, names, limits, load_at, report)
+        except ValueError as error:
+            if isinstance(error, SetupError):
+                raise
+            raise SetupError([f"{given.file}: {error}"]) from None
+    plant = run.linear
+    gains = {name: experiment.sensitivities(plant, d) for name, d in run.controllers.items()}
+    stable = {name: _is_stable(d, plant) for name, d in run.controllers.items()}
+    _print_scores(console, f"{given.title}: {run.plant}, dt = {run.dt:g} s", run.result, stable)
+    scored = "" if run.load_at is None else f"; the disturbance is scored from {run.load_at:g} s on"
+    console.print(
+        f"In the units of the setup{scored}. –: not settled, no step, or diverged before."
+    )
+    _print_gains(console, gains, run.entries, run.constraints)
+    paths = []
+    if outputs.figures:
+        name = f"{path.stem}-compare"
+        paths = figures.save(run.result, outputs.figures, outputs.overwrite, name)
+    results = _json(run.result, stable, gains, run.entries, run.constraints)
+    about = {"setup": given.as_json(), "load_at": run.load_at}
+    write_results(console, {**about, **results}, outputs, paths)
+    exit_if_diverged(run.result.runs.values())
+
+
+def _only_for(*, setup: bool, **options: Any) -> None:
+    """Refuse options that the other kind of comparison has, unless they have their defaults."""
+    import inspect
+
+    defaults = inspect.signature(compare).parameters
+    for name, value in options.items():
+        if value != defaults[name].default:
+            rule = "is for a comparison of a setup; give one" if setup else "is in the setup itself"
+            raise ValueError(f"--{name.replace('_', '-')} = {value!r}: {rule}")
+
+
+def _names(given: str | None, known: tuple[str, ...]) -> list[str]:
+    if given is None:
+        return list(known)
+    names = list(dict.fromkeys(name.strip() for name in given.split(",") if name.strip()))
+    if not names:
+        raise ValueError(
+            f"controllers = {given!r}: must be names with commas, of {', '.join(known)}"
+        )
+    return names
+
+
+def _is_guarded(controller: Controller) -> bool:
+    from quell.controllers.prefilters.prefilter import without_prefilters
+
+    return getattr(without_prefilters(controller), "guard", None) is not None
+
+
+def _is_stable(controller: Controller, plant: Any) -> bool | None:
     """Return whether the loop is stable; None for a controller that learns, as it is not linear."""
     from quell.analysis import analyse
     from quell.controllers.prefilters.prefilter import without_prefilters
-    from quell.plants import two_mass_spring
 
     inner = without_prefilters(controller)
-    if inner.features:
-        return None
-    return bool(analyse(two_mass_spring(settings.m1, settings.m2, settings.k), inner).stable)
+    return None if inner.features else bool(analyse(plant, inner).stable)
 
 
 def _certificate(controller: Controller, settings: Benchmark) -> Certificate | str:
@@ -120,12 +220,29 @@ def _certificate(controller: Controller, settings: Benchmark) -> Certificate | s
         return f"no certificate: {error}"
 
 
-def _print(
-    console: Console, result: Comparison, settings: Benchmark, stable: dict[str, bool | None]
-) -> None:
-    from quell.experiments.compare import BAND, END, FORCE, FORCE_AT
+def _json(
+    result: Comparison,
+    stable: Mapping[str, bool | None],
+    gains: Mapping[str, Any],
+    entries: Mapping[str, Entry],
+    bounds: Constraints | None,
+) -> dict[str, Any]:
+    results = result.to_json()
+    for name, scores in results["controllers"].items():
+        scores["stable"] = stable[name]
+        if gains[name] is not None:
+            scores |= asdict(gains[name])
+        if name in entries:
+            scores |= {"structure": entries[name].structure, "values": dict(entries[name].values)}
+    if bounds is not None:
+        results["constraints"] = {key: getattr(bounds, key) for key in ("m_s", "m_t", "m_ks")}
+    missing = {name: entry.reason for name, entry in entries.items() if entry.controller is None}
+    return results | ({"not_possible": missing} if missing else {})
 
-    title = f"Designed for m1 = m2 = k = 1, run on {settings.m1:g}, {settings.m2:g}, {settings.k:g}"
+
+def _print_scores(
+    console: Console, title: str, result: Comparison, stable: Mapping[str, bool | None]
+) -> None:
     headings = [heading for _, heading, _, _ in _COLUMNS]
     rows = table(title, "controller", *headings, padding=(0, 1, 0, 0), pad_edge=False)
     rows.add_column("status")
@@ -142,6 +259,11 @@ def _print(
             status = "[red]unstable[/]"
         rows.add_row(name, *cells, status)
     console.print(rows)
+
+
+def _print_two_mass(console: Console, settings: Benchmark) -> None:
+    from quell.experiments.compare import BAND, END, FORCE, FORCE_AT
+
     limit = "u not limited" if settings.u_max == inf else f"|u| up to {settings.u_max:g} N"
     console.print(
         f"Unit step from rest, judged until {FORCE_AT:g} s (settling ±{100.0 * BAND:g} %); "
@@ -151,6 +273,34 @@ def _print(
         "Unstable: the linear loop has a growing pole, perhaps a slow one.",
         soft_wrap=True,
     )
+
+
+def _print_gains(
+    console: Console,
+    gains: Mapping[str, Any],
+    entries: Mapping[str, Entry],
+    bounds: Constraints | None,
+) -> None:
+    """Print what the loops were tuned for, and who rejects loads best."""
+    shown = {name: found for name, found in gains.items() if found is not None}
+    headings = [heading for _, heading, _ in _GAINS]
+    rows = table("Largest gains and integral gain of the linear loops", "controller", *headings)
+    for name, found in shown.items():
+        rows.add_row(name, *(f"{getattr(found, key):.4g}" for key, _, _ in _GAINS))
+    if shown:
+        console.print(rows)
+        best = max(shown, key=lambda name: float(shown[name].k_i))
+        ours = [n for n in shown if n in entries]
+        text = f"Largest k_i: {best}"
+        if ours:
+            first = max(ours, key=lambda name: float(shown[name].k_i))
+            text += f"; of the tuned ones {first}"
+        console.print(text + ".", highlight=False)
+    if bounds is not None:
+        console.print(f"Tuned for the largest k_i under {bounds}.", soft_wrap=True, highlight=False)
+    for name, entry in entries.items():
+        if entry.controller is None:
+            console.print(f"{name}: {entry.reason}", soft_wrap=True, highlight=False)
 
 
 def _short(value: float, decimals: int) -> str:

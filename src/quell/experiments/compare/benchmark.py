@@ -2,7 +2,8 @@
 
 The benchmark is that of Wie & Bernstein (1992) without friction; the load's position is measured
 and controlled. From rest there is a unit step, then a constant force on the load, with measurement
-noise. All controllers are designed for m1 = m2 = k = 1, whatever the plant is.
+noise. All controllers are designed for m1 = m2 = k = 1, whatever the plant is. Those of ``NAMES``
+have fixed designs by published rules; ``tuned_controllers`` are optimal under the same constraints.
 
 This plant is hard for a PID controller: between force and load there is the phase of four
 integrators. Tuned by SIMC for the rigid body, with the filter's lag as its delay, it is stable and
@@ -21,12 +22,15 @@ from quell import checks
 from quell.controllers import ADRC, Controller, Prefiltered
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, Notch, NotchPID, ResonanceRatio
 from quell.experiments.compare.study import Comparison, compare
+from quell.experiments.compare.tuned import Entry, sensitivities, tuned
 from quell.guard import Guard
 from quell.learners import Kalman
 from quell.observers import ESO
 from quell.plants import two_mass_spring
 from quell.signals import BandLimitedNoise, Step
 from quell.simulation import Scenario
+from quell.tuning import Constraints
+from quell.types import Progress
 
 OMEGA_C, OMEGA_O = 1.0, 10.0
 """Bandwidths of all controllers that have them [rad/s]: those of the paper's simulation study."""
@@ -36,6 +40,8 @@ FORCE_AT, END = 40.0, 100.0  # start of the constant force, end of the scenario 
 FORCE = 0.1  # force on the load [N]: a tenth of the force that moves it by the step within a second
 # Longest sample time [s]: omega_o dt = 1 with the bandwidth above.
 _LONGEST_DT = 0.1
+# Largest |p| dt of poles of tuned observers and filters: sampling costs margin beyond.
+_POLES_DT = 0.5
 # About 1 GB of records for each controller.
 _MOST_SAMPLES = 5e6
 
@@ -95,11 +101,30 @@ def controller(name: str, dt: float, u_max: float = math.inf) -> Controller:
     return Prefiltered(design, _SHAPERS[shapers[0]](RESONANCE)) if shapers else design
 
 
+def tuned_controllers(
+    names: Sequence[str], dt: float, u_max: float = math.inf, progress: Progress | None = None
+) -> tuple[dict[str, Entry], Constraints]:
+    """Tune controllers (``compare.STRUCTURES``) for m1 = m2 = k = 1 as robustly as ``mf-eso``.
+
+    M_s, M_t and M_ks are bounded by those of ``mf-eso``.
+    """
+    plant = two_mass_spring()
+    ours = sensitivities(plant, controller("mf-eso", dt))
+    assert ours is not None
+    bounds = Constraints(m_s=ours.m_s, m_t=ours.m_t, m_ks=ours.m_ks, omega_o_dt=_POLES_DT)
+    limits = {"u_min": -u_max, "u_max": u_max}
+    return tuned(plant, dt, names, bounds, order=4, limits=limits, progress=progress)
+
+
 def two_mass(
-    settings: Benchmark, names: Sequence[str], progress: Callable[[float], None] | None = None
+    settings: Benchmark,
+    names: Sequence[str],
+    progress: Callable[[float], None] | None = None,
+    more: Mapping[str, Controller] | None = None,
 ) -> Comparison:
-    """Run the controllers ``names`` on the plant of ``settings``."""
+    """Run the controllers ``names``, and ``more``, on the plant of ``settings``."""
     controllers = {name: controller(name, settings.dt, settings.u_max) for name in names}
+    controllers |= more or {}
     plant = two_mass_spring(settings.m1, settings.m2, settings.k)
     return compare(plant, controllers, scenario(settings), load_at=FORCE_AT, progress=progress)
 

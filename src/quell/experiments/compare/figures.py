@@ -37,9 +37,14 @@ def draw(result: Comparison) -> Any:
     return figure
 
 
-def save(result: Comparison, folder: str | os.PathLike[str], overwrite: bool = False) -> list[Path]:
+def save(
+    result: Comparison,
+    folder: str | os.PathLike[str],
+    overwrite: bool = False,
+    name: str = "compare",
+) -> list[Path]:
     """Write the figure into ``folder``, created if missing; return the paths."""
-    return save_figures({"compare": partial(draw, result)}, folder, overwrite=overwrite)
+    return save_figures({name: partial(draw, result)}, folder, overwrite=overwrite)
 
 
 def _limits(signals: list[Any]) -> tuple[float, float]:
