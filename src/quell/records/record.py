@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,7 +60,7 @@ class Record:
         A ``ValueError`` says that the file exists, unless ``overwrite`` allows to replace it.
         """
         check_writable(path, overwrite)
-        image = netcdf_image(self.to_xarray())
+        image = _netcdf(self.to_xarray())
         with written_atomically(path, overwrite) as part:
             part.write_bytes(image)
 
@@ -83,19 +84,50 @@ class Record:
         return xarray.Dataset(variables, coordinates, attrs=attributes)
 
 
-def netcdf_image(dataset: xarray.Dataset) -> bytes:
-    """Return a dataset as a NetCDF file in memory.
+def _netcdf(dataset: xarray.Dataset) -> bytes:
+    """Return a dataset as a NetCDF file in memory."""
+    from xarray.backends import H5NetCDFStore
+
+    return _image(lambda netcdf: dataset.dump_to_store(H5NetCDFStore(netcdf)))
+
+
+def netcdf_of(
+    sizes: Mapping[str, int],
+    variables: Mapping[str, tuple[str, Any, Mapping[str, Any]]],
+    attributes: Mapping[str, Any],
+) -> bytes:
+    """Return variables over one dimension each as a NetCDF file in memory, without xarray.
+
+    ``variables`` has dimension, values and attributes; values are an array or a list of texts.
+    """
+
+    def write(netcdf: Any) -> None:
+        import h5py
+
+        netcdf.dimensions = dict(sizes)
+        netcdf.attrs.update(attributes)
+        for name, (dimension, values, about) in variables.items():
+            kind = h5py.string_dtype() if isinstance(values, list) else values.dtype
+            stored = netcdf.create_variable(name, (dimension,), kind)
+            if len(values):
+                stored[:] = np.array(values, dtype=object) if isinstance(values, list) else values
+            stored.attrs.update(about)
+
+    return _image(write)
+
+
+def _image(write: Callable[[Any], None]) -> bytes:
+    """Return the NetCDF file that ``write`` makes, in memory.
 
     HDF5 must not write to the disk itself: when that is full, it leaves objects behind that end the
     process as soon as they are collected.
     """
     import h5netcdf
     import h5py
-    from xarray.backends import H5NetCDFStore
 
     memory = {"driver": "core", "backing_store": False, "track_order": True}
     with h5py.File("in memory", "w", **memory) as file:
         with h5netcdf.File(file, "w") as netcdf:
-            dataset.dump_to_store(H5NetCDFStore(netcdf))
+            write(netcdf)
         file.flush()
         return bytes(file.id.get_file_image())

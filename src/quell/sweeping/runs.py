@@ -27,7 +27,7 @@ ERROR = -1
 
 # Memory for the records of the runs that are simulated at once [bytes]: as quick as more, and many
 # workers fit into a machine. Runs at once: all 32 lanes of several groups are full. By hand.
-_RECORD_BYTES, _MOST_AT_ONCE = 16e6, 256
+_RECORD_BYTES, _MOST_AT_ONCE = 8e6, 256
 # Seconds for which runs are repeated to know their time. By hand.
 _TIMING = 2.0
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from quell import checks
 from quell.files import write_json, written_atomically
-from quell.records.record import netcdf_image
+from quell.records.record import netcdf_of
 from quell.sweeping.measures import UNITS, Measure, Measures
 from quell.sweeping.plan import Part, Plan
 from quell.sweeping.runs import Outcome
@@ -57,25 +57,25 @@ class Store:
 
     def write(self, part: Part, outcome: Outcome) -> None:
         """Write the file of a part."""
-        import xarray
-
         errors = sorted(outcome.messages)
         seeds = part.seeds[part.places(np.arange(part.first, part.last))[0]]
-        variables: dict[str, Any] = {
+        variables: dict[str, tuple[str, Any, Mapping[str, Any]]] = {
             name: ("run", values, self.measures[name]) for name, values in outcome.measures.items()
         }
-        variables["status"] = ("run", outcome.status.astype(np.int32))
+        variables["status"] = ("run", outcome.status.astype(np.int32), {})
         variables["ended"] = ("run", outcome.ended, {"units": "s"})
-        variables["seed"] = ("run", seeds)
-        variables["error_run"] = ("error", np.array(errors, np.int64) + part.first)
-        variables["error"] = ("error", np.array([outcome.messages[i] for i in errors], object))
+        variables["seed"] = ("run", seeds, {})
+        variables["error_run"] = ("error", np.array(errors, np.int64) + part.first, {})
+        variables["error"] = ("error", [outcome.messages[i] for i in errors], {})
         for name, column in part.columns().items():
             texts = self.labels[name]
             codes = column if texts is None else column.astype(np.int32)
             about = {} if texts is None else {"labels": texts}
             variables[parameter_variable(name)] = ("run", codes, {"parameter": name, **about})
-        dataset = xarray.Dataset(variables, attrs={"format": _FORMAT, "first": part.first})
-        image = netcdf_image(dataset)
+        attributes = {"format": _FORMAT, "first": part.first}
+        image = netcdf_of(
+            {"run": part.last - part.first, "error": len(errors)}, variables, attributes
+        )
         with written_atomically(self.file(part.first), overwrite=True) as file:
             file.write_bytes(image)
 
