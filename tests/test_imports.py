@@ -28,6 +28,7 @@ ROWS = (
     ("tuning.result", "tuning"),
     ("realtime.system", "realtime.telemetry", "realtime.devices", "realtime.wire"),
     ("realtime.loop", "realtime.rig", "realtime.__init__", "setup"),
+    ("commissioning",),
     ("experiments.common", "experiments.two_mass_spring", "experiments.torsional"),
     ("experiments.compare", "experiments.acc", "experiments.stress", "experiments.__init__"),
     (

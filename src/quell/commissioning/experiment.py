@@ -1,15 +1,15 @@
 """An experiment at a rig: from limits to a record that a model can be identified from.
 
-All parts run in the loop of ``run_rig``, with its safe actions: beyond the limits of y, after missed
-samples and on Ctrl-C, u is ramped to zero.
+All parts run in the loop of ``run_rig``, with its safe actions: beyond the limits of y, after
+missed samples and on Ctrl-C, u is ramped to zero.
 
 1. *Listen*: u is at the operating point, to see y at rest and its noise.
 2. *Probe*: a step of u of part of its range, until y has moved by part of its room or the time is
    over. It shows the sign of the gain, the speed, and whether y settles or drifts.
 3. *Excite*: where y settles, a PRBS of u around the operating point, as large as the limits of y
-   allow. Where y drifts, a relay with a linear zone that keeps y within its limits, ``u = sat(k_p (r
-   − y) − k_d y')``, with r a PRBS between two values of y: the switching excites the plant (Åström &
-   Hägglund, *Automatica* 20, 1984), the limits hold in spite of the drift.
+   allow. Where y drifts, a relay with a linear zone that keeps y within its limits, ``u = sat(k_p
+   (r − y) − k_d y')``, with r a PRBS between two values of y: the switching excites the plant
+   (Åström & Hägglund, *Automatica* 20, 1984), and the limits hold in spite of the drift.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ _PROBE_STEPS, _PROBE_ROOM, _FILL, _RELAY_ROOM = (0.05, 0.4), 0.3, 0.6, 0.5
 # y settles if its mean speed in the last third of the probe is below this share of that of the
 # whole probe: 0.2 for a time constant of a third of the probe. Chosen by hand.
 _SETTLES = 0.4
-# Band of the excitation relative to the speed that the probe has shown, and its top relative to π/dt
-# at most. A PRBS needs some periods of its lowest frequency. Chosen by hand.
+# Band of the excitation relative to the speed that the probe has shown, and its top relative to
+# π/dt at most. A PRBS needs some periods of its lowest frequency. Chosen by hand.
 _BAND, _MOST_TOP, _PERIODS = (0.2, 10.0), 0.3, 6.0
-# Relay: error that puts u to its limit, as a share of the room; lead and filter relative to the time
-# in which the probe moved y. By trial on plants of order 1 to 4 (tests/test_commissioning.py).
+# Relay: error that puts u to its limit, as a share of the room; lead and filter relative to the
+# time in which the probe moved y. By trial on plants of order 1 to 3 (tests/test_commissioning.py).
 _ZONE, _LEAD, _FILTER = 0.25, 0.9, 0.05
 # y has moved if by more than so many times its noise, and this part of its room.
 _MOVED, _VISIBLE = 6.0, 0.02
@@ -161,9 +161,9 @@ class _Rig:
         self, controller: Any, reference: Signal, duration: float, y_min: float, y_max: float
     ) -> RigRun:
         """Run a part with limits of y."""
-        own = {"u_min": self.limits.u_min, "u_max": self.limits.u_max}
+        own: dict[str, Any] = {"u_min": self.limits.u_min, "u_max": self.limits.u_max}
         safety = Safety(**(self.safety | own | {"y_min": y_min, "y_max": y_max}))
-        options = {"duration": duration, "safety": safety} | self.options
+        options: dict[str, Any] = {"duration": duration, "safety": safety} | self.options
         device = self.open()
         self.has_no_clock = isinstance(device, TwinDevice)
         return run_rig(device, controller, reference, **options)
@@ -172,7 +172,7 @@ class _Rig:
         """Apply u as it is, from the first sample on."""
         none = np.zeros(0)
         law = LinearLaw(np.zeros((0, 0)), none, none, none, none, 1.0, 0.0)  # u = r
-        own = {"u_min": self.limits.u_min, "u_max": self.limits.u_max}
+        own: dict[str, Any] = {"u_min": self.limits.u_min, "u_max": self.limits.u_max}
         controller = LinearController(law, self.dt, name="excitation", **own)
         low, high = room or (self.limits.y_min, self.limits.y_max)
         return self.run(controller, u, duration, low, high)
@@ -254,8 +254,8 @@ def _relay(rig: _Rig, shown: _Shown, y_rest: float, room: float, seed: int) -> R
     limits, duration = rig.limits, _rest_of(rig)
     kp = shown.sign * limits.u_room / (_ZONE * room)
     lead, filtered = _LEAD * shown.time, max(_FILTER * shown.time, 2.0 * rig.dt)
-    own = {"u_min": limits.u_min, "u_max": limits.u_max}
-    controller = PID(kp, kd=kp * lead, tf=filtered, c=0.0, dt=rig.dt, **own)
+    own: dict[str, Any] = {"u_min": limits.u_min, "u_max": limits.u_max, "dt": rig.dt}
+    controller = PID(kp, kd=kp * lead, tf=filtered, c=0.0, **own)
     _, top = _band(rig, shown.time, duration)
     low = max(0.1 / shown.time, _PERIODS * 2.0 * np.pi / duration)
     # The loop itself switches fast; its reference moves at the speed of the probe.

@@ -132,10 +132,11 @@ def verify(
         height = min(height, _HELD * gain * limits.u_room)
     height = height if up else -height
     at = round(_BEFORE * duration / dt) * dt
-    safety = {"y_min": limits.y_min, "y_max": limits.y_max}
+    safety: dict[str, Any] = {"y_min": limits.y_min, "y_max": limits.y_max}
     safety |= {"u_min": limits.u_min, "u_max": limits.u_max} | dict(options.pop("safety", {}))
     reference = Step(y_start) + Step(height, at=at)
-    given = {"duration": duration, "safety": Safety(**safety), "approach": 0.5 * at} | options
+    given: dict[str, Any] = {"duration": duration, "safety": Safety(**safety), "approach": 0.5 * at}
+    given |= options
     run = run_rig(open_device(), controller, reference, **given)
     part = run.trajectory
     before = round(at / dt)

@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from quell.cli.commands.tune_sources import (
+    RECORD_OPTIONS,
+    RECORDS,
+    RIG_OPTIONS,
+    RecordOptions,
+    Rig,
+    RigOptions,
+    from_record,
+    from_rig,
+    rig_at,
+    verified,
+    with_rig_table,
+)
 from quell.cli.options import OUTPUTS, Outputs, WholeOrNone
 from quell.cli.output import check_outputs, print_line, progress_bar, table, write_results
 
 if TYPE_CHECKING:
+    from quell.commissioning import Verification
     from quell.tuning import Tuned
 
 _HEADINGS = ("M_s", "M_t", "M_ks", "delay\nmargin")
@@ -31,17 +46,23 @@ def tune(
     m_t: float | None = None,
     m_ks: float | None = None,
     out: Path | None = None,
+    save_record: Path | None = None,
+    record: RecordOptions = RECORD_OPTIONS,
+    rig: RigOptions = RIG_OPTIONS,
     outputs: Outputs = OUTPUTS,
 ) -> None:
     """Tune a controller for a linear plant: the best load rejection under constraints.
 
-    The plant is that of a setup file, or a transfer function. PI, PID and other structures are
-    tuned under the same constraints and shown beside it.
+    The plant is that of a setup file, a transfer function, one that a record shows, or that an
+    experiment at a rig shows (--device). A record is identified first, and the deviations of gain,
+    poles and delay become the set of plants. PI, PID and other structures are tuned under the same
+    constraints and shown beside it.
 
     Parameters
     ----------
     setup
-        The file, in TOML, with [plant], and [tune] for all options; docs/tuning.
+        The file, in TOML, with [plant], and [tune] for all options; docs/tuning. Or a record: a
+        recording of quell run-rig (.mcap or .csv), a saved run (.nc), or a table t,u,y (.csv).
     num
         Numerator of the transfer function, highest power of s first: 1 or 2,1.
     den
@@ -65,9 +86,10 @@ def tune(
         Largest gain from y to u; ten times that of the optimal PI controller by default.
     out
         Write a setup file with the tuned controller, for quell run and quell run-rig.
+    save_record
+        Write the samples of the experiment to this file, as t,u,y.
     """
     from quell.files import check_writable
-    from quell.tuning import tune as tuned_for
 
     named: dict[str, Any] = {
         "structure": structure,
@@ -77,19 +99,77 @@ def tune(
     }
     named |= {"m_s": m_s, "m_t": m_t, "m_ks": m_ks}
     options = {name: value for name, value in named.items() if value is not None}
-    plant, dt, options, name = _plant(setup, num, den, dt, options)
-    outputs = check_outputs(outputs, ["tuned"], [] if out is None else [out])
-    if out is not None:
-        check_writable(out, outputs.overwrite)
+    files = [file for file in (out, save_record) if file is not None]
+    outputs = check_outputs(outputs, ["tuned", "verified"], files)
+    for file in files:
+        check_writable(file, outputs.overwrite)
     console = Console()
+    measured = rig.device is not None or (setup is not None and setup.suffix in RECORDS)
+    if not measured:
+        plant, dt, options, name = _plant(setup, num, den, dt, options)
+        tuned = _tuned(console, plant, dt, options)
+        _print(console, tuned, name)
+        _write(console, tuned, out, outputs)
+        return
+    if num or den or (delay is not None) or (rig.device is not None and setup is not None):
+        raise ValueError("setup: a record or --device goes without --num, --den and --delay")
+    _bounds(options)
+    limits = {"u_min": rig.u_min, "u_max": rig.u_max}
+    options |= {key: value for key, value in limits.items() if value is not None}
+    place: Rig | None = None
+    if rig.device is not None:
+        place = rig_at(rig, dt)
+        shown = from_rig(console, place, float(dt or 0.0), record, save_record, outputs.overwrite)
+        if shown is None:
+            return
+        plant, dt, more, model, y_now = shown
+    else:
+        assert setup is not None
+        plant, dt, more, model = from_record(console, setup, dt, record)
+    tuned = _tuned(console, plant, dt, options | more)
+    _print(console, tuned, rig.device or str(setup))
+    step = None
+    if place is not None:
+        tuned = with_rig_table(tuned, place)
+        step = verified(console, place, tuned, model, y_now)
+    _write(console, tuned, out, outputs, {"model": model.to_json()}, step)
+
+
+def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:
+    from quell.tuning import tune as tuned_for
+
     with progress_bar(console, "tuning") as report:
-        tuned = tuned_for(plant, dt, progress=partial(_progress, report), **options)
-    _print(console, tuned, name)
+        return tuned_for(plant, dt, progress=partial(_progress, report), **options)
+
+
+def _write(
+    console: Console,
+    tuned: Tuned,
+    out: Path | None,
+    outputs: Outputs,
+    more: Mapping[str, Any] | None = None,
+    step: Verification | None = None,
+) -> None:
+    """Write setup, figures and results where they are asked for."""
     if out is not None:
         tuned.save(out, outputs.overwrite)
         print_line(console, f"Setup: {out}")
-    paths = _save_figure(tuned, outputs.figures, outputs.overwrite) if outputs.figures else []
-    write_results(console, tuned.to_json(), outputs, paths)
+    paths, results = [], tuned.to_json() | dict(more or {})
+    if outputs.figures:
+        paths += _save_figure(tuned.plot().flat[0].figure, outputs, "tuned")
+        if step is not None:
+            paths += _save_figure(step.plot()[0].figure, outputs, "verified")
+    if step is not None:
+        results["verification"] = step.to_json()
+    write_results(console, results, outputs, paths)
+
+
+def _bounds(options: dict[str, Any]) -> None:
+    """Put the constraints of the command line together."""
+    from quell.tuning import Constraints
+
+    bounds = {key: options.pop(key) for key in ("m_s", "m_t", "m_ks") if key in options}
+    options["constraints"] = Constraints(**bounds)
 
 
 def _progress(report: Any, part: str, share: float) -> None:
@@ -101,7 +181,6 @@ def _plant(
 ) -> tuple[Any, float, dict[str, Any], str]:
     """Return the plant, the sample time, the options of ``tune``, and the plant's name."""
     from quell.setup.tuning_task import tuning_task
-    from quell.tuning import Constraints
 
     if setup is not None:
         if num or den or dt is not None:
@@ -112,8 +191,7 @@ def _plant(
         raise ValueError(
             "setup: missing; must be a TOML file, or give --num 1 --den 1,3,3,1 --dt 0.01"
         )
-    bounds = {key: options.pop(key) for key in ("m_s", "m_t", "m_ks") if key in options}
-    options["constraints"] = Constraints(**bounds)
+    _bounds(options)
     plant = (_numbers("num", num), _numbers("den", den))
     return plant, dt, options, f"({num})/({den})"
 
@@ -125,11 +203,16 @@ def _numbers(name: str, text: str) -> list[float]:
         raise ValueError(f"{name} = {text!r}: must be numbers with commas, as 1,3,3,1") from None
 
 
-def _save_figure(tuned: Tuned, folder: Path, overwrite: bool) -> list[Path]:
+def _save_figure(figure: Any, outputs: Outputs, name: str) -> list[Path]:
+    import matplotlib.pyplot as plt
+
     from quell.experiments.common.figures import save_figure
 
-    figure = tuned.plot().flat[0].figure
-    return save_figure(figure, folder, "tuned", overwrite)
+    assert outputs.figures is not None
+    try:
+        return save_figure(figure, outputs.figures, name, outputs.overwrite)
+    finally:
+        plt.close(figure)
 
 
 def _print(console: Console, tuned: Tuned, name: str) -> None:

@@ -14,6 +14,9 @@ the errors of plant and noise model depend on each other, so the covariance is t
 parameters together::
 
     cov = σ² (Σ ψ ψᵀ)⁻¹,     ψ = ∂ŷ/∂(φ, β)
+
+if e is white, as for a true model of the noise. If it is not quite true, the covariance from sums
+of ψ e over blocks of the record holds (``output_error``); the one in which b varies more is taken.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import numpy as np
 
 from quell.identification.model.structure import nonzero_lengths
 from quell.identification.running_loop.model import Form, derivatives, is_stable, linear_columns
+from quell.identification.search.output_error import block_sums
 from quell.types import Matrix, Vector
 
 # First, least and last μ, and the relative gain that a step without damping must predict: as in
@@ -32,6 +36,8 @@ from quell.types import Matrix, Vector
 _MU, _LEAST_MU, _MOST_MU, _CONVERGED, _STEPS = 1e-3, 1e-8, 1e8, 1e-7, 60
 # Longest lag and delay, as a share of the record: chosen by hand.
 _LONGEST = 0.25
+# Blocks of the record for the covariance, as in ``output_error``.
+_BLOCKS = 60
 # Relative mean square that counts as zero: rounding of long simulations.
 _ROUNDING = 1e-20
 # Relative singular value that counts as zero, as in ``output_error``.
@@ -78,8 +84,13 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     variance = at.power / max(at.error.size - count, 1)
     order = np.r_[first:count, :first]  # φ before β
     rows = inverse[order] / size[order, None]
+    covariance = variance * rows @ rows.T
+    half = rows @ (inverse.T @ block_sums(psi, at.error, min(_BLOCKS, at.error.size)).T)
+    robust = half @ half.T
+    if robust[form.size, form.size] > covariance[form.size, form.size]:
+        covariance = robust
     aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
-    return LoopFit(form, at.phi, at.beta, variance * rows @ rows.T, at.error, aic, converged)
+    return LoopFit(form, at.phi, at.beta, covariance, at.error, aic, converged)
 
 
 def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:

@@ -1,0 +1,243 @@
+"""Where ``quell tune`` has its plant from, if not from a setup file: a record, or a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter
+from rich.console import Console
+
+from quell.cli.confirm import confirm
+from quell.cli.options import Switch, Whole
+from quell.cli.output import print_line
+from quell.cli.records import measured
+
+if TYPE_CHECKING:
+    from quell.commissioning import Limits, Verification
+    from quell.identification import Identified, Measured
+    from quell.realtime.devices.base import Device
+    from quell.tuning import Tuned
+
+RECORDS = (".csv", ".mcap", ".nc")
+"""Suffixes of files that are records, not setups."""
+
+# Longest delay that is searched by default [samples], and the verifying step's length in units of
+# 1/(frequency of the phase margin). Chosen by hand.
+_MOST_DELAY, _STEP_LENGTH = 20, 60.0
+# Safe actions for twins in this process: nothing is lost if a deadline is, as no plant moves.
+_TWIN = {"hold": 10_000, "most_overruns": 10_000}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RecordOptions:
+    """How a record is read and identified.
+
+    Parameters
+    ----------
+    columns
+        Names or numbers (from 1 on) of a table's columns: t,u,y by default.
+    time_unit
+        Unit of its times: s, ms, us or ns; s by default.
+    model_order
+        Poles of the model at first; fewer, or friction, where the record shows it.
+    max_delay
+        Longest delay to search [s]; 20 samples by default.
+    """
+
+    columns: str = ""
+    time_unit: str | None = None
+    model_order: Whole = 3
+    max_delay: float | None = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RigOptions:
+    """An experiment at a rig, and its limits.
+
+    Parameters
+    ----------
+    device
+        Device for an experiment, as for quell run-rig; then no file is read.
+    u_min
+        Least u, also of the controller.
+    u_max
+        Largest u, also of the controller.
+    y_min
+        Least y during the experiment; beyond it u is ramped to zero.
+    y_max
+        Largest y during the experiment.
+    seconds
+        Duration of the experiment [s].
+    u_rest
+        u at the operating point.
+    excite
+        prbs, relay, or auto: a relay where the plant drifts.
+    yes
+        Start experiment and verifying step without asking.
+    """
+
+    device: str | None = None
+    u_min: float | None = None
+    u_max: float | None = None
+    y_min: float | None = None
+    y_max: float | None = None
+    seconds: float = 30.0
+    u_rest: float = 0.0
+    excite: Annotated[str, Parameter(name="--excite")] = "auto"
+    yes: Switch = False
+
+
+RECORD_OPTIONS, RIG_OPTIONS = RecordOptions(), RigOptions()
+
+
+def identified(console: Console, record: Measured, options: RecordOptions) -> tuple[Any, float]:
+    """Identify a record; print and return the model, and half a sample if the delay was searched.
+
+    Raises ``ValueError`` for a model with faults that no controller should be tuned for.
+    """
+    from quell.identification import decided, identify
+
+    dt = record.dt
+    most = _MOST_DELAY * dt if options.max_delay is None else options.max_delay
+    delays = (0.0, round(most / dt) * dt)
+    with console.status("Identifying, with other orders and friction where the record shows it."):
+        first = identify(record.u, record.y, dt, options.model_order, delay=delays)
+        model: Identified = decided(first)
+    print_line(console, model.describe())
+    if model.shortcomings:
+        raise ValueError(
+            f"record: no plant to tune for: {'; '.join(model.shortcomings)}; give --model-order, "
+            "or record more"
+        )
+    return model, 0.5 * dt if delays[1] > 0.0 else 0.0
+
+
+def from_record(
+    console: Console,
+    path: Path,
+    dt: float | None,
+    options: RecordOptions,
+) -> tuple[list[Any], float, dict[str, Any], Identified]:
+    """Return the plants that a record shows, its sample time, options of ``tune``, the model."""
+    record = measured(path, options.columns, dt, options.time_unit)
+    print_line(console, f"{path.name}: {record.y.size} samples, dt = {record.dt:g} s")
+    model, late = identified(console, record, options)
+    return (*_plants(model, late, record.dt), model)
+
+
+def _plants(model: Identified, late: float, dt: float) -> tuple[list[Any], float, dict[str, Any]]:
+    from quell.tuning.identified import identified_plants
+
+    plants, delays = identified_plants(model, late)
+    return plants, dt, {"delay": delays}
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A rig at a URL, and how it may be used."""
+
+    url: str
+    limits: Limits
+    options: RigOptions
+    open: Callable[[], Device]
+    safety: dict[str, Any]
+
+
+def rig_at(options: RigOptions, dt: float | None) -> Rig:
+    """Return the rig of the options, all of them checked.
+
+    Raises ``ValueError`` for limits that are missing.
+    """
+    from quell.commissioning import Limits
+    from quell.realtime import TwinDevice, open_device
+
+    names = ("u_min", "u_max", "y_min", "y_max")
+    missing = [name for name in names if getattr(options, name) is None]
+    missing += ["dt"] if dt is None else []
+    if missing:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in missing)
+        raise ValueError(f"device = {options.device!r}: an experiment also needs {flags}")
+    values = {name: getattr(options, name) for name in names}
+    limits = Limits(**values, duration=options.seconds, u_rest=options.u_rest)
+    url = str(options.device)
+    first = open_device(url, float(dt or 0.0))
+    if isinstance(first, TwinDevice):  # it keeps its state between the parts
+        return Rig(url, limits, options, lambda: first, dict(_TWIN))
+    first.close()
+    return Rig(url, limits, options, lambda: open_device(url, float(dt or 0.0)), {})
+
+
+def from_rig(
+    console: Console,
+    rig: Rig,
+    dt: float,
+    options: RecordOptions,
+    record: Path | None,
+    overwrite: bool,
+) -> tuple[list[Any], float, dict[str, Any], Identified, float] | None:
+    """Run the experiment; return what ``from_record`` does, and where y is; None if not wanted.
+
+    The samples are written to the file ``record``, if any.
+    """
+    from quell.commissioning import experiment
+    from quell.files import written_atomically
+
+    print_line(console, f"Experiment at {rig.url}, dt = {dt:g} s: {rig.limits}.")
+    print_line(console, "Beyond the limits of y, after faults and on Ctrl-C u is ramped to zero.")
+    if not confirm(console, "Start it?", rig.options.yes):
+        return None
+    with console.status("The experiment runs."):
+        done = experiment(
+            rig.open, dt, rig.limits, kind=rig.options.excite, safety=rig.safety, priority=0
+        )
+    print_line(console, done.describe())
+    u, y = done.measured.u, done.measured.y
+    if record is not None:
+        table = np.column_stack([np.arange(u.size) * dt, u, y])
+        with written_atomically(record, overwrite) as part:
+            np.savetxt(part, table, delimiter=",", header="t,u,y", comments="", fmt="%.10g")
+        print_line(console, f"Record: {record}")
+    model, late = identified(console, done.measured, options)
+    last = float(done.runs[-1].record["y"][-1])
+    y_now = last if model.integrators else done.y_rest
+    return (*_plants(model, late, dt), model, y_now)
+
+
+def verified(
+    console: Console, rig: Rig, tuned: Tuned, model: Identified, y_now: float
+) -> Verification | None:
+    """Run the verifying step, if it is wanted; print how it went."""
+    from quell.commissioning import verify
+
+    margins = tuned.analysis.margins
+    duration = _STEP_LENGTH / margins.phase_omega
+    print_line(console, f"Verifying step at {rig.url} with {tuned.design.name}, {duration:.3g} s.")
+    if not confirm(console, "Apply the controller?", rig.options.yes):
+        return None
+    with console.status("The tuned controller runs."):
+        done = verify(
+            rig.open,
+            tuned.controller,
+            model,
+            rig.limits,
+            y_now,
+            duration,
+            safety=rig.safety,
+            priority=0,
+        )
+    print_line(console, done.describe())
+    return done
+
+
+def with_rig_table(tuned: Tuned, rig: Rig) -> Tuned:
+    """Return the result with a table for the rig in its setup file."""
+    limits = rig.limits
+    safety = {"y_min": limits.y_min, "y_max": limits.y_max}
+    table = {"device": rig.url, "safety": safety}
+    return replace(tuned, setup={**tuned.setup, "rig": table})
