@@ -37,6 +37,7 @@ ROWS = (
         "cli.exit_codes",
         "cli.output",
         "cli.records",
+        "cli.confirm",
         "cli.report",
         "cli.sweep_report",
         "cli.interrupt",

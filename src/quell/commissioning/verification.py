@@ -12,6 +12,7 @@ from quell import checks
 from quell.commissioning.experiment import Open
 from quell.commissioning.limits import Limits
 from quell.controllers.base import Controller
+from quell.files import nonfinite_to_none
 from quell.identification.result import Identified
 from quell.identification.validation import nrmse
 from quell.plants.delay import delayed
@@ -62,8 +63,9 @@ class Verification:
         """Return numbers of both steps for JSON."""
         runs = {"measured": self.run.trajectory, "predicted": self.predicted}
         scores = {name: dict(record.metrics(start=self.at)) for name, record in runs.items()}
-        about = {"height": self.height, "at": self.at, "fit": self.fit}
-        return about | {"completed": self.run.completed, "verdict": self.run.verdict} | scores
+        about: dict[str, Any] = {"height": self.height, "at": self.at, "fit": self.fit}
+        about |= {"completed": self.run.completed, "verdict": self.run.verdict}
+        return dict(nonfinite_to_none(about | scores))
 
     def plot(self, axes: Any = None) -> Any:
         """Draw y and u, measured and predicted, into two axes; return them."""

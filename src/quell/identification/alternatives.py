@@ -1,15 +1,15 @@
 """Other structures for the same record, and whether the record decides between them.
 
-Two models are compared by their errors e and e' of simulation, sample by sample. With ``d_k = e_k²
-− e'_k²``, the second is better if the mean of d is above zero by more than chance explains (Diebold
-& Mariano, *J. Business & Economic Statistics* 13, 1995, eq. (2)). Errors of simulation are
-correlated over long times, so the variance is that of means over a few blocks of the record::
+Two models are compared by their errors e and e' of simulation, over blocks of the record::
 
-    z = mean(D) / √(var(D)/B),     D_i = mean of d over block i,     i = 1 … B
+    D_i = log(Σ e²) − log(Σ e'²) in block i,     z = mean(D) √B / std(D),     i = 1 … B
 
-which for equal models is Student's t with B − 1 degrees of freedom. A model of higher order always
-fits a little better where it was fitted; this counts for the larger model, so that it is not
-rejected by mistake, and the result is only used to say that it is *not* better, or far better.
+The second is better if z is above zero by more than chance explains: for equal models it is
+Student's t with B − 1 degrees of freedom, as in the test of Diebold & Mariano (*J. Business &
+Economic Statistics* 13, 1995), with logarithms, so that a block of large errors does not decide
+alone, and blocks, because errors of simulation are correlated over long times. A larger model
+always fits a little better where it was fitted; this is a bias to its favour, so the test says
+little where a larger model is just better, and much where it is not.
 """
 
 from __future__ import annotations
@@ -25,8 +25,12 @@ from quell.identification.result import Identified
 # Blocks: each should be longer than the correlation of the errors, and there should be enough of
 # them for their variance. Chosen by hand.
 _BLOCKS = 12
+# Share of y's power that counts as no error: a fit of 99.9999 %, beyond any real record.
+_EXACT = 1e-12
 # Probability that equal models are taken for different.
 _LEVEL = 0.01
+# Share of the limit from which on z is a hint. Chosen by hand.
+_HINT = 0.5
 # The structure of a mass with friction.
 _RIGID = "order 2 with friction"
 # Least and largest order that ``identify`` fits, and least order in which friction has a place.
@@ -59,7 +63,8 @@ class Alternative:
             here = f"{here} without friction"
         if self.verdict == "better":
             return f"SUGGESTION: {self.name} ({self.options}) fits better: {fits}, z = {self.z:.1f}"
-        if self.verdict == "worse" or not (self.smaller or "friction" in self.name):
+        hinted = "friction" in self.name and self.z > _HINT * self.limit
+        if self.verdict == "worse" or not (self.smaller or hinted):
             return ""
         taken = f"{self.name} ({self.options})" if self.smaller else here
         return (
@@ -118,12 +123,13 @@ def alternatives(found: Identified) -> tuple[Alternative, ...]:
 def decided(found: Identified) -> Identified:
     """Return the model that the record supports: with friction if it fits better, of least order.
 
-    First a better alternative is taken, then, one after the other, smaller ones that are not worse.
+    First a better alternative is taken, then, one after the other, smaller ones without a hint that
+    they are worse.
     """
     for _ in range(_MOST_ORDER):
         others = [one for one in alternatives(found) if one.model.converged]
         better = [one for one in others if one.verdict == "better"]
-        smaller = [one for one in others if one.smaller and one.verdict != "worse"]
+        smaller = [one for one in others if one.smaller and one.z > -_HINT * one.limit]
         if not better and not smaller:
             break
         found = max(better or smaller, key=lambda one: one.z).model
@@ -143,8 +149,13 @@ def _compared(first: Identified, second: Identified) -> tuple[float, float]:
     """Return z, above zero if the second model is better, and its limit."""
     from scipy.stats import t
 
-    gain = (first.y - first.simulated) ** 2 - (second.y - second.simulated) ** 2
-    means = np.array([float(np.mean(part)) for part in np.array_split(gain, _BLOCKS)])
-    spread = float(np.std(means, ddof=1)) / np.sqrt(_BLOCKS)
+    powers = [
+        [float(np.sum(part**2)) for part in np.array_split(one.y - one.simulated, _BLOCKS)]
+        for one in (first, second)
+    ]
+    # Without any error, as in exact records, no model is better.
+    least = _EXACT * float(np.sum((first.y - np.mean(first.y)) ** 2))
+    gain = np.log(np.array(powers[0]) + least) - np.log(np.array(powers[1]) + least)
+    spread = float(np.std(gain, ddof=1)) / np.sqrt(_BLOCKS)
     limit = float(t.isf(0.5 * _LEVEL, _BLOCKS - 1))
-    return (float(np.mean(means)) / spread if spread > 0.0 else 0.0), limit
+    return (float(np.mean(gain)) / spread if spread > 0.0 else 0.0), limit

@@ -1,0 +1,144 @@
+"""From a rig to a tuned controller: the experiment keeps its limits, its record shows the plant, the step is as predicted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.cli.commands.tune_sources import RECORD_OPTIONS, identified
+from quell.commissioning import Experiment, Limits, experiment, verify
+from quell.identification import Measured, decided, excitation, identify
+from quell.plants import LinearPlant
+from quell.realtime import TwinDevice
+from quell.tuning.identified import identified_plants
+
+from .commands import Shown
+from .test_identification import answer
+
+pytestmark = pytest.mark.compiled
+
+DT = 0.01
+# A machine that is busy with other things may make the loop as late as it likes.
+PATIENT = {"settle": 5, "hold": 10_000, "most_overruns": 10_000, "ramp": 10}
+
+
+@cache
+def at_twin(den: tuple[float, ...], b: float) -> tuple[Any, Experiment]:
+    """Return a twin and the record of an experiment at it."""
+    twin = TwinDevice(LinearPlant.of(([b], den)), DT)
+    limits = Limits(-2.0, 2.0, -1.0, 1.0, 3.0)
+    return twin, experiment(lambda: twin, DT, limits, safety=PATIENT, priority=0)
+
+
+@pytest.mark.parametrize(
+    ("den", "b", "kind"),
+    [((1.0, 8.0), -3.0, "prbs"), ((1.0, 3.0, 0.0), 6.0, "relay")],
+)
+def test_an_experiment_keeps_its_limits_and_shows_the_plant(
+    den: tuple[float, ...], b: float, kind: str
+) -> None:
+    """A lag of negative gain gets a PRBS, a drifting plant a relay; y stays within, and the model is the plant."""
+    _, done = at_twin(den, b)
+    assert done.kind == kind
+    assert done.sign == np.sign(b)
+    u, y = done.measured.u, done.measured.y
+    assert np.max(np.abs(y)) < 1.0
+    assert np.max(np.abs(u)) <= 2.0
+    found = identify(u, y, DT, order=len(den) - 1, held_out=0.0)
+    assert found.num[0] == pytest.approx(b, rel=0.02)
+    assert found.den == pytest.approx(den, rel=0.05, abs=0.05)
+
+
+def test_an_experiment_without_effect_or_room_is_refused() -> None:
+    """U that does not act, and y outside of its limits: one line each, and nothing is identified."""
+    twin = TwinDevice(LinearPlant.of(([1e-9], [1.0, 8.0])), DT)
+    limits = Limits(-2.0, 2.0, -1.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match=r"y moved by .* u does not act"):
+        experiment(lambda: twin, DT, limits, safety=PATIENT, priority=0)
+    for change, message in (
+        ({"u_min": 1.0}, "must have zero, the safe u"),
+        ({"y_min": 3.0}, "y_min"),
+        ({"duration": 0.0}, "duration = 0.0"),
+        ({"u_rest": 5.0}, "u_rest = 5.0: must be between"),
+    ):
+        given: dict[str, float] = {"u_min": -2.0, "u_max": 2.0, "y_min": -1.0, "y_max": 1.0}
+        with pytest.raises(ValueError, match=message):
+            Limits(**(given | {"duration": 1.0} | change))
+
+
+def test_the_verifying_step_is_as_predicted() -> None:
+    """A tuned loop at the twin of the identified plant: prediction and measurement agree."""
+    twin, done = at_twin((1.0, 8.0), -3.0)
+    model = identify(done.measured.u, done.measured.y, DT, order=1, held_out=0.0)
+    observer = ql.ESO.model_free(1, float(model.num[0]), omega_o=20.0, dt=DT)
+    controller = ql.ADRC(observer, omega_c=5.0, u_min=-2.0, u_max=2.0)
+    limits = Limits(-2.0, 2.0, -1.0, 1.0, 2.0)
+    step = verify(
+        lambda: twin, controller, model, limits, done.y_rest, 2.0, safety=PATIENT, priority=0
+    )
+    assert step.run.completed
+    assert step.height > 0.0
+    assert "fit of the prediction" in step.describe()
+    if not step.run.tally.skipped:  # a busy machine: the twin stands still where the loop is late
+        assert step.fit > 95.0
+    assert len(step.plot()) == 2
+
+
+def test_the_deviations_of_a_model_are_plants_around_it() -> None:
+    """Each of the points lies within three deviations in each coefficient, in pairs; a pole at s = 0 stays there."""
+    rng = np.random.default_rng(0)
+    u = excitation("prbs", (0.5, 10.0), 20.0, 0.02).u
+    y = answer(([5.0], [1.0, 0.8, 0.0]), u, 0.02) + 0.02 * rng.standard_normal(u.size)
+    found = ql.identify(u, y, 0.02, order=2)
+    plants, delays = identified_plants(found, late=0.01)
+    assert len(plants) == 5
+    assert delays == [0.0, 0.01, 0.01, 0.01, 0.01]
+    assert all(den[-1] == 0.0 and den[0] == 1.0 for _, den in plants)
+    spread = np.sqrt(np.diag(found.covariance))
+    b = np.array([num[0] for num, _ in plants])
+    assert np.max(np.abs(b - b[0])) < 3.0 * spread[-1]
+    assert np.mean(b[1:]) == pytest.approx(b[0], rel=1e-9)
+    quiet = ql.identify(u, 1e-3 * y + rng.standard_normal(u.size), 0.02, order=1, held_out=0.0)
+    with pytest.raises(ValueError, match="the record does not tell its sign"):
+        identified_plants(quiet)
+
+
+def test_a_record_is_identified_and_tuned(quell: Callable[..., Shown], tmp_path: Path) -> None:
+    """``quell tune record.csv``: model, tuned controller, and a setup that ``quell run`` accepts."""
+    rng = np.random.default_rng(0)
+    u = excitation("prbs", (0.5, 20.0), 10.0, 0.02).u
+    y = answer(([5.0], [1.0, 3.0]), u, 0.02) + 0.01 * rng.standard_normal(u.size)
+    table = np.column_stack([np.arange(u.size) * 0.02, u, y])
+    np.savetxt(tmp_path / "data.csv", table, delimiter=",", header="t,u,y", comments="")
+    options = ("--structure", "pi", "--max-delay", "0", "--model-order", "1", "--no-figures")
+    shown = quell("tune", "data.csv", *options, "--out", "tuned.toml", "--json", "out.json")
+    assert shown.code == 0, shown.err
+    told = json.loads((tmp_path / "out.json").read_text())
+    assert told["model"]["den"] == pytest.approx([1.0, 3.0], rel=0.05)
+    assert told["plants"] == 5
+    assert ql.setup.load(tmp_path / "tuned.toml").controller.dt == pytest.approx(0.02)
+    refused = quell("tune", "--device", "twin:two-mass", "--u-max", "1")
+    assert refused.code == 2
+    assert "an experiment also needs --u-min, --y-min, --y-max, --dt" in refused.err
+    limits = ("--u-min=-1", "--u-max=1", "--y-min=-1", "--y-max=1", "--dt", "0.01")
+    refused = quell("tune", "--device", "twin:two-mass", *limits)
+    assert refused.code == 2
+    assert "there is no terminal to ask at; give --yes" in refused.err
+
+
+def test_a_faulty_model_is_not_tuned_for() -> None:
+    """A record of a plant that runs away: the report says why there is nothing to tune."""
+    from rich.console import Console
+
+    u = excitation("prbs", (0.5, 20.0), 10.0, 0.02).u
+    y = answer(([5.0], [1.0, -0.5]), u, 0.02)
+    with pytest.raises(ValueError, match="no plant to tune for: .* is unstable"):
+        identified(Console(quiet=True), Measured(u, y, 0.02, None), RECORD_OPTIONS)
+    assert decided(identify(u, y, 0.02, order=1)).shortcomings
