@@ -1,8 +1,8 @@
 """The ACC benchmark on a box of plants: tune by simulation, judge on fresh plants.
 
 python benchmarks/acc_box.py                      # judges the designs on 4000 fresh plants
-python benchmarks/acc_box.py --tune 1000          # repeats the search, then judges its result
-python benchmarks/acc_box.py --tune 1000 --storage box.log   # continues if it is interrupted
+python benchmarks/acc_box.py --tune 900          # repeats the search, then judges its result
+python benchmarks/acc_box.py --tune 900 --storage box.log   # continues if it is interrupted
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import argparse
 import time
 
 from quell.experiments.acc import DT, SPRINGS, box, designs, interval, judge_sampled
-from quell.experiments.acc.controllers import OURS
+from quell.experiments.acc.controllers import FREED, OURS
 from quell.experiments.acc.samples import boxed
 
 # Seeds of the plants for the search, and of the fresh ones, which nothing else uses.
@@ -22,12 +22,14 @@ def main() -> None:
     """Judge, after a search if there is to be one."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--tune", type=int, metavar="TRIALS", help="candidates of a search")
-    parser.add_argument("--plants", type=int, default=500, help="plants of the search")
+    parser.add_argument("--plants", type=int, default=400, help="plants of the search")
     parser.add_argument("--storage", help="Optuna's journal file")
     parser.add_argument("--executor", default="threads", help="threads, processes, tcp://…")
     parser.add_argument("--count", type=int, default=4000, help="fresh plants")
     options = parser.parse_args()
-    chosen = {name: controller for name, controller in designs(DT).items() if name in OURS}
+    chosen = {
+        name: controller for name, controller in designs(DT).items() if name in (*OURS, FREED)
+    }
     if options.tune:
         began = time.perf_counter()
         samples = boxed(options.plants, SEARCHED)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
-from quell.cli.options import OUTPUTS, MaxSize, Outputs, WholeOrNone
+from quell.cli.options import OUTPUTS, MaxSize, Outputs, Switch, WholeOrNone
 from quell.cli.output import check_outputs, compile_loops, progress_bar, table, write_results
 from quell.reading import MAX_SIZE
 
@@ -26,6 +26,7 @@ def acc(
     count: WholeOrNone = None,
     spread: float | None = None,
     seed: WholeOrNone = None,
+    box: Switch = False,
     max_size: MaxSize = MAX_SIZE,
     outputs: Outputs = OUTPUTS,
 ) -> None:
@@ -43,12 +44,21 @@ def acc(
         published design fails about half of them.
     seed
         Seed of the plants: 0 by default.
+    box
+        Draw m1 and m2 from 0.6 to 1.4 kg and k from 0.5 to 2 N/m, the rest with a spread of 3.
     """
     from quell.experiments.acc import figures, study
     from quell.experiments.acc import samples as plant_samples
     from quell.experiments.acc.controllers import DT, designs
 
-    if samples is None:
+    if box and not (samples is None and spread is None):
+        raise ValueError(
+            "--box draws the plants with a spread of its own: --samples and --spread exclude it"
+        )
+    if box:
+        plants = plant_samples.boxed(1000 if count is None else count, seed or 0)
+        source = f"box, seed {seed or 0}"
+    elif samples is None:
         spread, seed = 1.0 if spread is None else spread, seed or 0
         plants = plant_samples.generated(1000 if count is None else count, spread, seed)
         source = f"generated, spread {spread:g}, seed {seed}"

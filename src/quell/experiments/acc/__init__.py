@@ -1,6 +1,6 @@
 """The ACC robust-control benchmark: published controllers and ours on uncertain plants.
 
-May import ``experiments.common`` and ``experiments.compare``.
+May import ``tuning``, ``experiments.common`` and ``experiments.compare``.
 """
 
 from quell.experiments.acc.cases import CaseResult, study_cases
@@ -8,7 +8,7 @@ from quell.experiments.acc.controllers import DT, PUBLISHED, TransferFunction, d
 from quell.experiments.acc.criteria import Judged, interval, judge
 from quell.experiments.acc.figures import against_spread, save
 from quell.experiments.acc.published import judge_published
-from quell.experiments.acc.samples import generated, plant, read, widened
+from quell.experiments.acc.samples import boxed, generated, plant, read, widened
 from quell.experiments.acc.stability import unstable
 from quell.experiments.acc.study import SPRINGS, Result, judge_sampled, records, run
 
@@ -21,6 +21,7 @@ __all__ = [
     "Result",
     "TransferFunction",
     "against_spread",
+    "boxed",
     "designs",
     "generated",
     "interval",
