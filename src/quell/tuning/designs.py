@@ -13,11 +13,11 @@ from quell.analysis.loop import LoopAnalysis
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.extras import extras_of
 from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.objectives import cost_of
+from quell.tuning.optimiser.objectives import cost_of, load_cost
 from quell.tuning.optimiser.problem import Extra, Problem, Solution
 from quell.tuning.optimiser.requirements import Bound, bounds_of
 from quell.tuning.optimiser.search import best_solution, search
-from quell.tuning.optimiser.time_responses import Inputs, law_of
+from quell.tuning.optimiser.time_responses import Inputs, SetResponses, law_of
 from quell.tuning.result.design import Design, design_of, impossible, measured
 from quell.tuning.structures.adrc import AdrcStructure
 from quell.tuning.structures.base import Model, Structure
@@ -28,6 +28,8 @@ from quell.types import Matrix, Vector
 
 # Rounds of a search that starts at the optimum for slightly other limits.
 _NEARBY_ROUNDS = 6
+# Rounds of a search over time, from the optimum for the integral gain.
+_ROUNDS = 15
 # Factors by which contradicting limits are relaxed, and steps of the bisection between them.
 _RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0), 6
 # References come before what starts at their equivalents.
@@ -49,8 +51,9 @@ class Task:
 
     def problem(self) -> Problem:
         """Return the problem of the optimiser."""
-        cost = cost_of(self.objective, self.plants, self.inputs, self.quantile)
-        extras = extras_of(self.constraints, self.plants, self.inputs)
+        over = SetResponses(self.plants, self.inputs)
+        cost = cost_of(self.objective, over, self.quantile)
+        extras = extras_of(self.constraints, over)
         return Problem(self.plants, bounds_of(self.constraints), extras, self.objective, cost)
 
 
@@ -107,10 +110,24 @@ def _solutions(name: str, task: Task, solved: Mapping[str, Sequence[Solution]]) 
     problem, found = task.problem(), []
     for order in orders_of(name, task.model, task.order):
         structure = make_structure(name, task.model, order)
-        best = best_solution(problem, structure, _known_starts(structure, solved))
+        best = _best(problem, structure, _known_starts(structure, solved))
         if best is not None and _is_stable(task.plants, best):
             found.append(best)
     return found
+
+
+def _best(problem: Problem, structure: Structure, known: Matrix) -> Solution | None:
+    """Return the best solution.
+
+    What is about responses over time is slow: it comes in at the optimum for the integral gain.
+    """
+    slow = [extra for extra in problem.extras if extra.over_time]
+    if problem.objective == "load" and not slow:
+        return best_solution(problem, structure, known)
+    quick = tuple(extra for extra in problem.extras if not extra.over_time)
+    by_gain = replace(problem, objective="load", cost=load_cost, extras=quick)
+    first = best_solution(by_gain, structure, known)
+    return None if first is None else search(problem, structure, first.values, _ROUNDS)
 
 
 def _is_stable(plants: PlantSet, solution: Solution) -> bool:
@@ -175,7 +192,7 @@ def relaxed(problem: Problem, factor: float) -> Problem:
     """Return the problem with all limits larger by a factor."""
     bounds = tuple(Bound(kind, factor * limit) for kind, limit in problem.bounds)
     extras = tuple(
-        Extra(extra.name, factor * extra.limit, partial(_share, extra, factor))
+        extra._replace(limit=factor * extra.limit, ratio=partial(_share, extra, factor))
         for extra in problem.extras
     )
     return replace(problem, bounds=bounds, extras=extras)

@@ -10,7 +10,7 @@ from quell.analysis.frequency_response import Complex
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.problem import Extra
-from quell.tuning.optimiser.time_responses import Inputs, law_of, responses
+from quell.tuning.optimiser.time_responses import SetResponses
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector
 
@@ -18,8 +18,9 @@ from quell.types import Matrix, Vector
 _SECANTS = 4
 
 
-def extras_of(constraints: Constraints, plants: PlantSet, inputs: Inputs) -> tuple[Extra, ...]:
+def extras_of(constraints: Constraints, over: SetResponses) -> tuple[Extra, ...]:
     """Return the constraints that ``constraints`` has besides bounds over frequency."""
+    plants = over.plants
     found = []
     if constraints.u_std is not None:
         assert constraints.noise_std is not None
@@ -38,7 +39,7 @@ def extras_of(constraints: Constraints, plants: PlantSet, inputs: Inputs) -> tup
         found.append(Extra("delay margin", least, delay))
     for name, limit in (("u_max", constraints.u_max), ("rate_max", constraints.rate_max)):
         if limit is not None:
-            found.append(_limit_of_u(name, limit, plants, inputs))
+            found.append(_limit_of_u(name, limit, over))
     return tuple(found)
 
 
@@ -89,18 +90,16 @@ def _loop(plants: PlantSet, structure: Structure, row: Vector, j: int, omega: Ve
     return L
 
 
-def _limit_of_u(name: str, limit: float, plants: PlantSet, inputs: Inputs) -> Extra:
+def _limit_of_u(name: str, limit: float, over: SetResponses) -> Extra:
     def ratio(structure: Structure, values: Matrix) -> Vector:
         found = np.empty(values.shape[0])
         for i, row in enumerate(values):
-            law = law_of(structure.controller(row))
             largest = 0.0
-            for plant in plants.scaled():
-                u = responses(plant, law, inputs).u
+            for _, u in over.of(structure, row):
                 if name == "rate_max":
-                    u = np.diff(u, prepend=0.0) / plants.dt
+                    u = np.diff(u, prepend=0.0) / over.plants.dt
                 largest = max(largest, float(np.max(np.abs(u))))
             found[i] = min(largest / limit, 1e6)
         return found
 
-    return Extra(name, limit, ratio)
+    return Extra(name, limit, ratio, over_time=True)

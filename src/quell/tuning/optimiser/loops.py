@@ -78,6 +78,16 @@ class PlantSet:
         P: Complex = np.array(rows) * self.factors[:, None]
         return P
 
+    def responses_of(self, omega: Vector, members: NDArray[np.intp]) -> Complex:
+        """Return P (k,) at frequencies (k,), each of the plant with that number."""
+        found = np.empty(omega.size, dtype=np.complex128)
+        keys = np.array([id(plant) for plant in self.plants])[members]
+        for key in np.unique(keys):
+            own = keys == key
+            found[own] = self._responses[int(key)](omega[own], self.dt)
+        P: Complex = found * self.factors[members]
+        return P
+
     def scaled(self) -> list[SampledPlant]:
         """Return the plants with the factors of their gain."""
         return [
@@ -167,11 +177,15 @@ class PlantSet:
 
 
 def peaks(
-    function: Callable[[Vector], NDArray[np.float64]], omega: Vector, values: Matrix, least: float
+    function: Callable[[Vector, NDArray[np.intp]], NDArray[np.float64]],
+    omega: Vector,
+    values: Matrix,
+    least: float,
 ) -> list[Peak]:
     """Return the local maxima (refined between grid points) above ``least``.
 
-    ``function`` returns values (J, k) at frequencies (k,); ``values`` are those at ``omega``.
+    ``function`` returns values (k,) at frequencies (k,) of the plants with numbers (k,);
+    ``values`` (J, G) are those at ``omega``.
     """
     found = []
     padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
@@ -187,8 +201,8 @@ def peaks(
     rows = np.arange(plants.size)
     for _ in range(_ZOOMS):
         points = low[:, None] + (high - low)[:, None] * share
-        each = function(np.exp(points.ravel())).reshape(values.shape[0], plants.size, _ZOOM)
-        own = each[plants, rows]
+        members = np.repeat(plants, _ZOOM)
+        own = function(np.exp(points.ravel()), members).reshape(plants.size, _ZOOM)
         top = np.argmax(own, axis=1)
         better = own[rows, top] > best
         best = np.where(better, own[rows, top], best)

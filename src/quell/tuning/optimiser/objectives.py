@@ -14,8 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from quell.tuning.optimiser.loops import PlantSet
-from quell.tuning.optimiser.time_responses import Inputs, law_of, responses
+from quell.tuning.optimiser.time_responses import SetResponses
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector
 
@@ -35,22 +34,15 @@ def load_cost(structure: Structure, values: Matrix) -> Vector:
     return np.where(np.isfinite(cost), cost, _WORST)
 
 
-def scores(
-    objective: str, structure: Structure, values: Vector, plants: PlantSet, inputs: Inputs
-) -> Vector:
+def scores(objective: str, structure: Structure, values: Vector, over: SetResponses) -> Vector:
     """Return the objective of each plant (J,)."""
-    law = law_of(structure.controller(values))
-    found = np.empty(len(plants.plants))
-    for j, plant in enumerate(plants.scaled()):
-        y = responses(plant, law, inputs).y
-        if objective == "tracking":
-            found[j] = np.sqrt(np.mean((inputs.r - y) ** 2))
-        else:
-            found[j] = plants.dt * np.sum(np.abs(y))
-    return found
+    found = [each.y for each in over.of(structure, values)]
+    if objective == "tracking":
+        return np.array([np.sqrt(np.mean((over.inputs.r - y) ** 2)) for y in found])
+    return np.array([over.plants.dt * np.sum(np.abs(y)) for y in found])
 
 
-def cost_of(objective: str, plants: PlantSet, inputs: Inputs, quantile: float) -> Cost:
+def cost_of(objective: str, over: SetResponses, quantile: float) -> Cost:
     """Return the function from a structure and values (m, p) to costs (m,)."""
     if objective == "load":
         return load_cost
@@ -58,7 +50,7 @@ def cost_of(objective: str, plants: PlantSet, inputs: Inputs, quantile: float) -
     def cost(structure: Structure, values: Matrix) -> Vector:
         found = np.empty(values.shape[0])
         for i, row in enumerate(values):
-            each = scores(objective, structure, row, plants, inputs)
+            each = scores(objective, structure, row, over)
             value = float(np.quantile(each, quantile))
             found[i] = np.log(value) if 0.0 < value < np.inf else _WORST
         return found

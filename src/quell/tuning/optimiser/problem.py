@@ -23,6 +23,7 @@ class Extra(NamedTuple):
     name: str
     limit: float
     ratio: Callable[[Structure, Matrix], Vector]  # values (m, p) → value over limit (m,)
+    over_time: bool = False  # whether responses over time are computed for it
 
 
 @dataclass(frozen=True)

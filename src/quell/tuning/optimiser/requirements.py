@@ -7,6 +7,7 @@ smooth, zero at the bound, and of moderate slope far beyond it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -107,7 +108,11 @@ def slack_and_slope(
 
 
 def all_peaks(
-    bounds: tuple[Bound, ...], plants: PlantSet, controller: object, C: Complex, least: float
+    bounds: tuple[Bound, ...],
+    plants: PlantSet,
+    controller: Callable[[Vector], Complex],
+    C: Complex,
+    least: float,
 ) -> list[tuple[int, Peak]]:
     """Return the refined maxima with a ratio above ``least``, each with the number of its bound.
 
@@ -117,8 +122,10 @@ def all_peaks(
     found = []
     for number, (kind, limit) in enumerate(bounds):
 
-        def ratio(omega: Vector, kind: str = kind, limit: float = limit) -> Stack:
-            return sizes(kind, plants.responses(omega), controller(omega)) / limit  # type: ignore[operator]
+        def ratio(
+            omega: Vector, members: NDArray[np.intp], kind: str = kind, limit: float = limit
+        ) -> Stack:
+            return sizes(kind, plants.responses_of(omega, members), controller(omega)) / limit
 
         values = sizes(kind, plants.P, C) / limit
         found += [(number, peak) for peak in peaks(ratio, plants.omega, values, least)]

@@ -18,8 +18,12 @@ from quell.controllers.linear.form import linear_form
 from quell.controllers.linear.law import LinearLaw
 from quell.lti.system import System
 from quell.plants.sampled import SampledPlant
+from quell.tuning.optimiser.loops import PlantSet
+from quell.tuning.structures.base import Structure
 from quell.types import Vector
 
+# Controllers whose responses are kept: those of one difference quotient, and some more.
+_KEPT = 64
 # Beyond, a response is that of an unstable loop: it would overflow.
 _DIVERGED = 1e100
 
@@ -68,10 +72,27 @@ def _delayed(law: LinearLaw, samples: int) -> LinearLaw:
     return LinearLaw(A, B_r, B_y, B_u, np.append(law.C, none), law.D_r, law.D_y)
 
 
+class SetResponses:
+    """The responses of all plants of a set, kept for the last controllers that were asked for."""
+
+    def __init__(self, plants: PlantSet, inputs: Inputs) -> None:
+        self.plants, self.inputs = plants, inputs
+        self._scaled = plants.scaled()
+        self._known: dict[tuple[int, bytes], list[Responses]] = {}
+
+    def of(self, structure: Structure, values: Vector) -> list[Responses]:
+        """Return the responses with the controller of values (p,), one for each plant."""
+        key = id(structure), values.tobytes()
+        if key not in self._known:
+            if len(self._known) >= _KEPT:
+                self._known.clear()
+            law = law_of(structure.controller(values))
+            self._known[key] = [responses(plant, law, self.inputs) for plant in self._scaled]
+        return self._known[key]
+
+
 def responses(plant: SampledPlant, law: LinearLaw, inputs: Inputs) -> Responses:
     """Return y and u of a loop from rest; infinite for an unstable one that overflows."""
-    from scipy.signal import fftconvolve
-
     size = inputs.r.size
     found = []
     for target in ("y", "u"):
@@ -81,9 +102,17 @@ def responses(plant: SampledPlant, law: LinearLaw, inputs: Inputs) -> Responses:
                 pulse = _pulse(closed_loop(plant, law, source, target), size)
                 if not np.max(np.abs(pulse)) < _DIVERGED:
                     return Responses(np.full(size, np.inf), np.full(size, np.inf))
-                total = total + fftconvolve(pulse, given)[:size]
+                total = total + _convolved(pulse, given)
         found.append(total)
     return Responses(*found)
+
+
+def _convolved(one: Vector, other: Vector) -> Vector:
+    """Return the first terms of the convolution of two vectors of the same length."""
+    length = 1 << (2 * one.size - 1).bit_length()
+    product = np.fft.rfft(one, length) * np.fft.rfft(other, length)
+    found: Vector = np.fft.irfft(product, length)[: one.size]
+    return found
 
 
 def _pulse(system: System, size: int) -> Vector:

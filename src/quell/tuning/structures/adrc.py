@@ -179,7 +179,7 @@ class AdrcStructure:
     def integral_gain(self, values: Matrix) -> Vector:
         """Return k_i (m,)."""
         found = self._designs(values)
-        return np.abs(sampled_adrc.integral_gain(found)) * found.factor / values[:, 0]
+        return sampled_adrc.integral_gain(found) * found.factor / values[:, 0]
 
     def unstable_poles(self, values: Matrix) -> Vector:
         """Return how many poles of C_y are unstable (m,)."""

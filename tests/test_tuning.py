@@ -1,0 +1,341 @@
+"""The optimiser of linear loops: responses, stability, optima, constraints, results, errors."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.analysis import analyse
+from quell.setup import load
+from quell.tuning import Constraints
+from quell.tuning.optimiser.requirements import sizes
+from quell.tuning.plants import given_plants, model_of, plant_set
+from quell.tuning.structures.equivalent import equivalents
+from quell.tuning.structures.registry import make_structure
+
+LAGS = ([1.0], [1.0, 3.0, 3.0, 1.0])
+DT = 0.02
+ALL_STRUCTURES = [
+    ("pi-unfiltered", 0), ("pi", 0), ("pid", 0), ("bandwidths", 1), ("bandwidths", 3),
+    ("freed", 2), ("freed", 3), ("half-gain", 2), ("half-gain-law", 2), ("reduced", 2),
+    ("model-based", 0), ("model-based-freed", 0), ("delay", 1), ("delay-freed", 2),
+]  # fmt: skip
+
+
+def loop_of(plant: Any, dt: float, delay: float = 0.0) -> Any:
+    """Return a set of one plant and what structures know of it."""
+    given = given_plants(plant, dt, delay=delay)
+    plants = plant_set(given, dt)
+    return plants, model_of(given, plants, Constraints())
+
+
+@pytest.fixture(scope="module")
+def tuned() -> ql.Tuned:
+    """Three lags under the usual constraints."""
+    return ql.tune(LAGS, DT, compare=("pi", "pid", "bandwidths"))
+
+
+# ---- structures
+
+
+@pytest.mark.parametrize(("name", "order"), ALL_STRUCTURES)
+def test_the_response_of_a_structure_is_that_of_the_controller_it_builds(
+    name: str, order: int
+) -> None:
+    """C_y of its starts, as ``analyse`` has it from the controller's own step."""
+    _, model = loop_of(LAGS, DT, 10 * DT)
+    structure = make_structure(name, model, order)
+    values = structure.shapes()[5:7]
+    omega = np.array([0.01, 0.3, 2.0, 40.0])
+    found = structure.response(values, omega)
+    for row, response in zip(values, found, strict=True):
+        loop = analyse(LAGS, structure.controller(row), delay=10 * DT)
+        np.testing.assert_allclose(response, loop.response("C_y", omega), rtol=1e-7)
+
+
+@pytest.mark.parametrize(("name", "order"), ALL_STRUCTURES)
+def test_the_integral_gain_is_the_residue_at_zero_frequency(name: str, order: int) -> None:
+    """``C_y → k_i dt/(z − 1)`` for ω → 0, so that its real part counts."""
+    _, model = loop_of(LAGS, DT, 10 * DT)
+    structure = make_structure(name, model, order)
+    values = structure.shapes()[-8:-6]
+    omega = np.array([1e-6])
+    residue = structure.response(values, omega)[:, 0] * np.expm1(1j * omega * DT) / DT
+    np.testing.assert_allclose(structure.integral_gain(values), residue.real, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("plant", "delay", "order"),
+    [
+        (LAGS, 0.0, 2),
+        (([1.0], [1.0, 0.0, 0.0]), 0.0, 2),
+        (([1.0], [1.0, 0.0, -1.0]), 0.0, 2),
+        (([1.0], [1.0, 1.0]), 1.0, 1),
+        (ql.plants.two_mass_spring(), 0.0, 4),
+    ],
+)
+def test_unstable_loops_are_counted_as_their_poles_are(
+    plant: Any, delay: float, order: int
+) -> None:
+    """With integrators, an unstable plant, a dead time, an undamped resonance."""
+    plants, model = loop_of(plant, DT, delay)
+    structure = make_structure("bandwidths", model, order)
+    values = structure.shapes()
+    values = np.vstack([values * [factor, 1.0, 1.0] for factor in (0.2, 1.0, 5.0)])
+    found = plants.unstable_loops(
+        structure.response(values, plants.omega), structure.unstable_poles(values)
+    )[:, 0]
+    seen = np.isfinite(found)
+    assert np.sum(seen) > 0.6 * seen.size
+    compared = set()
+    for row, count in zip(values[seen][::4], found[seen][::4], strict=True):
+        poles = analyse(plant, structure.controller(row), delay=delay).poles
+        if np.min(np.abs(np.abs(poles) - 1.0)) > 1e-4:
+            assert (count > 0.5) == (np.max(np.abs(poles)) > 1.0), row
+            compared.add(count > 0.5)
+    assert compared == {False, True}
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_freed_adrc_has_the_feedback_of_a_filtered_pi_or_pid_controller(order: int) -> None:
+    """Up to the sampling, which differs by half a sample of delay."""
+    dt = 1e-4
+    _, model = loop_of(LAGS, dt)
+    pid = make_structure("pi" if order == 1 else "pid", model)
+    values = np.array([0.6, 2.0, 0.1] if order == 1 else [2.0, 2.0, 0.6, 0.1])
+    freed = make_structure("freed", model, order)
+    rows = equivalents(pid, values, freed)
+    assert len(rows)
+    omega = np.geomspace(1e-2, 1e2, 30)
+    expected = pid.response(values[None, :], omega)[0]
+    for row in rows:
+        found = freed.response(row[None, :], omega)[0]
+        np.testing.assert_allclose(found, expected, rtol=1.5e-2)
+
+
+# ---- optima
+
+
+def test_constraints_hold_on_a_grid_a_hundred_times_finer(tuned: ql.Tuned) -> None:
+    """Within 0.1 %, and each active one is reached."""
+    x = np.log(tuned.plants.omega)
+    fine = np.exp(np.linspace(x[0], x[-1], 100 * x.size))
+    P = tuned.plants.responses(fine)
+    limits = {"M_s": 1.6, "M_t": 1.6, "M_ks": tuned.constraints.m_ks}
+    for design in tuned.designs.values():
+        C = design.solution.structure.response(design.solution.values[None, :], fine)[0]
+        worst = {kind: float(np.max(sizes(kind, P, C))) for kind in limits}
+        assert all(worst[kind] <= 1.001 * limit for kind, limit in limits.items())
+        for active in design.active:
+            if active.name in worst:
+                assert worst[active.name] == pytest.approx(active.value, rel=1e-3)
+        assert any(worst[kind] > 0.995 * limit for kind, limit in limits.items())
+
+
+def test_measures_are_those_of_the_analysis(tuned: ql.Tuned) -> None:
+    """M_s, M_ks, the gain of noise and the delay margin of ``LoopAnalysis``."""
+    measures, loop = tuned.design.measures, tuned.analysis
+    assert loop.stable
+    assert measures["M_s"] == pytest.approx(1.0 / loop.margins.modulus, rel=1e-5)
+    assert measures["M_ks"] == pytest.approx(loop.noise_to_control_peak, rel=1e-4)
+    assert measures["noise_gain"] == pytest.approx(loop.noise_to_control, rel=1e-3)
+    assert measures["delay_margin"] == pytest.approx(loop.margins.delay, rel=1e-4)
+
+
+def test_freed_poles_are_better_than_bandwidths_and_pid(tuned: ql.Tuned) -> None:
+    """At ten times the M_ks of the optimal PI controller; the result says by how much."""
+    k_i = {name: design.k_i for name, design in tuned.designs.items()}
+    assert k_i["freed"] > 1.0 * k_i["pid"] > k_i["bandwidths"] > 2.0 * k_i["pi"]
+    assert any("PID" in line for line in tuned.costs)
+    assert "best" in tuned.costs[-1]
+
+
+def test_the_law_of_a_freed_adrc_is_well_damped(tuned: ql.Tuned) -> None:
+    """Its poles are those of the ideal response to the reference."""
+    poles = tuned.design.solution.structure.poles(tuned.design.solution.values[None, :])[0][0]
+    assert np.min(-poles.real / np.abs(poles)) >= 0.6 - 1e-9
+
+
+def test_the_tradeoff_is_monotone(tuned: ql.Tuned) -> None:
+    """A lower limit costs integral gain, a higher one gives some."""
+    for name in {name for name, _, _ in tuned.tradeoff}:
+        low, high = (value for key, _, value in tuned.tradeoff if key == name)
+        assert low < tuned.design.k_i < high
+
+
+def test_limits_of_noise_and_delay_are_kept() -> None:
+    """std(u) and the delay margin, as ``analyse`` finds them."""
+    how: dict[str, Any] = {"structure": "pi", "compare": ()}
+    free = ql.tune(LAGS, DT, **how).analysis
+    noise, delay = 0.1 * 0.5 * free.noise_to_control, 1.3 * free.margins.delay
+    bounds = Constraints(u_std=noise, noise_std=0.1, delay_margin=delay)
+    loop = ql.tune(LAGS, DT, constraints=bounds, **how).analysis
+    assert loop.margins.delay >= 0.999 * delay
+    assert 0.1 * loop.noise_to_control <= 1.002 * noise
+
+
+def test_the_integral_of_the_error_is_that_of_a_simulation() -> None:
+    """``load-iae``; and it is less than that of the loop with the largest integral gain."""
+    how: dict[str, Any] = {"structure": "pi", "compare": (), "duration": 30.0}
+    integral = {}
+    for objective in ("load", "load-iae"):
+        tuned = ql.tune(LAGS, DT, objective=objective, **how)
+        scenario = ql.Scenario(disturbances=(ql.signals.Step(),), duration=30.0)
+        run = ql.simulate(ql.plants.LinearPlant.of(LAGS), tuned.controller, scenario)
+        integral[objective] = DT * float(np.sum(np.abs(run["y"])))
+    assert tuned.design.objective == pytest.approx(integral["load-iae"], rel=2e-3)
+    assert integral["load-iae"] <= integral["load"]
+
+
+def test_a_profile_is_tracked_within_limits_of_u() -> None:
+    """The largest u of the simulated run is the limit."""
+    profile = ql.signals.Trapezoid(distance=1.0, duration=6.0)
+    bounds = Constraints(u_max=1.1, m_ks=20.0)
+    how = {"reference": profile, "duration": 12.0, "structure": "pi-unfiltered"}
+    tuned = ql.tune(LAGS, DT, objective="tracking", constraints=bounds, compare=(), **how)
+    scenario = ql.Scenario(reference=profile, duration=12.0)
+    run = ql.simulate(ql.plants.LinearPlant.of(LAGS), tuned.controller, scenario)
+    assert np.max(np.abs(run["u"])) <= 1.1 * 1.002
+    error = math.sqrt(float(np.mean((run["r"] - run["y"]) ** 2)))
+    assert error == pytest.approx(tuned.design.objective, rel=0.01)
+
+
+# ---- sets of plants
+
+
+def test_constraints_hold_for_all_plants_and_on_fresh_ones() -> None:
+    """A range of a lag and of the gain; without the set the same structure exceeds M_s."""
+
+    def make(tau: float) -> Any:
+        return [1.0], np.polymul([tau, 1.0], [1.0, 2.0, 1.0]).tolist()
+
+    how: dict[str, Any] = {"structure": "pi", "compare": ()}
+    ranges = {"uncertain": {"tau": (0.5, 2.0)}, "b_range": (0.8, 1.25), "samples": 4}
+    robust = ql.tune(make, DT, check_samples=100, **ranges, **how)
+    assert robust.check.unstable == 0
+    assert robust.check.violating <= 2
+    low, high = robust.check.interval
+    assert low <= robust.check.violating / 100 <= high
+    nominal = ql.tune(make(1.25), DT, **how)
+    for plant in (make(0.5), make(2.0)):
+        assert 1.0 / analyse(plant, robust.controller).margins.modulus <= 1.601
+    assert robust.design.k_i < nominal.design.k_i
+
+
+# ---- results
+
+
+def test_the_setup_of_a_result_has_the_same_controller(tuned: ql.Tuned, tmp_path: Path) -> None:
+    """To the last digit, through TOML; an existing file is not replaced."""
+    path = tmp_path / "tuned.toml"
+    tuned.save(path)
+    setup = load(path)
+    omega = np.geomspace(1e-2, 1e2, 7)
+    again = analyse(LAGS, setup.controller).response("C_y", omega)
+    np.testing.assert_allclose(again, tuned.analysis.response("C_y", omega), rtol=1e-9)
+    assert setup.scenario is not None
+    with pytest.raises(ValueError, match="exists"):
+        tuned.save(path)
+
+
+def test_a_result_is_drawn_beside_its_references(tuned: ql.Tuned) -> None:
+    """Four axes: loop, sensitivities with two bounds, two responses."""
+    axes = np.ravel(tuned.plot())
+    assert len(axes) == 4
+    labels = [text.get_text() for text in axes[0].get_legend().get_texts()]
+    assert len(labels) == 3
+    assert "pid" in labels[2]
+
+
+# ---- bad input
+
+
+def test_contradicting_constraints_are_named_with_their_excess() -> None:
+    """An unstable plant needs more gain than M_ks allows at so small an M_t."""
+    unstable = ([1.0], [1.0, -1.0])
+    bounds = Constraints(m_s=1.05, m_t=1.05, m_ks=3.0)
+    with pytest.raises(ValueError, match=r"contradict .*M_t 1.05.*excess that was found is \d"):
+        ql.tune(unstable, DT, structure="pi-unfiltered", constraints=bounds, compare=())
+
+
+def test_a_plant_that_no_controller_of_the_structure_stabilises_is_said() -> None:
+    """A PI controller and a double integrator."""
+    with pytest.raises(ValueError, match="no controller of this structure was found that stab"):
+        ql.tune(([1.0], [1.0, 0.0, 0.0]), DT, structure="pi", compare=())
+
+
+@pytest.mark.parametrize(
+    ("plant", "message"),
+    [
+        ([([1.0], [1.0, 1.0]), ([1.0], [1.0, 2.0, 1.0])], "relative degree 2, plant"),
+        ([([1.0], [1.0, 1.0]), ([-1.0], [1.0, 1.0])], "other sign of the gain"),
+        (([1.0, 0.0], [1.0, 2.0, 1.0]), "zero at s = 0"),
+    ],
+)
+def test_plants_that_do_not_fit_are_refused(plant: Any, message: str) -> None:
+    """A set with different degrees or signs, and a plant that blocks integral action."""
+    with pytest.raises(ValueError, match=message):
+        ql.tune(plant, DT)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ({"m_s": 1.0}, "m_s = 1.0: must be above 1"),
+        ({"m_s": None, "m_t": None}, "one of them must bound"),
+        ({"u_std": 0.1}, "needs noise_std"),
+        ({"m_ks": -1.0}, "m_ks = -1.0"),
+    ],
+)
+def test_impossible_constraints_are_refused(bounds: dict[str, Any], message: str) -> None:
+    """Before anything is searched."""
+    with pytest.raises(ValueError, match=message):
+        Constraints(**bounds)
+
+
+# ---- poles of their own
+
+
+def test_an_observer_has_the_poles_that_it_is_given() -> None:
+    """exp(p dt) in the z-plane, real and complex, in units of omega_o; all at −1 as without."""
+    poles = [-0.5, (-0.6, 0.8)]
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=4.0, dt=0.01, poles=poles)
+    model = observer.model
+    corrected = (np.eye(3) - np.outer(model.gain, np.eye(3)[0])) @ model.transition
+    expected = np.exp(0.04 * np.array([-0.6 - 0.8j, -0.6 + 0.8j, -0.5]))
+    found = np.sort_complex(np.linalg.eigvals(corrected))
+    np.testing.assert_allclose(found, np.sort_complex(expected), atol=1e-9)
+    usual = ql.ESO.model_free(order=2, b0=1.0, omega_o=4.0, dt=0.01)
+    same = ql.ESO.model_free(order=2, b0=1.0, omega_o=4.0, dt=0.01, poles=[-1, -1, -1])
+    np.testing.assert_allclose(same.model.gain, usual.model.gain, rtol=1e-12)
+    assert usual.has_one_pole
+    assert not observer.has_one_pole
+
+
+def test_a_law_has_the_poles_that_it_is_given_and_retunes_with_omega_c() -> None:
+    """``s² + k_2 s + k_1`` has them in units of omega_c."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=0.01)
+    controller = ql.ADRC(observer, omega_c=2.0, law_poles=[(-0.6, 0.8)])
+    np.testing.assert_allclose(controller.parameters.law, [4.0, 2.4], rtol=1e-12)
+    controller.retune(omega_c=1.0)
+    np.testing.assert_allclose(controller.parameters.law, [1.0, 1.2], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("poles", "message"),
+    [
+        ([-1.0, -1.0], "has 2 poles, must have 3"),
+        ([-1.0, -1.0, 0.5], "below zero"),
+        ([-1.0, -1.0 + 1.0j, -1.0 + 1.0j], "conjugate"),
+        (-1.0, "must be a list of poles"),
+    ],
+)
+def test_impossible_poles_are_refused(poles: Any, message: str) -> None:
+    """With the argument and the rule."""
+    with pytest.raises(ValueError, match=message):
+        ql.ESO.model_free(order=2, b0=1.0, omega_o=4.0, dt=0.01, poles=poles)
