@@ -417,11 +417,16 @@ def test_a_setup_in_a_sweep_is_the_one_with_these_values(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("plant.m1", "plant.m3", "sweep.parameters: plant.m3: unknown; must be one of"),
+        ("plant.m1", "plant.m3", "sweep.parameters, case mine: plant.m3: unknown; must be one of"),
         ("low = 0.6", "low = 1.6", "sweep: parameters.plant.m1: low = 1.6"),
         ("low = 0.6", "steps = 3", "sweep: parameters.plant.m1: .*low"),
-        ("low = 0.6", "low = -3.0", "sweep.parameters: plant.m1 = -0.7"),
-        ('"scenario.reference"', '"scenario.x.y"', "sweep.parameters: scenario.x: unknown"),
+        ("low = 0.6", "low = -3.0", "sweep.parameters, case mine: plant.m1 = -0.7"),
+        (
+            '"scenario.reference"',
+            '"scenario.x.y"',
+            "sweep.parameters, case mine: scenario.x: unknown",
+        ),
+        ("plant.m1", "observer.b0", "sweep.parameters, case pid: observer.kind: missing"),
         ("kp = 0.1", "kq = 0.1", "sweep.cases.pid: controller.kq: unknown"),
         ('"rms"', '"rmse"', "sweep.metrics: 'rmse' is unknown, did you mean rms?"),
         ("seed = 3", "limits = { ise = 1.0 }", "sweep.limits.ise: is none of the metrics"),

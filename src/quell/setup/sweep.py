@@ -49,20 +49,17 @@ def sweep_of(setup: Setup) -> dict[str, Any]:
 
 
 def _check_parameter(build: Variation, path: str, given: Any) -> None:
-    """Check that the setup has a parameter, in one of the cases at least."""
-    where, error = "sweep.parameters", SetupError([])
+    """Check that the setup has a parameter, in all cases."""
+    where = "sweep.parameters"
     try:
         values = as_values(path, given)
-    except ValueError as fault:
-        raise SetupError([f"{build.name}: {where}: {fault}"]) from None
+    except ValueError as error:
+        raise SetupError([f"{build.name}: {where}: {error}"]) from None
     value = values[0] if isinstance(values, tuple) else float(values.ppf(np.array([0.5]))[0])
-    for case in [{CASE: name} for name in build.cases] or [{}]:
-        try:
-            _attempt(build, where, {**case, path: value})
-            return
-        except SetupError as fault:
-            error = fault
-    raise error
+    for case in build.cases:
+        _attempt(build, f"{where}, case {case}", {CASE: case, path: value})
+    if not build.cases:
+        _attempt(build, where, {path: value})
 
 
 def _attempt(build: Variation, where: str, values: Mapping[str, Any]) -> None:
