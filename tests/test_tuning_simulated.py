@@ -333,3 +333,92 @@ def test_whole_numbers_stay_whole() -> None:
     found = search(build, space, BOWL, trials=8)
     assert isinstance(found, Search)
     assert all(float(c.parameters["a"]).is_integer() for c in found.candidates)
+
+
+def integrator(gain: float = 1.0) -> Any:
+    """Return a plant of order 1."""
+    return ql.plants.LinearPlant([[0.0]], [gain], [1.0])
+
+
+BOUNDS = ql.tuning.Constraints(m_s=1.6, m_t=1.6, m_ks=20.0, omega_o_dt=0.4)
+REST = ql.Scenario(duration=2.0, disturbances=(ql.signals.Step(height=0.8),))
+
+
+def test_tune_goes_on_by_simulation_within_the_bounds_of_the_linear_loop() -> None:
+    """With limited u and a criterion of the user's it beats the optimum of the linear loop, on fresh plants too."""
+
+    def effort(run: ql.Trajectory) -> float:
+        # The error, and what u moves.
+        return float(np.sum(np.abs(1.0 - run["y"])) + np.sum(np.abs(np.diff(run["u"]))))
+
+    tuned = ql.tune(
+        integrator,
+        dt=0.05,
+        structure="bandwidths",
+        order=1,
+        compare=("pi",),
+        constraints=BOUNDS,
+        uncertain={"gain": (0.8, 1.2)},
+        samples=4,
+        check_samples=30,
+        scenario=ql.Scenario(reference=1.0, duration=3.0),
+        objective=Objective(effort, Worst()),
+        search={"trials": 24, "factor": 4.0},
+        u_min=-1.0,
+        u_max=1.0,
+    )
+    assert tuned.search is not None
+    start, best = tuned.search.candidates[0], tuned.search.best
+    assert tuned.objective == "effort"
+    assert tuned.design.objective == best.values["effort"] < start.values["effort"]
+    assert dict(tuned.design.values) == best.parameters
+    for name, limit in (("M_s", 1.6), ("M_t", 1.6), ("M_ks", 20.0)):
+        assert tuned.design.measures[name] < 1.002 * limit
+    assert tuned.controller.parameters.limits.high == 1.0
+    assert tuned.simulated_check is not None
+    check = tuned.simulated_check["effort"]
+    assert check.samples == 30
+    assert check.value == pytest.approx(best.values["effort"], rel=0.05)
+    assert "effort on 30 fresh samples" in tuned.summary()
+    assert "against the optimal PI controller" in tuned.summary()
+    assert tuned.to_json()["search"]["front"] == [best.number]
+    assert "u_max = 1.0" in tuned.toml()
+
+
+def test_tune_by_simulation_takes_plants_that_are_not_linear() -> None:
+    """An encoder and a delay: the start is the optimum of what is linear, the runs have all of it."""
+    coarse = ql.plants.encoded(ql.plants.delayed(integrator(), 0.1, 0.05), 300)
+    tuned = ql.tune(
+        coarse,
+        dt=0.05,
+        structure="pi",
+        compare=(),
+        constraints=BOUNDS,
+        scenario=REST,
+        objective={"iae": Objective("iae"), "moves": Objective("total_variation")},
+        search={"trials": 20},
+    )
+    assert tuned.search is not None
+    front = tuned.search.front
+    run = ql.simulate(coarse, tuned.controller, REST)
+    assert front[0].values["iae"] == run.metrics()["iae"] == tuned.design.objective
+    assert len(front) > 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"objective": "rms"}, "objective = 'rms': must be load, load-iae or tracking; any other"),
+        ({"search": {"trials": 3}}, "is for a tuning by simulation; give a scenario"),
+        ({"scenario": REST, "objective": "fast", "search": {"trials": 1}}, "score = 'fast': must"),
+        (
+            {"scenario": REST, "objective": "iae", "search": {"factor": 1.0}},
+            "factor = 1.0: must be above 1",
+        ),
+    ],
+)
+def test_what_tune_by_simulation_lacks_is_named(change: dict[str, Any], message: str) -> None:
+    """Before a search begins."""
+    options: dict[str, Any] = {"structure": "pi", "compare": (), "constraints": BOUNDS}
+    with pytest.raises(ValueError, match=message):
+        ql.tune(integrator(), 0.05, **(options | change))

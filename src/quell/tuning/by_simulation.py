@@ -1,23 +1,46 @@
-"""Tuning of a structure by simulation, around a start such as the optimum of the linear loop."""
+"""Tuning of a structure by simulation, around the optimum of the linear loop.
+
+``tune`` finds the start, on the plants' linear parts; the search then varies the same parameters,
+and keeps to the same constraints of the linear loop.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from quell import checks
+from quell.analysis.frequency_response import Response
+from quell.analysis.linearise import linear_law
+from quell.analysis.loop import LoopAnalysis
+from quell.analysis.subsystems import law_matrix
 from quell.controllers.base import Controller
+from quell.lti.models import is_linear_model
+from quell.lti.system import System
+from quell.plants.linear import LinearPlant
+from quell.tuning.constraints import Constraints
+from quell.tuning.optimiser.loops import PlantSet
+from quell.tuning.optimiser.problem import Solution
+from quell.tuning.optimiser.requirements import bounds_of, worst_ratio
+from quell.tuning.plants import as_list
+from quell.tuning.result.design import Design, design_of
 from quell.tuning.simulated import Problem, Range, Search, search
 from quell.tuning.structures.base import Structure
+from quell.tuning.tuned import Tuned
+from quell.tuning.uncertain import Uncertain
 
 # Ranges around the start: a factor either way. Chosen by hand.
 _WIDE = 10.0
+# Seed of the scenarios of fresh samples, after that of the others: more than any set has samples.
+_FRESH = 1_000_000
 # Share of a range's ends by which a value may be beyond them through rounding.
 _ROUNDING = 1e-12
+# Logarithm by which bounds of the linear loops may be exceeded: optima keep to them within 0.1 %.
+_SLACK = 1e-3
 
 
 @dataclass(frozen=True)
@@ -79,3 +102,135 @@ def _around(structure: Structure, values: Mapping[str, float], factor: float) ->
         ends = max(low, value / factor), min(high, value * factor)
         found[name] = Range(min(ends[0], value), max(ends[1], value))
     return found
+
+
+class LinearBounds:
+    """By how much a controller exceeds the bounds of the linear loops, as a logarithm.
+
+    Parameters
+    ----------
+    plants
+        the linear plants, sampled.
+    constraints
+        the bounds of M_s, M_t and M_ks.
+    """
+
+    def __init__(self, plants: PlantSet, constraints: Constraints) -> None:
+        self._plants, self._bounds = plants, bounds_of(constraints)
+
+    def __call__(self, controller: Controller) -> float:
+        """Return zero or less if all bounds hold; infinity for an unstable loop."""
+        law, plants = linear_law(controller), self._plants
+        if not all(LoopAnalysis(plant, law, plants.dt).stable for plant in plants.scaled()):
+            return math.inf
+        input_y = law.B_y + law.B_u * law.D_y
+        C_y = Response(System(law_matrix(law), input_y, -law.C, -law.D_y))
+        ratio = worst_ratio(self._bounds, plants, C_y(plants.omega, plants.dt)[None, :])
+        # The start is within 0.1 % of its bounds, and so may be what follows.
+        return math.log(float(ratio[0])) - _SLACK
+
+
+def tune_by_simulation(
+    linear: Callable[..., Tuned],
+    plant: Any,
+    scenario: Any,
+    objective: Any,
+    options: Mapping[str, Any],
+    how: Mapping[str, Any],
+) -> Tuned:
+    """Return the result of ``tune`` for the linear parts, tuned further by simulation.
+
+    Parameters
+    ----------
+    linear
+        ``tune``, without a scenario, as a function of the plant and ``how``.
+    plant
+        as for ``tune``, but with all that is not linear.
+    scenario, objective
+        as for ``Problem.of_runs``.
+    options
+        of ``tune_structure`` and ``search``.
+    how
+        other arguments of ``tune``.
+    """
+    if scenario is None:
+        raise ValueError(
+            f"objective = {objective!r}: must be load, load-iae or tracking; any other one is "
+            "judged in a simulation, for which scenario must be given"
+        )
+    uncertain, count, seed = how.get("uncertain"), how.get("samples", 20), how.get("seed", 0)
+    box = None if uncertain is None else Uncertain(plant, uncertain)
+    parts = _linear_parts(plant, box)
+    found = linear(parts, **how, objective="load")
+    plants = as_list(plant) if box is None else box.plants(box.design_set(count, seed))
+    plants = [LinearPlant.of(p) if is_linear_model(p) else p for p in plants]
+    problem = Problem.of_runs(plants, scenario, objective)
+    assert found.design.solution is not None  # ``tune`` returns no other design
+    limits = found.task.u
+    build = Build(found.design.solution.structure, limits)
+    bounds = LinearBounds(found.plants, found.constraints)
+    progress = how.get("progress")
+    report = None if progress is None else lambda share: progress("simulations", share)
+    given = {"violation": bounds, "seed": seed, "progress": report, **options}
+    trials = tune_structure(build, problem, found.design.values, **given)
+    best = trials.best if len(trials.objectives) == 1 else trials.front[0]
+    first = trials.objectives[0]
+    design = _design(found, best.parameters, best.values[first])
+    designs = {name: _judged(each, problem) for name, each in found.designs.items()}
+    own = next(name for name, each in found.designs.items() if each is found.design)
+    checked = None
+    if box is not None:
+        fresh = box.plants(box.fresh(how.get("check_samples", 400), seed))
+        later = Problem.of_runs(fresh, _later(scenario, len(fresh)), objective)
+        checked = later.check(build(best.parameters), best.values)
+    law = linear_law(build(best.parameters))
+    loop = LoopAnalysis(found.analysis.plant, law, found.plants.dt, found.analysis.b_over_b0)
+    changes: dict[str, Any] = {"design": design, "designs": designs | {own: design}}
+    return replace(
+        found,
+        **changes,
+        check=None,
+        analysis=loop,
+        objective=first,
+        search=trials,
+        simulated_check=checked,
+    )
+
+
+def _linear_parts(plant: Any, box: Uncertain | None) -> Any:
+    """Return the linear parts of plants, or a function that makes them."""
+    if box is not None:
+        return lambda **values: _linear(plant(**values))
+    plants = as_list(plant)
+    parts = [_linear(each) for each in plants]
+    return parts[0] if len(parts) == 1 else parts
+
+
+def _linear(plant: Any) -> Any:
+    return getattr(plant, "linear", plant)
+
+
+def _later(scenario: Any, count: int) -> Any:
+    """Return the scenario, or as many of several as there are plants, with seeds of their own."""
+    if not checks.is_sequence(scenario):
+        return replace(scenario, seed=scenario.seed + _FRESH)
+    several = [scenario[i % len(scenario)] for i in range(count)]
+    return [replace(each, seed=each.seed + _FRESH + i) for i, each in enumerate(several)]
+
+
+def _design(found: Tuned, values: Mapping[str, float], objective: float) -> Design:
+    solution = found.design.solution
+    assert solution is not None
+    row = np.array([values[parameter.name] for parameter in solution.structure.parameters])
+    better = Solution(solution.structure, row, 0.0, 0.0)
+    made = design_of(
+        found.design.name, found.task.problem(), better, found.constraints, found.task.u
+    )
+    return replace(made, objective=objective)
+
+
+def _judged(design: Design, problem: Problem) -> Design:
+    """Return a linear optimum with what it reaches in the simulations."""
+    if design.controller is None:
+        return design
+    return replace(design, objective=problem.values(problem.scores(design.controller))[0])

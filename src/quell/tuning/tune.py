@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.parallel import one_blas_thread
 from quell.plants.linear import LinearPlant
+from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, tuned_designs, with_noise_bound
 from quell.tuning.optimiser.loops import PlantSet
@@ -37,7 +39,7 @@ def tune(
     *,
     structure: str = "freed",
     order: int | None = None,
-    objective: str = "load",
+    objective: Any = "load",
     constraints: Constraints | None = None,
     compare: Sequence[str] = COMPARED,
     reference: Any = None,
@@ -53,6 +55,8 @@ def tune(
     check_samples: int = 400,
     seed: int = 0,
     setup: Mapping[str, Any] | None = None,
+    scenario: Any = None,
+    search: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     **limits: Any,
 ) -> Tuned:
@@ -99,6 +103,15 @@ def tune(
         of the samples.
     setup
         tables of a setup file that ``Tuned.toml`` completes; made from ``plant`` by default.
+    scenario
+        tunes by simulation (extra ``tuning``), for saturation, friction, encoders and criteria of
+        your own: a ``Scenario`` that the plants, which need not be linear, run through, or one for
+        each. The optimum of the linear parts for the load is the start, and their bounds M_s, M_t
+        and M_ks hold. ``objective`` is then the name of a metric, as ``"iae"``, a function of a
+        ``Trajectory``, an ``Objective`` with a statistic over the plants, or several by name.
+    search
+        options of ``quell.tuning.simulated.search``: ``trials``, ``sampler``, ``storage``,
+        ``executor``, …; and ``factor``, the width of the ranges around the start.
     progress
         called with the structure and the share that is done.
     **limits
@@ -124,12 +137,22 @@ def tune(
     >>> round(tuned.design.values["K"], 2), round(tuned.design.values["T_i"], 2)
     (0.63, 1.96)
     """
+    if scenario is not None or not isinstance(objective, str) or objective not in OBJECTIVES:
+        how: dict[str, Any] = {"structure": structure, "order": order, "constraints": constraints}
+        how |= {"compare": compare, "delay": delay, "actuator_lag": actuator_lag, "setup": setup}
+        how |= {"operating_point": operating_point, "uncertain": uncertain, "b_range": b_range}
+        how |= {"samples": samples, "check_samples": check_samples, "seed": seed}
+        how |= {"progress": progress, **limits}
+        linear = partial(tune, dt=dt)
+        return tune_by_simulation(linear, plant, scenario, objective, search or {}, how)
+    if search is not None:
+        raise ValueError("search = {...}: is for a tuning by simulation; give a scenario, too")
     dt = checks.positive("dt", dt, "s")
     _check_names(structure, compare, objective)
     if not 0.0 < checks.finite("quantile", quantile) <= 1.0:
         raise ValueError(f"quantile = {quantile!r}: must be above 0 and at most 1, the worst case")
     report = progress or (lambda part, share: None)
-    how: dict[str, Any] = {"actuator_lag": actuator_lag, "b_range": b_range}
+    how = {"actuator_lag": actuator_lag, "b_range": b_range}
     how |= {"delay": delay, "operating_point": operating_point}
     box = None if uncertain is None else Uncertain(plant, uncertain)
     if box is not None:

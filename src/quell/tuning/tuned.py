@@ -20,6 +20,7 @@ from quell.tuning.result import report
 from quell.tuning.result.design import Design
 from quell.tuning.result.plots import draw
 from quell.tuning.result.setup_file import toml_text
+from quell.tuning.simulated import Checked, Search
 from quell.tuning.uncertain import Check
 
 
@@ -45,8 +46,10 @@ class Tuned:
         the result on fresh samples, if the plant has ranges.
     setup : Mapping
         tables of the setup file besides those of the controller.
-    search : object or None
-        the trials, if the tuning was by simulation.
+    search : Search or None
+        the trials, if the tuning was by simulation; ``search.front`` with several objectives.
+    simulated_check : Mapping or None
+        the objectives on fresh samples, if the plant has ranges and the tuning was by simulation.
     """
 
     design: Design
@@ -58,7 +61,8 @@ class Tuned:
     check: Check | None = None
     setup: Mapping[str, Any] = field(default_factory=dict)
     noise_bound: str = ""
-    search: Any = None
+    search: Search | None = None
+    simulated_check: Mapping[str, Checked] | None = None
 
     @property
     def controller(self) -> Controller:
@@ -74,7 +78,12 @@ class Tuned:
 
     @cached_property
     def tradeoff(self) -> list[tuple[str, float, float]]:
-        """Name, limit and objective for limits 10 % below and above the active ones."""
+        """Name, limit and objective for limits 10 % below and above the active ones.
+
+        Empty after a tuning by simulation, which would have to be repeated.
+        """
+        if self.search is not None:
+            return []
         with one_blas_thread():
             return tradeoff(self.task, self.design)
 
@@ -102,6 +111,9 @@ class Tuned:
         lines += [f"active: {', '.join(self.active) or 'no constraint'}", *self.costs]
         lines += report.tradeoff_lines(self.tradeoff, self.objective)
         lines += [str(self.check)] if self.check is not None else []
+        for name, each in (self.simulated_check or {}).items():
+            ends = f"95 % interval {each.low:.4g} to {each.high:.4g}"
+            lines.append(f"{name} on {each.samples} fresh samples: {each.value:.4g} ({ends})")
         return "\n".join([*lines, self.analysis.summary()])
 
     def plot(self, axes: Any = None) -> Any:
@@ -149,6 +161,10 @@ class Tuned:
                     for name, limit, value in self.tradeoff
                 ],
                 "check": check,
+                "search": None if self.search is None else self.search.to_json(),
+                "simulated_check": None
+                if self.simulated_check is None
+                else {name: each._asdict() for name, each in self.simulated_check.items()},
                 "plants": len(self.plants.plants),
                 "dt": self.plants.dt,
             }

@@ -14,13 +14,17 @@ _UNITS = {"load": "k_i", "load-iae": "∫|y|", "tracking": "RMS of r − y"}
 
 def quantity(objective: str) -> str:
     """Return the name of what an objective is about."""
-    return _UNITS.get(objective, "objective")
+    return _UNITS.get(objective, objective)
 
 
 def relative(design: Design, other: Design, objective: str) -> float:
     """Return how many times as good ``design`` is as ``other``."""
-    ratio = design.objective / other.objective
-    return ratio if objective == "load" else 1.0 / ratio
+    better, worse = design.objective, other.objective
+    if objective != "load":
+        better, worse = worse, better
+    if better == worse:  # both zero, perhaps, or infinite
+        return 1.0
+    return better / worse if worse != 0.0 else math.inf
 
 
 def active_text(active: Active, plants: int) -> str:
