@@ -25,10 +25,10 @@ from quell.types import Matrix, Vector
 _BOTTOM = 1e-4
 # With integral action |L| is large at the lowest frequency, if that is below the loop's dynamics.
 _LEAST_BOTTOM = 3.0
-# Points per decade of the grid, and phase of the longest dead time between points of its even part
-# [rad], which ends after so many turns: above, the gain of a loop with a dead time is small.
-# Doubling the points changes the optima of the test batch by less than 1e-4.
-_POINTS_PER_DECADE, _TURN, _TURNS = 24, 0.3, 12.0
+# Points per decade of the grid. With a dead time responses have a peak in each turn of its phase:
+# the grid has an even part with so many radians between points, up to where the plant's gain has
+# fallen to this share of that at the crossover. Beyond, the loop's gain is too small for peaks.
+_POINTS_PER_DECADE, _TURN, _FALLEN = 24, 0.5, 0.02
 # Half the sampling rate itself is a pole of Tustin's rule.
 _BELOW_HALF = 1.0 - 1e-6
 # Points between the neighbours of a maximum, and how often they are placed anew: an interval of
@@ -122,7 +122,7 @@ class PlantSet:
         parts = [np.geomspace(bottom, top, count)]
         longest = max(_dead_samples(plant) for plant in self.plants) * self.dt
         if longest > 0.0:
-            end = min(2.0 * math.pi * _TURNS / longest, top)
+            end = self._end_of_peaks(top)
             parts.append(np.arange(1.0, end * longest / _TURN) * (_TURN / longest))
         for plant in self.plants:
             poles = self._s_poles(plant)
@@ -134,6 +134,13 @@ class PlantSet:
         grid = np.unique(np.concatenate(parts))
         kept: Vector = grid[(grid >= bottom) & (grid <= top)]
         return kept
+
+    def _end_of_peaks(self, top: float) -> float:
+        """Return the frequency above which all plants' gain is small [rad/s]."""
+        omega = np.geomspace(self.crossover, top, 100)
+        gain = np.abs(self.responses(omega))
+        large = np.flatnonzero(np.any(gain > _FALLEN * gain[:, :1], axis=0))
+        return float(omega[large[-1]])
 
     def _open_poles(self, shifted: Complex) -> tuple[float, float, Vector]:
         """Return unstable poles, integrators, and the frequencies of undamped ones [rad/s]."""
