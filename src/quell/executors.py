@@ -7,7 +7,7 @@ import signal
 import socket
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -88,10 +88,11 @@ def executor_on(where: Where = None, workers: int | None = None) -> Iterator[Exe
 
 def completed(
     executor: Executor, function: Callable[[T], R], tasks: Iterable[T]
-) -> Iterator[tuple[T, R]]:
+) -> Generator[tuple[T, R], None, None]:
     """Yield each task and ``function(task)``, in the order in which they are done.
 
-    If a task raises an error, or the caller stops, tasks that have not begun are dropped.
+    If a task raises an error, or the caller closes the generator, tasks that have not begun are
+    dropped.
 
     Raises
     ------

@@ -21,13 +21,15 @@ _MESSAGES = 3
 
 
 def summary(found: Sweep, worst: int) -> dict[str, Any]:
-    """Return numbers of failures, quantiles of the measures and the worst runs."""
+    """Return numbers of failures, quantiles of the measures and the worst runs.
+
+    The quantiles are those of runs that did not diverge.
+    """
     from quell.sweeping.figures import QUANTILES, wilson
-    from quell.types import Status
 
     data, failed = found.dataset, found.failed
     status = data["status"].values
-    diverged = (status >= 0) & ((status & int(Status.DIVERGED)) != 0)
+    diverged = (status >= 0) & ~found.complete
     failures = int(np.sum(failed))
     beyond = {
         name: int(np.sum(~(data[name].values <= limit) & (status >= 0) & ~diverged))
@@ -35,7 +37,7 @@ def summary(found: Sweep, worst: int) -> dict[str, Any]:
     }
     quantiles = {}
     for name in found.store.measures:
-        values = data[name].values
+        values = data[name].values[found.complete]
         values = values[np.isfinite(values)]
         shares = np.quantile(values, QUANTILES).tolist() if values.size else [None] * len(QUANTILES)
         largest = float(np.max(values)) if values.size else None
@@ -90,7 +92,7 @@ def print_summary(
         f"({100.0 * results['failure_rate']:.3g} %, 95 % interval {low:.3g} … {high:.3g} %): "
         f"{results['errors']} with an error, {results['diverged']} diverged{limits}.",
     )
-    rows = table("", "measure", "runs", "5 %", "median", "95 %", "largest")
+    rows = table("Runs that did not diverge", "measure", "runs", "5 %", "median", "95 %", "largest")
     for name, each in results["measures"].items():
         numbers = [*each["quantiles"], each["largest"]]
         cells = ["–" if value is None else f"{value:.4g}" for value in numbers]

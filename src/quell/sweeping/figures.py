@@ -65,7 +65,8 @@ def plot_over(
     columns = min(3, 1 + len(measures))
     rows = -(-(1 + len(measures)) // columns)
     if figure is None:
-        figure = Figure(figsize=(3.6 * columns, 2.7 * rows), layout="constrained")
+        figure = Figure(figsize=(3.6 * columns, 2.9 * rows), layout="constrained")
+    figure.suptitle("failures; median and 5 to 95 % of the runs that did not diverge", fontsize=10)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
     _plot_failures(axes[0], failed, groups)
     for axis, (name, values) in zip(axes[1:], measures.items(), strict=False):
@@ -75,6 +76,7 @@ def plot_over(
         axis.set_axis_off()
     for axis in axes[: 1 + len(measures)]:
         axis.set_xlabel(parameter)
+        axis.tick_params(labelbottom=True)
         axis.grid(alpha=0.3)
         if groups.texts is not None:
             axis.set_xticks(groups.centres, groups.texts)

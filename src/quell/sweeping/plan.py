@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,6 +18,7 @@ from quell.sweeping.values import Distribution, as_values, labels
 from quell.types import Matrix
 
 SAMPLINGS = ("latin-hypercube", "random")
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 # More runs would need days and a design of gigabytes; it is most likely a mistake. By hand.
 _MOST_RUNS = 10**9
 # Words of the seed of each draw: 63 bits, so that two of 1e6 draws are equal with probability 5e-8.
@@ -183,7 +185,8 @@ class Plan:
         for name, column in self.drawn.items():
             found.update(name.encode() + b"\0" + column.tobytes())
         for name, values in self._lists.items():
-            found.update(f"{name}\0{values!r}\0".encode())
+            # Objects without a text of their own have their address in it.
+            found.update(f"{name}\0{_ADDRESS.sub('', repr(values))}\0".encode())
         return found.hexdigest()
 
     def _shares(self) -> Matrix:

@@ -16,7 +16,7 @@ from quell.records.trajectory import Trajectory
 from quell.simulation.simulate import simulate
 from quell.sweeping.lazy import NOT_DONE, lazy_dataset
 from quell.sweeping.plan import Plan, name_of
-from quell.sweeping.runs import ERROR, Job, Parts, built
+from quell.sweeping.runs import Job, Parts, built
 from quell.sweeping.store import Store, open_store
 from quell.types import Status
 
@@ -75,24 +75,29 @@ class Sweep:
         A measure that does not exist is beyond its limit, the settling time of a run that does not
         settle for example.
         """
-        status = self.dataset["status"].values
-        found = (status == ERROR) | ((status > 0) & ((status & int(Status.DIVERGED)) != 0))
+        found = ~self.complete
         for name, limit in self.limits.items():
             found |= ~(self.dataset[name].values <= limit)
-        return np.asarray(found & (status != NOT_DONE))
+        return np.asarray(found & self.done)
+
+    @property
+    def complete(self) -> NDArray[np.bool_]:
+        """True for runs that were simulated to their end, without divergence (runs,)."""
+        status = self.dataset["status"].values
+        return np.asarray((status >= 0) & ((status & int(Status.DIVERGED)) == 0))
 
     def worst(self, metric: str | None = None, count: int = 5) -> list[int]:
         """Return the runs with the largest values of a measure, by default the first one.
 
-        Runs without a value, which ended early or have an error, come before all others.
+        Runs without a value, with an error, or that diverged come before all others.
         """
         checks.whole("count", count, 1)
         name = metric or next(iter(self.store.measures))
         checks.one_of("metric", name, tuple(self.store.measures))
-        values = np.where(np.isnan(self.dataset[name].values), np.inf, self.dataset[name].values)
+        values = self.dataset[name].values
+        values = np.where(np.isnan(values) | ~self.complete, np.inf, values)
         values[~self.done] = -np.inf
-        first = np.argpartition(-values, min(count, values.size) - 1)[:count]
-        order = first[np.lexsort((first, -values[first]))]
+        order = np.argsort(-values, kind="stable")[:count]
         return [int(i) for i in order if values[i] > -np.inf]
 
     def describe(self, run: int) -> str:
@@ -128,6 +133,8 @@ class Sweep:
     def plot(self, parameter: str, figure: Any = None) -> Any:
         """Draw failure rate and quantiles of each measure over a parameter; return the figure.
 
+        The quantiles are those of runs that did not diverge.
+
         Parameters
         ----------
         parameter
@@ -142,6 +149,6 @@ class Sweep:
         for name, about in self.store.measures.items():
             unit = about.get("units", "1")
             title = name if unit == "1" else f"{name} [{unit}]"
-            measures[title] = self.dataset[name].values
+            measures[title] = np.where(self.complete, self.dataset[name].values, np.nan)
         groups = groups_of(values, texts, self.done)
         return plot_over(parameter, groups, self.failed, measures, figure)

@@ -9,7 +9,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from typing import Any
 
@@ -147,10 +147,12 @@ def _do(
     report = progress or (lambda share: None)
     report(1.0 - left / plan.runs)
     tasks = (plan.part(first, last) for first, last in missing)
-    for part, outcome in completed(pool, partial(run_part, job), tasks):
-        store.write(part, outcome)
-        left -= part.last - part.first
-        report(1.0 - left / plan.runs)
+    # Closed as soon as an error or Ctrl-C ends the loop, so that tasks not begun are dropped.
+    with closing(completed(pool, partial(run_part, job), tasks)) as results:
+        for part, outcome in results:
+            store.write(part, outcome)
+            left -= part.last - part.first
+            report(1.0 - left / plan.runs)
 
 
 def _runs_per_file(pool: Executor, plan: Plan, job: Job, given: int | None) -> int:
