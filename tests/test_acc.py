@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ from quell.experiments.acc import (
     DT,
     PUBLISHED,
     CaseResult,
+    box,
     controllers,
     designs,
     interval,
@@ -30,7 +32,8 @@ from quell.experiments.acc import (
     study_cases,
     unstable,
 )
-from quell.experiments.acc.controllers import MB, MF, L
+from quell.experiments.acc.controllers import MB, MF, L, freed
+from quell.experiments.acc.samples import BOX, boxed, generated
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
 
@@ -336,3 +339,55 @@ def test_samples_are_read_or_drawn(tmp_path: Path) -> None:
         ValueError, match="--samples reads plants, --count, --spread and --seed are for drawing"
     ):
         acc(samples=tmp_path / "a.csv", count=5)
+
+
+def test_a_box_is_filled_evenly_by_masses_and_stiffness() -> None:
+    """They are independent and uniform in their ranges; the other columns are those of a spread of 3."""
+    found, wide = boxed(4000, 5), generated(4000, 3.0, 5)
+    np.testing.assert_array_equal(found[:, 3:], wide[:, 3:])
+    for column, (low, high) in zip(found[:, :3].T, BOX, strict=True):
+        assert low <= column.min() < low + 0.01 * (high - low)
+        assert np.mean(column) == pytest.approx(0.5 * (low + high), abs=0.02 * (high - low))
+        assert np.std(column) == pytest.approx((high - low) / math.sqrt(12.0), rel=0.03)
+    related = np.corrcoef(found[:, [0, 1, 2, 4]].T) - np.eye(4)
+    assert np.max(np.abs(related)) < 0.06
+    np.testing.assert_array_equal(boxed(10, 5), boxed(10, 5))
+
+
+def test_the_search_for_the_box_begins_at_mf_eso_and_may_reach_its_result() -> None:
+    """The structure's start has the same gains; the result is within the poles' and the noise's bounds."""
+    made, ours = box.build(), designs()[MF]
+    start = made(box.start(made))
+    np.testing.assert_allclose(start.parameters.law, ours.parameters.law, rtol=1e-9)
+    np.testing.assert_allclose(start.parameters.eso.gain, ours.parameters.eso.gain, rtol=1e-9)
+    tuned, noise = freed(), box.TooMuchNoise()
+    loop = analyse(two_mass_spring(), tuned)
+    assert noise(ours) == pytest.approx(-math.log(10.0))
+    assert -0.1 < noise(tuned) < 0.0
+    assert loop.margins.modulus > analyse(two_mass_spring(), ours).margins.modulus
+    observer = np.eye(5) - np.outer(tuned.parameters.eso.gain, np.eye(5)[0])
+    poles = np.log(np.linalg.eigvals(observer @ tuned.parameters.eso.transition).astype(complex))
+    assert np.max(np.abs(poles)) < 0.5
+
+
+@pytest.mark.compiled
+def test_the_score_of_the_search_counts_failures_and_ranks_by_late_motion() -> None:
+    """A plant that fails scores about 1, another about 0; the tuned design fails on fewer of 60 plants."""
+    samples = boxed(60, 9)
+    rates = []
+    for controller in (designs()[MF], freed()):
+        judged = acc.judge_sampled(controller, samples, cubic=True)
+        (scores,) = box.scores(controller, list(samples))
+        assert np.array_equal(np.round(scores), judged.fails)
+        settled = ~judged.fails
+        order = np.argsort(judged.late_peak[settled])
+        assert np.all(np.diff(scores[settled][order]) >= -1e-12)
+        rates.append(np.mean(judged.fails))
+    assert rates[1] < 0.7 * rates[0]
+
+
+def test_a_box_has_its_own_ranges() -> None:
+    """No spread and no file beside it."""
+    for other in (["--spread", "2"], ["--samples", "a.csv"]):
+        with pytest.raises(ValueError, match="--box draws the plants with a spread of its own"):
+            app(["reproduce", "acc", "--box", *other])

@@ -297,7 +297,8 @@ def _print_gains(
             text += f"; of the tuned ones {first}"
         console.print(text + ".", highlight=False)
     if bounds is not None:
-        console.print(f"Tuned for the largest k_i under {bounds}.", soft_wrap=True, highlight=False)
+        text = f"Tuned for the largest k_i (PID: the least ∫|y| after a load) under {bounds}."
+        console.print(text, soft_wrap=True, highlight=False)
     for name, entry in entries.items():
         if entry.controller is None:
             console.print(f"{name}: {entry.reason}", soft_wrap=True, highlight=False)
