@@ -13,9 +13,9 @@ from quell.commissioning.experiment import Open
 from quell.commissioning.limits import Limits
 from quell.controllers.base import Controller
 from quell.files import nonfinite_to_none
+from quell.identification.friction_plant import simulated_plant
 from quell.identification.result import Identified
 from quell.identification.validation import nrmse
-from quell.plants.delay import delayed
 from quell.realtime.loop.result import RigRun
 from quell.realtime.loop.run import run_rig
 from quell.realtime.loop.safety import Safety
@@ -144,11 +144,8 @@ def verify(
     before = round(at / dt)
     if len(part) <= before + 1:
         raise ValueError(f"the verifying step was not reached: {run.verdict}")
-    plant: Any = model.plant
-    if late := round(model.delay / dt):
-        plant = delayed(plant, late * dt, dt)
     scenario = Scenario(reference=Step(height, at=at), duration=(len(part) - 1) * dt)
-    predicted = simulate(plant, controller, scenario)
+    predicted = simulate(simulated_plant(model), controller, scenario)
     few = slice(max(before - max(before // 5, 1), 0), before)
     y, u = part["y"] - y_start, part["u"] - float(np.mean(part["u"][few]))
     return Verification(run, predicted, height, at, y, u)

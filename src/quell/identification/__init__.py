@@ -12,6 +12,7 @@ from quell.identification.experiment.excitation import Excitation, excitation
 from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
 from quell.identification.experiment.measured import Measured, excited
 from quell.identification.experiment.record_file import read_record
+from quell.identification.friction_plant import simulated_plant
 from quell.identification.identify import identify
 from quell.identification.input_gain import InputGain, identify_b0
 from quell.identification.model.roots import Root
@@ -35,4 +36,5 @@ __all__ = [
     "identify",
     "identify_b0",
     "read_record",
+    "simulated_plant",
 ]

@@ -18,8 +18,6 @@ from quell.types import Vector
 
 # Standard deviations of the points, so that each is on the edge of about 95 %.
 _DEVIATIONS = 2.0
-# Deviations of the leading coefficient from zero, below which the sign of the gain is not known.
-_SIGN = 3.0
 
 
 def identified_plants(
@@ -43,11 +41,8 @@ def identified_plants(
     free = found.den.size - 1 - found.integrators
     theta = np.concatenate([found.den[::-1][found.integrators : -1], found.num[::-1]])
     spread = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
-    if not np.all(np.isfinite(spread)) or abs(theta[-1]) < _SIGN * spread[-1]:
-        raise ValueError(
-            f"gain = {theta[-1]:.3g} ± {spread[-1]:.2g}: the record does not tell its sign; "
-            "excite more, for a longer time, or lower the order"
-        )
+    if not np.all(np.isfinite(spread)):
+        raise ValueError("found: its deviations are not finite; identify with a lower order")
 
     def plant(values: Vector) -> tuple[Vector, Vector]:
         den = np.concatenate([[1.0], values[:free][::-1], np.zeros(found.integrators)])
@@ -59,5 +54,10 @@ def identified_plants(
     for size, axis in zip(np.sqrt(np.maximum(sizes, 0.0)), axes.T, strict=True):
         step = _DEVIATIONS * size * axis * scale
         points += [theta + step, theta - step] if np.any(step != 0.0) else []
+    if any(point[-1] * theta[-1] <= 0.0 for point in points):
+        raise ValueError(
+            f"gain = {theta[-1]:.3g} ± {spread[-1]:.2g}: the record does not tell its sign; "
+            "excite more, for a longer time, or lower the order"
+        )
     delays = [found.delay] + [found.delay + late] * (len(points) - 1)
     return [plant(point) for point in points], delays
