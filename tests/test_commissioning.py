@@ -39,7 +39,7 @@ def at_twin(den: tuple[float, ...], b: float) -> tuple[Any, Experiment]:
 
 @pytest.mark.parametrize(
     ("den", "b", "kind"),
-    [((1.0, 8.0), -3.0, "prbs"), ((1.0, 3.0, 0.0), 6.0, "relay")],
+    [((1.0, 20.0), -8.0, "prbs"), ((1.0, 3.0, 0.0), 6.0, "relay")],
 )
 def test_an_experiment_keeps_its_limits_and_shows_the_plant(
     den: tuple[float, ...], b: float, kind: str
@@ -75,7 +75,7 @@ def test_an_experiment_without_effect_or_room_is_refused() -> None:
 
 def test_the_verifying_step_is_as_predicted() -> None:
     """A tuned loop at the twin of the identified plant: prediction and measurement agree."""
-    twin, done = at_twin((1.0, 8.0), -3.0)
+    twin, done = at_twin((1.0, 20.0), -8.0)
     model = identify(done.measured.u, done.measured.y, DT, order=1, held_out=0.0)
     observer = ql.ESO.model_free(1, float(model.num[0]), omega_o=20.0, dt=DT)
     controller = ql.ADRC(observer, omega_c=5.0, u_min=-2.0, u_max=2.0)
@@ -87,7 +87,7 @@ def test_the_verifying_step_is_as_predicted() -> None:
     assert step.height > 0.0
     assert "fit of the prediction" in step.describe()
     if not step.run.tally.skipped:  # a busy machine: the twin stands still where the loop is late
-        assert step.fit > 95.0
+        assert step.fit > 85.0
     assert len(step.plot()) == 2
 
 

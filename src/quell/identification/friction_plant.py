@@ -21,8 +21,8 @@ def simulated_plant(found: Identified) -> Any:
     """Return the plant of a model for ``simulate``, with its friction and its delay.
 
     Friction acts against u, ``u − F tanh(y'/v)``, with v a fiftieth of the RMS speed in the record;
-    that of the model acts on driven and measured side, here all of it on the side of u. The constant
-    force is left out. Without friction it is the linear plant.
+    that of the model acts on driven and measured side, here all of it on the side of u. The
+    constant force is left out. Without friction it is the linear plant.
 
     Parameters
     ----------
