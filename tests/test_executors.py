@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
+import subprocess
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -71,3 +75,30 @@ def test_an_executor_of_ones_own_has_its_own_workers() -> None:
     with ThreadPoolExecutor(1) as own, pytest.raises(ValueError, match="workers = 2"):  # noqa: SIM117
         with executor_on(own, workers=2):
             pass
+
+
+def test_worker_processes_end_with_a_parent_that_is_killed() -> None:
+    """A parent that is killed can't tell them to end."""
+    code = (
+        "import os, time\n"
+        "from quell.executors import executor_on\n"
+        "if __name__ == '__main__':\n"
+        "    with executor_on('processes', workers=1) as one:\n"
+        "        print(one.submit(os.getpid).result(), flush=True)\n"
+        "        one.submit(time.sleep, 60.0).result()\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    os.kill(worker, 0)
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    deadline = time.monotonic() + 30.0
+    while time.monotonic() < deadline:
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.02)
+    pytest.fail("the worker is still there")

@@ -296,3 +296,18 @@ def test_a_thinned_line_keeps_its_extremes_and_ends(rng: np.random.Generator) ->
         100_002.0,
     )
     np.testing.assert_array_equal(values[few_t.astype(int)], few)
+
+
+@pytest.mark.parametrize("names", [(), ("iae",), ("settling_time", "rms"), ("rise_time", "ise")])
+@pytest.mark.parametrize("diverged", [False, True])
+def test_some_of_the_measures_are_those_of_all(names: tuple[str, ...], diverged: bool) -> None:
+    """With the same values, and the same reasons for those that do not exist."""
+    law = ql.ADRC(ql.ESO.model_free(1, -1.0 if diverged else 1.0, 20.0, 0.01), omega_c=5.0)
+    plant = ql.plants.LinearPlant([[0.0]], [1.0], [1.0])
+    run = ql.simulate(plant, law, ql.Scenario(1.0, duration=0.5), limit=3.0)
+    assert run.diverged == diverged
+    every, some = run.metrics(), run.metrics_of(names)
+    assert str(dict(sorted(some.items()))) == str(
+        {k: every[k] for k in sorted(names) if k in every}
+    )
+    assert some.missing == {name: why for name, why in every.missing.items() if name in names}
