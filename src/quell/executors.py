@@ -26,6 +26,7 @@ from urllib.parse import urlsplit
 
 from quell import checks
 from quell.optional import import_extra
+from quell.parallel import one_blas_thread
 from quell.types import DesignWarning
 
 T = TypeVar("T")
@@ -74,7 +75,9 @@ def executor_on(where: Where = None, workers: int | None = None) -> Iterator[Exe
             raise ValueError(f"workers = {workers}: an executor or a cluster has its own workers")
     if own:
         kind = _processes if where == "processes" else ThreadPoolExecutor
-        with kind(workers or os.cpu_count() or 1) as executor:
+        # A limit that another thread than the main one sets does not hold in OpenBLAS 0.3.31:
+        # threads that waited for each other took 1 to 5 ms for each matrix exponential.
+        with one_blas_thread(), kind(workers or os.cpu_count() or 1) as executor:
             yield executor
     elif isinstance(where, str) and where.startswith(_SCHEMES):
         with _dask(where) as executor:

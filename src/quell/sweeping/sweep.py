@@ -17,7 +17,6 @@ import numpy as np
 
 from quell import checks
 from quell.executors import Where, check_sendable, completed, executor_on, result_of
-from quell.parallel import one_blas_thread
 from quell.sweeping.measures import as_measures
 from quell.sweeping.plan import Plan
 from quell.sweeping.result import Sweep
@@ -117,9 +116,7 @@ def sweep(
     store = existing_store(folder, about)
     if store is not None and not store.missing():
         return Sweep(store, plan, job)
-    # A limit that another thread than the main one sets does not hold in OpenBLAS 0.3.31: threads
-    # that wait for each other took 1 to 5 ms for each matrix exponential.
-    with executor_on(executor, workers) as pool, _without_design_warnings(), one_blas_thread():
+    with executor_on(executor, workers) as pool, _without_design_warnings():
         if store is None:
             size = _runs_per_file(pool, plan, job, runs_per_file)
             store = new_store(folder, plan, size, about, measures)
