@@ -15,7 +15,14 @@ import pytest
 ROWS = (
     ("types", "checks", "files", "reading", "parallel", "optional", "executors", "kernels"),
     ("lti", "signals", "observers", "plants", "features"),
-    ("learners", "learners.kalman", "learners.regression", "learners.gradient", "learners.online"),
+    (
+        "learners",
+        "learners.kalman",
+        "learners.regression",
+        "learners.gradient",
+        "learners.online",
+        "learners.repetitive",
+    ),
     ("learners.adapters", "learners.__init__", "guard"),
     ("controllers", "controllers.linear", "controllers.adrc", "controllers.prefilters"),
     ("controllers.baselines", "controllers.__init__"),

@@ -15,6 +15,7 @@ from quell.learners.online.model import Model, infer, learn
 from quell.learners.online.network import MLP
 from quell.learners.regression.nlms import NLMS
 from quell.learners.regression.rls import RLS
+from quell.learners.repetitive.repetitive import Repetitive
 
 __all__ = [
     "MLP",
@@ -30,6 +31,7 @@ __all__ = [
     "NoLearner",
     "Online",
     "PythonModel",
+    "Repetitive",
     "RiverModel",
     "SklearnModel",
     "TorchModel",
