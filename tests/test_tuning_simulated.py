@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,8 @@ import pytest
 from scipy.stats import binomtest
 
 import quell as ql
+from quell.cli.app import app
+from quell.setup import load
 from quell.tuning.simulated import (
     FailureRate,
     Mean,
@@ -422,3 +425,35 @@ def test_what_tune_by_simulation_lacks_is_named(change: dict[str, Any], message:
     options: dict[str, Any] = {"structure": "pi", "compare": (), "constraints": BOUNDS}
     with pytest.raises(ValueError, match=message):
         ql.tune(integrator(), 0.05, **(options | change))
+
+
+MOTOR = """dt = 0.01
+plant = { kind = "dc-motor" }
+controller = { omega_c = 3.0 }
+observer = { kind = "model-free", order = 2, b0 = 250.0, omega_o = 20.0 }
+scenario = { duration = 0.5, reference = { kind = "step" } }
+[tune]
+structure = "pid"
+compare = []
+m_ks = 10.0
+"""
+
+
+def test_a_setup_is_tuned_by_simulation_with_its_friction_and_encoder(tmp_path: Path) -> None:
+    """``quell tune --trials``: the result is a setup, and its journal another search's start."""
+    file, out, told = (tmp_path / name for name in ("motor.toml", "out.toml", "out.json"))
+    file.write_text(MOTOR + f'storage = "{tmp_path}/journal.log"\n')
+    where = ["--out", str(out), "--json", str(told), "--no-figures"]
+    with pytest.raises(SystemExit, match="0"):
+        app(["tune", str(file), "--trials", "6", *where])
+    found = json.loads(told.read_text())
+    assert found["objective"] == "iae"
+    assert len(found["search"]["candidates"]) == 6
+    best = min(c["values"]["iae"] for c in found["search"]["candidates"] if c["finished"])
+    given = load(out)
+    run = ql.simulate(given.plant, given.controller, given.scenario)
+    assert run.metrics()["iae"] == pytest.approx(best, rel=1e-9)
+    assert found["design"]["objective"] == best
+    assert (tmp_path / "journal.log").exists()
+    with pytest.raises(ValueError, match="--trials = 3: needs a setup file with a scenario"):
+        app(["tune", "--num", "1", "--den", "1,1", "--dt", "0.01", "--trials", "3"])

@@ -49,8 +49,22 @@ def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
     return {"device": device, "live": live, **options}
 
 
-def tuning(**options: Any) -> dict[str, Any]:
-    """Return the arguments of ``quell.tune`` for ``quell tune``."""
+def tuning(trials: int | None = None, storage: str | None = None, **options: Any) -> dict[str, Any]:
+    """Return the arguments of ``quell.tune`` for ``quell tune``.
+
+    Parameters
+    ----------
+    trials
+        candidates of a tuning by simulation in ``[scenario]``, with all that is not linear in the
+        plant; ``objective`` is then the name of a metric, ``"iae"`` by default.
+    storage
+        Optuna's journal file for these candidates, from which an interrupted tuning continues;
+        not used without them.
+    """
+    if trials is not None:
+        options = {"objective": "iae", **options, "search": {"trials": trials}}
+        if storage is not None:
+            options["search"]["storage"] = storage
     bounds = {name: options.pop(name) for name in (*options,) if name in _BOUNDS}
     return {"constraints": Constraints(**bounds), **options}
 
@@ -168,13 +182,16 @@ Metrics = call_table("metrics", Trajectory.metrics, only=True)
 Safety = call_table("safety", RigSafety, only=True)
 _RIG = {"safety": Safety | None, "telemetry": list_of(str)}
 _BOUNDS = tuple(inspect.signature(Constraints).parameters)
-_NOT_IN_FILES = ("constraints", "operating_point", "uncertain", "setup", "progress")
+_NOT_IN_FILES = (
+    *("constraints", "operating_point", "uncertain", "setup", "progress"),
+    *("scenario", "search"),
+)
 Tune = call_table(
     "tune",
     tuning,
     only=True,
     forwards_to=(tune, Constraints),
-    types={"reference": Signal | None},
+    types={"reference": Signal | None, "objective": str},
     without=_NOT_IN_FILES,
 )
 _NO_KEYS = ("duration", "on_change", "overwrite")

@@ -20,7 +20,7 @@ _NO_CONTROLLER = {"kind": "pid", "kp": 0.0}
 class TuningTask(NamedTuple):
     """Arguments of ``quell.tune``."""
 
-    plant: Any  # a linear plant; with ranges, a function that makes it
+    plant: Any  # a plant, linear unless simulated; with ranges, a function that makes it
     dt: float  # [s]
     options: dict[str, Any]  # all others
     setup: Setup
@@ -32,7 +32,8 @@ def tuning_task(
     """Read a setup file for ``quell.tune``; ``changes`` are values of ``[tune]`` by name.
 
     Observer, controller, learner, guard and prefilter of the file are left out: they are what is
-    tuned. Dry friction and limits of the plant are left out, too; its limits of u stay.
+    tuned. Dry friction and limits of the plant are left out, too, unless the tuning is by
+    simulation (``trials``); its limits of u stay.
 
     Raises
     ------
@@ -53,15 +54,22 @@ def tuning_task(
         limits = ("u_min", "u_max", "rate_limit")
         options = {key: given[key] for key in limits if key in given} | options
     options["setup"] = {key: value for key, value in data.items() if key not in _REPLACED}
+    part = linear_part
+    if "search" in options:
+        options["scenario"], part = setup.needed("scenario"), _whole
     if not ranges:
-        return TuningTask(linear_part(plant), setup.controller.dt, options, setup)
+        return TuningTask(part(plant), setup.controller.dt, options, setup)
     for key in ranges:
         _with(setup.file, kept, {key: ranges[key][0]})  # an unknown key is an error now
 
     def make(**values: float) -> Any:
-        return linear_part(_with(name, kept, values).plant)
+        return part(_with(name, kept, values).plant)
 
     return TuningTask(make, setup.controller.dt, {**options, "uncertain": ranges}, setup)
+
+
+def _whole(plant: Any) -> Any:
+    return plant
 
 
 def _with(name: str, data: Mapping[str, Any], values: Mapping[str, float]) -> Setup:

@@ -45,6 +45,7 @@ def tune(
     m_s: float | None = None,
     m_t: float | None = None,
     m_ks: float | None = None,
+    trials: WholeOrNone = None,
     out: Path | None = None,
     save_record: Path | None = None,
     record: RecordOptions = RECORD_OPTIONS,
@@ -77,13 +78,17 @@ def tune(
     order
         Order of an ADRC without model; 1 and 2 are tried by default.
     objective
-        load (integral gain), load-iae or tracking; load by default.
+        load (integral gain), load-iae or tracking; load by default. With --trials the name of a
+        metric.
     m_s
         Largest sensitivity; 1.6 by default.
     m_t
         Largest complementary sensitivity; 1.6 by default.
     m_ks
         Largest gain from y to u; ten times that of the optimal PI controller by default.
+    trials
+        Of a setup: tune on by simulation in its scenario, with this many candidates and all that
+        is not linear in the plant; --objective is then a metric, as iae, which is the default.
     out
         Write a setup file with the tuned controller, for quell run and quell run-rig.
     save_record
@@ -96,6 +101,7 @@ def tune(
         "order": order,
         "objective": objective,
         "delay": delay,
+        "trials": trials,
     }
     named |= {"m_s": m_s, "m_t": m_t, "m_ks": m_ks}
     options = {name: value for name, value in named.items() if value is not None}
@@ -105,6 +111,8 @@ def tune(
         check_writable(file, outputs.overwrite)
     console = Console()
     measured = rig.device is not None or (setup is not None and setup.suffix in RECORDS)
+    if trials is not None and (measured or setup is None):
+        raise ValueError(f"--trials = {trials}: needs a setup file with a scenario")
     if not measured:
         plant, dt, options, name = _plant(setup, num, den, dt, options)
         tuned = _tuned(console, plant, dt, options)
