@@ -288,12 +288,13 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         q, p = f - memory.shown[0], memory.shown[2]
         assess(design, memory, f)
         large = abs(q) if (k + 1) * forget < 1.0 else min(abs(q), 5.0 * peak)
+        most_own = own if large > 1.15 * peak else 5.0 * own
         peak += rise * (large - peak) if large > peak else -decay * peak
         more = rise * (large - 0.2 * own - e)
         spared += large > e > large - 0.2 * own
         if more > 0.0:
             e += min(more, growth * e) if memory.sample[0].authority > 0.0 else more
-        more = rise * (large - own - outside)
+        more = rise * (large - most_own - outside)
         outside += more if more > 0.0 else -decay * outside
         e = min(e, peak, 2.5 * outside)
         m += forget * (q * q - m)
