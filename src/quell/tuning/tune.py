@@ -17,7 +17,7 @@ from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, tuned_designs, with_noise_bound
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import OBJECTIVES
-from quell.tuning.optimiser.time_responses import Inputs
+from quell.tuning.optimiser.time_responses import Inputs, load_step
 from quell.tuning.plants import Given, given_plants, model_of, plant_set
 from quell.tuning.result.design import Design
 from quell.tuning.result.setup_file import plant_table
@@ -28,9 +28,6 @@ from quell.types import Progress
 
 COMPARED = ("pi", "pid", "bandwidths", "freed", "half-gain", "reduced", "model-based")
 """The structures that a result is compared with by default."""
-
-# Responses last so many radians of the plant's phase crossover, and at most so many samples.
-_LASTS, _MOST_SAMPLES = 150.0, 50_000
 
 
 def tune(
@@ -200,14 +197,13 @@ def _inputs(
     if objective == "tracking" and reference is None:
         raise ValueError("reference = None: objective = 'tracking' needs a signal to follow")
     last = checks.optional(checks.positive, "duration", duration, "s")
-    count = round((_LASTS / plants.crossover if last is None else last) / plants.dt)
-    count = max(min(count, _MOST_SAMPLES), 10)
-    t = np.arange(count) * plants.dt
+    step = load_step(plants, checks.finite("load", load), last)
     if reference is None:
-        return Inputs(np.zeros(count), np.full(count, checks.finite("load", load)))
+        return step
+    t = np.arange(step.r.size) * plants.dt
     if not callable(reference):
         raise ValueError(f"reference = {reference!r}: must be a signal, as quell.signals.Step()")
-    return Inputs(np.asarray(reference(t), dtype=np.float64), np.zeros(count))
+    return Inputs(np.asarray(reference(t), dtype=np.float64), np.zeros(t.size))
 
 
 def _analysis(given: Given, plants: PlantSet, design: Design) -> LoopAnalysis:
@@ -250,7 +246,7 @@ def _setup(
 ) -> dict[str, Any]:
     """Return the tables of a setup file: ``known``, else the first plant, a step, a load."""
     linear, delay = LinearPlant.of(given.linear[0]), float(given.delays[0])
-    last = float(f"{_LASTS / plants.crossover:.2g}")
+    last = float(f"{load_step(plants).r.size * dt:.2g}")
     tables: dict[str, Any] = {"title": "Tuned controller", "dt": dt} | dict(known or {})
     if "plant" not in tables:
         late = round(delay / dt) * dt

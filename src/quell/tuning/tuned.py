@@ -176,5 +176,5 @@ def _measures(cells: list[str]) -> str:
     *numbers, reason = cells
     if reason:
         return reason
-    m_s, m_t, m_ks, margin = numbers
-    return f"M_s {m_s}, M_t {m_t}, M_ks {m_ks}, delay margin {margin}"
+    iae, m_s, m_t, m_ks, margin = numbers
+    return f"IAE {iae}, M_s {m_s}, M_t {m_t}, M_ks {m_ks}, delay margin {margin}"

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from quell.commissioning import Verification
     from quell.tuning import Tuned
 
-_HEADINGS = ("M_s", "M_t", "M_ks", "delay\nmargin")
+_HEADINGS = ("IAE", "M_s", "M_t", "M_ks", "delay\nmargin")
 
 
 def tune(

@@ -24,6 +24,8 @@ from quell.types import Vector
 
 # Controllers whose responses are kept: those of one difference quotient, and some more.
 _KEPT = 64
+# Responses last so many radians of the plant's phase crossover, and at most so many samples.
+_LASTS, _MOST_SAMPLES = 150.0, 50_000
 # Beyond, a response is that of an unstable loop: it would overflow.
 _DIVERGED = 1e100
 
@@ -70,6 +72,13 @@ def _delayed(law: LinearLaw, samples: int) -> LinearLaw:
     none = np.zeros(samples)
     B_r, B_y = np.append(law.B_r, none), np.append(law.B_y, none)
     return LinearLaw(A, B_r, B_y, B_u, np.append(law.C, none), law.D_r, law.D_y)
+
+
+def load_step(plants: PlantSet, size: float = 1.0, duration: float | None = None) -> Inputs:
+    """Return a step of the load, by default for 150 radians of the plants' crossover."""
+    last = _LASTS / plants.crossover if duration is None else duration
+    count = max(min(round(last / plants.dt), _MOST_SAMPLES), 10)
+    return Inputs(np.zeros(count), np.full(count, size))
 
 
 class SetResponses:

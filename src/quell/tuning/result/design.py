@@ -14,8 +14,10 @@ from quell.files import nonfinite_to_none
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.extras import delay_margin, noise_gain
 from quell.tuning.optimiser.loops import PlantSet
+from quell.tuning.optimiser.objectives import scores
 from quell.tuning.optimiser.problem import Problem, Solution
 from quell.tuning.optimiser.requirements import Active, Bound, all_peaks, sizes
+from quell.tuning.optimiser.time_responses import SetResponses, load_step
 from quell.types import Vector
 
 # A constraint within this share of its limit is active.
@@ -42,7 +44,8 @@ class Design:
         integral gain [u-unit/(y-unit s)].
     measures : Mapping
         ``M_s``, ``M_t``, ``M_ks`` [u-unit/y-unit], ``noise_gain`` (RMS of u for white noise of RMS
-        1 in y), ``delay_margin`` [s]: the worst over all plants.
+        1 in y), ``delay_margin`` [s], ``iae`` (integral of \|y\| after a unit step of the load):
+        the worst over all plants.
     active : tuple
         the constraints at their limits.
     tables : Mapping
@@ -131,6 +134,8 @@ def measured(
         if kind in bounds and at.value >= (1.0 - _ACTIVE) * bounds[kind]:
             active.append(Active(kind, at.value, bounds[kind], at.omega, at.plant))
     measures["noise_gain"] = float(noise_gain(plants, C)[0])
+    over = SetResponses(plants, load_step(plants))
+    measures["iae"] = float(np.max(scores("load-iae", structure, solution.values, over)))
     measures["delay_margin"] = float(delay_margin(plants, structure, values)[0])
     for extra in problem.extras:
         ratio = float(extra.ratio(structure, values)[0])

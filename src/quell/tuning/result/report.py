@@ -35,17 +35,18 @@ def active_text(active: Active, plants: int) -> str:
 
 
 def rows(designs: Mapping[str, Design], objective: str) -> list[tuple[str, ...]]:
-    """Return a row for each design: name, objective, M_s, M_t, M_ks, delay margin, or a reason."""
+    """Return rows: name, objective, IAE, M_s, M_t, M_ks, delay margin, a reason."""
     found: list[tuple[str, ...]] = []
     for design in designs.values():
         if design.controller is None:
-            found.append((design.name, "–", "–", "–", "–", "–", design.reason))
+            found.append((design.name, *["–"] * 6, design.reason))
             continue
         m = design.measures
         numbers = (f"{m[kind]:.3f}" for kind in ("M_s", "M_t"))
         margin = duration(m["delay_margin"])
+        iae = f"{m['iae']:.3g}"
         found.append(
-            (design.name, f"{design.objective:.4g}", *numbers, f"{m['M_ks']:.4g}", margin, "")
+            (design.name, f"{design.objective:.4g}", iae, *numbers, f"{m['M_ks']:.4g}", margin, "")
         )
     return found
 
