@@ -26,9 +26,10 @@ from quell.types import Matrix, Vector
 
 # Bounds of a pole in units of the plant's phase crossover, and of the damping of a pair. The law's
 # poles are those of the ideal response to the reference: with a damping of 0.6 it overshoots by
-# 9 %. The observer's poles show in no response to the reference.
+# 9 %. The observer's poles show in no response to the reference, but while u is at a limit; the
+# equivalents of PID controllers with slow filters have them hardly damped.
 _SLOWEST = 1e-3
-_DAMPING = {"c": (0.6, 20.0), "o": (0.1, 20.0)}
+_DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # Bandwidths to start from: of the law in units of the plant's phase crossover, and of the observer
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
