@@ -156,7 +156,8 @@ def _compare_setup(
     plant = run.linear
     gains = {name: experiment.sensitivities(plant, d) for name, d in run.controllers.items()}
     stable = {name: _is_stable(d, plant) for name, d in run.controllers.items()}
-    _print_scores(console, f"{given.title}: {run.plant}, dt = {run.dt:g} s", run.result, stable)
+    title = f"{given.title}: {run.plant}, dt = {run.dt:g} s"
+    _print_scores(console, title, run.result, stable, si_units=False)
     scored = "" if run.load_at is None else f"; the disturbance is scored from {run.load_at:g} s on"
     console.print(
         f"In the units of the setup{scored}. –: not settled, no step, or diverged before."
@@ -241,9 +242,15 @@ def _json(
 
 
 def _print_scores(
-    console: Console, title: str, result: Comparison, stable: Mapping[str, bool | None]
+    console: Console,
+    title: str,
+    result: Comparison,
+    stable: Mapping[str, bool | None],
+    si_units: bool = True,
 ) -> None:
     headings = [heading for _, heading, _, _ in _COLUMNS]
+    if not si_units:
+        headings = [text.replace("\n[m]", "").replace("\n[N]", "") for text in headings]
     rows = table(title, "controller", *headings, padding=(0, 1, 0, 0), pad_edge=False)
     rows.add_column("status")
     for name, score in result.scores.items():
