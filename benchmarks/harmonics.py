@@ -70,6 +70,7 @@ def main() -> None:
         "Harmonic()",
         "Harmonic(2)",
         "the same, 300 s after",
+        "with search",
         title="two sinusoids of 1 N: peak 60 s after the load came, over MF-ESO's",
     )
     for omegas in (
@@ -82,17 +83,21 @@ def main() -> None:
         (0.3, 0.4),
         (0.5, 0.7),
         (0.6, 0.8),
+        (0.5, 0.6),
+        (0.3, 0.36),
     ):
         plain = peaks(None, omegas)
         shares = [
             peaks(learner, omegas)
             for learner in (ql.learners.Kalman(), Harmonic(), Harmonic(count=2))
         ]
+        searched = peaks(Harmonic(count=2, search=True), omegas)
         two.add_row(
             ", ".join(f"{omega:g}" for omega in omegas),
             f"{plain[0]:.3f}",
             *(f"{share[0] / plain[0]:.4f}" for share in shares),
             f"{shares[-1][1] / plain[1]:.4f}",
+            f"{searched[0] / plain[0]:.4f}",
         )
     console = Console(width=120)
     console.print(one)
