@@ -29,6 +29,9 @@ _BLOCKS = 12
 _EXACT = 1e-12
 # Probability that equal models are taken for different.
 _LEVEL = 0.01
+# Logarithm of a ratio of squared errors that counts as none: 1 % of the error. With many samples a
+# needless pole explains some noise in every block.
+_EQUAL = 0.02
 # Share of the limit from which on z is a hint. Chosen by hand.
 _HINT = 0.5
 # The structure of a mass with friction.
@@ -43,6 +46,7 @@ class Alternative:
 
     name: str  #: what is different, for example ``"order 3"`` or ``"Coulomb friction"``
     smaller: bool  #: whether it has fewer parameters
+    gain: float  #: mean of D: how much smaller the logarithm of its squared error is
     z: float  #: above zero where it is better; see ``quell.identification.alternatives``
     limit: float  #: |z| from which on the record decides, at 99 %
     model: Identified  #: its fit
@@ -51,7 +55,14 @@ class Alternative:
     @property
     def verdict(self) -> str:
         """``"better"``, ``"worse"``, or ``"undecided"`` if the record does not decide."""
-        return "undecided" if abs(self.z) < self.limit else ("better" if self.z > 0.0 else "worse")
+        if abs(self.z) < self.limit or abs(self.gain) < _EQUAL:
+            return "undecided"
+        return "better" if self.z > 0.0 else "worse"
+
+    @property
+    def may_be_as_good(self) -> bool:
+        """Whether there is no hint that it is worse."""
+        return self.z > -_HINT * self.limit or self.gain > -_EQUAL
 
     def describe(self, than: Identified) -> str:
         """Return a line of text that compares it with ``than``, empty if it is of no use."""
@@ -74,22 +85,27 @@ class Alternative:
 
     def to_json(self) -> dict[str, Any]:
         """Return name, verdict and fits for JSON."""
-        names = ("name", "options", "smaller", "z", "limit", "verdict")
+        names = ("name", "options", "smaller", "gain", "z", "limit", "verdict")
         return {name: getattr(self, name) for name in names} | {"fits": self.model.fits}
 
 
-def alternatives(found: Identified) -> tuple[Alternative, ...]:
+def alternatives(
+    found: Identified, delay: tuple[float, float] | None = None
+) -> tuple[Alternative, ...]:
     """Fit other structures to the record of a model, and compare them with it.
 
     They are: one pole less, and one zero less; if the error is not white, also the opposite of the
     given assumption on Coulomb friction, and for a larger model without friction that of a mass
-    with friction; and one pole more, if the error depends on past u and the model has no
+    with friction, unless it would drive the plant; and one pole more, if the error depends on past u and the model has no
     ``shortcomings``. A structure that cannot be fitted to the record is left out.
 
     Parameters
     ----------
     found
         result of ``identify``.
+    delay
+        least and largest delay to search [s]; that of the model by default. With fewer poles
+        another delay may be the best.
     """
     order, zeros, rubs = found.den.size - 1, found.num.size - 1, found.friction is not None
     direct = zeros == order
@@ -107,7 +123,10 @@ def alternatives(found: Identified) -> tuple[Alternative, ...]:
             more = {"order": order + 1, "zeros": zeros + direct}
             tried.append((f"order {order + 1}", False, more))
     options: dict[str, Any] = {"order": order, "zeros": zeros, "friction": rubs}
-    options |= {"delay": found.delay, "held_out": 1.0 - found.held_from / found.y.size}
+    options |= {
+        "delay": found.delay if delay is None else delay,
+        "held_out": 1.0 - found.held_from / found.y.size,
+    }
     options |= {"reference": found.reference, "horizon": found.horizon}
     models = []
     for name, smaller, change in tried:
@@ -115,21 +134,23 @@ def alternatives(found: Identified) -> tuple[Alternative, ...]:
             model = identify(found.u, found.y, found.dt, **(options | change))
         except ValueError:  # too short a record for it, or no such model
             continue
+        if model.friction is not None and model.friction <= 0.0:  # it would drive the plant
+            continue
         flags = _options(change)
         models.append(Alternative(name, smaller, *_compared(found, model), model, flags))
     return tuple(models)
 
 
-def decided(found: Identified) -> Identified:
+def decided(found: Identified, delay: tuple[float, float] | None = None) -> Identified:
     """Return the model that the record supports: with friction if it fits better, of least order.
 
     First a better alternative is taken, then, one after the other, smaller ones without a hint that
-    they are worse.
+    they are worse. ``delay`` is that of ``alternatives``.
     """
     for _ in range(_MOST_ORDER):
-        others = [one for one in alternatives(found) if one.model.converged]
-        better = [one for one in others if one.verdict == "better"]
-        smaller = [one for one in others if one.smaller and one.z > -_HINT * one.limit]
+        others = alternatives(found, delay)
+        better = [one for one in others if one.verdict == "better" and one.model.converged]
+        smaller = [one for one in others if one.smaller and one.may_be_as_good]
         if not better and not smaller:
             break
         found = max(better or smaller, key=lambda one: one.z).model
@@ -145,8 +166,8 @@ def _options(change: dict[str, Any]) -> str:
     return " ".join([*numbers, *friction])
 
 
-def _compared(first: Identified, second: Identified) -> tuple[float, float]:
-    """Return z, above zero if the second model is better, and its limit."""
+def _compared(first: Identified, second: Identified) -> tuple[float, float, float]:
+    """Return the mean of D, z, above zero if the second model is better, and the limit of z."""
     from scipy.stats import t
 
     powers = [
@@ -158,4 +179,5 @@ def _compared(first: Identified, second: Identified) -> tuple[float, float]:
     gain = np.log(np.array(powers[0]) + least) - np.log(np.array(powers[1]) + least)
     spread = float(np.std(gain, ddof=1)) / np.sqrt(_BLOCKS)
     limit = float(t.isf(0.5 * _LEVEL, _BLOCKS - 1))
-    return (float(np.mean(gain)) / spread if spread > 0.0 else 0.0), limit
+    mean = float(np.mean(gain))
+    return mean, (mean / spread if spread > 0.0 else 0.0), limit

@@ -36,7 +36,7 @@ def simulated_plant(found: Identified) -> Any:
     """
     plant: Any = found.plant
     order = found.den.size - 1
-    if found.friction and found.num.size < order:  # else y' jumps with u
+    if (found.friction or 0.0) > 0.0 and found.num.size < order:  # else y' jumps with u
         plant = _with_friction(found)
     if late := round(found.delay / found.dt):
         plant = delayed(plant, late * found.dt, found.dt)

@@ -95,7 +95,7 @@ def identify(
     others: tuple[Alternative, ...] = ()
     if alternatives:
         with console.status("Fitting other structures."):
-            others = other_structures(model)
+            others = other_structures(model, delays if isinstance(delays, tuple) else None)
     for line in filter(None, (one.describe(model) for one in others)):
         print_line(console, line)
     paths = _save_figure(model, outputs.figures, outputs.overwrite) if outputs.figures else []

@@ -51,7 +51,7 @@ class RecordOptions:
 
     columns: str = ""
     time_unit: str | None = None
-    model_order: Whole = 3
+    model_order: Whole = 4
     max_delay: float | None = None
 
 
@@ -108,7 +108,7 @@ def identified(console: Console, record: Measured, options: RecordOptions) -> tu
     delays = (0.0, round(most / dt) * dt)
     with console.status("Identifying, with other orders and friction where the record shows it."):
         first = identify(record.u, record.y, dt, options.model_order, delay=delays)
-        model: Identified = decided(first)
+        model: Identified = decided(first, delays)
     print_line(console, model.describe())
     if model.shortcomings:
         raise ValueError(
