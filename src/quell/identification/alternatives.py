@@ -96,8 +96,8 @@ def alternatives(
 
     They are: one pole less, and one zero less; if the error is not white, also the opposite of the
     given assumption on Coulomb friction, and for a larger model without friction that of a mass
-    with friction, unless it would drive the plant; and one pole more, if the error depends on past u and the model has no
-    ``shortcomings``. A structure that cannot be fitted to the record is left out.
+    with friction, unless friction would drive the plant; and one pole more, if the error depends on
+    past u and the model has no ``shortcomings``. A structure that cannot be fitted is left out.
 
     Parameters
     ----------
