@@ -66,9 +66,9 @@ class Harmonic(Kalman):
     count: int = 1
     omegas: Sequence[float] | None = None
     limits: tuple[float, float] | None = None
+    pair_bandwidth: float | None = None
     orders: Sequence[int] = (1,)
     search: bool = False
-    pair_bandwidth: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
