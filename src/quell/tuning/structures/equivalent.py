@@ -23,6 +23,8 @@ from quell.types import Matrix, Vector
 
 # Damping of the law's poles that is enough; it is the least one of the structure.
 _LEAST = 0.6
+# Damping of the poles of a start, above the least damping of an observer.
+_LEAST_OF_ALL = 0.05
 # Values of b0 that are tried, over this range around the one that makes the slowest terms equal.
 _GAINS = np.logspace(-4.0, 4.0, 161)
 
@@ -30,8 +32,9 @@ _GAINS = np.logspace(-4.0, 4.0, 161)
 def equivalents(pid: FilteredPID, values: Vector, adrc: AdrcStructure, most: int = 3) -> Matrix:
     """Return values (k, p) of a freed ADRC of order 1 or 2 with the same feedback, k ≤ ``most``.
 
-    There are none for a PID controller that stabilises no nominal plant ``b0/s^n``, and for a
-    structure with another order or form.
+    Of a PID controller that stabilises no nominal plant ``b0/s^n``, the poles that are unstable or
+    hardly damped are replaced by damped ones of the same size: that is near it only. There are none
+    for a structure with another order or form.
     """
     rows: list[tuple[float, Vector]] = []
     order = 2 if pid.derivative else 1
@@ -47,17 +50,25 @@ def equivalents(pid: FilteredPID, values: Vector, adrc: AdrcStructure, most: int
         whole = np.concatenate([A, np.zeros(order + 1)])
         whole[-order - 1 :] += b0 * B
         poles = np.roots(whole)
-        damping = float(np.min(-poles.real / np.abs(poles)))
-        if damping > 0.0:
-            split = _split(poles, order)
-            if split is None:
-                continue
-            row = adrc.rows_of(b0, *split)
-            if row is not None:
-                rows.append((min(damping, _damping(split[0]) / 6.0), row))
+        damping = _damping(poles)
+        split = _split(poles if damping > 0.0 else _damped(poles), order)
+        row = None if split is None else adrc.rows_of(b0, *split)
+        if split is not None and row is not None:
+            rows.append((min(damping, _damping(split[0]) / 6.0), row))
     rows.sort(key=lambda entry: -entry[0])
-    kept = rows[:: max(len(rows) // most, 1)][:most]
+    exact = [entry for entry in rows if entry[0] > 0.0] or rows[:most]
+    kept = exact[:: max(len(exact) // most, 1)][:most]
     return np.array([row for _, row in kept]).reshape(-1, len(adrc.parameters))
+
+
+def _damped(poles: Any) -> Any:
+    """Return the poles with a damping of at least that of an observer."""
+    size, least = np.abs(poles), _LEAST_OF_ALL
+    few = -poles.real < least * size
+    angle = np.sqrt(1.0 - least**2)
+    moved = size * (-least + 1j * angle * np.sign(poles.imag))
+    moved = np.where(poles.imag == 0.0, -size, moved)
+    return np.where(few, moved, poles)
 
 
 def _split(poles: Any, order: int) -> tuple[Any, Any] | None:
