@@ -25,6 +25,7 @@ from .test_identification import answer
 pytestmark = pytest.mark.compiled
 
 DT = 0.01
+PLANT = LinearPlant.of(([1.0], [1.0, 20.0]))
 # A machine that is busy with other things may make the loop as late as it likes.
 PATIENT = {"settle": 5, "hold": 10_000, "most_overruns": 10_000, "ramp": 10}
 
@@ -71,6 +72,32 @@ def test_an_experiment_without_effect_or_room_is_refused() -> None:
         given: dict[str, float] = {"u_min": -2.0, "u_max": 2.0, "y_min": -1.0, "y_max": 1.0}
         with pytest.raises(ValueError, match=message):
             Limits(**(given | {"duration": 1.0} | change))
+
+
+def test_a_fault_ends_the_experiment() -> None:
+    """A sensor that fails in the probe: nothing more is applied after the ramp, and the error says what it was."""
+
+    class Failing:
+        """A twin whose measurements end after some samples."""
+
+        def __init__(self) -> None:
+            self.twin, self.left, self.closed = TwinDevice(PLANT, DT), 60, 0
+
+        def read(self) -> float:
+            self.left -= 1
+            return self.twin.read() if self.left > 0 else float("nan")
+
+        def write(self, u: float) -> None:
+            self.twin.write(u)
+
+        def close(self) -> None:
+            self.closed += 1
+
+    device = Failing()
+    limits = Limits(-2.0, 2.0, -1.0, 1.0, 5.0)
+    with pytest.raises(ValueError, match="the experiment was stopped: .*RAMP"):
+        experiment(lambda: device, DT, limits, safety={"settle": 5, "hold": 3}, priority=0)
+    assert device.closed <= 4  # run_rig closes it twice: two parts of three, at most
 
 
 def test_the_verifying_step_is_as_predicted() -> None:

@@ -28,6 +28,7 @@ from quell.controllers.linear.linear import LinearController
 from quell.identification import Measured, excitation
 from quell.realtime.devices.base import Device
 from quell.realtime.devices.twin import TwinDevice
+from quell.realtime.loop.modes import Cause
 from quell.realtime.loop.result import RigRun
 from quell.realtime.loop.run import run_rig
 from quell.realtime.loop.safety import Safety
@@ -103,8 +104,8 @@ def experiment(
     Raises
     ------
     ValueError
-        for arguments out of range, y outside of its limits at rest, a y that u does not move, or an
-        experiment that was stopped before it had half of its samples.
+        for arguments out of range, y outside of its limits at rest, a y that u does not move, and
+        an experiment that a fault or the user stopped, or a limit of y before it was half over.
     """
     dt = checks.positive("dt", dt, "s")
     checks.one_of("kind", kind, ("auto", "prbs", "relay"))
@@ -166,7 +167,11 @@ class _Rig:
         options: dict[str, Any] = {"duration": duration, "safety": safety} | self.options
         device = self.open()
         self.has_no_clock = isinstance(device, TwinDevice)
-        return run_rig(device, controller, reference, **options)
+        run = run_rig(device, controller, reference, **options)
+        # Limits of y are part of the plan; a fault, or somebody who stops it, ends the experiment.
+        if not run.completed and all(one.cause is not Cause.IMPLAUSIBLE for one in run.changes):
+            raise ValueError(f"the experiment was stopped: {run.verdict}")
+        return run
 
     def held(self, u: Signal, duration: float, room: tuple[float, float] | None = None) -> RigRun:
         """Apply u as it is, from the first sample on."""

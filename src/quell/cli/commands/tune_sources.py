@@ -146,7 +146,7 @@ class Rig:
     limits: Limits
     options: RigOptions
     open: Callable[[], Device]
-    safety: dict[str, Any]
+    how: dict[str, Any]  # further arguments of ``experiment`` and ``verify``
 
 
 def rig_at(options: RigOptions, dt: float | None) -> Rig:
@@ -168,7 +168,7 @@ def rig_at(options: RigOptions, dt: float | None) -> Rig:
     url = str(options.device)
     first = open_device(url, float(dt or 0.0))
     if isinstance(first, TwinDevice):  # it keeps its state between the parts
-        return Rig(url, limits, options, lambda: first, dict(_TWIN))
+        return Rig(url, limits, options, lambda: first, {"safety": dict(_TWIN), "priority": 0})
     first.close()
     return Rig(url, limits, options, lambda: open_device(url, float(dt or 0.0)), {})
 
@@ -193,9 +193,7 @@ def from_rig(
     if not confirm(console, "Start it?", rig.options.yes):
         return None
     with console.status("The experiment runs."):
-        done = experiment(
-            rig.open, dt, rig.limits, kind=rig.options.excite, safety=rig.safety, priority=0
-        )
+        done = experiment(rig.open, dt, rig.limits, kind=rig.options.excite, **rig.how)
     print_line(console, done.describe())
     u, y = done.measured.u, done.measured.y
     if record is not None:
@@ -221,16 +219,7 @@ def verified(
     if not confirm(console, "Apply the controller?", rig.options.yes):
         return None
     with console.status("The tuned controller runs."):
-        done = verify(
-            rig.open,
-            tuned.controller,
-            model,
-            rig.limits,
-            y_now,
-            duration,
-            safety=rig.safety,
-            priority=0,
-        )
+        done = verify(rig.open, tuned.controller, model, rig.limits, y_now, duration, **rig.how)
     print_line(console, done.describe())
     return done
 
