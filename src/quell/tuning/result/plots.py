@@ -43,7 +43,8 @@ def draw(
         count = min(int(_LASTS / crossover / plants.dt) + 2, _MOST)
         unit, none, t = np.ones(count), np.zeros(count), np.arange(count) * plants.dt
         for j in shown:
-            name = f"{label}: {design.name}" if j == 0 else None
+            text = label if label == design.name else f"{label}: {design.name}"
+            name = text if j == 0 else None
             style: dict[str, Any] = {"color": color, "linewidth": 1.2, "label": name}
             style["alpha"] = 1.0 if j == 0 else 0.35
             bode.loglog(omega, np.abs(plants.P[j] * C), **style)
