@@ -295,7 +295,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         if more > 0.0:
             e += min(more, growth * e) if memory.sample[0].authority > 0.0 else more
         more = rise * (large - most_own - outside)
-        outside += more if more > 0.0 else -decay * outside
+        outside = min(outside + max(more, 0.0), peak)
         e = min(e, peak, 2.5 * outside)
         m += forget * (q * q - m)
         s += forget * min(1.0, (q * q + p * p) / (0.4 * peak) ** 2) * (p * p / (q * q + p * p) - s)

@@ -16,7 +16,7 @@ that; and while the learner acts, e grows by a factor of 2.7 in five lags at mos
 
     c_L ← max(|e_L|, λ c_L),        e → |q| − γ c_L  where that is larger,        e ≤ min(P, 2.5 o)
 
-o, the error that is certainly not the learner's, follows |q| − 5 c_L as P follows |q|, and
+o ≤ P, the error that is certainly not the learner's, rises to |q| − 5 c_L as P rises to |q|, and to
 |q| − c_L while |q| rises so quickly that it is 1.15 P: what learner and loop build up together
 grows more slowly. So a learner that causes what it then explains does not raise e again and again.
 
@@ -253,7 +253,7 @@ def _update_bound(guard: GuardDesign, sample: GuardSample, error: float) -> None
     if larger > 0.0:
         size += min(larger, guard.growth * size) if sample.authority > 0.0 else larger
     more = guard.rise * (error - most_own - sample.outside)
-    sample.outside += more if more > 0.0 else -guard.decay * sample.outside
+    sample.outside = min(sample.outside + max(more, 0.0), sample.peak)
     size = min(size, sample.peak, _OWN_GROWTH * sample.outside)
     sample.typical_error = max(size, _TINY)
 
