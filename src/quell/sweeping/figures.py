@@ -49,7 +49,9 @@ def wilson(failures: int, runs: int) -> tuple[float, float]:
     rate, z2 = failures / runs, _Z**2 / runs
     centre = rate + 0.5 * z2
     half = _Z * np.sqrt(rate * (1.0 - rate) / runs + 0.25 * z2 / runs)
-    return max((centre - half) / (1.0 + z2), 0.0), min((centre + half) / (1.0 + z2), 1.0)
+    # The ends that are 0 and 1 exactly are so only up to rounding.
+    low = 0.0 if failures == 0 else float((centre - half) / (1.0 + z2))
+    return low, 1.0 if failures == runs else float((centre + half) / (1.0 + z2))
 
 
 def plot_over(

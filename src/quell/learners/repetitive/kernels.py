@@ -15,7 +15,7 @@ With W = 1 this is the step of steepest descent of Σ e² (adjoint iterative lea
 and Nonlinear Control 19 (2009)). At each frequency the rest is multiplied from cycle to
 cycle by ``1 − γ W |F|²``, whatever the lag. It also decreases if the loop changes the effect of g
 by a factor 1 + Δ, for example because b0 is wrong, as long as ``|1 − γ W |F|² (1 + Δ)| < 1``.
-W = (1 + ω²/ω_e²)^m, symmetric in time, makes up for a part of |F|² near the bandwidth of the
+W = (1 + ω²/ω_e²)^m, symmetric in time, makes up for a part of ``|F|²`` near the bandwidth of the
 observer. Above it the product goes to zero: there nothing is learned, so F itself is the robustness
 filter.
 

@@ -27,45 +27,25 @@ _KINDS = ("M_s", "M_t", "M_ks")
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    r"""A structure tuned under constraints, or why it could not be.
+    """A structure tuned under constraints, or why it could not be.
 
-    Attributes
-    ----------
-    name : str
-        name of the structure, with its order.
-    controller : Controller or None
-        the controller; None if ``reason`` says why there is none.
-    values : Mapping
-        the free parameters by name.
-    objective : float
-        what was optimised: k_i for load rejection [u-unit/(y-unit s)], which is to be large; else
-        the integral of \|y\| or the RMS of r − y, which are to be small.
-    k_i : float
-        integral gain [u-unit/(y-unit s)].
-    measures : Mapping
-        ``M_s``, ``M_t``, ``M_ks`` [u-unit/y-unit], ``noise_gain`` (RMS of u for white noise of RMS
-        1 in y), ``delay_margin`` [s], ``iae`` (integral of \|y\| after a unit step of the load):
-        the worst over all plants.
-    active : tuple
-        the constraints at their limits.
-    tables : Mapping
-        the tables of a setup file that describe the controller.
-    solution : Solution or None
-        what the optimiser found.
-    reason : str
-        why there is no controller; empty otherwise.
+    ``measures`` has ``M_s``, ``M_t``, ``M_ks`` [u-unit/y-unit], ``noise_gain`` (RMS of u for white
+    noise of RMS 1 in y), ``delay_margin`` [s], ``iae`` (integral of ``|y|`` after a unit step of
+    the load): the worst over all plants.
     """
 
-    name: str
-    controller: Controller | None
-    values: Mapping[str, float]
+    name: str  #: name of the structure, with its order
+    controller: Controller | None  #: None if ``reason`` says why there is none
+    values: Mapping[str, float]  #: the free parameters by name
+    #: what was optimised: k_i for load rejection [u-unit/(y-unit s)], which is to be large; else
+    #: the integral of ``|y|`` or the RMS of r − y, which are to be small
     objective: float
-    k_i: float
+    k_i: float  #: integral gain [u-unit/(y-unit s)]
     measures: Mapping[str, float]
-    active: tuple[Active, ...]
-    tables: Mapping[str, Mapping[str, Any]]
-    solution: Solution | None = None
-    reason: str = ""
+    active: tuple[Active, ...]  #: the constraints at their limits
+    tables: Mapping[str, Mapping[str, Any]]  #: tables of a setup file for the controller
+    solution: Solution | None = None  #: what the optimiser found
+    reason: str = ""  #: why there is no controller; empty otherwise
 
     def to_json(self) -> dict[str, Any]:
         """Return numbers and texts for a JSON file; infinite numbers become None."""
