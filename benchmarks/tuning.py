@@ -2,6 +2,7 @@
 
     python benchmarks/tuning.py                    all plants, M_s = 1.4 and 2: some 40 minutes
     python benchmarks/tuning.py --every 11         each eleventh plant
+    python benchmarks/tuning.py --m-s 2            one M_s
     python benchmarks/tuning.py --json file        the rows as JSON, too
 
 The nine families are those of K. J. Astrom and T. Hagglund, "Revisiting the Ziegler-Nichols step
@@ -119,6 +120,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--m-s", type=float, nargs="+", default=[1.4, 2.0])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -126,7 +128,7 @@ def main() -> None:
     table = Table(title=f"k_i over that of the optimal PI controller; {len(batch())} plants in all")
     for heading in ("plant", "M_s", *NAMES, "freed/pid", "excess", "CPU s"):
         table.add_column(heading)
-    for m_s in (1.4, 2.0):
+    for m_s in given.m_s:
         for plant in plants:
             row = trial(plant, m_s)
             rows.append(row)
@@ -138,7 +140,7 @@ def main() -> None:
             if given.json is not None:
                 given.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
     console.print(table)
-    for m_s in (1.4, 2.0):
+    for m_s in given.m_s:
         part = [row for row in rows if row["m_s"] == m_s]
         freed = np.array([row["freed"] for row in part], dtype=float)
         pid = np.array([row["pid"] for row in part], dtype=float)
