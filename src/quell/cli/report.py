@@ -134,8 +134,6 @@ def save_run_figure(
     """Save a run's figure, with what ``add`` draws into its axes; return the paths of the files."""
     if outputs.figures is None:
         return []
-    import matplotlib.pyplot as plt
-
     from quell.experiments.common.figures import save_figure
 
     axes = run.plot()
@@ -143,7 +141,4 @@ def save_run_figure(
     figure.suptitle(title)
     if add is not None:
         add(run, axes)
-    try:
-        return save_figure(figure, outputs.figures, name, outputs.overwrite)
-    finally:
-        plt.close(figure)
+    return save_figure(figure, outputs.figures, name, outputs.overwrite)

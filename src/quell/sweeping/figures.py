@@ -62,12 +62,12 @@ def plot_over(
     figure: Any = None,
 ) -> Any:
     """Draw failure rate and quantiles of each measure over a parameter."""
-    from matplotlib.figure import Figure
+    import matplotlib.pyplot as plt
 
     columns = min(3, 1 + len(measures))
     rows = -(-(1 + len(measures)) // columns)
     if figure is None:
-        figure = Figure(figsize=(3.6 * columns, 2.9 * rows), layout="constrained")
+        figure = plt.figure(figsize=(3.6 * columns, 2.9 * rows), layout="constrained")
     figure.suptitle("failures; median and 5 to 95 % of the runs that did not diverge", fontsize=10)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
     _plot_failures(axes[0], failed, groups)

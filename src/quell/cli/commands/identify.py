@@ -98,21 +98,14 @@ def identify(
             others = other_structures(model, delays if isinstance(delays, tuple) else None)
     for line in filter(None, (one.describe(model) for one in others)):
         print_line(console, line)
-    paths = _save_figure(model, outputs.figures, outputs.overwrite) if outputs.figures else []
+    paths: list[Path] = []
+    if outputs.figures:
+        from quell.experiments.common.figures import save_figure
+
+        figure = model.plot()[0].figure
+        paths = save_figure(figure, outputs.figures, "identified", outputs.overwrite)
     results = model.to_json() | {"alternatives": [one.to_json() for one in others]}
     write_results(console, results, outputs, paths)
-
-
-def _save_figure(model: Identified, folder: Path, overwrite: bool) -> list[Path]:
-    import matplotlib.pyplot as plt
-
-    from quell.experiments.common.figures import save_figure
-
-    figure = model.plot()[0].figure
-    try:
-        return save_figure(figure, folder, "identified", overwrite)
-    finally:
-        plt.close(figure)
 
 
 def _print(console: Console, model: Identified, source: str) -> None:

@@ -254,10 +254,7 @@ def _save_timing_figure(run: RigRun, setup: Setup, folder: Path, overwrite: bool
     axes.axvline(1e6 * setup.controller.dt, color="0.3", linestyle="--", linewidth=1.0, label="dt")
     axes.legend()
     axes.set_title(f"{setup.title}: {run.tally.cycles} cycles, {run.overruns} overruns")
-    try:
-        return save_figure(figure, folder, "timing", overwrite)
-    finally:
-        plt.close(figure)
+    return save_figure(figure, folder, "timing", overwrite)
 
 
 def _as_json(run: RigRun) -> dict[str, Any]:

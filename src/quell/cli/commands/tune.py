@@ -164,9 +164,13 @@ def _write(
         print_line(console, f"Setup: {out}")
     paths, results = [], tuned.to_json() | dict(more or {})
     if outputs.figures:
-        paths += _save_figure(tuned.plot().flat[0].figure, outputs, "tuned")
+        from quell.experiments.common.figures import save_figure
+
+        axes = {"tuned": tuned.plot().flat[0]}
         if step is not None:
-            paths += _save_figure(step.plot()[0].figure, outputs, "verified")
+            axes["verified"] = step.plot()[0]
+        for name, one in axes.items():
+            paths += save_figure(one.figure, outputs.figures, name, outputs.overwrite)
     if step is not None:
         results["verification"] = step.to_json()
     write_results(console, results, outputs, paths)
@@ -209,18 +213,6 @@ def _numbers(name: str, text: str) -> list[float]:
         return [float(part) for part in text.split(",")]
     except ValueError:
         raise ValueError(f"{name} = {text!r}: must be numbers with commas, as 1,3,3,1") from None
-
-
-def _save_figure(figure: Any, outputs: Outputs, name: str) -> list[Path]:
-    import matplotlib.pyplot as plt
-
-    from quell.experiments.common.figures import save_figure
-
-    assert outputs.figures is not None
-    try:
-        return save_figure(figure, outputs.figures, name, outputs.overwrite)
-    finally:
-        plt.close(figure)
 
 
 def _print(console: Console, tuned: Tuned, name: str) -> None:

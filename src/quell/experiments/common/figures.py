@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -66,17 +67,22 @@ def figure_files(folder: str | os.PathLike[str], names: Iterable[str]) -> list[P
 def save_figure(
     figure: Any, folder: str | os.PathLike[str], name: str, overwrite: bool = False
 ) -> list[Path]:
-    """Write a figure into ``folder`` as PNG and SVG; return the paths."""
+    """Write a figure into ``folder`` as PNG and SVG, close it, and return the paths."""
     import matplotlib
 
-    written = figure_files(make_folder(folder), [name])
-    for path in written:
-        check_free(path, overwrite)
-    with matplotlib.rc_context({"svg.hashsalt": "quell"}):
+    try:
+        written = figure_files(make_folder(folder), [name])
         for path in written:
-            with written_atomically(path, overwrite) as part:
-                about = {"Date": None} if path.suffix == ".svg" else None
-                figure.savefig(part, dpi=130, metadata=about)
+            check_free(path, overwrite)
+        with matplotlib.rc_context({"svg.hashsalt": "quell"}):
+            for path in written:
+                with written_atomically(path, overwrite) as part:
+                    about = {"Date": None} if path.suffix == ".svg" else None
+                    figure.savefig(part, dpi=130, metadata=about)
+    finally:
+        pyplot = sys.modules.get("matplotlib.pyplot")
+        if pyplot is not None:  # it would keep its figures until the program ends
+            pyplot.close(figure)
     return written
 
 

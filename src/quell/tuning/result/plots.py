@@ -27,10 +27,9 @@ def draw(
 ) -> Any:
     """Draw designs with all plants into four axes, the first design in black; return the axes."""
     if axes is None:
-        from matplotlib.figure import Figure
+        import matplotlib.pyplot as plt
 
-        figure = Figure(figsize=(10.0, 7.5), layout="constrained")
-        axes = figure.subplots(2, 2)
+        axes = plt.subplots(2, 2, figsize=(10.0, 7.5), layout="constrained")[1]
     bode, sensitivity, step, load = np.ravel(axes)
     omega, shown = plants.omega, range(min(len(plants.plants), _DRAWN))
     crossover = plants.crossover
