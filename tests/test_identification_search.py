@@ -25,7 +25,7 @@ from .test_identification import answer
 
 pytestmark = pytest.mark.compiled
 
-RECORDS = Path("/work/shared/data")
+RECORDS = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @cache
