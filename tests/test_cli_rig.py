@@ -70,7 +70,7 @@ def test_a_rig_runs_until_it_is_told_to_end_and_says_how_it_went(tmp_path: Path)
         process.send_signal(signal.SIGTERM)
         said, errors = process.communicate(timeout=60)
         assert process.returncode == 0
-    assert errors == ""
+    assert [line for line in errors.splitlines() if "compiled code for" not in line] == []
     assert "sessions: 1" in said
     assert "largest |u| 1, cut to the limit: 1" in said
     assert "frames that were not accepted:" in said
