@@ -1,6 +1,6 @@
 """Integral gains of tuned controllers on the test batch of Astrom and Hagglund.
 
-    python benchmarks/tuning.py                    all plants, M_s = 1.4 and 2: some 40 minutes
+    python benchmarks/tuning.py                    all plants, M_s = 1.4 and 2: some 12 minutes
     python benchmarks/tuning.py --every 11         each eleventh plant
     python benchmarks/tuning.py --m-s 2            one M_s
     python benchmarks/tuning.py --json file        the rows as JSON, too
