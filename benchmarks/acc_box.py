@@ -13,6 +13,7 @@ import time
 from quell.experiments.acc import DT, SPRINGS, box, designs, interval, judge_sampled
 from quell.experiments.acc.controllers import FREED, OURS
 from quell.experiments.acc.samples import boxed
+from quell.tuning.structures.base import vector
 
 # Seeds of the plants for the search, and of the fresh ones, which nothing else uses.
 SEARCHED, FRESH = 301, 1_000_000
@@ -40,7 +41,7 @@ def main() -> None:
             f"{len(found.candidates)} candidates in {time.perf_counter() - began:.0f} s;", end=" "
         )
         print(f"number {best.number} is the best one, {best.values}")
-        print(made.structure.tables(made.vector(best.parameters)))
+        print(made.structure.tables(vector(made.structure, best.parameters)))
         chosen = {"as found": controller}
     samples = boxed(options.count, FRESH)
     print(

@@ -12,6 +12,11 @@ from quell.plants.linearise import linearised
 from quell.plants.nonlinear import NonlinearPlant
 
 
+def linear_model(plant: Any) -> Any:
+    """Return the part of a plant that a design can use, for example the one without friction."""
+    return getattr(plant, "linear", plant)
+
+
 def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any, float]:
     """Return a linear plant and the delay [s] of its input, for ``analyse``.
 

@@ -9,17 +9,13 @@ from operator import add
 from typing import Any
 
 from quell.features.base import Features
+from quell.plants.linear_part import linear_model
 from quell.setup.errors import SetupError, with_path
 from quell.setup.schema import CallTable
 from quell.signals.base import Signal
 
 # Keys whose plant is a model: only its linear part is used.
 _MODELS = ("observer.plant", "controller.plant", "guard.certified_for")
-
-
-def linear_part(plant: Any) -> Any:
-    """Return the part of a plant that a design can use, for example the one without friction."""
-    return getattr(plant, "linear", plant)
 
 
 @cache
@@ -69,7 +65,7 @@ class Builder:
         """Build the tables in a value; add up the features or signals of a list if ``add_up``."""
         if isinstance(value, CallTable):
             built = self.build(value, path, **context)
-            return linear_part(built) if path.partition("[")[0] in _MODELS else built
+            return linear_model(built) if path.partition("[")[0] in _MODELS else built
         if not isinstance(value, tuple):
             return value
         entries = enumerate(value)

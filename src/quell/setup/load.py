@@ -14,8 +14,9 @@ from quell.controllers.base import Controller
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.files import nonfinite_to_none
 from quell.plants.base import Plant
+from quell.plants.linear_part import linear_model
 from quell.records.metrics import SETTLING_BAND
-from quell.setup.build import Builder, linear_part, parameters_of
+from quell.setup.build import Builder, parameters_of
 from quell.setup.description import Description, describe, read
 from quell.setup.errors import SetupError
 from quell.setup.schema import Table
@@ -114,7 +115,7 @@ def assembled(name: str, tables: Description, known: Known | None = None) -> Set
         return made_once(key, inputs, partial(builder.build, table, key, dt=dt, **context))
 
     plant = build("plant")
-    model = None if plant is None else made_once("model", (plant,), partial(linear_part, plant))
+    model = None if plant is None else made_once("model", (plant,), partial(linear_model, plant))
     parts = {key: build(key, plant=model) for key in ("observer", "learner", "guard")}
     kind, used = tables.controller.kind_name, tables.controller.context
     unused = [key for key, part in parts.items() if part is not None and key not in used]

@@ -125,7 +125,7 @@ class Variation:
 
     @property
     def identity(self) -> Any:
-        """What makes it this function, for the folder of a sweep."""
+        """Name and contents of this function, for the folder of a sweep."""
         told = nonfinite_to_none([self.data, self.cases])
         return {"setup": told[0], "cases": told[1], "hash": hash_of([self.data, self.cases])}
 

@@ -1,4 +1,4 @@
-"""What a setup file gives to ``quell.tune``: the plant, its ranges, constraints."""
+"""Arguments of ``quell.tune`` from a setup file: the plant, its ranges, constraints."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from quell.setup.build import linear_part
+from quell.plants.linear_part import linear_model
 from quell.setup.description import read
 from quell.setup.errors import SetupError
 from quell.setup.load import Setup, made
@@ -54,7 +54,7 @@ def tuning_task(
         limits = ("u_min", "u_max", "rate_limit")
         options = {key: given[key] for key in limits if key in given} | options
     options["setup"] = {key: value for key, value in data.items() if key not in _REPLACED}
-    part = linear_part
+    part = linear_model
     if "search" in options:
         options["scenario"], part = setup.needed("scenario"), _whole
     if not ranges:

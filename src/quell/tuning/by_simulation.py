@@ -22,6 +22,7 @@ from quell.controllers.base import Controller
 from quell.lti.models import is_linear_model
 from quell.lti.system import System
 from quell.plants.linear import LinearPlant
+from quell.plants.linear_part import linear_model
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.problem import Solution
@@ -29,7 +30,7 @@ from quell.tuning.optimiser.requirements import bounds_of, worst_ratio
 from quell.tuning.plants import as_list
 from quell.tuning.result.design import Design, design_of
 from quell.tuning.simulated import Problem, Range, Search, search
-from quell.tuning.structures.base import Structure
+from quell.tuning.structures.base import Structure, vector
 from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Uncertain
 
@@ -50,13 +51,9 @@ class Build:
     structure: Structure
     limits: Mapping[str, Any] = field(default_factory=dict)
 
-    def vector(self, values: Mapping[str, float]) -> Any:
-        """Return the values in the order of the structure's parameters (p,)."""
-        return np.array([values[parameter.name] for parameter in self.structure.parameters])
-
     def __call__(self, values: Mapping[str, float]) -> Controller:
         """Return the controller; raise a ``ValueError`` for values against the rules."""
-        row = self.vector(values)
+        row = vector(self.structure, values)
         if np.any(self.structure.rules(row[None, :]) < 0.0):
             raise ValueError(f"values {dict(values)!r}: are against the rules of the structure")
         return self.structure.controller(row, **self.limits)
@@ -200,14 +197,10 @@ def tune_by_simulation(
 def _linear_parts(plant: Any, box: Uncertain | None) -> Any:
     """Return the linear parts of plants, or a function that makes them."""
     if box is not None:
-        return lambda **values: _linear(plant(**values))
+        return lambda **values: linear_model(plant(**values))
     plants = as_list(plant)
-    parts = [_linear(each) for each in plants]
+    parts = [linear_model(each) for each in plants]
     return parts[0] if len(parts) == 1 else parts
-
-
-def _linear(plant: Any) -> Any:
-    return getattr(plant, "linear", plant)
 
 
 def _later(scenario: Any, count: int) -> Any:
@@ -221,7 +214,7 @@ def _later(scenario: Any, count: int) -> Any:
 def _design(found: Tuned, values: Mapping[str, float], objective: float) -> Design:
     solution = found.design.solution
     assert solution is not None
-    row = np.array([values[parameter.name] for parameter in solution.structure.parameters])
+    row = vector(solution.structure, values)
     better = Solution(solution.structure, row, 0.0, 0.0)
     made = design_of(
         found.design.name, found.task.problem(), better, found.constraints, found.task.u

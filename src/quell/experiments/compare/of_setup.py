@@ -11,7 +11,7 @@ from quell.analysis import LoopAnalysis, analyse
 from quell.controllers import Controller
 from quell.experiments.compare.study import Comparison, compare
 from quell.experiments.compare.tuned import STRUCTURES, Entry, of_loop, tuned
-from quell.plants.linear_part import linear_part
+from quell.plants.linear_part import linear_model, linear_part
 from quell.setup.load import Setup
 from quell.simulation import Scenario
 from quell.tuning import Constraints
@@ -25,7 +25,7 @@ OWN = "setup"
 
 @dataclass(frozen=True)
 class SetupComparison:
-    """What was compared, and how."""
+    """A comparison: plant, controllers, constraints and results."""
 
     plant: str  #: name of the plant
     linear: Any  #: its linear part, for which the controllers were tuned
@@ -55,7 +55,7 @@ def of_setup(
         raise ValueError(f"controllers: {unknown[0]!r} must be one of {known}")
     plant, scenario = given.needed("plant"), given.needed("scenario")
     dt = float(given.controller.dt)
-    linear, delay = linear_part(getattr(plant, "linear", plant), dt)
+    linear, delay = linear_part(linear_model(plant), dt)
     chosen = [name for name in names if name != OWN]
     entries: dict[str, Entry] = {}
     constraints = None

@@ -1,4 +1,4 @@
-"""What a structure is: a family of controllers with free parameters.
+"""The interface of structures: families of controllers with free parameters.
 
 All parameters are searched as logarithms. The first one is a gain: the whole controller is
 multiplied by its inverse or by itself (``gain_power``), while the others, the *shape*, stay. The
@@ -7,7 +7,10 @@ response of many parameter vectors at many frequencies is one call, without cont
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
+
+import numpy as np
 
 from quell.analysis.frequency_response import Complex
 from quell.controllers.base import Controller
@@ -25,7 +28,7 @@ class Parameter(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What a structure may know of the loop it is for."""
+    """Properties of the loop that a structure is made for."""
 
     plant: Any  # nominal linear plant, as given; None for plants known by their response only
     delay: float  # dead time of the nominal plant [s]
@@ -72,3 +75,8 @@ class Structure(Protocol):
     def tables(self, values: Vector) -> dict[str, dict[str, Any]]:
         """Return the tables of a setup file that describe the controller."""
         ...
+
+
+def vector(structure: Structure, values: Mapping[str, float]) -> Vector:
+    """Return values by name in the order of the structure's parameters (p,)."""
+    return np.array([values[parameter.name] for parameter in structure.parameters])
