@@ -135,7 +135,7 @@ def experiment(
 
 @dataclass(frozen=True)
 class _Shown:
-    """What the probe has shown."""
+    """Results of the probe."""
 
     sign: float
     time: float  # in which y moved [s]

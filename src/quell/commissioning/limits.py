@@ -10,7 +10,7 @@ from quell import checks
 
 @dataclass(frozen=True)
 class Limits:
-    """What an experiment may do; beyond the limits of y, u is ramped to zero.
+    """Limits of an experiment; beyond those of y, u is ramped to zero.
 
     Parameters
     ----------

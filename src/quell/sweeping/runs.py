@@ -34,7 +34,7 @@ _TIMING = 2.0
 
 @dataclass(frozen=True)
 class Job:
-    """What is done in each run of a sweep."""
+    """The work of each run of a sweep."""
 
     build: Callable[..., Any]  #: returns the parts of a run, see ``sweep``
     measures: Measures

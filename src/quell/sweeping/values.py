@@ -15,7 +15,7 @@ from quell.types import Vector
 
 @runtime_checkable
 class Distribution(Protocol):
-    """What is drawn: ``Range``, ``Normal``, or a distribution of ``scipy.stats``."""
+    """A distribution to draw from: ``Range``, ``Normal``, or one of ``scipy.stats``."""
 
     def ppf(self, q: Vector) -> Vector:
         """Return the quantiles of the probabilities ``q``, the inverse of its distribution."""

@@ -1,4 +1,4 @@
-"""What a tuned loop must keep to.
+"""Bounds of a tuned loop.
 
 With ``S = 1/(1 + L)``, ``T = 1 − S`` and the controller C_y from −y to u, the bounds are those of
 Åström & Hägglund (*Advanced PID Control*, ISA 2006, section 4.6): ``M_s = max |S|``, ``M_t = max

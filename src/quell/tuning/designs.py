@@ -38,7 +38,7 @@ _FIRST = ("pi-unfiltered", "pi", "pid", "bandwidths")
 
 @dataclass(frozen=True)
 class Task:
-    """What all structures are tuned for."""
+    """The problem that all structures are tuned for."""
 
     plants: PlantSet
     model: Model

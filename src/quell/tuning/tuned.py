@@ -95,7 +95,7 @@ class Tuned:
 
     @property
     def costs(self) -> list[str]:
-        """What the chosen structure costs against the best one, PI and PID, as sentences."""
+        """Costs of the chosen structure against the best one, PI and PID, as sentences."""
         return report.costs(self.design, self.designs, self.objective)
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""What ``quell compare`` prints and writes."""
+"""Tables and JSON of ``quell compare``."""
 
 from __future__ import annotations
 

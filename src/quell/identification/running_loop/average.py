@@ -1,4 +1,4 @@
-"""What the fits of several forms say together: means, physical units, the visible frequencies."""
+"""Averages over the fits of several forms: means, physical units, the visible frequencies."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def _fit_again(search: FrequencySearch, memory: SearchMemory, window: float) -> 
 
 @kernel
 def _adopt(search: FrequencySearch, memory: SearchMemory, left: float, omega: Vector) -> int:
-    """Give the oscillators the frequencies of the fit that are certain."""
+    """Set the oscillators to the frequencies of the fit that are certain."""
     loop, fit, adopted = memory.loop[0], memory.fit, memory.adopted
     result = NOTHING
     if loop.window < search.shortest or loop.left > search.certain * loop.variance:

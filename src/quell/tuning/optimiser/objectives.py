@@ -1,4 +1,4 @@
-"""What is minimised, as logarithms, for many parameter vectors.
+"""Objectives, as logarithms to minimise, for many parameter vectors.
 
 * ``load``: ``1/k_i``, the integral of y after a unit step of the load at the plant's input (IE;
   Åström & Hägglund, *Advanced PID Control*, ISA 2006, eq. 4.35). It is the same for all plants.

@@ -28,7 +28,7 @@ class Extra(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """What is searched for."""
+    """The problem of the optimiser: plants, bounds, objective."""
 
     plants: PlantSet
     bounds: tuple[Bound, ...]

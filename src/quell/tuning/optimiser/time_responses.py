@@ -31,7 +31,7 @@ _DIVERGED = 1e100
 
 
 class Inputs(NamedTuple):
-    """What acts on a loop: the reference and the load at the plant's input, sample by sample."""
+    """Inputs of a loop: the reference and the load at the plant's input, sample by sample."""
 
     r: Vector  # (k,) [y-unit]
     d: Vector  # (k,) [u-unit]

@@ -1,4 +1,4 @@
-"""What a tuning returns: designs with their measures, text, figures, setup files, checks.
+"""Results of a tuning: designs with their measures, text, figures, setup files, checks.
 
 May import ``tuning.optimiser`` and what stands before it.
 """

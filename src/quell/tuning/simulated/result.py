@@ -1,4 +1,4 @@
-"""What a search found: its candidates, the best one, and the Pareto front of several objectives."""
+"""Results of a search: its candidates, the best one, and the Pareto front of several objectives."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class _Task(NamedTuple):
 
 
 class _Score(NamedTuple):
-    """What a task found."""
+    """The result of a task."""
 
     scores: Matrix | None  # None for a design that is not possible
     violation: float

@@ -1,4 +1,4 @@
-"""What a search makes of the scores on many samples: one number, and its confidence interval.
+"""Statistics of the scores on many samples: one number, and its confidence interval.
 
 A score is better if it is lower; one that is not a number counts as infinite. All intervals have
 95 % confidence, are two-sided and hold for samples that were not used for the search.

@@ -110,7 +110,7 @@ def was_given_up(trial: Any, value: float, rung: int) -> bool:
 
 
 def tell(study: Any, trial: Any, values: Sequence[float] | None) -> None:
-    """Tell the study the values of a trial; None for one that was given up."""
+    """Pass the values of a trial to the study; None for one that was given up."""
     if values is None:
         study.tell(trial, state=optuna().trial.TrialState.PRUNED)
     else:
