@@ -1,4 +1,4 @@
-"""The failure criterion of the ACC benchmark, and the confidence interval of a failure rate."""
+"""The failure criterion of the ACC benchmark."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.experiments.acc.controllers import MOST_U
+from quell.tuning.simulated.statistics import share_interval as interval
 from quell.types import Matrix, Vector
 
 SETTLED_AT, MOST_Y = 15.0, 0.1
@@ -49,11 +50,3 @@ def judge(t: Vector, y: Matrix, u: Matrix, unstable: NDArray[np.bool_]) -> Judge
     late = np.max(np.abs(y[:, t >= SETTLED_AT - 1e-9]), axis=1)
     most_u = np.max(np.abs(np.nan_to_num(u, nan=0.0)), axis=1)
     return Judged(np.where(np.isnan(late) | unstable, np.inf, late), most_u)
-
-
-def interval(failures: int, count: int) -> tuple[float, float]:
-    """Return the 95 % confidence interval of a rate (Clopper & Pearson, *Biometrika* 26, 1934)."""
-    from scipy.stats import binomtest
-
-    found = binomtest(failures, count).proportion_ci(0.95, method="exact")
-    return float(found.low), float(found.high)

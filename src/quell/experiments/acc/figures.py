@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from quell.experiments.acc.controllers import DT, MF, MOST_U, OURS, PUBLISHED, designs
-from quell.experiments.acc.criteria import DURATION, MOST_Y, SETTLED_AT, interval
+from quell.experiments.acc.criteria import DURATION, MOST_Y, SETTLED_AT
 from quell.experiments.acc.published import judge_published
 from quell.experiments.acc.samples import generated, plant
 from quell.experiments.acc.study import SPRINGS, Result, judge_sampled, records
 from quell.experiments.common.figures import new_figure, save_figures
+from quell.tuning.simulated.statistics import share_interval as interval
 from quell.types import Matrix, Progress
 
 SPREADS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)

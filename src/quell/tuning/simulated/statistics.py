@@ -117,11 +117,10 @@ class FailureRate:
 
 def share_interval(found: int, count: int) -> tuple[float, float]:
     """Return the 95 % interval of a share (Clopper & Pearson, *Biometrika* 26, 1934)."""
-    from scipy.stats import beta
+    from scipy.stats import binomtest
 
-    tail = 0.5 * (1.0 - _CONFIDENCE)
-    low = float(beta.ppf(tail, found, count - found + 1)) if found > 0 else 0.0
-    return low, float(beta.ppf(1.0 - tail, found + 1, count - found)) if found < count else 1.0
+    ends = binomtest(found, count).proportion_ci(_CONFIDENCE, method="exact")
+    return float(ends.low), float(ends.high)
 
 
 def _numbers(scores: Vector) -> Vector:
