@@ -162,8 +162,8 @@ class _Rig:
         self, controller: Any, reference: Signal, duration: float, y_min: float, y_max: float
     ) -> RigRun:
         """Run a part with limits of y."""
-        own: dict[str, Any] = {"u_min": self.limits.u_min, "u_max": self.limits.u_max}
-        safety = Safety(**(self.safety | own | {"y_min": y_min, "y_max": y_max}))
+        own = self.limits.of_u | {"y_min": y_min, "y_max": y_max}
+        safety = Safety(**(self.safety | own))
         options: dict[str, Any] = {"duration": duration, "safety": safety} | self.options
         device = self.open()
         self.has_no_clock = isinstance(device, TwinDevice)
@@ -177,8 +177,7 @@ class _Rig:
         """Apply u as it is, from the first sample on."""
         none = np.zeros(0)
         law = LinearLaw(np.zeros((0, 0)), none, none, none, none, 1.0, 0.0)  # u = r
-        own: dict[str, Any] = {"u_min": self.limits.u_min, "u_max": self.limits.u_max}
-        controller = LinearController(law, self.dt, name="excitation", **own)
+        controller = LinearController(law, self.dt, name="excitation", **self.limits.of_u)
         low, high = room or (self.limits.y_min, self.limits.y_max)
         return self.run(controller, u, duration, low, high)
 
@@ -259,8 +258,8 @@ def _relay(rig: _Rig, shown: _Shown, y_rest: float, room: float, seed: int) -> R
     limits, duration = rig.limits, _rest_of(rig)
     kp = shown.sign * limits.u_room / (_ZONE * room)
     lead, filtered = _LEAD * shown.time, max(_FILTER * shown.time, 2.0 * rig.dt)
-    own: dict[str, Any] = {"u_min": limits.u_min, "u_max": limits.u_max, "dt": rig.dt}
-    controller = PID(kp, kd=kp * lead, tf=filtered, c=0.0, **own)
+    gains: dict[str, Any] = {"kp": kp, "kd": kp * lead, "tf": filtered, "c": 0.0}
+    controller = PID(**gains, dt=rig.dt, **limits.of_u)
     _, top = _band(rig, shown.time, duration)
     low = max(0.1 / shown.time, _PERIODS * 2.0 * np.pi / duration)
     # The loop itself switches fast; its reference moves at the speed of the probe.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from quell import checks
 
@@ -49,6 +50,11 @@ class Limits:
         checks.positive("duration", self.duration, "s")
         if not self.u_min < checks.finite("u_rest", self.u_rest) < self.u_max:
             raise ValueError(f"u_rest = {self.u_rest!r}: must be between u_min and u_max")
+
+    @property
+    def of_u(self) -> dict[str, Any]:
+        """``u_min`` and ``u_max``, as arguments of controllers and of ``Safety``."""
+        return {"u_min": self.u_min, "u_max": self.u_max}
 
     @property
     def u_room(self) -> float:

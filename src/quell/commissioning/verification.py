@@ -135,7 +135,7 @@ def verify(
     height = height if up else -height
     at = round(_BEFORE * duration / dt) * dt
     safety: dict[str, Any] = {"y_min": limits.y_min, "y_max": limits.y_max}
-    safety |= {"u_min": limits.u_min, "u_max": limits.u_max} | dict(options.pop("safety", {}))
+    safety |= limits.of_u | dict(options.pop("safety", {}))
     reference = Step(y_start) + Step(height, at=at)
     given: dict[str, Any] = {"duration": duration, "safety": Safety(**safety), "approach": 0.5 * at}
     given |= options

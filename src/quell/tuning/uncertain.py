@@ -48,6 +48,11 @@ class Uncertain:
                     f"uncertain.{name} = {ends!r}: must be [low, high], low below high"
                 )
 
+    @property
+    def ends(self) -> Matrix:
+        """Lowest and highest values (parameters, 2)."""
+        return np.array([tuple(map(float, pair)) for pair in self.ranges.values()])
+
     def plants(self, values: Matrix) -> list[Any]:
         """Return a plant for each row of values (k, parameters)."""
         names = list(self.ranges)
@@ -57,7 +62,7 @@ class Uncertain:
         """Return the values to design for: the middle, the corners, a Latin hypercube."""
         from scipy.stats import qmc
 
-        ends = np.array([tuple(map(float, pair)) for pair in self.ranges.values()])
+        ends = self.ends
         low, high = ends[:, 0], ends[:, 1]
         rows = [0.5 * (low + high)]
         if low.size <= _MOST_CORNERS:
@@ -70,7 +75,7 @@ class Uncertain:
 
     def fresh(self, count: int, seed: int) -> Matrix:
         """Return uniform values that the design did not have."""
-        ends = np.array([tuple(map(float, pair)) for pair in self.ranges.values()])
+        ends = self.ends
         draws = np.random.default_rng([seed, 1]).random((count, ends.shape[0]))
         found: Matrix = ends[:, 0] + draws * (ends[:, 1] - ends[:, 0])
         return found
