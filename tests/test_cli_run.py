@@ -28,19 +28,12 @@ from quell.records.measures import MEASURES, STEP_MEASURES
 from quell.setup import EXAMPLES, load
 
 from .commands import Shown
+from .setups import TWO_MASS
 
-SHORT = """
-title = "A short run"
-dt = 0.01
-[plant]
-kind = "two-mass"
-[observer]
-kind = "model-free"
-order = 4
-b0 = 1.0
-omega_o = 10.0
-[controller]
-omega_c = 1.0
+SHORT = (
+    'title = "A short run"'
+    + TWO_MASS
+    + """\
 [scenario]
 reference = 1.0
 duration = 12.0
@@ -50,6 +43,7 @@ stop = 8.0
 [[metrics]]
 start = 8.0
 """
+)
 
 
 def test_a_setup_is_simulated_printed_written_drawn_and_saved(

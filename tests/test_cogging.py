@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,21 +12,16 @@ import pytest
 
 import quell as ql
 
+from .benchmark_module import benchmark
+
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT.parent / "shared" / "data" / "cogging_a.csv"
 pytestmark = pytest.mark.skipif(not RECORD.exists(), reason=f"no measured map at {RECORD}")
 
 
-@cache
 def trial() -> Any:
     """Return the benchmark's module."""
-    spec = importlib.util.spec_from_file_location("cogging", ROOT / "benchmarks" / "cogging.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["cogging"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    return benchmark("cogging")
 
 
 @cache

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from quell.identification.search.output_error import descend, projected
 from quell.identification.search.reduced import reduced_models
 from quell.identification.validation import residuals
 
+from .benchmark_module import benchmark
 from .test_identification import answer
 
 pytestmark = pytest.mark.compiled
@@ -28,16 +27,9 @@ pytestmark = pytest.mark.compiled
 RECORDS = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
-@cache
 def trial() -> Any:
     """Return the benchmark's module, which draws the cases."""
-    path = Path(__file__).parents[1] / "benchmarks" / "identification_trial.py"
-    spec = importlib.util.spec_from_file_location("identification_trial", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return benchmark("identification_trial")
 
 
 @pytest.mark.parametrize("samples", [2000, 4000])

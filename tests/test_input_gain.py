@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from quell.identification import identify_b0
 from quell.identification.running_loop.bandwidth import bandwidth
 from quell.identification.running_loop.model import Form, linear_columns, placed, predicted
 
+from .benchmark_module import benchmark
 from .commands import Shown
 
 pytestmark = pytest.mark.compiled
@@ -26,16 +25,9 @@ DT = 0.01
 T = np.arange(1500) * DT
 
 
-@cache
 def trial() -> Any:
     """Return the benchmark's module, which simulates loops apart from the package's models."""
-    path = Path(__file__).parents[1] / "benchmarks" / "running_loop.py"
-    spec = importlib.util.spec_from_file_location("running_loop", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return benchmark("running_loop")
 
 
 def record(

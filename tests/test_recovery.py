@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +18,8 @@ from quell.learners.recovery import (
     is_in_proportion,
     window_samples,
 )
+
+from .benchmark_module import BENCHMARKS, benchmark
 
 WINDOW = 20
 
@@ -199,19 +199,11 @@ def test_a_window_is_ten_lags_of_the_observer() -> None:
     assert not is_in_proportion(watch, 2049.0)
 
 
-SCRIPT = Path(__file__).parents[1] / "benchmarks" / "hostile_steps.py"
-
-
 @pytest.fixture
 def trial(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The script of the full trial, as a module."""
-    monkeypatch.syspath_prepend(SCRIPT.parent)
-    spec = importlib.util.spec_from_file_location("hostile_steps", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return benchmark("hostile_steps")
 
 
 @pytest.mark.parametrize("name", ["NLMS", "Kalman, guarded", "order 1", "PID"])

@@ -15,23 +15,12 @@ from quell.setup import EXAMPLES, SetupError, load, made, varied
 from quell.setup.reference import keys, markdown
 from quell.setup.registry import CONTROLLERS, FEATURES, LEARNERS, OBSERVERS, PLANTS, SIGNALS
 
-BASE = """
-dt = 0.01
-[plant]
-kind = "two-mass"
-[observer]
-kind = "model-free"
-order = 4
-b0 = 1.0
-omega_o = 10.0
-[controller]
-omega_c = 1.0
-"""
+from .setups import TWO_MASS
 
 
 def setup(more: str = "", *, without: tuple[str, ...] = ()) -> Any:
     """Build the base with more in it: keys are added to a table of the same kind, and take the place of one of another."""
-    data = copy.deepcopy(tomllib.loads(BASE))
+    data = copy.deepcopy(tomllib.loads(TWO_MASS))
     for key in without:
         del data[key]
     for key, value in tomllib.loads(more).items():

@@ -25,6 +25,7 @@ from quell.sweeping import Measure, Normal, Plan, Range, Sweep, sweep
 from quell.sweeping.figures import wilson
 
 from .commands import Shown
+from .setups import TWO_MASS
 
 ESO = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=0.01)
 LAWS: Mapping[str, Any] = {
@@ -37,17 +38,9 @@ SCENARIO = ql.Scenario(
 )
 PARAMETERS: Mapping[str, Any] = {"m1": Range(-0.1, 1.4), "law": ["adrc", "learning", "pid"]}
 
-SETUP = """
-dt = 0.01
-[plant]
-kind = "two-mass"
-[observer]
-kind = "model-free"
-order = 4
-b0 = 1.0
-omega_o = 10.0
-[controller]
-omega_c = 1.0
+SETUP = (
+    TWO_MASS
+    + """\
 [scenario]
 reference = 1.0
 duration = 0.5
@@ -63,6 +56,7 @@ plant.m1 = { low = 0.6, high = 1.4 }
 mine = {}
 pid = { observer = "none", controller = { kind = "pid", kp = 0.1 } }
 """
+)
 
 
 def build(m1: float, law: str = "adrc", k: float = 1.0) -> tuple[Any, Any, ql.Scenario]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import socket
 import struct
@@ -24,6 +23,7 @@ from quell.realtime.wire import frames
 from quell.realtime.wire.shared_memory import SIZE
 from quell.realtime.wire.udp import UdpDevice
 
+from .benchmark_module import benchmark
 from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed, url_of
 
 HOSTILE = Path(__file__).parents[1] / "benchmarks" / "hostile_wire.py"
@@ -260,11 +260,7 @@ def test_hostile_packets_bytes_and_files_do_nothing(wire: str) -> None:
     """The trial of ``benchmarks/hostile_wire.py``, six hundred attacks."""
     if wire == "serial":
         pytest.importorskip("serial")
-    spec = importlib.util.spec_from_file_location("hostile_wire", HOSTILE)
-    assert spec is not None
-    assert spec.loader is not None
-    trial = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(trial)
+    trial = benchmark("hostile_wire")
     found = trial.trial(wire, 600, 60.0, seed=5)
     assert found["attacks"] >= 600
     assert found["wrong"] == []
