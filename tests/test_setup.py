@@ -190,6 +190,12 @@ def test_a_file_that_is_none_is_told_apart(tmp_path: Path) -> None:
         load(tmp_path / "deep.toml")
 
 
+def test_only_a_setup_can_be_varied() -> None:
+    """Anything else is named."""
+    with pytest.raises(ValueError, match="setup = 3: must be a Setup"):
+        varied(3, {"dt": 0.1})
+
+
 def test_a_mark_of_byte_order_is_no_mistake(tmp_path: Path) -> None:
     """As some editors put it in front of a text."""
     (tmp_path / "rig.toml").write_text(

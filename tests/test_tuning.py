@@ -284,6 +284,25 @@ def test_plants_that_do_not_fit_are_refused(plant: Any, message: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"limit": 1.0}, "limit: tune has no such argument, did you mean rate_limit"),
+        ({"uncertain": {"a": (1.0, 2.0)}}, "plant = .*: with uncertain it must be a function"),
+        (
+            {"plant": lambda a: ([a], [1.0, 1.0]), "uncertain": {"b": (1.0, 2.0)}},
+            "uncertain: plant can't be called with these: missing a required argument: 'a'",
+        ),
+        ({"scenario": 3.0}, "scenario = 3.0: must be a quell.Scenario"),
+        ({"scenario": [3.0]}, r"scenario\[0\] = 3.0: must be a quell.Scenario"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_named(arguments: dict[str, Any], message: str) -> None:
+    """Before anything is searched, whatever would have failed later."""
+    with pytest.raises(ValueError, match=message):
+        ql.tune(arguments.pop("plant", ([1.0], [1.0, 1.0])), 0.01, compare=(), **arguments)
+
+
+@pytest.mark.parametrize(
     ("bounds", "message"),
     [
         ({"m_s": 1.0}, "m_s = 1.0: must be above 1"),

@@ -39,6 +39,8 @@ def varied(setup: Setup, changes: Mapping[str, Any]) -> Setup:
     >>> float(setup.plant.B[2, 0]), float(lighter.plant.B[2, 0])
     (1.0, 1.4285714285714286)
     """
+    if not isinstance(setup, Setup):
+        raise ValueError(f"setup = {setup!r:.80}: must be a Setup, as quell.setup.load returns it")
     return made(setup.file, changed(setup.file, setup.tables(), changes))
 
 

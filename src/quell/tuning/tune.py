@@ -28,6 +28,8 @@ from quell.types import Progress
 
 COMPARED = ("pi", "pid", "bandwidths", "freed", "half-gain", "reduced", "model-based")
 """The structures that a result is compared with by default."""
+# Names of the limits of a controller.
+_LIMITS = ("u_min", "u_max", "rate_limit")
 
 
 def tune(
@@ -146,6 +148,9 @@ def tune(
         raise ValueError("search = {...}: is for a tuning by simulation; give a scenario, too")
     dt = checks.positive("dt", dt, "s")
     _check_names(structure, compare, objective)
+    for name in limits:
+        if name not in _LIMITS:
+            raise ValueError(f"{name}: tune has no such argument, {checks.nearest(name, _LIMITS)}")
     if not 0.0 < checks.finite("quantile", quantile) <= 1.0:
         raise ValueError(f"quantile = {quantile!r}: must be above 0 and at most 1, the worst case")
     report = progress or (lambda part, share: None)

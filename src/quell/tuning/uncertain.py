@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,12 +36,19 @@ class Uncertain:
         lowest and highest value of each parameter.
     """
 
-    make: Callable[..., Any]
+    make: Any  # Callable[..., Any]; checked below
     ranges: Mapping[str, tuple[float, float]]
 
     def __post_init__(self) -> None:
         if not self.ranges:
             raise ValueError("uncertain = {}: must have at least one parameter")
+        if not callable(self.make):
+            rule = "with uncertain it must be a function that returns a plant for its parameters"
+            raise ValueError(f"plant = {self.make!r:.80}: {rule}")
+        try:
+            inspect.signature(self.make).bind(**self.ranges)
+        except TypeError as error:
+            raise ValueError(f"uncertain: plant can't be called with these: {error}") from None
         for name, ends in self.ranges.items():
             low, high = checks.vector(f"uncertain.{name}", ends, 2).tolist()
             if not low < high:

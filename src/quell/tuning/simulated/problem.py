@@ -19,6 +19,7 @@ from quell.controllers.base import Controller
 from quell.plants.base import Plant
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
+from quell.simulation.scenario import check_scenario
 from quell.tuning.simulated.statistics import Mean, Statistic, share_interval
 from quell.types import Matrix
 
@@ -110,7 +111,11 @@ class Problem:
             seeds = range(scenario.seed, scenario.seed + len(several))
             scenarios = [replace(scenario, seed=seed) for seed in seeds]
         else:
+            if not checks.is_sequence(scenario):
+                check_scenario(scenario)
             scenarios = list(scenario)
+            for i, each in enumerate(scenarios):
+                check_scenario(each, f"scenario[{i}]")
             several = several if checks.is_sequence(given) else several * len(scenarios)
         if len(several) != len(scenarios):
             raise ValueError(
