@@ -10,6 +10,7 @@ from quell.plants.cubic_spring import CubicSpringPlant, lagged_two_mass_spring
 from quell.plants.dc_motor import DcMotor, dc_motor
 from quell.plants.delay import delayed
 from quell.plants.encoder import encoded
+from quell.plants.fmu.plant import FMU
 from quell.plants.linear import LinearPlant
 from quell.plants.linearise import linearised
 from quell.plants.nonlinear import NonlinearPlant
@@ -17,7 +18,7 @@ from quell.plants.torsional import TorsionalPlant, torsional, torsional_identifi
 from quell.plants.two_mass_spring import two_mass_spring
 
 __all__ = [
-    "CubicSpringPlant", "DcMotor", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch",
+    "FMU", "CubicSpringPlant", "DcMotor", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch",
     "TorsionalPlant", "batch", "dc_motor", "delayed", "encoded", "lagged_two_mass_spring",
     "linearised", "torsional", "torsional_identified", "two_mass_spring",
 ]  # fmt: skip

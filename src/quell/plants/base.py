@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from quell.kernels.dispatch import generic
+from quell.kernels.dispatch import generic, generic_with_default
 from quell.types import Vector
 
 
@@ -78,6 +78,20 @@ def measure(plant: Any, x: Vector) -> float:
 def advance(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
     """Advance the state ``x`` (n,) by a sample from the time ``t`` [s], with held u and w (m,).
 
-    ``scratch`` has room for 6 n numbers.
+    ``scratch`` has room for 6 n numbers. It is the same array during a run, and zero before it.
     """
     raise TypeError
+
+
+@generic_with_default
+def begin_run(plant: Any, x: Vector, scratch: Vector) -> None:
+    """Begin a run from the state ``x`` (n,), or begin it again.
+
+    Loops call it, as Python, before the first sample and whenever they put the plant back to its
+    initial state. Most plants need nothing.
+    """
+
+
+@generic_with_default
+def check_run(plant: Any, scratch: Vector) -> None:
+    """Raise the error that ended a run, if the plant met one; loops call it as Python."""

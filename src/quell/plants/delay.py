@@ -11,7 +11,15 @@ from typing import Any, NamedTuple
 
 from quell import checks
 from quell.kernels.sized import Size
-from quell.plants.base import Plant, PlantWrapper, advance, check_plant, measure
+from quell.plants.base import (
+    Plant,
+    PlantWrapper,
+    advance,
+    begin_run,
+    check_plant,
+    check_run,
+    measure,
+)
 from quell.types import Vector
 
 
@@ -37,6 +45,16 @@ def _advance(
         x[i] = x[i - 1]
     x[plant.size] = u
     advance(plant.inner, x[: plant.size], scratch, t, arriving, w)
+
+
+@begin_run.register(DelayedPlantModel)
+def _begin_run(plant: DelayedPlantModel, x: Vector, scratch: Vector) -> None:
+    begin_run(plant.inner, x[: plant.size], scratch)
+
+
+@check_run.register(DelayedPlantModel)
+def _check_run(plant: DelayedPlantModel, scratch: Vector) -> None:
+    check_run(plant.inner, scratch)
 
 
 @dataclass(frozen=True, eq=False)

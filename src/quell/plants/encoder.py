@@ -14,7 +14,15 @@ import numpy as np
 
 from quell import checks
 from quell.kernels.dispatch import kernel
-from quell.plants.base import Plant, PlantWrapper, advance, check_plant, measure
+from quell.plants.base import (
+    Plant,
+    PlantWrapper,
+    advance,
+    begin_run,
+    check_plant,
+    check_run,
+    measure,
+)
 from quell.types import Vector
 
 
@@ -41,6 +49,16 @@ def _advance(
     plant: EncodedPlantModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector
 ) -> None:
     advance(plant.inner, x, scratch, t, u, w)
+
+
+@begin_run.register(EncodedPlantModel)
+def _begin_run(plant: EncodedPlantModel, x: Vector, scratch: Vector) -> None:
+    begin_run(plant.inner, x, scratch)
+
+
+@check_run.register(EncodedPlantModel)
+def _check_run(plant: EncodedPlantModel, scratch: Vector) -> None:
+    check_run(plant.inner, scratch)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from quell.plants.cubic_spring import lagged_two_mass_spring
 from quell.plants.dc_motor import dc_motor
 from quell.plants.delay import delayed
 from quell.plants.encoder import encoded
+from quell.plants.fmu.plant import FMU
 from quell.plants.linear import LinearPlant
 from quell.plants.torsional import torsional, torsional_identified
 from quell.plants.two_mass_spring import two_mass_spring
@@ -53,6 +54,7 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
     "linear": linear,
     "delayed": delayed,
     "encoded": encoded,
+    "fmu": FMU,
 }
 """Plants that a setup file can have, by their ``kind``."""
 

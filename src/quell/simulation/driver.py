@@ -16,7 +16,7 @@ from quell.controllers.base import (
 )
 from quell.kernels.dispatch import compiled, compiled_loop, interpreted, is_available, specialised
 from quell.kernels.user_types import explain_compile_errors
-from quell.plants.base import Plant, advance, measure
+from quell.plants.base import Plant, advance, begin_run, check_run, measure
 from quell.simulation.integration import IntegrationCheck, Samples
 from quell.simulation.sampled_scenario import SampledScenario, Segment
 from quell.types import Channels, Matrix, Status, Vector
@@ -105,6 +105,7 @@ class Loop:
         self.state = controller.initial_state()
         self.x0, self.limit = scenario.x0, scenario.limit
         self.x, self.scratch = scenario.x0.copy(), np.zeros(6 * plant.order)
+        begin_run(model, self.x, self.scratch)
         self.done = self.status = self.until_next = 0
         as_python = interpret or not plant.compiled
         self.integration = IntegrationCheck(model, as_python)
@@ -151,6 +152,7 @@ class Loop:
         ):
             if from_rest:
                 self.x[:] = self.x0
+                begin_run(self.model, self.x, self.scratch)
                 start = (self.design, self.state)
                 self._entry(start_from_rest, *start)(*start)
             arguments = self._arguments(segment, log, row, every)
@@ -158,6 +160,7 @@ class Loop:
                 other = None if self._like is None else self._like._run_block
                 self._run_block = other or self._entry(run_block, *arguments)
             samples, row, self.until_next, flags = self._run_block(*arguments)
+        check_run(self.model, self.scratch)
         self.done = first + samples
         if samples < segment.r.size and row > 0:
             self.last_row = log[row - 1].copy()

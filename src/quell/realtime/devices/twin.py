@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.kernels.dispatch import call_specialised, compiled
-from quell.plants.base import Plant, advance, check_plant, measure
+from quell.plants.base import Plant, advance, begin_run, check_plant, check_run, measure
 from quell.plants.destroyed import is_destroyed
 from quell.plants.registry import named_plant
 from quell.realtime.devices.base import read_measurement, write_command
@@ -80,6 +80,7 @@ class TwinDevice:
         scratch, w = np.zeros(6 * order), np.zeros(plant.disturbances)
         model = plant.sampled(dt, not plant.compiled)
         self._x0 = x.copy()
+        begin_run(model, x, scratch)
         self._handle = TwinHandle(model, x, scratch, w, np.array([0.0, dt]))
         # Without a public handle the loop runs as Python.
         self.handle = self._handle if plant.compiled else None
@@ -106,12 +107,14 @@ class TwinDevice:
             write_command(self._handle, float(u))
         else:
             call_specialised(_write, self.handle, float(u))
+        check_run(self._handle.plant, self._handle.scratch)
 
     def close(self) -> None:
         """Put a plant whose state is destroyed back to ``x0``, so that the device can be reused."""
-        if is_destroyed(self._handle.x, self._x0):
-            self._handle.x[:] = self._x0
-            self._handle.t[0] = 0.0
+        plant, x, scratch, _, t = self._handle
+        if is_destroyed(x, self._x0):
+            x[:], t[0] = self._x0, 0.0
+            begin_run(plant, x, scratch)
 
 
 def twin_device(url: str, dt: float) -> TwinDevice:

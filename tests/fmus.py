@@ -1,0 +1,96 @@
+"""FMUs for tests: a mass in C (``fmu_plant.c``), compiled and packed for FMI 2.0 or 3.0."""
+
+from __future__ import annotations
+
+import functools
+import platform
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parent / "fmu_plant.c"
+GCC = shutil.which("gcc")
+needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc, which compiles the FMUs, is missing")
+
+_PARAMETERS = ("gain", "fail_at")
+_NAMES = ("time", "u", "w", "y", "v", "gain", "fail_at", "fail_with", "count")
+
+
+def _variables(version: int) -> str:
+    """Return the elements of all variables."""
+    causality = {"time": "independent", "u": "input", "w": "input", "y": "output", "v": "local"}
+    text = ""
+    for reference, name in enumerate(_NAMES):
+        whole = name in ("fail_with", "count")
+        kind = {2: "Integer", 3: "Int32"}[version] if whole else {2: "Real", 3: "Float64"}[version]
+        role = causality.get(name, "local" if name == "count" else "parameter")
+        start = {"gain": "1", "fail_at": "1e300", "fail_with": "3", "u": "0", "w": "0"}.get(name)
+        value = f' start="{start}"' if start else ""
+        vary = ' variability="fixed"' if role == "parameter" else ""
+        vary = ' variability="discrete"' if name == "count" else vary
+        head = f'name="{name}" valueReference="{reference}" causality="{role}"{vary}'
+        text += (
+            f"<ScalarVariable {head}><{kind}{value}/></ScalarVariable>"
+            if version == 2
+            else f"<{kind} {head}{value}/>"
+        )
+    return text
+
+
+def description(version: int) -> str:
+    """Return the model description."""
+    if version == 2:
+        return (
+            '<fmiModelDescription fmiVersion="2.0" modelName="mass" guid="{mass}">'
+            '<CoSimulation modelIdentifier="mass" canHandleVariableCommunicationStepSize="true" '
+            f'canGetAndSetFMUstate="true"/><ModelVariables>{_variables(2)}</ModelVariables>'
+            '<ModelStructure><Outputs><Unknown index="4"/></Outputs></ModelStructure>'
+            "</fmiModelDescription>"
+        )
+    return (
+        '<fmiModelDescription fmiVersion="3.0" modelName="mass" instantiationToken="{mass}">'
+        '<CoSimulation modelIdentifier="mass" canHandleVariableCommunicationStepSize="true"/>'
+        f"<ModelVariables>{_variables(3)}</ModelVariables>"
+        '<ModelStructure><Output valueReference="3"/></ModelStructure></fmiModelDescription>'
+    )
+
+
+@functools.cache
+def binary(version: int) -> bytes:
+    """Return the compiled library."""
+    assert GCC is not None
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "mass.so"
+        command = [GCC, "-shared", "-fPIC", "-O1", f"-DFMI={version}", str(SOURCE)]
+        subprocess.run([*command, "-o", str(library), "-lm"], check=True)
+        return library.read_bytes()
+
+
+def place(version: int) -> str:
+    """Return the name of the binary in the archive."""
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
+        platform.machine().lower(), platform.machine().lower()
+    )
+    return f"binaries/{'linux64' if version == 2 else machine + '-linux'}/mass.so"
+
+
+def contents(version: int) -> dict[str, bytes]:
+    """Return the files of a good FMU."""
+    return {
+        "modelDescription.xml": description(version).encode(),
+        place(version): binary(version),
+        "resources/table.txt": b"1 2 3\n",
+        "sources/fmu_plant.c": SOURCE.read_bytes(),
+    }
+
+
+def packed(path: Path, files: dict[str, bytes]) -> Path:
+    """Write an FMU of these files."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return path
