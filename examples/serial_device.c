@@ -2,8 +2,12 @@
  *
  * Frames, packets and sessions are those of wire/frames.py, wire/cobs.py and rig/kernel.py in
  * src/quell/realtime. Write the four board_ functions, call quell_byte() for each received byte and
- * quell_tick() every DT from a timer. The processor must be little-endian, with 64-bit double (not
- * AVR).
+ * quell_tick() every DT from a timer. If quell_tick() can interrupt quell_byte(), define QUELL_LOCK()
+ * and QUELL_UNLOCK() as interrupts off and on: a tick must not see half of a command. The processor
+ * must be little-endian, with 64-bit double (not AVR).
+ *
+ * If the controller runs on the device, too, the commands are references and board_apply() computes u;
+ * it sends what shall be recorded with quell_telemetry(). See target/serial_target.c.
  *
  * With -DQUELL_HOST this is a program that simulates y' = u on a pseudoterminal and prints the name
  * of its other end.
@@ -12,18 +16,32 @@
 #include <stdint.h>
 #include <string.h>
 
+#ifndef DT
 #define DT 0.001     /* sample time [s] */
+#endif
+#ifndef U_MAX
 #define U_MAX 10.0   /* larger commands are limited to it [u-unit] */
+#endif
+#ifndef WATCHDOG
 #define WATCHDOG 20  /* ticks without a fresh command until u is zero; reset by a new session */
+#endif
+#ifndef PATIENCE
 #define PATIENCE 60000 /* ticks that a session may wait for its first command */
+#endif
+#ifndef MOST_AGE
 #define MOST_AGE 20  /* a command is stale if the answered measurement is older [ticks] */
+#endif
+#ifndef QUELL_LOCK
+#define QUELL_LOCK()
+#define QUELL_UNLOCK()
+#endif
 
 double board_measure(void);                     /* return y [y-unit] */
 void board_apply(double u);                     /* apply u until the next call [u-unit] */
 void board_send(const uint8_t *data, int size); /* append to the UART's queue; must not wait */
 int64_t board_time(void);                       /* return the time of any monotonic clock [ns] */
 
-enum { MEASUREMENT = 1, COMMAND, HELLO, WELCOME, GOODBYE };
+enum { MEASUREMENT = 1, COMMAND, HELLO, WELCOME, GOODBYE, TELEMETRY };
 enum { TRIPPED_FLAG = 1, BUSY_FLAG = 2, OTHER_DT_FLAG = 4 };
 
 typedef struct {
@@ -39,6 +57,7 @@ static enum { IDLE, WAITING, LIVE, TRIPPED } mode = IDLE;
 static uint32_t session, sent, heard;
 static double newest, applied;
 static int fresh, silent;
+static uint32_t answered; /* number of the measurement that the last command answers */
 
 static uint32_t crc32(const void *data, int size)
 {
@@ -84,7 +103,7 @@ static void greet(const Frame *hello)
             refusal = BUSY_FLAG;
         } else {
             session = hello->session;
-            sent = heard = 0;
+            sent = heard = answered = 0;
             silent = fresh = 0;
             applied = 0.0;
             mode = WAITING;
@@ -95,8 +114,6 @@ static void greet(const Frame *hello)
 
 static void take(const Frame *frame)
 {
-    if (memcmp(frame->magic, "QL\1", 3) || frame->crc != crc32(frame, sizeof *frame - 4))
-        return;
     if (frame->kind == HELLO) {
         greet(frame);
     } else if (mode != IDLE && frame->session == session) {
@@ -107,6 +124,7 @@ static void take(const Frame *frame)
             if (ahead <= 0 || age < 0 || age > MOST_AGE)
                 return;
             heard = frame->number;
+            answered = frame->answers;
             if (isfinite(frame->value)) {
                 newest = frame->value;
                 fresh = 1;
@@ -143,7 +161,11 @@ void quell_byte(uint8_t byte)
     if (out == sizeof(Frame)) {
         Frame frame;
         memcpy(&frame, data, sizeof frame);
+        if (memcmp(frame.magic, "QL\1", 3) || frame.crc != crc32(&frame, sizeof frame - 4))
+            return;
+        QUELL_LOCK();
         take(&frame);
+        QUELL_UNLOCK();
     }
 }
 
@@ -166,6 +188,16 @@ void quell_tick(void)
         send_frame(MEASUREMENT, session, ++sent, y, mode == TRIPPED ? TRIPPED_FLAG : 0);
     board_apply(applied);
 }
+
+/* Send a channel of the telemetry of this tick, from board_apply(); the loop knows its name. */
+void quell_telemetry(uint32_t channel, double value)
+{
+    if (mode != IDLE)
+        send_frame(TELEMETRY, session, sent, value, channel);
+}
+
+/* Return whether a command answers the last measurement; a simulated plant can wait for it. */
+int quell_answered(void) { return answered == sent; }
 
 #ifdef QUELL_HOST
 #include <fcntl.h>

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from quell.realtime.telemetry.live import LiveSink
     from quell.realtime.telemetry.load import load
     from quell.realtime.telemetry.mcap_file import McapSink
+    from quell.realtime.wire.target import record_target
 
 _HOME = {
     "CsvSink": "telemetry.csv_file",
@@ -42,13 +43,14 @@ _HOME = {
     "TwinDevice": "devices.twin",
     "load": "telemetry.load",
     "open_device": "devices.registry",
+    "record_target": "wire.target",
     "replay": "loop.replay",
     "run_rig": "loop.run",
 }
 
 __all__ = [
     "CsvSink", "Device", "LiveSink", "McapSink", "Rig", "RigRun", "Safety", "TwinDevice",
-    "load", "open_device", "replay", "run_rig",
+    "load", "open_device", "record_target", "replay", "run_rig",
 ]  # fmt: skip
 
 

@@ -5,7 +5,8 @@ offset  size  type     content
 ======  ====  =======  ==========================================================================
 0       2     bytes    ``QL``
 2       1     uint8    version of the protocol: 1
-3       1     uint8    kind: 1 measurement, 2 command, 3 hello, 4 welcome, 5 goodbye
+3       1     uint8    kind: 1 measurement, 2 command, 3 hello, 4 welcome, 5 goodbye,
+                       6 telemetry of a controller on the device (``target``)
 4       4     uint32   session: drawn by the loop for each run, never 0
 8       4     uint32   number of the frame: the sender's count of ticks or cycles from 1, mod 2^32
 12      4     uint32   answers: number of the newest frame accepted from the other side; 0 if none
@@ -13,7 +14,7 @@ offset  size  type     content
 24      8     float64  value: y [y-unit], u [u-unit]; in hello and welcome the sample time [s]
 32      4     uint32   state flags of the sender: 1 its watchdog has set u to zero (measurement);
                        2 another session is active, 4 the sample time differs (welcome); 8 the
-                       device has ended the session (goodbye)
+                       device has ended the session (goodbye); index of the channel (telemetry)
 36      4     uint32   CRC-32 of the 36 bytes before it (IEEE 802.3, as in zlib, Ethernet and PNG)
 ======  ====  =======  ==========================================================================
 
@@ -36,7 +37,7 @@ from quell.kernels.dispatch import is_finite, kernel
 
 LENGTH = 40
 VERSION = 1
-MEASUREMENT, COMMAND, HELLO, WELCOME, GOODBYE = range(1, 6)
+MEASUREMENT, COMMAND, HELLO, WELCOME, GOODBYE, TELEMETRY = range(1, 7)
 WATCHDOG_TRIPPED, BUSY, OTHER_DT, GONE = 1, 2, 4, 8
 
 REFUSALS = (
