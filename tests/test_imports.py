@@ -25,6 +25,7 @@ ROWS = (
     ),
     ("learners.adapters", "learners.__init__", "guard"),
     ("controllers", "controllers.linear", "controllers.adrc", "controllers.prefilters"),
+    ("controllers.single",),
     ("controllers.baselines", "controllers.__init__"),
     ("records", "simulation", "analysis"),
     ("identification.experiment", "identification.model", "identification.search"),

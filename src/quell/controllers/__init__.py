@@ -21,6 +21,7 @@ from quell.controllers.linear.linear import LinearController
 from quell.controllers.prefilters.differentiator import TrackingDifferentiator
 from quell.controllers.prefilters.prefilter import Prefilter, Prefiltered
 from quell.controllers.prefilters.reference_model import ReferenceModel
+from quell.controllers.single import in_single_precision
 
 __all__ = [
     "ADRC",
@@ -37,6 +38,7 @@ __all__ = [
     "adrc_for_dead_time",
     "baselines",
     "dead_time_tuning",
+    "in_single_precision",
     "omega_c_for",
     "warn_if_unwise",
 ]

@@ -1,7 +1,8 @@
 """Replacement of references and measurements that are not numbers of any physical quantity.
 
 What is not finite, or beyond 1e60, counts as missing. Arithmetic with larger numbers would overflow
-in squares, and an observer would need longer to return from them.
+in squares, and an observer would need longer to return from them. In single precision, whose
+numbers end at 3.4e38, the limit is 1e12.
 """
 
 from __future__ import annotations
@@ -11,16 +12,22 @@ from typing import Any
 from quell.checks import LARGEST_SIGNAL
 from quell.controllers.limits import Limits
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import is_single
 from quell.types import Status
 
 _MEASUREMENT_HELD = int(Status.MEASUREMENT_HELD)
 _REFERENCE_HELD = int(Status.REFERENCE_HELD)
 
+# f is larger than y by the power of omega_o with the order of the plant, and squares of f must be
+# finite: so they are up to 2e7 y-units/s^n for each of y. No sensor has so many steps. Where
+# they overflow all the same, learner and guard start again.
+LARGEST_SINGLE_SIGNAL = 1e12
+
 
 @kernel
 def is_usable(value: float) -> bool:
     """Return whether ``value`` can be a reference, one of its derivatives or a measurement."""
-    return abs(value) <= LARGEST_SIGNAL
+    return abs(value) <= (LARGEST_SINGLE_SIGNAL if is_single(value) else LARGEST_SIGNAL)
 
 
 @kernel

@@ -206,5 +206,6 @@ def named_arrays(state: Any, prefix: str = "") -> dict[str, NDArray[np.float64]]
         if isinstance(value, tuple):
             found |= named_arrays(value, f"{prefix}{name}.")
         else:
-            found[prefix + name] = value if value.dtype.names is None else value.view(np.float64)
+            is_record = value.dtype.names is not None
+            found[prefix + name] = value.view(value.dtype[0]) if is_record else value
     return found

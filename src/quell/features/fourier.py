@@ -12,6 +12,7 @@ import numpy as np
 from quell import checks
 from quell.features.base import Features, dimensionless, unit, write
 from quell.features.states import StateIndices, check_states, state_indices
+from quell.kernels.functions import cos
 from quell.types import Matrix, Vector
 
 
@@ -85,7 +86,7 @@ def _write(features: RandomFourierDesign, x: Vector, u: float, out: Vector) -> N
         angle = features.phase[j]
         for k in range(features.states.size):
             angle += features.waves[j, k] * x[features.states[k]]
-        out[j] = features.size * math.cos(angle)
+        out[j] = features.size * cos(angle)
 
 
 unit.register(RandomFourierDesign)(dimensionless)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from quell.features.base import (
     write_physical,
 )
 from quell.features.states import StateIndices, check_states, state_indices
+from quell.kernels.functions import tanh
 from quell.kernels.sized import Flag
 from quell.types import Vector
 
@@ -104,7 +104,7 @@ def _write(features: Any, x: Vector, u: float, out: Vector) -> None:
     at = 0
     for k in range(features.states.size):
         velocity = x[features.states[k]]
-        out[at] = math.tanh(velocity / features.width)
+        out[at] = tanh(velocity / features.width)
         at += 1
         if features.sign:
             out[at] = 1.0 if velocity > 0.0 else (-1.0 if velocity < 0.0 else 0.0)

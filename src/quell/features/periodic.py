@@ -19,6 +19,7 @@ from quell.features.base import (
     write_nothing,
     write_physical,
 )
+from quell.kernels.functions import cos, sin
 from quell.kernels.sized import Size
 from quell.types import Vector
 
@@ -121,11 +122,11 @@ class Periodic(Features):
 @write_physical.register(PeriodicDesign)
 def _write(features: PeriodicDesign, x: Vector, u: float, out: Vector) -> None:
     angle = features.rate * x[features.state]
-    step_sine, step_cosine = math.sin(angle), math.cos(angle)
+    step_sine, step_cosine = sin(angle), cos(angle)
     sine, cosine = 0.0, 1.0
     before = 0
     for k in range(features.orders.size):
-        m = features.orders[k]
+        m = int(features.orders[k])
         if m == before + 1:
             # The next order by the addition theorem, a fifth of the time of sin and cos. The error
             # of 500 such steps is below 1e-13.
@@ -133,7 +134,7 @@ def _write(features: PeriodicDesign, x: Vector, u: float, out: Vector) -> None:
             cosine = cosine * step_cosine - sine * step_sine
             sine = turned
         else:
-            sine, cosine = math.sin(m * angle), math.cos(m * angle)
+            sine, cosine = sin(m * angle), cos(m * angle)
         out[2 * k], out[2 * k + 1] = sine, cosine
         before = m
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +10,7 @@ import numpy as np
 from quell import checks
 from quell.features.base import Features, dimensionless, unit, write
 from quell.features.states import StateIndices, check_states, state_indices
+from quell.kernels.functions import exp
 from quell.types import Matrix, Vector
 
 # Bases of the Halton sequence, one for each state.
@@ -111,7 +111,7 @@ def _write(features: RadialDesign, x: Vector, u: float, out: Vector) -> None:
         for k in range(features.states.size):
             difference = x[features.states[k]] - features.centers[j, k]
             distance += difference * difference
-        out[j] = math.exp(-features.weight * distance)
+        out[j] = exp(-features.weight * distance)
 
 
 unit.register(RadialDesign)(dimensionless)

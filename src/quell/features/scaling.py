@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import is_single, log2
 from quell.kernels.sized import Flag
 from quell.observers.eso import ESO
 from quell.types import Vector
 
 # Avoids division by zero and the logarithm of zero; far below any signal.
-LEAST = 1e-100
+LEAST, LEAST_SINGLE = 1e-100, 1e-30
 # Least scale of a derivative, as a share of the one in a motion of x_1 at the frequency ω. Chosen
 # by hand; not tuned further.
 _FLOOR = 1.0 / 8.0
@@ -46,12 +47,18 @@ def initial_scale(scaling: Scaling) -> Vector:
 
 
 @kernel
+def least_scale(like: float) -> float:
+    """Return the scale of what was always zero, in the precision of ``like``."""
+    return LEAST_SINGLE if is_single(like) else LEAST
+
+
+@kernel
 def reset_scale(scaling: Scaling, scale: Vector) -> None:
     """Go back to the scales before the first sample, unless they are given."""
     if scaling.fixed:
         return
     for i in range(scale.size):
-        scale[i] = LEAST
+        scale[i] = least_scale(scale[i])
 
 
 @kernel
@@ -62,6 +69,6 @@ def update_scale(scaling: Scaling, scale: Vector, estimate: Vector, u: float, f:
     order = scale.size - 2
     for i in range(scale.size):
         size = abs(estimate[i]) if i < order else (abs(u) if i == order else abs(f))
-        size = max(size, scaling.floors[i] * scale[0], LEAST)
+        size = max(size, scaling.floors[i] * scale[0], least_scale(scale[i]))
         if size > scale[i] and is_finite(size):
-            scale[i] = 2.0 ** math.ceil(math.log2(size))
+            scale[i] = 2.0 ** math.ceil(log2(size))

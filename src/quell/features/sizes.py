@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.features.base import Features, unit
-from quell.features.scaling import LEAST
+from quell.features.scaling import LEAST, least_scale
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import log2
 from quell.types import Vector
 
 Indices = NDArray[np.int64]
@@ -34,7 +35,7 @@ def initial_sizes(unscaled: Indices) -> Vector:
 def reset_sizes(sizes: Vector) -> None:
     """Go back to the sizes before the first sample."""
     for k in range(sizes.size):
-        sizes[k] = LEAST
+        sizes[k] = least_scale(sizes[k])
 
 
 @kernel
@@ -44,7 +45,7 @@ def update_sizes(unscaled: Indices, sizes: Vector, values: Vector) -> bool:
     for k in range(sizes.size):
         size = abs(values[unscaled[k]])
         if size > sizes[k] and is_finite(size):
-            sizes[k] = 2.0 ** math.ceil(math.log2(size))
+            sizes[k] = 2.0 ** math.ceil(log2(size))
             grown = True
     return grown
 
@@ -58,7 +59,7 @@ def scale_by_sizes(unscaled: Indices, sizes: Vector, values: Vector) -> None:
     """
     for k in range(sizes.size):
         value = values[unscaled[k]]
-        known = sizes[k] > LEAST and is_finite(value)
+        known = sizes[k] > least_scale(sizes[k]) and is_finite(value)
         values[unscaled[k]] = value / sizes[k] if known else 0.0
 
 

@@ -51,7 +51,6 @@ docs/theory, "The guard", gives theorem, proof and measurements.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
@@ -67,6 +66,7 @@ from quell.guard.base import (
 )
 from quell.guard.reason import Reason
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import is_single, sqrt
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
 from quell.learners.lag import lag_push, reset_lag
@@ -92,8 +92,8 @@ _OUTLIER = 5.0
 _OWN_GROWTH, _MOST_OWN, _SUDDEN = 2.5, 5.0, 1.15
 # An output that is so many times larger than f is cut off.
 _CUT_OFF = 100.0
-# Avoids division by zero; squares of f are larger in any unit.
-_TINY = 1e-200
+# Avoids division by zero; squares of f are larger in any unit, also those of single precision.
+_TINY, _TINY_SINGLE = 1e-200, 1e-30
 
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
 _OUT_OF_BOUNDS, _EXPLODED = int(Reason.OUT_OF_BOUNDS), int(Reason.EXPLODED)
@@ -171,6 +171,11 @@ class GuardMemory(NamedTuple):
 _F_PLAIN, _G, _V, _F_L = range(4)
 
 
+@kernel
+def _tiny(guard: GuardDesign) -> float:
+    return _TINY_SINGLE if is_single(guard.forget) else _TINY
+
+
 @assess.register(GuardDesign)
 def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     shown, averages, sample = memory.shown, memory.averages[0], memory.sample[0]
@@ -189,7 +194,7 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
         return
     _update_bound(guard, sample, abs(q))
     energy = qq + pp
-    if energy < _TINY:
+    if energy < _tiny(guard):
         return
     is_new = sample.samples * guard.forget < 1.0
     averages.square = _mean_square(guard, averages.square, qq, guard.forget, is_new)
@@ -202,7 +207,7 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     )
     most = guard.bound * sample.typical_error
     bounded = min(max(p, -most), most)
-    earned = _earned(q, bounded, averages.square)
+    earned = _earned(q, bounded, averages.square, _tiny(guard))
     sample.credit = min(max(sample.credit + guard.earn * earned, -1.0), 1.0)
     _judge_effect(guard, memory, q, bounded, is_new)
 
@@ -219,7 +224,7 @@ def _judge_effect(
         q, bounded = effects[0, i], effects[1, i]
     rate = guard.forget_effect
     averages.effect_square = _mean_square(guard, averages.effect_square, q * q, rate, is_new)
-    earned = _earned(q, bounded, averages.effect_square)
+    earned = _earned(q, bounded, averages.effect_square, _tiny(guard))
     sample.effect_credit = min(max(sample.effect_credit + rate * earned, -1.0), 1.0)
 
 
@@ -233,9 +238,9 @@ def _mean_square(
 
 
 @kernel
-def _earned(q: float, p: float, mean_square: float) -> float:
+def _earned(q: float, p: float, mean_square: float, tiny: float) -> float:
     """Return what a sample earns in which q − p is left of q."""
-    earned = (2.0 * q - p) * p / max(q * q, _MEAN_SQUARES * mean_square, _TINY)
+    earned = (2.0 * q - p) * p / max(q * q, _MEAN_SQUARES * mean_square, tiny)
     return max(earned, -_WORST_SAMPLE)
 
 
@@ -248,14 +253,14 @@ def _update_bound(guard: GuardDesign, sample: GuardSample, error: float) -> None
         error = min(error, _OUTLIER * peak)
     most_own = own if error > _SUDDEN * peak else _MOST_OWN * own
     peak += guard.rise * (error - peak) if error > peak else -guard.decay * peak
-    sample.peak = max(peak, _TINY)
+    sample.peak = max(peak, _tiny(guard))
     larger = guard.rise * (error - guard.own * own - size)
     if larger > 0.0:
         size += min(larger, guard.growth * size) if sample.authority > 0.0 else larger
     more = guard.rise * (error - most_own - sample.outside)
     sample.outside = min(sample.outside + max(more, 0.0), sample.peak)
     size = min(size, sample.peak, _OWN_GROWTH * sample.outside)
-    sample.typical_error = max(size, _TINY)
+    sample.typical_error = max(size, _tiny(guard))
 
 
 @limit.register(GuardDesign)
@@ -284,7 +289,7 @@ def _limit(
         return f_shown, 0.0, not finite
     before = sample.output if sample.begun != 0.0 else output
     sample.output, sample.begun = output, 1.0
-    authority, sample.reason = _authority(memory)
+    authority, sample.reason = _authority(guard, memory)
     sample.authority = authority
     sample.limit = authority * guard.bound * sample.typical_error
     sample.share += guard.smooth * (authority - sample.share)
@@ -304,13 +309,13 @@ def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float
 
 
 @kernel
-def _authority(memory: GuardMemory) -> tuple[float, int]:
+def _authority(guard: GuardDesign, memory: GuardMemory) -> tuple[float, int]:
     """Return β and the reason for it."""
     loudness, sample = memory.averages[0].loudness, memory.sample[0]
     earned = min(sample.credit, _FULL_CREDIT + sample.effect_credit) / _FULL_CREDIT
     if earned <= 0.0:
         return 0.0, _UNPROVEN
-    scaled = _LOUDEST * (1.0 - loudness) / max(loudness, _TINY)
+    scaled = _LOUDEST * (1.0 - loudness) / max(loudness, _tiny(guard))
     if scaled < min(earned, 1.0):
         return scaled, _TOO_LOUD
     return (earned, _UNPROVEN) if earned < 1.0 else (1.0, _TRUSTED)
@@ -344,8 +349,8 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
 @write_channels.register(GuardDesign)
 def _write_channels(guard: GuardDesign, memory: GuardMemory, row: Vector) -> int:
     row[0] = memory.sample[0].authority
-    row[1] = math.sqrt(memory.averages[0].error_plain)
-    row[2] = math.sqrt(memory.averages[0].error_learned)
+    row[1] = sqrt(memory.averages[0].error_plain)
+    row[2] = sqrt(memory.averages[0].error_learned)
     row[3] = memory.sample[0].reason
     return 4
 

@@ -30,7 +30,8 @@ from numba.extending import overload, register_jitable
 
 import quell.kernels.compile_time  # noqa: F401  (counts from the first compilation on)
 from quell.kernels.cache import code_cache
-from quell.kernels.linking import KERNEL_OPTIONS, WithoutOverlaps
+from quell.kernels.functions import is_single
+from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS, WithoutOverlaps
 from quell.kernels.overlaps import overlap
 from quell.kernels.sized import layout_of, type_of
 from quell.kernels.user_types import add_user_type, uses_user_types
@@ -53,17 +54,7 @@ class Generic(Protocol[P, R_co]):
         """Return a decorator that makes a function the implementation for ``cls``."""
 
 
-# Fused multiply-add is allowed. Sums are not re-ordered: the order would depend on what a kernel is
-# inlined into, and a rig would no longer be its simulation to the last bit. (Write what is known
-# late at the end of a sum: the processor works on the rest meanwhile.) Inlining is forced because a
-# NamedTuple of arrays is passed as some forty words, which costs more than most kernels do.
-OPTIONS: dict[str, Any] = {
-    "fastmath": {"contract", "nsz"},
-    "error_model": "numpy",
-    "forceinline": True,
-}
-
-_LARGEST = sys.float_info.max
+_LARGEST, _LARGEST_SINGLE = sys.float_info.max, float(np.finfo(np.float32).max)
 
 interpret_all = bool(numba.config.DISABLE_JIT)
 """Whether entry points run as plain Python wherever they are called by ``specialised``: for tests
@@ -135,7 +126,7 @@ def is_finite(value: float) -> bool:
     ``math.isfinite`` tests in compiled code whether x − x is a number. Where a compiler may
     re-order sums, and x is one, x − x becomes zero before the test. A comparison is always right.
     """
-    return abs(value) <= _LARGEST
+    return abs(value) <= (_LARGEST_SINGLE if is_single(value) else _LARGEST)
 
 
 def compiled(function: F) -> F:

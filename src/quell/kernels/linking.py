@@ -10,7 +10,8 @@ the entry point gets the rest. This halves the compile time of a loop and does n
 from __future__ import annotations
 
 import weakref
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import llvmlite.binding as llvm
 import numba
@@ -19,6 +20,8 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import AnnotateTypes
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 # Prefix of Numba's variables that point to a function's environment, which ``print`` needs.
 _ENVIRONMENT = "_ZN08NumbaEnv"
@@ -73,6 +76,15 @@ class KernelCompiler(CompilerBase):
         return [passes]
 
 
+def in_both_precisions(function: F) -> F:
+    """Mark a kernel that converts between double and single precision.
+
+    Floats in its code stay double, although it has arguments in single precision.
+    """
+    function.in_both_precisions = True  # type: ignore[attr-defined]
+    return function
+
+
 class WithoutOverlaps(CompilerBase):
     """Numba's compiler for an entry point that writes to no memory which it reaches in two ways.
 
@@ -93,3 +105,13 @@ KERNEL_OPTIONS: dict[str, Any] = (
     if numba.__version__.startswith(_TESTED_VERSIONS)
     else {}
 )
+
+# Fused multiply-add is allowed. Sums are not re-ordered: the order would depend on what a kernel is
+# inlined into, and a rig would no longer be its simulation to the last bit. (Write what is known
+# late at the end of a sum: the processor works on the rest meanwhile.) Inlining is forced because a
+# NamedTuple of arrays is passed as some forty words, which costs more than most kernels do.
+OPTIONS: dict[str, Any] = {
+    "fastmath": {"contract", "nsz"},
+    "error_model": "numpy",
+    "forceinline": True,
+}

@@ -13,9 +13,9 @@
     state.loop[0].u = 1.0           # the same statement in a kernel and in Python
     loop = state.loop[0]            # refers to the record, does not copy it
 
-If all fields are floats, ``state.loop.view(np.float64)`` is the record as a vector; ``clear`` and
-the saved state of a controller use that. A field must not have the name of an attribute that NumPy
-needs (``dtype``, ``view``, ``copy`` …).
+If all fields are floats, ``state.loop.view(np.float64)`` is the record as a vector; the saved state
+of a controller uses that. ``single_dtype`` is the same record in single precision. A field must not
+have the name of an attribute that NumPy needs (``dtype``, ``view``, ``copy`` …).
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ from numba.core import types as nb_types
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
-from quell.kernels.dispatch import OPTIONS
-from quell.kernels.linking import KERNEL_OPTIONS
+from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS
 
 if TYPE_CHECKING:
     _Record = np.generic  # NumPy's stubs forbid subclasses of np.void, NumPy itself does not
@@ -66,6 +65,13 @@ def _field(name: str) -> property:
         record[name] = value
 
     return property(itemgetter(name), write)
+
+
+def single_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of the same record with its floats in single precision."""
+    names = dtype.names or ()
+    kinds = {name: np.float32 if dtype[name] == np.float64 else dtype[name] for name in names}
+    return np.dtype((dtype.type, list(kinds.items())))
 
 
 def clear(scalars: NDArray[Any]) -> None:

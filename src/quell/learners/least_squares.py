@@ -15,7 +15,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import is_single
 from quell.types import Matrix, Vector
+
+# A larger φ·Pφ could overflow in what follows; in single precision earlier.
+_LARGEST_SPREAD, _LARGEST_SPREAD_SINGLE = 1e100, 1e15
 
 
 class RlsRule(NamedTuple):
@@ -24,6 +28,18 @@ class RlsRule(NamedTuple):
     noise: float  # R
     forget: float  # 1 − λ
     prior: float  # variance of θ before anything is known
+
+
+@kernel
+def make_symmetric(covariance: Matrix) -> None:
+    """Copy the lower triangle to the upper one.
+
+    Rounding makes P asymmetric, and the asymmetric part does not shrink with the data. In single
+    precision it would exceed what the data leave of P.
+    """
+    for i in range(covariance.shape[0]):
+        for j in range(i):
+            covariance[j, i] = covariance[i, j]
 
 
 @kernel
@@ -44,7 +60,8 @@ def least_squares_gain(
         spread += total * features[i]
         length += total * total
         trace += covariance[i, i]
-    if not 0.0 < spread < 1e100:  # φ is zero, or P is not a covariance any more: learn nothing
+    largest = _LARGEST_SPREAD_SINGLE if is_single(rule.prior) else _LARGEST_SPREAD
+    if not 0.0 < spread < largest:  # φ is zero, or P is no covariance any more: learn nothing
         for i in range(size):
             gain[i] = 0.0  # zero times what is not finite would be NaN
         return 0.0

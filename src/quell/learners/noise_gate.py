@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import is_single
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
 from quell.types import Vector
@@ -28,8 +29,9 @@ from quell.types import Vector
 SIGNAL_TO_NOISE = 6.0
 # Standard deviations of noise in f that ``confidence`` counts: a three-sigma bound.
 _NOISE_DEVIATIONS = 3.0
-# Rounding in y counts as noise of this share of y: no sensor resolves better.
-RESOLUTION = 1e-8
+# Rounding in y counts as noise of this share of y: no sensor resolves better, and in single
+# precision y itself has no finer steps.
+_RESOLUTION, _RESOLUTION_SINGLE = 1e-8, 2.0**-23
 # Averaging time of means and variances in lags of the observer; chosen by hand, not tuned further.
 AVERAGING_LAGS = 10.0
 
@@ -85,9 +87,15 @@ def noise_gate_memory(order: int) -> NoiseGateMemory:
 
 
 @kernel
+def resolution(like: float) -> float:
+    """Return the share of y that counts as rounding, in the precision of ``like``."""
+    return _RESOLUTION_SINGLE if is_single(like) else _RESOLUTION
+
+
+@kernel
 def update_gate(gate: NoiseGate, memory: NoiseGateMemory, seen: Vector, y: float, u: float) -> bool:
     """Update the means with a sample; return whether any state moves."""
-    rounding, error = RESOLUTION * y, y - seen[0]
+    rounding, error = resolution(gate.forget) * y, y - seen[0]
     memory.noise[0] += gate.forget * (error * error + rounding * rounding - memory.noise[0])
     memory.noise[1] += gate.forget * (1.0 - memory.noise[1])
     order = memory.mean.size - 1

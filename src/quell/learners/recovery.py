@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars
-from quell.learners.noise_gate import AVERAGING_LAGS, RESOLUTION
+from quell.learners.noise_gate import AVERAGING_LAGS, resolution
 from quell.observers.eso import ESO
 
 # The time over which learners average: what has decayed in it is gone from them as well.
@@ -111,7 +111,8 @@ def has_lost_range(
     if watch.samples < window:
         return False
     watch.peak = max(watch.peak, watch.most)
-    moves = watch.y_high - watch.y_low > RESOLUTION * max(abs(watch.y_low), abs(watch.y_high))
+    largest = max(abs(watch.y_low), abs(watch.y_high))
+    moves = watch.y_high - watch.y_low > resolution(watch.peak) * largest
     steady = watch.most >= _STEADY * watch.most_before
     least = _LEAST_SHARE_AT_LIMITS if 2.0 * watch.limited > watch.samples else _LEAST_SHARE
     out_of_range = moves and steady and watch.most < least * watch.peak

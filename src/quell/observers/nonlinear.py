@@ -19,13 +19,13 @@ power of e. Beyond 2⁴⁰ δ it starts again at y. Han's gains are ``β_i = L_i
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import copysign
 from quell.observers.base import begin, observe, predict_state
 from quell.observers.linear import EsoModel
 from quell.types import Matrix, Vector
@@ -60,7 +60,20 @@ def fal(error: float, alpha: float, delta: float) -> float:
     size = abs(error)
     if size <= delta:
         return float(error / delta ** (1.0 - alpha))
-    return math.copysign(size**alpha, error)
+    return copysign(size**alpha, error)
+
+
+@kernel
+def is_lost(model: Any, error: float) -> bool:
+    """Return whether ``error`` is too large for an error of estimation."""
+    return not abs(error) <= _LARGEST_ERROR * model.delta
+
+
+@kernel
+def nonlinear_correction(model: Any, i: int, error: float) -> float:
+    """Return ``L_i δ^(1−α_i) fal(e, α_i, δ)``."""
+    alpha, delta = model.alpha[i], model.delta
+    return float(model.gain[i] * delta ** (1.0 - alpha) * fal(error, alpha, delta))
 
 
 @observe.register(NonlinearModel)
@@ -69,15 +82,11 @@ def _observe(
 ) -> None:
     predict_state(model, z, estimate, u, f_learned)
     error = y - estimate[0]
-    if not abs(error) <= _LARGEST_ERROR * model.delta:
+    if is_lost(model, error):
         begin(model, z, estimate, y)
         return
     for i in range(z.size):
-        estimate[i] += (
-            model.gain[i]
-            * model.delta ** (1.0 - model.alpha[i])
-            * fal(error, model.alpha[i], model.delta)
-        )
+        estimate[i] += nonlinear_correction(model, i, error)
         z[i] = estimate[i]
 
 

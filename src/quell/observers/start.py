@@ -8,6 +8,7 @@ import numpy as np
 
 from quell.observers.cascade import CascadeModel
 from quell.observers.delay import DelayedModel
+from quell.observers.delta import DeltaCascadeModel
 from quell.types import Vector
 
 
@@ -22,8 +23,8 @@ def state_for(model: Any, x: Vector, f: float, u: float) -> Vector:
         return np.append(inner, np.full(model.samples, u))
     z = np.zeros(model.states)
     z[: x.size], z[x.size] = x, f
-    if isinstance(model, CascadeModel):
-        for level in range(1, model.gains.shape[0]):
-            start = level * (x.size + 1)
+    if isinstance(model, CascadeModel | DeltaCascadeModel):
+        levels = model.gains.shape[0]
+        for start in range(z.size // levels, z.size, z.size // levels):
             z[start : start + x.size] = x
     return z

@@ -147,7 +147,7 @@ class Loop:
         # An interpreted loop that diverges would warn of every overflow; the status reports it
         # once.
         with (
-            np.errstate(over="ignore", invalid="ignore"),
+            np.errstate(all="ignore"),
             explain_compile_errors(self.model, self.design),
         ):
             if from_rest:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.base import Controller, check_controller
+from quell.controllers.single import in_single_precision
 from quell.kernels import dispatch
 from quell.lti.models import is_linear_model
 from quell.plants.base import Plant, check_plant
@@ -32,6 +33,7 @@ def simulate(  # type: ignore[overload-overlap]  # a plant is no sequence
     record_every: int = 1,
     limit: float | None = None,
     interpret: bool = False,
+    precision: str = "double",
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory: ...
 @overload
@@ -43,6 +45,7 @@ def simulate(
     record_every: int = 1,
     limit: float | None = None,
     interpret: bool = False,
+    precision: str = "double",
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
@@ -56,6 +59,7 @@ def simulate(
     record_every: int = 1,
     limit: float | None = None,
     interpret: bool = False,
+    precision: str = "double",
     progress: Callable[[float], None] | None = None,
     record: Sequence[str] | None = None,
     workers: int | None = None,
@@ -86,6 +90,10 @@ def simulate(
     interpret
         run the same functions as plain Python, the plant's too, to debug; about a thousand times
         slower.
+    precision
+        of the controller: ``"double"``, or ``"single"`` for what it computes on a processor without
+        double precision (``quell.controllers.in_single_precision``). The plant is always in double;
+        r and y are rounded where the controller receives them.
     progress
         called with the share done, 0 to 1, every few thousand samples, or every few runs.
     record
@@ -122,6 +130,9 @@ def simulate(
     interpret = interpret or dispatch.interpret_all
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
+    if checks.one_of("precision", precision, ("double", "single")) == "single":
+        several = checks.is_sequence(controller)
+        controller = _in_single(controller) if several else in_single_precision(controller)
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
         options = (record_every, limit, interpret, progress, record, workers, exact)
         return simulate_batch(plant, controller, scenario, *options)
@@ -162,3 +173,9 @@ def simulate(
         features=controller.features,
         final_state=loop.state,
     )
+
+
+def _in_single(controllers: Sequence[Controller]) -> list[Controller]:
+    """Return controllers in single precision; what is the same object stays so."""
+    single = {id(controller): in_single_precision(controller) for controller in controllers}
+    return [single[id(controller)] for controller in controllers]

@@ -40,14 +40,15 @@ def start_at_rest(
     design: AdrcDesign, state: AdrcState, samples: int, y: float, u: float, r: float
 ) -> None:
     """Set the state to rest at y under u, with the reference r; see ``samples_to_settle``."""
+    number = state.z.dtype.type  # that of its precision
+    y, u, r = number(y), number(u), number(r)
     _start_loop(design, state, y, u, r)
     begin(design.eso, state.z, state.seen, y)
     loop = state.loop[0]
-    call_specialised(_observe_at_rest, design.eso, state.z, state.seen, y, u, 0.0, samples)
+    call_specialised(_observe_at_rest, design.eso, state.z, state.seen, y, u, number(0.0), samples)
     _feed_forward(design, state, u)
-    call_specialised(
-        _observe_at_rest, design.eso, state.z, state.seen, y, u, float(loop.f_learned), samples
-    )
+    f_learned = number(loop.f_learned)
+    call_specialised(_observe_at_rest, design.eso, state.z, state.seen, y, u, f_learned, samples)
     loop.bumpless = 1.0
 
 

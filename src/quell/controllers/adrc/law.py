@@ -43,6 +43,7 @@ from quell.guard import (
     write_channels,
 )
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import is_single
 from quell.kernels.scalars import Scalars, clear
 from quell.learners.base import (
     adapt,
@@ -64,8 +65,9 @@ _OVERFLOWED = int(Status.OVERFLOWED)
 _LEARNER_CUT = int(Status.LEARNER_CUT)
 
 # A decaying offset below this is set to zero: arithmetic with denormal numbers (below 2.2e-308) is
-# slow. Any value between that and the rounding error of u gives the same u.
-_SMALLEST_OFFSET = 1e-200
+# slow. Any value between that and the rounding error of u gives the same u. In single precision
+# such numbers are below 1.2e-38.
+_SMALLEST_OFFSET, _SMALLEST_OFFSET_SINGLE = 1e-200, 1e-30
 # An offset so many times the limits of u comes from absurd estimates, which return faster than it
 # decays: there is nothing to continue from. It would decay to the limits in 7/omega_c.
 _LARGEST_OFFSET = 2.0**10
@@ -173,6 +175,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         begin(design.eso, state.z, seen, loop.y)
         constant = slope = loop.offset = 0.0
         unlimited = loop.u
+    smallest = _SMALLEST_OFFSET_SINGLE if is_single(design.b0) else _SMALLEST_OFFSET
     if loop.bumpless != 0.0:
         loop.offset = loop.u - unlimited
         loop.bumpless = 0.0
@@ -180,7 +183,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         if not abs(loop.offset) <= _LARGEST_OFFSET * largest_magnitude(design.limits):
             loop.offset = 0.0
         unlimited += loop.offset
-        loop.offset = loop.offset * design.fade if abs(loop.offset) > _SMALLEST_OFFSET else 0.0
+        loop.offset = loop.offset * design.fade if abs(loop.offset) > smallest else 0.0
     u, cut = apply_limits(design.limits, unlimited, loop.u)
     loop.u_limited = u
     if loop.manual == 0.0:
@@ -191,7 +194,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
     if design.window > 0 and status & _MEASUREMENT_HELD == 0:
-        excess = abs(unlimited) / max(abs(u), _SMALLEST_OFFSET)
+        excess = abs(unlimited) / max(abs(u), smallest)
         limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
         if has_escaped(watch, output, excess) or has_lost_range(
             watch, design.window, loop.y, f_plain, output, excess, limited
@@ -270,8 +273,9 @@ def unlimited_control(design: AdrcDesign, state: AdrcState, constant: float, slo
 @set_reference_derivatives.register(AdrcDesign)
 def _set_reference_derivatives(design: AdrcDesign, state: AdrcState, derivatives: Vector) -> None:
     for i in range(state.reference.size):
-        known = i < derivatives.size and is_usable(derivatives[i])
-        state.reference[i] = derivatives[i] if known else 0.0
+        state.reference[i] = derivatives[i] if i < derivatives.size else 0.0
+        if not is_usable(state.reference[i]):
+            state.reference[i] = 0.0
 
 
 @write_row.register(AdrcDesign)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.kernels.dispatch import generic
 from quell.types import Matrix, Vector
 
 # Singular values below this share of the largest one count as zero: they belong to integrators.
@@ -32,6 +33,23 @@ class LinearLaw(NamedTuple):
     C: Vector  # (m,)
     D_r: float  # [u-unit/y-unit]
     D_y: float  # [u-unit/y-unit]
+
+
+@generic
+def advance_law(law: Any, x: Vector, work: Vector, r: float, y: float, u: float) -> None:
+    """Advance the state ``x`` (m,) by a sample; ``work`` (m,) is zero before the first one."""
+    raise TypeError
+
+
+@advance_law.register(LinearLaw)
+def _advance(law: LinearLaw, x: Vector, work: Vector, r: float, y: float, u: float) -> None:
+    for i in range(x.size):
+        total = law.B_r[i] * r + law.B_y[i] * y + law.B_u[i] * u
+        for j in range(x.size):
+            total += law.A[i, j] * x[j]
+        work[i] = total
+    for i in range(x.size):
+        x[i] = work[i]
 
 
 def checked_law(law: Any) -> LinearLaw:

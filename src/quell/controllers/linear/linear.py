@@ -18,7 +18,7 @@ from quell.controllers.limits import (
     checked_limits,
     largest_wish,
 )
-from quell.controllers.linear.law import LinearLaw, checked_law, rest_state
+from quell.controllers.linear.law import LinearLaw, advance_law, checked_law, rest_state
 from quell.controllers.linear.transfer import as_state_space, sampled_law
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import is_finite, kernel
@@ -32,7 +32,7 @@ _OVERFLOWED = int(Status.OVERFLOWED)
 class LinearDesign(NamedTuple):
     """Parameters of the controller."""
 
-    law: LinearLaw
+    law: Any  # a LinearLaw or DeltaLaw
     start: Vector  # initial state for y = 1 (m,), see ``rest_state``
     limits: Limits
 
@@ -53,7 +53,7 @@ class LinearState(NamedTuple):
     """State of the controller."""
 
     x: Vector  # state of the law (m,)
-    next: Vector  # memory for the next state (m,)
+    next: Vector  # memory for the next state, or carries of a law in delta form (m,)
     loop: NDArray[LinearLoop]  # (1,)
 
 
@@ -62,6 +62,7 @@ def _set_rest(design: LinearDesign, state: LinearState, y: float) -> None:
     """Set the state of the law to rest at ``y``."""
     for i in range(state.x.size):
         state.x[i] = design.start[i] * y
+        state.next[i] = 0.0
 
 
 @kernel
@@ -74,7 +75,7 @@ def _unlimited_control(design: LinearDesign, state: LinearState) -> float:
 
 @control.register(LinearDesign)
 def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> float:
-    law, x, loop = design.law, state.x, state.loop[0]
+    loop = state.loop[0]
     status = hold_last_good(loop, r, y)
     if loop.started == 0.0:
         if status & _MEASUREMENT_HELD != 0:
@@ -93,13 +94,7 @@ def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> fl
         _set_rest(design, state, loop.y)
         unlimited = _unlimited_control(design, state)
     u, cut = apply_limits(design.limits, unlimited, loop.u)
-    for i in range(x.size):
-        total = law.B_r[i] * loop.r + law.B_y[i] * loop.y + law.B_u[i] * u
-        for j in range(x.size):
-            total += law.A[i, j] * x[j]
-        state.next[i] = total
-    for i in range(x.size):
-        x[i] = state.next[i]
+    advance_law(design.law, state.x, state.next, loop.r, loop.y, u)
     loop.u = u
     loop.u_unlimited = unlimited
     loop.status = status | cut

@@ -12,7 +12,6 @@ a position, so it must be ``r_0 h_0²``.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +20,7 @@ import numpy as np
 from quell import checks
 from quell.controllers.prefilters.prefilter import prefilter, settle, write_derivatives
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import copysign, sqrt
 from quell.types import Vector
 
 
@@ -44,8 +44,8 @@ def fhan(x1: float, x2: float, r0: float, h0: float) -> float:
     d = r0 * h0 * h0
     a0 = h0 * x2
     y = x1 + a0
-    a = a0 + (y if abs(y) <= d else math.copysign(0.5 * (math.sqrt(d * (d + 8.0 * abs(y))) - d), y))
-    return -r0 * a / d if abs(a) <= d else -math.copysign(r0, a)
+    a = a0 + (y if abs(y) <= d else copysign(0.5 * (sqrt(d * (d + 8.0 * abs(y))) - d), y))
+    return -r0 * a / d if abs(a) <= d else -copysign(r0, a)
 
 
 @prefilter.register(TrackingDesign)

@@ -36,12 +36,12 @@ docs/theory, "Learning without lag", has the derivation and measurements.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import is_single, sqrt
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
@@ -56,7 +56,8 @@ from quell.learners.kalman.oscillators import (
 from quell.learners.kalman.search import advance_search, is_locked, start_search_again
 from quell.learners.kalman.search_verdict import LEARN_ANEW
 from quell.learners.lag import STARTUP_LAGS, lag_push, reset_lag
-from quell.learners.noise_gate import RESOLUTION
+from quell.learners.least_squares import make_symmetric
+from quell.learners.noise_gate import resolution
 from quell.types import Matrix, Vector
 
 # Least share of f that counts as unexplained by a linear model; chosen by hand, not tuned further.
@@ -178,6 +179,8 @@ def _adapt(
                 covariance[i, i] += (
                     learner.walk[i] * learner.dt * deviation * deviation / memory.variance[i]
                 )
+    if is_single(inverse):
+        make_symmetric(covariance)
     step, unexplained = inverse * innovation, averages.unexplained
     for j in range(memory.omega.size):
         if not is_locked(learner.search, memory.search, j):
@@ -194,14 +197,14 @@ def _update_averages(
     target: float,
 ) -> tuple[float, float]:
     """Update the averages; return the mean square of y − x̂_1, and √R."""
-    rounding, doubt = RESOLUTION * y, _UNEXPLAINED_SHARE * target
+    rounding, doubt = resolution(learner.dt) * y, _UNEXPLAINED_SHARE * target
     averages.noise += learner.forget * (error * error + rounding * rounding - averages.noise)
     square = innovation * innovation + doubt * doubt
     averages.unexplained += learner.forget * (square - averages.unexplained)
     averages.weight += learner.forget * (1.0 - averages.weight)
     averages.time += learner.dt
     unexplained = averages.unexplained + learner.f_noise * averages.noise
-    deviation = math.sqrt(learner.lag_time * unexplained / averages.weight)
+    deviation = sqrt(learner.lag_time * unexplained / averages.weight)
     return averages.noise / averages.weight, deviation
 
 

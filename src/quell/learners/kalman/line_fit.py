@@ -16,16 +16,17 @@ squares over all parameters, which for white noise is the most likely answer (Ri
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import cos, is_single, sin, sqrt
 from quell.types import Matrix, Vector
 
-# A column whose part that others do not explain is below this share of its square is left out.
-_DEPENDENT = 1e-11
+# A column whose part that others do not explain is below this share of its square is left out:
+# it is rounding, some thousand times the unit roundoff, and more where rows are few.
+_DEPENDENT, _DEPENDENT_SINGLE = 1e-11, 1e-5
 # Standard deviation of a frequency of which nothing is known: beyond all frequencies [rad/sample].
 _UNKNOWN = 10.0
 
@@ -70,7 +71,7 @@ def begin_pass(orders: Vector, fit: LineFit, omega: Vector, scale: float, found:
         for k in range(orders.size):
             at = 2 * (j * orders.size + k)
             angle = -orders[k] * scale * omega[j]
-            fit.turn[at], fit.turn[at + 1] = math.sin(angle), math.cos(angle)
+            fit.turn[at], fit.turn[at + 1] = sin(angle), cos(angle)
             fit.wave[at], fit.wave[at + 1] = 0.0, 1.0
     fit.square[0] = 0.0
     for i in range(fit.moment.size):
@@ -85,8 +86,8 @@ def shift_amplitudes(orders: Vector, fit: LineFit, found: int, later: float) -> 
     for j in range(found):
         for k in range(orders.size):
             at = 2 * (j * orders.size + k)
-            sine = math.sin(orders[k] * fit.omega[j] * later)
-            cosine = math.cos(orders[k] * fit.omega[j] * later)
+            sine = sin(orders[k] * fit.omega[j] * later)
+            cosine = cos(orders[k] * fit.omega[j] * later)
             a, b = fit.amplitude[at], fit.amplitude[at + 1]
             fit.amplitude[at] = a * cosine - b * sine
             fit.amplitude[at + 1] = a * sine + b * cosine
@@ -141,6 +142,7 @@ def solve(fit: LineFit, linear: int, size: int) -> tuple[float, float]:
     """
     gram, moment, solution = fit.gram, fit.moment, fit.solution
     left = about_mean = unexplained = fit.square[0]
+    dependent = _DEPENDENT_SINGLE if is_single(left) else _DEPENDENT
     for i in range(size):
         whole = gram[i, i]
         for j in range(i + 1):
@@ -150,7 +152,7 @@ def solve(fit: LineFit, linear: int, size: int) -> tuple[float, float]:
             if j < i:
                 gram[i, j] = total / gram[j, j] if gram[j, j] > 0.0 else 0.0
             else:
-                gram[i, i] = math.sqrt(total) if total > _DEPENDENT * whole else 0.0
+                gram[i, i] = sqrt(total) if total > dependent * whole else 0.0
         total = moment[i]
         for k in range(i):
             total -= gram[i, k] * moment[k]
@@ -186,5 +188,5 @@ def write_deviations(fit: LineFit, linear: int, size: int, noise: float) -> None
             column[i] = value / gram[i, i] if gram[i, i] > 0.0 else 0.0
             total += column[i] * column[i]
         determined = gram[j, j] > 0.0
-        deviation = math.sqrt(noise * total) if determined else _UNKNOWN
+        deviation = sqrt(noise * total) if determined else _UNKNOWN
         fit.deviation[j - linear] = min(deviation, _UNKNOWN)

@@ -23,6 +23,7 @@ import math
 from typing import Any, NamedTuple
 
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import cos, sin
 from quell.kernels.sized import Size
 from quell.learners.lag import lag_push
 from quell.types import Matrix, Vector
@@ -75,7 +76,7 @@ def combined(oscillators: Oscillators, phase: Vector, theta: Vector, constant: f
     for j in range(phase.size):
         for k in range(orders.size):
             at, angle = oscillators.first + 2 * (j * orders.size + k), orders[k] * phase[j]
-            constant += theta[at] * math.sin(angle) + theta[at + 1] * math.cos(angle)
+            constant += theta[at] * sin(angle) + theta[at + 1] * cos(angle)
     return constant
 
 
@@ -88,8 +89,8 @@ def push_pairs(
     for j in range(phase.size):
         for k in range(orders.size):
             at, angle = oscillators.first + 2 * (j * orders.size + k), orders[k] * phase[j]
-            filtered[at] = lag_push(lag, chain, at, math.sin(angle))
-            filtered[at + 1] = lag_push(lag, chain, at + 1, math.cos(angle))
+            filtered[at] = lag_push(lag, chain, at, sin(angle))
+            filtered[at + 1] = lag_push(lag, chain, at + 1, cos(angle))
 
 
 @kernel

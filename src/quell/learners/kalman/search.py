@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.kernels.dispatch import generic, kernel
+from quell.kernels.functions import is_single, sin
 from quell.kernels.scalars import clear
 from quell.learners.kalman.line_fit import (
     add_row,
@@ -68,8 +69,8 @@ _LEAST_LEFT = 1e-3
 # Shortest window whose frequencies are used, in units of 1/omega_c: transients of the loop, also
 # those that a learner causes, last some ten.
 _LOOP_TIMES = 20.0
-# The square of f_plain, summed over a window, is still finite.
-_ABSURD = 1e100
+# The square of f_plain, summed over a window, is still finite; in single precision, too.
+_ABSURD, _ABSURD_SINGLE = 1e100, 1e16
 
 
 class NoSearch(NamedTuple):
@@ -164,7 +165,7 @@ def _start_again(search: FrequencySearch, memory: SearchMemory) -> None:
 @advance_search.register(FrequencySearch)
 def _advance(search: FrequencySearch, memory: SearchMemory, f_plain: float, omega: Vector) -> int:
     loop = memory.loop[0]
-    if not abs(f_plain) < _ABSURD:
+    if not abs(f_plain) < (_ABSURD_SINGLE if is_single(search.step) else _ABSURD):
         start_search_again(search, memory)
         return NOTHING
     loop.total += f_plain
@@ -193,7 +194,7 @@ def _take_row(search: FrequencySearch, memory: SearchMemory) -> None:
     pairs = 2 * search.orders.size * found
     if loop.stage == SCAN:
         rest = value - fit.solution[0] - fitted(fit, pairs)
-        _add_to_scores(memory, rest * math.sin(math.pi * (loop.row + 0.5) / loop.window) ** 2)
+        _add_to_scores(memory, rest * sin(math.pi * (loop.row + 0.5) / loop.window) ** 2)
     else:
         add_row(search.orders, fit, found, -loop.row, value)
     next_row(fit, pairs)

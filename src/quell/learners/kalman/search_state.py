@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from numpy.typing import NDArray
 
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import cos, sin
 from quell.kernels.scalars import Scalars
 from quell.kernels.sized import Buffer
 from quell.learners.kalman.line_fit import LineFit, begin_pass, shift_amplitudes
@@ -93,7 +93,7 @@ def begin_scan(search: FrequencySearch, memory: SearchMemory) -> None:
     begin_pass(search.orders, fit, fit.omega, 1.0, int(loop.found))
     for i in range(search.lines.size):
         angle = -search.lines[i]
-        memory.turn[2 * i], memory.turn[2 * i + 1] = math.sin(angle), math.cos(angle)
+        memory.turn[2 * i], memory.turn[2 * i + 1] = sin(angle), cos(angle)
         memory.wave[2 * i], memory.wave[2 * i + 1] = 0.0, 1.0
         memory.score[2 * i] = memory.score[2 * i + 1] = 0.0
 

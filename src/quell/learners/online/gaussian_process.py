@@ -25,6 +25,7 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import exp, sqrt
 from quell.kernels.sized import Buffer, Size
 from quell.learners.online.learner import Online
 from quell.learners.online.model import infer, learn
@@ -69,7 +70,7 @@ def _similarity(model: ProcessDesign, memory: ProcessMemory, i: int, features: V
     for j in range(features.size):
         away = features[j] - memory.points[i, j]
         distance += away * away
-    return math.exp(-model.weight * distance)
+    return exp(-model.weight * distance)
 
 
 @kernel
@@ -139,7 +140,7 @@ def _forget(model: ProcessDesign, memory: ProcessMemory, count: int) -> None:
     if model.forget == 0.0:
         return
     keep = 1.0 - model.forget
-    root = math.sqrt(keep)
+    root = sqrt(keep)
     for i in range(count):
         memory.mean[i] *= root
         for j in range(count):

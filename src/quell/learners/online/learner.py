@@ -26,6 +26,7 @@ from quell.features import Features
 from quell.features.scaling import reset_scale, update_scale
 from quell.features.sizes import reset_sizes
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import is_single
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Buffer
 from quell.learners.base import (
@@ -57,8 +58,8 @@ from quell.types import Vector
 
 # Least confidence in f with which a model learns: at least half of f² is not noise. Chosen by hand.
 _LEAST_CONFIDENCE = 0.5
-# A state beyond this is as good as infinite: squares of it overflow.
-_LARGEST = 1e100
+# A state beyond this is as good as infinite: squares of it overflow; in single precision earlier.
+_LARGEST, _LARGEST_SINGLE = 1e100, 1e15
 
 
 class OnlineDesign(NamedTuple):
@@ -157,7 +158,9 @@ def _restart(learner: OnlineDesign, memory: OnlineMemory) -> None:
     reset_gate(memory.gate)
     finite = True
     for i in range(memory.flat.size):
-        finite = finite and abs(memory.flat[i]) <= _LARGEST
+        value = memory.flat[i]
+        largest = _LARGEST_SINGLE if is_single(value) else _LARGEST
+        finite = finite and abs(value) <= largest
     if not finite:
         _forget_model(memory)
 

@@ -19,6 +19,7 @@ import numpy as np
 from quell import checks
 from quell.features import Features, State
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import tanh
 from quell.kernels.sized import Size
 from quell.learners.least_squares import RlsRule, least_squares_gain
 from quell.learners.online.learner import Online
@@ -67,7 +68,7 @@ def _infer(model: NetworkDesign, memory: NetworkMemory, features: Vector) -> flo
         inner = theta[at + 1]
         for i in range(features.size):
             inner += theta[at + 2 + i] * features[i]
-        output += theta[at] * math.tanh(inner)
+        output += theta[at] * tanh(inner)
     return output
 
 
@@ -83,7 +84,7 @@ def _infer_with_gradient(model: NetworkDesign, memory: NetworkMemory, features: 
         inner = theta[at + 1]
         for i in range(features.size):
             inner += theta[at + 2 + i] * features[i]
-        unit = math.tanh(inner)
+        unit = tanh(inner)
         output += theta[at] * unit
         gradient[at] = unit
         steep = theta[at] * (1.0 - unit * unit)

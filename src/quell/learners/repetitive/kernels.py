@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.functions import is_single
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Buffer
 from quell.learners.base import (
@@ -47,8 +48,9 @@ from quell.learners.base import (
 from quell.learners.lag import lag_push, reset_lag
 from quell.types import Matrix, Vector
 
-# A larger f_plain follows from absurd measurements: its sums could overflow.
-_ABSURD = 1e100
+# A larger f_plain follows from absurd measurements: its sums could overflow, also in single
+# precision.
+_ABSURD, _ABSURD_SINGLE = 1e100, 1e30
 
 
 class RepetitiveDesign(NamedTuple):
@@ -93,7 +95,8 @@ def _adapt(
     f_plain: float,
 ) -> None:
     loop = memory.loop[0]
-    if loop.samples <= learner.startup or not abs(f_plain) < _ABSURD:
+    absurd = _ABSURD_SINGLE if is_single(loop.level) else _ABSURD
+    if loop.samples <= learner.startup or not abs(f_plain) < absurd:
         return
     memory.past[int(loop.phase)] = f_plain
     if loop.has_begun == 0.0:
