@@ -227,6 +227,12 @@ class _Annotations(NamedTuple):
     sized: tuple[bool, ...]  # for each field, whether an array in it has a known shape
 
 
+def constant_fields(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a NamedTuple that are annotated with Size or Flag."""
+    names = getattr(kind, "_fields", ())
+    return tuple(names[i] for i in _annotations(kind).constants)
+
+
 @functools.cache
 def _annotations(kind: Any) -> _Annotations:
     notes = getattr(kind, "__annotations__", {})

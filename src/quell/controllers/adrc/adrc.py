@@ -147,6 +147,7 @@ class ADRC(StatefulController):
             learner=checked_design(self.learner, observer, self._learner_omega_c),
             lag=lag_of(observer) if learns else NO_LAG,
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer, law),
+            learns=learns,
             window=window_samples(observer) if learns else 0,
         )
 

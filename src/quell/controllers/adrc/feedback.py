@@ -58,7 +58,7 @@ def _fal_part(
     total = linear
     for i in range(feedback.alpha.size):
         wished = r if i == 0 else 0.0
-        if i > 0 and i - 1 < reference.size:
+        if reference.size > 0 and 0 < i <= reference.size:
             wished = reference[i - 1]
         error, alpha, delta = wished - seen[i], feedback.alpha[i], feedback.delta[i]
         if abs(error) > delta:

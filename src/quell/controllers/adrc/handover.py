@@ -117,7 +117,9 @@ def change_design(old: AdrcDesign, new: AdrcDesign, state: AdrcState) -> None:
     before = unlimited_control(old, state, loop.constant, loop.slope)
     # By definition f is what b0 u and a·x do not explain, so its estimate changes with b0 and a.
     acting = acting_control(old.eso, state.z, float(loop.u))
-    change = (old.b0 - new.b0) * acting + (new.cancel - old.cancel) @ state.seen[:size]
+    change = (old.b0 - new.b0) * acting
+    for i in range(size):
+        change += (new.cancel[i] - old.cancel[i]) * state.seen[i]
     state.z[size] += change
     state.seen[size] += change
     loop.offset += before - unlimited_control(new, state, loop.constant, loop.slope)

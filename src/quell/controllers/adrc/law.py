@@ -45,6 +45,7 @@ from quell.guard import (
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import is_single
 from quell.kernels.scalars import Scalars, clear
+from quell.kernels.sized import Flag
 from quell.learners.base import (
     adapt,
     coefficients,
@@ -107,7 +108,8 @@ class AdrcDesign(NamedTuple):
     learner: Any
     lag: Any  # lag filter of f_L; without taps if there is no learner
     guard: Any
-    window: int  # samples of the windows in which the learner is watched; 0 without a learner
+    learns: Flag  # whether there is a learner
+    window: int  # samples of the windows in which it is watched
 
 
 class AdrcState(NamedTuple):
@@ -193,7 +195,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop.u = u
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
-    if design.window > 0 and status & _MEASUREMENT_HELD == 0:
+    if design.learns and status & _MEASUREMENT_HELD == 0:
         excess = abs(unlimited) / max(abs(u), smallest)
         limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
         if has_escaped(watch, output, excess) or has_lost_range(

@@ -116,22 +116,22 @@ def _learn(model: ProcessDesign, memory: ProcessMemory, features: Vector, target
         variance += total * q[i]
     if not (variance > 0.0 and is_finite(error)):
         return
-    total = count
+    points = count
     if novelty > _LEAST_NOVELTY:
         _add_point(memory, count, features, novelty, variance, target - error)
-        total = count + 1
+        points = count + 1
     gain = 1.0 / (variance + model.noise)
-    for i in range(total):
+    for i in range(points):
         mean[i] += h[i] * error * gain
         for j in range(i + 1):
             covariance[i, j] -= h[i] * h[j] * gain
             covariance[j, i] = covariance[i, j]
-    _update_weights(memory, total)
-    if total > model.budget:
-        _remove_point(memory, total)
-        total -= 1
-        _update_weights(memory, total)
-    memory.counters[0] = total
+    _update_weights(memory, points)
+    if points > model.budget:
+        _remove_point(memory, points)
+        points -= 1
+        _update_weights(memory, points)
+    memory.counters[0] = points
 
 
 @kernel

@@ -1,0 +1,9 @@
+"""Controllers for other machines: C code generated from the kernels.
+
+This folder may import everything except setups, experiments and the command line.
+"""
+
+from quell.export.c_source import CSource, c_source
+from quell.export.translate.values import TranslationError
+
+__all__ = ["CSource", "TranslationError", "c_source"]

@@ -1,0 +1,178 @@
+"""Translation of calls: built-in functions, <math.h>, generic functions and kernels."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from quell.export.translate.values import (
+    ATOM,
+    NOTHING,
+    SUM,
+    UNKNOWN,
+    Array,
+    Number,
+    Struct,
+    TranslationError,
+    Value,
+    join_numbers,
+)
+from quell.kernels.dispatch import interpreted, is_finite
+from quell.kernels.function_pointers import call as call_pointer
+from quell.kernels.scalars import clear
+
+if TYPE_CHECKING:
+    from quell.export.translate.expressions import Expressions
+    from quell.export.translate.program import Program
+
+# Functions of <math.h> with the name that they have in Python.
+_SAME_NAME = (
+    "sqrt sin cos tan tanh exp log log2 ceil floor copysign atan atan2 asin acos sinh cosh fabs "
+    "hypot expm1 log1p"
+)
+_INTEGERS = frozenset({"ceil", "floor"})  # they return integers in Python
+
+
+class Calls:
+    """The calls of a program."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+
+    def helper(self, name: str) -> str:
+        """Return the name of a helper function in C, which the program then contains."""
+        self.program.helpers.add(name)
+        return name
+
+    def builtin(
+        self, body: Expressions, node: ast.Call, name: str, arguments: list[Value]
+    ) -> Value:
+        """Return a call of a built-in function."""
+        if name in ("min", "max"):
+            found = arguments[0]
+            for other in arguments[1:]:
+                found = self._extreme(body, name, found, other)
+            return found
+        one = arguments[0]
+        if name == "float":
+            return body.real(one)
+        if name == "bool":
+            if one.kind is Number.BOOL or one.is_constant:
+                return one if one.kind is Number.BOOL else body.constant(bool(one.constant))
+            zero = body.as_kind(body.constant(0), one.kind)
+            return Value(Number.BOOL, f"{one.at(SUM)} != {zero.code}", 6, calls=one.calls)
+        if name == "int":
+            if one.kind is not Number.REAL:
+                return Value(Number.INT, one.code, one.level, one.constant, calls=one.calls)
+            if one.is_constant:
+                return body.constant(int(one.constant))
+            return self._call(Number.INT, self.helper("truncated"), one)
+        if name == "abs":
+            if one.is_constant:
+                return body.constant(abs(one.constant))
+            if one.kind is Number.REAL:
+                return self._call(Number.REAL, self.program.literals.math_function("fabs"), one)
+            return self._call(Number.INT, self.helper("absolute"), one)
+        if name == "len" and isinstance(one.kind, Array):
+            return body.constant(one.kind.shape[0])
+        raise body.fail(node, f"{name}() can not be translated")
+
+    def _extreme(self, body: Expressions, name: str, one: Value, other: Value) -> Value:
+        if one.is_constant and other.is_constant:
+            return body.constant({"min": min, "max": max}[name](one.constant, other.constant))
+        kind = join_numbers(one, other, body.where)
+        one, other = body.as_kind(one, kind), body.as_kind(other, kind)
+        helper = f"{name}imum" + ("" if kind is Number.REAL else "_int")
+        return self._call(kind, self.helper(helper), one, other)
+
+    @staticmethod
+    def _call(kind: Number, name: str, *arguments: Value) -> Value:
+        code = ", ".join(argument.code for argument in arguments)
+        return Value(kind, f"{name}({code})", ATOM, calls=any(a.calls for a in arguments))
+
+    def math_call(self, body: Expressions, name: str, arguments: list[Value]) -> Value:
+        """Return a call of a function of Python's ``math``."""
+        if name not in _SAME_NAME.split():
+            raise TranslationError(f"{body.where}: math.{name} can not be translated")
+        if all(argument.is_constant for argument in arguments):
+            import math
+
+            return body.constant(getattr(math, name)(*(a.constant for a in arguments)))
+        reals = [body.real(argument) for argument in arguments]
+        found = self._call(Number.REAL, self.program.literals.math_function(name), *reals)
+        if name in _INTEGERS:
+            return self._call(Number.INT, self.helper("truncated"), found)
+        return found
+
+    def special_operation(
+        self, body: Expressions, sign: ast.operator, one: Value, other: Value
+    ) -> Value:
+        """Return a power, a remainder or a quotient that is rounded down."""
+        if one.is_constant and other.is_constant:
+            values = one.constant, other.constant
+            if isinstance(sign, ast.Pow):
+                return body.constant(values[0] ** values[1])
+            whole = isinstance(sign, ast.FloorDiv)
+            return body.constant(values[0] // values[1] if whole else values[0] % values[1])
+        if isinstance(sign, ast.Pow):
+            name = self.program.literals.math_function("pow")
+            return self._call(Number.REAL, name, body.real(one), body.real(other))
+        kind = join_numbers(one, other, body.where)
+        one, other = body.as_kind(one, kind), body.as_kind(other, kind)
+        base = "remainder" if isinstance(sign, ast.Mod) else "quotient"
+        ending = "real" if kind is Number.REAL else "int"
+        return self._call(kind, self.helper(f"{base}_{ending}"), one, other)
+
+    def function(
+        self,
+        body: Expressions,
+        node: ast.Call,
+        function: Any,
+        arguments: list[Value],
+        names: tuple[str, ...],
+    ) -> Value:
+        """Return a call of a kernel, or of the implementation of a generic function."""
+        if function is clear:
+            record = arguments[0]
+            for field in self.program.structs.layouts[record.kind.name].members:
+                place = self.program.structs.field(record, field)
+                if place is not None and place.constant not in (0, UNKNOWN):
+                    self.program.structs.vary((record.kind.name, field))
+            if not self.program.structs.fields_of(record.kind):
+                return Value(NOTHING)
+            body.written.add(record.root)
+            self.program.includes.add("string.h")
+            size = f"sizeof *{record.code}" if record.pointer else f"sizeof {record.code}"
+            return Value(Number.INT, f"memset({record.address}, 0, {size})", calls=True)
+        if function is is_finite:
+            return self._call(Number.BOOL, self.helper("is_finite"), body.real(arguments[0]))
+        if function is call_pointer:
+            return self._user_function(body, node, arguments)
+        keep = self.program.keep_type
+        if function in keep:
+            return self.math_call(body, keep[function], arguments)
+        implementation, generic_name = self._resolve(body, node, function, arguments)
+        return self.program.function(implementation, arguments, generic_name, names).call(
+            body, arguments
+        )
+
+    def _resolve(
+        self, body: Expressions, node: ast.Call, function: Any, arguments: list[Value]
+    ) -> tuple[Callable[..., Any], str]:
+        table = getattr(function, "implementations", None)
+        if table is not None:
+            kind = arguments[0].kind
+            cls = kind.python if isinstance(kind, Struct) else None
+            implementation = table.get(cls) or table.get(object)
+            if implementation is None:
+                raise body.fail(node, f"has no implementation for {cls}")
+            return implementation, function.__name__
+        plain = interpreted(function)
+        if not inspect.isfunction(plain):
+            raise body.fail(node, f"{plain!r} is no function that can be translated")
+        return plain, ""
+
+    def _user_function(self, body: Expressions, node: ast.Call, arguments: list[Value]) -> Value:
+        raise body.fail(node, "calls a function of the user by its address")

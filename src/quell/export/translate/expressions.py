@@ -1,0 +1,372 @@
+"""Translation of Python expressions: the values of names, and operators on them."""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+from collections.abc import Callable
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quell.export.translate.values import (
+    AND,
+    ATOM,
+    BIT_AND,
+    BIT_OR,
+    BIT_XOR,
+    EQUAL,
+    LESS,
+    OR,
+    PRODUCT,
+    SHIFT,
+    SUM,
+    TERNARY,
+    UNARY,
+    Array,
+    Number,
+    Several,
+    Struct,
+    TranslationError,
+    Value,
+    join,
+    join_numbers,
+)
+from quell.kernels.dispatch import call_specialised
+
+if TYPE_CHECKING:
+    from quell.export.translate.program import Program
+
+_ARITHMETIC: dict[type, tuple[str, int, Callable[[Any, Any], Any]]] = {
+    ast.Add: ("+", SUM, operator.add),
+    ast.Sub: ("-", SUM, operator.sub),
+    ast.Mult: ("*", PRODUCT, operator.mul),
+    ast.Div: ("/", PRODUCT, operator.truediv),
+    ast.BitAnd: ("&", BIT_AND, operator.and_),
+    ast.BitOr: ("|", BIT_OR, operator.or_),
+    ast.BitXor: ("^", BIT_XOR, operator.xor),
+    ast.LShift: ("<<", SHIFT, operator.lshift),
+    ast.RShift: (">>", SHIFT, operator.rshift),
+}
+_BITS = (BIT_AND, BIT_OR, BIT_XOR, SHIFT)
+_COMPARISONS: dict[type, tuple[str, int, Callable[[Any, Any], bool]]] = {
+    ast.Lt: ("<", LESS, operator.lt),
+    ast.LtE: ("<=", LESS, operator.le),
+    ast.Gt: (">", LESS, operator.gt),
+    ast.GtE: (">=", LESS, operator.ge),
+    ast.Eq: ("==", EQUAL, operator.eq),
+    ast.NotEq: ("!=", EQUAL, operator.ne),
+}
+
+
+class Expressions:
+    """The expressions of one function; ``names`` are its parameters and local variables."""
+
+    def __init__(self, program: Program, globals_: dict[str, Any], where: str, module: str) -> None:
+        self.program = program
+        self.literals = program.literals
+        self.globals = globals_
+        self.where = where
+        self.module = module
+        self.names: dict[str, Value] = {}
+        self.written: set[str] = set()  # parameters through which something is written
+        self.pending: list[str] = []  # calls before the statement whose results are known
+
+    def fail(self, node: ast.AST, why: str) -> TranslationError:
+        """Return an error about a node."""
+        return TranslationError(f"{self.where}: {ast.unparse(node)}: {why}")
+
+    def translate(self, node: ast.expr) -> Value:
+        """Return the value of an expression."""
+        method = getattr(self, f"_{type(node).__name__.lower()}", None)
+        if method is None:
+            raise self.fail(node, f"the translation to C has no {type(node).__name__}")
+        found: Value = method(node)
+        return found
+
+    def constant(self, value: Any) -> Value:
+        """Return a number that is known now."""
+        kind = (
+            Number.BOOL
+            if isinstance(value, bool)
+            else Number.INT
+            if isinstance(value, int)
+            else Number.REAL
+        )
+        code = self.literals.write(value)
+        return Value(kind, code, UNARY if code.startswith("-") else ATOM, value)
+
+    def real(self, value: Value) -> Value:
+        """Return a number as a real number."""
+        if value.kind is Number.REAL:
+            return value
+        if not value.is_number:
+            raise TranslationError(f"{self.where}: {value.code} is not a number")
+        if value.is_constant:
+            return self.constant(float(value.constant))
+        code = f"({self.literals.real}){value.at(UNARY)}"
+        return Value(Number.REAL, code, UNARY, calls=value.calls)
+
+    def as_kind(self, value: Value, kind: Number) -> Value:
+        """Return a number as one of a kind that can hold it."""
+        return self.real(value) if kind is Number.REAL else value
+
+    def _constant(self, node: ast.Constant) -> Value:
+        if isinstance(node.value, bool | int | float):
+            return self.constant(node.value)
+        raise self.fail(node, "only numbers can be translated")
+
+    def _name(self, node: ast.Name) -> Value:
+        found = self.names.get(node.id)
+        if found is not None:
+            return found
+        if node.id in self.globals:
+            return self._global(node, self.globals[node.id])
+        raise self.fail(node, "has no value here")
+
+    def _global(self, node: ast.Name, value: Any) -> Value:
+        if isinstance(value, np.bool_ | np.number):
+            value = value.item()
+        if isinstance(value, bool):
+            return self.constant(value)
+        if isinstance(value, int | float):
+            number = int(value) if isinstance(value, int) else float(value)
+            if isinstance(number, float) and not math.isfinite(number):
+                return self.constant(number)
+            name = self.program.named_constant(node.id, number, self.module)
+            kind = Number.INT if isinstance(number, int) else Number.REAL
+            return Value(kind, name, constant=number)
+        raise self.fail(node, f"is {type(value).__name__}; only numbers can be constants")
+
+    def _attribute(self, node: ast.Attribute) -> Value:
+        if isinstance(node.value, ast.Name) and node.value.id not in self.names:
+            owner = self.globals.get(node.value.id)
+            if isinstance(owner, ModuleType | type):
+                value = getattr(owner, node.attr)
+                return self.constant(int(value) if isinstance(value, int) else float(value))
+        base = self.translate(node.value)
+        if isinstance(base.kind, Array):
+            if node.attr == "size":
+                return self.constant(base.kind.size)
+            if node.attr == "shape":
+                items = tuple(self.constant(length) for length in base.kind.shape)
+                return Value(Several(tuple(item.kind for item in items)), items=items)
+        if isinstance(base.kind, Struct):
+            found = self.program.structs.field(base, node.attr)
+            if found is not None:
+                return found
+        raise self.fail(node, "has no such field")
+
+    def _subscript(self, node: ast.Subscript) -> Value:
+        base = self.translate(node.value)
+        if isinstance(base.kind, Several):
+            found: Value = base.items[self.translate(node.slice).constant]
+            return found
+        if isinstance(base.kind, Struct):  # the only record of an array
+            if self.translate(node.slice).constant == 0:
+                return base
+            raise self.fail(node, "a record has only the index 0")
+        if not isinstance(base.kind, Array):
+            raise self.fail(node, "is not an array")
+        if isinstance(node.slice, ast.Slice):
+            return self._slice(node, base, node.slice)
+        indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        shape, code = base.kind.shape, base.at(ATOM)
+        calls = False
+        for at, length in zip(indices, shape, strict=False):
+            index = self.translate(at)
+            if index.kind is Number.REAL:
+                raise self.fail(node, "an index must be an integer")
+            if index.is_constant and index.constant < 0:
+                index = self.constant(index.constant + length)
+            code += f"[{index.code}]"
+            calls = calls or index.calls
+        rest = shape[len(indices) :]
+        kind = Array(rest, base.kind.element) if rest else base.kind.element
+        return Value(kind, code, ATOM, root=base.root, mutable=base.mutable, calls=calls)
+
+    def _slice(self, node: ast.Subscript, base: Value, part: ast.Slice) -> Value:
+        if part.step is not None or len(base.kind.shape) != 1:
+            raise self.fail(node, "a slice must be of one dimension, without a step")
+        size = base.kind.shape[0]
+        lower = self.constant(0) if part.lower is None else self.translate(part.lower)
+        upper = self.constant(size) if part.upper is None else self.translate(part.upper)
+        length = self._length(node, part, lower, upper, size)
+        code = base.code if lower.constant == 0 else f"&{base.at(ATOM)}[{lower.code}]"
+        level = base.level if lower.constant == 0 else UNARY
+        kind = Array((length,), base.kind.element)
+        return Value(kind, code, level, root=base.root, mutable=base.mutable)
+
+    def _length(
+        self, node: ast.Subscript, part: ast.Slice, lower: Value, upper: Value, size: int
+    ) -> int:
+        """Return the length of a slice, which must not depend on variables."""
+        if lower.is_constant and upper.is_constant:
+            low, high, _ = slice(lower.constant, upper.constant).indices(size)
+            return max(high - low, 0)
+        # The difference of two bounds such as (i + 1) * n and i * n is the same for any i.
+        bounds = [part.lower or ast.Constant(0), part.upper or ast.Constant(size)]
+        expression = ast.Expression(ast.Tuple(bounds, ast.Load()))
+        code = compile(ast.fix_missing_locations(expression), "<slice>", "eval")
+        lengths = set()
+        for trial in (3, 17, 101):
+            known = {
+                name: value.constant if value.is_constant else trial
+                for name, value in self.names.items()
+            }
+            low, high = eval(code, {"__builtins__": {}}, known)
+            lengths.add(high - low)
+        if len(lengths) != 1:
+            raise self.fail(node, "the length of a slice must be known")
+        return int(lengths.pop())
+
+    def _unaryop(self, node: ast.UnaryOp) -> Value:
+        inner = self.translate(node.operand)
+        if isinstance(node.op, ast.Not):
+            if inner.is_constant:
+                return self.constant(not inner.constant)
+            return Value(Number.BOOL, f"!{inner.at(UNARY)}", UNARY, calls=inner.calls)
+        if isinstance(node.op, ast.USub):
+            code = f"-{inner.at(ATOM)}"
+            constant = -inner.constant if inner.is_constant else inner.constant
+            return Value(inner.kind, code, UNARY, constant, calls=inner.calls)
+        raise self.fail(node, "only 'not' and '-' can be translated")
+
+    def _binop(self, node: ast.BinOp) -> Value:
+        return self.operation(node, node.op, self.translate(node.left), self.translate(node.right))
+
+    def operation(self, node: ast.AST, sign: ast.operator, one: Value, other: Value) -> Value:
+        """Return an arithmetic operation on two numbers."""
+        if not (one.is_number and other.is_number):
+            raise self.fail(node, "arithmetic is for numbers")
+        if isinstance(sign, ast.Pow | ast.Mod | ast.FloorDiv):
+            return self.program.calls.special_operation(self, sign, one, other)
+        if type(sign) not in _ARITHMETIC:
+            raise self.fail(node, "this operator can not be translated")
+        text, level, function = _ARITHMETIC[type(sign)]
+        if one.is_constant and other.is_constant:
+            return self.constant(function(one.constant, other.constant))
+        if (plain := self._neutral(text, one, other)) is not None:
+            return plain
+        kind = join_numbers(one, other, self.where)
+        if text == "/" or kind is Number.REAL:
+            one, other, kind = self.real(one), self.real(other), Number.REAL
+        elif kind is Number.BOOL and level not in _BITS:
+            kind = Number.INT
+        # Operands of bit operations are in parentheses unless they are plain: compilers warn.
+        left, right = (UNARY, UNARY) if level in _BITS else (level, level + 1)
+        code = f"{one.at(left)} {text} {other.at(right)}"
+        return Value(kind, code, level, calls=one.calls or other.calls)
+
+    def _neutral(self, sign: str, one: Value, other: Value) -> Value | None:
+        """Return the value of an operation with a zero or a one, if that is known.
+
+        A product with the constant zero is zero: all signals are finite.
+        """
+        zeros = [value.is_constant and value.constant == 0 for value in (one, other)]
+        if any(zeros) and not (one.calls or other.calls):
+            real = Number.REAL in (one.kind, other.kind)
+            if sign == "*" or (sign == "/" and zeros[0]):
+                return self.constant(0.0 if real else 0)
+            rest = other if zeros[0] else one
+            if sign == "+" or (sign == "-" and zeros[1]):
+                return self.real(rest) if real else rest
+        return None
+
+    def _compare(self, node: ast.Compare) -> Value:
+        values = [self.translate(part) for part in (node.left, *node.comparators)]
+        if any(value.calls for value in values[1:-1]):
+            raise self.fail(node, "a call in the middle of a chained comparison")
+        found = self.constant(True)
+        for sign, one, other in zip(node.ops, values[:-1], values[1:], strict=True):
+            text, level, function = _COMPARISONS[type(sign)]
+            if one.is_constant and other.is_constant:
+                part = self.constant(function(one.constant, other.constant))
+            else:
+                if join(one.kind, other.kind, self.where) is Number.REAL:
+                    one, other = self.real(one), self.real(other)
+                code = f"{one.at(level + 1)} {text} {other.at(level + 1)}"
+                part = Value(Number.BOOL, code, level, calls=one.calls or other.calls)
+            found = self._and(found, part)
+        return found
+
+    def _and(self, one: Value, other: Value) -> Value:
+        if one.is_constant:
+            return other if one.constant else self.constant(False)
+        if other.is_constant and (other.constant or not one.calls):
+            return one if other.constant else self.constant(False)
+        code = f"{one.at(AND)} && {other.at(AND + 1)}"
+        return Value(Number.BOOL, code, AND, calls=one.calls or other.calls)
+
+    def _or(self, one: Value, other: Value) -> Value:
+        if one.is_constant:
+            return self.constant(True) if one.constant else other
+        if other.is_constant and (not other.constant or not one.calls):
+            return self.constant(True) if other.constant else one
+        # Compilers warn about && without parentheses in ||.
+        left = one.code if one.level == OR else one.at(BIT_OR)
+        code = f"{left} || {other.at(BIT_OR)}"
+        return Value(Number.BOOL, code, OR, calls=one.calls or other.calls)
+
+    def _boolop(self, node: ast.BoolOp) -> Value:
+        is_and = isinstance(node.op, ast.And)
+        found = self.translate(node.values[0])
+        for part in node.values[1:]:
+            if found.is_constant and bool(found.constant) is not is_and:
+                return found  # what follows is not evaluated
+            following = self._conditional(part)
+            found = self._and(found, following) if is_and else self._or(found, following)
+        return found
+
+    def _conditional(self, node: ast.expr) -> Value:
+        """Return the value of an expression that is not always evaluated."""
+        before = len(self.pending)
+        found = self.translate(node)
+        if len(self.pending) > before:
+            raise self.fail(node, "call this function in a statement of its own")
+        return found
+
+    def _ifexp(self, node: ast.IfExp) -> Value:
+        test = self.translate(node.test)
+        if test.is_constant:
+            return self.translate(node.body if test.constant else node.orelse)
+        one, other = self._conditional(node.body), self._conditional(node.orelse)
+        if one.is_constant and other.is_constant and _same(one.constant, other.constant):
+            return one
+        kind = join_numbers(one, other, self.where)
+        one, other = self.as_kind(one, kind), self.as_kind(other, kind)
+        code = f"{test.at(TERNARY + 1)} ? {one.at(TERNARY + 1)} : {other.at(TERNARY)}"
+        return Value(kind, code, TERNARY, calls=test.calls or one.calls or other.calls)
+
+    def _tuple(self, node: ast.Tuple) -> Value:
+        items = tuple(self.translate(part) for part in node.elts)
+        calls = any(item.calls for item in items)
+        return Value(Several(tuple(item.kind for item in items)), items=items, calls=calls)
+
+    def _call(self, node: ast.Call) -> Value:
+        return self.call(node)
+
+    def call(self, node: ast.Call, names: tuple[str, ...] = ()) -> Value:
+        """Return the value of a call; ``names`` are those of the numbers of a tuple."""
+        if node.keywords:
+            raise self.fail(node, "arguments must be given by position")
+        if isinstance(node.func, ast.Name) and self.globals.get(node.func.id) is call_specialised:
+            node = ast.copy_location(ast.Call(node.args[0], node.args[1:], []), node)
+        arguments = [self.translate(part) for part in node.args]
+        if isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Name):
+            module = self.globals.get(node.func.value.id)
+            if module is math or module is np:
+                return self.program.calls.math_call(self, node.func.attr, arguments)
+        if isinstance(node.func, ast.Name):
+            name = node.func.id
+            function = self.globals.get(name)
+            if function is None:
+                return self.program.calls.builtin(self, node, name, arguments)
+            return self.program.calls.function(self, node, function, arguments, names)
+        raise self.fail(node, "this call can not be translated")
+
+
+def _same(one: Any, other: Any) -> bool:
+    return type(one) is type(other) and (one == other or (one != one and other != other))

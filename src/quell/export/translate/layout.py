@@ -1,0 +1,123 @@
+"""The text of C code: indentation, comments and line breaks."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+
+from quell.export.translate.blocks import Block, Branch, Line
+
+_WIDTH = 100
+
+
+def comment_block(text: str, indent: int = 0) -> list[str]:
+    """Return a text as a comment: paragraphs are filled, indented lines stay as they are."""
+    pad = " " * indent
+    text = text.replace("*/", "* /").replace("/*", "/ *").replace("``", "").replace("::\n", ":\n")
+    lines = [line for part in _paragraphs(text) for line in _filled(part, _WIDTH - indent - 6)]
+    if len(lines) == 1:
+        return [f"{pad}/* {lines[0]} */"]
+    body = [f"{pad} * {line}".rstrip() for line in lines[1:]]
+    return [f"{pad}/* {lines[0]}", *body[:-1], f"{body[-1]} */"]
+
+
+def _paragraphs(text: str) -> list[str]:
+    """Return a text with each paragraph in one line."""
+    parts: list[str] = []
+    for line in text.splitlines():
+        starts = not parts or not line or line[0] in " *-123456789" or parts[-1][:1] in ("", " ")
+        if starts:
+            parts.append(line)
+        else:
+            parts[-1] += f" {line}"
+    return parts
+
+
+def _filled(part: str, width: int) -> list[str]:
+    return [part] if part[:1] == " " else textwrap.wrap(part, width) or [""]
+
+
+def wrapped(line: str) -> list[str]:
+    """Return a line of code in lines of at most 100 signs, broken where it nests least."""
+    if len(line) <= _WIDTH or line.lstrip().startswith(("/*", "*")):
+        return [line]
+    code, mark, comment = line.partition(" /* ")
+    if mark and len(code) <= _WIDTH:
+        pad = re.match(r" *", code)
+        return [*comment_block(comment.removesuffix(" */"), len(pad[0]) if pad else 0), code]
+    place = _break(line)
+    if place is None:
+        return [line]
+    indent = len(line) - len(line.lstrip()) + 4
+    return [line[:place].rstrip(), *wrapped_rest(" " * indent + line[place:].lstrip(), indent)]
+
+
+def wrapped_rest(line: str, indent: int) -> list[str]:
+    """Return the rest of a broken line, with the same indentation for each further line."""
+    if len(line) <= _WIDTH:
+        return [line]
+    place = _break(line)
+    if place is None:
+        return [line]
+    return [line[:place].rstrip(), *wrapped_rest(" " * indent + line[place:].lstrip(), indent)]
+
+
+def _break(line: str) -> int | None:
+    """Return where to break a line: after a comma or before an operator, with least nesting."""
+    best, place, depth = None, None, 0
+    start = len(line) - len(line.lstrip()) + 8
+    for i, sign in enumerate(line[:_WIDTH]):
+        if sign in "([{":
+            depth += 1
+        elif sign in ")]}":
+            depth -= 1
+        if i < start:
+            continue
+        after = line[i : i + 4]
+        comma = line[i - 1] == "," and sign == " "
+        operator = sign == " " and re.match(r" (\|\||&&|\?|:|[-+*/]|==|<=?|>=?) ", after + " ")
+        if comma or operator:
+            rank = (depth, not (comma or "&&" in after or "||" in after))
+            if best is None or rank <= best:
+                best, place = rank, i
+    return place
+
+
+def block_lines(block: Block, indent: int = 4) -> list[str]:
+    """Return the lines of a block."""
+    lines: list[str] = []
+    for item in block:
+        pad = " " * indent
+        for comment in item.comments and [" ".join(item.comments)]:
+            lines += comment_block(comment, indent)
+        behind = f" /* {item.behind} */" if item.behind else ""
+        if isinstance(item, Line):
+            text = item.code
+            if item.target:
+                name = item.declares or item.target
+                text = f"{item.code}" if item.updates else f"{name} = {item.code}"
+            lines += wrapped(f"{pad}{text};{behind}")
+        elif isinstance(item, Branch):
+            lines += _branch(item, indent, behind)
+        else:
+            lines += wrapped(f"{pad}{item.header} {{{behind}")
+            lines += [*block_lines(item.body, indent + 4), f"{pad}}}"]
+    return lines
+
+
+def _branch(item: Branch, indent: int, behind: str) -> list[str]:
+    pad, lines = " " * indent, []
+    opening = f"{pad}if ({item.test}) {{{behind}"
+    while True:
+        lines += wrapped(opening)
+        lines += block_lines(item.body, indent + 4)
+        rest = item.orelse
+        if not rest:
+            return [*lines, f"{pad}}}"]
+        if len(rest) == 1 and isinstance(rest[0], Branch):
+            item = rest[0]
+            for comment in item.comments and [" ".join(item.comments)]:
+                lines += comment_block(comment, indent + 4)
+            opening = f"{pad}}} else if ({item.test}) {{"
+            continue
+        return [*lines, f"{pad}}} else {{", *block_lines(rest, indent + 4), f"{pad}}}"]

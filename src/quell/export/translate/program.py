@@ -1,0 +1,227 @@
+"""A C program that is made of Python kernels, function by function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from quell.export.translate.blocks import lines_of, words
+from quell.export.translate.calls import Calls
+from quell.export.translate.expressions import Expressions
+from quell.export.translate.functions import Function
+from quell.export.translate.layout import block_lines, comment_block, wrapped
+from quell.export.translate.literals import Literals
+from quell.export.translate.naming import function_name, snake_case, unique
+from quell.export.translate.source import local_names, module_doc, read_function
+from quell.export.translate.structs import Structs
+from quell.export.translate.values import Array, Kind, Struct, Value
+
+# Helper functions in C; "real" stands for float or double, "" for the suffix of functions.
+_HELPERS = {
+    "minimum": ("real minimum(real a, real b)", "return b < a ? b : a;",
+                "Return the smaller number; a if one is not a number."),
+    "maximum": ("real maximum(real a, real b)", "return b > a ? b : a;",
+                "Return the larger number; a if one is not a number."),
+    "minimum_int": ("int minimum_int(int a, int b)", "return b < a ? b : a;",
+                    "Return the smaller number."),
+    "maximum_int": ("int maximum_int(int a, int b)", "return b > a ? b : a;",
+                    "Return the larger number."),
+    "absolute": ("int absolute(int a)", "return a < 0 ? -a : a;", "Return |a|."),
+    "is_finite": ("bool is_finite(real a)", "return fabs(a) <= REAL_MAX;",
+                  "Return whether a is finite."),
+    "truncated": ("int truncated(real a)",
+                  "return a > -{2147483648} && a < {2147483648} ? (int)a : 0;",
+                  "Return a without its fraction; 0 if it is not a number or too large."),
+    "remainder_int": ("int remainder_int(int a, int b)",
+                      "const int rest = a % b;\n    return rest != 0 && (rest < 0) != (b < 0) "
+                      "? rest + b : rest;", "Return a modulo b, with the sign of b."),
+    "quotient_int": ("int quotient_int(int a, int b)",
+                     "const int rest = a % b;\n    return a / b - "
+                     "(rest != 0 && (rest < 0) != (b < 0) ? 1 : 0);",
+                     "Return a / b, rounded down."),
+    "remainder_real": ("real remainder_real(real a, real b)",
+                       "const real rest = fmod(a, b);\n    return rest != {0} && (rest < {0}) != "
+                       "(b < {0}) ? rest + b : rest;", "Return a modulo b, with the sign of b."),
+    "quotient_real": ("real quotient_real(real a, real b)", "return floor(a / b);",
+                      "Return a / b, rounded down."),
+}  # fmt: skip
+
+
+class Program:
+    """The functions, structs and constants that a set of kernels needs.
+
+    Parameters
+    ----------
+    prefix
+        begins the names of structs.
+    single
+        whether real numbers are ``float``.
+    varying
+        numbers of the state that change, see ``Structs``.
+    """
+
+    def __init__(self, prefix: str, single: bool, varying: set[tuple[str, str]]) -> None:
+        self.literals = Literals(single)
+        self.structs = Structs(prefix, self.literals, varying)
+        self.calls = Calls(self)
+        self.functions: list[Function] = []
+        self.helpers: set[str] = set()
+        self.includes: set[str] = {"math.h"}
+        self.results: dict[str, Struct] = {}  # structs of results by the name of the function
+        self.keep_type: dict[Any, str] = {}  # functions of ours that are functions of <math.h>
+        self._found: dict[Any, Function] = {}
+        self._names = set(_HELPERS)
+        self._constants: dict[str, tuple[Any, str]] = {}
+
+    def function(
+        self,
+        python: Callable[..., Any],
+        arguments: list[Value],
+        generic_name: str = "",
+        hints: tuple[str, ...] = (),
+    ) -> Function:
+        """Return the C function of a Python function for arguments like these."""
+        key = (python, *((a.kind, a.mutable and not a.is_number) for a in arguments))
+        found = self._found.get(key)
+        if found is None:
+            found = Function(self, read_function(python), arguments, hints)
+            self._found[key] = found
+            if found.inline is None:
+                found.name = self._function_name(python, arguments, generic_name)
+                self.functions.append(found)
+                if found.result_members:
+                    self.results[found.name] = Struct(f"{found.name}_result", tuple, False)
+                    self._complete_results(found)
+        return found
+
+    def _function_name(
+        self, python: Callable[..., Any], arguments: list[Value], generic_name: str
+    ) -> str:
+        name = function_name(generic_name or python.__name__)
+        if name in local_names(python.__module__):
+            name = f"{name}_value"
+        head = arguments[0].kind if arguments else None
+        if name in self._names and isinstance(head, Struct):
+            kind = snake_case(head.python.__name__).removesuffix("_design").removesuffix("_model")
+            name = f"{name}_{kind}"
+        return unique(name, self._names)
+
+    def has_function(self, name: str) -> bool:
+        """Return whether a function has this name."""
+        return name in self._names
+
+    def _complete_results(self, function: Function) -> None:
+        """Write the return statements of a function with several results."""
+        for line in lines_of(function.block):
+            if line.code.startswith("RESULT "):
+                parts = line.code.removeprefix("RESULT ").split("\0")
+                line.code = f"RETURN {function.name}_result\0" + "\0".join(parts)
+
+    def named_constant(self, name: str, value: Any, module: str) -> str:
+        """Return the C name of a constant of a module."""
+        name = name.lstrip("_")
+        kept = self._constants.get(name)
+        if kept is not None and kept[0] != value:
+            name = f"{name}_{module.rsplit('.', 1)[-1].upper()}"
+        self._constants.setdefault(name, (value, module))
+        return name
+
+    def pointer(self, kind: Kind, name: str, const: bool) -> str:
+        """Return the declaration of a variable that points to an array or a struct."""
+        word = "const " if const else ""
+        if isinstance(kind, Struct):
+            return f"{word}{kind.name} *{name}"
+        if not isinstance(kind, Array):
+            raise AssertionError
+        number = self.structs.number(kind.element)
+        if len(kind.shape) == 1:
+            return f"{word}{number} *{name}"
+        return f"{word}{number} (*{name})[{kind.shape[1]}]"
+
+    def parameter(self, kind: Kind, name: str, const: bool) -> str:
+        """Return the declaration of a parameter that is an array or a struct."""
+        if isinstance(kind, Array):
+            return f"{'const ' if const else ''}{self.structs.declaration(kind, name)}"
+        return self.pointer(kind, name, const)
+
+    def entry_expressions(self) -> Expressions:
+        """Return expressions outside of any kernel, for calls from the public functions."""
+        return Expressions(self, {}, "entry point", "")
+
+    def kernel_lines(self, used_by: str) -> list[str]:
+        """Return constants, helpers and functions, as far as the code ``used_by`` needs them."""
+        needed = words(used_by)
+        kept: list[Function] = []
+        for function in reversed(self.functions):
+            if function.name in needed:
+                kept.append(function)
+                needed |= function.names_used()
+        self.functions = kept[::-1]
+        self.helpers &= needed
+        for name in [name for name in self._constants if name not in needed]:
+            del self._constants[name]
+        constants = [line for each in self.constant_lines() for line in wrapped(each)]
+        return ["", *constants, *self.helper_lines(), *self.function_lines()]
+
+    def constant_lines(self) -> list[str]:
+        """Return the definitions of named constants."""
+        lines = []
+        for name, (value, module) in self._constants.items():
+            comment = f" /* {module} */"
+            if isinstance(value, int) and not isinstance(value, bool):
+                lines.append(f"enum {{ {name} = {value} }};{comment}")
+            else:
+                number = self.literals.write(value)
+                lines.append(f"static const {self.literals.real} {name} = {number};{comment}")
+        return lines
+
+    def helper_lines(self) -> list[str]:
+        """Return the definitions of helper functions."""
+        lines: list[str] = []
+        for name, (head, body, doc) in _HELPERS.items():
+            if name in self.helpers:
+                head, body = (self._in_precision(text) for text in (head, body))
+                lines += ["", f"/* {doc} */", f"static {head}", "{", f"    {body}", "}"]
+        return lines
+
+    def _in_precision(self, text: str) -> str:
+        import re
+
+        text = text.replace("REAL_MAX", "FLT_MAX" if self.literals.single else "DBL_MAX")
+        text = re.sub(r"\breal\b", self.literals.real, text)
+        text = re.sub(r"\{(\d+)\}", lambda m: self.literals.write_real(float(m[1])), text)
+        return re.sub(
+            r"\b(fabs|fmod|floor)\(", lambda m: f"{self.literals.math_function(m[1])}(", text
+        )
+
+    def function_lines(self) -> list[str]:
+        """Return the definitions of all functions, each after those that it calls."""
+        lines: list[str] = []
+        modules: set[str] = set()
+        for function in self.functions:
+            source = function.source
+            if source.module not in modules and (doc := module_doc(source.module)):
+                modules.add(source.module)
+                lines += ["", *comment_block(f"---- {source.module} ----\n\n{doc}")]
+            if function.result_members:
+                members = " ".join(f"{self.structs.declaration(kind, name)};"
+                                   for name, kind in function.result_members)  # fmt: skip
+                lines += ["", f"typedef struct {{ {members} }} {function.name}_result;"]
+            origin = f"From {source.module}.{source.name}."
+            doc = f"{source.doc}\n\n{origin}" if source.doc else origin
+            lines += ["", *comment_block(doc), *wrapped(function.signature()), "{"]
+            lines += [*self._with_results(block_lines(function.block)), "}"]
+        return lines
+
+    @staticmethod
+    def _with_results(lines: list[str]) -> list[str]:
+        found = []
+        for line in lines:
+            if "RETURN " not in line:
+                found.append(line)
+                continue
+            pad = line[: len(line) - len(line.lstrip())]
+            name, *parts = line.strip().removeprefix("RETURN ").rstrip(";").split("\0")
+            found += wrapped(f"{pad}const {name} returned = {{{', '.join(parts)}}};")
+            found.append(f"{pad}return returned;")
+        return found

@@ -1,0 +1,373 @@
+"""Translation of the statements of a function."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from quell.export.translate.blocks import (
+    Block,
+    Branch,
+    Line,
+    Loop,
+    lines_of,
+    words,
+)
+from quell.export.translate.expressions import Expressions
+from quell.export.translate.naming import identifier
+from quell.export.translate.source import Source
+from quell.export.translate.values import (
+    NOTHING,
+    SHIFT,
+    UNARY,
+    Number,
+    Several,
+    Struct,
+    TranslationError,
+    Value,
+    is_empty,
+    join,
+    join_numbers,
+)
+
+if TYPE_CHECKING:
+    from quell.export.translate.program import Program
+
+
+class WrongAssumptionError(Exception):
+    """An assumption about a local variable was wrong: the body must be translated again."""
+
+
+@dataclass
+class Assumptions:
+    """What is assumed about local variables until the opposite is found."""
+
+    varying: set[str] = field(default_factory=set)  # not the same constant everywhere
+    kinds: dict[str, Number] = field(default_factory=dict)
+
+
+class Body(Expressions):
+    """The body of a function, translated once under given assumptions."""
+
+    def __init__(
+        self, program: Program, source: Source, arguments: dict[str, Value], known: Assumptions
+    ) -> None:
+        where = f"{source.module}.{source.name}"
+        super().__init__(program, source.names, where, source.module)
+        self.source, self.known = source, known
+        self.names = dict(arguments)
+        self.local: dict[str, Value] = {}  # variables in C
+        self.loop_variables: set[str] = set()
+        self.returns: list[tuple[Line, Value]] = []
+        self.taken = set(arguments)
+        self.all_names = {part.id for part in ast.walk(source.tree) if isinstance(part, ast.Name)}
+        self.block: Block = self._statements(source.tree.body)
+
+    def _statements(self, nodes: list[ast.stmt]) -> Block:
+        """Return the translation of statements, without what can not be reached."""
+        block: Block = []
+        for node in nodes:
+            here: Block = []
+            ends = self._statement(node, here)
+            calls: Block = [Line(code, calls=True) for code in self.pending]
+            self.pending.clear()
+            here = calls + here
+            if here:
+                before, behind = self.source.comments.of(node)
+                here[0].comments = before + here[0].comments
+                here[0].behind = here[0].behind or behind
+            block += here
+            if ends:
+                break
+        return block
+
+    def _statement(self, node: ast.stmt, block: Block) -> bool:
+        """Add a statement to ``block``; return whether nothing after it is reached."""
+        if isinstance(node, ast.Expr):
+            if not isinstance(node.value, ast.Constant):
+                self._call_statement(self.translate(node.value), block)
+            return False
+        if isinstance(node, ast.Return):
+            self._return(node.value, block)
+            return True
+        if isinstance(node, ast.Continue | ast.Break):
+            block.append(Line(type(node).__name__.lower()))
+            return True
+        if isinstance(node, ast.If):
+            return self._if(node, block)
+        method = getattr(self, f"_{type(node).__name__.lower()}_statement", None)
+        if method is None:
+            raise self.fail(node, "this statement can not be translated")
+        method(node, block)
+        return False
+
+    def _pass_statement(self, node: ast.Pass, block: Block) -> None:
+        pass
+
+    def _raise_statement(self, node: ast.Raise, block: Block) -> None:
+        raise self.fail(node, "C has no exceptions")
+
+    def _call_statement(self, value: Value, block: Block) -> None:
+        if value.calls:
+            block.append(Line(value.code, calls=True))
+
+    def _if(self, node: ast.If, block: Block) -> bool:
+        test = self.translate(node.test)
+        if test.is_constant:
+            arm = self._statements(node.body if test.constant else node.orelse)
+            block.extend(arm)
+            return bool(arm) and ends(arm)
+        body, orelse = self._statements(node.body), self._statements(node.orelse)
+        if not body and orelse:
+            test = self._not(test)
+            body, orelse = orelse, []
+        if body or orelse or test.calls:
+            block.append(Branch(test.code, body, orelse))
+        return bool(body and orelse and ends(body) and ends(orelse))
+
+    def _not(self, test: Value) -> Value:
+        return Value(Number.BOOL, f"!{test.at(UNARY)}", UNARY, calls=test.calls)
+
+    def _for_statement(self, node: ast.For, block: Block) -> None:
+        call = node.iter
+        is_range = isinstance(call, ast.Call) and getattr(call.func, "id", "") == "range"
+        if not (is_range and isinstance(node.target, ast.Name) and not node.orelse):
+            raise self.fail(node, "only 'for … in range(…)' can be translated")
+        bounds = [self.translate(part) for part in call.args]  # type: ignore[attr-defined]
+        start = bounds[0] if len(bounds) > 1 else self.constant(0)
+        stop = bounds[1] if len(bounds) > 1 else bounds[0]
+        step = bounds[2].constant if len(bounds) > 2 else 1
+        if (
+            start.is_constant
+            and stop.is_constant
+            and not range(start.constant, stop.constant, step)
+        ):
+            return
+        name = node.target.id if node.target.id != "_" else self._fresh("k")
+        variable = identifier(name)
+        self.loop_variables.add(variable)
+        self.names[node.target.id] = Value(Number.INT, variable)
+        body = self._statements(node.body)
+        if not body:
+            return
+        end, more = stop.at(SHIFT), ""
+        if not stop.is_constant and (stop.calls or words(stop.code) & _set_names(body)
+                                     or "->" in stop.code):  # fmt: skip
+            last = self._fresh("end")
+            self.loop_variables.add(last)
+            end, more = last, f", {last} = {stop.code}"
+        sign = "<" if step > 0 else ">"
+        change = {1: f"{variable}++", -1: f"{variable}--"}.get(step, f"{variable} += {step}")
+        header = f"for (int {variable} = {start.code}{more}; {variable} {sign} {end}; {change})"
+        block.append(Loop(header, variable, body))
+
+    def _fresh(self, name: str) -> str:
+        found, number = name, 2
+        while found in self.all_names or found in self.names or found in self.loop_variables:
+            found, number = f"{name}{number}", number + 1
+        return found
+
+    def _return(self, node: ast.expr | None, block: Block) -> None:
+        if isinstance(node, ast.IfExp) and isinstance(node.body, ast.Tuple):
+            test = self.translate(node.test)
+            if test.is_constant:
+                self._return(node.body if test.constant else node.orelse, block)
+                return
+            arms: list[Block] = [[], []]
+            self._return(node.body, arms[0])
+            block.append(Branch(test.code, arms[0], []))
+            self._return(node.orelse, block)
+            return
+        line = Line("return")
+        value = Value(NOTHING)
+        if node is not None:
+            names = ()
+            value = self.call(node, names) if isinstance(node, ast.Call) else self.translate(node)
+        if isinstance(value.kind, Several) and not value.items:
+            raise self.fail(self.source.tree, "returns the tuple of another function; unpack it")
+        codes = [item.code for item in value.items] if value.items else [value.code]
+        line.code = f"return {', '.join(codes)}".strip()
+        self.returns.append((line, value))
+        block.append(line)
+
+    def _assign_statement(self, node: ast.Assign, block: Block) -> None:
+        if len(node.targets) == 1 and isinstance(node.targets[0], ast.Tuple):
+            self._unpack(node.targets[0], node.value, block)
+            return
+        value = self.translate(node.value)
+        for target in node.targets:
+            self._store(target, value, block, node)
+            if value.calls and len(node.targets) > 1:
+                value = self.translate(node.targets[0])
+
+    def _annassign_statement(self, node: ast.AnnAssign, block: Block) -> None:
+        if node.value is not None:
+            self._store(node.target, self.translate(node.value), block, node)
+
+    def _unpack(self, targets: ast.Tuple, node: ast.expr, block: Block) -> None:
+        names = tuple(part.id if isinstance(part, ast.Name) else "" for part in targets.elts)
+        value = self.call(node, names) if isinstance(node, ast.Call) else self.translate(node)
+        if not isinstance(value.kind, Several):
+            raise self.fail(node, "is not a tuple")
+        items = value.items
+        if value.code:  # a call that returns a struct with what is not known otherwise
+            result = self._fresh("result")
+            struct: Struct = self.program.results[value.code.split("(")[0]]
+            self._set(result, replace(value, kind=struct), block)
+            items = tuple(
+                item if not item.code.startswith(".") else replace(item, code=result + item.code)
+                for item in items
+            )
+        if isinstance(node, ast.Tuple):
+            items = self._without_overlap(targets, node, items, block)
+        for target, item in zip(targets.elts, items, strict=True):
+            self._store(target, item, block, node)
+
+    def _without_overlap(
+        self, targets: ast.Tuple, node: ast.Tuple, items: tuple[Value, ...], block: Block
+    ) -> tuple[Value, ...]:
+        """Return the items, the later ones in new variables if an earlier target is in them."""
+        found = list(items)
+        for i, target in enumerate(targets.elts[:-1]):
+            base = ast.unparse(target).split("[")[0]
+            for k in range(i + 1, len(found)):
+                used = [ast.unparse(part) for part in ast.walk(node.elts[k])
+                        if isinstance(part, ast.Name | ast.Attribute)]  # fmt: skip
+                if base in used and found[k].is_number and not found[k].is_constant:
+                    name = self._fresh("before")
+                    self._set(name, found[k], block)
+                    found[k] = self.names[name]
+        return tuple(found)
+
+    def _store(self, target: ast.expr, value: Value, block: Block, node: ast.AST) -> None:
+        if isinstance(target, ast.Name):
+            self._set(target.id, value, block)
+            return
+        place = self.translate(target)
+        if place.member is not None:
+            same = value.is_constant and float(value.constant) == float(place.constant)
+            if not same:
+                self.program.structs.vary(place.member)
+            return
+        self._check_place(target, place)
+        value = self._fitting(place.kind, value, node)
+        self.written.add(place.root)
+        block.append(Line(f"{place.code} = {value.code}", calls=True))
+
+    def _check_place(self, target: ast.expr, place: Value) -> None:
+        if not place.is_number or place.is_constant:
+            raise self.fail(target, "only numbers can be assigned")
+        if not place.mutable:
+            raise self.fail(target, "parameters can not be changed")
+
+    def _fitting(self, kind: Any, value: Value, node: ast.AST) -> Value:
+        if kind is Number.REAL:
+            return self.real(value)
+        if value.kind is Number.REAL or not value.is_number:
+            raise self.fail(node, "a real number is assigned to an integer")
+        return value
+
+    def _augassign_statement(self, node: ast.AugAssign, block: Block) -> None:
+        value = self.translate(node.value)
+        if value.constant == 0 and isinstance(node.op, ast.Add | ast.Sub | ast.BitOr):
+            return
+        if isinstance(node.target, ast.Name):
+            before = self.names[node.target.id]
+            if before.is_constant:
+                self.known.varying.add(node.target.id)
+                raise WrongAssumptionError
+            found = self.operation(node, node.op, before, value)
+            if found.kind is not before.kind:
+                self.known.kinds[node.target.id] = found.kind
+                raise WrongAssumptionError
+            name, place = before.code, before
+        else:
+            place = self.translate(node.target)
+            if place.member is not None:
+                self.program.structs.vary(place.member)
+                return
+            self._check_place(node.target, place)
+            self.written.add(place.root)
+            found = self.operation(node, node.op, place, value)
+            self._fitting(place.kind, found, node)
+            name = ""
+        if isinstance(node.op, ast.Pow | ast.Mod | ast.FloorDiv):
+            code = f"{place.code} = {found.code}"
+        else:
+            value = self.as_kind(value, place.kind)
+            sign = found.code[len(place.code) + 1 :].split(" ", 1)[0]
+            code = f"{place.code} {sign}= {value.code}"
+        block.append(Line(code, name, calls=not name or value.calls, updates=bool(name)))
+
+    def _set(self, name: str, value: Value, block: Block) -> None:
+        """Set a local variable, which vanishes if it always has the same known value."""
+        if value.is_constant and name not in self.known.varying:
+            before = self.names.get(name)
+            if before is None or name not in self.local:
+                if before is None or (before.is_constant and same_constant(before, value)):
+                    self.names[name] = value
+                    return
+                self.known.varying.add(name)
+                raise WrongAssumptionError
+        elif name in self.names and self.names[name].is_constant:
+            self.known.varying.add(name)
+            raise WrongAssumptionError
+        if is_empty(value):
+            self.names[name] = value
+            return
+        variable = self._variable(name)
+        if value.is_number:
+            self._set_number(name, variable, value, block)
+            return
+        if isinstance(value.kind, Several):
+            raise TranslationError(f"{self.where}: {name}: a tuple must be unpacked")
+        before = self.local.get(name)
+        if before is not None and before.kind != value.kind:
+            raise TranslationError(f"{self.where}: {name} refers to different arrays")
+        is_result = value.code.split("(")[0] in self.program.results and value.calls
+        self.local[name] = value
+        self.names[name] = replace(value.named(variable), pointer=not is_result)
+        code = value.address if isinstance(value.kind, Struct) and not is_result else value.code
+        block.append(Line(code, variable, calls=value.calls))
+
+    def _variable(self, name: str) -> str:
+        """Return the C name of a variable, which must not be that of a function."""
+        variable = identifier(name)
+        return f"{variable}_" if self.program.has_function(variable) else variable
+
+    def _set_number(self, name: str, variable: str, value: Value, block: Block) -> None:
+        kind = self.known.kinds.get(name, value.kind)
+        if name in self.names and name not in self.local:
+            before = self.names[name].kind  # a parameter that is set
+        else:
+            before = self.local[name].kind if name in self.local else kind
+        joined = join_numbers(Value(join(before, kind, name)), value, name)
+        if joined is not kind or (name in self.local and joined is not before):
+            self.known.kinds[name] = joined
+            raise WrongAssumptionError
+        value = self.as_kind(value, joined)
+        if value.code == variable:  # x = x
+            return
+        if name not in self.taken:
+            self.local[name] = replace(value, kind=joined)
+        self.names[name] = Value(joined, variable)
+        block.append(Line(value.code, variable, calls=value.calls))
+
+
+def same_constant(one: Value, other: Value) -> bool:
+    """Return whether two known values are the same, not-a-number included."""
+    a, b = one.constant, other.constant
+    return type(a) is type(b) and (a == b or (a != a and b != b))
+
+
+def ends(block: Block) -> bool:
+    """Return whether nothing after a block is reached."""
+    last = block[-1] if block else None
+    if isinstance(last, Line):
+        return last.code.startswith(("return", "continue", "break")) and not last.target
+    return isinstance(last, Branch) and ends(last.body) and ends(last.orelse)
+
+
+def _set_names(block: Block) -> set[str]:
+    return {line.target for line in lines_of(block) if line.target}
