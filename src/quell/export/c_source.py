@@ -19,6 +19,7 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.prefilters.prefilter import without_prefilters
+from quell.controllers.single.single import SingleDesign
 from quell.export import operations
 from quell.export.translate.initial import initial_lines
 from quell.export.translate.layout import comment_block, wrapped
@@ -69,6 +70,8 @@ class ControllerSource:
     def __init__(self, controller: Any, name: str, varying: set[tuple[str, str]]) -> None:
         self.controller, self.name = controller, name
         self.parameters, self.state = controller.parameters, controller.initial_state()
+        if isinstance(self.parameters, SingleDesign):
+            self.parameters = self.parameters.controller
         precisions = {array.dtype for array in arrays_of(self.state) if array.dtype.kind == "f"}
         self.single = np.dtype(np.float32) in precisions
         self.program = Program(name, self.single, varying)

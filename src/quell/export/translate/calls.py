@@ -19,6 +19,7 @@ from quell.export.translate.values import (
     Value,
     join_numbers,
 )
+from quell.kernels import functions
 from quell.kernels.dispatch import interpreted, is_finite
 from quell.kernels.function_pointers import call as call_pointer
 from quell.kernels.scalars import clear
@@ -150,9 +151,12 @@ class Calls:
             return self._call(Number.BOOL, self.helper("is_finite"), body.real(arguments[0]))
         if function is call_pointer:
             return self._user_function(body, node, arguments)
-        keep = self.program.keep_type
-        if function in keep:
-            return self.math_call(body, keep[function], arguments)
+        if function is functions.is_single:
+            return body.constant(self.program.literals.single)
+        if function is functions.single:
+            return body.real(arguments[0])
+        if getattr(function, "__module__", "") == functions.__name__:
+            return self.math_call(body, function.__name__, arguments)
         implementation, generic_name = self._resolve(body, node, function, arguments)
         return self.program.function(implementation, arguments, generic_name, names).call(
             body, arguments

@@ -68,7 +68,6 @@ class Program:
         self.helpers: set[str] = set()
         self.includes: set[str] = {"math.h"}
         self.results: dict[str, Struct] = {}  # structs of results by the name of the function
-        self.keep_type: dict[Any, str] = {}  # functions of ours that are functions of <math.h>
         self._found: dict[Any, Function] = {}
         self._names = set(_HELPERS)
         self._constants: dict[str, tuple[Any, str]] = {}
