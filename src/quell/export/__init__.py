@@ -1,6 +1,6 @@
 """Controllers for other machines: C code generated from the kernels.
 
-This folder may import everything except setups, experiments and the command line.
+May import: everything but setups, experiments and the command line.
 """
 
 from quell.export.c_source import CSource, c_source

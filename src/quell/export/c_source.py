@@ -18,8 +18,8 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.prefilters.prefilter import without_prefilters
-from quell.controllers.single.single import SingleDesign
+from quell.controllers.prefilters.prefilter import Prefiltered, without_prefilters
+from quell.controllers.single.single import SinglePrecision
 from quell.export import operations
 from quell.export.translate.initial import initial_lines
 from quell.export.translate.layout import comment_block, wrapped
@@ -70,7 +70,9 @@ class ControllerSource:
     def __init__(self, controller: Any, name: str, varying: set[tuple[str, str]]) -> None:
         self.controller, self.name = controller, name
         self.parameters, self.state = controller.parameters, controller.initial_state()
-        if isinstance(self.parameters, SingleDesign):
+        self.described = controller  # the controller in double precision
+        if isinstance(controller, SinglePrecision):
+            self.described = controller.controller
             self.parameters = self.parameters.controller
         precisions = {array.dtype for array in arrays_of(self.state) if array.dtype.kind == "f"}
         self.single = np.dtype(np.float32) in precisions
@@ -113,7 +115,7 @@ class ControllerSource:
     def write(self) -> CSource:
         """Return the files."""
         self.roots = set()
-        real, name, inner = self.real, self.name, without_prefilters(self.controller)
+        real, name, inner = self.real, self.name, without_prefilters(self.described)
         state, both = f"{name}_state *state", (self.design, self.memory)
         r, y, u = self._real("r"), self._real("y"), self._real("u")
         tables: list[str] = []
@@ -132,7 +134,7 @@ class ControllerSource:
                   "Set the control signal that was really applied since the last step.",
                   f"    {self._translated(set_applied_control, *both, u)};")  # fmt: skip
         self._derivatives(both, state)
-        if isinstance(inner, ADRC) or hasattr(inner, "observer"):
+        if isinstance(inner, ADRC):
             self._hand_over(both, state, inner, (r, y, u))
         self._retuning(state)
         self._add("reset", f"void NAME({state})",
@@ -155,7 +157,7 @@ class ControllerSource:
 
     def _derivatives(self, both: tuple[Value, Value], state: str) -> None:
         count = int(getattr(self.controller, "derivatives", 0))
-        if count == 0 or type(self.controller) is not type(without_prefilters(self.controller)):
+        if count == 0 or isinstance(self.described, Prefiltered):
             return
         given = Value(Array((count,), Number.REAL), "derivatives", root="derivatives")
         self._add("set_derivatives", f"void NAME({state}, const {self.real} derivatives[{count}])",
@@ -246,7 +248,7 @@ class ControllerSource:
         flags = ", ".join(f"{upper}_{flag.name} = {int(flag)}" for flag in Status if flag.name)
         reasons = ", ".join(f"{upper}_{reason.name} = {int(reason)}" for reason in Reason)
         lines = [
-            f"/* Controller {name}: {type(self.controller).__name__}, in "
+            f"/* Controller {name}: {type(self.described).__name__}, in "
             f"{'single' if self.single else 'double'} precision, one sample every {dt} s.",
             " *",
             f" * Call {name}_init once, then {name}_step every {dt} s. Several controllers may be "

@@ -232,7 +232,9 @@ class ADRC(StatefulController):
         """
         y, u = checks.signal("y", y), checks.signal("u", u)
         goal = y if r is None else checks.signal("r", r)
-        start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), y, u, goal)
+        number = self._state.z.dtype.type  # of the precision of the state
+        signals = map(number, (y, u, goal))
+        start_at_rest(self.parameters, self._state, samples_to_settle(self.observer), *signals)
 
     def start_at(self, x: Any, f: float = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
         """Start with given estimates, for a plant in motion; what was learned is kept.

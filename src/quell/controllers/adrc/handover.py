@@ -39,16 +39,17 @@ _MOST_SAMPLES = 100_000_000
 def start_at_rest(
     design: AdrcDesign, state: AdrcState, samples: int, y: float, u: float, r: float
 ) -> None:
-    """Set the state to rest at y under u, with the reference r; see ``samples_to_settle``."""
-    number = state.z.dtype.type  # that of its precision
-    y, u, r = number(y), number(u), number(r)
+    """Set the state to rest at y under u, with the reference r; see ``samples_to_settle``.
+
+    The numbers are in the precision of the state.
+    """
     _start_loop(design, state, y, u, r)
     begin(design.eso, state.z, state.seen, y)
     loop = state.loop[0]
-    call_specialised(_observe_at_rest, design.eso, state.z, state.seen, y, u, number(0.0), samples)
+    model, z, seen = design.eso, state.z, state.seen
+    call_specialised(_observe_at_rest, model, z, seen, y, u, loop.f_learned, samples)
     _feed_forward(design, state, u)
-    f_learned = number(loop.f_learned)
-    call_specialised(_observe_at_rest, design.eso, state.z, state.seen, y, u, f_learned, samples)
+    call_specialised(_observe_at_rest, model, z, seen, y, u, loop.f_learned, samples)
     loop.bumpless = 1.0
 
 

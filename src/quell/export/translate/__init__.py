@@ -5,6 +5,8 @@ What compiled Python code knows (``kernels/sized.py``) is constant in C, too: sh
 fields annotated with ``Size`` or ``Flag``, the implementations of generic functions. A branch that
 is never taken, a loop without a pass and a number that never changes do not exist in C.
 
+May import: ``kernels``.
+
 ``program.py`` is the whole, ``functions.py`` translates a function, ``expressions.py`` and
 ``calls.py`` what is in it, ``blocks.py`` places declarations, ``structs.py`` defines the structs.
 """

@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import inspect
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from quell.export.translate.expressions import Expressions
+from quell.export.translate.interfaces import Translation
 from quell.export.translate.values import (
     ATOM,
     NOTHING,
@@ -24,10 +26,6 @@ from quell.kernels.dispatch import interpreted, is_finite
 from quell.kernels.function_pointers import call as call_pointer
 from quell.kernels.scalars import clear
 
-if TYPE_CHECKING:
-    from quell.export.translate.expressions import Expressions
-    from quell.export.translate.program import Program
-
 # Functions of <math.h> with the name that they have in Python.
 _SAME_NAME = (
     "sqrt sin cos tan tanh exp log log2 ceil floor copysign atan atan2 asin acos sinh cosh fabs "
@@ -39,7 +37,7 @@ _INTEGERS = frozenset({"ceil", "floor"})  # they return integers in Python
 class Calls:
     """The calls of a program."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: Translation) -> None:
         self.program = program
 
     def helper(self, name: str) -> str:
@@ -144,7 +142,6 @@ class Calls:
             if not self.program.structs.fields_of(record.kind):
                 return Value(NOTHING)
             body.written.add(record.root)
-            self.program.includes.add("string.h")
             size = f"sizeof *{record.code}" if record.pointer else f"sizeof {record.code}"
             return Value(Number.INT, f"memset({record.address}, 0, {size})", calls=True)
         if function is is_finite:

@@ -7,10 +7,11 @@ import math
 import operator
 from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from quell.export.translate.interfaces import Translation
 from quell.export.translate.values import (
     AND,
     ATOM,
@@ -35,9 +36,6 @@ from quell.export.translate.values import (
     join_numbers,
 )
 from quell.kernels.dispatch import call_specialised
-
-if TYPE_CHECKING:
-    from quell.export.translate.program import Program
 
 _ARITHMETIC: dict[type, tuple[str, int, Callable[[Any, Any], Any]]] = {
     ast.Add: ("+", SUM, operator.add),
@@ -64,7 +62,9 @@ _COMPARISONS: dict[type, tuple[str, int, Callable[[Any, Any], bool]]] = {
 class Expressions:
     """The expressions of one function; ``names`` are its parameters and local variables."""
 
-    def __init__(self, program: Program, globals_: dict[str, Any], where: str, module: str) -> None:
+    def __init__(
+        self, program: Translation, globals_: dict[str, Any], where: str, module: str
+    ) -> None:
         self.program = program
         self.literals = program.literals
         self.globals = globals_

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from quell.export.translate.blocks import (
     Block,
@@ -14,8 +13,16 @@ from quell.export.translate.blocks import (
     remove_unused,
 )
 from quell.export.translate.expressions import Expressions
+from quell.export.translate.interfaces import Translation
 from quell.export.translate.naming import identifier
 from quell.export.translate.source import Source
+from quell.export.translate.statements import (
+    Assumptions,
+    Body,
+    WrongAssumptionError,
+    ends,
+    same_constant,
+)
 from quell.export.translate.values import (
     ATOM,
     NOTHING,
@@ -30,18 +37,6 @@ from quell.export.translate.values import (
     join,
 )
 
-if TYPE_CHECKING:
-    from quell.export.translate.program import Program
-
-
-from quell.export.translate.statements import (
-    Assumptions,
-    Body,
-    WrongAssumptionError,
-    ends,
-    same_constant,
-)
-
 
 class Function:
     """A C function; the result of translating a Python function for kinds of arguments.
@@ -54,7 +49,7 @@ class Function:
 
     def __init__(
         self,
-        program: Program,
+        program: Translation,
         source: Source,
         arguments: list[Value],
         hints: tuple[str, ...],

@@ -5,17 +5,18 @@ from __future__ import annotations
 import re
 
 # Keywords of C99 and C++, and names that <math.h>, <string.h> or compilers already have.
-KEYWORDS = """auto break case char const continue default do double else enum extern float for
-    goto if inline int long register restrict return short signed sizeof static struct switch typedef union
-    unsigned void volatile while _Bool _Complex _Imaginary alignas alignof and and_eq asm bitand
-    bitor bool catch char16_t char32_t char8_t class co_await co_return co_yield compl concept
-    const_cast consteval constexpr constinit decltype delete dynamic_cast explicit export false
-    friend mutable namespace new noexcept not not_eq nullptr operator or or_eq private protected
-    public reinterpret_cast requires static_assert static_cast template this thread_local throw
-    true try typeid typename using virtual wchar_t xor xor_eq"""
-_TAKEN = """abs acos asin atan ceil clear copysign cos cosh erf exp fabs floor fmax fmin fmod
-    gamma hypot index j0 j1 jn log log2 logb main memcpy memset modf pow read remainder remove rename rint round
-    signal sin sinh sqrt tan tanh tgamma trunc write y0 y1 yn"""
+KEYWORDS = """auto break case char const continue default do double else enum extern float for goto if
+    inline int long register restrict return short signed sizeof static struct switch
+    typedef union unsigned void volatile while _Bool _Complex _Imaginary alignas alignof
+    and and_eq asm bitand bitor bool catch char16_t char32_t char8_t class co_await
+    co_return co_yield compl concept const_cast consteval constexpr constinit decltype
+    delete dynamic_cast explicit export false friend mutable namespace new noexcept not
+    not_eq nullptr operator or or_eq private protected public reinterpret_cast requires
+    static_assert static_cast template this thread_local throw true try typeid typename
+    using virtual wchar_t xor xor_eq"""
+_TAKEN = """abs acos asin atan ceil clear copysign cos cosh erf exp fabs floor fmax fmin fmod gamma
+    hypot index j0 j1 jn log log2 logb main memcpy memset modf pow read remainder remove
+    rename rint round signal sin sinh sqrt tan tanh tgamma trunc write y0 y1 yn"""
 
 
 def identifier(name: str) -> str:

@@ -66,7 +66,6 @@ class Program:
         self.calls = Calls(self)
         self.functions: list[Function] = []
         self.helpers: set[str] = set()
-        self.includes: set[str] = {"math.h"}
         self.results: dict[str, Struct] = {}  # structs of results by the name of the function
         self._found: dict[Any, Function] = {}
         self._names = set(_HELPERS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from quell.export.translate.blocks import (
     Block,
@@ -15,6 +15,7 @@ from quell.export.translate.blocks import (
     words,
 )
 from quell.export.translate.expressions import Expressions
+from quell.export.translate.interfaces import Translation
 from quell.export.translate.naming import identifier
 from quell.export.translate.source import Source
 from quell.export.translate.values import (
@@ -30,9 +31,6 @@ from quell.export.translate.values import (
     join,
     join_numbers,
 )
-
-if TYPE_CHECKING:
-    from quell.export.translate.program import Program
 
 
 class WrongAssumptionError(Exception):
@@ -51,7 +49,7 @@ class Body(Expressions):
     """The body of a function, translated once under given assumptions."""
 
     def __init__(
-        self, program: Program, source: Source, arguments: dict[str, Value], known: Assumptions
+        self, program: Translation, source: Source, arguments: dict[str, Value], known: Assumptions
     ) -> None:
         where = f"{source.module}.{source.name}"
         super().__init__(program, source.names, where, source.module)

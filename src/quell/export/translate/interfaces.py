@@ -1,0 +1,41 @@
+"""What the parts of the translator need from the program that they write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from quell.export.translate.literals import Literals
+from quell.export.translate.structs import Structs
+from quell.export.translate.values import Kind, Struct, Value
+
+
+class Translation(Protocol):
+    """A program while it is written; ``program.py`` has it."""
+
+    literals: Literals
+    structs: Structs
+    calls: Any  # a ``Calls``
+    helpers: set[str]
+    results: dict[str, Struct]
+
+    def function(
+        self,
+        python: Callable[..., Any],
+        arguments: list[Value],
+        generic_name: str = "",
+        hints: tuple[str, ...] = (),
+    ) -> Any:
+        """Return the C function of a Python function for arguments like these."""
+
+    def has_function(self, name: str) -> bool:
+        """Return whether a function has this name."""
+
+    def named_constant(self, name: str, value: Any, module: str) -> str:
+        """Return the C name of a constant of a module."""
+
+    def pointer(self, kind: Kind, name: str, const: bool) -> str:
+        """Return the declaration of a variable that points to an array or a struct."""
+
+    def parameter(self, kind: Kind, name: str, const: bool) -> str:
+        """Return the declaration of a parameter that is an array or a struct."""
