@@ -7,12 +7,15 @@ import types
 import numpy as np
 import pytest
 
+import quell as ql
 from quell.realtime import open_device, record_target
 from quell.realtime.wire import frames
 from quell.realtime.wire.serial_line import SerialListener
 from quell.realtime.wire.transport import receive, send, wait_for_frame
-from quell.signals import Sinusoid
+from quell.signals import Sinusoid, Step
 from quell.types import Status
+
+from .benchmark_module import BENCHMARKS, benchmark
 
 pytest.importorskip("serial")
 DT = 1e-3
@@ -132,3 +135,81 @@ def test_wrong_arguments_are_named_before_anything_is_sent(options, message):
     given = {"reference": 1.0, "channels": CHANNELS, "duration": 0.1} | options
     with pytest.raises(ValueError, match=message):
         record_target(device, **given)
+
+
+# ---- exported controllers in the emulator ----
+
+DRIVE = ql.plants.LinearPlant(A=[[0.0, 1.0], [0.0, -0.6]], B=[0.0, 5.0], C=[1.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def table():
+    """The benchmark, which has the emulator; skipped where the tools or the script are missing."""
+    if not (BENCHMARKS / "target.py").exists():
+        pytest.skip("there are no benchmarks here")
+    table = benchmark("target")
+    if tool := table.emulator.missing_tool():
+        pytest.skip(f"{tool} is not installed")
+    return table
+
+
+def servo(learner=None):
+    """A controller for the drive."""
+    observer = ql.ESO.model_free(order=2, b0=5.0, omega_o=50.0, dt=DT)
+    return ql.ADRC(observer, omega_c=10.0, learner=learner, u_min=-10.0, u_max=10.0)
+
+
+def built(table, folder, board, precision, parts, *flags, plant=DRIVE):
+    """The path of a program of the examples with the controller."""
+    table.export(servo(), precision, "servo", folder)
+    (folder / "plant_numbers.h").write_text(table.plant_numbers(plant, DT))
+    sources = [table.emulator.HERE / part for part in parts]
+    program = folder / "servo.elf"
+    flags = (f"-I{folder}", *flags)
+    table.emulator.build(board, program, [*sources, folder / "servo.c"], *flags)
+    return program
+
+
+def test_the_emulator_counts_instructions(table, tmp_path):
+    """A thousand of them as a thousand; u is that of the simulation; stack and state are small."""
+    scenario = ql.Scenario(reference=Sinusoid(), duration=0.2)
+    run = ql.simulate(DRIVE, servo(), scenario, interpret=True)
+    case = table.Case("servo", "Cortex-M4F", "single", DRIVE, servo())
+    found = table.measured(case, run, tmp_path)  # an error if a known loop is counted wrongly
+    assert 100.0 < found["instructions"] <= found["most"] < 400.0
+    assert found["state"] <= 100.0
+    assert 0.0 < found["stack"] <= 100.0
+    assert found["difference"] < 1e-4
+
+
+def test_a_timer_interrupt_controls_a_drive(table, tmp_path):
+    """Under load from the start, through manual operation, and off when the sensor has failed."""
+    board = table.emulator.BOARDS["Cortex-M4F"]
+    parts = ("timer_interrupt.c", "simulated_drive.c", "plant.c")
+    program = built(table, tmp_path, board, "single", parts)
+    code, output = table.emulator.run(board, program, "-icount", "shift=6,sleep=off")
+    assert code == 0, output
+    y, u = np.loadtxt(output.splitlines(), unpack=True)
+    assert np.max(np.abs(y[:200])) < 1e-6  # started under load
+    assert abs(y[1199] - 1.0) < 1e-3
+    assert np.allclose(u[1200:1700], 3.2)  # manual
+    assert abs(u[1700] - 3.2) < 0.02  # handed over
+    assert abs(y[2499] - 1.0) < 5e-3
+    assert np.max(np.abs(np.diff(u[2490:3290]))) < 0.05  # retuned, and five samples without y
+    assert np.all(u[-75:] == 0.0)
+
+
+def test_a_target_in_double_precision_equals_the_simulation(table, tmp_path):
+    """Reference, output, control signal and estimates over the serial line, bit for bit."""
+    board, reference = table.emulator.BOARDS["Cortex-M7"], Sinusoid(amplitude=0.5, omega=20.0)
+    parts = ("serial_target.c", "plant.c", "mps2_uart.c")
+    flags = ("-DMOST_WAIT=1000", "-DLOAD_AT=50", "-DLOAD=(-3.0)")
+    program = built(table, tmp_path, board, "double", parts, *flags)
+    load = Step(height=-3.0, at=50 * DT)
+    scenario = ql.Scenario(reference=reference, disturbances=(load,), duration=0.15)
+    simulated = ql.simulate(DRIVE, servo(), scenario, interpret=True)
+    channels = (("r", 1), ("u", 1), *((name, width) for name, width in servo().channels if width))
+    with table.emulator.serial_line(board, program) as url, open_device(url, DT) as device:
+        run = record_target(device, reference, channels, scenario.duration)
+    for name in run.names:
+        assert np.array_equal(run[name], simulated[name]), name

@@ -5,6 +5,7 @@
 
 static const double transition[PLANT_ORDER][PLANT_ORDER] = PLANT_TRANSITION;
 static const double input[PLANT_ORDER] = PLANT_INPUT, output[PLANT_ORDER] = PLANT_OUTPUT;
+static const double disturbance[PLANT_ORDER] = PLANT_DISTURBANCE;
 static double x[PLANT_ORDER];
 
 void plant_reset(void)
@@ -21,11 +22,11 @@ double plant_measure(void)
     return y;
 }
 
-void plant_advance(double u)
+void plant_advance(double u, double w)
 {
     double next[PLANT_ORDER];
     for (int i = 0; i < PLANT_ORDER; i++) {
-        double total = 0.0;
+        double total = disturbance[i] * w;
         for (int j = 0; j < PLANT_ORDER; j++)
             total += transition[i][j] * x[j];
         next[i] = total + input[i] * u;

@@ -23,9 +23,16 @@
 #ifndef MOST_WAIT
 #define MOST_WAIT 0
 #endif
+#ifndef LOAD_AT
+#define LOAD_AT 0 /* ticks until the plant is loaded */
+#endif
+#ifndef LOAD
+#define LOAD 0.0
+#endif
 
 static servo_state servo;
 static double y, r;
+static uint32_t live; /* ticks since the first reference */
 static volatile uint32_t ticks;
 
 static void send_telemetry(double u)
@@ -34,8 +41,9 @@ static void send_telemetry(double u)
     uint32_t channel = 0;
     quell_telemetry(channel++, r);
     quell_telemetry(channel++, u);
-    for (int i = 0; i < SERVO_ORDER; i++)
-        quell_telemetry(channel++, estimate.x[i]);
+    /* the channels of the controller in Python, in its order */
+    for (size_t i = 0; i < sizeof estimate.x_hat / sizeof estimate.x_hat[0]; i++)
+        quell_telemetry(channel++, estimate.x_hat[i]);
     quell_telemetry(channel++, estimate.f_residual);
     quell_telemetry(channel++, estimate.f_learned);
     quell_telemetry(channel++, estimate.status);
@@ -52,12 +60,14 @@ void board_apply(double command)
     if (mode == IDLE || mode == WAITING) {
         servo_init(&servo);
         plant_reset();
+        live = 0;
         return;
     }
     if (mode == LIVE)
         r = command;
     double u = servo_step(&servo, r, y);
-    plant_advance(u);
+    plant_advance(u, live >= LOAD_AT ? LOAD : 0.0);
+    live++;
     send_telemetry(u);
 }
 

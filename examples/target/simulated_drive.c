@@ -41,12 +41,15 @@ double drive_apply(double u)
     u = is_safe ? 0.0 : fmin(fmax(u, -10.0), 10.0);
     y_log[tick] = plant_measure();
     u_log[tick] = u;
-    plant_advance(u + LOAD);
+    plant_advance(u, LOAD);
     tick++;
     if (tick == STEP)
         reference = 1.0f;
     if (tick == RETUNE) {
         faster = servo_default_parameters;
+        faster.law[0] = 400; /* omega_c = 20 rad/s instead of 10 */
+        faster.law[1] = 40;
+        faster.limits.high = 5;
         retuned = &faster;
     }
     manual_u = 3.2f;

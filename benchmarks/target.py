@@ -1,0 +1,178 @@
+"""Instructions, code, state and stack of exported controllers on a Cortex-M, in the emulator.
+
+    python benchmarks/target.py [--samples 20000] [--json FILE]
+
+Each controller is exported to C, compiled by ``arm-none-eabi-gcc -O2`` without FMA and run in
+``qemu-system-arm`` over r and y of a loop that quell has simulated before, with noise. Instructions
+are those of a step with its call, counted by the emulated timer (``target.c``); they are no
+cycles: a Cortex-M4 takes 1 for most, 1 to 3 for a load or a jump, 14 for a division or root. Code
+and constants are those of the exported file, with all its functions, without the C library. The
+stack is painted and measured. The last column is the RMS difference of u to quell's own in double
+precision, relative to the RMS of u.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import quell as ql
+from quell.experiments.two_mass_spring import setup as study
+from quell.export import c_source
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "examples" / "target"))
+import emulator  # noqa: E402
+from plant import plant_numbers  # noqa: E402, F401  # for the tests
+
+# An instruction takes 1024 ns of emulated time, 25.6 ticks of the timer (see target.c).
+_COUNTING = ("-icount", "shift=10,sleep=off")
+# The loop of known length in target.c.
+_KNOWN = 1000.0
+DRIVE = ql.plants.LinearPlant(A=[[0.0, 1.0], [0.0, -0.6]], B=[0.0, 5.0], C=[1.0, 0.0])
+
+TYPES = {"single": ("float", np.float32), "double": ("double", np.float64)}
+
+
+class Case(NamedTuple):
+    """A controller on a processor, in a precision, with bars."""
+
+    name: str
+    board: str
+    precision: str
+    plant: Any
+    controller: Any
+    bars: dict[str, float] = {}  # nobody changes it
+
+
+def cases() -> list[Case]:
+    """Return the rows of the table."""
+    two_mass, m4, m7 = ql.plants.two_mass_spring(), "Cortex-M4F", "Cortex-M7"
+    limits = {"u_min": -10.0, "u_max": 10.0}
+    observer = ql.ESO.model_free(order=2, b0=5.0, omega_o=50.0, dt=1e-3)
+    mf = ql.ADRC(observer, omega_c=10.0, **limits)
+    pid = ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits)
+    learners = ql.learners
+    guarded = law(learners.Kalman(), ql.Guard())
+    network, process = law(learners.MLP()), law(learners.GaussianProcess())
+    l_eso = "L-ESO, order 4, Kalman, guard"
+    small = {"instructions": 220.0, "state": 100.0}
+    large = {"instructions": 2200.0, "state": 700.0, "stack": 250.0}
+    return [
+        Case("PID", m4, "single", DRIVE, pid),
+        Case("MF-ESO, order 2", m4, "single", DRIVE, mf, small),
+        Case("MF-ESO, order 2", m7, "double", DRIVE, mf),
+        Case("MF-ESO, order 4", m4, "single", two_mass, law()),
+        Case(l_eso, m4, "single", two_mass, guarded, large),
+        Case(l_eso, m7, "single", two_mass, guarded),
+        Case(l_eso, m7, "double", two_mass, guarded),
+        Case(l_eso, m4, "double", two_mass, guarded),
+        Case("L-ESO, order 4, MLP", m4, "single", two_mass, network),
+        Case("L-ESO, order 4, GaussianProcess", m4, "single", two_mass, process),
+    ]
+
+
+def law(learner: Any = None, guard: Any = None) -> ql.ADRC:
+    """Return the controller of the two-mass study with limits, a learner and a guard."""
+    settings = study.Settings()
+    observer = study.controller(settings).observer
+    limits = {"u_min": -10.0, "u_max": 10.0}
+    return ql.ADRC(observer, settings.omega_c, learner=learner, guard=guard, **limits)
+
+
+def simulated(case: Case, samples: int) -> ql.Trajectory:
+    """Return a run with noise, a moving reference and a load."""
+    scenario = ql.Scenario(
+        reference=ql.signals.Sinusoid(amplitude=1.0, omega=1.0),
+        noise=ql.signals.BandLimitedNoise(power=1e-12, sample_time=0.01),
+        duration=(samples - 1) * case.controller.dt,
+    )
+    return ql.simulate(case.plant, case.controller, scenario)
+
+
+def export(controller: Any, precision: str, name: str, folder: Path) -> None:
+    """Write header and source of a controller."""
+    if precision == "single":
+        controller = ql.controllers.in_single_precision(controller)
+    source = c_source(controller, name)
+    (folder / f"{name}.h").write_text(source.header, encoding="utf-8")
+    (folder / f"{name}.c").write_text(source.source, encoding="utf-8")
+
+
+def measured(case: Case, run: ql.Trajectory, folder: Path) -> dict[str, float]:
+    """Return what a case costs on its target, in instructions and bytes."""
+    board = emulator.BOARDS[case.board]
+    export(case.controller, case.precision, "counted", folder)
+    real, dtype = {"single": ("float", np.float32), "double": ("double", np.float64)}[
+        case.precision
+    ]
+    r, y, u = run["r"].astype(dtype), run["y_measured"].astype(dtype), run["u"]
+    (folder / "samples.bin").write_bytes(r.tobytes() + y.tobytes() + u.tobytes())
+    program, flags = folder / "target.elf", (f"-DREAL={real}", f"-DSAMPLES={len(run)}")
+    sources = [HERE / "target.c", folder / "counted.c"]
+    emulator.build(board, program, sources, *flags, f"-I{folder}", f"-Wa,-I{folder}")
+    code, output = emulator.run(board, program, *_COUNTING, timeout=600.0)
+    if code:
+        raise RuntimeError(f"{case.name}: the program has ended with {code}: {output}")
+    found = {name: float(value) for name, value in (line.split() for line in output.splitlines())}
+    if abs(found["known"] - _KNOWN) > 1.0:
+        raise RuntimeError(f"{found['known']} instructions counted where there are {_KNOWN:.0f}")
+    text, constants = emulator.sizes(board, folder / "counted.c", f"-I{folder}")
+    return {
+        "instructions": found["mean"],
+        "most": found["most"],
+        "code": text,
+        "constants": constants,
+        "state": found["state"],
+        "stack": found["stack"],
+        "difference": found["difference"],
+    }
+
+
+def shown(case: Case, found: dict[str, float]) -> list[str]:
+    """Return a row of the table."""
+
+    def text(name: str) -> str:
+        bar = case.bars.get(name)
+        over = "" if bar is None else f" ≤ {bar:.0f}" if found[name] <= bar else f" > {bar:.0f} (!)"
+        return f"{found[name]:.0f}{over}"
+
+    names = ("instructions", "most", "code", "constants", "state", "stack")
+    difference = f"{found['difference']:.1e}"
+    return [case.name, case.board, case.precision, *map(text, names), difference]
+
+
+def main() -> None:
+    """Measure all cases; print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--samples", type=int, default=20_000, help="steps of each run")
+    parser.add_argument("--json", type=Path, help="write the table to this file")
+    arguments = parser.parse_args()
+    if tool := emulator.missing_tool():
+        sys.exit(f"{tool} is not installed; {emulator.INSTALL}")
+    rows, runs = [], dict[str, ql.Trajectory]()
+    heads = ("controller", "processor", "precision", "instructions, mean", "most", "code [B]")
+    table = Table(*heads, "constants [B]", "state [B]", "stack [B]", "u − double")
+    for case in cases():
+        if case.name not in runs:
+            runs[case.name] = simulated(case, arguments.samples)
+        with tempfile.TemporaryDirectory() as folder:
+            found = measured(case, runs[case.name], Path(folder))
+        table.add_row(*shown(case, found))
+        names = {"controller": case.name, "board": case.board, "precision": case.precision}
+        rows.append({**names, **found})
+    Console().print(table)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
