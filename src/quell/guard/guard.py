@@ -41,7 +41,7 @@ _LEAK_LAGS = 20.0
 # The target approaches β̄g over this time, by at most e in it: a slow drift has almost no effect.
 _HOME_LAGS = 1000.0
 # What a learner does to y is judged over T and so many times n/ω_c, in which y responds.
-_EFFECT_TIME = 5.0
+EFFECT_TIME = 5.0
 # After the filters were emptied in mid-run, q is wrong for this time.
 _SETTLING_LAGS = 3.0
 
@@ -115,7 +115,7 @@ class Guard:
             earn=dt / (_CREDIT_TIME * time),
             stages=stages,
             respond=-math.expm1(-omega_c * dt),
-            forget_effect=dt / (time + _EFFECT_TIME * stages / omega_c),
+            forget_effect=dt / (time + EFFECT_TIME * stages / omega_c),
             rise=share(_RISE_LAGS),
             decay=share(_DECAY_LAGS),
             growth=share(_GROWTH_LAGS),

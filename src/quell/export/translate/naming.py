@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 # Keywords of C99 and C++, and names that <math.h>, <string.h> or compilers already have.
-KEYWORDS = """auto break case char const continue default do double else enum extern float for goto if
-    inline int long register restrict return short signed sizeof static struct switch
+KEYWORDS = """auto break case char const continue default do double else enum extern float for goto
+    if inline int long register restrict return short signed sizeof static struct switch
     typedef union unsigned void volatile while _Bool _Complex _Imaginary alignas alignof
     and and_eq asm bitand bitor bool catch char16_t char32_t char8_t class co_await
     co_return co_yield compl concept const_cast consteval constexpr constinit decltype
@@ -17,6 +17,16 @@ KEYWORDS = """auto break case char const continue default do double else enum ex
 _TAKEN = """abs acos asin atan ceil clear copysign cos cosh erf exp fabs floor fmax fmin fmod gamma
     hypot index j0 j1 jn log log2 logb main memcpy memset modf pow read remainder remove
     rename rint round signal sin sinh sqrt tan tanh tgamma trunc write y0 y1 yn"""
+
+
+def checked_name(name: str) -> str:
+    """Return ``name`` if files and functions in C can be called so; else raise a ``ValueError``."""
+    if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) or name in f"{KEYWORDS} {_TAKEN}".split():
+        raise ValueError(
+            f"name = {name!r}: must be a name in C, of letters, digits and _, that begins with a "
+            "letter and is no word of C or of its library"
+        )
+    return name
 
 
 def identifier(name: str) -> str:
