@@ -24,6 +24,7 @@ from quell.kernels.function_pointers import (
     call,
     compile_cfunc,
     jit_user_function,
+    set_origin,
 )
 from quell.types import Vector
 
@@ -50,6 +51,10 @@ class Custom(Features):
         address.
     names
         name of each of the numbers.
+    c_function
+        name of the same function in C, ``void name(const double *x, double u, double *out)``, with
+        ``float`` in single precision. Exported code then calls it, and does not contain a
+        translation of ``function``.
 
     Raises
     ------
@@ -63,7 +68,9 @@ class Custom(Features):
     >>> gravity = Custom(lambda x, u: (math.sin(x[0]), math.cos(x[0])), names=("sin", "cos"))
     """
 
-    def __init__(self, function: Callable[..., Any], names: Sequence[str]) -> None:
+    def __init__(
+        self, function: Callable[..., Any], names: Sequence[str], *, c_function: str | None = None
+    ) -> None:
         if not callable(function):
             raise ValueError(f"function = {function!r}: must be a function f(x, u)")
         listed = isinstance(names, Sequence) and not isinstance(names, str) and len(names) > 0
@@ -71,7 +78,12 @@ class Custom(Features):
             raise ValueError(f"names = {names!r}: must be a tuple with a name for each feature")
         if len(set(names)) < len(names):
             raise ValueError(f"names = {names!r}: must not repeat a name")
+        if c_function is not None and not (
+            isinstance(c_function, str) and c_function.isidentifier() and c_function.isascii()
+        ):
+            raise ValueError(f"c_function = {c_function!r}: must be the name of a function in C")
         self.function = function
+        self.c_function = c_function
         self.labels = tuple(names)
 
     def __repr__(self) -> str:
@@ -94,7 +106,9 @@ class Custom(Features):
                 f"function returns shape {returned}: must return a tuple of {count} numbers, one "
                 "for each of names"
             )
-        return CustomDesign(_machine_code(self.function, order, count).address)
+        address = _machine_code(self.function, order, count).address
+        set_origin(address, self.function, self.c_function)
+        return CustomDesign(address)
 
     def names(self, order: int) -> tuple[str, ...]:
         """Return ``names``."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -19,6 +19,26 @@ from numba.core import types as nb_types
 from numba.extending import intrinsic, overload
 
 POINTER = nb_types.CPointer(nb_types.float64)
+
+
+class Origin(NamedTuple):
+    """What the function at an address was made of."""
+
+    function: Callable[..., Any]
+    c_function: str | None  # name of the same function in C, if the user has one
+
+
+_origins: dict[int, Origin] = {}
+
+
+def set_origin(address: int, function: Callable[..., Any], c_function: str | None = None) -> None:
+    """Note what the function at an address was made of, for its translation to C."""
+    _origins[address] = Origin(function, c_function)
+
+
+def origin_of(address: Any) -> Origin | None:
+    """Return what the function at an address was made of; None for any other number."""
+    return _origins.get(address) if isinstance(address, int) else None
 
 
 def call(address: int, *arguments: Any) -> None:

@@ -245,6 +245,8 @@ class NonlinearPlant:
         if interpret or self._machine_code is None:
             return PythonNonlinear(self.f, self._output_function, step, substeps)
         rate, output = self._machine_code
+        function_pointers.set_origin(rate.address, self.f)
+        function_pointers.set_origin(output.address, self._output_function)
         return CompiledNonlinear(rate.address, output.address, step, substeps)
 
     def _chosen_substeps(self, dt: float) -> int:

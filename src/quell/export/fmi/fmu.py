@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.base import check_controller
-from quell.export.c_source import c_source
+from quell.export.controller_source import c_source
 from quell.export.fmi.binary import compiled, place
 from quell.export.fmi.description import build_description, model_description
 from quell.export.fmi.model import Model

@@ -169,8 +169,7 @@ class Model:
                 f"{name}_state controller;",
             ]
         if self.plant:
-            order = self.plant.order
-            lines += [f"double x[{order}];", f"double scratch[{6 * order}];"]
+            lines.append(f"{self.plant.source.name}_state plant;")
         return lines
 
     def _source(self) -> str:
@@ -192,7 +191,11 @@ class Model:
             ]
             tune = tuning_lines(self.controller)
             outputs += ["set_estimate(m);"]
-        begin += [f"m->x[{i}] = m->real[X0_{i + 1}];" for i in range(self._order)]
+        if self.plant:
+            name = self.plant.source.name
+            moved.append(f"m->plant.parameters = &{name}_default_parameters;")
+            reset.append(f"{name}_init(&m->plant);")
+        begin += [f"m->plant.x[{i}] = m->real[X0_{i + 1}];" for i in range(self._order)]
         sample += self._sample_lines()
         if self.plant:
             outputs += _plant_outputs(self.plant)
@@ -218,7 +221,7 @@ class Model:
         time_used = False
         y = "m->real[Y]"
         if self.plant and self.controller:
-            lines.append(f"const double y = {self.plant.source.name}_measure(m->x);")
+            lines.append(f"const double y = {self.plant.source.name}_measure(&m->plant);")
             y = "y + m->real[NOISE]"
         if self.controller:
             source, count = self.controller.source, self.controller.derivatives
@@ -231,9 +234,9 @@ class Model:
             y = f"{cast}({y})" if cast else y
             lines.append(f"m->real[U] = {source.name}_step({state}, {cast}m->real[R], {y});")
         if self.plant:
-            w = "&m->real[W_1]" if self.plant.disturbances else "NULL"
+            w = ", &m->real[W_1]" if self.plant.disturbances else ""
             name = self.plant.source.name
-            lines.append(f"{name}_advance(m->x, m->scratch, t, m->real[U], {w});")
+            lines.append(f"{name}_advance(&m->plant, t, m->real[U]{w});")
             time_used = True
         return lines if time_used else ["(void)t;", *lines]
 
@@ -244,8 +247,8 @@ def place(variable: Variable) -> str:
 
 
 def _plant_outputs(plant: PlantPart) -> list[str]:
-    lines = [f"m->real[Y] = {plant.source.name}_measure(m->x);"]
-    return [*lines, *(f"m->real[X_{i + 1}] = m->x[{i}];" for i in range(plant.order))]
+    lines = [f"m->real[Y] = {plant.source.name}_measure(&m->plant);"]
+    return [*lines, *(f"m->real[X_{i + 1}] = m->plant.x[{i}];" for i in range(plant.order))]
 
 
 def _estimate_function(controller: ControllerPart) -> str:

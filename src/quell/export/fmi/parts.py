@@ -8,7 +8,7 @@ from typing import Any
 
 from quell.controllers.limits import Limits
 from quell.controllers.single.single import SinglePrecision
-from quell.export.c_source import CSource
+from quell.export.c_files import CSource
 from quell.export.fmi.bandwidths import Bandwidths, bandwidths
 from quell.export.fmi.variables import INPUT, OUTPUT, TUNABLE, Variable, several
 
@@ -107,7 +107,7 @@ class ControllerPart:
 class PlantPart:
     """A plant in C, with the functions ``measure`` and ``advance``."""
 
-    source: Any  # PlantSource
+    source: CSource
     order: int
     disturbances: int
     x0: Sequence[float]

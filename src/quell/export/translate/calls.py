@@ -21,9 +21,9 @@ from quell.export.translate.values import (
     Value,
     join_numbers,
 )
-from quell.kernels import functions
+from quell.kernels import function_pointers, functions
 from quell.kernels.dispatch import interpreted, is_finite
-from quell.kernels.function_pointers import call as call_pointer
+from quell.kernels.function_pointers import origin_of
 from quell.kernels.scalars import clear
 
 # Functions of <math.h> with the name that they have in Python.
@@ -31,6 +31,7 @@ _SAME_NAME = (
     "sqrt sin cos tan tanh exp log log2 ceil floor copysign atan atan2 asin acos sinh cosh fabs "
     "hypot expm1 log1p"
 )
+_NUMPY = {"abs": "fabs", "absolute": "fabs", "arctan": "atan", "arctan2": "atan2"}
 _INTEGERS = frozenset({"ceil", "floor"})  # they return integers in Python
 
 
@@ -91,8 +92,14 @@ class Calls:
         code = ", ".join(argument.code for argument in arguments)
         return Value(kind, f"{name}({code})", ATOM, calls=any(a.calls for a in arguments))
 
-    def math_call(self, body: Expressions, name: str, arguments: list[Value]) -> Value:
-        """Return a call of a function of Python's ``math``."""
+    def math_call(
+        self, body: Expressions, name: str, arguments: list[Value], whole: bool = True
+    ) -> Value:
+        """Return a call of a function of Python's ``math``, or of NumPy's of the same name.
+
+        ``ceil`` and ``floor`` return whole numbers in Python, which NumPy's do not.
+        """
+        name = _NUMPY.get(name, name)
         if name not in _SAME_NAME.split():
             raise TranslationError(f"{body.where}: math.{name} can not be translated")
         if all(argument.is_constant for argument in arguments):
@@ -101,7 +108,7 @@ class Calls:
             return body.constant(getattr(math, name)(*(a.constant for a in arguments)))
         reals = [body.real(argument) for argument in arguments]
         found = self._call(Number.REAL, self.program.literals.math_function(name), *reals)
-        if name in _INTEGERS:
+        if whole and name in _INTEGERS:
             return self._call(Number.INT, self.helper("truncated"), found)
         return found
 
@@ -146,8 +153,9 @@ class Calls:
             return Value(Number.INT, f"memset({record.address}, 0, {size})", calls=True)
         if function is is_finite:
             return self._call(Number.BOOL, self.helper("is_finite"), body.real(arguments[0]))
-        if function is call_pointer:
-            return self._user_function(body, node, arguments)
+        if function in (function_pointers.call, function_pointers.evaluate):
+            returns = function is function_pointers.evaluate
+            return self._user_function(body, node, arguments, returns)
         if function is functions.is_single:
             return body.constant(self.program.literals.single)
         if function is functions.single:
@@ -175,5 +183,34 @@ class Calls:
             raise body.fail(node, f"{plain!r} is no function that can be translated")
         return plain, ""
 
-    def _user_function(self, body: Expressions, node: ast.Call, arguments: list[Value]) -> Value:
-        raise body.fail(node, "calls a function of the user by its address")
+    def _user_function(
+        self, body: Expressions, node: ast.Call, arguments: list[Value], returns: bool
+    ) -> Value:
+        """Return a call of a user's function, which its address stands for.
+
+        If it ``returns`` nothing, its last argument is the array for the numbers in its tuple.
+        """
+        origin = origin_of(arguments[0].constant)
+        if origin is None:
+            raise body.fail(node, "calls a function by its address")
+        given = arguments[1:]
+        if origin.c_function is not None:
+            return self._c_function(body, origin.c_function, given)
+        if returns:
+            found = self.program.function(origin.function, given)
+        else:
+            found = self.program.function(origin.function, given, into_array=True)
+        return found.call(body, given)
+
+    def _c_function(self, body: Expressions, name: str, given: list[Value]) -> Value:
+        """Return a call of a function that the user has in C."""
+        body.written.add(given[-1].root)
+        kinds = [self._c_parameter(value, value is given[-1]) for value in given]
+        self.program.externals[name] = f"void {name}({', '.join(kinds)});"
+        return Value(NOTHING, f"{name}({', '.join(value.code for value in given)})", calls=True)
+
+    def _c_parameter(self, value: Value, written: bool) -> str:
+        real = self.program.literals.real
+        if isinstance(value.kind, Array):
+            return f"{'' if written else 'const '}{real} *"
+        return real

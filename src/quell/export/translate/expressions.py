@@ -138,6 +138,10 @@ class Expressions:
             name = self.program.named_constant(node.id, number, self.module)
             kind = Number.INT if isinstance(number, int) else Number.REAL
             return Value(kind, name, constant=number)
+        if isinstance(value, tuple) and value and all(isinstance(v, int | float) for v in value):
+            numbers = tuple(map(float, value))
+            name = self.program.named_constant(node.id, numbers, self.module)
+            return Value(Array((len(numbers),), Number.REAL), name)
         raise self.fail(node, f"is {type(value).__name__}; only numbers can be constants")
 
     def _attribute(self, node: ast.Attribute) -> Value:
@@ -358,7 +362,8 @@ class Expressions:
         if isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Name):
             module = self.globals.get(node.func.value.id)
             if module is math or module is np:
-                return self.program.calls.math_call(self, node.func.attr, arguments)
+                whole = module is math
+                return self.program.calls.math_call(self, node.func.attr, arguments, whole)
         if isinstance(node.func, ast.Name):
             name = node.func.id
             function = self.globals.get(name)

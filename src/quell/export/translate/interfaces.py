@@ -18,6 +18,7 @@ class Translation(Protocol):
     calls: Any  # a ``Calls``
     helpers: set[str]
     results: dict[str, Struct]
+    externals: dict[str, str]  # declarations of functions that the user has in C
 
     def function(
         self,
@@ -25,8 +26,12 @@ class Translation(Protocol):
         arguments: list[Value],
         generic_name: str = "",
         hints: tuple[str, ...] = (),
+        into_array: bool = False,
     ) -> Any:
-        """Return the C function of a Python function for arguments like these."""
+        """Return the C function of a Python function for arguments like these.
+
+        With ``into_array`` the last of them is an array for the numbers that it returns.
+        """
 
     def has_function(self, name: str) -> bool:
         """Return whether a function has this name."""

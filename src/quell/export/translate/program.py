@@ -12,7 +12,13 @@ from quell.export.translate.functions import Function
 from quell.export.translate.layout import block_lines, comment_block, wrapped
 from quell.export.translate.literals import Literals
 from quell.export.translate.naming import function_name, snake_case, unique
-from quell.export.translate.source import local_names, module_doc, read_function
+from quell.export.translate.source import (
+    Source,
+    into_procedure,
+    local_names,
+    module_doc,
+    read_function,
+)
 from quell.export.translate.structs import Structs
 from quell.export.translate.values import Array, Kind, Struct, Value
 
@@ -66,6 +72,7 @@ class Program:
         self.calls = Calls(self)
         self.functions: list[Function] = []
         self.helpers: set[str] = set()
+        self.externals: dict[str, str] = {}  # declarations of functions that the user has in C
         self.results: dict[str, Struct] = {}  # structs of results by the name of the function
         self._found: dict[Any, Function] = {}
         self._names = set(_HELPERS)
@@ -77,26 +84,31 @@ class Program:
         arguments: list[Value],
         generic_name: str = "",
         hints: tuple[str, ...] = (),
+        into_array: bool = False,
     ) -> Function:
-        """Return the C function of a Python function for arguments like these."""
-        key = (python, *((a.kind, a.mutable and not a.is_number) for a in arguments))
+        """Return the C function of a Python function for arguments like these.
+
+        With ``into_array`` the last of them is an array for the numbers that it returns.
+        """
+        key = (python, into_array, *((a.kind, a.mutable and not a.is_number) for a in arguments))
         found = self._found.get(key)
         if found is None:
-            found = Function(self, read_function(python), arguments, hints)
+            source = read_function(python)
+            if into_array:
+                source = into_procedure(source)
+            found = Function(self, source, arguments, hints)
             self._found[key] = found
             if found.inline is None:
-                found.name = self._function_name(python, arguments, generic_name)
+                found.name = self._function_name(found.source, arguments, generic_name)
                 self.functions.append(found)
                 if found.result_members:
                     self.results[found.name] = Struct(f"{found.name}_result", tuple, False)
                     self._complete_results(found)
         return found
 
-    def _function_name(
-        self, python: Callable[..., Any], arguments: list[Value], generic_name: str
-    ) -> str:
-        name = function_name(generic_name or python.__name__)
-        if name in local_names(python.__module__):
+    def _function_name(self, source: Source, arguments: list[Value], generic_name: str) -> str:
+        name = function_name(generic_name or source.name)
+        if name in local_names(source.module):
             name = f"{name}_value"
         head = arguments[0].kind if arguments else None
         if name in self._names and isinstance(head, Struct):
@@ -158,15 +170,20 @@ class Program:
         self.helpers &= needed
         for name in [name for name in self._constants if name not in needed]:
             del self._constants[name]
+        externals = [self.externals[name] for name in self.externals if name in needed]
         constants = [line for each in self.constant_lines() for line in wrapped(each)]
-        return ["", *constants, *self.helper_lines(), *self.function_lines()]
+        return ["", *externals, *constants, *self.helper_lines(), *self.function_lines()]
 
     def constant_lines(self) -> list[str]:
         """Return the definitions of named constants."""
         lines = []
         for name, (value, module) in self._constants.items():
             comment = f" /* {module} */"
-            if isinstance(value, int) and not isinstance(value, bool):
+            if isinstance(value, tuple):
+                numbers = ", ".join(map(self.literals.write_real, value))
+                head = f"static const {self.literals.real} {name}[{len(value)}]"
+                lines.append(f"{head} = {{{numbers}}};{comment}")
+            elif isinstance(value, int) and not isinstance(value, bool):
                 lines.append(f"enum {{ {name} = {value} }};{comment}")
             else:
                 number = self.literals.write(value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import functools
 import inspect
 import io
@@ -12,7 +13,7 @@ import textwrap
 import tokenize
 import unicodedata
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from quell.export.translate.values import TranslationError
@@ -94,7 +95,10 @@ def read_function(function: Callable[..., Any]) -> Source:
 
     Raises ``TranslationError`` if there is none, for example in an interactive session.
     """
+    function = getattr(function, "py_func", function)
     name, module = function.__name__, function.__module__
+    if name == "<lambda>":
+        return _read_lambda(function)
     try:
         text = textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError):
@@ -104,10 +108,66 @@ def read_function(function: Callable[..., Any]) -> Source:
     if not isinstance(tree, ast.FunctionDef):
         rule = "must be written as a function with def"
         raise TranslationError(f"{module}.{name}: {rule}")
-    closure = inspect.getclosurevars(function).nonlocals
-    names = {**function.__globals__, **closure}
+    names = _names(function)
     doc = ascii_text(inspect.getdoc(function) or "")
     return Source(tree, _comments(text), doc, module, name, names)
+
+
+def _names(function: Any) -> dict[str, Any]:
+    return {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
+
+
+def _read_lambda(function: Any) -> Source:
+    """Return a lambda as a function with a return statement."""
+    where = f"the lambda in {function.__module__}"
+    try:
+        tree = ast.parse("".join(inspect.findsource(function)[0]))
+    except (OSError, SyntaxError):
+        tree = ast.Module([], [])
+    code = function.__code__
+    arguments = list(code.co_varnames[: code.co_argcount])
+    found = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Lambda)
+        and node.lineno == code.co_firstlineno
+        and [argument.arg for argument in node.args.args] == arguments
+    ]
+    if len(found) != 1:
+        raise TranslationError(f"{where} can't be found in its file; write it as a function")
+    body: list[ast.stmt] = [ast.Return(found[0].body)]
+    definition = ast.FunctionDef("user_function", found[0].args, body, [], None)
+    ast.fix_missing_locations(definition)
+    names = _names(function)
+    return Source(definition, Comments(), "", function.__module__, "user_function", names)
+
+
+def into_procedure(source: Source) -> Source:
+    """Return a function that writes the numbers of its tuple to an array, its last argument."""
+    tree = copy.deepcopy(source.tree)
+    tree.args.args.append(ast.arg("out"))
+    _Returns(f"{source.module}.{source.name}").visit(tree)
+    return replace(source, tree=ast.fix_missing_locations(tree))
+
+
+class _Returns(ast.NodeTransformer):
+    """Replacement of return statements by assignments to the array ``out``."""
+
+    def __init__(self, where: str) -> None:
+        self.where = where
+
+    def visit_Return(self, node: ast.Return) -> list[ast.stmt]:
+        value = node.value
+        is_array = isinstance(value, ast.Call) and getattr(value.func, "attr", "") == "array"
+        if is_array and isinstance(value, ast.Call):
+            value = value.args[0]
+        if not isinstance(value, ast.Tuple | ast.List):
+            raise TranslationError(f"{self.where}: must return a tuple of numbers, written as one")
+        lines: list[ast.stmt] = []
+        for i, number in enumerate(value.elts):
+            place = ast.Subscript(ast.Name("out", ast.Load()), ast.Constant(i), ast.Store())
+            lines.append(ast.copy_location(ast.Assign([place], number), node))
+        return [*lines, ast.copy_location(ast.Return(None), node)]
 
 
 @functools.cache

@@ -21,6 +21,7 @@ from quell.export.translate.values import (
     Value,
     is_empty,
 )
+from quell.kernels.function_pointers import origin_of
 from quell.kernels.scalars import Scalars
 from quell.kernels.sized import constant_fields
 
@@ -107,7 +108,8 @@ class Structs:
 
     def _named_tuple(self, value: Any, name: str) -> Struct:
         cls: Any = type(value)
-        constant = constant_fields(cls)
+        functions = [part for part in cls._fields if origin_of(getattr(value, part)) is not None]
+        constant = (*constant_fields(cls), *functions)
         kinds = {
             part: self.of(entry, f"{name}.{part}" if name else part)
             for part, entry in zip(value._fields, value, strict=True)

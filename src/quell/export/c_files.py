@@ -1,0 +1,188 @@
+"""A pair of C files around translated kernels: structs, public functions, default parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from quell.export.translate.initial import initial_lines
+from quell.export.translate.layout import comment_block, wrapped
+from quell.export.translate.program import Program
+from quell.export.translate.structs import arrays_of
+from quell.export.translate.values import Number, Struct, Value
+
+
+@dataclass(frozen=True)
+class CSource:
+    """The text of the two files.
+
+    Attributes
+    ----------
+    name
+        begins all public names, and the names of the files.
+    header, source
+        the text of ``name.h`` and ``name.c``.
+    precision
+        ``"double"`` or ``"single"``.
+    channels
+        names and widths of the estimate; none for a plant.
+    operations
+        names of the functions, without the prefix.
+    """
+
+    name: str
+    header: str
+    source: str
+    precision: str
+    channels: tuple[tuple[str, int], ...]
+    operations: tuple[str, ...]
+
+    @property
+    def real(self) -> str:
+        """The C type of real numbers."""
+        return "float" if self.precision == "single" else "double"
+
+
+class CFiles:
+    """Writer of the files for parameters and a state; ``varying``: see ``Structs``."""
+
+    def __init__(
+        self, name: str, parameters: Any, state: Any, varying: set[tuple[str, str]]
+    ) -> None:
+        self.name, self.parameters, self.state = name, parameters, state
+        precisions = {array.dtype for array in arrays_of(state) if array.dtype.kind == "f"}
+        self.single = np.dtype(np.float32) in precisions
+        self.program = Program(name, self.single, varying)
+        self.real = self.program.literals.real
+        structs = self.program.structs
+        design = structs.rename(_struct(structs.of(parameters)), f"{name}_parameters")
+        memory = structs.rename(_struct(structs.of(state)), f"{name}_state")
+        self.design = Value(design, "state->parameters", root="parameters")
+        self.memory = Value(memory, "state", root="state", mutable=True)
+        self.operations: list[str] = []
+        self.structs: list[str] = []  # further lines of the header, after the structs
+        self.enums: list[str] = []  # the same, before them
+        self._prototypes: list[str] = []
+        self._definitions: list[str] = []
+        self._tables: list[str] = []
+
+    @property
+    def both(self) -> tuple[Value, Value]:
+        """The first arguments of most kernels."""
+        return self.design, self.memory
+
+    def number(self, code: str) -> Value:
+        """Return a real number as an argument of a kernel."""
+        return Value(Number.REAL, code)
+
+    def call(self, kernel: Any, *arguments: Value) -> str:
+        """Return the code of a call of a kernel, or of the implementation for its arguments."""
+        head: Any = arguments[0].kind
+        table = getattr(kernel, "implementations", None)
+        function: Callable[..., Any] = kernel
+        if table is not None:
+            function = table.get(head.python) or table[object]
+        body = self.program.entry_expressions()
+        found = self.program.function(function, list(arguments), kernel.__name__)
+        value = found.call(body, list(arguments))
+        return value.code or "".join(body.pending)
+
+    def add(self, name: str, head: str, doc: str, *body: str) -> None:
+        """Add a public function; ``NAME`` in its head becomes its name."""
+        self.operations.append(name)
+        head = head.replace("NAME", f"{self.name}_{name}")
+        self._prototypes += ["", *comment_block(doc), *wrapped(f"{head};")]
+        self._definitions += ["", *wrapped(head), "{", *body, "}"]
+
+    def add_init(self) -> None:
+        """Add the function that sets the state before the first sample."""
+        self.add(
+            "init",
+            f"void NAME({self.name}_state *state)",
+            "Set the state before the first sample, with the default parameters.",
+            "    memset(state, 0, sizeof *state);",
+            f"    state->parameters = &{self.name}_default_parameters;",
+            *initial_lines(self.program.structs, self.memory, self.state, self._tables),
+        )
+
+    def write(
+        self, title: list[str], channels: tuple[tuple[str, int], ...], defines: list[str]
+    ) -> CSource:
+        """Return the files."""
+        source = self._source()
+        header = self._header(title, defines)
+        precision = "single" if self.single else "double"
+        return CSource(self.name, header, source, precision, channels, tuple(self.operations))
+
+    def _header(self, title: list[str], defines: list[str]) -> str:
+        name, upper, structs = self.name, self.name.upper(), self.program.structs
+        lines = [
+            *comment_block("\n".join(title)),
+            f"#ifndef {upper}_H",
+            f"#define {upper}_H",
+            "",
+            "#include <stdbool.h>",
+            "",
+            "#ifdef __cplusplus",
+            'extern "C" {',
+            "#endif",
+            "",
+            *defines,
+            "",
+            f"typedef {self.real} {name}_real;",
+            *self.enums,
+        ]
+        for layout in list(structs.layouts.values()):
+            if layout.members:
+                first = ""
+                if layout.struct == self.memory.kind:
+                    first = f"const {name}_parameters *parameters;"
+                lines += ["", *(line for each in structs.definition(layout.struct, first)
+                                for line in wrapped(each))]  # fmt: skip
+        lines += [*self.structs, ""]
+        lines += [f"extern const {name}_parameters {name}_default_parameters;"]
+        lines += [*self._prototypes, "", "#ifdef __cplusplus", "}", "#endif", "", "#endif", ""]
+        return "\n".join(lines)
+
+    def _source(self) -> str:
+        structs, name = self.program.structs, self.name
+        kernels = self.program.kernel_lines("\n".join(self._definitions))
+        structs.keep_used("\n".join([*kernels, *self._definitions]))
+        values = structs.initialiser(self.design.kind, self.parameters, 0)
+        lines = [
+            f'#include "{name}.h"',
+            "",
+            "#include <float.h>",
+            "#include <math.h>",
+            "#include <string.h>",
+            "",
+            "#ifdef __FAST_MATH__",
+            '#error "-ffast-math removes the tests for NaN and the compensated sums"',
+            "#endif",
+            *kernels,
+            "",
+            f"const {name}_parameters {name}_default_parameters =",
+            *(line for each in values for line in wrapped(each)),
+        ]
+        lines[-1] += ";"
+        for table in self._tables:
+            lines += ["", *wrapped(table)]
+        return "\n".join([*lines, *self._definitions, ""])
+
+
+def _struct(kind: Any) -> Struct:
+    if not isinstance(kind, Struct):
+        raise TypeError
+    return kind
+
+
+def translated(write: Callable[[set[tuple[str, str]]], tuple[CFiles, CSource]]) -> CSource:
+    """Return the files that ``write`` makes, when it knows all numbers of the state that change."""
+    varying: set[tuple[str, str]] = set()
+    while True:
+        files, source = write(varying)
+        if not files.program.structs.found_varying:
+            return source
