@@ -8,7 +8,9 @@ import shutil
 import subprocess
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -94,3 +96,59 @@ def packed(path: Path, files: dict[str, bytes]) -> Path:
         for name, content in files.items():
             archive.writestr(name, content)
     return path
+
+
+class Driven:
+    """An instance of an FMU of FMI 3.0 that FMPy calls, with its variables by name."""
+
+    def __init__(self, path: Path, folder: Path) -> None:
+        import fmpy
+        from fmpy.fmi3 import FMU3Slave
+
+        self.description = fmpy.read_model_description(str(path))
+        self.references = {v.name: v.valueReference for v in self.description.modelVariables}
+        self.messages: list[str] = []
+        self.fmu = FMU3Slave(
+            guid=self.description.guid,
+            unzipDirectory=fmpy.extract(str(path), str(folder)),
+            modelIdentifier=self.description.coSimulation.modelIdentifier,
+            instanceName="driven",
+        )
+        self.instantiate()
+
+    def instantiate(self) -> None:
+        """Make the instance, which has not begun its initialisation."""
+
+        def note(environment: Any, status: int, category: bytes, message: bytes) -> None:
+            self.messages.append(message.decode())
+
+        self.fmu.instantiate(logMessage=note)
+        self.time = 0.0
+
+    def begin(self, **start: float) -> Driven:
+        """Set start values and go through the initialisation."""
+        self.set(start)
+        self.fmu.enterInitializationMode(startTime=0.0)
+        self.fmu.exitInitializationMode()
+        return self
+
+    def set(self, values: Mapping[str, float]) -> None:
+        """Set variables by name."""
+        self.fmu.setFloat64([self.references[name] for name in values], [*values.values()])
+
+    def get(self, name: str) -> float:
+        """Return a variable."""
+        whole = name in ("status", "reason")
+        read = self.fmu.getInt32 if whole else self.fmu.getFloat64
+        return float(read([self.references[name]])[0])
+
+    def step(self, length: float, **inputs: float) -> float:
+        """Set inputs, advance by a communication step [s], and return the first output."""
+        self.set(inputs)
+        self.fmu.doStep(self.time, length)
+        self.time += length
+        return self.get("u" if "u" not in inputs else "y")
+
+    def free(self) -> None:
+        """Free the instance."""
+        self.fmu.fmi3FreeInstance(self.fmu.component)
