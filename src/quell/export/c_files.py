@@ -11,7 +11,7 @@ import numpy as np
 from quell.export.translate.initial import initial_lines
 from quell.export.translate.layout import comment_block, wrapped
 from quell.export.translate.program import Program
-from quell.export.translate.structs import arrays_of
+from quell.export.translate.structs import Varying, arrays_of
 from quell.export.translate.values import Number, Struct, Value
 
 
@@ -49,9 +49,7 @@ class CSource:
 class CFiles:
     """Writer of the files for parameters and a state; ``varying``: see ``Structs``."""
 
-    def __init__(
-        self, name: str, parameters: Any, state: Any, varying: set[tuple[str, str]]
-    ) -> None:
+    def __init__(self, name: str, parameters: Any, state: Any, varying: Varying) -> None:
         self.name, self.parameters, self.state = name, parameters, state
         precisions = {array.dtype for array in arrays_of(state) if array.dtype.kind == "f"}
         self.single = np.dtype(np.float32) in precisions
@@ -179,9 +177,9 @@ def _struct(kind: Any) -> Struct:
     return kind
 
 
-def translated(write: Callable[[set[tuple[str, str]]], tuple[CFiles, CSource]]) -> CSource:
+def translated(write: Callable[[Varying], tuple[CFiles, CSource]]) -> CSource:
     """Return the files that ``write`` makes, when it knows all numbers of the state that change."""
-    varying: set[tuple[str, str]] = set()
+    varying: Varying = {}
     while True:
         files, source = write(varying)
         if not files.program.structs.found_varying:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.export.c_files import CFiles, CSource, translated
+from quell.export.translate.structs import Varying
 from quell.export.translate.values import Array, Number, TranslationError, Value
 from quell.plants.base import Plant, advance, measure
 from quell.types import Vector
@@ -45,7 +46,7 @@ def plant_source(plant: Plant, dt: float, name: str = "plant", x0: Any = None) -
         raise TranslationError(f"{plant.name}: it calls Python at each sample, which C can not")
     parameters = plant.sampled(dt)
 
-    def write(varying: set[tuple[str, str]]) -> tuple[CFiles, CSource]:
+    def write(varying: Varying) -> tuple[CFiles, CSource]:
         x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=np.float64)
         state = PlantState(x, np.zeros(6 * plant.order))
         files = CFiles(name, parameters, state, varying)

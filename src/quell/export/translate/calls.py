@@ -13,7 +13,6 @@ from quell.export.translate.values import (
     ATOM,
     NOTHING,
     SUM,
-    UNKNOWN,
     Array,
     Number,
     Struct,
@@ -144,8 +143,8 @@ class Calls:
             record = arguments[0]
             for field in self.program.structs.layouts[record.kind.name].members:
                 place = self.program.structs.field(record, field)
-                if place is not None and place.constant not in (0, UNKNOWN):
-                    self.program.structs.vary((record.kind.name, field))
+                if place is not None and place.is_constant and place.constant != 0:
+                    self.program.structs.vary((record.kind.name, field), Number.BOOL)
             if not self.program.structs.fields_of(record.kind):
                 return Value(NOTHING)
             body.written.add(record.root)

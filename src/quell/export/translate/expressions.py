@@ -289,12 +289,35 @@ class Expressions:
             if one.is_constant and other.is_constant:
                 part = self.constant(function(one.constant, other.constant))
             else:
+                flag = self._flag(text, one, other)
+                if flag is not None:
+                    found = self._and(found, flag)
+                    continue
                 if join(one.kind, other.kind, self.where) is Number.REAL:
-                    one, other = self.real(one), self.real(other)
+                    one, other = self._as_integers(one, other)
                 code = f"{one.at(level + 1)} {text} {other.at(level + 1)}"
                 part = Value(Number.BOOL, code, level, calls=one.calls or other.calls)
             found = self._and(found, part)
         return found
+
+    def _flag(self, sign: str, one: Value, other: Value) -> Value | None:
+        """Return the comparison of a truth value with 0 or 1 as the truth value, or not it."""
+        if one.kind is not Number.BOOL or other.constant not in (0, 1) or sign not in ("==", "!="):
+            return None
+        if (sign == "==") == bool(other.constant):
+            return one
+        return Value(Number.BOOL, f"!{one.at(UNARY)}", UNARY, calls=one.calls)
+
+    def _as_integers(self, one: Value, other: Value) -> tuple[Value, Value]:
+        """Return two numbers of one kind: integers if one is, and the other is a whole constant."""
+        pair = (one, other)
+        for i in (0, 1):
+            constant = pair[i].constant
+            is_whole = isinstance(constant, float) and constant.is_integer()
+            if pair[1 - i].kind is Number.INT and is_whole and abs(constant) < 2**15:
+                number = self.constant(int(constant))
+                return (number, other) if i == 0 else (one, number)
+        return self.real(one), self.real(other)
 
     def _and(self, one: Value, other: Value) -> Value:
         if one.is_constant:
@@ -341,8 +364,11 @@ class Expressions:
             return one
         kind = join_numbers(one, other, self.where)
         one, other = self.as_kind(one, kind), self.as_kind(other, kind)
+        is_flag = one.is_constant and other.is_constant and (one.constant, other.constant) == (1, 0)
+        whole = test if is_flag and test.kind is Number.BOOL else None
         code = f"{test.at(TERNARY + 1)} ? {one.at(TERNARY + 1)} : {other.at(TERNARY)}"
-        return Value(kind, code, TERNARY, calls=test.calls or one.calls or other.calls)
+        calls = test.calls or one.calls or other.calls
+        return Value(kind, code, TERNARY, calls=calls, whole=whole)
 
     def _tuple(self, node: ast.Tuple) -> Value:
         items = tuple(self.translate(part) for part in node.elts)

@@ -19,7 +19,7 @@ from quell.export.translate.source import (
     module_doc,
     read_function,
 )
-from quell.export.translate.structs import Structs
+from quell.export.translate.structs import Structs, Varying
 from quell.export.translate.values import Array, Kind, Struct, Value
 
 # Helper functions in C; "real" stands for float or double, "" for the suffix of functions.
@@ -66,7 +66,7 @@ class Program:
         numbers of the state that change, see ``Structs``.
     """
 
-    def __init__(self, prefix: str, single: bool, varying: set[tuple[str, str]]) -> None:
+    def __init__(self, prefix: str, single: bool, varying: Varying) -> None:
         self.literals = Literals(single)
         self.structs = Structs(prefix, self.literals, varying)
         self.calls = Calls(self)

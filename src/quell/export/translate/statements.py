@@ -18,6 +18,7 @@ from quell.export.translate.expressions import Expressions
 from quell.export.translate.interfaces import Translation
 from quell.export.translate.naming import identifier
 from quell.export.translate.source import Source
+from quell.export.translate.structs import whole_kind
 from quell.export.translate.values import (
     NOTHING,
     SHIFT,
@@ -244,10 +245,12 @@ class Body(Expressions):
             return
         place = self.translate(target)
         if place.member is not None:
-            same = value.is_constant and float(value.constant) == float(place.constant)
+            same = value.is_constant and float(value.constant) == place.constant
             if not same:
-                self.program.structs.vary(place.member)
-            return
+                value = whole(value)
+                self.program.structs.vary(place.member, needed_kind(value))
+            if place.is_constant:
+                return
         self._check_place(target, place)
         value = self._fitting(place.kind, value, node)
         self.written.add(place.root)
@@ -262,7 +265,14 @@ class Body(Expressions):
     def _fitting(self, kind: Any, value: Value, node: ast.AST) -> Value:
         if kind is Number.REAL:
             return self.real(value)
-        if value.kind is Number.REAL or not value.is_number:
+        value = whole(value)
+        if kind is Number.BOOL and value.is_constant:
+            return self.constant(bool(value.constant))
+        if kind is Number.INT and value.is_constant:
+            return self.constant(int(value.constant))
+        if not value.is_number or needed_kind(value).value > kind.value:
+            if self.program.structs.found_varying:
+                return value  # the program will be translated again
             raise self.fail(node, "a real number is assigned to an integer")
         return value
 
@@ -283,8 +293,9 @@ class Body(Expressions):
         else:
             place = self.translate(node.target)
             if place.member is not None:
-                self.program.structs.vary(place.member)
-                return
+                self.program.structs.vary(place.member, Number.REAL)
+                if place.is_constant:
+                    return
             self._check_place(node.target, place)
             self.written.add(place.root)
             found = self.operation(node, node.op, place, value)
@@ -351,6 +362,18 @@ class Body(Expressions):
             self.local[name] = replace(value, kind=joined)
         self.names[name] = Value(joined, variable)
         block.append(Line(value.code, variable, calls=value.calls))
+
+
+def whole(value: Value) -> Value:
+    """Return a value as a truth value if it is one that was made real."""
+    return value.whole if value.whole is not None else value
+
+
+def needed_kind(value: Value) -> Number:
+    """Return the kind of number that can hold a value."""
+    if value.is_constant:
+        return whole_kind(value.constant)
+    return value.kind if isinstance(value.kind, Number) else Number.REAL
 
 
 def same_constant(one: Value, other: Value) -> bool:

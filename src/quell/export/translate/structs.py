@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from quell.export.translate.values import (
 from quell.kernels.function_pointers import origin_of
 from quell.kernels.scalars import Scalars
 from quell.kernels.sized import constant_fields
+
+Varying: TypeAlias = dict[tuple[str, str], Number]
+"""Kinds of the numbers of a state that change, by struct and field."""
 
 # Name of the union of arrays that lie in the same memory.
 _SHARED = "shared"
@@ -44,9 +47,10 @@ class Layout:
 class Structs:
     """All structs of a program.
 
-    A number in the state that is only ever set to its initial value is a constant, and does not
-    exist in C. That is assumed for all numbers that are not in ``varying``; where something else is
-    assigned, the number is added there, and the program has to be translated again.
+    A number in a record of the state that is only ever set to its initial value is a constant, and
+    does not exist in C; one that is only ever 0 or 1 is a ``bool``, one that only gets integers an
+    ``int``. That is assumed until something else is assigned; then ``varying`` gets the number
+    with the kind that it needs, and the program has to be translated again.
 
     Parameters
     ----------
@@ -55,10 +59,10 @@ class Structs:
     literals
         writer of numbers.
     varying
-        struct and field of each number that is known to change.
+        kind of each number that is known to change, by its struct and field.
     """
 
-    def __init__(self, prefix: str, literals: Literals, varying: set[tuple[str, str]]) -> None:
+    def __init__(self, prefix: str, literals: Literals, varying: Varying) -> None:
         self.prefix = prefix
         self.literals = literals
         self.varying = varying
@@ -103,7 +107,7 @@ class Structs:
         for member in self.layouts[found.name].members:
             number = array[0][member].item()
             if self._initial.setdefault((found.name, member), number) != number:
-                self.vary((found.name, member))
+                self.vary((found.name, member), whole_kind(number))
         return found
 
     def _named_tuple(self, value: Any, name: str) -> Struct:
@@ -151,12 +155,19 @@ class Structs:
             initial = self._initial[member]
             return Value(kind, self.literals.write(initial), constant=initial, member=member)
         code = f"{owner.code}{'->' if owner.pointer else '.'}{path}{identifier(name)}"
-        return Value(kind, code, root=owner.root, mutable=owner.mutable, pointer=False)
+        kind = self.varying.get(member, kind)
+        chosen = member if member in self.varying else None
+        return Value(
+            kind, code, root=owner.root, mutable=owner.mutable, pointer=False, member=chosen
+        )
 
-    def vary(self, member: tuple[str, str]) -> None:
-        """Note that a number of the state changes."""
-        if member not in self.varying:
-            self.varying.add(member)
+    def vary(self, member: tuple[str, str], kind: Number) -> None:
+        """Note that a number of the state gets another value, of a kind."""
+        initial = whole_kind(self._initial[member])
+        known = self.varying.get(member, Number.BOOL)
+        needed = max(initial, kind, known, key=lambda number: number.value)
+        if self.varying.get(member) is not needed:
+            self.varying[member] = needed
             self.found_varying = True
 
     def fields_of(self, struct: Struct) -> list[str]:
@@ -173,7 +184,7 @@ class Structs:
                 constant = (name, part) in self._initial and (name, part) not in self.varying
                 empty = isinstance(kind, Struct) and not self.layouts[kind.name].members
                 if identifier(part) in used and not constant and not empty:
-                    kept[part] = kind
+                    kept[part] = self.varying.get((name, part), kind)
             layout.members = kept
 
     def rename(self, struct: Struct, name: str) -> Struct:
@@ -239,6 +250,13 @@ class Structs:
             self._braced(entry) if isinstance(entry, np.ndarray) else self.literals.write(entry)
             for entry in array
         ) + "}"  # fmt: skip
+
+
+def whole_kind(value: float) -> Number:
+    """Return the kind that a number needs: of a truth value, an integer, or a real number."""
+    if value in (0.0, 1.0):
+        return Number.BOOL
+    return Number.INT if float(value).is_integer() and abs(value) < 2**15 else Number.REAL
 
 
 def _comma_before_comment(lines: list[str]) -> list[str]:

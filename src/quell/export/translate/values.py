@@ -96,7 +96,8 @@ class Value:
     pointer: bool = True  # whether the code of a struct is a pointer to it
     items: tuple[Any, ...] = ()
     calls: bool = False  # whether a function is called
-    member: tuple[str, str] | None = None  # struct and field that were constant so far
+    member: tuple[str, str] | None = None  # struct and field of a number whose kind is assumed
+    whole: Any = None  # for 1.0 or 0.0 by a condition: the condition
 
     @property
     def is_constant(self) -> bool:
@@ -119,7 +120,9 @@ class Value:
 
     def named(self, code: str) -> Value:
         """Return the value that a local variable ``code`` has after it was set to this one."""
-        return replace(self, code=code, level=ATOM, constant=UNKNOWN, pointer=True, calls=False)
+        return replace(
+            self, code=code, level=ATOM, constant=UNKNOWN, pointer=True, calls=False, member=None
+        )
 
 
 def is_empty(value: Value) -> bool:
