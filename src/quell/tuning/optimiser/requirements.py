@@ -66,10 +66,14 @@ def sizes(kind: str, P: Complex, C: Complex) -> NDArray[np.float64]:
 
 def worst_ratio(bounds: tuple[Bound, ...], plants: PlantSet, C: Complex) -> Vector:
     """Return the largest ratio (m,) on the grid, for controllers (m, G)."""
-    worst = np.zeros(C.shape[0])
-    for kind, limit in bounds:
-        for j in range(plants.P.shape[0]):
-            worst = np.maximum(worst, np.max(sizes(kind, plants.P[j], C), axis=1) / limit)
+    worst, gain = np.zeros(C.shape[0]), np.abs(C)
+    for P in plants.P:
+        L = P * C
+        with np.errstate(divide="ignore", invalid="ignore"):
+            S = 1.0 / np.abs(1.0 + L)
+            size = {"M_s": S, "M_t": np.abs(P) * gain * S, "M_ks": gain * S}
+        for kind, limit in bounds:
+            worst = np.maximum(worst, np.max(size[kind], axis=1) / limit)
     return worst
 
 
@@ -100,10 +104,10 @@ def slack_and_slope(
             "M_t": (P * here * S, S**2 * P),
             "M_ks": (here * S, S**2),
         }[kind]
-        square = np.abs(X) ** 2 / limit**2
-        rise = 2.0 * np.real(np.conj(X) * slope * change) / limit**2
+        square = (X.real**2 + X.imag**2) / limit**2
         values[mine] = 1.0 - np.log1p(square) / math.log(2.0)
-        slopes[mine] = (-rise / (1.0 + square) / math.log(2.0)).T
+        weight = np.conj(X) * slope * (-2.0 / math.log(2.0) / limit**2) / (1.0 + square)
+        slopes[mine] = (weight.real * change.real - weight.imag * change.imag).T
     return values, slopes
 
 

@@ -56,14 +56,14 @@ def best_solution(
 ) -> Solution | None:
     """Return the best solution from several starts; None if no start is stable.
 
-    All of them take some rounds, the best go on until they settle. ``more`` (k, p) are values to
-    start from besides those of the structure.
+    All of them take some rounds, the best go on until they settle, the winner until its parameters
+    do. ``more`` (k, p) are values to start from besides those of the structure.
     """
     if more is None:
         more = np.zeros((0, len(structure.parameters)))
     found = []
     for start in starts(problem, structure, more, _STARTS):
-        solution = search(problem, structure, start, _FIRST_ROUNDS)
+        solution = search(problem, structure, start, _FIRST_ROUNDS, roughly=True)
         if solution is not None:
             found.append(solution)
     found.sort(key=lambda solution: _merit(solution.cost, solution.violation))
@@ -73,9 +73,13 @@ def best_solution(
             break
         near = (np.max(np.abs(np.log(solution.values / end.values))) < 0.02 for end in ends)
         if not any(near):
-            end = search(problem, structure, solution.values, _ROUNDS)
+            end = search(problem, structure, solution.values, _ROUNDS, roughly=True)
             ends.append(solution if end is None else end)
-    return min(ends, key=_rank, default=None)
+    best = min(ends, key=_rank, default=None)
+    if best is None or not _is_precise(problem, structure):
+        return best
+    end = search(problem, structure, best.values, _ROUNDS)
+    return best if end is None or (best.feasible and not end.feasible) else end
 
 
 def _is_precise(problem: Problem, structure: Structure) -> bool:
@@ -93,27 +97,33 @@ def _merit(cost: float, violation: float) -> float:
     return cost + _EXCESS * violation
 
 
-def search(problem: Problem, structure: Structure, start: Vector, rounds: int) -> Solution | None:
-    """Return the optimum that is reached from a start; None if all rounds end unstable."""
+def search(
+    problem: Problem, structure: Structure, start: Vector, rounds: int, roughly: bool = False
+) -> Solution | None:
+    """Return the optimum that is reached from a start; None if all rounds end unstable.
+
+    ``roughly`` ends when the objective settles, even if there are few parameters.
+    """
     low, high = (np.log(limit) for limit in limits(structure))
     x, box = np.clip(np.log(start), low, high), _BOX
     best: tuple[float, float, Vector] | None = None
     extra_points: list[tuple[int, int, float]] = []
-    last, few = math.inf, _is_precise(problem, structure)
+    last, few = math.inf, not roughly and _is_precise(problem, structure)
     settled = _SETTLED_OF_FEW if few else _SETTLED
     allowed = _SETTLED_OF_FEW if few else _VIOLATION
     for i in range(rounds):
         cost, violation, refined = _judged(problem, structure, x)
         if best is None or _merit(cost, violation) < _merit(*best[:2]):
             best = (cost, violation, x)
-        if violation <= allowed and abs(last - cost) < settled:
+        if i == rounds - 1 or (violation <= allowed and abs(last - cost) < settled):
             break
         last = cost
         extra_points = (extra_points + refined)[-400:]
         near = _NEAR if i < _EARLY_ROUNDS else _NEARER
         points = _points(problem, structure, x, extra_points, near)
         bounds = list(zip(np.maximum(low, x - box), np.minimum(high, x + box), strict=True))
-        after = _quadratic_programming(problem, structure, x, points, bounds)
+        tolerance = _TOLERANCE_OF_FEW if few else _TOLERANCE
+        after = _quadratic_programming(problem, structure, x, points, bounds, tolerance)
         if after is None or not _stable(problem, structure, after):
             box *= _SHRINK
             if box < 1e-3:
@@ -182,12 +192,16 @@ def _points(
 
 
 def _quadratic_programming(
-    problem: Problem, structure: Structure, x: Vector, points: Points, bounds: list[Any]
+    problem: Problem,
+    structure: Structure,
+    x: Vector,
+    points: Points,
+    bounds: list[Any],
+    tolerance: float,
 ) -> Vector | None:
     from scipy.optimize import minimize
 
     size = x.size
-    tolerance = _TOLERANCE_OF_FEW if _is_precise(problem, structure) else _TOLERANCE
     steps = np.vstack([np.zeros(size), _DIFFERENCE * np.eye(size)])
     memo: dict[bytes, Any] = {}
 

@@ -10,6 +10,9 @@ and with ``ζ = z − 1``, ``Δ = Φ − I`` nothing is a small difference of la
 
     z I − (I − L c) (Φ − z^(−d) Γ K) = ζ I + L c − (I − L c) (Δ − z^(−d) Γ K)
 
+L follows from Ackermann's formula, ``L = π(−Δ) O⁻¹ e_N`` but for signs, with π the polynomial with
+the roots ``1 − z_i`` and O the observability matrix: it is linear in the coefficients of π.
+
 C_y has a pole at z = 1. With v and w the right and left null vectors of that matrix M at ζ = 0, its
 residue is ``K v · w L / (w M'(0) v)``, from which the integral gain follows. All is in coordinates
 ``x_i/ω^(i−1)``, ``f/ω^q`` with ω the geometric mean of the observer's poles; then C_y is
@@ -39,6 +42,7 @@ class SampledChain(NamedTuple):
 
     difference: Matrix  # Φ − I (N, N)
     input: Vector  # Γ for b0 = 1 and u in units of dt^−r (N,)
+    placing: Matrix  # Δ^j O⁻¹ e_N in row N − j (N + 1, N)
     power: Vector  # 0 … n − 1, q
     cancel: Vector  # (n,)
     cancel_f: float
@@ -58,7 +62,21 @@ def sampled_chain(plant: Canonical, dt: float) -> SampledChain:
     cancel = plant.a if plant.degree == n else -np.eye(n)[plant.degree]
     power = np.append(np.arange(float(n)), float(q))
     matched = 1.0 if plant.matched else 0.0
-    return SampledChain(difference, gamma[:, 0], power, cancel, matched, plant.degree, dt)
+    return SampledChain(
+        difference, gamma[:, 0], _placing(difference), power, cancel, matched, plant.degree, dt
+    )
+
+
+def _placing(difference: Matrix) -> Matrix:
+    """Return what places poles: L is a combination of its rows (Ackermann's formula)."""
+    size = difference.shape[0]
+    rows = [difference[0] + np.eye(size)[0]]
+    for _ in range(size - 1):
+        rows.append(rows[-1] @ difference)
+    found = [np.linalg.solve(np.array(rows), np.eye(size)[-1])]
+    for _ in range(size):
+        found.append(difference @ found[-1])
+    return np.array(found[::-1])
 
 
 class Designs(NamedTuple):
@@ -94,7 +112,7 @@ def designs(
     offsets = -np.expm1(poles * chain.dt)
     if reduced:
         offsets = np.hstack([offsets, np.ones((count, 1))])
-    gain = _placed(difference, offsets)
+    gain = monic(-offsets) @ chain.placing * step[:, None] ** -power
     if reduced:
         gain[:, 0] = 1.0
     if half_gain:
@@ -115,31 +133,17 @@ def designs(
 
 def coefficients(roots: NDArray[np.complex128]) -> Matrix:
     """Return ``c_0 … c_(n−1)`` (m, n) of the polynomials ``s^n + … + c_1 s + c_0`` with roots."""
+    return np.ascontiguousarray(monic(roots)[:, :0:-1])
+
+
+def monic(roots: NDArray[np.complex128]) -> Matrix:
+    """Return the coefficients (m, n + 1), highest power first, of the polynomials with roots."""
     count, size = roots.shape
     found = np.zeros((count, size + 1), dtype=complex)
     found[:, 0] = 1.0
     for i in range(size):
         found[:, 1 : i + 2] -= roots[:, i : i + 1] * found[:, : i + 1]
-    return np.ascontiguousarray(found[:, :0:-1].real)
-
-
-def _placed(difference: Stack, offsets: NDArray[np.complex128]) -> Matrix:
-    """Return L (m, N) as ``observers.placement.place_poles`` does, for many designs."""
-    count, size, _ = difference.shape
-    unit = np.max(np.abs(offsets), axis=1)
-    rate = difference / unit[:, None, None]
-    rows = np.empty_like(difference)
-    rows[:, 0] = difference[:, 0]
-    rows[:, 0, 0] += 1.0
-    for i in range(1, size):
-        rows[:, i] = np.matmul(rows[:, i - 1, None], rate)[:, 0]
-    last = np.zeros((count, size, 1))
-    last[:, -1] = 1.0
-    vector = np.linalg.solve(rows, last).astype(complex)
-    for i in range(offsets.shape[1]):
-        vector = rate @ vector + (offsets[:, i] / unit)[:, None, None] * vector
-    gain: Matrix = unit[:, None] * vector[:, :, 0].real
-    return gain
+    return np.ascontiguousarray(found.real)
 
 
 def feedback(found: Designs, omega: Vector) -> Complex:
