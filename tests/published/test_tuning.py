@@ -2,8 +2,12 @@
 
 The values of two plants are those of Åström, Panagopoulos & Hägglund, "Design of PI controllers
 based on non-convex optimization", *Automatica* 34, 1998. For 1/(s+1)⁴ the optimum is found here,
-in continuous time. It is flat: K = 0.438, T_i = 2.28 has M_s = 1.4004 and the k_i of that within
-0.01 %, although both numbers are 1.2 % from the optimum.
+in continuous time: K = 0.4327, T_i = 2.254. It is flat: from T_i = 2.20 to 2.30 the best k_i changes
+by 0.04 %. K = 0.438, T_i = 2.28 has M_s = 1.4004 and a k_i that is 0.07 % larger, although both
+numbers are 1.2 % from the optimum. It is no optimum for that M_s either, which is K = 0.4329, T_i =
+2.253, nor for the integral of |y|, which has the same optimum. Such values come from a search that
+takes M_s as the largest value on a coarse grid: with 200 to 1000 frequencies over four to six
+decades the optimum moves between T_i = 2.20 and 2.27.
 """
 
 from __future__ import annotations
