@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from quell.setup import load
+from quell.tuning import STRUCTURES
 from tests.commands import Shown, in_this_process
 
 LAGS = ("tune", "--num", "1", "--den", "1,3,3,1", "--dt", "0.02", "--structure", "pi")
@@ -65,6 +66,13 @@ def test_a_setup_with_ranges_is_tuned_for_them(quell: object, tmp_path: Path) ->
     setup = load(out)
     assert setup.description.plant.uncertain == {"k": (0.9, 1.1)}
     assert setup.controller.observer.order == 4
+
+
+def test_the_help_names_all_structures(quell: object) -> None:
+    """As the registry has them."""
+    shown: Shown = quell("tune", "--help")  # type: ignore[operator]
+    words = shown.out.replace(",", " ").replace(";", " ").split()
+    assert set(STRUCTURES) <= set(words)
 
 
 @pytest.mark.parametrize(

@@ -133,6 +133,15 @@ def test_the_example_is_the_python_of_the_first_example() -> None:
             "plant.delay = 0.015 s with dt = 0.01 s: must be a whole number",
         ),
         (
+            "[plant]\nkind = 'two-mass'\nuncertain = { m1 = [0.6, 1.4], mass = [0.5, 2.0] }",
+            "plant.uncertain: plant.mass: unknown; must be one of m1, m2, k",
+        ),
+        (
+            "plant = {kind = 'delayed', plant = 'two-mass', delay = 0.02, "
+            "uncertain = {'plant.k2' = [0.5, 2.0]}}",
+            "plant.uncertain: plant.plant.k2: unknown; did you mean k?",
+        ),
+        (
             "[controller]\nkind = 'pid'\nkp = 1.0",
             "observer: a controller of the kind pid does not use it",
         ),

@@ -22,7 +22,6 @@ from quell.setup import SetupError, made, varied
 from quell.setup.description import read
 from quell.setup.sweep import sweep_of
 from quell.sweeping import Measure, Normal, Plan, Range, Sweep, sweep
-from quell.sweeping.figures import wilson
 
 from .commands import Shown
 from .setups import TWO_MASS
@@ -372,15 +371,6 @@ def test_ranges_without_values_are_refused(change: dict[str, Any]) -> None:
     """The error names the argument."""
     with pytest.raises(ValueError, match=next(iter(change))):
         Range(**{"low": 0.5, "high": 1.0, **change})
-
-
-def test_the_interval_of_a_failure_rate_is_that_of_scipy() -> None:
-    """Wilson's, of 95 %."""
-    from scipy.stats import binomtest
-
-    for failures, runs in ((0, 10), (3, 10), (220, 1000)):
-        expected = binomtest(failures, runs).proportion_ci(0.95, "wilson")
-        assert wilson(failures, runs) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
 
 def test_a_setup_in_a_sweep_is_the_one_with_these_values(tmp_path: Path) -> None:

@@ -252,6 +252,17 @@ def test_a_result_is_drawn_beside_its_references(tuned: ql.Tuned) -> None:
     assert "pid" in labels[2]
 
 
+def test_the_bode_diagram_has_the_phase_of_the_margin(tuned: ql.Tuned) -> None:
+    """At the frequency where |L| is 1, on an axis at the right; the chosen design comes first."""
+    bode = np.ravel(tuned.plot())[0]
+    (phase,) = [axis for axis in bode.figure.axes if axis.get_ylabel() == "phase [°]"]
+    omega, degrees = phase.lines[0].get_data()
+    margins = tuned.analysis.margins
+    at = np.interp(np.log(margins.phase_omega), np.log(omega), degrees)
+    assert at == pytest.approx(-180.0 + margins.phase, abs=0.5)
+    assert degrees[0] == pytest.approx(-90.0, abs=0.1)
+
+
 # ---- bad input
 
 

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
+from scipy.stats import binom
 
 import quell as ql
 from quell.cli.app import app
 from quell.setup import load
+from quell.sweeping.shares import share_interval
 from quell.tuning.simulated import (
     FailureRate,
     Mean,
@@ -26,7 +27,7 @@ from quell.tuning.simulated import (
     Worst,
     search,
 )
-from quell.tuning.simulated.statistics import Statistic, share_interval
+from quell.tuning.simulated.statistics import Statistic
 from quell.types import Matrix
 
 pytest.importorskip("optuna")
@@ -89,10 +90,14 @@ def test_a_confidence_interval_covers_the_truth_as_often_as_it_says(
 
 
 def test_the_interval_of_a_share_is_that_of_clopper_and_pearson() -> None:
-    """As scipy computes it by another way, none and all found included."""
+    """At each end so many or so few are found in 2.5 % of all cases; of nothing it is all."""
     for found, count in ((0, 20), (3, 20), (20, 20), (411, 4000)):
-        exact = binomtest(found, count).proportion_ci(0.95, method="exact")
-        assert share_interval(found, count) == pytest.approx((exact.low, exact.high), abs=1e-9)
+        low, high = share_interval(found, count)
+        least = binom.sf(found - 1, count, low) if found else 0.025
+        most = binom.cdf(found, count, high) if found < count else 0.025
+        assert (least, most) == pytest.approx((0.025, 0.025), rel=1e-6)
+    assert share_interval(0, 20)[0] == 0.0
+    assert share_interval(0, 0) == (0.0, 1.0)
 
 
 def test_too_few_samples_bound_a_quantile_on_one_side_only() -> None:

@@ -36,7 +36,8 @@ _MEANINGS = {
         "says which; no run was finished"
     ),
     ExitCode.ENDED_BY_SAFETY: (
-        "quell run-rig: a limit of [rig.safety] or a fault ended the run; u was ramped to zero"
+        "quell run-rig, quell tune --device: a limit of safety or a fault ended the run; u was "
+        "ramped to zero"
     ),
     ExitCode.DIVERGED: (
         "quell run, compare, reproduce two-mass and torsional: a simulated run diverged; all "

@@ -25,7 +25,8 @@ def summary(found: Sweep, worst: int) -> dict[str, Any]:
 
     The quantiles are those of runs that did not diverge.
     """
-    from quell.sweeping.figures import QUANTILES, wilson
+    from quell.sweeping.figures import QUANTILES
+    from quell.sweeping.shares import share_interval
 
     data, failed = found.dataset, found.failed
     status = data["status"].values
@@ -57,7 +58,7 @@ def summary(found: Sweep, worst: int) -> dict[str, Any]:
         "runs": found.store.runs,
         "failures": failures,
         "failure_rate": failures / found.store.runs,
-        "ci95": list(wilson(failures, found.store.runs)),
+        "ci95": list(share_interval(failures, found.store.runs)),
         "errors": int(np.sum(status < 0)),
         "diverged": int(np.sum(diverged)),
         "beyond_limits": beyond,

@@ -19,7 +19,7 @@ from quell.records.metrics import SETTLING_BAND
 from quell.setup.build import Builder, parameters_of
 from quell.setup.description import Description, describe, read
 from quell.setup.errors import SetupError
-from quell.setup.schema import Table
+from quell.setup.schema import CallTable, Table
 from quell.simulation.scenario import Scenario
 
 Known: TypeAlias = dict[str, tuple[tuple[Any, ...], Any]]
@@ -114,6 +114,7 @@ def assembled(name: str, tables: Description, known: Known | None = None) -> Set
         inputs = table, dt, *context, *context.values()
         return made_once(key, inputs, partial(builder.build, table, key, dt=dt, **context))
 
+    _check_ranges(name, tables.plant)
     plant = build("plant")
     model = None if plant is None else made_once("model", (plant,), partial(linear_model, plant))
     parts = {key: build(key, plant=model) for key in ("observer", "learner", "guard")}
@@ -139,6 +140,20 @@ def assembled(name: str, tables: Description, known: Known | None = None) -> Set
     title = tables.title or name.removesuffix(".toml").replace("_", " ")
     tune = build("tune")
     return Setup(name, title, controller, plant, scenario, rig, sweep, windows, tables, tune)
+
+
+def _check_ranges(name: str, plant: CallTable | None) -> None:
+    """Check that the ranges of a plant are those of its keys."""
+    for path in getattr(plant, "uncertain", None) or ():
+        table: Any = plant
+        for step in path.split("."):
+            key = step.partition("[")[0]
+            known = [*type(table).model_fields] if isinstance(table, Table) else []
+            known = [each for each in known if each not in ("kind", "uncertain")]
+            if key not in known:
+                where = f"{name}: plant.uncertain: plant.{path}"
+                raise SetupError([f"{where}: unknown; {checks.nearest(key, known)}"])
+            table = getattr(table, key)
 
 
 def _made_once(known: Known, key: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:

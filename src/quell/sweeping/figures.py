@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.sweeping.shares import share_interval
 from quell.types import Vector
 
 QUANTILES = (0.05, 0.5, 0.95)
 # Groups of values of a parameter: enough to show a shape, few enough that each has runs. By hand.
 _MOST_GROUPS = 20
-# 97.5 % quantile of the normal distribution, for intervals of 95 %.
-_Z = 1.959963984540054
 
 
 class Groups(NamedTuple):
@@ -40,18 +39,6 @@ def groups_of(values: NDArray[Any], texts: list[str] | None, done: NDArray[np.bo
         return Groups(distinct, None, [runs[values[runs] == each] for each in distinct])
     members = [each for each in np.array_split(order, _MOST_GROUPS) if each.size]
     return Groups(np.array([np.median(values[each]) for each in members]), None, members)
-
-
-def wilson(failures: int, runs: int) -> tuple[float, float]:
-    """Return the 95 % interval of a failure rate (Wilson, *J. Am. Stat. Assoc.* 22, 1927)."""
-    if runs == 0:
-        return 0.0, 1.0
-    rate, z2 = failures / runs, _Z**2 / runs
-    centre = rate + 0.5 * z2
-    half = _Z * np.sqrt(rate * (1.0 - rate) / runs + 0.25 * z2 / runs)
-    # The ends that are 0 and 1 exactly are so only up to rounding.
-    low = 0.0 if failures == 0 else float((centre - half) / (1.0 + z2))
-    return low, 1.0 if failures == runs else float((centre + half) / (1.0 + z2))
 
 
 def plot_over(
@@ -88,7 +75,7 @@ def plot_over(
 def _plot_failures(axis: Any, failed: NDArray[np.bool_], groups: Groups) -> None:
     counts = [(int(np.sum(failed[each])), each.size) for each in groups.members]
     rates = np.array([100.0 * failures / max(runs, 1) for failures, runs in counts])
-    low, high = 100.0 * np.array([wilson(*each) for each in counts]).T
+    low, high = 100.0 * np.array([share_interval(*each) for each in counts]).T
     reach = np.maximum([rates - low, high - rates], 0.0)
     axis.errorbar(groups.centres, rates, reach, fmt="o", markersize=3, capsize=2, color="#c1440e")
     axis.set_title("failure rate [%], 95 % interval")

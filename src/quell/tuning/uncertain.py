@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from quell import checks
+from quell.sweeping.shares import share_interval
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.problem import Problem, Solution
 from quell.tuning.optimiser.requirements import all_peaks
-from quell.tuning.simulated.statistics import share_interval
 from quell.types import Matrix, Vector
 
 # With more parameters, the corners of their box are not all in the set.

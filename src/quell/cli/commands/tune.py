@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from quell.cli.commands.run_rig import exit_code
 from quell.cli.commands.tune_sources import (
     RECORD_OPTIONS,
     RECORDS,
@@ -22,6 +23,7 @@ from quell.cli.commands.tune_sources import (
     verified,
     with_rig_table,
 )
+from quell.cli.exit_codes import ExitCode
 from quell.cli.options import OUTPUTS, Outputs, WholeOrNone
 from quell.cli.output import check_outputs, print_line, progress_bar, table, write_results
 
@@ -51,13 +53,13 @@ def tune(
     record: RecordOptions = RECORD_OPTIONS,
     rig: RigOptions = RIG_OPTIONS,
     outputs: Outputs = OUTPUTS,
-) -> None:
+) -> int:
     """Tune a controller for a linear plant: the best load rejection under constraints.
 
     The plant is that of a setup file, a transfer function, one that a record shows, or that an
     experiment at a rig shows (--device). A record is identified first, and the deviations of gain,
     poles and delay become the set of plants. PI, PID and other structures are tuned under the same
-    constraints and shown beside it.
+    constraints and shown beside it. If safety ends the verifying step the exit code is 3.
 
     Parameters
     ----------
@@ -74,7 +76,7 @@ def tune(
         Dead time of the plant [s].
     structure
         bandwidths, freed, half-gain, half-gain-law, reduced, model-based, model-based-freed,
-        delay, delay-freed, pi, pi-unfiltered or pid; freed by default.
+        delay, delay-freed, pi, pi-unfiltered, pid or lqg; freed by default.
     order
         Order of an ADRC without model; 1 and 2 are tried by default.
     objective
@@ -118,7 +120,7 @@ def tune(
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
         _write(console, tuned, out, outputs)
-        return
+        return ExitCode.DONE
     if num or den or (delay is not None) or (rig.device is not None and setup is not None):
         raise ValueError("setup: a record or --device goes without --num, --den and --delay")
     _bounds(options)
@@ -129,7 +131,7 @@ def tune(
         place = rig_at(rig, dt)
         shown = from_rig(console, place, float(dt or 0.0), record, save_record, outputs.overwrite)
         if shown is None:
-            return
+            return ExitCode.DONE
         plant, dt, more, model, y_now = shown
     else:
         assert setup is not None
@@ -141,6 +143,7 @@ def tune(
         tuned = with_rig_table(tuned, place)
         step = verified(console, place, tuned, model, y_now)
     _write(console, tuned, out, outputs, {"model": model.to_json()}, step)
+    return ExitCode.DONE if step is None else exit_code(step.run)
 
 
 def _tuned(console: Console, plant: Any, dt: float, options: dict[str, Any]) -> Tuned:

@@ -11,7 +11,7 @@ from quell.experiments.acc.published import judge_published
 from quell.experiments.acc.samples import boxed, generated, plant, read, widened
 from quell.experiments.acc.stability import unstable
 from quell.experiments.acc.study import SPRINGS, Result, judge_sampled, records, run
-from quell.tuning.simulated.statistics import share_interval as interval
+from quell.sweeping.shares import share_interval as interval
 
 __all__ = [
     "DT",

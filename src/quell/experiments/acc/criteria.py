@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.experiments.acc.controllers import MOST_U
-from quell.tuning.simulated.statistics import share_interval as interval
+from quell.sweeping.shares import share_interval as interval
 from quell.types import Matrix, Vector
 
 SETTLED_AT, MOST_Y = 15.0, 0.1

@@ -16,7 +16,7 @@ from quell.experiments.acc.published import judge_published
 from quell.experiments.acc.samples import generated, plant
 from quell.experiments.acc.study import SPRINGS, Result, judge_sampled, records
 from quell.experiments.common.figures import new_figure, save_figures
-from quell.tuning.simulated.statistics import share_interval as interval
+from quell.sweeping.shares import share_interval as interval
 from quell.types import Matrix, Progress
 
 SPREADS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)

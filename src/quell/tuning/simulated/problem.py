@@ -20,7 +20,8 @@ from quell.plants.base import Plant
 from quell.records.trajectory import Trajectory
 from quell.simulation import Scenario, simulate
 from quell.simulation.scenario import check_scenario
-from quell.tuning.simulated.statistics import Mean, Statistic, share_interval
+from quell.sweeping.shares import share_interval
+from quell.tuning.simulated.statistics import Mean, Statistic
 from quell.types import Matrix
 
 Score: TypeAlias = str | Callable[[Trajectory], float]

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from quell import checks
+from quell.sweeping.shares import share_interval
 from quell.types import Vector
 
 _CONFIDENCE = 0.95
@@ -113,14 +114,6 @@ class FailureRate:
     def interval(self, scores: Vector) -> tuple[float, float]:
         """Return the exact interval of a binomial share."""
         return share_interval(int(np.sum(_numbers(scores) > self.limit)), scores.size)
-
-
-def share_interval(found: int, count: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Clopper & Pearson, *Biometrika* 26, 1934)."""
-    from scipy.stats import binomtest
-
-    ends = binomtest(found, count).proportion_ci(_CONFIDENCE, method="exact")
-    return float(ends.low), float(ends.high)
 
 
 def _numbers(scores: Vector) -> Vector:
