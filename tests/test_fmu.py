@@ -53,13 +53,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
 
 
 @pytest.fixture(autouse=True)
-def _nothing_left() -> Any:
+def _nothing_left(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Any:
     """No test leaves an instance or a folder behind."""
-    before = {*Path(tempfile.gettempdir()).glob("quell-fmu-*")}
+    folder = tmp_path_factory.mktemp("unpacked")
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
     yield
     gc.collect()
     assert not INSTANCES
-    assert not {*Path(tempfile.gettempdir()).glob("quell-fmu-*")} - before
+    assert not [*folder.glob("quell-fmu-*")]
 
 
 @pytest.mark.parametrize("version", VERSIONS)

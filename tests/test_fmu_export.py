@@ -379,7 +379,46 @@ def test_an_fmu_without_binary_has_its_sources(tmp_path: Path) -> None:
 
 def pendulum(t: float, x: Any, u: float, w: Any) -> tuple[float, float]:
     """Return the derivatives of a pendulum."""
-    return x[1], u - 9.81 * math.sin(x[0])
+    return x[1], u + w[0] * math.cos(t) - 9.81 * math.sin(x[0])
+
+
+def test_a_plant_of_the_user_is_translated_and_integrated(tmp_path: Path, made: Maker) -> None:
+    """With the sub-steps of ``simulate``; the time of the FMU is that of f."""
+    plant = ql.plants.NonlinearPlant(pendulum, order=2, substeps=3)
+    fmu(plant, tmp_path / "swing.fmu", dt=DT, x0=[0.5, 0.0])
+    running = made("swing").begin()
+    scenario = ql.Scenario(0.0, 0.5, disturbances=[0.3], x0=[0.5, 0.0])
+    run = ql.simulate(plant, plain(), scenario)
+    found = [running.get("y"), *(running.step(DT, u=u, **{"w[1]": 0.3}) for u in run["u"][:-1])]
+    np.testing.assert_allclose(found, run["y"], rtol=0, atol=1e-9)
+
+
+def test_functions_in_c_come_along(tmp_path: Path, made: Maker) -> None:
+    """A feature that the user has in C: without its file it is missing, with it the FMU is that of Python."""
+
+    def product(x: Any, u: float) -> tuple[float]:
+        return (x[0] * x[1],)
+
+    def law(c_function: str | None) -> ql.ADRC:
+        feature = ql.features.Custom(product, ["x v"], c_function=c_function)
+        return plain(learner=ql.learners.RLS(features=ql.features.State() + feature))
+
+    source = tmp_path / "product.c"
+    source.write_text(
+        "void product(const double *x, double u, double *out);\n"
+        "void product(const double *x, double u, double *out) {\n"
+        "    (void)u;\n    out[0] = x[0] * x[1];\n}\n"
+    )
+    with pytest.raises(ValueError, match="undefined reference to `product'"):
+        fmu(law("product"), tmp_path / "own.fmu")
+    fmu(law("product"), tmp_path / "own.fmu", sources=[source])
+    running, same = made("own").begin(), law(None)
+    for k in range(50):
+        r, y = 1.0, 0.01 * k
+        assert running.step(DT, r=r, y=y) == pytest.approx(same.step(r, y), abs=1e-9)
+    for wrong in (tmp_path / "product.o", tmp_path / "model.c", tmp_path / "none.c"):
+        with pytest.raises((ValueError, FileNotFoundError), match=wrong.name):
+            fmu(law("product"), tmp_path / "other.fmu", sources=[wrong])
 
 
 @pytest.mark.parametrize(
@@ -407,13 +446,13 @@ def test_bad_arguments_leave_no_file(
 
 
 def test_what_c_cannot_compute_is_refused(files: dict[str, Path], tmp_path: Path) -> None:
-    """A plant that is itself an FMU, and one whose f is a function without source in Python."""
+    """A plant that is itself an FMU."""
     own = ql.plants.FMU(files["mass"], w=["w[1]"])
     for plant in (own, ql.plants.delayed(own, DT, DT)):
-        with pytest.raises(TranslationError, match="calls other programs or Python"):
+        with pytest.raises(
+            TranslationError, match="it calls an FMU at each sample, which C can not"
+        ):
             fmu(plant, tmp_path / "mass.fmu", dt=DT)
-    with pytest.raises(TranslationError, match="function of yours"):
-        fmu(ql.plants.NonlinearPlant(pendulum, 2), tmp_path / "mass.fmu", dt=DT)
     assert not [*tmp_path.iterdir()]
 
 

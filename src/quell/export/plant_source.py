@@ -10,6 +10,7 @@ from quell.export.c_files import CFiles, CSource, translated
 from quell.export.translate.structs import Varying
 from quell.export.translate.values import Array, Number, TranslationError, Value
 from quell.plants.base import Plant, advance, measure
+from quell.plants.fmu.plant import FMU
 from quell.types import Vector
 
 
@@ -42,8 +43,12 @@ def plant_source(plant: Plant, dt: float, name: str = "plant", x0: Any = None) -
     TranslationError
         naming what has no counterpart in C.
     """
-    if not plant.compiled:
-        raise TranslationError(f"{plant.name}: it calls Python at each sample, which C can not")
+    inner: Any = plant
+    while hasattr(inner, "plant"):
+        inner = inner.plant
+    if isinstance(inner, FMU) or not plant.compiled:
+        called = "an FMU" if isinstance(inner, FMU) else "Python"
+        raise TranslationError(f"{plant.name}: it calls {called} at each sample, which C can not")
     parameters = plant.sampled(dt)
 
     def write(varying: Varying) -> tuple[CFiles, CSource]:

@@ -14,6 +14,8 @@ _COMPILERS = ("gcc", "clang", "cc")
 # As the golden vectors of the C export: bits do not depend on whether a processor has FMA.
 _OPTIONS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden")
 _SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib")}
+# Else a function that is missing would be noticed only by the tool that loads the FMU.
+_COMPLETE = {"linux": ("-Wl,-z,defs",)}
 _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 # A model of the largest learners takes some seconds. Chosen by hand.
 _LONGEST = 300.0
@@ -58,11 +60,13 @@ def compiled(folder: Path, files: Sequence[str], name: str) -> bytes:
         without a compiler, and with its first message if it fails.
     """
     library = folder / f"{name}.library"
-    command = [compiler(), *_OPTIONS, *files, "-lm", "-o", library.name]
+    last = (*_COMPLETE.get(sys.platform, ()), "-lm", "-o", library.name)
+    command = [compiler(), *_OPTIONS, *files, *last]
     done = subprocess.run(
         command, cwd=folder, capture_output=True, text=True, timeout=_LONGEST, check=False
     )
     if done.returncode != 0:
-        said = [line for line in done.stderr.splitlines() if "error" in line] or [done.stderr]
+        lines, marks = done.stderr.splitlines(), ("undefined", "error")
+        said = [line for mark in marks for line in lines if mark in line] or [done.stderr]
         raise ValueError(f"binary = True: {command[0]} failed: {said[0].strip()[:300]}")
     return library.read_bytes()

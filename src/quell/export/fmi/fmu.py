@@ -7,7 +7,7 @@ import os
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from quell.files import check_writable, written_atomically
 from quell.lti.models import is_linear_model
 from quell.plants.base import check_plant
 from quell.plants.linear import LinearPlant
+from quell.reading import check_regular, whole_text
 
 # Files beside those that have the name of the model.
 _OWN_NAMES = ("fmi3", "fmi3_refused", "model", "refuse")
@@ -42,6 +43,7 @@ def fmu(
     name: str = "",
     dt: float | None = None,
     x0: ArrayLike | None = None,
+    sources: Sequence[str | os.PathLike[str]] = (),
     binary: bool = True,
     overwrite: bool = False,
 ) -> None:
@@ -65,6 +67,8 @@ def fmu(
         sample time of a plant alone [s]; a controller has its own.
     x0
         initial state of the plant, zero by default; a parameter of the FMU.
+    sources
+        C files of yours that the parts call, of ``features.Custom(…, c_function=…)``.
     binary
         whether to compile a binary. Without one, other tools compile the sources.
     overwrite
@@ -96,7 +100,7 @@ def fmu(
     model, files = _model(plant, controller, name, dt, x0)
     if checks.flag("binary", binary):
         place(name)
-    content = _content(model, files, name, binary)
+    content = _content(model, files | _own_sources(sources, files), name, binary)
     with (
         written_atomically(target, overwrite) as file,
         zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -120,6 +124,23 @@ def _parts(part: Any) -> tuple[Any, Any]:
             plant = LinearPlant.of(plant)
         check_plant(plant, "part")
     return plant, controller
+
+
+def _own_sources(
+    sources: Sequence[str | os.PathLike[str]], generated: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the texts of the user's C files by name."""
+    if not checks.is_sequence(sources):
+        raise ValueError(f"sources = {sources!r}: must be a sequence of files")
+    found: dict[str, str] = {}
+    for path in map(Path, sources):
+        if path.suffix not in (".c", ".h") or path.stem in _OWN_NAMES:
+            raise ValueError(f"sources: {path.name}: must be a file *.c or *.h, of another name")
+        if path.name in generated or path.name in found:
+            raise ValueError(f"sources: {path.name}: there are two files of this name")
+        check_regular(path, f"sources: {path}")
+        found[path.name] = whole_text(path)
+    return found
 
 
 def _model(
