@@ -124,10 +124,10 @@ def _write(features: PeriodicDesign, x: Vector, u: float, out: Vector) -> None:
     angle = features.rate * x[features.state]
     step_sine, step_cosine = sin(angle), cos(angle)
     sine, cosine = 0.0, 1.0
-    before = 0
+    before = 0.0
     for k in range(features.orders.size):
-        m = int(features.orders[k])
-        if m == before + 1:
+        m = float(features.orders[k])
+        if m == before + 1.0:
             # The next order by the addition theorem, a fifth of the time of sin and cos. The error
             # of 500 such steps is below 1e-13.
             turned = sine * step_cosine + cosine * step_sine

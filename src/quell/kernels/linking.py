@@ -10,8 +10,7 @@ the entry point gets the rest. This halves the compile time of a loop and does n
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import llvmlite.binding as llvm
 import numba
@@ -20,8 +19,9 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import AnnotateTypes
+from numba.core.untyped_passes import IRProcessing
 
-F = TypeVar("F", bound=Callable[..., Any])
+from quell.kernels.single_literals import SingleLiterals
 
 # Prefix of Numba's variables that point to a function's environment, which ``print`` needs.
 _ENVIRONMENT = "_ZN08NumbaEnv"
@@ -69,20 +69,12 @@ class KernelCompiler(CompilerBase):
     """Numba's compiler, writing to a ``KernelLibrary``."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return Numba's passes, with the library replaced before code generation."""
+        """Return Numba's passes, with single literals, and the library replaced."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.add_pass_after(SingleLiterals, IRProcessing)
         passes.add_pass_after(_UseKernelLibrary, AnnotateTypes)
         passes.finalize()
         return [passes]
-
-
-def in_both_precisions(function: F) -> F:
-    """Mark a kernel that converts between double and single precision.
-
-    Floats in its code stay double, although it has arguments in single precision.
-    """
-    function.in_both_precisions = True  # type: ignore[attr-defined]
-    return function
 
 
 class WithoutOverlaps(CompilerBase):

@@ -59,11 +59,13 @@ def _rounded_array(array: NDArray[Any], name: str, owners: dict[int, Any]) -> ND
     owner: Any = array
     while isinstance(owner.base, np.ndarray):
         owner = owner.base
-    if owner is array or owner.dtype != array.dtype or array.size == 0:
-        return _rounded_values(array, name)
+    if owner.dtype != array.dtype:
+        owner = array
     if id(owner) not in owners:  # the second entry keeps the owner, and so its number
         owners[id(owner)] = _rounded_values(owner, name), owner
-    rounded = owners[id(owner)][0]
+    rounded: NDArray[Any] = owners[id(owner)][0]
+    if owner is array:
+        return rounded
     offset = (array.ctypes.data - owner.ctypes.data) // 2
     steps = tuple(step // 2 for step in array.strides)
     view: NDArray[Any] = np.ndarray(array.shape, rounded.dtype, rounded, offset, steps)

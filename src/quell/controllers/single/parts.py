@@ -11,8 +11,23 @@ from quell.controllers.adrc.law import AdrcDesign
 from quell.controllers.linear.delta import delta_law
 from quell.controllers.linear.linear import LinearDesign
 from quell.controllers.prefilters.prefilter import PrefilteredDesign
+from quell.features.custom import CustomDesign
+from quell.guard.kernels import GuardDesign
 from quell.kernels.single import in_single
+from quell.learners.adapters.kernels import PythonDesign
+from quell.learners.kalman.kernels import KalmanDesign
+from quell.learners.noise_gate import NoiseGate
 from quell.observers.delta import delta_form
+
+_OTHERS = "take a learner of quell.learners with its own kernels, or one of the other features"
+# Shares by which averages follow in a sample. What is left of a smaller one in the sum is below
+# half a unit of the last digit where the average is within a tenth of its goal.
+_RATES: dict[type, tuple[str, ...]] = {
+    GuardDesign: ("forget", "earn", "forget_effect", "rise", "decay", "growth", "smooth"),
+    KalmanDesign: ("forget",),
+    NoiseGate: ("forget",),
+}
+_LEAST_RATE = 2.0**-21
 
 
 def single_design(design: Any) -> Any:
@@ -21,6 +36,7 @@ def single_design(design: Any) -> Any:
     Observers and linear laws are in delta form. Raises ``ValueError`` for what is out of the range
     of single precision, or works in double only.
     """
+    _check(design, "")
     return in_single(_in_delta_form(design))
 
 
@@ -30,6 +46,22 @@ def single_state(design: Any, state: Any) -> Any:
     ``state`` is that of the controller in double precision before the first sample.
     """
     return in_single(_with_carries(design, state))
+
+
+def _check(value: Any, name: str) -> None:
+    """Raise a ``ValueError`` for a part that works in double only, or averages for too long."""
+    if isinstance(value, PythonDesign | CustomDesign):
+        what = "a model in Python" if isinstance(value, PythonDesign) else "features.Custom"
+        raise ValueError(f"{name} is {what}: it works in double precision only; {_OTHERS}")
+    for field, part in zip(getattr(value, "_fields", ()), value, strict=False):
+        if isinstance(part, tuple):
+            _check(part, f"{name}.{field}" if name else field)
+        elif field in _RATES.get(type(value), ()) and 0.0 < part < _LEAST_RATE:
+            raise ValueError(
+                f"{name}.{field} = {part:.3g} a sample: must be at least {_LEAST_RATE:.3g} in "
+                "single precision, or the average stands still; raise dt or omega_o, or stay in "
+                "double precision"
+            )
 
 
 @singledispatch

@@ -31,7 +31,7 @@ from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.controllers.single.parts import single_design, single_state
 from quell.controllers.stateful import StatefulController
 from quell.kernels.functions import single
-from quell.kernels.linking import in_both_precisions
+from quell.kernels.single_literals import in_both_precisions
 from quell.observers.eso import ESO
 from quell.types import Channels, Status, Vector
 
@@ -45,7 +45,7 @@ class SingleDesign(NamedTuple):
 @control.register(SingleDesign)
 @in_both_precisions
 def _control(design: SingleDesign, state: Any, r: float, y: float) -> float:
-    return float(control(design.controller, state, single(r), single(y)))
+    return np.float64(control(design.controller, state, single(r), single(y)))
 
 
 @set_reference_derivatives.register(SingleDesign)

@@ -63,8 +63,10 @@ from quell.types import Matrix, Vector
 # Least share of f that counts as unexplained by a linear model; chosen by hand, not tuned further.
 _UNEXPLAINED_SHARE = 0.1
 # Variance of amplitudes that are to be learned anew, in units of R: they may be 10⁴ times what is
-# unexplained. Chosen by hand: a hundred times less delays the result, more changes nothing.
-_UNKNOWN = 1e8
+# unexplained. Chosen by hand: a hundred times less delays the result, more changes nothing. In
+# single precision P then shrinks to less than what rounding leaves of the difference, and θ is
+# lost; with 10⁴ it is not (benchmarks/single_precision.py).
+_UNKNOWN, _UNKNOWN_SINGLE = 1e8, 1e4
 
 
 class KalmanDesign(NamedTuple):
@@ -149,7 +151,8 @@ def _adapt(
     result = advance_search(learner.search, memory.search, f_plain, memory.omega)
     # Many orders that are learned anew at once upset the loop: they explain almost anything.
     if result == LEARN_ANEW and learner.oscillators.orders.size == 1:
-        open_pairs(learner.oscillators, covariance, _UNKNOWN / learner.lag_time)
+        unknown = _UNKNOWN_SINGLE if is_single(weight) else _UNKNOWN
+        open_pairs(learner.oscillators, covariance, unknown / learner.lag_time)
     spread = 0.0
     for i in range(size):
         total = 0.0

@@ -69,6 +69,10 @@ _LEAST_LEFT = 1e-3
 # Shortest window whose frequencies are used, in units of 1/omega_c: transients of the loop, also
 # those that a learner causes, last some ten.
 _LOOP_TIMES = 20.0
+# Numbers of entries are counted up to this, and then are less by a multiple of the ring's length:
+# in single precision a count ends at 2²⁴.
+_WRAP = 4096.0 * ENTRIES
+_MOST_ENTRIES = 2.0 * _WRAP
 # The square of f_plain, summed over a window, is still finite; in single precision, too.
 _ABSURD, _ABSURD_SINGLE = 1e100, 1e16
 
@@ -174,10 +178,13 @@ def _advance(search: FrequencySearch, memory: SearchMemory, f_plain: float, omeg
         memory.past[int(loop.entries) % ENTRIES] = loop.total / loop.samples
         loop.entries += 1.0
         loop.total = loop.samples = 0.0
+        if loop.entries >= _MOST_ENTRIES:
+            loop.entries -= _WRAP
+            loop.newest -= _WRAP
     if loop.stage == 0.0:
         if loop.entries < SHORTEST:
             return NOTHING
-        search_from_nothing(search, memory, SHORTEST)
+        search_from_nothing(search, memory, float(SHORTEST))
     if loop.row >= loop.window:
         return _finish_pass(search, memory, omega)
     for _ in range(search.rows):

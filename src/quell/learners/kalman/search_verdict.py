@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import is_single
 from quell.learners.kalman.line_fit import LineFit
 from quell.learners.kalman.search_state import (
     ENTRIES,
@@ -27,6 +28,8 @@ _GROWTH, _WORSE = 1.25, 1.3
 COMPLETE = 1e-4
 # How many times more the frequencies of the oscillators leave if they count as wrong.
 _WRONG = 4.0
+# Share of the variance that rounding leaves in single precision.
+_ROUNDING_SINGLE = 1e-5
 # What a window resolves: phase of a frequency over the window, of the difference of two, and of the
 # standard deviation of a frequency [rad].
 _PHASE, _APART, _DOUBT = 5.0, 1.5, 0.2
@@ -48,17 +51,19 @@ def judge(search: FrequencySearch, memory: SearchMemory, left: float, omega: Vec
         loop.level = loop.left / loop.window
         result = _adopt(search, memory, left, omega)
         loop.continues = 1.0
-        _fit_again(search, memory, math.floor(min(_GROWTH * loop.window, longest)))
+        _fit_again(search, memory, float(math.floor(min(_GROWTH * loop.window, longest))))
         return result
     if loop.continues > 0.0:
         loop.continues = 0.0
-        _fit_again(search, memory, max(math.floor(loop.window / _GROWTH), float(SHORTEST)))
+        shorter = float(math.floor(loop.window / _GROWTH))
+        _fit_again(search, memory, max(shorter, float(SHORTEST)))
         return NOTHING
     if loop.found > 0.0:
         for j in range(memory.adopted.size):
             memory.adopted[j] = 0.0
     following = 2.0 * loop.window
-    search_from_nothing(search, memory, following if following <= longest else SHORTEST)
+    shortest = float(SHORTEST)
+    search_from_nothing(search, memory, following if following <= longest else shortest)
     return NOTHING
 
 
@@ -80,10 +85,11 @@ def _adopt(search: FrequencySearch, memory: SearchMemory, left: float, omega: Ve
     result = NOTHING
     if loop.window < search.shortest or loop.left > search.certain * loop.variance:
         return result
+    least = max(loop.left, _ROUNDING_SINGLE * loop.variance) if is_single(left) else loop.left
     for j in range(int(loop.found)):
         if not _is_resolved(loop, fit, j):
             continue
-        is_new = adopted[j] == 0.0 or left > _WRONG * loop.left
+        is_new = adopted[j] == 0.0 or left > _WRONG * least
         if is_new or fit.deviation[j] < _WORSE * adopted[j]:
             omega[j] = fit.omega[j] / search.step
             adopted[j] = fit.deviation[j]

@@ -48,6 +48,11 @@ from quell.types import Matrix, Vector
 _LEAST_CONFIDENCE = 0.1
 
 
+# Samples are counted up to this; in single precision a count ends at 2²⁴. It is longer than any
+# start of a loop that is fast enough for its observer.
+_MOST_SAMPLES = 2.0**23
+
+
 @generic
 def update_theta(
     rule: Any, memory: Any, theta: Vector, features: Vector, error: float, confidence: float
@@ -206,8 +211,12 @@ def _predict(
 def _commit(
     learner: LinearDesign, memory: LinearMemory, seen: Vector, u: float, f_learned: float
 ) -> None:
-    memory.loop[0].samples += 1.0
-    if memory.loop[0].has_scale == 0.0:
+    loop = memory.loop[0]
+    if loop.samples < _MOST_SAMPLES:
+        loop.samples += 1.0
+    elif loop.learn_after > 0.0:
+        loop.learn_after -= 1.0
+    if loop.has_scale == 0.0:
         return
     write_features(learner.inputs, memory, seen, u, memory.features)
     for i in range(memory.filtered.size):
