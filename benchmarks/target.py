@@ -1,8 +1,8 @@
 """Instructions, code, state and stack of exported controllers on a Cortex-M, in the emulator.
 
-    python benchmarks/target.py [--samples 20000] [--json FILE]
+    python benchmarks/target.py [--optimise=-O3] [--samples 20000] [--json FILE]
 
-Each controller is exported to C, compiled by ``arm-none-eabi-gcc -O2`` without FMA and run in
+Each controller is exported to C, compiled by ``arm-none-eabi-gcc``, without FMA, and run in
 ``qemu-system-arm`` over r and y of a loop that quell has simulated before, with noise. Instructions
 are those of a step with its call, counted by the emulated timer (``target.c``); they are no
 cycles: a Cortex-M4 takes 1 for most, 1 to 3 for a load or a jump, 14 for a division or root. Code
@@ -26,12 +26,11 @@ from rich.table import Table
 
 import quell as ql
 from quell.experiments.two_mass_spring import setup as study
-from quell.export import c_source
+from quell.export import CSource, c_source
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "examples" / "target"))
 import emulator  # noqa: E402
-from plant import plant_numbers  # noqa: E402, F401  # for the tests
 
 # An instruction takes 1024 ns of emulated time, 25.6 ticks of the timer (see target.c).
 _COUNTING = ("-icount", "shift=10,sleep=off")
@@ -62,7 +61,7 @@ def cases() -> list[Case]:
     pid = ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits)
     learners = ql.learners
     guarded = law(learners.Kalman(), ql.Guard())
-    network, process = law(learners.MLP()), law(learners.GaussianProcess())
+    network, process = law(learners.MLP(5)), law(learners.GaussianProcess(20))
     l_eso = "L-ESO, order 4, Kalman, guard"
     small = {"instructions": 220.0, "state": 100.0}
     large = {"instructions": 2200.0, "state": 700.0, "stack": 250.0}
@@ -75,8 +74,8 @@ def cases() -> list[Case]:
         Case(l_eso, m7, "single", two_mass, guarded),
         Case(l_eso, m7, "double", two_mass, guarded),
         Case(l_eso, m4, "double", two_mass, guarded),
-        Case("L-ESO, order 4, MLP", m4, "single", two_mass, network),
-        Case("L-ESO, order 4, GaussianProcess", m4, "single", two_mass, process),
+        Case("L-ESO, order 4, MLP(5)", m4, "single", two_mass, network),
+        Case("L-ESO, order 4, GaussianProcess(20)", m4, "single", two_mass, process),
     ]
 
 
@@ -102,12 +101,18 @@ def export(controller: Any, precision: str, name: str, folder: Path) -> None:
     """Write header and source of a controller."""
     if precision == "single":
         controller = ql.controllers.in_single_precision(controller)
-    source = c_source(controller, name)
-    (folder / f"{name}.h").write_text(source.header, encoding="utf-8")
-    (folder / f"{name}.c").write_text(source.source, encoding="utf-8")
+    write(c_source(controller, name), folder)
 
 
-def measured(case: Case, run: ql.Trajectory, folder: Path) -> dict[str, float]:
+def write(source: CSource, folder: Path) -> None:
+    """Write header and source."""
+    (folder / f"{source.name}.h").write_text(source.header, encoding="utf-8")
+    (folder / f"{source.name}.c").write_text(source.source, encoding="utf-8")
+
+
+def measured(
+    case: Case, run: ql.Trajectory, folder: Path, optimise: str = "-O2"
+) -> dict[str, float]:
     """Return what a case costs on its target, in instructions and bytes."""
     board = emulator.BOARDS[case.board]
     export(case.controller, case.precision, "counted", folder)
@@ -118,14 +123,15 @@ def measured(case: Case, run: ql.Trajectory, folder: Path) -> dict[str, float]:
     (folder / "samples.bin").write_bytes(r.tobytes() + y.tobytes() + u.tobytes())
     program, flags = folder / "target.elf", (f"-DREAL={real}", f"-DSAMPLES={len(run)}")
     sources = [HERE / "target.c", folder / "counted.c"]
-    emulator.build(board, program, sources, *flags, f"-I{folder}", f"-Wa,-I{folder}")
+    includes = (f"-I{folder}", f"-Wa,-I{folder}", optimise)
+    emulator.build(board, program, sources, *flags, *includes)
     code, output = emulator.run(board, program, *_COUNTING, timeout=600.0)
     if code:
         raise RuntimeError(f"{case.name}: the program has ended with {code}: {output}")
     found = {name: float(value) for name, value in (line.split() for line in output.splitlines())}
     if abs(found["known"] - _KNOWN) > 1.0:
         raise RuntimeError(f"{found['known']} instructions counted where there are {_KNOWN:.0f}")
-    text, constants = emulator.sizes(board, folder / "counted.c", f"-I{folder}")
+    text, constants = emulator.sizes(board, folder / "counted.c", f"-I{folder}", optimise)
     return {
         "instructions": found["mean"],
         "most": found["most"],
@@ -154,6 +160,7 @@ def main() -> None:
     """Measure all cases; print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--samples", type=int, default=20_000, help="steps of each run")
+    parser.add_argument("--optimise", default="-O2", help="option of the compiler, -O2 or -O3")
     parser.add_argument("--json", type=Path, help="write the table to this file")
     arguments = parser.parse_args()
     if tool := emulator.missing_tool():
@@ -161,11 +168,12 @@ def main() -> None:
     rows, runs = [], dict[str, ql.Trajectory]()
     heads = ("controller", "processor", "precision", "instructions, mean", "most", "code [B]")
     table = Table(*heads, "constants [B]", "state [B]", "stack [B]", "u − double")
+    table.title = f"arm-none-eabi-gcc {arguments.optimise}"
     for case in cases():
         if case.name not in runs:
             runs[case.name] = simulated(case, arguments.samples)
         with tempfile.TemporaryDirectory() as folder:
-            found = measured(case, runs[case.name], Path(folder))
+            found = measured(case, runs[case.name], Path(folder), arguments.optimise)
         table.add_row(*shown(case, found))
         names = {"controller": case.name, "board": case.board, "precision": case.precision}
         rows.append({**names, **found})

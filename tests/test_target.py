@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.export import plant_source
 from quell.realtime import open_device, record_target
 from quell.realtime.wire import frames
 from quell.realtime.wire.serial_line import SerialListener
@@ -159,11 +160,11 @@ def servo(learner=None):
     return ql.ADRC(observer, omega_c=10.0, learner=learner, u_min=-10.0, u_max=10.0)
 
 
-def built(table, folder, board, precision, parts, *flags, plant=DRIVE):
+def built(table, folder, board, precision, parts, *flags):
     """The path of a program of the examples with the controller."""
     table.export(servo(), precision, "servo", folder)
-    (folder / "plant_numbers.h").write_text(table.plant_numbers(plant, DT))
-    sources = [table.emulator.HERE / part for part in parts]
+    table.write(plant_source(DRIVE, DT), folder)
+    sources = [*(table.emulator.HERE / part for part in parts), folder / "plant.c"]
     program = folder / "servo.elf"
     flags = (f"-I{folder}", *flags)
     table.emulator.build(board, program, [*sources, folder / "servo.c"], *flags)
@@ -185,7 +186,7 @@ def test_the_emulator_counts_instructions(table, tmp_path):
 def test_a_timer_interrupt_controls_a_drive(table, tmp_path):
     """Under load from the start, through manual operation, and off when the sensor has failed."""
     board = table.emulator.BOARDS["Cortex-M4F"]
-    parts = ("timer_interrupt.c", "simulated_drive.c", "plant.c")
+    parts = ("timer_interrupt.c", "simulated_drive.c")
     program = built(table, tmp_path, board, "single", parts)
     code, output = table.emulator.run(board, program, "-icount", "shift=6,sleep=off")
     assert code == 0, output
@@ -202,7 +203,7 @@ def test_a_timer_interrupt_controls_a_drive(table, tmp_path):
 def test_a_target_in_double_precision_equals_the_simulation(table, tmp_path):
     """Reference, output, control signal and estimates over the serial line, bit for bit."""
     board, reference = table.emulator.BOARDS["Cortex-M7"], Sinusoid(amplitude=0.5, omega=20.0)
-    parts = ("serial_target.c", "plant.c", "mps2_uart.c")
+    parts = ("serial_target.c", "mps2_uart.c")
     flags = ("-DMOST_WAIT=1000", "-DLOAD_AT=50", "-DLOAD=(-3.0)")
     program = built(table, tmp_path, board, "double", parts, *flags)
     load = Step(height=-3.0, at=50 * DT)

@@ -50,7 +50,11 @@ def missing_tool() -> str:
 def build(board: Board, program: Path, sources: Sequence[Path], *flags: str) -> None:
     """Compile and link a program; ``RuntimeError`` has the messages of the compiler."""
     link = (
-        *("-nostartfiles", "--specs=rdimon.specs", "-Wl,--gc-sections"),
+        *(
+            "-nostartfiles",
+            "--specs=rdimon.specs",
+            "-Wl,--gc-sections,-u,exit,-u,initialise_monitor_handles",
+        ),
         *("-T", str(HERE / "target.ld")),
         *("-I", str(HERE), str(HERE / "startup.c"), *map(str, sources), "-lm"),
     )

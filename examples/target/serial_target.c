@@ -1,8 +1,9 @@
 /* A controller of quell on the target, with telemetry over a serial line.
  *
  * It joins ../serial_device.c, which has frames and sessions, with an exported controller, "servo",
- * and a simulated plant. Commands are references; every tick sends y as the measurement and the rest
- * as telemetry, in the order of the names that the loop gives to quell.realtime.record_target.
+ * and an exported plant, "plant", in place of a drive. Commands are references; every tick sends y as
+ * the measurement and the rest as telemetry, in the order of the names that the loop gives to
+ * quell.realtime.record_target.
  *
  *     idle, waiting   the plant rests, the controller is in its initial state
  *     live            r is the newest command
@@ -31,6 +32,7 @@
 #endif
 
 static servo_state servo;
+static plant_state plant;
 static double y, r;
 static uint32_t live; /* ticks since the first reference */
 static volatile uint32_t ticks;
@@ -51,7 +53,7 @@ static void send_telemetry(double u)
 
 double board_measure(void)
 {
-    y = plant_measure();
+    y = plant_measure(&plant);
     return y;
 }
 
@@ -59,14 +61,15 @@ void board_apply(double command)
 {
     if (mode == IDLE || mode == WAITING) {
         servo_init(&servo);
-        plant_reset();
+        plant_init(&plant);
         live = 0;
         return;
     }
     if (mode == LIVE)
         r = command;
     double u = servo_step(&servo, r, y);
-    plant_advance(u, live >= LOAD_AT ? LOAD : 0.0);
+    const double load[PLANT_DISTURBANCES] = {live >= LOAD_AT ? LOAD : 0.0};
+    plant_advance(&plant, live * DT, u, load);
     live++;
     send_telemetry(u);
 }
@@ -90,6 +93,7 @@ int main(void)
 {
     uint8_t byte;
     servo_init(&servo);
+    plant_init(&plant);
     uart_start(921600);
     timer_start(SERVO_SAMPLE_TIME);
     for (;;) {

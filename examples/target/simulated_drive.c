@@ -1,4 +1,4 @@
-/* A simulated drive for timer_interrupt.c: a plant under a load of -3, and a day in its life.
+/* A simulated drive for timer_interrupt.c: an exported plant under a load, and a day in its life.
  *
  * The emulator runs it. It prints y and u of each tick and exits.
  */
@@ -9,12 +9,14 @@
 #include "servo.h"
 
 #define LOAD (-3.0)
-enum { STEP = 200, MANUAL = 1200, AUTOMATIC = 1700, RETUNE = 2500, BLIND = 3000, LOST = 3300, END = 3400 };
+enum { STEP = 200, MANUAL = 1200, AUTOMATIC = 1700, RETUNE = 2500 }; /* ticks */
+enum { BLIND = 3000, LOST = 3300, END = 3400 };
 
-extern volatile float reference, manual_u;
+extern volatile servo_real reference, manual_u;
 extern volatile bool manual, is_off;
 extern const servo_parameters *volatile retuned;
 
+static plant_state plant;
 static double y_log[END], u_log[END];
 static int tick, fed, is_safe;
 
@@ -27,7 +29,9 @@ void drive_off(void) { is_safe = 1; }
 double drive_measure(void)
 {
     int no_sensor = (tick >= BLIND && tick < BLIND + 5) || tick >= LOST;
-    return no_sensor ? NAN : plant_measure();
+    if (plant.parameters == NULL)
+        plant_init(&plant);
+    return no_sensor ? NAN : plant_measure(&plant);
 }
 
 double drive_apply(double u)
@@ -39,9 +43,10 @@ double drive_apply(double u)
         exit(fed == END && is_safe && is_off ? 0 : 1);
     }
     u = is_safe ? 0.0 : fmin(fmax(u, -10.0), 10.0);
-    y_log[tick] = plant_measure();
+    y_log[tick] = plant_measure(&plant);
     u_log[tick] = u;
-    plant_advance(u, LOAD);
+    const double load[PLANT_DISTURBANCES] = {LOAD};
+    plant_advance(&plant, tick * PLANT_SAMPLE_TIME, u, load);
     tick++;
     if (tick == STEP)
         reference = 1.0f;

@@ -8,7 +8,9 @@
 extern uint32_t memory_stack[], memory_data_image[], memory_data[], memory_data_end[];
 extern uint32_t memory_bss[], memory_bss_end[];
 extern int main(void);
+/* Of newlib with --specs=rdimon.specs: printf and the result of main go to the debugger. */
 extern void initialise_monitor_handles(void) __attribute__((weak));
+extern void exit(int code) __attribute__((weak));
 
 void reset_handler(void);
 void stop_handler(void);
@@ -50,7 +52,9 @@ void reset_handler(void)
     for (uint32_t *to = memory_bss; to < memory_bss_end; to++)
         *to = 0;
     if (initialise_monitor_handles)
-        initialise_monitor_handles(); /* with --specs=rdimon.specs: printf to the debugger */
-    main();
+        initialise_monitor_handles();
+    int code = main();
+    if (exit)
+        exit(code);
     stop_handler();
 }

@@ -16,8 +16,8 @@ void watchdog_start(double seconds);
 void watchdog_feed(void);
 
 /* The main loop writes these, the interrupt reads them. Each is one word: no half of it is read. */
-volatile float reference;
-volatile float manual_u;
+volatile servo_real reference;
+volatile servo_real manual_u;
 volatile bool manual; /* u is manual_u */
 const servo_parameters *volatile retuned; /* parameters to change to, or 0 */
 
@@ -67,7 +67,7 @@ int main(void)
     servo_init(&servo);
     /* The plant rests at y, held by u: long, and therefore before the timer starts. */
     servo_start(&servo, drive_measure(), drive_holding(), drive_measure());
-    reference = (float)drive_measure();
+    reference = (servo_real)drive_measure();
     watchdog_start(5.0 * SERVO_SAMPLE_TIME);
     timer_start(SERVO_SAMPLE_TIME);
     for (;;)
