@@ -411,7 +411,12 @@ def test_a_setup_in_a_sweep_is_the_one_with_these_values(tmp_path: Path) -> None
             '"scenario.x.y"',
             "sweep.parameters, case mine: scenario.x: unknown",
         ),
-        ("plant.m1", "observer.b0", "sweep.parameters, case pid: observer.kind: missing"),
+        (
+            "plant.m1",
+            "observer.b0",
+            "sweep.parameters, case pid: observer.kind: missing; observer.b0 fits the case mine, "
+            "but a parameter must fit all cases",
+        ),
         ("kp = 0.1", "kq = 0.1", "sweep.cases.pid: controller.kq: unknown"),
         ('"rms"', '"rmse"', "sweep.metrics: 'rmse' is unknown, did you mean rms?"),
         ("seed = 3", "limits = { ise = 1.0 }", "sweep.limits.ise: is none of the metrics"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from scipy.stats import binom
 
 import quell as ql
 from quell.cli.app import app
-from quell.setup import load
+from quell.setup import controllers_of, load, varied
 from quell.sweeping.shares import share_interval
 from quell.tuning.simulated import (
     FailureRate,
@@ -232,6 +233,36 @@ def test_what_violates_constraints_is_not_simulated() -> None:
     assert any(c.violation > 0.0 for c in found.candidates)
     none = search(build, SPACE, problem, trials=4, violation=lambda c: 7.0 + c["b"] ** 2)
     with pytest.raises(ValueError, match=r"all violate the constraints, the best one by [789].*;"):
+        _ = none.best
+
+
+LEARNING = """dt = 0.05
+plant = { kind = "linear", num = [1.0], den = [1.0, 0.4] }
+observer = { kind = "model-free", order = 1, b0 = 1.0, omega_o = 4.0 }
+controller = { omega_c = 1.0 }
+learner = { kind = "nlms", rate = 0.1 }
+guard = { bound = 0.5 }
+scenario = { duration = 6.0, reference = 1.0, noise = { kind = "noise", power = 1e-6, sample_time = 0.05 } }
+"""
+
+
+def test_numbers_of_a_learner_and_its_guard_are_searched_by_their_paths(tmp_path: Path) -> None:
+    """Each candidate is the setup's controller with these values, in other processes too; it is no worse than the file's own."""
+    file = tmp_path / "learning.toml"
+    file.write_text(LEARNING)
+    setup = load(file)
+    make = pickle.loads(pickle.dumps(controllers_of(setup)))
+    problem = Problem.of_runs([setup.plant], setup.scenario, "iae")
+    own = {"learner.rate": 0.1, "guard.bound": 0.5, "observer.omega_o": 4.0}
+    space = {name: Range(0.5 * value, 2.0 * value) for name, value in own.items()}
+    found = search(make, space, problem, trials=6, starts=[own])
+    best = varied(setup, found.best.parameters)
+    assert best.controller.learner.rate == found.best.parameters["learner.rate"]
+    assert best.controller.guard.bound == found.best.parameters["guard.bound"]
+    run = ql.simulate(setup.plant, best.controller, setup.scenario)
+    assert run.metrics()["iae"] == found.best.values["iae"] < found.candidates[0].values["iae"]
+    none = search(make, {"learner.speed": Range(0.1, 1.0)}, problem, trials=2)
+    with pytest.raises(ValueError, match=r"values are rejected.*learner.speed: unknown"):
         _ = none.best
 
 

@@ -56,10 +56,25 @@ def _check_parameter(build: Variation, path: str, given: Any) -> None:
     except ValueError as error:
         raise SetupError([f"{build.name}: {where}: {error}"]) from None
     value = values[0] if isinstance(values, tuple) else float(values.ppf(np.array([0.5]))[0])
-    for case in build.cases:
-        _attempt(build, f"{where}, case {case}", {CASE: case, path: value})
     if not build.cases:
         _attempt(build, where, {path: value})
+    lacking: list[SetupError] = []
+    having = []
+    for case in build.cases:
+        try:
+            _attempt(build, f"{where}, case {case}", {CASE: case, path: value})
+            having.append(case)
+        except SetupError as error:
+            lacking.append(error)
+    if not lacking:
+        return
+    first = list(lacking[0].mistakes)
+    if having:
+        first[-1] += (
+            f"; {path} fits the case {having[0]}, but a parameter must fit all cases: sweep those "
+            "that it fits apart from the others"
+        )
+    raise SetupError(first)
 
 
 def _attempt(build: Variation, where: str, values: Mapping[str, Any]) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
+from quell.controllers.base import Controller
 from quell.setup.errors import SetupError
 from quell.setup.load import Setup, made
 
@@ -42,6 +44,31 @@ def varied(setup: Setup, changes: Mapping[str, Any]) -> Setup:
     if not isinstance(setup, Setup):
         raise ValueError(f"setup = {setup!r:.80}: must be a Setup, as quell.setup.load returns it")
     return made(setup.file, changed(setup.file, setup.tables(), changes))
+
+
+def controllers_of(setup: Setup) -> Callable[[Mapping[str, float]], Controller]:
+    """Return a function from values by path to the setup's controller with these values.
+
+    It is the ``build`` of ``quell.tuning.simulated.search``, which so varies any numbers of
+    observer, controller, learner and guard; it may be sent to other processes.
+
+    Raises
+    ------
+    SetupError
+        as ``varied``, when it is called.
+
+    Examples
+    --------
+    >>> from quell.setup import EXAMPLES, load
+    >>> build = controllers_of(load(EXAMPLES / "two_mass.toml"))
+    >>> build({"observer.omega_o": 9.0, "learner.prior": 1.0}).learner.prior
+    1.0
+    """
+    return partial(_controller, setup.file, setup.tables())
+
+
+def _controller(name: str, tables: Mapping[str, Any], values: Mapping[str, float]) -> Controller:
+    return made(name, changed(name, tables, values)).controller
 
 
 def changed(name: str, data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ class Candidate:
     values: dict[str, float]  #: by name of the objective; empty if it was given up early
     violation: float  #: by how much it violates constraints; it was not simulated then
     finished: bool  #: whether it was simulated on all samples
+    reason: str = ""  #: why its values were rejected; empty if they were not
 
     def dominates(self, other: Candidate) -> bool:
         """Whether no objective of this one is worse, and one is better."""
@@ -81,6 +82,9 @@ class Search:
         return {"objectives": list(self.objectives), "candidates": rows, "front": front}
 
     def _why_none(self) -> str:
+        reasons = [c.reason for c in self.candidates if c.reason]
+        if len(reasons) == len(self.candidates):
+            return f"their values are rejected, the last ones because of: {reasons[-1]}"
         least = min((c.violation for c in self.candidates if c.violation > 0.0), default=math.inf)
         if all(c.violation > 0.0 for c in self.candidates):
             return f"all violate the constraints, the best one by {least:.3g}; widen the ranges"

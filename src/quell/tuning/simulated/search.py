@@ -19,6 +19,7 @@ from quell.tuning.simulated.problem import Problem
 from quell.tuning.simulated.result import Candidate, Search
 from quell.tuning.simulated.space import Space, checked_space, checked_start
 from quell.tuning.simulated.study import (
+    REASON,
     VIOLATION,
     begun_trial,
     open_study,
@@ -54,6 +55,7 @@ class _Score(NamedTuple):
 
     scores: Matrix | None  # None for a design that is not possible
     violation: float
+    reason: str = ""  # why there is no such design
 
 
 def search(
@@ -201,6 +203,8 @@ def _run(
             trial, one = group[i][0], found[i]
             if one.scores is None:
                 trial.set_user_attr(VIOLATION, one.violation)
+                if one.reason:
+                    trial.set_user_attr(REASON, one.reason)
                 ended.append((trial, [math.inf] * objectives))
                 alive.remove(i)
                 continue
@@ -229,8 +233,8 @@ def _evaluate(
 ) -> _Score:
     try:
         controller = build(task.values)
-    except ValueError:
-        return _Score(None, 1.0)
+    except ValueError as error:
+        return _Score(None, 1.0, str(error))
     if violation is not None and task.first == 0:
         beyond = float(violation(controller))
         if not beyond <= 0.0:
@@ -248,5 +252,6 @@ def _candidates(study: Any, space: Space, problem: Problem) -> tuple[Candidate, 
         over = float(trial.user_attrs.get(VIOLATION, 0.0))
         parameters = {name: trial.params[name] for name in space if name in trial.params}
         finished = complete and over <= 0.0
-        found.append(Candidate(trial.number, parameters, values, over, finished))
+        reason = str(trial.user_attrs.get(REASON, ""))
+        found.append(Candidate(trial.number, parameters, values, over, finished, reason))
     return tuple(found)

@@ -19,6 +19,7 @@ from quell.optional import import_extra
 SAMPLERS = ("cma", "tpe", "nsga2", "qmc", "random")
 PRUNERS = ("median", "halving", "none")
 _ABOUT = "quell: problem"  # attribute of the study: what is searched
+REASON = "quell: reason"  # and why its values were rejected, if they were
 VIOLATION = "quell: violation"  # attribute of a trial: by how much it violates constraints
 
 
