@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from quell.export.translate.findings import Findings
 from quell.export.translate.initial import initial_lines
 from quell.export.translate.layout import comment_block, wrapped
 from quell.export.translate.program import Program
-from quell.export.translate.structs import Varying, arrays_of
+from quell.export.translate.structs import arrays_of
 from quell.export.translate.values import Number, Struct, Value
 
 
@@ -47,13 +48,13 @@ class CSource:
 
 
 class CFiles:
-    """Writer of the files for parameters and a state; ``varying``: see ``Structs``."""
+    """Writer of the files for parameters and a state, with the findings of earlier translations."""
 
-    def __init__(self, name: str, parameters: Any, state: Any, varying: Varying) -> None:
+    def __init__(self, name: str, parameters: Any, state: Any, findings: Findings) -> None:
         self.name, self.parameters, self.state = name, parameters, state
         precisions = {array.dtype for array in arrays_of(state) if array.dtype.kind == "f"}
         self.single = np.dtype(np.float32) in precisions
-        self.program = Program(name, self.single, varying)
+        self.program = Program(name, self.single, findings)
         self.real = self.program.literals.real
         structs = self.program.structs
         design = structs.rename(_struct(structs.of(parameters)), f"{name}_parameters")
@@ -177,10 +178,11 @@ def _struct(kind: Any) -> Struct:
     return kind
 
 
-def translated(write: Callable[[Varying], tuple[CFiles, CSource]]) -> CSource:
-    """Return the files that ``write`` makes, when it knows all numbers of the state that change."""
-    varying: Varying = {}
+def translated(write: Callable[[Findings], CSource]) -> CSource:
+    """Return the files that ``write`` makes, when it finds nothing more that is not constant."""
+    findings = Findings()
     while True:
-        files, source = write(varying)
-        if not files.program.structs.found_varying:
+        findings.is_new = False
+        source = write(findings)
+        if not findings.is_new:
             return source

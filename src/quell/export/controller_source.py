@@ -18,8 +18,8 @@ from quell.controllers.prefilters.prefilter import Prefiltered, without_prefilte
 from quell.controllers.single.single import SinglePrecision
 from quell.export import operations
 from quell.export.c_files import CFiles, CSource, translated
+from quell.export.translate.findings import Findings
 from quell.export.translate.layout import wrapped
-from quell.export.translate.structs import Varying
 from quell.export.translate.values import Array, Number, TranslationError, Value
 from quell.guard import Reason
 from quell.types import Channels, Status
@@ -61,11 +61,7 @@ def c_source(controller: Any, name: str = "controller") -> CSource:
     """
     _check_parts(controller)
 
-    def write(varying: Varying) -> tuple[CFiles, CSource]:
-        writer = _Writer(controller, name, varying)
-        return writer.files, writer.write()
-
-    return translated(write)
+    return translated(lambda findings: _Writer(controller, name, findings).write())
 
 
 def _check_parts(controller: Any) -> None:
@@ -86,13 +82,13 @@ def _check_parts(controller: Any) -> None:
 class _Writer:
     """Writer of the public functions of one controller."""
 
-    def __init__(self, controller: Any, name: str, varying: Varying) -> None:
+    def __init__(self, controller: Any, name: str, findings: Findings) -> None:
         self.controller, self.name = controller, name
         parameters = controller.parameters
         self.described = controller  # the controller in double precision
         if isinstance(controller, SinglePrecision):
             self.described, parameters = controller.controller, parameters.controller
-        self.files = CFiles(name, parameters, controller.initial_state(), varying)
+        self.files = CFiles(name, parameters, controller.initial_state(), findings)
         self.real = self.files.real
         self.state = f"{name}_state *state"
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell.export.c_files import CFiles, CSource, translated
-from quell.export.translate.structs import Varying
+from quell.export.translate.findings import Findings
 from quell.export.translate.values import Array, Number, TranslationError, Value
 from quell.plants.base import Plant, advance, measure
 from quell.plants.fmu.plant import FMU
@@ -51,10 +51,10 @@ def plant_source(plant: Plant, dt: float, name: str = "plant", x0: Any = None) -
         raise TranslationError(f"{plant.name}: it calls {called} at each sample, which C can not")
     parameters = plant.sampled(dt)
 
-    def write(varying: Varying) -> tuple[CFiles, CSource]:
+    def write(findings: Findings) -> CSource:
         x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=np.float64)
         state = PlantState(x, np.zeros(6 * plant.order))
-        files = CFiles(name, parameters, state, varying)
+        files = CFiles(name, parameters, state, findings)
         _add_functions(files, plant)
         title = [
             f"Plant {name}: {plant.name}, one sample every {dt!r} s.",
@@ -67,7 +67,7 @@ def plant_source(plant: Plant, dt: float, name: str = "plant", x0: Any = None) -
             f"#define {name.upper()}_ORDER {plant.order}",
             f"#define {name.upper()}_DISTURBANCES {plant.disturbances}",
         ]
-        return files, files.write(title, (), defines)
+        return files.write(title, (), defines)
 
     return translated(write)
 

@@ -134,7 +134,8 @@ class Guard:
 
     def memory(self, parameters: GuardDesign) -> GuardMemory:
         """Return the state before the first sample, without authority."""
-        filters = lag_memory(parameters.lag, 3), lag_memory(parameters.fed_lag, 1), np.zeros(4)
+        fed = lag_memory(parameters.fed_lag, 0 if parameters.invertible else 1)
+        filters = lag_memory(parameters.lag, 3), fed, np.zeros(4)
         effects = np.zeros((2, parameters.stages))
         memory = GuardMemory(*filters, effects, GuardAverages.zeros(), GuardSample.zeros())
         withdraw_authority(memory)

@@ -160,7 +160,7 @@ class GuardMemory(NamedTuple):
     """State of the guard."""
 
     chain: Matrix  # lag filters of f_plain, g and v (3, …)
-    fed: Matrix  # lag filter of f_L, if it is not that of the observer (1, …)
+    fed: Matrix  # lag filter of f_L (1, …), if it is not that of the observer, else (0, …)
     shown: Vector  # their outputs: f_plain^F, g^F, p and f_L^F (4,)
     effects: Matrix  # what q and p̄ do to y, stage by stage (2, n) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from dataclasses import replace
+from typing import Any
 
 from quell.export.translate.blocks import (
     Block,
@@ -17,11 +18,12 @@ from quell.export.translate.interfaces import Translation
 from quell.export.translate.naming import identifier
 from quell.export.translate.source import Source
 from quell.export.translate.statements import (
-    Assumptions,
     Body,
+    LocalAssumptions,
     WrongAssumptionError,
     ends,
     same_constant,
+    same_number,
 )
 from quell.export.translate.values import (
     ATOM,
@@ -53,7 +55,9 @@ class Function:
         source: Source,
         arguments: list[Value],
         hints: tuple[str, ...],
+        key: Any,
     ) -> None:
+        self.key = key
         self.program, self.source = program, source
         names = [argument.arg for argument in source.tree.args.args]
         if len(names) != len(arguments):
@@ -62,7 +66,18 @@ class Function:
             name: _parameter(name, argument, node.annotation)
             for name, argument, node in zip(names, arguments, source.tree.args.args, strict=True)
         }
-        known = Assumptions()
+        self.constants: dict[
+            str, Any
+        ] = {}  # of parameters that have the same value in all calls so far
+        stored = {part.id for part in ast.walk(source.tree)
+                  if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}  # fmt: skip
+        for name, argument in zip(names, arguments, strict=True):
+            if name in stored or not isinstance(argument.kind, Number):
+                continue
+            if argument.is_constant and (key, name) not in program.findings.parameters:
+                self.constants[name] = argument.constant
+                parameters[name] = replace(parameters[name], **_known(program, argument))
+        known = LocalAssumptions()
         while True:
             try:
                 body = Body(program, source, parameters, known)
@@ -204,6 +219,10 @@ class Function:
     def call(self, body: Expressions, arguments: list[Value]) -> Value:
         """Return the value of a call with these arguments."""
         by_name = dict(zip(self.order, arguments, strict=True))
+        for name, constant in self.constants.items():
+            number = by_name[name]
+            if not (number.is_constant and same_number(number.constant, constant)):
+                self.program.findings.add_parameter((self.key, name))
         for name in self.written:
             body.written.add(by_name[name].root)
         if self.inline is not None:
@@ -253,3 +272,8 @@ def _parameter(name: str, argument: Value, annotation: ast.expr | None) -> Value
     if getattr(annotation, "id", "") == "float" and isinstance(kind, Number):
         kind = Number.REAL
     return Value(kind, identifier(name), root=name, mutable=argument.mutable, constant=UNKNOWN)
+
+
+def _known(program: Translation, argument: Value) -> dict[str, Any]:
+    """Return the code and the value of a constant argument, for its parameter."""
+    return {"code": argument.code, "level": argument.level, "constant": argument.constant}

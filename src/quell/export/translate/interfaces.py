@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from quell.export.translate.findings import Findings
 from quell.export.translate.literals import Literals
 from quell.export.translate.structs import Structs
 from quell.export.translate.values import Kind, Struct, Value
@@ -13,6 +14,7 @@ from quell.export.translate.values import Kind, Struct, Value
 class Translation(Protocol):
     """A program while it is written; ``program.py`` has it."""
 
+    findings: Findings
     literals: Literals
     structs: Structs
     calls: Any  # a ``Calls``

@@ -8,6 +8,7 @@ from typing import Any
 from quell.export.translate.blocks import lines_of, words
 from quell.export.translate.calls import Calls
 from quell.export.translate.expressions import Expressions
+from quell.export.translate.findings import Findings
 from quell.export.translate.functions import Function
 from quell.export.translate.layout import block_lines, comment_block, wrapped
 from quell.export.translate.literals import Literals
@@ -19,7 +20,7 @@ from quell.export.translate.source import (
     module_doc,
     read_function,
 )
-from quell.export.translate.structs import Structs, Varying
+from quell.export.translate.structs import Structs
 from quell.export.translate.values import Array, Kind, Struct, Value
 
 # Helper functions in C; "real" stands for float or double, "" for the suffix of functions.
@@ -62,13 +63,14 @@ class Program:
         begins the names of structs.
     single
         whether real numbers are ``float``.
-    varying
-        numbers of the state that change, see ``Structs``.
+    findings
+        of earlier translations of the same program.
     """
 
-    def __init__(self, prefix: str, single: bool, varying: Varying) -> None:
+    def __init__(self, prefix: str, single: bool, findings: Findings) -> None:
+        self.findings = findings
         self.literals = Literals(single)
-        self.structs = Structs(prefix, self.literals, varying)
+        self.structs = Structs(prefix, self.literals, findings)
         self.calls = Calls(self)
         self.functions: list[Function] = []
         self.helpers: set[str] = set()
@@ -96,7 +98,7 @@ class Program:
             source = read_function(python)
             if into_array:
                 source = into_procedure(source)
-            found = Function(self, source, arguments, hints)
+            found = Function(self, source, arguments, hints, key)
             self._found[key] = found
             if found.inline is None:
                 found.name = self._function_name(found.source, arguments, generic_name)

@@ -39,7 +39,7 @@ class WrongAssumptionError(Exception):
 
 
 @dataclass
-class Assumptions:
+class LocalAssumptions:
     """What is assumed about local variables until the opposite is found."""
 
     varying: set[str] = field(default_factory=set)  # not the same constant everywhere
@@ -50,7 +50,11 @@ class Body(Expressions):
     """The body of a function, translated once under given assumptions."""
 
     def __init__(
-        self, program: Translation, source: Source, arguments: dict[str, Value], known: Assumptions
+        self,
+        program: Translation,
+        source: Source,
+        arguments: dict[str, Value],
+        known: LocalAssumptions,
     ) -> None:
         where = f"{source.module}.{source.name}"
         super().__init__(program, source.names, where, source.module)
@@ -271,7 +275,7 @@ class Body(Expressions):
         if kind is Number.INT and value.is_constant:
             return self.constant(int(value.constant))
         if not value.is_number or needed_kind(value).value > kind.value:
-            if self.program.structs.found_varying:
+            if self.program.findings.is_new:
                 return value  # the program will be translated again
             raise self.fail(node, "a real number is assigned to an integer")
         return value
@@ -378,8 +382,12 @@ def needed_kind(value: Value) -> Number:
 
 def same_constant(one: Value, other: Value) -> bool:
     """Return whether two known values are the same, not-a-number included."""
-    a, b = one.constant, other.constant
-    return type(a) is type(b) and (a == b or (a != a and b != b))
+    return same_number(one.constant, other.constant)
+
+
+def same_number(one: Any, other: Any) -> bool:
+    """Return whether two numbers are of one type and equal, or both not a number."""
+    return type(one) is type(other) and (one == other or (one != one and other != other))
 
 
 def ends(block: Block) -> bool:

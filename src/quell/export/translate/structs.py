@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
+from quell.export.translate.findings import Findings
 from quell.export.translate.literals import Literals
 from quell.export.translate.naming import identifier, snake_case, unique
 from quell.export.translate.source import ascii_text, field_comments
@@ -24,9 +25,6 @@ from quell.export.translate.values import (
 from quell.kernels.function_pointers import origin_of
 from quell.kernels.scalars import Scalars
 from quell.kernels.sized import constant_fields
-
-Varying: TypeAlias = dict[tuple[str, str], Number]
-"""Kinds of the numbers of a state that change, by struct and field."""
 
 # Name of the union of arrays that lie in the same memory.
 _SHARED = "shared"
@@ -49,7 +47,7 @@ class Structs:
 
     A number in a record of the state that is only ever set to its initial value is a constant, and
     does not exist in C; one that is only ever 0 or 1 is a ``bool``, one that only gets integers an
-    ``int``. That is assumed until something else is assigned; then ``varying`` gets the number
+    ``int``. That is assumed until something else is assigned; then ``findings`` gets the number
     with the kind that it needs, and the program has to be translated again.
 
     Parameters
@@ -58,15 +56,14 @@ class Structs:
         begins the names of structs.
     literals
         writer of numbers.
-    varying
-        kind of each number that is known to change, by its struct and field.
+    findings
+        of earlier translations.
     """
 
-    def __init__(self, prefix: str, literals: Literals, varying: Varying) -> None:
+    def __init__(self, prefix: str, literals: Literals, findings: Findings) -> None:
         self.prefix = prefix
         self.literals = literals
-        self.varying = varying
-        self.found_varying = False
+        self.findings = findings
         self._initial: dict[tuple[str, str], Any] = {}
         self.layouts: dict[str, Layout] = {}  # by name, in the order of their definitions
         self._by_signature: dict[Any, Struct] = {}
@@ -151,12 +148,12 @@ class Structs:
             return None
         path = f"{_SHARED}." if name in layout.shared else ""
         member = (owner.kind.name, name)
-        if owner.mutable and member in self._initial and member not in self.varying:
+        if owner.mutable and member in self._initial and member not in self.findings.numbers:
             initial = self._initial[member]
             return Value(kind, self.literals.write(initial), constant=initial, member=member)
         code = f"{owner.code}{'->' if owner.pointer else '.'}{path}{identifier(name)}"
-        kind = self.varying.get(member, kind)
-        chosen = member if member in self.varying else None
+        kind = self.findings.numbers.get(member, kind)
+        chosen = member if member in self.findings.numbers else None
         return Value(
             kind, code, root=owner.root, mutable=owner.mutable, pointer=False, member=chosen
         )
@@ -164,16 +161,16 @@ class Structs:
     def vary(self, member: tuple[str, str], kind: Number) -> None:
         """Note that a number of the state gets another value, of a kind."""
         initial = whole_kind(self._initial[member])
-        known = self.varying.get(member, Number.BOOL)
+        known = self.findings.numbers.get(member, Number.BOOL)
         needed = max(initial, kind, known, key=lambda number: number.value)
-        if self.varying.get(member) is not needed:
-            self.varying[member] = needed
-            self.found_varying = True
+        self.findings.add_number(member, needed)
 
     def fields_of(self, struct: Struct) -> list[str]:
         """Return the names of the fields of a record that change."""
         name = struct.name
-        return [each for each in self.layouts[name].members if (name, each) in self.varying]
+        return [
+            each for each in self.layouts[name].members if (name, each) in self.findings.numbers
+        ]
 
     def keep_used(self, code: str) -> None:
         """Remove the fields that do not occur in the code, and structs that become empty."""
@@ -181,10 +178,13 @@ class Structs:
         for name, layout in self.layouts.items():
             kept = {}
             for part, kind in layout.members.items():
-                constant = (name, part) in self._initial and (name, part) not in self.varying
+                constant = (name, part) in self._initial and (
+                    name,
+                    part,
+                ) not in self.findings.numbers
                 empty = isinstance(kind, Struct) and not self.layouts[kind.name].members
                 if identifier(part) in used and not constant and not empty:
-                    kept[part] = self.varying.get((name, part), kind)
+                    kept[part] = self.findings.numbers.get((name, part), kind)
             layout.members = kept
 
     def rename(self, struct: Struct, name: str) -> Struct:
