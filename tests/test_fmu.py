@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import gc
 import pickle
+import random
 import struct
 import tempfile
 import zipfile
@@ -22,6 +23,7 @@ from quell.reading import TooLargeError
 from quell.realtime.devices.twin import TwinDevice
 
 from . import fmus
+from .mutations import mutated
 
 pytest.importorskip("fmpy", reason="FMPy, which reads and calls FMUs, is missing")
 pytestmark = fmus.needs_gcc
@@ -225,6 +227,7 @@ def added(name: str, content: bytes = b"") -> Callable[[dict[str, bytes]], None]
         (without("modelDescription.xml"), "is no FMU: it has no modelDescription.xml"),
         (added("modelDescription.xml", b"<fmi"), "modelDescription.xml can't be read"),
         (replaced('fmiVersion="3.0"', 'fmiVersion="1.0"'), "modelDescription.xml can't be read"),
+        (replaced("<fmi", "<!DOCTYPE x [<!ENTITY e 'e'>]><fmi"), "must be in UTF-8, without a doc"),
         (replaced("CoSimulation", "ModelExchange"), "is not for co-simulation"),
         (
             without("binaries/"),
@@ -280,6 +283,33 @@ def test_archives_that_lie_about_their_sizes_unpack_to_no_more(
         ql.plants.FMU(tmp_path / "none.fmu")
     with pytest.raises(TooLargeError):
         ql.plants.FMU(files[3], max_size=0.001)
+
+
+def test_random_changes_of_an_fmu_are_read_or_refused_in_a_line(
+    tmp_path: Path,
+) -> None:
+    """Of its description, and of the archive; no code of it runs."""
+    random_, path, results = random.Random(3), tmp_path / "changed.fmu", list[str]()
+    for k in range(60):
+        content = fmus.contents(2 + k % 2)
+        if k % 3:
+            text = content["modelDescription.xml"]
+            content["modelDescription.xml"] = mutated(text, "setup", b"<a>", random_)
+        fmus.packed(path, content)
+        if not k % 3:
+            path.write_bytes(mutated(path.read_bytes(), "NetCDF", b"PK", random_))
+        try:
+            ql.plants.FMU(path, w=["w"], max_size=10.0).sampled(DT)
+            results.append("")
+        except ValueError as error:
+            results.append(str(error))
+    assert "" in results
+    assert any(results)
+    assert not any("\n" in message for message in results)
+    content = fmus.packed(path, {"resources/a": b""}).read_bytes()
+    path.write_bytes(content.replace(b"resources/a", b"\0esources/a"))
+    with pytest.raises(ValueError, match="contains '', a link or a path"):
+        ql.plants.FMU(path)
 
 
 def test_binaries_that_cannot_be_used_are_named(tmp_path: Path) -> None:

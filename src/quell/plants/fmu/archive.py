@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import stat
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -13,6 +14,11 @@ from quell.reading import check_regular, check_size
 
 # An FMU of a large tool has some hundred files. Chosen by hand.
 _MOST_FILES = 10_000
+# What the library raises for archives that are damaged.
+_DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, LookupError, OSError),
+    *(NotImplementedError, RuntimeError, UnicodeError),
+)
 _ENCRYPTED = 1  # bit of a file's flags (ZIP specification, 4.4.4)
 
 
@@ -43,7 +49,7 @@ def unpack(path: Path, folder: Path, most: int, wanted: Callable[[str], bool]) -
     check_regular(path, str(path))
     try:
         with zipfile.ZipFile(path) as archive:
-            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+            entries = [each for each in archive.infolist() if not each.filename.endswith("/")]
             _check(entries, where)
             chosen = [entry for entry in entries if wanted(entry.filename)]
             check_size(sum(entry.file_size for entry in chosen), most, where)
@@ -54,7 +60,7 @@ def unpack(path: Path, folder: Path, most: int, wanted: Callable[[str], bool]) -
                 with archive.open(entry) as source, target.open("xb") as file:
                     shutil.copyfileobj(source, file)
             return [entry.filename for entry in entries]
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError) as error:
+    except _DAMAGE as error:
         raise ValueError(f"{where}: is no FMU, or is damaged ({error})") from None
 
 

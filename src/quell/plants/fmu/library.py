@@ -164,6 +164,9 @@ def _read(fmpy: Any, folder: Path, name: str) -> Any:
     """Return the description of the FMU ``name``; it is one for co-simulation."""
     if not (folder / _DESCRIPTION).is_file():
         raise ValueError(f"{name}: is no FMU: it has no {_DESCRIPTION}")
+    text = (folder / _DESCRIPTION).read_bytes()
+    if b"<!DOCTYPE" in text or b"\0" in text:  # entities could expand to anything
+        raise ValueError(f"{name}: {_DESCRIPTION}: must be in UTF-8, without a document type")
     try:
         description = fmpy.read_model_description(str(folder))
         version = description.fmiMajorVersion
