@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         analysis,
         controllers,
         experiments,
+        export,
         features,
         identification,
         learners,
@@ -77,7 +78,7 @@ _MODULES = {"baselines": "quell.controllers.baselines", "metrics": "quell.record
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Guard", "Reason", "Scenario",
     "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers",
-    "experiments", "features", "identification", "identify", "learners", "metrics", "observers",
+    "experiments", "export", "features", "identification", "identify", "learners", "metrics", "observers",
     "omega_c_for", "plants", "realtime", "setup", "signals", "simulate", "sweep", "sweeping",
     "tune", "tuning",
 ]  # fmt: skip

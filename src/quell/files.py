@@ -10,8 +10,9 @@ import itertools
 import json
 import math
 import os
+import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,75 @@ def written_atomically(path: str | os.PathLike[str], overwrite: bool = False) ->
         raise OSError(error.errno, os.strerror(error.errno), str(target)) from None
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_folder(
+    path: str | os.PathLike[str], files: Mapping[str, str], overwrite: bool = False
+) -> tuple[Path, ...]:
+    """Write text files into a folder, all of them or none; return their paths.
+
+    Parameters
+    ----------
+    path
+        the folder; it is created if its parent exists. With files in it, it needs ``overwrite``.
+    files
+        text by path inside the folder, as ``src/servo.c``.
+    overwrite
+        whether to replace files of these names; others in the folder are left alone.
+
+    Raises
+    ------
+    ValueError
+        if the folder is a file, has files and is not to be changed, or can't be written.
+    """
+    target = Path(path)
+    check_folder(target, overwrite)
+    part = target.with_name(f".{target.name}-{uuid.uuid4().hex[:12]}")
+    try:
+        for name, text in files.items():
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            (part / name).write_text(text, encoding="utf-8", newline="\n")
+        if target.exists() and any(target.iterdir()):
+            _move_into(part, target, files)
+        else:
+            if target.exists():
+                target.rmdir()
+            part.rename(target)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ValueError(f"path = {str(target)!r}: can't be written ({reason})") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return tuple(target / name for name in files)
+
+
+def check_folder(path: str | os.PathLike[str], overwrite: bool = False) -> None:
+    """Check that ``write_folder`` can write; raise a ``ValueError`` if not."""
+    target = Path(path).absolute()
+    if os.path.lexists(target) and not target.is_dir():
+        raise ValueError(f"path = {str(path)!r}: must be a folder, is a file")
+    if not target.parent.is_dir():
+        raise ValueError(f"path = {str(path)!r}: the folder {str(target.parent)!r} must exist")
+    found = next(target.iterdir(), None) if target.is_dir() else None
+    if found is not None and not overwrite:
+        raise ValueError(
+            f"path = {str(path)!r}: the folder has files ({found.name}); choose another folder, or "
+            "ask to replace files of the same names (--overwrite on the command line, "
+            "overwrite=True in Python)"
+        )
+
+
+def _move_into(part: Path, target: Path, names: Iterable[str]) -> None:
+    """Move files into a folder, over those of the same names, after a check that all can be."""
+    for name in names:
+        for place in [target / name, *(target / name).parents]:
+            if place == target:
+                break
+            if os.path.lexists(place) and place.is_dir() == (place == target / name):
+                raise ValueError(f"path = {str(place)!r}: is in the way of a file to write")
+    for name in names:
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        (part / name).replace(target / name)
 
 
 def new_folder(path: str | os.PathLike[str]) -> Path:

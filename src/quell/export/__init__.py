@@ -6,7 +6,11 @@ May import: everything but setups, experiments and the command line.
 from quell.export.c_files import CSource
 from quell.export.controller_source import c_source
 from quell.export.fmi import fmu
+from quell.export.library import Comparison, Exported, NoCompilerError, Sizes, c
 from quell.export.plant_source import plant_source
 from quell.export.translate.values import TranslationError
 
-__all__ = ["CSource", "TranslationError", "c_source", "fmu", "plant_source"]
+__all__ = [
+    "CSource", "Comparison", "Exported", "NoCompilerError", "Sizes", "TranslationError", "c",
+    "c_source", "fmu", "plant_source",
+]  # fmt: skip

@@ -11,9 +11,18 @@ import numpy as np
 from quell.export.translate.findings import Findings
 from quell.export.translate.initial import initial_lines
 from quell.export.translate.layout import comment_block, wrapped
+from quell.export.translate.naming import checked_name
 from quell.export.translate.program import Program
 from quell.export.translate.structs import arrays_of
 from quell.export.translate.values import Number, Struct, Value
+
+
+# Compilers for small processors have a double of four bytes.
+_DOUBLE = [
+    "#if DBL_MANT_DIG < 53",
+    '#error "double has less than 53 bits here: export in single precision"',
+    "#endif",
+]
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,8 @@ class CSource:
         names and widths of the estimate; none for a plant.
     operations
         names of the functions, without the prefix.
+    externals
+        names of functions in C that the user has to link.
     """
 
     name: str
@@ -40,6 +51,7 @@ class CSource:
     precision: str
     channels: tuple[tuple[str, int], ...]
     operations: tuple[str, ...]
+    externals: tuple[str, ...] = ()
 
     @property
     def real(self) -> str:
@@ -51,7 +63,7 @@ class CFiles:
     """Writer of the files for parameters and a state, with the findings of earlier translations."""
 
     def __init__(self, name: str, parameters: Any, state: Any, findings: Findings) -> None:
-        self.name, self.parameters, self.state = name, parameters, state
+        self.name, self.parameters, self.state = checked_name(name), parameters, state
         precisions = {array.dtype for array in arrays_of(state) if array.dtype.kind == "f"}
         self.single = np.dtype(np.float32) in precisions
         self.program = Program(name, self.single, findings)
@@ -114,7 +126,8 @@ class CFiles:
         source = self._source()
         header = self._header(title, defines)
         precision = "single" if self.single else "double"
-        return CSource(self.name, header, source, precision, channels, tuple(self.operations))
+        operations, externals = tuple(self.operations), tuple(self.program.externals)
+        return CSource(self.name, header, source, precision, channels, operations, externals)
 
     def _header(self, title: list[str], defines: list[str]) -> str:
         name, upper, structs = self.name, self.name.upper(), self.program.structs
@@ -161,6 +174,7 @@ class CFiles:
             "#ifdef __FAST_MATH__",
             '#error "-ffast-math removes the tests for NaN and the compensated sums"',
             "#endif",
+            *([] if self.single else _DOUBLE),
             *kernels,
             "",
             f"const {name}_parameters {name}_default_parameters =",

@@ -20,6 +20,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from types import FunctionType
 from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
@@ -217,8 +218,23 @@ def _dispatcher_and_layouts(entry: Any, arguments: tuple[Any, ...]) -> tuple[Any
     return dispatcher_for(entry, *arguments), layouts
 
 
+_as_python: ContextVar[bool] = ContextVar("as_python", default=False)
+
+
+@contextmanager
+def as_python() -> Iterator[None]:
+    """Make ``call_specialised`` run plain Python inside the ``with`` block."""
+    token = _as_python.set(True)
+    try:
+        yield
+    finally:
+        _as_python.reset(token)
+
+
 def call_specialised(entry: Any, *arguments: Any) -> Any:
     """Call an entry point, ``specialised`` for its arguments."""
+    if _as_python.get():
+        return entry.plain(*arguments)
     return specialised(entry, *arguments)(*arguments)
 
 

@@ -1,0 +1,111 @@
+"""The C program that compares a controller with golden vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from quell.export.c_files import CSource
+from quell.export.library.templates import filled
+from quell.export.library.vectors import Action, Vectors
+from quell.export.translate.literals import Literals
+
+# What the program does before the step in a sample of each kind; NAME is the controller's.
+_CODE = {
+    Action.APPLIED: ("NAME_applied(state, now->given);",),
+    Action.TRACK: ("return NAME_track(state, now->r, now->y, now->given);",),
+    Action.HAND_OVER: ("NAME_hand_over(state);",),
+    Action.LIMIT: (
+        "*limited = NAME_default_parameters;",
+        "limited->PATH.high = LIMIT;",
+        "NAME_retune(state, limited);",
+    ),
+    Action.FREE: ("NAME_retune(state, &NAME_default_parameters);",),
+    Action.RESET: ("NAME_reset(state);",),
+    Action.START: ("NAME_start(state, now->y, now->given, now->r);",),
+}
+# The derivatives of the reference belong to each step.
+_DERIVATIVES = """    for (int i = 0; i < COUNT; i++)
+        derivatives[i] = HALF * now->r;
+    NAME_set_derivatives(state, derivatives);
+"""
+
+
+def test_program(source: CSource, vectors: Vectors) -> str:
+    """Return the text of ``test_NAME.c``."""
+    single = source.precision == "single"
+    write = Literals(single).write_real
+    used = [action for action in Action if any(row.action == action for row in vectors.rows)]
+    limits = Action.LIMIT in used
+    cases: list[str] = []
+    for action in used:
+        lines = _CODE.get(action, ())
+        if action is Action.TRACK and vectors.derivatives:
+            lines = (*_derivatives(source.name, vectors, write(0.5)).splitlines(), *lines)
+        if lines:
+            cases.append(f"    case {action.name}:")
+            cases += [f"        {line.strip()}" for line in lines]
+            cases += [] if lines[-1].startswith("return") else ["        break;"]
+    text = "\n".join(cases).replace("NAME", source.name).replace("PATH", vectors.limit_path)
+    limit = write(vectors.limit) if limits else ""
+    rows = (
+        f"    {{{row.action.name}, {write(row.r)}, {write(row.y)}, {write(row.given)}, "
+        f"{write(row.u)}, {row.status}}},"
+        for row in vectors.rows
+    )
+    parameters = f"{source.name}_parameters"
+    return filled("test.c", {
+        "name": source.name,
+        "precision": source.precision,
+        "real": source.real,
+        "epsilon": "FLT_EPSILON" if single else "DBL_EPSILON",
+        "scale": repr(vectors.scale),
+        "digits": 9 if single else 17,
+        "actions": ", ".join(action.name for action in used),
+        "rows": "\n".join(rows),
+        "expected": "\n".join(_expected(source, vectors)),
+        "found": ",\n        ".join(f"(real)estimate.{place}" for place, *_ in _places(source)),
+        "cases": text.replace("LIMIT;", f"{limit};"),
+        "limited_parameter": f", {parameters} *limited" if limits else "",
+        "limited_variable": f"    static {parameters} limited;\n" if limits else "",
+        "limited_argument": ", &limited" if limits else "",
+        "variables": _variables(source, vectors),
+        "before_step": _derivatives(source.name, vectors, write(0.5)),
+        "tolerance": "0.0",
+        "tolerance_reason": "",
+    })  # fmt: skip
+
+
+def _places(source: CSource) -> Iterator[tuple[str, slice]]:
+    """Yield the members of the estimate that are compared, and the numbers of their channel."""
+    at = 0
+    for channel, width in source.channels:
+        if channel != "status":
+            for i in range(width):
+                yield f"{channel}[{i}]" if width > 1 else channel, slice(at, at + width)
+        at += width
+
+
+def _expected(source: CSource, vectors: Vectors) -> Iterator[str]:
+    """Yield the lines of the estimate: name, value, and the largest size in its channel."""
+    write = Literals(source.precision == "single").write_real
+    row, before = vectors.estimate, -1
+    for place, part in _places(source):
+        at = max(part.start, before + 1)
+        before = at
+        size = float(np.max(np.abs(np.where(np.isfinite(row[part]), row[part], 0.0))))
+        yield f'    {{"{place}", {write(row[at])}, {size!r}}},'
+
+
+def _derivatives(name: str, vectors: Vectors, half: str) -> str:
+    if not vectors.derivatives:
+        return ""
+    text = _DERIVATIVES.replace("COUNT", str(vectors.derivatives))
+    return text.replace("HALF", half).replace("NAME", name)
+
+
+def _variables(source: CSource, vectors: Vectors) -> str:
+    if not vectors.derivatives:
+        return ""
+    return f"    {source.real} derivatives[{vectors.derivatives}];\n\n"

@@ -1,0 +1,107 @@
+"""The files around an exported controller: project files, description and example."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from quell import __version__
+from quell.controllers.single import SinglePrecision
+from quell.export.c_files import CSource
+from quell.export.library.templates import filled
+from quell.export.library.test_program import test_program
+from quell.export.library.vectors import Vectors, limits_path
+
+# Calls of the functions, and when they belong there; s is &state.
+_OPERATIONS = {
+    "init": ("init(s)", "once, before all others"),
+    "start": ("start(s, y, u, r)", "the plant rests at y under u; long: before the timer starts"),
+    "set_derivatives": (
+        "set_derivatives(s, derivatives)",
+        "before the step, if r', r'', ... are known",
+    ),
+    "step": ("step(s, r, y)", "each sample; returns u"),
+    "applied": ("applied(s, u)", "after the step, if another u was applied"),
+    "track": ("track(s, r, y, u)", "instead of the step in manual operation, under u"),
+    "hand_over": (
+        "hand_over(s)",
+        "once, before the first step after manual operation; false before the first sample",
+    ),
+    "retune": ("retune(s, &parameters)", "between two samples: other parameters, without a jump"),
+    "reset": ("reset(s)", "from rest at the next sample; what was learned is kept"),
+    "status": ("status(s)", "after the step: flags, see the enum in the header"),
+    "get_estimate": ("get_estimate(s)", "after the step: what the controller knows, for telemetry"),
+}
+_RETUNING = """## Other limits
+
+Parameters are constants. To change a limit while running, change a copy:
+
+```c
+static NAME_parameters derated;
+
+derated = NAME_default_parameters;
+derated.PATH.high = ONE;
+NAME_retune(&state, &derated); /* the copy must stay in memory, unchanged while it is in use */
+```
+"""
+_EXTERNALS = """## Your functions
+
+The controller calls functions that you have to link: FUNCTIONS. `src/NAME.c` declares them.
+
+"""
+_DOUBLE = """- `double` must have 8 bytes; where it has 4 (AVR) the file refuses to compile. A processor
+  without a unit for double (Cortex-M4F) needs about twenty times as long as for single precision.
+
+"""
+
+
+def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[str, str]:
+    """Return the text of all files of the library by path.
+
+    Parameters
+    ----------
+    controller
+        the exported controller.
+    source
+        its C code.
+    vectors
+        a run of it.
+    """
+    name, single = source.name, source.precision == "single"
+    one = "1.0f" if single else "1.0"
+    described = controller.controller if isinstance(controller, SinglePrecision) else controller
+    rows = (
+        f"| `{name}_{call}` | {when} |"
+        for operation, (call, when) in _OPERATIONS.items()
+        if operation in source.operations
+    )
+    path = limits_path(controller)
+    retuning = _RETUNING.replace("PATH", path).replace("ONE", one) if path else ""
+    functions = ", ".join(f"`{each}`" for each in source.externals)
+    externals = _EXTERNALS.replace("FUNCTIONS", functions) if functions else ""
+    values = {
+        "name": name,
+        "NAME": name.upper(),
+        "title": f"Controller {type(described).__name__}",
+        "precision": source.precision,
+        "real": source.real,
+        "one": one,
+        "zero": "0.0f" if single else "0.0",
+        "dt": repr(float(controller.dt)),
+        "version": __version__,
+        "operations": "\n".join(rows),
+        "fast_math": ", and so do the compensated sums" if single else "",
+        "double": "" if single else _DOUBLE,
+        "retuning": retuning.replace("NAME", name),
+        "externals": externals.replace("NAME", name),
+        "external_note": " # and your functions" if functions else "",
+        "link": " YOUR_FILES" if functions else "",
+        "tolerance_reason": "",
+    }
+    texts = ("CMakeLists.txt", "library.json", "library.properties", "README.md")
+    return {
+        f"src/{name}.h": source.header,
+        f"src/{name}.c": source.source,
+        f"test_{name}.c": test_program(source, vectors),
+        f"examples/{name}/{name}.ino": filled("example.ino", values),
+        **{each: filled(each, values) for each in texts},
+    }

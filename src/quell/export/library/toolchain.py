@@ -1,0 +1,142 @@
+"""Bytes of code, constants, state and stack of an exported controller, as a compiler tells."""
+
+from __future__ import annotations
+
+import platform
+import re
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+# Compilers for targets, of which the first that is here measures; then that of this machine.
+_ARM = ("-mthumb", "-mfloat-abi=hard")
+_TARGETS = {
+    "single": ("Cortex-M4F", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", *_ARM)),
+    "double": ("Cortex-M7", ("-mcpu=cortex-m7", "-mfpu=fpv5-d16", *_ARM)),
+}
+_CROSS = "arm-none-eabi-"
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
+"""Flags with which the golden vectors hold bit for bit."""
+# A compiler that takes longer hangs: the largest learners take some seconds.
+_LONGEST = 120.0
+# gcc 10 and later write the calls of functions, with the stack of each.
+_CALLS = "-fcallgraph-info=su"
+
+
+class Sizes(NamedTuple):
+    """Bytes that a controller takes on a processor.
+
+    Attributes
+    ----------
+    processor, compiler
+        for which, and by which compiler (with ``-O2``).
+    code, constants
+        of all functions, without the C library.
+    state, parameters
+        of one ``NAME_state``, and of one ``NAME_parameters``, which is part of the constants.
+    stack
+        of ``NAME_step`` and all it calls, without the C library; None if the compiler can't tell.
+    """
+
+    processor: str
+    compiler: str
+    code: int
+    constants: int
+    state: int
+    parameters: int
+    stack: int | None
+
+
+class NoCompilerError(ValueError):
+    """There is no compiler that can measure sizes."""
+
+
+def measured_sizes(name: str, header: str, source: str, precision: str) -> Sizes:
+    """Return the sizes of a controller, whose files are given as texts.
+
+    Raises
+    ------
+    NoCompilerError
+        if there is no gcc; and if it fails, with its first message.
+    """
+    processor, prefix, flags = _compiler(precision)
+    with tempfile.TemporaryDirectory(prefix="quell-sizes-") as folder:
+        place = Path(folder)
+        (place / f"{name}.h").write_text(header, encoding="utf-8")
+        (place / f"{name}.c").write_text(source, encoding="utf-8")
+        structs = f'#include "{name}.h"\nchar of_state[sizeof({name}_state)];\n'
+        structs += f"char of_parameters[sizeof({name}_parameters)];\n"
+        (place / "structs.c").write_text(structs, encoding="utf-8")
+        _run(place, f"{prefix}gcc", *FLAGS, *flags, _CALLS, "-c", f"{name}.c", "structs.c")
+        sections = _run(place, f"{prefix}size", "-A", f"{name}.o")
+        symbols = _run(place, f"{prefix}nm", "-S", "structs.o")
+        calls = place / f"{name}.ci"
+        stack = stack_of(f"{name}_step", calls.read_text(encoding="utf-8"))
+    return Sizes(
+        processor,
+        f"{prefix}gcc",
+        _sum(sections, ".text"),
+        _sum(sections, ".rodata"),
+        *(
+            int(_found(rf"^\S+ (\S+) \w of_{what}$", symbols), 16)
+            for what in ("state", "parameters")
+        ),
+        stack,
+    )
+
+
+def _compiler(precision: str) -> tuple[str, str, tuple[str, ...]]:
+    """Return the processor, the prefix of the compiler's programs, and its flags."""
+    if all(shutil.which(_CROSS + program) for program in ("gcc", "size", "nm")):
+        processor, flags = _TARGETS[precision]
+        return processor, _CROSS, flags
+    if not all(shutil.which(program) for program in ("gcc", "size", "nm")):
+        raise NoCompilerError("there is no gcc here")
+    return platform.machine(), "", ()
+
+
+def _run(folder: Path, *command: str) -> str:
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=_LONGEST, check=False
+    )
+    if done.returncode:
+        lines = [line for line in done.stderr.splitlines() if "error" in line]
+        raise NoCompilerError(f"{command[0]} fails: {(lines or [done.stderr.strip()])[0]}")
+    return done.stdout
+
+
+def _sum(sections: str, kind: str) -> int:
+    pattern = rf"^{re.escape(kind)}\S*\s+(\d+)"
+    return sum(int(size) for size in re.findall(pattern, sections, re.MULTILINE))
+
+
+def _found(pattern: str, text: str) -> str:
+    found = re.search(pattern, text, re.MULTILINE)
+    if found is None:
+        raise NoCompilerError("the output of nm is not known")
+    return found[1]
+
+
+def stack_of(function: str, calls: str) -> int | None:
+    """Return the stack of a function and the deepest of its calls, from the graph of gcc.
+
+    ``calls`` is the content of the ``.ci`` file, in the format VCG. Functions of other files count
+    as zero. None if the graph lacks the function.
+    """
+    own = {
+        found[1].rpartition(":")[2]: int(found[2])
+        for found in re.finditer(
+            r'node: \{ title: "([^"]+)" label: "[^"]*?(\d+) bytes', calls.replace("\\n", " ")
+        )
+    }
+    edges: dict[str, set[str]] = {}
+    for found in re.finditer(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"', calls):
+        caller, called = (found[i].rpartition(":")[2] for i in (1, 2))
+        edges.setdefault(caller, set()).add(called)
+
+    def depth(name: str) -> int:
+        return own.get(name, 0) + max((depth(each) for each in edges.get(name, ())), default=0)
+
+    return depth(function) if function in own else None
