@@ -16,7 +16,6 @@ from quell.export.translate.program import Program
 from quell.export.translate.structs import arrays_of
 from quell.export.translate.values import Number, Struct, Value
 
-
 # Compilers for small processors have a double of four bytes.
 _DOUBLE = [
     "#if DBL_MANT_DIG < 53",

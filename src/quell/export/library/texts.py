@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from quell import __version__
 from quell.controllers.single import SinglePrecision
 from quell.export.c_files import CSource
 from quell.export.library.templates import filled
-from quell.export.library.test_program import test_program
+from quell.export.library.test_program import TOLERANCE_REASON, test_program
 from quell.export.library.vectors import Vectors, limits_path
 
 # Calls of the functions, and when they belong there; s is &state.
@@ -48,8 +47,9 @@ _EXTERNALS = """## Your functions
 The controller calls functions that you have to link: FUNCTIONS. `src/NAME.c` declares them.
 
 """
-_DOUBLE = """- `double` must have 8 bytes; where it has 4 (AVR) the file refuses to compile. A processor
-  without a unit for double (Cortex-M4F) needs about twenty times as long as for single precision.
+_DOUBLE = """- `double` must have 8 bytes; where it has 4 (AVR) the file refuses to compile. A
+  processor without a unit for double (Cortex-M4F) needs about twenty times as long as for single
+  precision.
 
 """
 
@@ -87,7 +87,6 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
         "one": one,
         "zero": "0.0f" if single else "0.0",
         "dt": repr(float(controller.dt)),
-        "version": __version__,
         "operations": "\n".join(rows),
         "fast_math": ", and so do the compensated sums" if single else "",
         "double": "" if single else _DOUBLE,
@@ -95,7 +94,7 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
         "externals": externals.replace("NAME", name),
         "external_note": " # and your functions" if functions else "",
         "link": " YOUR_FILES" if functions else "",
-        "tolerance_reason": "",
+        "tolerance_reason": TOLERANCE_REASON,
     }
     texts = ("CMakeLists.txt", "library.json", "library.properties", "README.md")
     return {

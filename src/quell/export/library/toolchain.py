@@ -79,10 +79,8 @@ def measured_sizes(name: str, header: str, source: str, precision: str) -> Sizes
         f"{prefix}gcc",
         _sum(sections, ".text"),
         _sum(sections, ".rodata"),
-        *(
-            int(_found(rf"^\S+ (\S+) \w of_{what}$", symbols), 16)
-            for what in ("state", "parameters")
-        ),
+        _size_of("of_state", symbols),
+        _size_of("of_parameters", symbols),
         stack,
     )
 
@@ -112,11 +110,11 @@ def _sum(sections: str, kind: str) -> int:
     return sum(int(size) for size in re.findall(pattern, sections, re.MULTILINE))
 
 
-def _found(pattern: str, text: str) -> str:
-    found = re.search(pattern, text, re.MULTILINE)
+def _size_of(symbol: str, symbols: str) -> int:
+    found = re.search(rf"^\S+ (\S+) \w {symbol}$", symbols, re.MULTILINE)
     if found is None:
         raise NoCompilerError("the output of nm is not known")
-    return found[1]
+    return int(found[1], 16)
 
 
 def stack_of(function: str, calls: str) -> int | None:

@@ -114,9 +114,7 @@ class Player:
             elif action is Action.RESET:
                 reset_loop(old, self.state)
             elif action is Action.START:
-                observer = without_prefilters(self.described).observer
-                samples = samples_to_settle(observer)
-                operations.start(old, self.state, samples, y_, given_, r_)
+                operations.start(old, self.state, _samples(self.described), y_, given_, r_)
             if self.derivatives:
                 half = np.full(self.derivatives, real(0.5) * r_, dtype=type(real(0.0)))
                 set_reference_derivatives(self.design, self.state, half)
