@@ -96,7 +96,7 @@ class CFiles:
         if table is not None:
             function = table.get(head.python) or table[object]
         body = self.program.entry_expressions()
-        found = self.program.function(function, list(arguments), kernel.__name__)
+        found = self.program.function(function, list(arguments), kernel)
         value = found.call(body, list(arguments))
         return value.code or "".join(body.pending)
 

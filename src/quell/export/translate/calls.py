@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -102,8 +103,6 @@ class Calls:
         if name not in _SAME_NAME.split():
             raise TranslationError(f"{body.where}: math.{name} can not be translated")
         if all(argument.is_constant for argument in arguments):
-            import math
-
             return body.constant(getattr(math, name)(*(a.constant for a in arguments)))
         reals = [body.real(argument) for argument in arguments]
         found = self._call(Number.REAL, self.program.literals.math_function(name), *reals)
@@ -151,6 +150,8 @@ class Calls:
             size = f"sizeof *{record.code}" if record.pointer else f"sizeof {record.code}"
             return Value(Number.INT, f"memset({record.address}, 0, {size})", calls=True)
         if function is is_finite:
+            if arguments[0].is_constant:
+                return body.constant(math.isfinite(arguments[0].constant))
             return self._call(Number.BOOL, self.helper("is_finite"), body.real(arguments[0]))
         if function in (function_pointers.call, function_pointers.evaluate):
             returns = function is function_pointers.evaluate
@@ -161,14 +162,13 @@ class Calls:
             return body.real(arguments[0])
         if getattr(function, "__module__", "") == functions.__name__:
             return self.math_call(body, function.__name__, arguments)
-        implementation, generic_name = self._resolve(body, node, function, arguments)
-        return self.program.function(implementation, arguments, generic_name, names).call(
-            body, arguments
-        )
+        implementation, declaration = self._resolve(body, node, function, arguments)
+        found = self.program.function(implementation, arguments, declaration, names)
+        return found.call(body, arguments)
 
     def _resolve(
         self, body: Expressions, node: ast.Call, function: Any, arguments: list[Value]
-    ) -> tuple[Callable[..., Any], str]:
+    ) -> tuple[Callable[..., Any], Callable[..., Any] | None]:
         table = getattr(function, "implementations", None)
         if table is not None:
             kind = arguments[0].kind
@@ -176,11 +176,11 @@ class Calls:
             implementation = table.get(cls) or table.get(object)
             if implementation is None:
                 raise body.fail(node, f"has no implementation for {cls}")
-            return implementation, function.__name__
+            return implementation, function
         plain = interpreted(function)
         if not inspect.isfunction(plain):
             raise body.fail(node, f"{plain!r} is no function that can be translated")
-        return plain, ""
+        return plain, None
 
     def _user_function(
         self, body: Expressions, node: ast.Call, arguments: list[Value], returns: bool

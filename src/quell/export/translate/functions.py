@@ -168,14 +168,15 @@ class Function:
                 kinds = Several(tuple(item.kind for item in items))
                 self.inline = Value(kinds, items=tuple(items))
             return
-        self.kind = Several(tuple(item.kind for item in items))
+        single = len(self.result_members) == 1
+        self.kind = self.result_members[0][1] if single else Several(tuple(i.kind for i in items))
         for line, value in body.returns:
             parts = [
                 body.as_kind(item, kept.kind).code
                 for item, kept in zip(value.items, items, strict=True)
                 if kept.code.startswith(".")
             ]
-            line.code = "RESULT " + "\0".join(parts)
+            line.code = f"return {parts[0]}" if single else "RESULT " + "\0".join(parts)
 
     def _return_nothing(self, body: Body, block: Block) -> None:
         for line, _ in body.returns:
@@ -229,8 +230,9 @@ class Function:
             return self._inlined(body, by_name)
         given = [self._passed(body, name, by_name[name]) for name in self.used]
         code = f"{self.name}({', '.join(given)})"
-        if isinstance(self.kind, Several):
-            return Value(self.kind, code, items=self.items, calls=True)
+        if self.items and self.result_members:
+            kinds = Several(tuple(item.kind for item in self.items))
+            return Value(kinds, code, items=self.items, calls=True)
         if self.items:
             kinds = Several(tuple(item.kind for item in self.items))
             body.pending.append(code)

@@ -26,13 +26,14 @@ class Translation(Protocol):
         self,
         python: Callable[..., Any],
         arguments: list[Value],
-        generic_name: str = "",
+        declaration: Callable[..., Any] | None = None,
         hints: tuple[str, ...] = (),
         into_array: bool = False,
     ) -> Any:
         """Return the C function of a Python function for arguments like these.
 
-        With ``into_array`` the last of them is an array for the numbers that it returns.
+        If it implements a generic function, that is the ``declaration``. With ``into_array``, the
+        last of them is an array for the numbers that it returns.
         """
 
     def has_function(self, name: str) -> bool:

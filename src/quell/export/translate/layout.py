@@ -25,16 +25,20 @@ def _paragraphs(text: str) -> list[str]:
     """Return a text with each paragraph in one line."""
     parts: list[str] = []
     for line in text.splitlines():
+        in_list = bool(parts) and parts[-1][:2] in ("* ", "- ") and line[:2] == "  "
         starts = not parts or not line or line[0] in " *-123456789" or parts[-1][:1] in ("", " ")
-        if starts:
+        if starts and not in_list:
             parts.append(line)
         else:
-            parts[-1] += f" {line}"
+            parts[-1] += f" {line.lstrip()}"
     return parts
 
 
 def _filled(part: str, width: int) -> list[str]:
-    return [part] if part[:1] == " " else textwrap.wrap(part, width) or [""]
+    if part[:1] == " ":
+        return [part]
+    indent = "  " if part[:2] in ("* ", "- ") else ""
+    return textwrap.wrap(part, width, subsequent_indent=indent) or [""]
 
 
 def wrapped(line: str) -> list[str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from quell.export.translate.blocks import lines_of, words
@@ -15,6 +17,7 @@ from quell.export.translate.literals import Literals
 from quell.export.translate.naming import function_name, snake_case, unique
 from quell.export.translate.source import (
     Source,
+    doc_of,
     into_procedure,
     local_names,
     module_doc,
@@ -84,32 +87,37 @@ class Program:
         self,
         python: Callable[..., Any],
         arguments: list[Value],
-        generic_name: str = "",
+        declaration: Callable[..., Any] | None = None,
         hints: tuple[str, ...] = (),
         into_array: bool = False,
     ) -> Function:
         """Return the C function of a Python function for arguments like these.
 
-        With ``into_array`` the last of them is an array for the numbers that it returns.
+        If it implements a generic function, that is the ``declaration``. With ``into_array``, the
+        last of them is an array for the numbers that it returns.
         """
         key = (python, into_array, *((a.kind, a.mutable and not a.is_number) for a in arguments))
         found = self._found.get(key)
         if found is None:
             source = read_function(python)
+            if declaration is not None and not source.doc:
+                source = replace(source, doc=doc_of(declaration))
             if into_array:
                 source = into_procedure(source)
             found = Function(self, source, arguments, hints, key)
             self._found[key] = found
             if found.inline is None:
-                found.name = self._function_name(found.source, arguments, generic_name)
+                found.name = self._function_name(found.source, arguments, declaration)
                 self.functions.append(found)
-                if found.result_members:
+                if len(found.result_members) > 1:
                     self.results[found.name] = Struct(f"{found.name}_result", tuple, False)
                     self._complete_results(found)
         return found
 
-    def _function_name(self, source: Source, arguments: list[Value], generic_name: str) -> str:
-        name = function_name(generic_name or source.name)
+    def _function_name(
+        self, source: Source, arguments: list[Value], declaration: Callable[..., Any] | None
+    ) -> str:
+        name = function_name(declaration.__name__ if declaration else source.name)
         if name in local_names(source.module):
             name = f"{name}_value"
         head = arguments[0].kind if arguments else None
@@ -202,8 +210,6 @@ class Program:
         return lines
 
     def _in_precision(self, text: str) -> str:
-        import re
-
         text = text.replace("REAL_MAX", "FLT_MAX" if self.literals.single else "DBL_MAX")
         text = re.sub(r"\breal\b", self.literals.real, text)
         text = re.sub(r"\{(\d+)\}", lambda m: self.literals.write_real(float(m[1])), text)
@@ -220,7 +226,7 @@ class Program:
             if source.module not in modules and (doc := module_doc(source.module)):
                 modules.add(source.module)
                 lines += ["", *comment_block(f"---- {source.module} ----\n\n{doc}")]
-            if function.result_members:
+            if len(function.result_members) > 1:
                 members = " ".join(f"{self.structs.declaration(kind, name)};"
                                    for name, kind in function.result_members)  # fmt: skip
                 lines += ["", f"typedef struct {{ {members} }} {function.name}_result;"]

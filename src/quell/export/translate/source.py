@@ -23,16 +23,18 @@ from quell.export.translate.values import TranslationError
 _SIGNS = {
     "−": "-", "–": "-", "…": "...", "·": "*", "×": "*", "≤": "<=", "≥": ">=", "≈": "~", "→": "->",
     "←": "<-", "∞": "inf", "√": "sqrt ", "Σ": "sum ", "∫": "integral ", "∂": "d", "±": "+-",
-    "²": "^2", "³": "^3", "⁴": "^4", "⁵": "^5", "⁸": "^8", "⁻": "-", "¹": "1", "⁺": "+", "ᵀ": "'",
-    "₀": "0", "½": "1/2", "’": "'", "“": '"', "”": '"', "∈": "in", "‖": "|", "ᵢ": "i", "⁰": "0",
+    "⁻": "-", "⁺": "+", "ᵀ": "'",
+    "₀": "0", "½": "1/2", "’": "'", "“": '"', "”": '"', "∈": "in", "‖": "|", "ᵢ": "i",
     "Δ": "D", "Φ": "Phi", "Γ": "Gamma", "Λ": "Lambda", "Ω": "Omega", "µ": "u", "∇": "grad ",
 }  # fmt: skip
+_POWERS = dict(zip("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-", strict=True))
 _ACCENTS = {"\u0302": "_hat", "\u0303": "_tilde", "\u0304": "_bar", "\u0305": "_bar"}
 
 
 def ascii_text(text: str) -> str:
     """Return a text in ASCII: Greek letters by name, accents of symbols as ``_hat``."""
     found = []
+    text = re.sub("[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]*[⁰¹²³⁴⁵⁶⁷⁸⁹]", _power, text)
     for sign in unicodedata.normalize("NFD", text):
         if sign.isascii():
             found.append(sign)
@@ -42,6 +44,10 @@ def ascii_text(text: str) -> str:
             name = unicodedata.name(sign, "?").lower()
             found.append(name.rsplit(" ", 1)[-1] if name.startswith("greek") else "?")
     return "".join(found)
+
+
+def _power(found: re.Match[str]) -> str:
+    return "^" + "".join(_POWERS[sign] for sign in found[0])
 
 
 @dataclass
@@ -109,8 +115,13 @@ def read_function(function: Callable[..., Any]) -> Source:
         rule = "must be written as a function with def"
         raise TranslationError(f"{module}.{name}: {rule}")
     names = _names(function)
-    doc = ascii_text(inspect.getdoc(function) or "")
+    doc = doc_of(function)
     return Source(tree, _comments(text), doc, module, name, names)
+
+
+def doc_of(function: Any) -> str:
+    """Return the docstring of a function, in ASCII."""
+    return ascii_text(inspect.getdoc(function) or "")
 
 
 def _names(function: Any) -> dict[str, Any]:

@@ -209,23 +209,32 @@ class Body(Expressions):
             self._store(node.target, self.translate(node.value), block, node)
 
     def _unpack(self, targets: ast.Tuple, node: ast.expr, block: Block) -> None:
-        names = tuple(part.id if isinstance(part, ast.Name) else "" for part in targets.elts)
+        names = tuple(str(getattr(part, "id", getattr(part, "attr", ""))) for part in targets.elts)
         value = self.call(node, names) if isinstance(node, ast.Call) else self.translate(node)
         if not isinstance(value.kind, Several):
             raise self.fail(node, "is not a tuple")
         items = value.items
         if value.code:  # a call that returns a struct with what is not known otherwise
-            result = self._fresh("result")
-            struct: Struct = self.program.results[value.code.split("(")[0]]
-            self._set(result, replace(value, kind=struct), block)
-            items = tuple(
-                item if not item.code.startswith(".") else replace(item, code=result + item.code)
-                for item in items
-            )
+            items = self._results(value, block)
         if isinstance(node, ast.Tuple):
             items = self._without_overlap(targets, node, items, block)
         for target, item in zip(targets.elts, items, strict=True):
             self._store(target, item, block, node)
+
+    def _results(self, value: Value, block: Block) -> tuple[Value, ...]:
+        """Return the numbers that a call returns, without those that are constant."""
+        struct = self.program.results.get(value.code.split("(")[0])
+        if struct is None:  # it returns the only one
+            return tuple(
+                replace(item, code=value.code, calls=True) if item.code.startswith(".") else item
+                for item in value.items
+            )
+        result = self._fresh("result")
+        self._set(result, replace(value, kind=struct), block)
+        return tuple(
+            replace(item, code=result + item.code) if item.code.startswith(".") else item
+            for item in value.items
+        )
 
     def _without_overlap(
         self, targets: ast.Tuple, node: ast.Tuple, items: tuple[Value, ...], block: Block
