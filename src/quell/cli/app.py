@@ -13,6 +13,7 @@ from quell.cli.commands.acc import acc
 from quell.cli.commands.b0 import b0
 from quell.cli.commands.compare import compare
 from quell.cli.commands.excite import excite
+from quell.cli.commands.export import export
 from quell.cli.commands.identify import identify
 from quell.cli.commands.replay import replay
 from quell.cli.commands.rig import rig
@@ -40,7 +41,20 @@ reproduce = App(name="reproduce", help="Run a published experiment again and jud
 app.command(reproduce)
 for _command in (two_mass, torsional, acc):
     reproduce.command(_command)
-for _each in (stress, compare, identify, tune, b0, excite, rig, run, run_rig, replay, sweep):
+for _each in (
+    stress,
+    compare,
+    identify,
+    tune,
+    b0,
+    excite,
+    rig,
+    run,
+    run_rig,
+    replay,
+    sweep,
+    export,
+):
     app.command(_each)
 
 
