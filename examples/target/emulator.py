@@ -40,6 +40,11 @@ FLAGS = (
     *("-std=c99", "-mthumb", "-mfloat-abi=hard", "-ffp-contract=off", "-O2"),
     *("-Wall", "-Wextra", "-Werror"),
 )
+# newlib's semihosting, kept by -u: the emulator prints and takes the result of main.
+LINK = (
+    *("-nostartfiles", "--specs=rdimon.specs", "-T", str(HERE / "target.ld")),
+    "-Wl,--gc-sections,-u,exit,-u,initialise_monitor_handles",
+)
 
 
 def missing_tool() -> str:
@@ -49,16 +54,8 @@ def missing_tool() -> str:
 
 def build(board: Board, program: Path, sources: Sequence[Path], *flags: str) -> None:
     """Compile and link a program; ``RuntimeError`` has the messages of the compiler."""
-    link = (
-        *(
-            "-nostartfiles",
-            "--specs=rdimon.specs",
-            "-Wl,--gc-sections,-u,exit,-u,initialise_monitor_handles",
-        ),
-        *("-T", str(HERE / "target.ld")),
-        *("-I", str(HERE), str(HERE / "startup.c"), *map(str, sources), "-lm"),
-    )
-    command = [COMPILER, *board.flags, *FLAGS, *flags, "-o", str(program), *link]
+    parts = ["-I", str(HERE), str(HERE / "startup.c"), *map(str, sources), "-lm"]
+    command = [COMPILER, *board.flags, *FLAGS, *LINK, *flags, *parts, "-o", str(program)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)}:\n{done.stderr}")
@@ -91,14 +88,7 @@ def emulated(board: Board, program: Path, *options: str) -> list[str]:
 def run(board: Board, program: Path, *options: str, timeout: float = 60.0) -> tuple[int, str]:
     """Run a program until it exits; return its exit code and what it has printed."""
     command = emulated(board, program, "-serial", "none", *options)
-    done = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
     return done.returncode, done.stdout + done.stderr
 
 

@@ -12,7 +12,7 @@
 enum { STEP = 200, MANUAL = 1200, AUTOMATIC = 1700, RETUNE = 2500 }; /* ticks */
 enum { BLIND = 3000, LOST = 3300, END = 3400 };
 
-extern volatile servo_real reference, manual_u;
+extern volatile float reference, manual_u;
 extern volatile bool manual, is_off;
 extern const servo_parameters *volatile retuned;
 

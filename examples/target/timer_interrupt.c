@@ -9,15 +9,16 @@
 #define MOST_MISSING 20 /* samples without measurement until the drive is switched off */
 
 double drive_measure(void);     /* return y; NaN if the sensor gives none. No filter, no step of y */
-double drive_apply(double u);   /* apply u; return what the drive really applies */
+double drive_apply(double u);   /* apply u; return what the drive really applies, a finite number */
 double drive_holding(void);     /* return the u that is applied before the controller takes over */
 void drive_off(void);           /* make the drive safe; stays until the next reset */
 void watchdog_start(double seconds);
 void watchdog_feed(void);
 
-/* The main loop writes these, the interrupt reads them. Each is one word: no half of it is read. */
-volatile servo_real reference;
-volatile servo_real manual_u;
+/* The main loop writes these, the interrupt reads them. Each is one word, so that the interrupt never
+ * reads half of it: float in double precision, too. */
+volatile float reference;
+volatile float manual_u;
 volatile bool manual; /* u is manual_u */
 const servo_parameters *volatile retuned; /* parameters to change to, or 0 */
 
@@ -64,10 +65,14 @@ void systick_handler(void)
 
 int main(void)
 {
+    double y;
+    do
+        y = drive_measure();
+    while (y != y); /* NaN: no start without measurement */
+    reference = (float)y;
     servo_init(&servo);
     /* The plant rests at y, held by u: long, and therefore before the timer starts. */
-    servo_start(&servo, drive_measure(), drive_holding(), drive_measure());
-    reference = (servo_real)drive_measure();
+    servo_start(&servo, y, drive_holding(), reference);
     watchdog_start(5.0 * SERVO_SAMPLE_TIME);
     timer_start(SERVO_SAMPLE_TIME);
     for (;;)
