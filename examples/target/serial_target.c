@@ -34,7 +34,7 @@
 static servo_state servo;
 static plant_state plant;
 static double y, r;
-static uint32_t live; /* ticks since the first reference */
+static int32_t live; /* ticks since the first reference */
 static volatile uint32_t ticks;
 
 static void send_telemetry(double u)

@@ -12,11 +12,11 @@ import functools
 import math
 import operator
 import time
-from typing import NamedTuple
 
 import numpy as np
 
 from quell import checks
+from quell.kernels.dispatch import compiled, specialised
 from quell.realtime.wire import frames
 from quell.realtime.wire.device import WireDevice
 from quell.realtime.wire.handle import WireHandle, is_own
@@ -29,13 +29,11 @@ from quell.types import Channels, Matrix, Status
 _NEEDED = ("r", "u")
 
 
-class _Value(NamedTuple):
-    """A number from the device."""
-
-    tick: int
-    column: int  # 0: y
-    number: float
-    acts: bool  # whether a reference has acted at this tick
+# Numbers that are taken from the line at once: those of about a hundred ticks, so that references
+# are sent even if frames come without a pause. Chosen by hand.
+_AT_ONCE = 1000
+# Columns of these numbers: tick, channel (-1: y), value, and whether a reference acts at this tick.
+_TICK, _CHANNEL, _NUMBER, _ACTS = range(4)
 
 
 def record_target(
@@ -92,14 +90,13 @@ def record_target(
     log = np.full((rows, sum(width for _, width in recorded)), math.nan)
     first, newest = 0, 0  # ticks; 0: none yet
     while first == 0 or newest < first + rows:
-        answered = newest
-        for value in _received(device, timeout):
-            if first == 0 and value.acts:
-                first = value.tick
-            if first and value.tick < first + rows:
-                _store(log, value, value.tick - first)
-            if value.column == 0:
-                newest = value.tick
+        answered, values = newest, _received(device, timeout)
+        acting = values[values[:, _ACTS] > 0.0, _TICK]
+        if first == 0 and acting.size:
+            first = int(acting[0])
+        if first:
+            _store(log, values, first)
+        newest = int(np.max(values[values[:, _CHANNEL] < 0.0, _TICK], initial=newest))
         if newest > answered:
             device.write(float(r[min(newest + 1 - first, rows) if first else 0]))
     return _trajectory(device, recorded, log)
@@ -115,17 +112,45 @@ def _check_channels(channels: Channels) -> None:
         )
 
 
-def _received(device: WireDevice, timeout: float) -> list[_Value]:
-    """Return the numbers in the frames that have come; wait for the first."""
-    handle, values, end = device.handle, list[_Value](), time.monotonic() + timeout
-    while not values and (left := end - time.monotonic()) > 0.0:
+def _received(device: WireDevice, timeout: float) -> Matrix:
+    """Return the numbers in the frames that have come, see ``_TICK``; wait for the first."""
+    handle, values = device.handle, np.zeros((_AT_ONCE, 4))
+    take = specialised(_take, handle, values)  # may compile it, which must not count as waiting
+    count, end = 0, time.monotonic() + timeout
+    while count == 0 and (left := end - time.monotonic()) > 0.0:
         wait_for_frame(handle.transport, round(1e9 * left))
-        while (size := receive(handle.transport, handle.inbox)) >= 0:
-            values += _values(handle, size)
+        count = take(handle, values)
         _check_state(device)
-    if not values:
+    if count == 0:
         raise ConnectionError(f"{device.url}: nothing has come for {timeout:g} s")
-    return values
+    return values[:count]
+
+
+@compiled
+def _take(handle: WireHandle, values: Matrix) -> int:
+    """Write the numbers in the frames that have come to ``values``; return how many."""
+    own, frame, count = handle.endpoint, handle.inbox, 0
+    while count < values.shape[0]:
+        size = receive(handle.transport, frame)
+        if size < 0:
+            break
+        if not frames.is_well_formed(frame, size, own.counters):
+            continue
+        if is_own(own, frame, frames.GOODBYE):
+            own.numbers[frames.STATE] |= frames.GONE
+            continue
+        if is_own(own, frame, frames.TELEMETRY):
+            channel = int(frame.words[8])
+        elif not is_own(own, frame, frames.WELCOME) and frames.accept(frame, own):
+            channel = -1
+        else:
+            continue
+        values[count, _TICK] = frame.words[2]
+        values[count, _CHANNEL] = channel
+        values[count, _NUMBER] = frame.doubles[3]
+        values[count, _ACTS] = 1.0 if frame.words[3] > 0 else 0.0
+        count += 1
+    return count
 
 
 def _check_state(device: WireDevice) -> None:
@@ -139,31 +164,16 @@ def _check_state(device: WireDevice) -> None:
         )
 
 
-def _values(handle: WireHandle, size: int) -> list[_Value]:
-    """Return the number in the frame received last, or nothing."""
-    own, frame = handle.endpoint, handle.inbox
-    if not frames.is_well_formed(frame, size, own.counters) or is_own(own, frame, frames.WELCOME):
-        return []
-    if is_own(own, frame, frames.GOODBYE):
-        own.numbers[frames.STATE] |= frames.GONE
-        return []
-    if is_own(own, frame, frames.TELEMETRY):
-        column = 1 + int(frame.words[8])
-    elif frames.accept(frame, own):
-        column = 0
-    else:
-        return []
-    return [_Value(int(frame.words[2]), column, float(frame.doubles[3]), frame.words[3] > 0)]
-
-
-def _store(log: Matrix, value: _Value, row: int) -> None:
-    if value.column >= log.shape[1]:
+def _store(log: Matrix, values: Matrix, first: int) -> None:
+    """Write numbers into the log, whose first row is the tick ``first``."""
+    row, column = (values[:, (_TICK, _CHANNEL)] - (first, -1)).astype(np.int64).T
+    if np.max(column) >= log.shape[1]:
         raise ValueError(
             f"channels: must be all that the program sends; {log.shape[1] - 1} numbers are named, "
-            f"and it has sent one with the index {value.column - 1}"
+            f"and it has sent one with the index {np.max(column) - 1}"
         )
-    if row >= 0:
-        log[row, value.column] = value.number
+    within = (row >= 0) & (row < log.shape[0])
+    log[row[within], column[within]] = values[within, _NUMBER]
 
 
 def _trajectory(device: WireDevice, channels: Channels, log: Matrix) -> Trajectory:
