@@ -58,6 +58,8 @@ def _type(annotation: Any) -> str:
     inside = [part for part in get_args(annotation) if part is not types.NoneType]
     if origin is tuple:
         return "list"
+    if origin is dict:
+        return "table"
     if origin in (Union, types.UnionType):
         named = list(dict.fromkeys(_type(part) for part in inside))
         return "table" if all(name == "table" for name in named) else ", ".join(named)

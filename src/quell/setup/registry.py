@@ -120,7 +120,8 @@ def _switchable(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
 # A plant may contain a plant, and a signal a signal: their types are names until all tables exist.
 _RANGES = Field(None, description="ranges [low, high] of its keys, for `quell tune` and sweeps.")
 _UNCERTAIN = {"uncertain": (dict[str, tuple[float, float]] | None, _RANGES)}
-PLANTS = _call_tables(plants.PLANTS, {"plant": "Plant"}, beside=_UNCERTAIN)
+_OF_AN_FMU = {"path": str, "start": dict[str, float | int | bool | str] | None}
+PLANTS = _call_tables(plants.PLANTS, {"plant": "Plant", **_OF_AN_FMU}, beside=_UNCERTAIN)
 _SWITCHING = {
     "until": "time at which `then` takes over [s].",
     "then": "signal or number from `until` on.",

@@ -1,0 +1,130 @@
+"""FMUs of every controller and plant of the contract tests, against the interpreted kernels.
+
+    python benchmarks/fmus.py [--samples 1000] [--out fmus.json]
+
+Each controller becomes an FMU, which FMPy validates and runs with a sine as reference, noise, and
+NaN now and then; its u is compared with that of ``step``, interpreted. Each plant becomes an FMU
+that is a plant again by ``quell.plants.FMU``, in a loop with a controller; y is compared with that
+of the plant itself. At last the time of a sample in which ``simulate`` calls an FMU is measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import quell as ql
+from quell.export import TranslationError, fmu
+from quell.kernels import dispatch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from fmpy.validation import validate_fmu
+
+from tests.contracts.examples import LEARNERS, OBSERVERS, PLANTS
+from tests.contracts.test_controllers import CONTROLLERS
+from tests.fmus import Driven
+
+DT = 0.01
+
+
+def controllers() -> dict[str, Any]:
+    """Return those of the contract tests, and an ADRC with each learner and each observer."""
+    found = dict(CONTROLLERS)
+    for name, learner in LEARNERS.items():
+        observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=DT)
+        limits = {"u_min": -8.0, "u_max": 8.0}
+        law = ql.ADRC(observer, omega_c=3.0, learner=learner, guard=ql.Guard(), **limits)
+        found[f"learner: {name}"] = law
+    for name, observer in OBSERVERS.items():
+        found[f"observer: {name}"] = ql.ADRC(observer, omega_c=2.0, u_min=-8.0, u_max=8.0)
+    return found
+
+
+def deviation(law: Any, running: Driven, samples: int) -> float:
+    """Return the largest difference of u, relative to the largest of 1 and u."""
+    rng, worst = np.random.default_rng(0), 0.0
+    count = sum(name.startswith("r_derivative") for name in running.references)
+    for k in range(samples):
+        r, y = math.sin(0.05 * k), 0.8 * math.sin(0.05 * k - 0.2) + 0.01 * rng.normal()
+        y = math.nan if k % 101 == 100 else y
+        more = {f"r_derivative[{i + 1}]": 0.1 * i for i in range(count)}
+        u = law.step(r, y, *more.values()) if more else law.step(r, y)
+        worst = max(worst, abs(running.step(law.dt, r=r, y=y, **more) - u) / max(1.0, abs(u)))
+    return worst
+
+
+def plant_deviation(plant: Any, path: Path, samples: int) -> float:
+    """Return the largest difference of y between a plant and its FMU in a loop, relative to y."""
+    law = ql.ADRC(ql.ESO.model_free(order=2, b0=5.0, omega_o=20.0, dt=DT), omega_c=2.0)
+    w = [f"w[{i + 1}]" for i in range(plant.disturbances)]
+    scenario = ql.Scenario(0.5, samples * DT, disturbances=[0.1] * len(w))
+    runs = [ql.simulate(p, law, scenario)["y"] for p in (plant, ql.plants.FMU(path, w=w))]
+    length = min(map(len, runs))
+    y = runs[0][:length]
+    scale = max(1.0, float(np.max(np.abs(y))))
+    return float(np.max(np.abs(runs[1][:length] - y))) / scale
+
+
+def sample_time(path: Path) -> float:
+    """Return the time of a sample of a compiled loop that calls an FMU [s]."""
+    law = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=DT), omega_c=3.0)
+    plant, scenario = ql.plants.FMU(path, w=["w[1]", "w[2]"]), ql.Scenario(1.0, 200.0)
+    ql.simulate(plant, law, ql.Scenario(1.0, 1.0))
+    begin = time.perf_counter()
+    samples = len(ql.simulate(plant, law, scenario).t)
+    return (time.perf_counter() - begin) / samples
+
+
+def main() -> None:
+    """Run the trial."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=1000)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    found: dict[str, Any] = {"controllers": {}, "refused": [], "plants": {}}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        dispatch.interpret_all = True
+        for i, (label, law) in enumerate(controllers().items()):
+            path = folder / f"c{i}.fmu"
+            try:
+                fmu(law, path)
+            except TranslationError:
+                found["refused"].append(label)
+                continue
+            problems = validate_fmu(str(path))
+            running = Driven(path, folder / f"c{i}").begin()
+            worst = deviation(law, running, options.samples)
+            running.free()
+            found["controllers"][label] = worst
+            print(f"{label:45} {worst:8.1e} {' '.join(problems)}")
+        for i, (label, plant) in enumerate(PLANTS.items()):
+            path = folder / f"p{i}.fmu"
+            fmu(plant, path, dt=DT)
+            worst = plant_deviation(plant, path, options.samples)
+            found["plants"][label] = worst
+            print(f"plant: {label:38} {worst:8.1e} {' '.join(validate_fmu(str(path)))}")
+        dispatch.interpret_all = False
+        fmu(ql.plants.two_mass_spring(), folder / "two.fmu", dt=DT)
+        found["sample_time"] = sample_time(folder / "two.fmu")
+    print(f"refused: {', '.join(found['refused'])}")
+    for kind in ("controllers", "plants"):
+        worst = max(found[kind].values())
+        print(f"{len(found[kind])} {kind}: largest deviation {worst:.1e}")
+    print(f"a sample of simulate with an FMU: {1e6 * found['sample_time']:.1f} µs")
+    if options.out:
+        options.out.write_text(json.dumps(found, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
