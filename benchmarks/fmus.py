@@ -77,11 +77,14 @@ def plant_deviation(plant: Any, path: Path, samples: int) -> float:
 def sample_time(path: Path) -> float:
     """Return the time of a sample of a compiled loop that calls an FMU [s]."""
     law = ql.ADRC(ql.ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=DT), omega_c=3.0)
-    plant, scenario = ql.plants.FMU(path, w=["w[1]", "w[2]"]), ql.Scenario(1.0, 200.0)
+    plant, scenario = ql.plants.FMU(path, w=["w[1]"]), ql.Scenario(1.0, 200.0)
     ql.simulate(plant, law, ql.Scenario(1.0, 1.0))
-    begin = time.perf_counter()
-    samples = len(ql.simulate(plant, law, scenario).t)
-    return (time.perf_counter() - begin) / samples
+    times = []
+    for _ in range(5):  # the machine may be busy with other things
+        begin = time.perf_counter()
+        samples = len(ql.simulate(plant, law, scenario).t)
+        times.append((time.perf_counter() - begin) / samples)
+    return min(times)
 
 
 def main() -> None:
@@ -115,8 +118,8 @@ def main() -> None:
             found["plants"][label] = worst
             print(f"plant: {label:38} {worst:8.1e} {' '.join(validate_fmu(str(path)))}")
         dispatch.interpret_all = False
-        fmu(ql.plants.two_mass_spring(), folder / "two.fmu", dt=DT)
-        found["sample_time"] = sample_time(folder / "two.fmu")
+        fmu(ql.plants.LinearPlant.of(([1.0], [1.0, 0.0, 0.0])), folder / "mass.fmu", dt=DT)
+        found["sample_time"] = sample_time(folder / "mass.fmu")
     print(f"refused: {', '.join(found['refused'])}")
     for kind in ("controllers", "plants"):
         worst = max(found[kind].values())

@@ -10,9 +10,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from quell.export.library.toolchain import FLAGS, NoCompilerError
+
 _COMPILERS = ("gcc", "clang", "cc")
-# As the golden vectors of the C export: bits do not depend on whether a processor has FMA.
-_OPTIONS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden")
+_OPTIONS = (*FLAGS, "-fPIC", "-shared", "-fvisibility=hidden")
 _SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib")}
 # Else a function that is missing would be noticed only by the tool that loads the FMU.
 _COMPLETE = {"linux": ("-Wl,-z,defs",)}
@@ -38,14 +39,14 @@ def compiler() -> str:
 
     Raises
     ------
-    ValueError
+    NoCompilerError
         if there is none.
     """
     candidates = (os.environ["CC"],) if os.environ.get("CC") else _COMPILERS
     for candidate in candidates:
         if shutil.which(candidate):
             return candidate
-    raise ValueError(
+    raise NoCompilerError(
         f"binary = True: no C compiler was found ({', '.join(candidates)}); install one, set CC, "
         "or give binary=False for an FMU of sources only"
     )
@@ -56,7 +57,7 @@ def compiled(folder: Path, files: Sequence[str], name: str) -> bytes:
 
     Raises
     ------
-    ValueError
+    NoCompilerError
         without a compiler, and with its first message if it fails.
     """
     library = folder / f"{name}.library"
@@ -68,5 +69,5 @@ def compiled(folder: Path, files: Sequence[str], name: str) -> bytes:
     if done.returncode != 0:
         lines, marks = done.stderr.splitlines(), ("undefined", "error")
         said = [line for mark in marks for line in lines if mark in line] or [done.stderr]
-        raise ValueError(f"binary = True: {command[0]} failed: {said[0].strip()[:300]}")
+        raise NoCompilerError(f"binary = True: {command[0]} failed: {said[0].strip()[:300]}")
     return library.read_bytes()

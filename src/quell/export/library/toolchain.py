@@ -50,7 +50,7 @@ class Sizes(NamedTuple):
 
 
 class NoCompilerError(ValueError):
-    """There is no compiler that can measure sizes."""
+    """There is no C compiler for what is asked, or it fails."""
 
 
 def measured_sizes(name: str, header: str, source: str, precision: str) -> Sizes:
