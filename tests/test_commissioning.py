@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,9 @@ from quell.cli.commands.tune_sources import RECORD_OPTIONS, identified
 from quell.commissioning import Experiment, Limits, experiment, verify
 from quell.identification import Measured, decided, excitation, identify
 from quell.plants import LinearPlant
-from quell.realtime import TwinDevice
+from quell.realtime import TwinDevice, open_device
+from quell.realtime.devices.registry import listen
+from quell.realtime.rig.server import Rig
 from quell.tuning.identified import identified_plants
 
 from .commands import Shown
@@ -55,6 +59,27 @@ def test_an_experiment_keeps_its_limits_and_shows_the_plant(
     found = identify(u, y, DT, order=len(den) - 1, held_out=0.0)
     assert found.num[0] == pytest.approx(b, rel=0.02)
     assert found.den == pytest.approx(den, rel=0.05, abs=0.05)
+
+
+def test_an_experiment_at_a_rig_over_udp_shows_the_plant() -> None:
+    """A session for each part, and a plant that stays where the last one left it."""
+    with (
+        closing(listen("udp://127.0.0.1:0")) as listener,
+        Rig(PLANT, DT, listener=listener, rest=False, wait=0.02) as rig,
+    ):
+        rig.prepare()
+        ticking = threading.Thread(target=rig.run, kwargs={"priority": 0})
+        ticking.start()
+        try:
+            limits = Limits(-2.0, 2.0, -1.0, 1.0, 3.0)
+            how: dict[str, Any] = {"safety": PATIENT, "priority": 0}
+            done = experiment(lambda: open_device(listener.url, DT), DT, limits, **how)
+        finally:
+            rig.stop()
+            ticking.join()
+    found = identify(done.measured.u, done.measured.y, DT, order=1, held_out=0.0, delay=(0.0, DT))
+    assert found.num[0] == pytest.approx(1.0, rel=0.05)
+    assert found.den == pytest.approx((1.0, 20.0), rel=0.05)
 
 
 def test_an_experiment_without_effect_or_room_is_refused() -> None:

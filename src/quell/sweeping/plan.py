@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.sweeping.values import Distribution, as_values, labels
+from quell.sweeping.values import Distribution, as_values, labels, latin_hypercube
 from quell.types import Matrix
 
 SAMPLINGS = ("latin-hypercube", "random")
@@ -191,12 +191,9 @@ class Plan:
 
     def _shares(self) -> Matrix:
         """Return draws (draws, distributions) from the unit cube, without its faces."""
-        rng = np.random.default_rng([self.seed, 0])
-        shares = rng.random((self.draws, len(self._distributions)))
-        if self.sampling != "random":
-            # Each stratum of width 1/draws has one value, in random order. That of scipy.stats does
-            # the same; its import takes 45 MB and a second.
-            for column in shares.T:
-                column += rng.permutation(self.draws)
-            shares /= self.draws
+        rng, size = np.random.default_rng([self.seed, 0]), len(self._distributions)
+        random = self.sampling == "random"
+        shares = (
+            rng.random((self.draws, size)) if random else latin_hypercube(rng, self.draws, size)
+        )
         return np.clip(shares, np.finfo(np.float64).tiny, 1.0 - np.finfo(np.float64).epsneg)

@@ -12,6 +12,7 @@ import numpy as np
 
 from quell import checks
 from quell.sweeping.shares import share_interval
+from quell.sweeping.values import latin_hypercube
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.problem import Problem, Solution
 from quell.tuning.optimiser.requirements import all_peaks
@@ -68,8 +69,6 @@ class Uncertain:
 
     def design_set(self, count: int, seed: int) -> Matrix:
         """Return the values to design for: the middle, the corners, a Latin hypercube."""
-        from scipy.stats import qmc
-
         ends = self.ends
         low, high = ends[:, 0], ends[:, 1]
         rows = [0.5 * (low + high)]
@@ -77,7 +76,7 @@ class Uncertain:
             rows += [np.array(corner) for corner in itertools.product(*ends)]
         rest = count - len(rows)
         if rest > 0:
-            cube = qmc.LatinHypercube(low.size, rng=np.random.default_rng(seed)).random(rest)
+            cube = latin_hypercube(np.random.default_rng(seed), rest, low.size)
             rows += list(low + cube * (high - low))
         return np.array(rows)
 
