@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from quell.export.translate.blocks import words
 from quell.export.translate.findings import Findings
 from quell.export.translate.initial import initial_lines
 from quell.export.translate.layout import comment_block, wrapped
@@ -22,6 +24,10 @@ _DOUBLE = [
     '#error "double has less than 53 bits here: export in single precision"',
     "#endif",
 ]
+
+
+# Stands for the lines of ``init``, which are known when all others are.
+_INITIAL = "    initial"
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,6 @@ class CFiles:
         self.enums: list[str] = []  # the same, before them
         self._prototypes: list[str] = []
         self._definitions: list[str] = []
-        self._tables: list[str] = []
 
     @property
     def both(self) -> tuple[Value, Value]:
@@ -104,6 +109,9 @@ class CFiles:
         """Add a public function; ``NAME`` in its head becomes its name."""
         self.operations.append(name)
         head = head.replace("NAME", f"{self.name}_{name}")
+        given = re.findall(r"(\w+)(?:\[\d+\])?[,)]", head)
+        used = words("\n".join(body)) | ({"state"} if _INITIAL in body else set())
+        body = (*(f"    (void){each};" for each in given if each not in used), *body)
         self._prototypes += ["", *comment_block(doc), *wrapped(f"{head};")]
         self._definitions += ["", *wrapped(head), "{", *body, "}"]
 
@@ -113,9 +121,7 @@ class CFiles:
             "init",
             f"void NAME({self.name}_state *state)",
             "Set the state before the first sample, with the default parameters.",
-            "    memset(state, 0, sizeof *state);",
-            f"    state->parameters = &{self.name}_default_parameters;",
-            *initial_lines(self.program.structs, self.memory, self.state, self._tables),
+            _INITIAL,
         )
 
     def write(
@@ -147,10 +153,12 @@ class CFiles:
             *self.enums,
         ]
         for layout in list(structs.layouts.values()):
-            if layout.members:
-                first = ""
-                if layout.struct == self.memory.kind:
-                    first = f"const {name}_parameters *parameters;"
+            first = ""
+            if layout.struct == self.memory.kind:
+                first = f"const {name}_parameters *parameters;"
+            elif layout.struct == self.design.kind and not layout.members:
+                first = "bool unused; /* there are no parameters */"
+            if layout.members or first:
                 lines += ["", *(line for each in structs.definition(layout.struct, first)
                                 for line in wrapped(each))]  # fmt: skip
         lines += [*self.structs, ""]
@@ -162,7 +170,15 @@ class CFiles:
         structs, name = self.program.structs, self.name
         kernels = self.program.kernel_lines("\n".join(self._definitions))
         structs.keep_used("\n".join([*kernels, *self._definitions]))
+        tables: list[str] = []
+        place = self._definitions.index(_INITIAL)
+        self._definitions[place : place + 1] = [
+            "    memset(state, 0, sizeof *state);",
+            f"    state->parameters = &{name}_default_parameters;",
+            *initial_lines(structs, self.memory, self.state, tables),
+        ]
         values = structs.initialiser(self.design.kind, self.parameters, 0)
+        values = ["{ false }"] if len(values) == 2 else values
         lines = [
             f'#include "{name}.h"',
             "",
@@ -180,7 +196,7 @@ class CFiles:
             *(line for each in values for line in wrapped(each)),
         ]
         lines[-1] += ";"
-        for table in self._tables:
+        for table in tables:
             lines += ["", *wrapped(table)]
         return "\n".join([*lines, *self._definitions, ""])
 

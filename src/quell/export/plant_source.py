@@ -87,15 +87,9 @@ def _add_functions(files: CFiles, plant: Plant) -> None:
     w = Value(Array((plant.disturbances,), Number.REAL), "w", root="w")
     inputs = f", const {real} w[{plant.disturbances}]" if plant.disturbances else ""
     call = files.call(advance, files.design, x, scratch, files.number("t"), files.number("u"), w)
-    unused = [f"    (void){each};" for each in ("t", "w") if each not in _arguments(call)]
     files.add(
         "advance",
         f"void NAME({name}_state *state, {real} t, {real} u{inputs})",
         "Take the state through a sample that begins at the time t [s], with held u and w.",
-        *[line for line in unused if inputs or line != "    (void)w;"],
         f"    {call};",
     )
-
-
-def _arguments(call: str) -> list[str]:
-    return call.partition("(")[2].removesuffix(")").split(", ")

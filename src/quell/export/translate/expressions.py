@@ -214,16 +214,19 @@ class Expressions:
         bounds = [part.lower or ast.Constant(0), part.upper or ast.Constant(size)]
         expression = ast.Expression(ast.Tuple(bounds, ast.Load()))
         code = compile(ast.fix_missing_locations(expression), "<slice>", "eval")
-        lengths = set()
+        lengths, rule = set(), "the length of a slice must be known"
         for trial in (3, 17, 101):
             known = {
                 name: value.constant if value.is_constant else trial
                 for name, value in self.names.items()
             }
-            low, high = eval(code, {"__builtins__": {}}, known)
+            try:
+                low, high = eval(code, {"__builtins__": {}}, known)
+            except Exception:  # a bound is more than names, numbers and operators
+                raise self.fail(node, rule) from None
             lengths.add(high - low)
         if len(lengths) != 1:
-            raise self.fail(node, "the length of a slice must be known")
+            raise self.fail(node, rule)
         return int(lengths.pop())
 
     def _unaryop(self, node: ast.UnaryOp) -> Value:
