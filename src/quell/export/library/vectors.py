@@ -31,8 +31,8 @@ _FIRST, _PART = 60, 20
 # A start under load takes twice the samples in which the observer settles; longer ones are left
 # out, because the kernels are interpreted here (20 us a sample).
 _LONGEST_START = 4000
-# A measurement beyond all physical quantities, within the range of single precision.
-_ABSURD = 1e30
+# A measurement beyond all physical quantities, by precision (``controllers.bad_samples``).
+_ABSURD, _ABSURD_SINGLE = 1e80, 1e30
 # How far u goes beyond its limits, relative to their distance.
 _EXCESS = 1.5
 
@@ -152,9 +152,10 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
         player.play(Action.STEP, math.nan, math.nan)
     for _ in range(_FIRST):
         player.play(Action.STEP, *signals.next())
+    absurd = _ABSURD_SINGLE if player.real is np.float32 else _ABSURD
     for i in range(_PART):
         r, y = signals.next()
-        y = (y, math.nan, y, math.inf, _ABSURD)[i % 5]
+        y = (y, math.nan, y, math.inf, absurd)[i % 5]
         player.play(Action.STEP, math.nan if i % 7 == 3 else r, y)
     for i in range(_PART):
         action = Action.APPLIED if i % 5 == 0 else Action.STEP

@@ -194,7 +194,7 @@ class Program:
                 head = f"static const {self.literals.real} {name}[{len(value)}]"
                 lines.append(f"{head} = {{{numbers}}};{comment}")
             elif isinstance(value, int) and not isinstance(value, bool):
-                lines.append(f"enum {{ {name} = {value} }};{comment}")
+                lines.append(f"static const int {name} = {value};{comment}")
             else:
                 number = self.literals.write(value)
                 lines.append(f"static const {self.literals.real} {name} = {number};{comment}")

@@ -1,0 +1,334 @@
+"""``ql.export.c`` and ``quell export``: a controller as a library in C."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.export.library.templates import filled
+from quell.export.library.toolchain import stack_of
+from quell.export.library.vectors import golden_vectors
+from quell.features import Periodic, State
+from quell.kernels import dispatch
+from quell.types import Status
+
+from .commands import in_this_process
+from .contracts.python_models import python_learners
+from .setups import TWO_MASS
+
+GCC, GPP = shutil.which("gcc"), shutil.which("g++")
+needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc, which compiles exported code, is missing")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+EXACT = ("-O1", "-ffp-contract=off")
+
+DT = 0.01
+LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
+OBSERVER = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=DT)
+ADRC = ql.ADRC(OBSERVER, 1.5, **LIMITS)
+PID = ql.baselines.PID(4.0, 2.0, 1.0, tf=0.05, dt=DT, **LIMITS)
+LEARNING = ql.ADRC(OBSERVER, 1.5, learner=ql.learners.Kalman(), guard=ql.Guard(), **LIMITS)
+HAN = ql.controllers.Prefiltered(
+    ql.ADRC(OBSERVER, 1.5, feedforward=True, **LIMITS), ql.controllers.TrackingDifferentiator(2.0)
+)
+CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
+SCENARIO = ql.Scenario(
+    reference=ql.signals.Sinusoid(omega=1.5),
+    noise=ql.signals.BandLimitedNoise(1e-8, 0.01),
+    duration=3.0,
+)
+
+
+def exported(
+    folder: Path, controller: Any = ADRC, precision: str = "double", **options: Any
+) -> Any:
+    """Export a controller as ``servo``, in single precision without comparison."""
+    given = {"name": "servo", "accept": True} | options
+    return ql.export.c(controller, folder / "out", precision=precision, **given)
+
+
+def built(folder: Path, *flags: str) -> Path:
+    """Compile the test with golden vectors, without warnings; return the program."""
+    program = folder / "test_servo"
+    sources = (folder / "out/test_servo.c", folder / "out/src/servo.c")
+    command = ["gcc", *STRICT, *EXACT, *flags, "-I", folder / "out/src", *sources, "-o", program]
+    done = subprocess.run([*command, "-lm"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def outcome(program: Path, *arguments: str) -> tuple[int, str]:
+    """Run a program; return its exit code and output."""
+    done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout
+
+
+@needs_gcc
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize(
+    "controller",
+    [
+        PID,
+        LEARNING,
+        HAN,
+        ql.ADRC(ql.ESO.nonlinear(2, 1.5, 12.0, DT, delta=0.05), 1.5),
+        ql.ADRC(OBSERVER, 1.5, learner=ql.learners.RLS(State() + Periodic(highest=2)), **LIMITS),
+    ],
+    ids=["PID", "Kalman and guard", "prefilter", "nonlinear observer", "RLS"],
+)
+def test_the_c_code_repeats_the_kernels_bit_for_bit(
+    tmp_path: Path, controller: Any, precision: str
+) -> None:
+    """With noise, NaN, saturation, manual operation, retuning and restarts; no warning in C99."""
+    exported(tmp_path, controller, precision)
+    code, text = outcome(built(tmp_path), "0")
+    assert code == 0, text
+    assert "largest difference 0 ulp" in text
+
+
+def test_the_run_of_the_golden_vectors_has_what_can_happen() -> None:
+    """Held values, both limits, u beside manual operation, and a continuation without a jump."""
+    vectors = golden_vectors(ADRC, ("track", "start"))
+    flags = Status(int(np.bitwise_or.reduce([row.status for row in vectors.rows])))
+    held = Status.MEASUREMENT_HELD | Status.REFERENCE_HELD
+    assert flags == held | Status.SATURATED | Status.RATE_LIMITED
+    names = [row.action.name for row in vectors.rows]
+    assert set(names) == {
+        "STEP",
+        "APPLIED",
+        "TRACK",
+        "HAND_OVER",
+        "LIMIT",
+        "FREE",
+        "RESET",
+        "START",
+    }
+    for name in ("HAND_OVER", "START"):
+        at = names.index(name)
+        before = vectors.rows[at - 1].given if name == "HAND_OVER" else vectors.rows[at].given
+        assert vectors.rows[at].u == pytest.approx(before, rel=1e-6)
+    limited = vectors.rows[names.index("LIMIT") : names.index("FREE")]
+    assert max(row.u for row in limited) == vectors.limit < 3.0
+
+
+@needs_gcc
+def test_golden_vectors_find_a_wrong_controller(tmp_path: Path) -> None:
+    """Another gain, or a missing test for NaN: the program fails and names the first sample."""
+    exported(tmp_path)
+    source = tmp_path / "out/src/servo.c"
+    text = source.read_text()
+    for old, new, first in (
+        ("LARGEST_SIGNAL;", "LARGEST_SIGNAL || value != value;", "sample 0:"),
+        ("1.5, /* b0 */", "1.5000000001, /* b0 */", "sample 3:"),
+    ):
+        assert old in text
+        source.write_text(text.replace(old, new))
+        code, shown = outcome(built(tmp_path))
+        assert code == 1
+        assert first in shown
+        assert "FAILED" in shown
+
+
+@needs_gcc
+def test_fast_math_is_refused(tmp_path: Path) -> None:
+    """It would remove the tests for NaN."""
+    exported(tmp_path)
+    command = ["gcc", "-Ofast", "-fsyntax-only", tmp_path / "out/src/servo.c"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "-ffast-math removes the tests for NaN" in done.stderr
+
+
+@pytest.mark.skipif(GPP is None, reason="g++ is missing")
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_everything_compiles_as_cpp_and_the_examples_compile(
+    tmp_path: Path, precision: str
+) -> None:
+    """Source and test as C++, the timer interrupt of README.md as C, the sketch with a stand-in for Arduino."""
+    folder = exported(tmp_path, LEARNING, precision).folder
+    (interrupt,) = re.findall(r"```c\n(#include.*?)```", (folder / "README.md").read_text(), re.S)
+    (tmp_path / "interrupt.c").write_text(interrupt)
+    (tmp_path / "arduino.h").write_text(
+        "enum { A0 };\nint analogRead(int), constrain(int, int, int);\n"
+        "unsigned long micros(void);\nvoid analogWrite(int, int);\n"
+    )
+    sketch = folder / "examples/servo/servo.ino"
+    warnings = ("-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-I", folder / "src")
+    for command in (
+        ("g++", "-std=c++11", "-x", "c++", folder / "src/servo.c", folder / "test_servo.c"),
+        ("gcc", "-std=c99", tmp_path / "interrupt.c"),
+        ("g++", "-std=c++11", "-include", tmp_path / "arduino.h", "-x", "c++", sketch),
+    ):
+        done = subprocess.run([*command, *warnings], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+
+
+def test_the_folder_has_all_files_and_no_placeholder(tmp_path: Path) -> None:
+    """A project for CMake and a library for Arduino and PlatformIO; text files of ASCII but for README.md."""
+    result = exported(tmp_path)
+    names = {str(path.relative_to(result.folder)) for path in result.files}
+    found = {str(p.relative_to(result.folder)) for p in result.folder.rglob("*") if p.is_file()}
+    assert names == found == {
+        "src/servo.h", "src/servo.c", "test_servo.c", "CMakeLists.txt", "README.md",
+        "library.properties", "library.json", "examples/servo/servo.ino",
+    }  # fmt: skip
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    for path in result.files:
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"@\w+@", text), path
+        assert path.suffix == ".md" or text.isascii(), path
+    with pytest.raises(KeyError):
+        filled("README.md", {"name": "servo"})
+
+
+@pytest.mark.parametrize(
+    ("name", "rule"),
+    [
+        ("2fast", "must be a C identifier"),
+        ("_servo", "must be a C identifier"),
+        ("sérvo", "must be a C identifier"),
+        ("a b", "must be a C identifier"),
+        ("", "must be a C identifier"),
+        ("while", "is a keyword of C or C++"),
+        ("class", "is a keyword of C or C++"),
+        ("Math", "Math.h would hide the standard header"),
+        ("x" * 64, "63 characters"),
+    ],
+)
+def test_a_name_that_c_can_not_use_is_refused(tmp_path: Path, name: str, rule: str) -> None:
+    """Nothing is written."""
+    with pytest.raises(ValueError, match=re.escape(rule)):
+        exported(tmp_path, name=name)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_with_files_is_left_alone_unless_asked(tmp_path: Path) -> None:
+    """With overwrite only the files of the export are replaced."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    exported(tmp_path)  # an empty folder
+    (folder / "mine.txt").write_text("mine")
+    (folder / "src/servo.h").write_text("old")
+    with pytest.raises(ValueError, match=r"the folder has files .*--overwrite"):
+        exported(tmp_path)
+    assert (folder / "src/servo.h").read_text() == "old"
+    exported(tmp_path, overwrite=True)
+    assert (folder / "src/servo.h").read_text().startswith("/*")
+    assert (folder / "mine.txt").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_place_that_can_not_be_written_is_named(tmp_path: Path) -> None:
+    """A file in place of the folder, a missing parent, a folder in place of a file."""
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(ValueError, match="must be a folder, is a file"):
+        exported(tmp_path)
+    with pytest.raises(ValueError, match="must exist"):
+        exported(tmp_path / "missing")
+    (tmp_path / "out").unlink()
+    (tmp_path / "out/src/servo.h").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"servo\.h.*in the way"):
+        exported(tmp_path, overwrite=True)
+    assert [path.name for path in (tmp_path / "out").rglob("*")] == ["src", "servo.h"]
+
+
+@pytest.mark.parametrize(
+    ("controller", "precision", "rule"),
+    [
+        (
+            ql.ADRC(OBSERVER, 1.5, learner=python_learners()["PythonModel"]),
+            "double",
+            "calls Python at each",
+        ),
+        (
+            ql.ADRC(ql.ESO.model_free(2, 1e39, 12.0, DT), 1.5),
+            "single",
+            "b0 = 1e[+]39: above the range of single precision",
+        ),
+        (42, "double", "controller = 42"),
+        (ADRC, "half", "precision = 'half'"),
+    ],
+)
+def test_what_can_not_be_exported_is_named_and_nothing_is_written(
+    tmp_path: Path, controller: Any, precision: str, rule: str
+) -> None:
+    """Python adapters, numbers out of range, what is no controller."""
+    with pytest.raises(ValueError, match=rule):
+        exported(tmp_path, controller, precision)
+    assert not any(tmp_path.iterdir())
+
+
+def test_single_precision_is_compared_and_refused_where_it_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Order 4 with a fast observer: the rounding of y times omega_o^5 exceeds u."""
+    monkeypatch.setattr(dispatch, "interpret_all", True)  # short runs need no compilation
+    loop = {"plant": CHAIN, "scenario": SCENARIO, "accept": False}
+    good = exported(tmp_path, ADRC, "single", **loop).comparison
+    assert 0.0 < good.u < 1e-4 < good.u_noise
+    assert good.y < good.u
+    shutil.rmtree(tmp_path / "out")
+    hasty = ql.ADRC(ql.ESO.model_free(4, 1.0, 60.0, DT), 2.0, u_min=-90.0, u_max=90.0)
+    loop |= {"plant": ql.plants.two_mass_spring(), "scenario": replace(SCENARIO, noise=0.0)}
+    with pytest.raises(ValueError, match=r"changes u by .* 1 % is the limit.*lower omega_o"):
+        exported(tmp_path, hasty, "single", **loop)
+    assert not any(tmp_path.iterdir())
+    accepted = exported(tmp_path, hasty, "single", **loop | {"accept": True})
+    assert accepted.comparison.u > 0.01
+
+
+def test_single_precision_without_a_loop_must_be_accepted(tmp_path: Path) -> None:
+    """Nobody has compared it then."""
+    with pytest.raises(ValueError, match="needs plant and scenario.*--accept"):
+        exported(tmp_path, precision="single", accept=False)
+    assert exported(tmp_path, precision="single").comparison is None
+
+
+def test_the_command_exports_and_prints_sizes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The sizes need a compiler; without one the command says so, and writes the same files."""
+    monkeypatch.chdir(tmp_path)
+    Path("setup.toml").write_text(TWO_MASS)
+    arguments = ("export", "setup.toml", "--to", "c", "--name", "servo", "--out")
+    shown = in_this_process((*arguments, "firmware"), monkeypatch, capsys)
+    assert shown.code == 0, shown.err
+    assert "firmware/src/servo.h and .c, in double precision" in shown.out
+    if GCC is not None:
+        assert re.search(r"code \d+ B, constants \d+ B, state \d+ B, stack \d+ B", shown.out)
+    assert in_this_process((*arguments, "firmware"), monkeypatch, capsys).code == 2
+    shown = in_this_process((*arguments, "a", "--precision", "single"), monkeypatch, capsys)
+    assert (shown.code, "scenario: missing" in shown.err) == (2, True)
+    monkeypatch.setenv("PATH", "")
+    shown = in_this_process((*arguments, "bare"), monkeypatch, capsys)
+    assert (shown.code, "not measured, there is no gcc here" in shown.out) == (0, True)
+    for path in Path("firmware").rglob("*.[ch]"):
+        assert (Path("bare") / path.relative_to("firmware")).read_text() == path.read_text()
+    assert not Path("a").exists()
+
+
+@needs_gcc
+def test_sizes_are_those_of_the_structs(tmp_path: Path) -> None:
+    """Half of them in single precision, but for the pointer; the deepest path of calls counts."""
+    double, single = (
+        exported(tmp_path, ADRC, each, overwrite=True).sizes() for each in ("double", "single")
+    )
+    assert 0.4 < single.parameters / double.parameters < 0.6
+    assert single.state < double.state
+    assert 0 < single.code < 10_000
+    assert 0 < (single.stack or 0) < 1000
+    graph = "\n".join(
+        f'node: {{ title: "f.c:{name}" label: "{name}\\nf.c:1:1\\n{size} bytes (static)" }}'
+        for name, size in (("step", 8), ("a", 16), ("b", 48), ("c", 24))
+    ) + "".join(
+        f'\nedge: {{ sourcename: "f.c:{one}" targetname: "{two}" label: "f.c:2:2" }}'
+        for one, two in (("step", "f.c:a"), ("step", "f.c:b"), ("a", "f.c:c"), ("b", "sinf"))
+    )
+    assert stack_of("step", graph) == 8 + 48
+    assert stack_of("other", graph) is None
