@@ -123,7 +123,7 @@ class Program:
         head = arguments[0].kind if arguments else None
         if name in self._names and isinstance(head, Struct):
             kind = snake_case(head.python.__name__).removesuffix("_design").removesuffix("_model")
-            name = f"{name}_{kind}"
+            name = f"{name.rstrip('_')}_{kind}"
         return unique(name, self._names)
 
     def has_function(self, name: str) -> bool:
