@@ -7,6 +7,7 @@ import stat
 import struct
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
@@ -52,6 +53,7 @@ def unpack(path: Path, folder: Path, most: int, wanted: Callable[[str], bool]) -
             entries = [each for each in archive.infolist() if not each.filename.endswith("/")]
             _check(entries, where)
             chosen = [entry for entry in entries if wanted(entry.filename)]
+            _check_once([entry.filename for entry in chosen], where)
             check_size(sum(entry.file_size for entry in chosen), most, where)
             for entry in chosen:
                 target = folder / entry.filename
@@ -68,7 +70,6 @@ def _check(entries: list[zipfile.ZipInfo], where: str) -> None:
     """Raise a ``ValueError`` for entries that must not be unpacked."""
     if len(entries) > _MOST_FILES:
         raise ValueError(f"{where}: has {len(entries)} files; at most {_MOST_FILES} are permitted")
-    names: set[str] = set()
     for entry in entries:
         name = entry.filename
         parts = PurePosixPath(name).parts
@@ -77,6 +78,10 @@ def _check(entries: list[zipfile.ZipInfo], where: str) -> None:
             raise ValueError(f"{where}: contains {name!r}, a link or a path out of its folder")
         if entry.flag_bits & _ENCRYPTED:
             raise ValueError(f"{where}: {name!r} is encrypted; must be readable")
-        if name in names:
-            raise ValueError(f"{where}: contains {name!r} twice")
-        names.add(name)
+
+
+def _check_once(names: list[str], where: str) -> None:
+    """Raise a ``ValueError`` if a name is there twice: it is not clear which file is meant."""
+    name, count = Counter(names).most_common(1)[0] if names else ("", 0)
+    if count > 1:
+        raise ValueError(f"{where}: contains {name!r} twice")

@@ -17,7 +17,7 @@ from quell.kernels.function_pointers import call
 from quell.plants.base import advance, begin_run, check_run, measure
 from quell.plants.fmu.instances import INSTANCES, Instance, begin, callback_address
 from quell.plants.fmu.library import Library
-from quell.plants.fmu.variables import Ports, Start, Variables, check_step
+from quell.plants.fmu.variables import Ports, Start, Variables, warn_of_step
 from quell.reading import MAX_SIZE, bytes_of
 from quell.types import Vector
 
@@ -95,11 +95,15 @@ class FMU:
     ValueError
         for a file that is no FMU, is damaged, unpacks to more than ``max_size`` or would write
         outside of its folder; an FMU without co-simulation, or without a binary for this machine;
-        names and values that do not fit its variables. ``simulate`` raises it if dt is no multiple
-        of the FMU's internal step, if ``x0`` is not zero (give ``start``), and where the FMU
-        reports an error or asks to end the simulation.
+        names and values that do not fit its variables. ``simulate`` raises it if ``x0`` is not
+        zero (give ``start``), and where the FMU reports an error or asks to end the simulation.
     ImportError
         without FMPy; the message names the extra that installs it.
+
+    Warns
+    -----
+    DesignWarning
+        in ``simulate``, if ``dt/substeps`` is no multiple of the FMU's internal step.
 
     Examples
     --------
@@ -157,7 +161,7 @@ class FMU:
     def sampled(self, dt: float, interpret: bool = False) -> FMUModel:
         """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
         checks.positive("dt", dt, "s")
-        check_step(self._library.description, dt, self.substeps, self._library.name)
+        warn_of_step(self._library.description, dt, self.substeps, self._library.name)
         return FMUModel(self._number, dt, callback_address())
 
     def instance(self, dt: float, x0: Vector) -> Instance:

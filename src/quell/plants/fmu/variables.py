@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from quell import checks
+from quell.types import DesignWarning
 
 _REAL = ("Real", "Float32", "Float64")
 _WHOLE = ("Integer", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")
@@ -160,8 +162,8 @@ def _range(kind: str) -> tuple[int, int]:
     return (0, 2**bits - 1) if kind.startswith("U") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
 
 
-def check_step(description: Any, dt: float, substeps: int, where: str) -> None:
-    """Raise a ``ValueError`` if an FMU can't take communication steps of ``dt/substeps`` [s]."""
+def warn_of_step(description: Any, dt: float, substeps: int, where: str) -> None:
+    """Warn if ``dt/substeps`` [s] is no multiple of the internal step of an FMU of FMI 3.0."""
     fixed = getattr(description.coSimulation, "fixedInternalStepSize", None)
     try:
         internal = float(fixed or 0.0)
@@ -171,7 +173,9 @@ def check_step(description: Any, dt: float, substeps: int, where: str) -> None:
         return
     ratio = dt / substeps / internal
     if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-9):
-        raise ValueError(
-            f"{where}: dt/substeps = {dt / substeps!r} s: must be a multiple of the FMU's internal "
-            f"step of {internal!r} s"
+        warnings.warn(
+            f"{where}: dt/substeps = {dt / substeps!r} s is no multiple of the FMU's internal step "
+            f"of {internal!r} s: its outputs are then those of an earlier time",
+            DesignWarning,
+            stacklevel=4,
         )
