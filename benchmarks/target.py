@@ -7,14 +7,16 @@ Each controller is exported to C, compiled by ``arm-none-eabi-gcc``, without FMA
 are those of a step with its call, counted by the emulated timer (``target.c``); they are no
 cycles: a Cortex-M4 takes 1 for most, 1 to 3 for a load or a jump, 14 for a division or root. Code
 and constants are those of the exported file, with all its functions, without the C library. The
-stack is painted and measured. The last column is the RMS difference of u to quell's own in double
-precision, relative to the RMS of u.
+stack is painted and measured. Then the RMS difference of u to quell's own in double precision,
+relative to the RMS of u, and the largest difference in the golden vectors of the export, which are
+of the same precision.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 import tempfile
 from pathlib import Path
@@ -143,6 +145,19 @@ def measured(
     }
 
 
+def golden(case: Case, folder: Path) -> float:
+    """Return the largest difference in the golden vectors, run on the board [ulp]."""
+    ql.export.c(case.controller, folder, name="servo", precision=case.precision, accept=True)
+    board, program, source = emulator.BOARDS[case.board], folder / "test.elf", folder / "src"
+    parts = [folder / "test_servo.c", source / "servo.c"]
+    emulator.build(board, program, parts, f"-I{source}")
+    code, output = emulator.run(board, program)
+    found = re.search(r"largest difference (\S+) ulp", output)
+    if code or found is None:
+        raise RuntimeError(f"{case.name}: {output}")
+    return float(found[1])
+
+
 def shown(case: Case, found: dict[str, float]) -> list[str]:
     """Return a row of the table."""
 
@@ -152,8 +167,8 @@ def shown(case: Case, found: dict[str, float]) -> list[str]:
         return f"{found[name]:.0f}{over}"
 
     names = ("instructions", "most", "code", "constants", "state", "stack")
-    difference = f"{found['difference']:.1e}"
-    return [case.name, case.board, case.precision, *map(text, names), difference]
+    last = (f"{found['difference']:.1e}", f"{found['golden']:.3g}")
+    return [case.name, case.board, case.precision, *map(text, names), *last]
 
 
 def main() -> None:
@@ -167,13 +182,14 @@ def main() -> None:
         sys.exit(f"{tool} is not installed; {emulator.INSTALL}")
     rows, runs = [], dict[str, ql.Trajectory]()
     heads = ("controller", "processor", "precision", "instructions, mean", "most", "code [B]")
-    table = Table(*heads, "constants [B]", "state [B]", "stack [B]", "u − double")
+    table = Table(*heads, "constants [B]", "state [B]", "stack [B]", "u − double", "golden [ulp]")
     table.title = f"arm-none-eabi-gcc {arguments.optimise}"
     for case in cases():
         if case.name not in runs:
             runs[case.name] = simulated(case, arguments.samples)
         with tempfile.TemporaryDirectory() as folder:
             found = measured(case, runs[case.name], Path(folder), arguments.optimise)
+            found["golden"] = golden(case, Path(folder) / "golden")
         table.add_row(*shown(case, found))
         names = {"controller": case.name, "board": case.board, "precision": case.precision}
         rows.append({**names, **found})

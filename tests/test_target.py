@@ -183,6 +183,25 @@ def test_the_emulator_counts_instructions(table, tmp_path):
     assert found["difference"] < 1e-4
 
 
+@pytest.mark.parametrize(
+    ("board", "precision"), [("Cortex-M4F", "single"), ("Cortex-M7", "double")]
+)
+def test_golden_vectors_hold_on_the_target(table, tmp_path, board, precision):
+    """Those of the export, with sines and roots of the C library, saturation, NaN and retuning.
+
+    Without FMA newlib differs from the C library of this machine by a few units in the last place.
+    """
+    controller = servo(ql.learners.Harmonic())
+    ql.export.c(controller, tmp_path / "c", name="servo", precision=precision, accept=True)
+    program, source = tmp_path / "test.elf", tmp_path / "c" / "src"
+    parts, emulator = [tmp_path / "c" / "test_servo.c", source / "servo.c"], table.emulator
+    flags = (f"-I{source}", "-DTOLERANCE=8")
+    emulator.build(emulator.BOARDS[board], program, parts, *flags)
+    code, output = emulator.run(emulator.BOARDS[board], program)
+    assert code == 0, output
+    assert "passed" in output
+
+
 def test_a_timer_interrupt_controls_a_drive(table, tmp_path):
     """Under load from the start, through manual operation, and off when the sensor has failed."""
     board = table.emulator.BOARDS["Cortex-M4F"]

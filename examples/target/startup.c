@@ -7,7 +7,7 @@
 
 extern uint32_t memory_stack[], memory_data_image[], memory_data[], memory_data_end[];
 extern uint32_t memory_bss[], memory_bss_end[];
-extern int main(void);
+extern int main(int count, char **arguments);
 /* Of newlib with --specs=rdimon.specs: printf and the result of main go to the debugger. */
 extern void initialise_monitor_handles(void) __attribute__((weak));
 extern void exit(int code) __attribute__((weak));
@@ -53,7 +53,8 @@ void reset_handler(void)
         *to = 0;
     if (initialise_monitor_handles)
         initialise_monitor_handles();
-    int code = main();
+    static char *no_arguments[] = {0};
+    int code = main(0, no_arguments);
     if (exit)
         exit(code);
     stop_handler();
