@@ -305,7 +305,7 @@ def test_what_an_fmu_cannot_do_is_refused_with_a_reason(made: Maker) -> None:
     for call in (
         lambda: fmi.doStep(0.0, DT),
         fmi.enterEventMode,
-        fmi.enterConfigurationMode,
+        lambda: fmi.fmi3EnterConfigurationMode(fmi.component),
         fmi.updateDiscreteStates,
         lambda: fmi.getDirectionalDerivative([5], [1], [1.0]),
         lambda: fmi.getOutputDerivatives([5], [1]),

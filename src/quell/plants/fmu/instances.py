@@ -120,9 +120,9 @@ class Instance:
         fmu = self._fmu
         structural = [start for start in self._starts if start.structural]
         if structural:
-            fmu.enterConfigurationMode()
+            fmu.fmi3EnterConfigurationMode(fmu.component)
             self._set(structural)
-            fmu.exitConfigurationMode()
+            fmu.fmi3ExitConfigurationMode(fmu.component)
         self._set([start for start in self._starts if not start.structural])
         if self._library.old:
             fmu.setupExperiment(startTime=0.0)

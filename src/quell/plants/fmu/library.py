@@ -60,7 +60,7 @@ class Library:
         try:
             names = unpack(path, self._folder, most, wanted)
             self.description = _read(fmpy, self._folder, self.name)
-            self.old = self.description.fmiMajorVersion == 2
+            self.old = _major(self.description) == 2
             slave = self.description.coSimulation
             self._check_binary(names, slave.modelIdentifier, places[2 if self.old else 3])
         except BaseException:
@@ -169,7 +169,7 @@ def _read(fmpy: Any, folder: Path, name: str) -> Any:
         raise ValueError(f"{name}: {_DESCRIPTION}: must be in UTF-8, without a document type")
     try:
         description = fmpy.read_model_description(str(folder))
-        version = description.fmiMajorVersion
+        version = _major(description)
     except Exception as error:  # FMPy raises plain exceptions, and lxml several kinds
         problems = getattr(error, "problems", None)
         what = " ".join(str(problems[0] if problems else error).split())
@@ -182,6 +182,11 @@ def _read(fmpy: Any, folder: Path, name: str) -> Any:
             f"{name}: is not for co-simulation; export it for co-simulation from its tool"
         )
     return description
+
+
+def _major(description: Any) -> int:
+    """Return the version of FMI before the dot."""
+    return int(description.fmiVersion.partition(".")[0])
 
 
 def _remove(folder: Path, loaded: list[Any]) -> None:
