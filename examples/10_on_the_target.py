@@ -35,11 +35,7 @@ def on_target(board: emulator.Board, controller: ql.ADRC, precision: str) -> ql.
         program = folder / "servo.elf"
         flags = (f"-DLOAD_AT={round(LOAD_AT / DT)}", f"-DLOAD=({LOAD})", "-DMOST_WAIT=1000")
         emulator.build(board, program, parts, f"-I{folder}", f"-I{folder}/src", *flags)
-        channels = (
-            ("r", 1),
-            ("u", 1),
-            *((name, width) for name, width in controller.channels if width),
-        )
+        channels = (("r", 1), ("u", 1), *controller.channels)  # as serial_target.c sends them
         with emulator.serial_line(board, program) as url, open_device(url, DT) as device:
             return record_target(device, REFERENCE, channels, DURATION)
 

@@ -221,7 +221,7 @@ def test_a_target_in_double_precision_equals_the_simulation(table, tmp_path):
     load = Step(height=-3.0, at=50 * DT)
     scenario = ql.Scenario(reference=reference, disturbances=(load,), duration=0.15)
     simulated = ql.simulate(DRIVE, servo(), scenario, interpret=True)
-    channels = (("r", 1), ("u", 1), *((name, width) for name, width in servo().channels if width))
+    channels = (("r", 1), ("u", 1), *servo().channels)
     with table.emulator.serial_line(board, program) as url, open_device(url, DT) as device:
         run = record_target(device, reference, channels, scenario.duration)
     for name in run.names:
