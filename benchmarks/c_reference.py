@@ -44,28 +44,7 @@ def c_reference(
     run = ctypes.CDLL(str(library)).run
     run.restype = ctypes.c_double
     pointer = ctypes.c_void_p
-    design = study.controllers(settings)[study.L].parameters
-    kalman, plant = design.learner, ql.plants.two_mass_spring().sampled(settings.dt)
-    numbers = np.concatenate(
-        [
-            [settings.dt],
-            *(field.ravel() for field in plant),
-            *(field.ravel() for field in design.eso[:4]),
-            design.law,
-            [design.b0, kalman.lag.pole, kalman.lag.rise],
-            kalman.lag.taps,
-            kalman.scale[:4],
-            kalman.threshold,
-            [
-                kalman.walk[-1],
-                kalman.forget,
-                kalman.lag_time,
-                kalman.prior[0],
-                kalman.fastest,
-                kalman.f_noise,
-            ],
-        ]
-    )
+    numbers = c_design(settings)
     samples, hold = round(duration / settings.dt) + 1, round(0.01 / settings.dt)
     noise = study.scenario(settings).noise.seeded(settings.seed)(
         np.arange(samples // hold + 1) * 0.01
@@ -88,6 +67,32 @@ def c_reference(
         return log
 
     return reference
+
+
+def c_design(settings: study.Settings) -> np.ndarray:
+    """Return the numbers of ``design_t`` in ``reference.c`` for the study's L-ESO."""
+    design = study.controllers(settings)[study.L].parameters
+    kalman, plant = design.learner, ql.plants.two_mass_spring().sampled(settings.dt)
+    return np.concatenate(
+        [
+            [settings.dt],
+            *(field.ravel() for field in plant),
+            *(field.ravel() for field in design.eso[:4]),
+            design.law,
+            [design.b0, kalman.lag.pole, kalman.lag.rise],
+            kalman.lag.taps,
+            kalman.scale[:4],
+            kalman.threshold,
+            [
+                kalman.walk[-1],
+                kalman.forget,
+                kalman.lag_time,
+                kalman.prior[0],
+                kalman.fastest,
+                kalman.f_noise,
+            ],
+        ]
+    )
 
 
 def best(*candidates: Callable[[], object], trials: int) -> list[float]:

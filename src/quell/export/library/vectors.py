@@ -126,6 +126,12 @@ class Player:
         self.rows.append(Row(action, r_, y_, given_, u, status))
         return float(u)
 
+    def limit_at(self, path: str, high: Any) -> None:
+        """Set the parameters of ``LIMIT``: the upper limit at ``path`` is ``high``."""
+        limits = _at_path(self.default, path)
+        limits = limits._replace(high=max(self.real(high), limits.low))
+        self.limited = _with_limits(self.default, path, limits)
+
     def u_of(self, rows: slice) -> Any:
         """Return u of some rows."""
         return np.array([float(row.u) for row in self.rows[rows]])
@@ -184,9 +190,8 @@ def _play_limited(player: Player, path: str, signals: _Signals) -> None:
     """Set the upper limit into the middle of the range that u had so far, and back."""
     u = player.u_of(slice(2, _FIRST))
     limits = _at_path(player.default, path)
-    high = player.real(0.5 * (float(np.min(u)) + float(np.max(u))))
-    high = max(high, limits.low) if math.isfinite(high) else limits.high
-    player.limited = _with_limits(player.default, path, limits._replace(high=high))
+    high = 0.5 * (float(np.min(u)) + float(np.max(u)))
+    player.limit_at(path, high if math.isfinite(high) else limits.high)
     for action in (Action.LIMIT, Action.FREE):
         player.play(action, *signals.next())
         for _ in range(2 * _PART):

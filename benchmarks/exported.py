@@ -1,0 +1,321 @@
+"""Exported controllers on this machine: bits, compilers, sanitizers, coverage, speed, long runs.
+
+    python benchmarks/exported.py [--samples 100000] [--seconds 20] [--only TEXT] [--part PART]
+
+Every controller, observer, learner and feature of the contract tests is exported in double and in
+single precision, compiled without a warning by gcc, clang and as C++, and run in a loop with a plant
+(``exported.c``): noise, saturation, bursts of NaN, absurd values, manual operation, retuning,
+restarts. The interpreted kernels replay what the C code was given, for so many seconds each; the
+column has the number of samples, and how many of them differ in a bit. "compiled" is the largest
+difference of u to the compiled kernels, relative to the RMS of u. Branches are those of ``servo.c``
+that the run has taken (gcov). The parts are ``bits``, ``speed`` (the exported learner against
+``reference.c``) and ``long`` (10^8 samples in single precision).
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from c_reference import c_design
+from rich.console import Console
+from rich.table import Table
+
+import quell as ql
+from quell.controllers import in_single_precision
+from quell.controllers.adrc.handover import samples_to_settle
+from quell.experiments.two_mass_spring import setup as study
+from quell.export import TranslationError
+from quell.export.library.vectors import Action, Player, limits_path
+
+HERE = Path(__file__).parent
+STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+EXACT = ("-O2", "-ffp-contract=off")
+COMPILERS = {
+    "gcc": ("gcc", "-std=c99", *STRICT, *EXACT),
+    "clang": ("clang", "-std=c99", *STRICT, *EXACT),
+    "g++": ("g++", "-std=c++11", "-x", "c++", "-Wall", "-Wextra", "-Werror", *EXACT),
+    "sanitizers": (
+        "gcc", "-std=c99", "-O1", "-g", "-ffp-contract=off", "-fsanitize=address,undefined",
+        "-fno-sanitize-recover=all",
+    ),
+    "coverage": ("gcc", "-std=c99", "-O0", "-ffp-contract=off", "--coverage"),
+}  # fmt: skip
+NAMES = ("r", "y", "given", "u", "status")
+
+
+def cases() -> Iterator[tuple[str, Any]]:
+    """Yield name and controller of everything that the contract tests know."""
+    sys.path.insert(0, str(HERE.parent))
+    from tests.contracts.examples import LEARNERS, OBSERVERS
+    from tests.contracts.test_controllers import CONTROLLERS
+
+    yield from CONTROLLERS.items()
+    for name, observer in OBSERVERS.items():
+        yield f"observer: {name}", ql.ADRC(observer, omega_c=1.5, u_min=-3.0, u_max=3.0)
+    observer = OBSERVERS["model-free, order 2, current"]
+    limits = {"u_min": -5.0, "u_max": 5.0}
+    for name, learner in LEARNERS.items():
+        yield (
+            f"learner: {name}",
+            ql.ADRC(observer, 1.5, learner=learner, guard=ql.Guard(), **limits),
+        )
+    yield "learner without guard", ql.ADRC(observer, 1.5, learner=ql.learners.RLS(), **limits)
+
+
+def script(samples: int, single: bool) -> np.ndarray:
+    """Return the rows (action, reference, noise, share of u) of a run."""
+    random, k = np.random.default_rng(7), np.arange(samples)
+    rows = np.zeros((samples, 4))
+    rows[:, 1] = np.sin(0.01 * k) + np.where(k % 3000 < 1500, 0.0, 2.0)
+    rows[:, 2] = 1e-3 * random.standard_normal(samples)
+    rows[:, 3] = 0.9
+    rows[k % 997 < 5, 2] = np.nan  # also before the first sample
+    rows[k % 4001 == 17, 2] = np.inf
+    rows[k % 9973 == 400, 2] = 1e30 if single else 1e300
+    rows[k % 1511 < 2, 1] = np.nan
+    rows[k % 101 == 50, 0] = Action.APPLIED
+    manual = (k % 5000 >= 2000) & (k % 5000 < 2100)
+    rows[manual, 0], rows[manual, 3] = Action.TRACK, 0.99
+    rows[k % 5000 == 2100, 0] = Action.HAND_OVER
+    rows[k % 7000 == 3000, 0] = Action.LIMIT
+    rows[k % 7000 == 3500, 0] = Action.FREE
+    rows[k % 20_000 == 19_000, 0] = Action.RESET
+    rows[k % 33_000 == 31_000, 0] = Action.START
+    return rows
+
+
+def build(folder: Path, compiler: str, defines: tuple[str, ...]) -> Path:
+    """Compile servo.c and the loop; return the program."""
+    place = folder / compiler.replace("+", "p")
+    place.mkdir()
+    shutil.copy(HERE / "exported.c", place / "loop.c")
+    for file in (folder / "src").iterdir():
+        shutil.copy(file, place)
+    command = [*COMPILERS[compiler], *defines, "servo.c", "loop.c", "-lm", "-o", "loop"]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{compiler}: {done.stderr[:2000]}")
+    return place / "loop"
+
+
+def played(program: Path, rows: np.ndarray, single: bool) -> np.ndarray:
+    """Run a program over the rows; return what it was given and its results."""
+    done = subprocess.run([program], input=rows.tobytes(), capture_output=True, check=False)
+    if done.returncode:
+        raise RuntimeError(done.stderr.decode()[:2000])
+    kind = np.float32 if single else np.float64
+    return np.frombuffer(done.stdout, [(name, kind) for name in NAMES])
+
+
+def same_bits(one: np.ndarray, other: np.ndarray) -> bool:
+    """Return whether two results are the same; the sign of a NaN does not count."""
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in NAMES)
+
+
+def branches(folder: Path) -> str:
+    """Return the share of the branches of servo.c that were taken, in per cent."""
+    command = ["gcov", "-b", "loop-servo.gcda"]
+    text = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout
+    part = text.partition("servo.c'")[2]
+    found = re.search(r"Taken at least once:(\d+\.\d+)% of (\d+)", part)
+    return f"{float(found[1]):.0f} % of {found[2]}" if found else "–"
+
+
+def replayed(
+    controller: Any, rows: np.ndarray, given: np.ndarray, seconds: float, names: set[str]
+) -> tuple[int, int]:
+    """Return how many samples the interpreted kernels replayed, and how many of them differ."""
+    player, path, began = Player(controller), limits_path(controller), time.perf_counter()
+    if path:
+        player.limit_at(path, 0.5)
+    for k, row in enumerate(given):
+        if time.perf_counter() - began > seconds:
+            break
+        action = available(Action(int(rows[k, 0])), names, path)
+        player.play(action, row["r"], row["y"], row["given"])
+    count = len(player.rows)
+    u = player.u_of(slice(None))
+    status = np.array([row.status for row in player.rows])
+    same = (u == given["u"][:count]) & (status == given["status"][:count])
+    return count, int(np.sum(~same))
+
+
+def available(action: Action, names: set[str], path: str) -> Action:
+    """Return the action, or a step if the controller can't do it."""
+    needs = {
+        Action.TRACK: "track" in names,
+        Action.HAND_OVER: "hand_over" in names,
+        Action.LIMIT: bool(path),
+        Action.FREE: bool(path),
+        Action.START: "start" in names,
+    }
+    return action if needs.get(action, True) else Action.STEP
+
+
+def compiled_difference(controller: Any, rows: np.ndarray, given: np.ndarray) -> float:
+    """Return the largest difference of u to the compiled kernels in the first steps of the run.
+
+    They are the samples before the first that is not a step, the longest part without NaN.
+    """
+    ends = np.flatnonzero(rows[:, 0] != Action.STEP)
+    count = int(ends[0]) if ends.size else len(rows)
+    runner = copy.deepcopy(controller)
+    derivatives = int(getattr(controller, "derivatives", 0))
+    u = [runner.step(row["r"], row["y"], *[0.5 * row["r"]] * derivatives) for row in given[:count]]
+    size = float(np.sqrt(np.mean(np.square(given["u"][:count])))) or 1.0
+    return float(np.max(np.abs(u - given["u"][:count]))) / size
+
+
+def judged(name: str, controller: Any, precision: str, options: argparse.Namespace) -> list[str]:
+    """Return a row of the table."""
+    single = precision == "single"
+    shown = in_single_precision(controller) if single else controller
+    rows = script(options.samples, single)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "servo"
+        done = ql.export.c(controller, folder, name="servo", precision=precision, accept=True)
+        names, path = set(done.source.operations), limits_path(shown)
+        inner = ql.controllers.prefilters.prefilter.without_prefilters(controller)
+        if "start" in names and samples_to_settle(inner.observer) > 20_000:
+            names.discard("start")  # interpreted it would take minutes
+        derivatives = int(getattr(shown, "derivatives", 0)) if "set_derivatives" in names else 0
+        defines = tuple(
+            f"-D{each}"
+            for each in (
+                *(f"HAS_{what.upper()}" for what in ("track", "start") if what in names),
+                *([f"LIMITS={path}"] if path else []),
+                f"DERIVATIVES={derivatives}",
+            )
+        )
+        runs = {each: played(build(folder, each, defines), rows, single) for each in COMPILERS}
+        taken = branches(folder / "coverage")
+    given = runs["gcc"]
+    others = sum(not same_bits(each, given) for each in runs.values())
+    count, wrong = replayed(shown, rows, given, options.seconds, names)
+    compiled = "–"
+    if options.compiled:
+        compiled = f"{compiled_difference(shown, rows, given):.0e}"
+    flags = ql.Status(int(np.bitwise_or.reduce(given["status"].astype(int))))
+    cells = [name, precision, f"{count}", f"{wrong}", f"{others}", compiled, taken]
+    return [*cells, f"{int(flags)}"]
+
+
+def bits(options: argparse.Namespace, console: Console) -> None:
+    """Print the table of all combinations."""
+    heads = ("controller", "precision", "replayed", "differ", "compilers that differ", "compiled")
+    table = Table(*heads, "branches taken", "flags seen")
+    wrong = 0
+    for name, controller in cases():
+        if options.only not in name:
+            continue
+        for precision in ("double", "single"):
+            try:
+                cells = judged(name, controller, precision, options)
+                wrong += cells[3:5] != ["0", "0"]
+            except TranslationError as error:
+                cells = [name, precision, "refused", str(error)[:40], "", "", "", ""]
+            except (RuntimeError, ValueError) as error:
+                cells, wrong = (
+                    [name, precision, "FAILED", str(error)[:200], "", "", "", ""],
+                    wrong + 1,
+                )
+            console.print(" | ".join(cells), highlight=False)
+            table.add_row(*cells)
+    console.print(table)
+    console.print(f"{wrong} rows have an error" if wrong else "all rows are as they must be")
+
+
+def speed(console: Console) -> None:
+    """Print the time of a step of the exported learner over that of ``reference.c``."""
+    settings = study.Settings()
+    controller = study.controllers(settings)[study.L]
+    run = ql.simulate(ql.plants.two_mass_spring(), controller, study.scenario(settings))
+    design = c_design(settings)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "servo"
+        ql.export.c(controller, folder, name="servo")
+        for name, values in (("design", design), ("r", run["r"]), ("y", run["y_measured"])):
+            (Path(place) / name).write_bytes(np.ascontiguousarray(values, dtype=float).tobytes())
+        table = Table("compiler and flags", "exported [ns]", "by hand [ns]", "ratio (bar 1.1)")
+        for flags in (
+            ("gcc", "-O2"), ("gcc", "-O3"), ("gcc", "-O3", "-march=native", "-std=gnu11"),
+            ("clang", "-O2"), ("clang", "-O3", "-march=native"),
+        ):  # fmt: skip
+            program = Path(place) / "timing"
+            sources = (HERE / "exported_speed.c", folder / "src/servo.c")
+            include = (f"-I{HERE}", f"-I{folder / 'src'}")
+            subprocess.run([*flags, *include, *sources, "-lm", "-o", program], check=True)
+            text = subprocess.run([program], cwd=place, capture_output=True, check=True).stdout
+            exported, by_hand = map(float, text.split())
+            cells = (f"{exported:.0f}", f"{by_hand:.0f}", f"{exported / by_hand:.2f}")
+            table.add_row(" ".join(flags), *cells)
+    console.print(table)
+
+
+def long_runs(samples: float, console: Console) -> None:
+    """Print what single precision does in 10^8 samples, at rest and in motion."""
+    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=30.0, dt=1e-3)
+    limits = {"u_min": -20.0, "u_max": 20.0}
+    laws = {
+        "MF-ESO": ql.ADRC(observer, 3.0, **limits),
+        "Kalman, guard": ql.ADRC(
+            observer, 3.0, learner=ql.learners.Kalman(), guard=ql.Guard(), **limits
+        ),
+        "RLS, guard": ql.ADRC(observer, 3.0, learner=ql.learners.RLS(), guard=ql.Guard(), **limits),
+        "PID": ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits),
+    }
+    heads = ("controller", "plant", "RMS r - y: first, ninth, last tenth", "mean u of each")
+    table = Table(*heads, "learned", "flags", "not finite")
+    for name, controller in laws.items():
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place) / "servo"
+            done = ql.export.c(controller, folder, name="servo", precision="single", accept=True)
+            defines = [
+                f"-DHAS_{channel.upper()}" for channel, width in done.source.channels if width > 1
+            ]
+            program = Path(place) / "long"
+            sources = (HERE / "exported_long.c", folder / "src/servo.c")
+            flags = ("gcc", "-O2", f"-I{folder / 'src'}", *defines)
+            subprocess.run([*flags, *sources, "-lm", "-o", program], check=True)
+            for moving in ("0", "1"):
+                command = [program, f"{samples:.0f}", moving]
+                text = subprocess.run(command, capture_output=True, check=True, text=True).stdout
+                table.add_row(name, "in motion" if moving == "1" else "at rest", *text.split("|"))
+    console.print(table)
+
+
+def main() -> None:
+    """Run the parts."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--samples", type=int, default=100_000, help="samples of each run in C")
+    parser.add_argument("--seconds", type=float, default=20.0, help="time of each replay")
+    parser.add_argument("--only", default="", help="controllers whose name has this text")
+    parser.add_argument("--part", choices=("bits", "speed", "long"), help="one part only")
+    parser.add_argument("--compiled", action="store_true", help="compare with compiled kernels")
+    parser.add_argument("--long", type=float, default=1e8, help="samples of the long runs")
+    options = parser.parse_args()
+    console = Console(width=max(160, int(os.environ.get("COLUMNS", "0"))))
+    warnings.simplefilter("ignore")
+    if options.part in (None, "bits"):
+        bits(options, console)
+    if options.part in (None, "speed"):
+        speed(console)
+    if options.part in (None, "long"):
+        long_runs(options.long, console)
+
+
+if __name__ == "__main__":
+    main()
