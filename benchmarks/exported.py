@@ -3,8 +3,8 @@
     python benchmarks/exported.py [--samples 100000] [--seconds 20] [--only TEXT] [--part PART]
 
 Every controller, observer, learner and feature of the contract tests is exported in double and in
-single precision, compiled without a warning by gcc, clang and as C++, and run in a loop with a plant
-(``exported.c``): noise, saturation, bursts of NaN, absurd values, manual operation, retuning,
+single precision, compiled without a warning by gcc, clang and as C++, and run in a loop with a
+plant (``exported.c``): noise, saturation, bursts of NaN, absurd values, manual operation, retuning,
 restarts. The interpreted kernels replay what the C code was given, for so many seconds each; the
 column has the number of samples, and how many of them differ in a bit. "compiled" is the largest
 difference of u to the compiled kernels, relative to the RMS of u. Branches are those of ``servo.c``
