@@ -17,14 +17,7 @@ from quell.export.translate.expressions import Expressions
 from quell.export.translate.interfaces import Translation
 from quell.export.translate.naming import identifier
 from quell.export.translate.source import Source
-from quell.export.translate.statements import (
-    Body,
-    LocalAssumptions,
-    WrongAssumptionError,
-    ends,
-    same_constant,
-    same_number,
-)
+from quell.export.translate.statements import Body, ends
 from quell.export.translate.values import (
     ATOM,
     NOTHING,
@@ -37,6 +30,12 @@ from quell.export.translate.values import (
     TranslationError,
     Value,
     join,
+)
+from quell.export.translate.variables import (
+    Assumptions,
+    WrongAssumptionError,
+    same_constant,
+    same_number,
 )
 
 
@@ -77,7 +76,7 @@ class Function:
             if argument.is_constant and (key, name) not in program.findings.parameters:
                 self.constants[name] = argument.constant
                 parameters[name] = replace(parameters[name], **_known(program, argument))
-        known = LocalAssumptions()
+        known = Assumptions()
         while True:
             try:
                 body = Body(program, source, parameters, known)
@@ -86,8 +85,8 @@ class Function:
                 continue
         self.order = names
         self.parameters = parameters
-        self.written = body.written
-        local = {body.names[name].code for name in body.local}
+        self.written = body.expressions.written
+        local = {body.variables.names[name].code for name in body.variables.local}
         block = remove_unused(body.block, local)
         self._find_result(body, block, hints)
         used = names_in_block(block)
@@ -114,7 +113,7 @@ class Function:
                 self.inline = Value(NOTHING)
             return
         if falls:
-            raise TranslationError(f"{body.where}: a path has no return value")
+            raise TranslationError(f"{body.expressions.where}: a path has no return value")
         if isinstance(values[0].kind, Several):
             self._find_items(body, block, hints)
             return
@@ -130,12 +129,14 @@ class Function:
             return
         kind = first.kind
         for value in values[1:]:
-            kind = join(kind, value.kind, body.where)
+            kind = join(kind, value.kind, body.expressions.where)
         self.kind = kind
         for line, value in body.returns:
-            line.code = f"return {body.as_kind(value, kind).code}" if value.is_number else ""
+            line.code = (
+                f"return {body.expressions.as_kind(value, kind).code}" if value.is_number else ""
+            )
             if not value.is_number:
-                raise TranslationError(f"{body.where}: returns an array")
+                raise TranslationError(f"{body.expressions.where}: returns an array")
 
     constant: Value | None = None
 
@@ -154,7 +155,7 @@ class Function:
             else:
                 kind = first.kind
                 for item in each[1:]:
-                    kind = join(kind, item.kind, body.where)
+                    kind = join(kind, item.kind, body.expressions.where)
                 hint = hints[i] if i < len(hints) and hints[i] not in ("", "_") else f"value{i + 1}"
                 member = identifier(hint)
                 if member in dict(self.result_members):
@@ -172,7 +173,7 @@ class Function:
         self.kind = self.result_members[0][1] if single else Several(tuple(i.kind for i in items))
         for line, value in body.returns:
             parts = [
-                body.as_kind(item, kept.kind).code
+                body.expressions.as_kind(item, kept.kind).code
                 for item, kept in zip(value.items, items, strict=True)
                 if kept.code.startswith(".")
             ]
@@ -185,7 +186,11 @@ class Function:
             del block[-1]
 
     def _declaration(self, body: Body, name: str, constant: bool) -> str:
-        value = next(v for local, v in body.local.items() if body.names[local].code == name)
+        value = next(
+            v
+            for local, v in body.variables.local.items()
+            if body.variables.names[local].code == name
+        )
         kind = value.kind
         if isinstance(kind, Number):
             return f"{'const ' if constant else ''}{self.program.structs.number(kind)} {name}"

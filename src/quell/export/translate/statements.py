@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 from quell.export.translate.blocks import (
@@ -25,28 +25,12 @@ from quell.export.translate.values import (
     UNARY,
     Number,
     Several,
-    Struct,
-    TranslationError,
     Value,
-    is_empty,
-    join,
-    join_numbers,
 )
+from quell.export.translate.variables import Assumptions, Variables
 
 
-class WrongAssumptionError(Exception):
-    """An assumption about a local variable was wrong: the body must be translated again."""
-
-
-@dataclass
-class LocalAssumptions:
-    """What is assumed about local variables until the opposite is found."""
-
-    varying: set[str] = field(default_factory=set)  # not the same constant everywhere
-    kinds: dict[str, Number] = field(default_factory=dict)
-
-
-class Body(Expressions):
+class Body:
     """The body of a function, translated once under given assumptions."""
 
     def __init__(
@@ -54,17 +38,13 @@ class Body(Expressions):
         program: Translation,
         source: Source,
         arguments: dict[str, Value],
-        known: LocalAssumptions,
+        assumptions: Assumptions,
     ) -> None:
         where = f"{source.module}.{source.name}"
-        super().__init__(program, source.names, where, source.module)
-        self.source, self.known = source, known
-        self.names = dict(arguments)
-        self.local: dict[str, Value] = {}  # variables in C
-        self.loop_variables: set[str] = set()
+        self.program, self.source = program, source
+        self.expressions = Expressions(program, source.names, where, source.module)
+        self.variables = Variables(self.expressions, source, arguments, assumptions)
         self.returns: list[tuple[Line, Value]] = []
-        self.taken = set(arguments)
-        self.all_names = {part.id for part in ast.walk(source.tree) if isinstance(part, ast.Name)}
         self.block: Block = self._statements(source.tree.body)
 
     def _statements(self, nodes: list[ast.stmt]) -> Block:
@@ -73,8 +53,8 @@ class Body(Expressions):
         for node in nodes:
             here: Block = []
             ends = self._statement(node, here)
-            calls: Block = [Line(code, calls=True) for code in self.pending]
-            self.pending.clear()
+            calls: Block = [Line(code, calls=True) for code in self.expressions.pending]
+            self.expressions.pending.clear()
             here = calls + here
             if here:
                 before, behind = self.source.comments.of(node)
@@ -89,7 +69,7 @@ class Body(Expressions):
         """Add a statement to ``block``; return whether nothing after it is reached."""
         if isinstance(node, ast.Expr):
             if not isinstance(node.value, ast.Constant):
-                self._call_statement(self.translate(node.value), block)
+                self._call_statement(self.expressions.translate(node.value), block)
             return False
         if isinstance(node, ast.Return):
             self._return(node.value, block)
@@ -101,7 +81,7 @@ class Body(Expressions):
             return self._if(node, block)
         method = getattr(self, f"_{type(node).__name__.lower()}_statement", None)
         if method is None:
-            raise self.fail(node, "this statement can not be translated")
+            raise self.expressions.fail(node, "this statement can not be translated")
         method(node, block)
         return False
 
@@ -109,14 +89,14 @@ class Body(Expressions):
         pass
 
     def _raise_statement(self, node: ast.Raise, block: Block) -> None:
-        raise self.fail(node, "C has no exceptions")
+        raise self.expressions.fail(node, "C has no exceptions")
 
     def _call_statement(self, value: Value, block: Block) -> None:
         if value.calls:
             block.append(Line(value.code, calls=True))
 
     def _if(self, node: ast.If, block: Block) -> bool:
-        test = self.translate(node.test)
+        test = self.expressions.translate(node.test)
         if test.is_constant:
             arm = self._statements(node.body if test.constant else node.orelse)
             block.extend(arm)
@@ -136,9 +116,9 @@ class Body(Expressions):
         call = node.iter
         is_range = isinstance(call, ast.Call) and getattr(call.func, "id", "") == "range"
         if not (is_range and isinstance(node.target, ast.Name) and not node.orelse):
-            raise self.fail(node, "only 'for … in range(…)' can be translated")
-        bounds = [self.translate(part) for part in call.args]  # type: ignore[attr-defined]
-        start = bounds[0] if len(bounds) > 1 else self.constant(0)
+            raise self.expressions.fail(node, "only 'for … in range(…)' can be translated")
+        bounds = [self.expressions.translate(part) for part in call.args]  # type: ignore[attr-defined]
+        start = bounds[0] if len(bounds) > 1 else self.expressions.constant(0)
         stop = bounds[1] if len(bounds) > 1 else bounds[0]
         step = bounds[2].constant if len(bounds) > 2 else 1
         if (
@@ -147,33 +127,25 @@ class Body(Expressions):
             and not range(start.constant, stop.constant, step)
         ):
             return
-        name = node.target.id if node.target.id != "_" else self._fresh("k")
+        name = node.target.id if node.target.id != "_" else self.variables.fresh("k")
         variable = identifier(name)
-        self.loop_variables.add(variable)
-        self.names[node.target.id] = Value(Number.INT, variable)
+        self.expressions.names[node.target.id] = Value(Number.INT, variable)
         body = self._statements(node.body)
         if not body:
             return
         end, more = stop.at(SHIFT), ""
         if not stop.is_constant and (stop.calls or words(stop.code) & _set_names(body)
                                      or "->" in stop.code):  # fmt: skip
-            last = self._fresh("end")
-            self.loop_variables.add(last)
+            last = self.variables.fresh("end")
             end, more = last, f", {last} = {stop.code}"
         sign = "<" if step > 0 else ">"
         change = {1: f"{variable}++", -1: f"{variable}--"}.get(step, f"{variable} += {step}")
         header = f"for (int {variable} = {start.code}{more}; {variable} {sign} {end}; {change})"
         block.append(Loop(header, variable, body))
 
-    def _fresh(self, name: str) -> str:
-        found, number = name, 2
-        while found in self.all_names or found in self.names or found in self.loop_variables:
-            found, number = f"{name}{number}", number + 1
-        return found
-
     def _return(self, node: ast.expr | None, block: Block) -> None:
         if isinstance(node, ast.IfExp) and isinstance(node.body, ast.Tuple):
-            test = self.translate(node.test)
+            test = self.expressions.translate(node.test)
             if test.is_constant:
                 self._return(node.body if test.constant else node.orelse, block)
                 return
@@ -186,9 +158,15 @@ class Body(Expressions):
         value = Value(NOTHING)
         if node is not None:
             names = ()
-            value = self.call(node, names) if isinstance(node, ast.Call) else self.translate(node)
+            value = (
+                self.expressions.call(node, names)
+                if isinstance(node, ast.Call)
+                else self.expressions.translate(node)
+            )
         if isinstance(value.kind, Several) and not value.items:
-            raise self.fail(self.source.tree, "returns the tuple of another function; unpack it")
+            raise self.expressions.fail(
+                self.source.tree, "returns the tuple of another function; unpack it"
+            )
         codes = [item.code for item in value.items] if value.items else [value.code]
         line.code = f"return {', '.join(codes)}".strip()
         self.returns.append((line, value))
@@ -198,21 +176,25 @@ class Body(Expressions):
         if len(node.targets) == 1 and isinstance(node.targets[0], ast.Tuple):
             self._unpack(node.targets[0], node.value, block)
             return
-        value = self.translate(node.value)
+        value = self.expressions.translate(node.value)
         for target in node.targets:
             self._store(target, value, block, node)
             if value.calls and len(node.targets) > 1:
-                value = self.translate(node.targets[0])
+                value = self.expressions.translate(node.targets[0])
 
     def _annassign_statement(self, node: ast.AnnAssign, block: Block) -> None:
         if node.value is not None:
-            self._store(node.target, self.translate(node.value), block, node)
+            self._store(node.target, self.expressions.translate(node.value), block, node)
 
     def _unpack(self, targets: ast.Tuple, node: ast.expr, block: Block) -> None:
         names = tuple(str(getattr(part, "id", getattr(part, "attr", ""))) for part in targets.elts)
-        value = self.call(node, names) if isinstance(node, ast.Call) else self.translate(node)
+        value = (
+            self.expressions.call(node, names)
+            if isinstance(node, ast.Call)
+            else self.expressions.translate(node)
+        )
         if not isinstance(value.kind, Several):
-            raise self.fail(node, "is not a tuple")
+            raise self.expressions.fail(node, "is not a tuple")
         items = value.items
         if value.code:  # a call that returns a struct with what is not known otherwise
             items = self._results(value, block)
@@ -229,8 +211,8 @@ class Body(Expressions):
                 replace(item, code=value.code, calls=True) if item.code.startswith(".") else item
                 for item in value.items
             )
-        result = self._fresh("result")
-        self._set(result, replace(value, kind=struct), block)
+        result = self.variables.fresh("result")
+        self.variables.set(result, replace(value, kind=struct), block)
         return tuple(
             replace(item, code=result + item.code) if item.code.startswith(".") else item
             for item in value.items
@@ -247,16 +229,16 @@ class Body(Expressions):
                 used = [ast.unparse(part) for part in ast.walk(node.elts[k])
                         if isinstance(part, ast.Name | ast.Attribute)]  # fmt: skip
                 if base in used and found[k].is_number and not found[k].is_constant:
-                    name = self._fresh("before")
-                    self._set(name, found[k], block)
-                    found[k] = self.names[name]
+                    name = self.variables.fresh("before")
+                    self.variables.set(name, found[k], block)
+                    found[k] = self.expressions.names[name]
         return tuple(found)
 
     def _store(self, target: ast.expr, value: Value, block: Block, node: ast.AST) -> None:
         if isinstance(target, ast.Name):
-            self._set(target.id, value, block)
+            self.variables.set(target.id, value, block)
             return
-        place = self.translate(target)
+        place = self.expressions.translate(target)
         if place.member is not None:
             same = value.is_constant and float(value.constant) == place.constant
             if not same:
@@ -266,115 +248,59 @@ class Body(Expressions):
                 return
         self._check_place(target, place)
         value = self._fitting(place.kind, value, node)
-        self.written.add(place.root)
+        self.expressions.written.add(place.root)
         block.append(Line(f"{place.code} = {value.code}", calls=True))
 
     def _check_place(self, target: ast.expr, place: Value) -> None:
         if not place.is_number or place.is_constant:
-            raise self.fail(target, "only numbers can be assigned")
+            raise self.expressions.fail(target, "only numbers can be assigned")
         if not place.mutable:
-            raise self.fail(target, "parameters can not be changed")
+            raise self.expressions.fail(target, "parameters can not be changed")
 
     def _fitting(self, kind: Any, value: Value, node: ast.AST) -> Value:
         if kind is Number.REAL:
-            return self.real(value)
+            return self.expressions.real(value)
         value = whole(value)
         if kind is Number.BOOL and value.is_constant:
-            return self.constant(bool(value.constant))
+            return self.expressions.constant(bool(value.constant))
         if kind is Number.INT and value.is_constant:
-            return self.constant(int(value.constant))
+            return self.expressions.constant(int(value.constant))
         if not value.is_number or needed_kind(value).value > kind.value:
             if self.program.findings.is_new:
                 return value  # the program will be translated again
-            raise self.fail(node, "a real number is assigned to an integer")
+            raise self.expressions.fail(node, "a real number is assigned to an integer")
         return value
 
     def _augassign_statement(self, node: ast.AugAssign, block: Block) -> None:
-        value = self.translate(node.value)
+        value = self.expressions.translate(node.value)
         if value.constant == 0 and isinstance(node.op, ast.Add | ast.Sub | ast.BitOr):
             return
         if isinstance(node.target, ast.Name):
-            before = self.names[node.target.id]
+            before = self.expressions.names[node.target.id]
             if before.is_constant:
-                self.known.varying.add(node.target.id)
-                raise WrongAssumptionError
-            found = self.operation(node, node.op, before, value)
+                self.variables.assumptions.fail_as_varying(node.target.id)
+            found = self.expressions.operation(node, node.op, before, value)
             if found.kind is not before.kind:
-                self.known.kinds[node.target.id] = found.kind
-                raise WrongAssumptionError
+                self.variables.assumptions.fail_as(node.target.id, found.kind)
             name, place = before.code, before
         else:
-            place = self.translate(node.target)
+            place = self.expressions.translate(node.target)
             if place.member is not None:
                 self.program.structs.vary(place.member, Number.REAL)
                 if place.is_constant:
                     return
             self._check_place(node.target, place)
-            self.written.add(place.root)
-            found = self.operation(node, node.op, place, value)
+            self.expressions.written.add(place.root)
+            found = self.expressions.operation(node, node.op, place, value)
             self._fitting(place.kind, found, node)
             name = ""
         if isinstance(node.op, ast.Pow | ast.Mod | ast.FloorDiv):
             code = f"{place.code} = {found.code}"
         else:
-            value = self.as_kind(value, place.kind)
+            value = self.expressions.as_kind(value, place.kind)
             sign = found.code[len(place.code) + 1 :].split(" ", 1)[0]
             code = f"{place.code} {sign}= {value.code}"
         block.append(Line(code, name, calls=not name or value.calls, updates=bool(name)))
-
-    def _set(self, name: str, value: Value, block: Block) -> None:
-        """Set a local variable, which vanishes if it always has the same known value."""
-        if value.is_constant and name not in self.known.varying:
-            before = self.names.get(name)
-            if before is None or name not in self.local:
-                if before is None or (before.is_constant and same_constant(before, value)):
-                    self.names[name] = value
-                    return
-                self.known.varying.add(name)
-                raise WrongAssumptionError
-        elif name in self.names and self.names[name].is_constant:
-            self.known.varying.add(name)
-            raise WrongAssumptionError
-        if is_empty(value):
-            self.names[name] = value
-            return
-        variable = self._variable(name)
-        if value.is_number:
-            self._set_number(name, variable, value, block)
-            return
-        if isinstance(value.kind, Several):
-            raise TranslationError(f"{self.where}: {name}: a tuple must be unpacked")
-        before = self.local.get(name)
-        if before is not None and before.kind != value.kind:
-            raise TranslationError(f"{self.where}: {name} refers to different arrays")
-        is_result = value.code.split("(")[0] in self.program.results and value.calls
-        self.local[name] = value
-        self.names[name] = replace(value.named(variable), pointer=not is_result)
-        code = value.address if isinstance(value.kind, Struct) and not is_result else value.code
-        block.append(Line(code, variable, calls=value.calls))
-
-    def _variable(self, name: str) -> str:
-        """Return the C name of a variable, which must not be that of a function."""
-        variable = identifier(name)
-        return f"{variable}_" if self.program.has_function(variable) else variable
-
-    def _set_number(self, name: str, variable: str, value: Value, block: Block) -> None:
-        kind = self.known.kinds.get(name, value.kind)
-        if name in self.names and name not in self.local:
-            before = self.names[name].kind  # a parameter that is set
-        else:
-            before = self.local[name].kind if name in self.local else kind
-        joined = join_numbers(Value(join(before, kind, name)), value, name)
-        if joined is not kind or (name in self.local and joined is not before):
-            self.known.kinds[name] = joined
-            raise WrongAssumptionError
-        value = self.as_kind(value, joined)
-        if value.code == variable:  # x = x
-            return
-        if name not in self.taken:
-            self.local[name] = replace(value, kind=joined)
-        self.names[name] = Value(joined, variable)
-        block.append(Line(value.code, variable, calls=value.calls))
 
 
 def whole(value: Value) -> Value:
@@ -387,16 +313,6 @@ def needed_kind(value: Value) -> Number:
     if value.is_constant:
         return whole_kind(value.constant)
     return value.kind if isinstance(value.kind, Number) else Number.REAL
-
-
-def same_constant(one: Value, other: Value) -> bool:
-    """Return whether two known values are the same, not-a-number included."""
-    return same_number(one.constant, other.constant)
-
-
-def same_number(one: Any, other: Any) -> bool:
-    """Return whether two numbers are of one type and equal, or both not a number."""
-    return type(one) is type(other) and (one == other or (one != one and other != other))
 
 
 def ends(block: Block) -> bool:
