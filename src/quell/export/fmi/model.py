@@ -195,7 +195,7 @@ class Model:
             name = self.plant.source.name
             moved.append(f"m->plant.parameters = &{name}_default_parameters;")
             reset.append(f"{name}_init(&m->plant);")
-        begin += [f"m->plant.x[{i}] = m->real[X0_{i + 1}];" for i in range(self._order)]
+        begin += [f"m->plant.x[{i}] = m->real[AT_X0_{i + 1}];" for i in range(self._order)]
         sample += self._sample_lines()
         if self.plant:
             outputs += _plant_outputs(self.plant)
@@ -219,24 +219,24 @@ class Model:
         """Return the lines of a sample, without the outputs after it."""
         lines = []
         time_used = False
-        y = "m->real[Y]"
+        y = "m->real[AT_Y]"
         if self.plant and self.controller:
             lines.append(f"const double y = {self.plant.source.name}_measure(&m->plant);")
-            y = "y + m->real[NOISE]"
+            y = "y + m->real[AT_NOISE]"
         if self.controller:
             source, count = self.controller.source, self.controller.derivatives
             real, state = source.real, "&m->controller"
             cast = "" if real == "double" else f"({real})"
             if count:
-                values = [f"{cast}m->real[R_DERIVATIVE_{i + 1}]" for i in range(count)]
+                values = [f"{cast}m->real[AT_R_DERIVATIVE_{i + 1}]" for i in range(count)]
                 lines.append(f"const {real} derivatives[{count}] = {{{', '.join(values)}}};")
                 lines.append(f"{source.name}_set_derivatives({state}, derivatives);")
             y = f"{cast}({y})" if cast else y
-            lines.append(f"m->real[U] = {source.name}_step({state}, {cast}m->real[R], {y});")
+            lines.append(f"m->real[AT_U] = {source.name}_step({state}, {cast}m->real[AT_R], {y});")
         if self.plant:
-            w = ", &m->real[W_1]" if self.plant.disturbances else ""
+            w = ", &m->real[AT_W_1]" if self.plant.disturbances else ""
             name = self.plant.source.name
-            lines.append(f"{name}_advance(&m->plant, t, m->real[U]{w});")
+            lines.append(f"{name}_advance(&m->plant, t, m->real[AT_U]{w});")
             time_used = True
         return lines if time_used else ["(void)t;", *lines]
 
@@ -247,8 +247,8 @@ def place(variable: Variable) -> str:
 
 
 def _plant_outputs(plant: PlantPart) -> list[str]:
-    lines = [f"m->real[Y] = {plant.source.name}_measure(&m->plant);"]
-    return [*lines, *(f"m->real[X_{i + 1}] = m->plant.x[{i}];" for i in range(plant.order))]
+    lines = [f"m->real[AT_Y] = {plant.source.name}_measure(&m->plant);"]
+    return [*lines, *(f"m->real[AT_X_{i + 1}] = m->plant.x[{i}];" for i in range(plant.order))]
 
 
 def _estimate_function(controller: ControllerPart) -> str:
@@ -256,7 +256,7 @@ def _estimate_function(controller: ControllerPart) -> str:
     name = controller.source.name
     lines = [f"const {name}_estimate estimate = {name}_get_estimate(&m->controller);"]
     if "status" not in dict(controller.source.channels):
-        lines.append(f"m->integer[STATUS - MODEL_REALS] = {name}_status(&m->controller);")
+        lines.append(f"m->integer[AT_STATUS - MODEL_REALS] = {name}_status(&m->controller);")
     names = {"f_hat": "f"}
     for channel, width in controller.channels:
         if channel == "status" and "status" not in dict(controller.source.channels):
@@ -266,9 +266,9 @@ def _estimate_function(controller: ControllerPart) -> str:
             constant = f"{channel}_{i + 1}" if counted else channel
             field = f"estimate.{names.get(channel, channel)}" + (f"[{i}]" if width > 1 else "")
             if channel in ("status", "reason"):
-                lines.append(f"m->integer[{constant.upper()} - MODEL_REALS] = {field};")
+                lines.append(f"m->integer[AT_{constant.upper()} - MODEL_REALS] = {field};")
             else:
-                lines.append(f"m->real[{constant.upper()}] = {field};")
+                lines.append(f"m->real[AT_{constant.upper()}] = {field};")
     body = _indented(lines)
     doc = "/* Copy what the controller knows to the outputs. */"
     return f"\n{doc}\nstatic void set_estimate(model *m)\n{{\n{body}\n}}\n"

@@ -78,7 +78,12 @@ class ControllerPart:
         found = []
         for name, width in self.channels:
             text = _DESCRIPTIONS.get(name, name)
-            if width == 1 and name not in ("x_hat", "theta"):
+            if name == "theta":
+                found += [
+                    Variable(f"theta[{i + 1}]", OUTPUT, f"{text} for {feature}", held=True)
+                    for i, feature in enumerate(self.features)
+                ]
+            elif width == 1 and name != "x_hat":
                 found.append(Variable(name, OUTPUT, text, held=True, whole=name in WHOLE))
             else:
                 found += several(name, width, OUTPUT, f"{text}, {{i}}", held=True)

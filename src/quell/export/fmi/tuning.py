@@ -20,7 +20,7 @@ def tuning_lines(controller: ControllerPart) -> list[str]:
     name, real = source.name, source.real
     cast = "" if real == "double" else f"({real})"
     lines = [
-        "if (!(m->real[U_MIN] < m->real[U_MAX])) {",
+        "if (!(m->real[AT_U_MIN] < m->real[AT_U_MAX])) {",
         '    return "u_min must be less than u_max";',
         "}",
     ]
@@ -36,8 +36,8 @@ def tuning_lines(controller: ControllerPart) -> list[str]:
     lines += [
         f"{name}_parameters *next = &m->parameters[1 - m->acting];",
         f"*next = {name}_default_parameters;",
-        f"next->{path}.low = {cast}m->real[U_MIN];",
-        f"next->{path}.high = {cast}m->real[U_MAX];",
+        f"next->{path}.low = {cast}m->real[AT_U_MIN];",
+        f"next->{path}.high = {cast}m->real[AT_U_MAX];",
     ]
     if known is not None:
         if known.weights is not None:
@@ -66,9 +66,9 @@ def _omega_c_lines(known: Bandwidths, cast: str) -> list[str]:
             f"    next->{known.path}guard.forget_effect = {cast}({dt!r} / {times});",
         ]
     return [
-        f"if (m->real[OMEGA_C] != {known.omega_c!r}) {{ /* else the numbers of the export */",
+        f"if (m->real[AT_OMEGA_C] != {known.omega_c!r}) {{ /* else the numbers of the export */",
         f"    static const double weights[{count}] = {_braced(weights.tolist())};",
-        "    const double omega_c = m->real[OMEGA_C];",
+        "    const double omega_c = m->real[AT_OMEGA_C];",
         f"    for (int i = 0; i < {count}; i++) {{",
         f"        next->{known.path}law[i] = {cast}(weights[i] * pow(omega_c, {count} - i));",
         "    }",
@@ -83,11 +83,11 @@ def _omega_o_lines(known: Bandwidths, cast: str) -> list[str]:
     coefficients = known.coefficients if known.coefficients is not None else np.zeros((0, 0))
     rows, columns = coefficients.shape
     return [
-        f"if (m->real[OMEGA_O] != {known.omega_o!r}) {{ /* else the numbers of the export */",
+        f"if (m->real[AT_OMEGA_O] != {known.omega_o!r}) {{ /* else the numbers of the export */",
         f"    static const double coefficients[{rows}][{columns}] = {{",
         *(f"        {_braced(row)}," for row in coefficients.tolist()),
         "    };",
-        f"    const double omega = -expm1(-m->real[OMEGA_O] * {known.dt!r});",
+        f"    const double omega = -expm1(-m->real[AT_OMEGA_O] * {known.dt!r});",
         f"    for (int i = 0; i < {rows}; i++) {{",
         "        double gain = 0.0;",
         f"        for (int k = {columns - 1}; k >= 0; k--) {{",

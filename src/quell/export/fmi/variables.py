@@ -23,8 +23,8 @@ class Variable(NamedTuple):
 
     @property
     def constant(self) -> str:
-        """Name of the C constant for its place: ``X_HAT_1`` for ``x_hat[1]``."""
-        return re.sub(r"\W+", "_", self.name).strip("_").upper()
+        """Name of the C constant for its place: ``AT_X_HAT_1`` for ``x_hat[1]``."""
+        return "AT_" + re.sub(r"\W+", "_", self.name).strip("_").upper()
 
 
 TIME = Variable("time", "independent", "time", unit="s")
