@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 import math
-import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,8 +21,8 @@ from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
 from quell.types import Matrix, Vector
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
-STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
+from .in_c import InC, needs_gcc
+
 NUMBERS = (0.0, -0.0, 1.0, -2.5, 1e300, 1e-300, math.inf, -math.inf, math.nan)
 
 _LIMIT = 3.5
@@ -74,26 +71,10 @@ def source_of(function: Callable[..., Any], design: Design, state: State) -> Any
     return translated(write)
 
 
-_folders = itertools.count()
-
-
 def compiled(tmp_path: Path, function: Callable[..., Any], design: Design) -> Any:
     """Return a function that runs ``function`` in C, from a fresh state on."""
-    source = source_of(function, design, new_state())
-    folder = tmp_path / f"c{next(_folders)}"
-    folder.mkdir()
-    (folder / "t.h").write_text(source.header)
-    size = "\nunsigned long t_size(void);\nunsigned long t_size(void) { return sizeof(t_state); }\n"
-    (folder / "t.c").write_text(source.source + size)
-    library = folder / f"{folder.name}.so"
-    flags = [*STRICT, "-ffp-contract=off", "-shared", "-fPIC", "-o", str(library)]
-    subprocess.run(["gcc", *flags, str(folder / "t.c"), "-lm"], check=True, capture_output=True)
-    loaded = ctypes.CDLL(str(library))
-    loaded.t_size.restype = ctypes.c_ulong
-    state = ctypes.create_string_buffer(loaded.t_size())
-    loaded.t_init(state)
-    loaded.t_run.restype = ctypes.c_double
-    return lambda a, b: loaded.t_run(state, ctypes.c_double(a), ctypes.c_double(b))
+    in_c = InC(source_of(function, design, new_state()), tmp_path)
+    return lambda a, b: in_c.run("run", a, b)
 
 
 def new_design(**changes: Any) -> Design:
