@@ -3,6 +3,7 @@
 import math
 import threading
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -226,3 +227,18 @@ def test_a_target_in_double_precision_equals_the_simulation(table, tmp_path):
         run = record_target(device, reference, channels, scenario.duration)
     for name in run.names:
         assert np.array_equal(run[name], simulated[name]), name
+
+
+def test_a_tick_never_sees_half_of_a_command(table, tmp_path):
+    """Wherever the timer interrupts the receiver, if it masks the timer; else ticks do see it."""
+    emulator, wrong = table.emulator, []
+    board, source = emulator.BOARDS["Cortex-M4F"], Path(__file__).with_name("preempted_device.c")
+    for flags in ((), ("-DLOCKED",)):
+        program, include = tmp_path / "device.elf", f"-I{emulator.HERE.parent}"
+        emulator.build(board, program, [source], include, *flags)
+        code, output = emulator.run(board, program, "-icount", "shift=10,sleep=off")
+        assert code == 0, output
+        assert "live 1" in output
+        wrong.append(int(output.split()[2]))
+    assert wrong[0] > 0
+    assert wrong[1] == 0
