@@ -20,7 +20,7 @@ from quell.kernels.functions import is_single
 from quell.kernels.single import in_single
 from quell.learners.base import commit
 from quell.learners.kalman.search import ENTRIES, advance_search
-from quell.learners.least_squares import make_symmetric
+from quell.learners.least_squares import reduce_row
 from quell.observers.base import begin, expected_measurement, observe
 from quell.observers.delta import delta_form
 
@@ -227,9 +227,11 @@ def test_a_search_for_frequencies_counts_its_entries_without_end() -> None:
 
 def test_covariance_stays_symmetric() -> None:
     """In single precision the lower triangle counts."""
-    P = np.array([[1.0, 2.0], [3.0, 4.0]])
-    make_symmetric(P)
-    assert P.tolist() == [[1.0, 3.0], [3.0, 4.0]]
+    P = np.array([[1.0, 2.0], [3.0, 4.0]], np.float32)
+    gain = np.array([0.5, 1.0], np.float32)
+    for i in range(2):
+        reduce_row(P, i, gain[i], gain)
+    assert P.tolist() == [[0.75, 2.5], [2.5, 3.0]]
     controller = ql.ADRC(ORDER_2, 1.5, learner=ql.learners.Kalman())
     run = ql.simulate(CHAIN, controller, SCENARIO, precision="single")
     covariance = run.final_state.learner.covariance

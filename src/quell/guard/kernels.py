@@ -161,7 +161,8 @@ class GuardMemory(NamedTuple):
 
     chain: Matrix  # lag filters of f_plain, g and v (3, …)
     fed: Matrix  # lag filter of f_L (1, …), if it is not that of the observer, else (0, …)
-    shown: Vector  # their outputs: f_plain^F, g^F, p and f_L^F (4,)
+    # Their outputs f_plain^F, g^F, p and f_L^F (4,); in single precision carries, too (6,).
+    shown: Vector
     effects: Matrix  # what q and p̄ do to y, stage by stage (2, n) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
@@ -169,6 +170,31 @@ class GuardMemory(NamedTuple):
 
 # Rows of GuardMemory.chain and, with the last, entries of GuardMemory.shown.
 _F_PLAIN, _G, _V, _F_L = range(4)
+# Carries of sums in single precision, the last entries of GuardMemory.shown there.
+_TARGET, _SHARE = 4, 5
+CARRIES = 2
+
+
+@kernel
+def _sum(
+    guard: GuardDesign, memory: GuardMemory, place: int, value: float, increment: float
+) -> float:
+    """Return ``value + increment``; in single precision what rounding takes is carried over.
+
+    Share and target move by so little in a sample that rounding would stop them.
+    """
+    if is_single(guard.forget):
+        increment += memory.shown[place]
+        total = value + increment
+        memory.shown[place] = increment - (total - value)
+        return total
+    return value + increment
+
+
+@kernel
+def _clear_carry(memory: GuardMemory, place: int) -> None:
+    if place < memory.shown.size:
+        memory.shown[place] = 0.0
 
 
 @kernel
@@ -285,6 +311,7 @@ def _limit(
         sample.reason = _EXPLODED if finite else _NOT_FINITE
         sample.authority = sample.limit = sample.begun = 0.0
         sample.target = f_shown
+        _clear_carry(memory, _TARGET)
         withdraw_authority(memory)
         return f_shown, 0.0, not finite
     before = sample.output if sample.begun != 0.0 else output
@@ -292,9 +319,15 @@ def _limit(
     authority, sample.reason = _authority(guard, memory)
     sample.authority = authority
     sample.limit = authority * guard.bound * sample.typical_error
-    sample.share += guard.smooth * (authority - sample.share)
-    base = sample.target - sample.share * before
-    sample.target = base + sample.share * output
+    more = guard.smooth * (authority - sample.share)
+    sample.share = _sum(guard, memory, _SHARE, sample.share, more)
+    if is_single(guard.forget):
+        step = sample.share * (output - before)
+        sample.target = _sum(guard, memory, _TARGET, sample.target, step)
+        base = sample.target - sample.share * output
+    else:
+        base = sample.target - sample.share * before
+        sample.target = base + sample.share * output
     if abs(sample.target - f_shown) > sample.limit:
         sample.reason = _OUT_OF_BOUNDS if authority > 0.0 else sample.reason
     elif guard.least_slope <= sample.share * slope <= guard.largest_slope:
@@ -338,12 +371,15 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
         shown[_F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
     sample.own_peak = max(abs(f_learned - sample.shown), guard.own_decay * sample.own_peak)
     if sample.limit > 0.0:
-        sample.target += guard.leak * (f_learned - sample.target)
+        more = guard.leak * (f_learned - sample.target)
+        sample.target = _sum(guard, memory, _TARGET, sample.target, more)
         step = guard.home * sample.typical_error
         distance = sample.share * sample.output - sample.target
-        sample.target += min(max(guard.home * distance, -step), step)
+        more = min(max(guard.home * distance, -step), step)
+        sample.target = _sum(guard, memory, _TARGET, sample.target, more)
     else:
         sample.target = f_learned
+        _clear_carry(memory, _TARGET)
 
 
 @write_channels.register(GuardDesign)

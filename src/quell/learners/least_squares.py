@@ -31,15 +31,20 @@ class RlsRule(NamedTuple):
 
 
 @kernel
-def make_symmetric(covariance: Matrix) -> None:
-    """Copy the lower triangle to the upper one.
+def reduce_row(covariance: Matrix, i: int, share: float, gain: Vector) -> None:
+    """Subtract ``share · gain`` from row ``i`` of P; after all rows P is less by ``g (Pφ)ᵀ``.
 
     Rounding makes P asymmetric, and the asymmetric part does not shrink with the data. In single
-    precision it would exceed what the data leave of P.
+    precision it would exceed what the data leave of P, so there only the lower triangle is
+    calculated.
     """
-    for i in range(covariance.shape[0]):
-        for j in range(i):
-            covariance[j, i] = covariance[i, j]
+    if is_single(share):
+        for j in range(i + 1):
+            value = covariance[i, j] - share * gain[j]
+            covariance[i, j] = covariance[j, i] = value
+    else:
+        for j in range(covariance.shape[0]):
+            covariance[i, j] -= share * gain[j]
 
 
 @kernel

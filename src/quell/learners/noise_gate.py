@@ -20,6 +20,7 @@ import numpy as np
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import is_single
+from quell.kernels.sums import add_small
 from quell.observers.eso import ESO
 from quell.observers.noise import noise_gains
 from quell.types import Vector
@@ -29,9 +30,9 @@ from quell.types import Vector
 SIGNAL_TO_NOISE = 6.0
 # Standard deviations of noise in f that ``confidence`` counts: a three-sigma bound.
 _NOISE_DEVIATIONS = 3.0
-# Rounding in y counts as noise of this share of y: no sensor resolves better, and in single
-# precision y itself has no finer steps.
-_RESOLUTION, _RESOLUTION_SINGLE = 1e-8, 2.0**-23
+# Rounding in y counts as noise of this share of y: no sensor resolves better. In single precision
+# y itself is rounded, by 2⁻²⁶ to 2⁻²⁵ of it in the root mean square.
+_RESOLUTION, _RESOLUTION_SINGLE = 1e-8, 2.0**-25
 # Averaging time of means and variances in lags of the observer; chosen by hand, not tuned further.
 AVERAGING_LAGS = 10.0
 
@@ -49,7 +50,7 @@ class NoiseGate(NamedTuple):
 class NoiseGateMemory(NamedTuple):
     """Running means of the signals and of the noise."""
 
-    mean: Vector  # of x_1 … x_n and u (n + 1,)
+    mean: Vector  # of x_1 … x_n and u (n + 1,); in single precision with carries (2n + 2,)
     variance: Vector  # (n + 1,)
     noise: Vector  # (2,): mean square of y − x̂_1; sum of its weights, which grows from 0 to 1
 
@@ -98,11 +99,12 @@ def update_gate(gate: NoiseGate, memory: NoiseGateMemory, seen: Vector, y: float
     rounding, error = resolution(gate.forget) * y, y - seen[0]
     memory.noise[0] += gate.forget * (error * error + rounding * rounding - memory.noise[0])
     memory.noise[1] += gate.forget * (1.0 - memory.noise[1])
-    order = memory.mean.size - 1
+    size = memory.variance.size
+    order = size - 1
     moves = False
     for i in range(order + 1):
         away = (seen[i] if i < order else u) - memory.mean[i]
-        memory.mean[i] += gate.forget * away
+        add_small(memory.mean, size, i, gate.forget * away)
         memory.variance[i] += gate.forget * (away * away - memory.variance[i])
         # u alone does not count: without motion it is the answer to a load.
         moves = moves or (i < order and is_moving(gate, memory, i))
@@ -133,5 +135,7 @@ def confidence(gate: NoiseGate, memory: NoiseGateMemory, size: float) -> float:
 def reset_gate(memory: NoiseGateMemory) -> None:
     """Go back to the state before the first sample."""
     for i in range(memory.mean.size):
-        memory.mean[i] = memory.variance[i] = 0.0
+        memory.mean[i] = 0.0
+    for i in range(memory.variance.size):
+        memory.variance[i] = 0.0
     memory.noise[0] = memory.noise[1] = 0.0

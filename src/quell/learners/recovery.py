@@ -25,6 +25,7 @@ The controller then calls ``forget`` (``learners/base.py``).
 from __future__ import annotations
 
 from quell.kernels.dispatch import kernel
+from quell.kernels.functions import is_single
 from quell.kernels.scalars import Scalars
 from quell.learners.noise_gate import AVERAGING_LAGS, resolution
 from quell.observers.eso import ESO
@@ -38,6 +39,8 @@ _LEAST_SHARE = 2.0**-40
 _TOO_LARGE = 2.0**10
 # With features of this size a regression learns 2⁻²⁰ of what it learns at its scale from a sample.
 _LEAST_SHARE_AT_LIMITS = 2.0**-10
+# In single precision a y that rests may still change by its last digit, 2⁻²³ of it at most.
+_STEP_OF_SINGLE = 2.0**-22
 # A window counts only if |f_plain| has not decayed to less than this share of the last one. At
 # rest without noise a loop with omega_c = omega_o/10 decays faster.
 _STEADY = 0.5
@@ -112,7 +115,8 @@ def has_lost_range(
         return False
     watch.peak = max(watch.peak, watch.most)
     largest = max(abs(watch.y_low), abs(watch.y_high))
-    moves = watch.y_high - watch.y_low > resolution(watch.peak) * largest
+    still = _STEP_OF_SINGLE if is_single(watch.peak) else resolution(watch.peak)
+    moves = watch.y_high - watch.y_low > still * largest
     steady = watch.most >= _STEADY * watch.most_before
     least = _LEAST_SHARE_AT_LIMITS if 2.0 * watch.limited > watch.samples else _LEAST_SHARE
     out_of_range = moves and steady and watch.most < least * watch.peak

@@ -30,6 +30,7 @@ import numpy as np
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Flag
+from quell.kernels.sums import add_with_carry
 from quell.observers.base import begin, expected_measurement, observe
 from quell.observers.cascade import CascadeModel
 from quell.observers.delay import DelayedModel
@@ -94,14 +95,6 @@ def predict_increments(model: Any, z: Vector, increments: Vector, u: float, f: f
         increments[i] = total + model.feed[i] * f + model.input[i] * u
 
 
-@kernel
-def add_increment(z: Vector, size: int, i: int, increment: float) -> None:
-    """Add an increment to state ``i`` of ``size``; what rounding takes of it is carried over."""
-    before = z[i]
-    z[i] = before + increment
-    z[size + i] = increment - (z[i] - before)
-
-
 @observe.register(DeltaModel)
 def _observe(
     model: DeltaModel, z: Vector, estimate: Vector, y: float, u: float, f_learned: float
@@ -111,7 +104,7 @@ def _observe(
     error = (y - z[0]) - estimate[0]
     for i in range(size):
         before, predicted = z[i], estimate[i]
-        add_increment(z, size, i, predicted + model.gain[i] * error)
+        add_with_carry(z, size, i, predicted + model.gain[i] * error)
         estimate[i] = before + predicted if model.predictor else z[i]
 
 
@@ -126,7 +119,7 @@ def _observe_nonlinearly(
         begin(model, z, estimate, y)
         return
     for i in range(size):
-        add_increment(z, size, i, estimate[i] + nonlinear_correction(model, i, error))
+        add_with_carry(z, size, i, estimate[i] + nonlinear_correction(model, i, error))
         estimate[i] = z[i]
 
 
@@ -142,7 +135,7 @@ def _observe_by_levels(
         predict_increments(model, state, estimate, u, f_known)
         error = (target - state[0]) - estimate[0]
         for i in range(size):
-            add_increment(state, size, i, estimate[i] + model.gains[level, i] * error)
+            add_with_carry(state, size, i, estimate[i] + model.gains[level, i] * error)
         target = state[0]
         f_known += f_before
         f_estimate += state[size - 1]

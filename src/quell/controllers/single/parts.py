@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from functools import singledispatch
 from typing import Any
 
 import numpy as np
 
 from quell.controllers.adrc.law import AdrcDesign
 from quell.controllers.linear.delta import delta_law
-from quell.controllers.linear.linear import LinearDesign
+from quell.controllers.linear.law import LinearLaw
 from quell.controllers.prefilters.prefilter import PrefilteredDesign
 from quell.features.custom import CustomDesign
-from quell.guard.kernels import GuardDesign
+from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels.single import in_single
 from quell.learners.adapters.kernels import PythonDesign
-from quell.learners.kalman.kernels import KalmanDesign
-from quell.learners.noise_gate import NoiseGate
+from quell.learners.kalman.kernels import KalmanDesign, KalmanMemory
+from quell.learners.noise_gate import NoiseGate, NoiseGateMemory
 from quell.observers.delta import delta_form
 
 _OTHERS = "take a learner of quell.learners with its own kernels, or one of the other features"
@@ -38,6 +37,18 @@ def single_design(design: Any) -> Any:
     """
     _check(design, "")
     return in_single(_in_delta_form(design))
+
+
+def _in_delta_form(design: Any) -> Any:
+    """Return parameters with observers and linear laws in delta form, still in double."""
+    form = delta_form(design)
+    if form is not design:
+        return form
+    if isinstance(design, LinearLaw):
+        return delta_law(design)
+    if hasattr(design, "_fields"):
+        return type(design)(*map(_in_delta_form, design))
+    return design
 
 
 def single_state(design: Any, state: Any) -> Any:
@@ -64,30 +75,22 @@ def _check(value: Any, name: str) -> None:
             )
 
 
-@singledispatch
-def _in_delta_form(design: Any) -> Any:
-    return design
-
-
-@_in_delta_form.register
-def _of_adrc(design: AdrcDesign) -> AdrcDesign:
-    return design._replace(eso=delta_form(design.eso))
-
-
-@_in_delta_form.register
-def _of_law(design: LinearDesign) -> LinearDesign:
-    return design._replace(law=delta_law(design.law))
-
-
-@_in_delta_form.register
-def _of_prefiltered(design: PrefilteredDesign) -> PrefilteredDesign:
-    return design._replace(controller=_in_delta_form(design.controller))
-
-
 def _with_carries(design: Any, state: Any) -> Any:
-    """Return the state with room for what the delta form of the observer needs."""
-    if isinstance(design, AdrcDesign):
-        return state._replace(z=np.zeros(design.eso.states))
+    """Return the state with room for the carries of compensated sums."""
     if isinstance(design, PrefilteredDesign):
         return state._replace(controller=_with_carries(design.controller, state.controller))
+    if isinstance(design, AdrcDesign):
+        state = state._replace(z=np.zeros(design.eso.states))
+    return _with_longer(state)
+
+
+def _with_longer(state: Any) -> Any:
+    """Return a state with longer arrays where kernels carry what rounding takes."""
+    if not hasattr(state, "_fields"):
+        return state
+    state = type(state)(*map(_with_longer, state))
+    if isinstance(state, GuardMemory):
+        return state._replace(shown=np.append(state.shown, np.zeros(CARRIES)))
+    if isinstance(state, KalmanMemory | NoiseGateMemory):
+        return state._replace(mean=np.zeros(2 * state.mean.size))
     return state

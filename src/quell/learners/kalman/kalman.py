@@ -144,7 +144,6 @@ class Kalman:
             filtered=np.zeros(p),
             mean=np.zeros(p),
             variance=np.zeros(p),
-            regressor=np.zeros(p),
             gain=np.zeros(p),
             phase=np.zeros(parameters.oscillators.omega.size),
             omega=parameters.oscillators.omega.copy(),

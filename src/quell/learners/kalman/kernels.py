@@ -44,6 +44,7 @@ from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
+from quell.kernels.sums import add_small
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.kalman.oscillators import (
     Oscillators,
@@ -56,7 +57,7 @@ from quell.learners.kalman.oscillators import (
 from quell.learners.kalman.search import advance_search, is_locked, start_search_again
 from quell.learners.kalman.search_verdict import LEARN_ANEW
 from quell.learners.lag import STARTUP_LAGS, lag_push, reset_lag
-from quell.learners.least_squares import make_symmetric
+from quell.learners.least_squares import reduce_row
 from quell.learners.noise_gate import resolution
 from quell.types import Matrix, Vector
 
@@ -110,10 +111,9 @@ class KalmanMemory(NamedTuple):
     theta: Vector  # θ in scaled units (p,)
     covariance: Matrix  # P (p, p); for the bias in units of R
     chain: Matrix  # lag filters of the features (p, …)
-    filtered: Vector  # φ^F (p,)
-    mean: Vector  # running means of φ^F (p,)
+    filtered: Vector  # φ^F (p,); from ``adapt`` to the next ``commit`` φ̃ in its place
+    mean: Vector  # running means of φ^F (p,); in single precision with carries (2p,)
     variance: Vector  # running variances of φ^F (p,)
-    regressor: Vector  # φ̃ of the newest sample (p,)
     gain: Vector  # P φ̃ (p,)
     phase: Vector  # ψ of each oscillator [rad] (m,)
     omega: Vector  # ω̂ of each oscillator [rad/s] (m,)
@@ -131,7 +131,7 @@ def _adapt(
     f_plain: float,
 ) -> None:
     theta, covariance, gain = memory.theta, memory.covariance, memory.gain
-    regressor, averages = memory.regressor, memory.averages[0]
+    regressor, averages = memory.filtered, memory.averages[0]
     size = theta.size
     # Loops, because at this size a call of BLAS takes longer than the arithmetic.
     explained = 0.0
@@ -165,8 +165,7 @@ def _adapt(
     inverse = 1.0 / max(spread + 1.0 / learner.dt, spread / (learner.fastest * learner.dt))
     for i in range(size):
         share = gain[i] * inverse
-        for j in range(size):
-            covariance[i, j] -= share * gain[j]
+        reduce_row(covariance, i, share, gain)
         if learner.threshold[i] == 0.0:
             theta[i] += share * innovation
             covariance[i, i] += learner.walk[i] * learner.dt
@@ -178,12 +177,10 @@ def _adapt(
             theta[i] = updated
             if learner.bias:
                 theta[learner.states] -= change * memory.mean[i]
-            if memory.regressor[i] != 0.0:
+            if regressor[i] != 0.0:
                 covariance[i, i] += (
                     learner.walk[i] * learner.dt * deviation * deviation / memory.variance[i]
                 )
-    if is_single(inverse):
-        make_symmetric(covariance)
     step, unexplained = inverse * innovation, averages.unexplained
     for j in range(memory.omega.size):
         if not is_locked(learner.search, memory.search, j):
@@ -215,18 +212,16 @@ def _update_averages(
 def _update_regressor(
     learner: KalmanDesign, memory: KalmanMemory, noise: float, weight: float
 ) -> None:
-    """Calculate φ̃; ``noise`` is the mean square of y − x̂_1, ``weight`` 1/√R."""
+    """Put φ̃ in place of φ^F; ``noise`` is the mean square of y − x̂_1, ``weight`` 1/√R."""
     filtered, mean, variance = memory.filtered, memory.mean, memory.variance
     for i in range(filtered.size):
-        if learner.threshold[i] == 0.0:
-            memory.regressor[i] = filtered[i]
-        else:
+        if learner.threshold[i] != 0.0:
             away = filtered[i] - mean[i]
-            mean[i] += learner.forget * away
+            add_small(mean, filtered.size, i, learner.forget * away)
             variance[i] += learner.forget * (away * away - variance[i])
             centre = mean[i] if learner.bias else 0.0
             moves = variance[i] > learner.threshold[i] * noise
-            memory.regressor[i] = weight * (filtered[i] - centre) if moves else 0.0
+            filtered[i] = weight * (filtered[i] - centre) if moves else 0.0
 
 
 @predict.register(KalmanDesign)
@@ -299,9 +294,11 @@ def _forget(learner: KalmanDesign, memory: KalmanMemory) -> None:
     for j in range(memory.omega.size):
         memory.phase[j] = 0.0
         memory.omega[j] = learner.oscillators.omega[j]
+    for i in range(memory.mean.size):
+        memory.mean[i] = 0.0
     for i in range(memory.theta.size):
-        memory.theta[i] = memory.mean[i] = memory.variance[i] = 0.0
-        memory.regressor[i] = memory.gain[i] = 0.0
+        memory.theta[i] = memory.variance[i] = 0.0
+        memory.gain[i] = 0.0
         for j in range(memory.theta.size):
             memory.covariance[i, j] = learner.prior[i] ** 2 if i == j else 0.0
 
