@@ -9,7 +9,8 @@ restarts. The interpreted kernels replay what the C code was given, for so many 
 column has the number of samples, and how many of them differ in a bit. "compiled" is the largest
 difference of u to the compiled kernels, relative to the RMS of u. Branches are those of ``servo.c``
 that the run has taken (gcov). The parts are ``bits``, ``speed`` (the exported learner against
-``reference.c``) and ``long`` (10^8 samples in single precision).
+``reference.c``) and ``long`` (10^8 samples in single and in double
+precision).
 """
 
 from __future__ import annotations
@@ -266,7 +267,7 @@ def speed(console: Console) -> None:
 
 
 def long_runs(samples: float, console: Console) -> None:
-    """Print what single precision does in 10^8 samples, at rest and in motion."""
+    """Print what both precisions do in very many samples, at rest and in motion."""
     observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=30.0, dt=1e-3)
     limits = {"u_min": -20.0, "u_max": 20.0}
     laws = {
@@ -277,24 +278,31 @@ def long_runs(samples: float, console: Console) -> None:
         "RLS, guard": ql.ADRC(observer, 3.0, learner=ql.learners.RLS(), guard=ql.Guard(), **limits),
         "PID": ql.baselines.PID(20.0, ki=30.0, kd=3.0, tf=0.01, dt=1e-3, **limits),
     }
-    heads = ("controller", "plant", "RMS r - y: first, ninth, last tenth", "mean u of each")
-    table = Table(*heads, "learned", "flags", "not finite")
+    heads = ("controller", "plant", "precision", "RMS r - y: first, ninth, last tenth")
+    table = Table(*heads, "mean u of each", "learned", "flags", "not finite")
     for name, controller in laws.items():
         with tempfile.TemporaryDirectory() as place:
-            folder = Path(place) / "servo"
-            done = ql.export.c(controller, folder, name="servo", precision="single", accept=True)
-            defines = [
-                f"-DHAS_{channel.upper()}" for channel, width in done.source.channels if width > 1
-            ]
-            program = Path(place) / "long"
-            sources = (HERE / "exported_long.c", folder / "src/servo.c")
-            flags = ("gcc", "-O2", f"-I{folder / 'src'}", *defines)
-            subprocess.run([*flags, *sources, "-lm", "-o", program], check=True)
-            for moving in ("0", "1"):
-                command = [program, f"{samples:.0f}", moving]
-                text = subprocess.run(command, capture_output=True, check=True, text=True).stdout
-                table.add_row(name, "in motion" if moving == "1" else "at rest", *text.split("|"))
+            programs = {
+                precision: long_program(Path(place) / precision, controller, precision)
+                for precision in ("double", "single")
+            }
+            for plant in ("at rest", "in motion"):
+                for precision, program in programs.items():
+                    command = [program, f"{samples:.0f}", "1" if plant == "in motion" else "0"]
+                    done = subprocess.run(command, capture_output=True, check=True, text=True)
+                    table.add_row(name, plant, precision, *done.stdout.split("|"))
     console.print(table)
+
+
+def long_program(folder: Path, controller: Any, precision: str) -> Path:
+    """Return the program of the long runs."""
+    done = ql.export.c(controller, folder, name="servo", precision=precision, accept=True)
+    channels = done.source.channels
+    defines = [f"-DHAS_{channel.upper()}" for channel, width in channels if width > 1]
+    sources = (HERE / "exported_long.c", folder / "src/servo.c")
+    flags = ("gcc", "-O2", f"-I{folder / 'src'}", *defines)
+    subprocess.run([*flags, *sources, "-lm", "-o", folder / "long"], check=True)
+    return folder / "long"
 
 
 def main() -> None:

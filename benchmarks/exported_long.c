@@ -1,5 +1,5 @@
-/* A controller "servo" in single precision in a loop for very many samples: arguments are their
- * number, and 1 for a plant in motion, 0 at rest.
+/* A controller "servo" in a loop for very many samples: arguments are their number, and 1 for a plant
+ * in motion, 0 at rest.
  *
  * The plant is x'' = 1.5 u - 0.5 x' - k x + 0.2 with noise in y; k is 2, and 3 in the last tenth.
  * At rest r = 1. Prints columns for exported.py, separated by |.
@@ -37,7 +37,7 @@ int main(int argc, char **argv)
         const long period = k % 6283; /* sin of small numbers only: the loop does not drift */
         const double r = moving ? sin(1e-3 * (double)period * 6283.185307179586 / 6283.0) : 1.0;
         const double y = x + noise();
-        const double u = servo_step(&state, (float)r, (float)y);
+        const double u = servo_step(&state, (servo_real)r, (servo_real)y);
         const double stiffness = moving && tenth == 9 ? 3.0 : 2.0;
 
         flags |= servo_status(&state);
@@ -58,7 +58,7 @@ int main(int argc, char **argv)
     printf("%.5f, %.5f, %.5f|", means[0] / count, means[8] / count, means[9] / count);
 #ifdef HAS_THETA
     const servo_estimate found = servo_get_estimate(&state);
-    printf("authority %.2f, theta %.2f %.2f", (double)found.authority, (double)found.theta[0],
+    printf("authority %.3f, theta %.4f %.4f", (double)found.authority, (double)found.theta[0],
         (double)found.theta[1]);
 #endif
     printf("|%d|%ld", flags, bad);

@@ -23,6 +23,7 @@ from quell.controllers.limits import Limits
 from quell.controllers.prefilters.prefilter import without_prefilters
 from quell.controllers.single import SinglePrecision
 from quell.export import operations
+from quell.export.library.loop import BLOCK, Loop, Plant, plant_for
 from quell.kernels.dispatch import as_python
 
 # Samples of each part of the run: enough for observers to settle in, few enough that the file is
@@ -48,6 +49,7 @@ class Action(IntEnum):
     FREE = 5  # the default parameters again
     RESET = 6
     START = 7  # under load
+    LEARN = 8  # a block of samples in a small loop, see ``loop.py``
 
 
 class Row(NamedTuple):
@@ -76,6 +78,8 @@ class Vectors(NamedTuple):
         RMS of u.
     estimate
         all that the controller knows after the last sample, in the order of its channels.
+    plant
+        of the blocks in which a learner takes part, if there is one.
     """
 
     rows: tuple[Row, ...]
@@ -84,6 +88,7 @@ class Vectors(NamedTuple):
     limit: Any
     scale: float
     estimate: Any
+    plant: Plant | None
 
 
 class Player:
@@ -98,6 +103,7 @@ class Player:
         self.derivatives = int(getattr(controller, "derivatives", 0))
         self.described = controller.controller if single else controller
         self.rows: list[Row] = []
+        self.loop: Loop | None = None
 
     def play(self, action: Action, r: float, y: float, given: float = 0.0) -> float:
         """Do what the C test does for this row, and add it; return u."""
@@ -115,16 +121,27 @@ class Player:
                 reset_loop(old, self.state)
             elif action is Action.START:
                 operations.start(old, self.state, _samples(self.described), y_, given_, r_)
-            if self.derivatives:
+            if self.derivatives and action is not Action.LEARN:
                 half = np.full(self.derivatives, real(0.5) * r_, dtype=type(real(0.0)))
                 set_reference_derivatives(self.design, self.state, half)
-            if action is Action.TRACK:
+            if action is Action.LEARN:
+                u = self._block()
+            elif action is Action.TRACK:
                 u = operations.track(self.design, self.state, r_, y_, given_)
             else:
                 u = control(self.design, self.state, r_, y_)
         status = int(status_flags(self.design, self.state))
         self.rows.append(Row(action, r_, y_, given_, u, status))
         return float(u)
+
+    def _block(self) -> Any:
+        """Play a block of samples in the loop; return the last u."""
+        assert self.loop is not None
+        u: Any = 0.0
+        for _ in range(BLOCK):
+            u = control(self.design, self.state, *self.loop.measure())
+            self.loop.advance(u)
+        return u
 
     def limit_at(self, path: str, high: Any) -> None:
         """Set the parameters of ``LIMIT``: the upper limit at ``path`` is ``high``."""
@@ -178,12 +195,18 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
         player.play(Action.START, r, y, float(np.median(player.u_of(slice(2, _FIRST)))))
         for _ in range(_PART):
             player.play(Action.STEP, *signals.next())
+    plant = plant_for(player.described, signals.amplitude, player.real)
+    if plant is not None:
+        player.play(Action.RESET, *signals.next())
+        player.loop = Loop(plant, player.real)
+        for _ in range(plant.samples // BLOCK):
+            player.play(Action.LEARN, 0.0, 0.0)
     u = player.u_of(slice(None))
     scale = float(np.sqrt(np.mean(np.square(u[np.isfinite(u)]))))
     limit = _at_path(player.limited, path).high if path else math.inf
     row = np.zeros(sum(width for _, width in controller.channels), dtype=type(player.real(0.0)))
     write_row(player.design, player.state, row)
-    return Vectors(tuple(player.rows), player.derivatives, path, limit, scale, row)
+    return Vectors(tuple(player.rows), player.derivatives, path, limit, scale, row, plant)
 
 
 def _play_limited(player: Player, path: str, signals: _Signals) -> None:

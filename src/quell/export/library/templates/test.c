@@ -58,6 +58,7 @@ static double in_ulps(real found, real right, double size)
     return found == right ? 0.0 : fabs((double)found - (double)right) / ulp;
 }
 
+@loop@
 static real play(@name@_state *state@limited_parameter@, const sample *now)
 {
 @variables@    switch (now->action) {
@@ -107,7 +108,7 @@ int main(int argc, char **argv)
             printf("%s is %.@digits@g, must be %.@digits@g\n", right->name, (double)found[i],
                 (double)right->value);
     }
-    printf("@name@: %d samples, largest difference %.3g ulp, tolerance %.3g ulp: %s\n", count,
-        largest, tolerance, wrong == 0 ? "passed" : "FAILED");
+    printf("@name@: %d samples, largest difference %.3g ulp, tolerance %.3g ulp: %s\n",
+        @samples@, largest, tolerance, wrong == 0 ? "passed" : "FAILED");
     return wrong == 0 ? 0 : 1;
 }
