@@ -178,13 +178,14 @@ class Structs:
         for name, layout in self.layouts.items():
             kept = {}
             for part, kind in layout.members.items():
-                constant = (name, part) in self._initial and (
-                    name,
-                    part,
-                ) not in self.findings.numbers
+                member = (name, part)
+                constant = member in self._initial and member not in self.findings.numbers
                 empty = isinstance(kind, Struct) and not self.layouts[kind.name].members
                 if identifier(part) in used and not constant and not empty:
-                    kept[part] = self.findings.numbers.get((name, part), kind)
+                    kept[part] = self.findings.numbers.get(member, kind)
+            if issubclass(layout.struct.python, Scalars):
+                # Flags come last, so that they share words.
+                kept = dict(sorted(kept.items(), key=lambda item: item[1] is Number.BOOL))
             layout.members = kept
 
     def rename(self, struct: Struct, name: str) -> Struct:
