@@ -28,6 +28,7 @@ ROWS = (
     ("controllers.single",),
     ("controllers.baselines", "controllers.__init__"),
     ("records", "simulation", "analysis"),
+    ("envs",),
     ("identification.experiment", "identification.model", "identification.search"),
     ("identification.running_loop",),
     ("identification",),
