@@ -33,6 +33,7 @@ NOISY = ql.Scenario(
     duration=1.5,
 )
 QUIET = ql.Scenario(ql.signals.Step(), duration=0.3)
+SHORT = ql.Scenario(duration=1e-11)  # zero samples, to rounding
 OPEN = {"dt": DT, "u_min": -U_MAX, "u_max": U_MAX}
 
 
@@ -246,7 +247,7 @@ def test_scenarios_are_drawn_from_the_generator_of_the_episode() -> None:
         ("x_limit has 3 entries", {"x_limit": (1.0, 2.0, 3.0)}),
         ("limit = -1.0", {"limit": -1.0}),
         ("render_mode", {"render_mode": "human"}),
-        ("must be at least one sample", {"scenario": ql.Scenario(duration=DT), "dt": 0.1}),
+        ("must be at least one sample", {"scenario": SHORT}),
     ],
 )
 def test_bad_arguments_are_refused(problem: str, changes: dict[str, Any]) -> None:
