@@ -332,3 +332,75 @@ def test_sizes_are_those_of_the_structs(tmp_path: Path) -> None:
     )
     assert stack_of("step", graph) == 8 + 48
     assert stack_of("other", graph) is None
+
+
+COUNTS = """
+#include <math.h>
+#include <stdio.h>
+#include "exact.h"
+#include "servo.h"
+
+/* The plant is a chain of four integrators with a spring; the exact controller closes the loop. */
+int main(void)
+{
+    static exact_state exact;
+    static servo_state counts, plain;
+    const double b0 = 1.0, dt = EXACT_SAMPLE_TIME, resolution = 1e-7;
+    const int32_t first = 2147480000; /* the counter overflows soon */
+    double x[4] = {0.0}, wrong[2] = {0.0}, size = 0.0;
+
+    exact_init(&exact);
+    servo_init(&counts);
+    servo_init(&plain);
+    for (int k = 0; k < 4000; k++) {
+        const int32_t count = (int32_t)floor(x[0] / resolution), goal = k < 100 ? 0 : 10000000;
+        const double u = exact_step(&exact, resolution * goal, resolution * count);
+        const float one = servo_step_counts(&counts, (int32_t)((uint32_t)first + (uint32_t)goal),
+            (int32_t)((uint32_t)first + (uint32_t)count));
+        const float two = servo_step(&plain, (float)(resolution * goal), (float)(resolution * count));
+        wrong[0] += (one - u) * (one - u);
+        wrong[1] += (two - u) * (two - u);
+        size += u * u;
+        const double snap = b0 * u - x[0] - 0.5 * x[3];
+        for (int i = 0; i < 3; i++)
+            x[i] += dt * x[i + 1];
+        x[3] += dt * snap;
+    }
+    printf("%g %g %g\\n", sqrt(wrong[0] / size), sqrt(wrong[1] / size), x[0]);
+    return 0;
+}
+"""
+
+
+@needs_gcc
+def test_counts_spare_the_rounding_of_the_position(tmp_path: Path) -> None:
+    """Order 4 in single precision beside double, in one program; the counter overflows on the way."""
+    controller = ql.ADRC(ql.ESO.model_free(4, 1.0, 50.0, 2e-3), 2.0)
+    (tmp_path / "a").mkdir()
+    exported(tmp_path / "a", controller, name="exact")
+    exported(tmp_path, controller, "single", resolution=1e-7)
+    assert outcome(built(tmp_path), "0")[0] == 0
+    (tmp_path / "main.c").write_text(COUNTS)
+    sources = (tmp_path / "main.c", tmp_path / "a/out/src/exact.c", tmp_path / "out/src/servo.c")
+    include = ("-I", tmp_path / "a/out/src", "-I", tmp_path / "out/src")
+    command = ["gcc", "-std=c99", *EXACT, *include, *sources, "-o", tmp_path / "main", "-lm"]
+    subprocess.run(command, check=True)
+    counts, plain, y = map(float, outcome(tmp_path / "main")[1].split())
+    assert abs(y - 1.0) < 0.02
+    assert counts < 2e-4
+    assert plain > 20.0 * counts
+
+
+def test_counts_are_refused_where_the_position_matters(tmp_path: Path) -> None:
+    """A learner and a model with a spring know where they are; PID has no origin to move."""
+    model = ql.ESO.model_based(([2.0, 0.3], 1.5), omega_o=12.0, dt=DT)
+    for controller, rule in (
+        (LEARNING, "needs the position itself"),
+        (ql.ADRC(model, 1.5), "needs the position itself"),
+        (PID, "PID can't take y as counts"),
+    ):
+        with pytest.raises(ValueError, match=rule):
+            exported(tmp_path, controller, resolution=1e-4)
+    with pytest.raises(ValueError, match="resolution = -1"):
+        exported(tmp_path, resolution=-1.0)
+    assert not any(tmp_path.iterdir())

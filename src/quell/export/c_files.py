@@ -80,6 +80,8 @@ class CFiles:
         self.memory = Value(memory, "state", root="state", mutable=True)
         self.operations: list[str] = []
         self.structs: list[str] = []  # further lines of the header, after the structs
+        self.members: list[str] = []  # of the state, besides those of the kernels
+        self.includes = ["#include <stdbool.h>"]  # of the header
         self.enums: list[str] = []  # the same, before them
         self._prototypes: list[str] = []
         self._definitions: list[str] = []
@@ -141,7 +143,7 @@ class CFiles:
             f"#ifndef {upper}_H",
             f"#define {upper}_H",
             "",
-            "#include <stdbool.h>",
+            *self.includes,
             "",
             "#ifdef __cplusplus",
             'extern "C" {',
@@ -155,7 +157,7 @@ class CFiles:
         for layout in list(structs.layouts.values()):
             first = ""
             if layout.struct == self.memory.kind:
-                first = f"const {name}_parameters *parameters;"
+                first = "\n    ".join([f"const {name}_parameters *parameters;", *self.members])
             elif layout.struct == self.design.kind and not layout.members:
                 first = "bool unused; /* there are no parameters */"
             if layout.members or first:

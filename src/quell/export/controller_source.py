@@ -18,6 +18,7 @@ from quell.controllers.prefilters.prefilter import Prefiltered, without_prefilte
 from quell.controllers.single.single import SinglePrecision
 from quell.export import operations
 from quell.export.c_files import CFiles, CSource, translated
+from quell.export.counts import check_counts
 from quell.export.translate.findings import Findings
 from quell.export.translate.layout import wrapped
 from quell.export.translate.values import Array, Number, TranslationError, Value
@@ -43,7 +44,9 @@ _CHANNELS = {
 }
 
 
-def c_source(controller: Any, name: str = "controller") -> CSource:
+def c_source(
+    controller: Any, name: str = "controller", *, resolution: float | None = None
+) -> CSource:
     """Return the C code of a controller, translated from the kernels that simulate it.
 
     Parameters
@@ -53,15 +56,20 @@ def c_source(controller: Any, name: str = "controller") -> CSource:
         sample are written. One of ``controllers.in_single_precision`` becomes code in ``float``.
     name
         begins all public names.
+    resolution
+        of an encoder [y-unit per count]: the code then has ``NAME_step_counts``, which takes r and
+        y as integers. For controllers that are not changed by another origin of y.
 
     Raises
     ------
     TranslationError
-        naming a kernel, or a part of the parameters, that has no counterpart in C.
+        naming a kernel, or a part of the parameters, that has no counterpart in C; and for a
+        resolution, if the controller needs the position itself.
     """
     _check_parts(controller)
-
-    return translated(lambda findings: _Writer(controller, name, findings).write())
+    if resolution is not None:
+        check_counts(controller, resolution)
+    return translated(lambda findings: _Writer(controller, name, findings, resolution).write())
 
 
 def _check_parts(controller: Any) -> None:
@@ -82,8 +90,10 @@ def _check_parts(controller: Any) -> None:
 class _Writer:
     """Writer of the public functions of one controller."""
 
-    def __init__(self, controller: Any, name: str, findings: Findings) -> None:
-        self.controller, self.name = controller, name
+    def __init__(
+        self, controller: Any, name: str, findings: Findings, resolution: float | None
+    ) -> None:
+        self.controller, self.name, self.resolution = controller, name, resolution
         parameters = controller.parameters
         self.described = controller  # the controller in double precision
         if isinstance(controller, SinglePrecision):
@@ -97,6 +107,8 @@ class _Writer:
         inner = without_prefilters(self.described)
         self.files.add_init()
         self._add_step()
+        if self.resolution is not None:
+            self._add_counts(self.resolution)
         if isinstance(inner, ADRC):
             self._add_start(2 * samples_to_settle(inner.observer))
             self._add_manual_operation()
@@ -146,6 +158,25 @@ class _Writer:
                 "Set r', r'', ... for the next step; what is not finite counts as zero.",
                 f"    {files.call(set_reference_derivatives, *both, given)};",
             )
+
+    def _add_counts(self, resolution: float) -> None:
+        files, real, write = self.files, self.real, self.files.program.literals.write_real
+        moved = f"({real})(int32_t)((uint32_t)count - (uint32_t)state->origin) * resolution"
+        files.members.append("int32_t origin; /* y is counted from here [counts] */")
+        files.includes.append("#include <stdint.h>")
+        files.add(
+            "step_counts",
+            f"{real} NAME({self.state}, int32_t r, int32_t count)",
+            f"Take one sample with r and y as encoder counts of {resolution!r} y-units.\n\n"
+            "Differences are taken as integers, which may overflow: the position is always exact.\n"
+            "y is then counted from this sample's count: servo_start and servo_track take y and r\n"
+            "as differences to state->origin.".replace("servo", self.name),
+            f"    static const {real} resolution = {write(resolution)};",
+            f"    {files.call(operations.move_origin, *files.both, files.number(moved))};",
+            "    state->origin = count;",
+            f"    return {self.name}_step(state, ({real})(int32_t)((uint32_t)r - (uint32_t)count) *"
+            f" resolution, {write(0.0)});",
+        )
 
     def _add_start(self, samples: int) -> None:
         files, real = self.files, self.real

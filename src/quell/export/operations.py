@@ -114,6 +114,21 @@ def _hand_over_inside(design: PrefilteredDesign, state: PrefilteredState) -> boo
 
 
 @generic
+def move_origin(design: Any, state: Any, distance: float) -> None:
+    """Count y and r from a point that is ``distance`` further on."""
+    raise TypeError
+
+
+@move_origin.register(AdrcDesign)
+def _move_origin(design: AdrcDesign, state: AdrcState, distance: float) -> None:
+    loop = state.loop[0]
+    state.z[0] -= distance
+    state.seen[0] -= distance
+    loop.y -= distance
+    loop.r -= distance
+
+
+@generic
 def retune(old: Any, new: Any, state: Any) -> None:
     """Continue with other parameters of the same structure, without a jump of u."""
     raise TypeError

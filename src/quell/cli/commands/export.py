@@ -12,7 +12,6 @@ from quell.cli.output import print_line
 
 if TYPE_CHECKING:
     from quell.export import Comparison, Exported
-    from quell.setup import Setup
 
 
 def export(
@@ -23,6 +22,7 @@ def export(
     name: str | None = None,
     precision: Literal["double", "single"] = "double",
     what: Literal["controller", "plant", "loop"] = "controller",
+    resolution: float | None = None,
     accept: Switch = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -46,14 +46,19 @@ def export(
         Of the C code: double, or single for a processor that has no double precision.
     what
         Of an FMU: controller, plant or loop.
+    resolution
+        Of an encoder [y-unit per count]: adds NAME_step_counts to the C code, which takes r and y
+        as integers.
     accept
         Write in single precision even if it differs too much, or can't be compared.
     """
+    from quell.export import c
     from quell.setup import load
 
     if to == "fmu":
-        if precision != "double" or accept:
-            raise ValueError("--precision and --accept: are for --to c; an FMU is in double")
+        if precision != "double" or accept or resolution is not None:
+            rule = "are for --to c; an FMU is in double"
+            raise ValueError(f"--precision, --resolution and --accept: {rule}")
         _to_fmu(setup, what, out, name, overwrite)
         return
     if what != "controller":
@@ -62,7 +67,18 @@ def export(
     if precision == "single" and not accept:
         given.needed("plant")
         given.needed("scenario")
-    _to_c(given, precision, out, name or "controller", accept, overwrite)
+    exported = c(
+        given.controller,
+        out,
+        name=name or "controller",
+        precision=precision,
+        plant=given.plant,
+        scenario=given.scenario,
+        resolution=resolution,
+        accept=accept,
+        overwrite=overwrite,
+    )
+    _print(given.title, exported)
 
 
 def _to_fmu(setup: Path, what: str, out: Path, name: str | None, overwrite: bool) -> None:
@@ -80,28 +96,17 @@ def _to_fmu(setup: Path, what: str, out: Path, name: str | None, overwrite: bool
     print_line(Console(), f"FMU of the {what}: {out}")
 
 
-def _to_c(
-    given: Setup, precision: str, out: Path, name: str, accept: bool, overwrite: bool
-) -> None:
-    from quell.export import c
-
-    exported = c(
-        given.controller,
-        out,
-        name=name,
-        precision=precision,
-        plant=given.plant,
-        scenario=given.scenario,
-        accept=accept,
-        overwrite=overwrite,
-    )
+def _print(title: str, exported: Exported) -> None:
+    """Print what was written, the differences of the precisions, and the sizes."""
+    source, folder = exported.source, exported.folder
+    name = source.name
     console = Console()
-    print_line(console, f"{given.title}: {out}/src/{name}.h and .c, in {precision} precision")
+    print_line(console, f"{title}: {folder}/src/{name}.h and .c, in {source.precision} precision")
     if exported.comparison is not None:
         for line in _differences(exported.comparison):
             print_line(console, line)
     print_line(console, _sizes(exported))
-    print_line(console, f"Test: {out}/test_{name}.c; how to use it: {out}/README.md")
+    print_line(console, f"Test: {folder}/test_{name}.c; how to use it: {folder}/README.md")
 
 
 def _differences(found: Comparison) -> list[str]:

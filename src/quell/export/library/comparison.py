@@ -46,9 +46,9 @@ class Comparison(NamedTuple):
         what = "diverges" if self.diverged else f"changes u by {100 * self.u:.2g} % RMS"
         raise ValueError(
             f"precision = 'single': {what} in this scenario, and {100 * LIMIT:g} % is the limit; "
-            "a lower omega_o, a y of which only the difference to a near reference point is "
-            "handed over (small numbers have small rounding errors), or double precision would "
-            "help; accept=True (--accept) writes it all the same"
+            "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with "
+            "resolution=, --resolution), or double precision would help; accept=True (--accept) "
+            "writes it all the same"
         )
 
 

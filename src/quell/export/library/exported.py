@@ -51,6 +51,7 @@ def c(
     precision: str = "double",
     plant: Plant | None = None,
     scenario: Scenario | None = None,
+    resolution: float | None = None,
     accept: bool = False,
     overwrite: bool = False,
 ) -> Exported:
@@ -74,6 +75,9 @@ def c(
         ``"double"`` or ``"single"``.
     plant, scenario
         for single precision: the loop in which it is compared with double.
+    resolution
+        of an encoder [y-unit per count]: adds ``NAME_step_counts``, which takes r and y as integers
+        and computes with differences to the last count. For an ADRC without model of the position.
     accept
         write in single precision even if nothing is compared, or the difference is too large.
     overwrite
@@ -104,7 +108,7 @@ def c(
     check_folder(folder, checks.flag("overwrite", overwrite))
     single = single or isinstance(controller, SinglePrecision)
     shown = in_single_precision(controller) if single else controller
-    source = c_source(shown, name)
+    source = c_source(shown, name, resolution=resolution)
     comparison = None
     if single and plant is not None and scenario is not None:
         comparison = compared(plant, controller, scenario)

@@ -19,6 +19,10 @@ _OPERATIONS = {
         "before the step, if r', r'', ... are known",
     ),
     "step": ("step(s, r, y)", "each sample; returns u"),
+    "step_counts": (
+        "step_counts(s, r, count)",
+        "instead of the step, with r and y as encoder counts; without rounding of the position",
+    ),
     "applied": ("applied(s, u)", "after the step, if another u was applied"),
     "track": ("track(s, r, y, u)", "instead of the step in manual operation, under u"),
     "hand_over": (
