@@ -41,6 +41,7 @@ ROWS = (
     ("commissioning",),
     ("experiments.common", "experiments.two_mass_spring", "experiments.torsional"),
     ("experiments.compare", "experiments.acc", "experiments.stress", "experiments.__init__"),
+    ("studio",),
     (
         "__init__",
         "cli.options",

@@ -20,6 +20,7 @@ from quell.cli.commands.rig import rig
 from quell.cli.commands.run import run
 from quell.cli.commands.run_rig import run_rig
 from quell.cli.commands.stress import stress
+from quell.cli.commands.studio import studio
 from quell.cli.commands.sweep import sweep
 from quell.cli.commands.torsional import torsional
 from quell.cli.commands.tune import tune
@@ -54,6 +55,7 @@ for _each in (
     replay,
     sweep,
     export,
+    studio,
 ):
     app.command(_each)
 

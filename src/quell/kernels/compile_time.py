@@ -19,6 +19,7 @@ class CompileTime(event.Listener):
 
     def __init__(self) -> None:
         self.seconds = 0.0
+        self.running = 0  # threads that compile now
         self._own = threading.local()
 
     def on_start(self, event: Any) -> None:
@@ -26,6 +27,7 @@ class CompileTime(event.Listener):
         self._own.depth = getattr(self._own, "depth", 0) + 1
         if self._own.depth == 1:
             self._own.began = time.perf_counter()
+            self.running += 1
 
     def on_end(self, event: Any) -> None:
         """Add the time of the outermost compilation of a thread."""
@@ -33,6 +35,7 @@ class CompileTime(event.Listener):
         if self._own.depth == 0:
             # Numba compiles in one thread at a time, so the sum is safe.
             self.seconds += time.perf_counter() - self._own.began
+            self.running -= 1
 
 
 compile_time = CompileTime()

@@ -86,20 +86,28 @@ def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
     name = Path(path).name
     try:
         text = whole_text(path)
-        if _DEEP_KEY.search(text):
-            raise RecursionError
-        data = tomllib.loads(text)
-        _check_depth(data)
-        return name, data
     except OSError as error:
         raise SetupError([f"{path}: can't be read ({error.strerror})"]) from None
     except UnicodeDecodeError as error:
         raise SetupError([f"{name}: not TOML: byte {error.start} is not UTF-8"]) from None
+    except ValueError as error:  # too long
+        raise SetupError([f"{name}: not a setup: {error}"]) from None
+    return name, parsed(name, text)
+
+
+def parsed(name: str, text: str) -> dict[str, Any]:
+    """Return the content of the text of a file called ``name``; raise as ``read``."""
+    try:
+        if _DEEP_KEY.search(text):
+            raise RecursionError
+        data = tomllib.loads(text)
+        _check_depth(data)
+        return data
     except tomllib.TOMLDecodeError as error:
         raise SetupError([f"{name}: not TOML: {error}"]) from None
     except RecursionError:
         raise SetupError([f"{name}: not a setup: tables or lists are nested too deeply"]) from None
-    except ValueError as error:  # too long, or a number of more digits than Python reads
+    except ValueError as error:  # a number of more digits than Python reads
         raise SetupError([f"{name}: not a setup: {error}"]) from None
 
 

@@ -1,0 +1,193 @@
+"""Long tasks of the page: tuning, comparison with tuned PID and LQG, runs over a set of plants."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from quell import checks
+from quell.experiments.compare import tuned as tuned_references
+from quell.plants.linear_part import linear_model, linear_part
+from quell.setup.load import Setup
+from quell.simulation import simulate
+from quell.studio.frames import Columns, frame
+from quell.studio.messages import columns, number
+from quell.studio.runs import Maker, StoppedError, run_frames, watched
+from quell.tuning import Constraints, tune
+
+Stale = Callable[[], bool]
+Report = Callable[[str, float], None]
+
+# Structures that a page may ask for, and the bounds of M_s in the trade-off. Chosen by hand.
+STRUCTURES = ("freed", "bandwidths", "model-based", "pid", "pi")
+_TRADEOFF = (1.2, 1.3, 1.4, 1.6, 1.8, 2.0)
+_COMPARED = {"tuned-pid": "PID", "tuned-lqg": "LQG"}
+_LIMITS = ("u_min", "u_max", "rate_limit")
+# Plants of a band, and the most that their parameters change [%]. Chosen by hand: 24 runs take a
+# quarter of a second.
+_PLANTS, _MOST_PERCENT = 24, 50.0
+
+
+def stoppable(report: Report, stale: Stale) -> Report:
+    """Return a report of progress that ends the work when nobody waits for it."""
+
+    def progress(part: str, share: float) -> None:
+        if stale():
+            raise StoppedError
+        report(part, share)
+
+    return progress
+
+
+def tuned_frames(
+    setup: Setup, message: Mapping[str, Any], stale: Stale, report: Report
+) -> Iterator[bytes]:
+    """Yield the tuned controller's tables, and then the trade-off between M_s and load rejection.
+
+    The message has ``structure``, ``m_s`` and ``m_t``.
+    """
+    structure = checks.one_of("structure", message.get("structure", "freed"), STRUCTURES)
+    m_s = number(message, "m_s", 1.6, 1.05, 5.0)
+    m_t = number(message, "m_t", 1.6, 1.05, 5.0)
+    dt = float(setup.controller.dt)
+    plant, delay = linear_part(linear_model(setup.plant), dt)
+    options: dict[str, Any] = {"structure": structure, "delay": delay, "compare": ()}
+    options["progress"] = stoppable(report, stale)
+    best = tune(plant, dt, constraints=Constraints(m_s=m_s, m_t=m_t), **options, **_limits(setup))
+    design = best.design
+    tables = setup.tables() | {key: dict(table) for key, table in design.tables.items()}
+    limits = _limits(setup)
+    if limits:
+        tables["controller"] = tables["controller"] | limits
+    if "observer" not in design.tables:
+        for key in ("observer", "learner", "guard"):
+            tables.pop(key, None)
+    yield frame(
+        {
+            "kind": "tuned",
+            "id": message["id"],
+            "setup": tables,
+            "name": design.name,
+            "values": dict(design.values),
+            "measures": dict(design.measures),
+            "k_i": design.k_i,
+            "active": list(best.active),
+            "constraints": str(best.constraints),
+        }
+    )
+    bounds = dataclasses.replace(best.constraints)
+    for at in sorted({*_TRADEOFF, m_s}):
+        try:
+            one = tune(plant, dt, constraints=dataclasses.replace(bounds, m_s=at), **options)
+        except ValueError:
+            continue  # no loop satisfies these bounds: the curve has no point there
+        point = {"m_s": at, "k_i": one.design.k_i, "iae": one.design.measures.get("iae")}
+        yield frame({"kind": "tradeoff", "id": message["id"], **point})
+
+
+def compared_frames(
+    setup: Setup, message: Mapping[str, Any], stale: Stale, report: Report
+) -> Iterator[bytes]:
+    """Yield runs and loops of PID and LQG controllers that were tuned for the same plant.
+
+    The bounds ``m_s`` and ``m_t`` are the message's.
+    """
+    m_s = number(message, "m_s", 1.6, 1.05, 5.0)
+    m_t = number(message, "m_t", 1.6, 1.05, 5.0)
+    wide, dt = columns(message), float(setup.controller.dt)
+    plant, delay = linear_part(linear_model(setup.plant), dt)
+    entries, _ = tuned_references(
+        plant,
+        dt,
+        tuple(_COMPARED),
+        Constraints(m_s=m_s, m_t=m_t),
+        limits=_limits(setup),
+        delay=delay,
+        progress=stoppable(report, stale),
+    )
+    for name, entry in entries.items():
+        label = _COMPARED[name]
+        if entry.controller is None:
+            text = f"{label}: {entry.reason}"
+            yield frame({"kind": "note", "id": message["id"], "text": text})
+            continue
+        other = dataclasses.replace(setup, controller=entry.controller)
+        about = {"id": message["id"], "pin": label, "values": dict(entry.values)}
+        yield from run_frames(other, wide, about, stale)
+
+
+def band_frames(
+    setup: Setup, tables: Mapping[str, Any], message: Mapping[str, Any], stale: Stale
+) -> Iterator[bytes]:
+    """Yield the range of y and u over plants whose parameters differ by up to ``percent``.
+
+    Ranges ``plant.uncertain`` of the setup are used in place of the percentage, if it has them.
+    """
+    percent = number(message, "percent", 20.0, 0.0, _MOST_PERCENT)
+    make, wide = Maker(), columns(message)
+    random = np.random.default_rng(0)
+    ranges = tables["plant"].get("uncertain") if isinstance(tables["plant"], dict) else None
+    found: dict[str, list[Any]] = {"y": [], "u": []}
+    cut, t = None, np.zeros(0)
+    diverged = 0
+    for _ in range(_PLANTS):
+        if stale():
+            raise StoppedError
+        other = {**tables, "plant": _varied(tables["plant"], percent, ranges, random)}
+        plant = make(other).needed("plant")
+        scenario = setup.needed("scenario")
+        run = simulate(plant, setup.controller, scenario, progress=watched(stale))
+        if run.diverged:
+            diverged += 1
+            continue
+        if cut is None:
+            cut = Columns(len(run), wide)
+            t = cut.times(np.asarray(run.t, dtype=np.float64))
+        for name, ends in found.items():
+            ends.append((cut.low(run[name]), cut.high(run[name])))
+    curves = {"t": t}
+    for name, ends in found.items():
+        if ends:
+            curves[f"{name}_low"] = np.min([low for low, _ in ends], axis=0)
+            curves[f"{name}_high"] = np.max([high for _, high in ends], axis=0)
+    about = {"plants": _PLANTS, "diverged": diverged, "percent": percent}
+    yield frame({"kind": "band", "id": message["id"], **about}, curves)
+
+
+def _varied(plant: Any, percent: float, ranges: Any, random: np.random.Generator) -> Any:
+    """Return the table of a plant with other parameters."""
+
+    def other(value: Any) -> Any:
+        if isinstance(value, float | int) and not isinstance(value, bool):
+            return float(value) * (1.0 + 0.01 * percent * random.uniform(-1.0, 1.0))
+        if isinstance(value, list | tuple):
+            return [other(part) for part in value]
+        return value
+
+    if not isinstance(plant, Mapping):
+        return plant
+    table = dict(plant)
+    if ranges:
+        return table | {
+            key: float(random.uniform(low, high)) for key, (low, high) in ranges.items()
+        }
+    for key, value in plant.items():
+        if key == "plant":
+            table[key] = _varied(value, percent, None, random)
+        elif key not in _EXACT:
+            table[key] = other(value)
+    return table
+
+
+# Whole numbers; delays, which must be whole samples; and weights of the measurement.
+_EXACT = ("counts", "dac_bits", "late", "kind", "delay", "uncertain", "c1", "c2")
+
+
+def _limits(setup: Setup) -> dict[str, Any]:
+    """Return the limits of u of the setup's controller."""
+    table = setup.tables().get("controller", {})
+    given = table if isinstance(table, Mapping) else {}
+    return {key: given[key] for key in _LIMITS if given.get(key) is not None}

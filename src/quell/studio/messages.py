@@ -1,0 +1,159 @@
+"""Messages of the page: what they may ask for, and how large that may be."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from quell import checks
+
+MOST_BYTES = 262_144
+"""Largest message [bytes]; chosen by hand: a setup takes two thousand, one with matrices fifty."""
+
+# A run of so many samples takes some 0.3 s; chosen by hand.
+_MOST_SAMPLES = 200_000
+# Largest whole number in a setup, besides seeds and counts of an encoder: orders, numbers of
+# features and the like, which decide how much memory a controller takes. Chosen by hand.
+_MOST_PARTS = 200
+_FREE_NUMBERS = ("seed", "counts", "dac_bits")
+# Entries of a list, and samples of a delay. Chosen by hand.
+_MOST_ENTRIES, _MOST_DELAYED = 1000, 10_000
+# Pixels across a plot.
+_COLUMNS = (50, 4000)
+# Tables that reach devices, files or other processes.
+_NOT_HERE = ("rig", "sweep")
+# Keys that name files, or functions in them.
+_FILES = ("path", "storage", "telemetry", "function", "file")
+TASKS = ("run", "band", "compare", "tune", "export", "toml", "open", "cancel")
+
+
+def parsed(text: str | bytes) -> dict[str, Any]:
+    """Return a message as a dictionary; raise a ``ValueError`` if it is not one.
+
+    A message has ``do``, one of ``TASKS``, and ``id``, a whole number that the answers repeat.
+    """
+    if len(text) > MOST_BYTES:
+        raise ValueError(f"the message has {len(text)} bytes: must have at most {MOST_BYTES}")
+    try:
+        found = json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError:
+        raise ValueError("the message is nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(f"the message is not JSON: {error}") from None
+    if not isinstance(found, dict):
+        raise ValueError("the message must be an object with do and id")
+    checks.one_of("do", found.get("do"), TASKS)
+    number = found.get("id")
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 2**53:
+        raise ValueError("id: must be a whole number")
+    return found
+
+
+def identity(text: str | bytes) -> int | None:
+    """Return the id of a message that may be malformed, None if it has none."""
+    try:
+        number = json.loads(text)["id"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return number if type(number) is int and 0 <= number < 2**53 else None
+
+
+def columns(message: Mapping[str, Any]) -> int:
+    """Return how many pixels the plots of the page have across."""
+    low, high = _COLUMNS
+    wide = message.get("columns", 600)
+    if isinstance(wide, bool) or not isinstance(wide, int) or not low <= wide <= high:
+        raise ValueError(f"columns = {wide!r:.40}: must be a whole number from {low} to {high}")
+    return wide
+
+
+def number(message: Mapping[str, Any], key: str, usual: float, low: float, high: float) -> float:
+    """Return a number of a message within its range."""
+    value = message.get(key, usual)
+    good = isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+    if not good:
+        raise ValueError(f"{key} = {value!r:.40}: must be a number from {low:g} to {high:g}")
+    return float(value)
+
+
+def setup_tables(message: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables of the setup in a message; raise a ``ValueError`` for too large ones."""
+    tables = message.get("setup")
+    if not isinstance(tables, dict):
+        raise ValueError("setup: must be a table, as a setup file has it")
+    return checked(tables)
+
+
+def checked(tables: dict[str, Any]) -> dict[str, Any]:
+    """Return the tables of a setup that the studio can take, or raise a ``ValueError``."""
+    tables = {key: table for key, table in tables.items() if key not in _NOT_HERE}
+    dt = tables.get("dt")
+    if isinstance(dt, bool) or not isinstance(dt, int | float) or not 0.0 < dt < math.inf:
+        raise ValueError(f"dt = {dt!r:.40}: must be a positive sample time [s]")
+    scenario = tables.get("scenario")
+    duration = scenario.get("duration", 10.0) if isinstance(scenario, dict) else 10.0
+    if isinstance(duration, int | float) and duration > _MOST_SAMPLES * dt:
+        raise ValueError(
+            f"scenario.duration = {duration:g} s: must be at most {_MOST_SAMPLES} samples, "
+            f"{_MOST_SAMPLES * dt:g} s at dt = {dt:g} s"
+        )
+    _check_sizes(tables, "", float(dt))
+    return tables
+
+
+def _check_sizes(value: Any, path: str, dt: float) -> None:
+    """Check all numbers and lists of a setup that decide how much memory and time it takes."""
+    key = path.rpartition(".")[2].partition("[")[0]
+    if isinstance(value, dict):
+        if value.get("kind") == "fmu":
+            raise ValueError(f"{path}: an FMU is a program, which the studio does not run")
+        for each, part in value.items():
+            if each in _FILES:
+                raise ValueError(f"{path}.{each}: the studio opens no files")
+            _check_sizes(part, f"{path}.{each}" if path else str(each), dt)
+    elif isinstance(value, list | tuple):
+        if len(value) > _MOST_ENTRIES:
+            raise ValueError(f"{path}: has {len(value)} entries, must have at most {_MOST_ENTRIES}")
+        for i, part in enumerate(value):
+            _check_sizes(part, f"{path}[{i}]", dt)
+    elif isinstance(value, float) and not math.isfinite(value) and key not in _INFINITE:
+        raise ValueError(f"{path} = {value!r}: must be finite")
+    elif isinstance(value, int) and not isinstance(value, bool):
+        # In JSON a whole number may stand for any number, so only what must be whole is small.
+        if key in _PARTS and abs(value) > _MOST_PARTS:
+            raise ValueError(f"{path} = {value}: must be at most {_MOST_PARTS} in the studio")
+        if abs(value) > 2**53:
+            raise ValueError(f"{path}: is beyond what numbers in the studio can be")
+    if key in ("delay", "dead_time", "late") and isinstance(value, int | float):
+        samples = value if key == "late" else value / dt
+        if samples > _MOST_DELAYED:
+            raise ValueError(f"{path} = {value:g}: must be at most {_MOST_DELAYED} samples")
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number in JSON")
+
+
+def _whole_keys() -> frozenset[str]:
+    """Return the keys of setups whose values are whole numbers, besides ``_FREE_NUMBERS``."""
+    from quell.setup import registry
+    from quell.setup.reference import keys
+
+    groups = (
+        *(registry.PLANTS, registry.OBSERVERS, registry.LEARNERS, registry.CONTROLLERS),
+        *(registry.PREFILTERS, registry.SIGNALS, registry.FEATURES),
+    )
+    found = {
+        key
+        for group in groups
+        for table in group.values()
+        for key, kind, *_ in keys(table)
+        if "whole number" in kind
+    }
+    return frozenset(found - set(_FREE_NUMBERS) | {"orders"})
+
+
+_PARTS = _whole_keys()
+_INFINITE = frozenset(("u_min", "u_max", "rate_limit", "stop"))

@@ -1,0 +1,325 @@
+// Forms for the tables of a setup, made from the server's description of their keys.
+
+import { at } from "./store.js";
+
+const TITLES = {
+  plant: "Plant", observer: "Observer", controller: "Controller", learner: "Learner",
+  guard: "Guard", prefilter: "Prefilter of the reference", scenario: "Scenario",
+};
+const NAMES = {
+  omega_c: "ω_c [rad/s]", omega_o: "ω_o [rad/s]", u_min: "u_min", u_max: "u_max",
+  disturbances: "disturbance", at: "at [s]", duration: "duration [s]", delay: "delay [s]",
+};
+const OPTIONAL = ["observer", "learner", "guard", "prefilter"];
+const OPEN = ["plant", "observer", "controller"];
+const WHOLE = "whole number";
+
+export class Forms {
+  // `change(path, value, structure)` is called for each change.
+  constructor(home, change) {
+    this.home = home;
+    this.change = change;
+    this.groups = null;
+    this.anchors = new Map();
+    this.unfolded = new Map();
+  }
+
+  build(setup) {
+    this.setup = setup;
+    const focus = document.activeElement?.dataset?.path;
+    const kind = document.activeElement?.type;
+    const parts = [this.sampling(setup)];
+    for (const [group, title] of Object.entries(TITLES)) parts.push(this.section(group, title));
+    this.home.replaceChildren(...parts);
+    if (focus) {
+      const same = [...this.home.querySelectorAll("[data-path]")].filter((e) => e.dataset.path === focus);
+      (same.find((e) => e.type === kind) ?? same[0])?.focus();
+    }
+  }
+
+  // Show other values in the same form.
+  refresh(setup, except) {
+    this.setup = setup;
+    for (const input of this.home.querySelectorAll("[data-path]")) {
+      if (input !== except && input.showValue) input.showValue(at(setup, input.dataset.path));
+    }
+  }
+
+  sampling() {
+    const entry = { key: "dt", type: "number", about: "sample time of the loop [s].", needed: true };
+    const box = element("div");
+    box.append(this.number(entry, "dt", "sample time [s]", false));
+    return box;
+  }
+
+  section(group, title) {
+    const table = at(this.setup, group);
+    const box = this.details(group, title, OPEN.includes(group) || (table != null && group !== "scenario"));
+    if (OPTIONAL.includes(group)) {
+      const on = input("checkbox", group + "!", `Use: ${title}`);
+      on.checked = table != null;
+      on.onchange = () => this.change(group, on.checked ? this.fresh(group) : undefined, true);
+      box.append(field(`Use`, on));
+    }
+    if (table != null) box.append(...this.table(group, table, group));
+    return box;
+  }
+
+  details(path, title, open) {
+    const box = element("details", "group");
+    box.open = this.unfolded.get(path) ?? open;
+    box.ontoggle = () => this.unfolded.set(path, box.open);
+    box.append(element("summary", "", title));
+    return box;
+  }
+
+  // Return the fields of a table of one of the kinds of a group.
+  table(group, table, path) {
+    const kinds = this.groups[group];
+    const names = Object.keys(kinds);
+    const given = typeof table === "string" ? { kind: table } : table;
+    const kind = given.kind ?? (group === "controller" ? "adrc" : names[0]);
+    const parts = [];
+    if (names.length > 1) {
+      const choice = select(names, kind, path + ".kind", TITLES[group] ?? "kind");
+      choice.onchange = () => this.change(path, this.fresh(group, choice.value), true);
+      parts.push(field("kind", choice));
+    }
+    const about = kinds[kind];
+    if (!about) return parts;
+    if (names.length > 1 && about.about) parts.push(element("p", "about", about.about));
+    const rest = [];
+    for (const entry of about.keys) {
+      const found = this.entry(entry, `${path}.${entry.key}`, given[entry.key]);
+      const shown = entry.needed || given[entry.key] !== undefined;
+      (shown ? parts : rest).push(found);
+    }
+    if (rest.length) {
+      const more = element("details", "more");
+      more.open = this.unfolded.get(path + " more") ?? false;
+      more.ontoggle = () => this.unfolded.set(path + " more", more.open);
+      more.append(element("summary", "", "More"), ...rest);
+      parts.push(more);
+    }
+    return parts;
+  }
+
+  entry(entry, path, value) {
+    const name = NAMES[entry.key] ?? entry.key.replaceAll("_", " ");
+    if (entry.group === "signal") return this.signal(entry, path, name, value);
+    if (entry.group) return this.inner(entry, path, name, value);
+    if (entry.list_of) return this.list(entry, path, name, value);
+    if (entry.type === "true or false") return this.flag(entry, path, name, value);
+    if (entry.type === "number" || entry.type === WHOLE) return this.number(entry, path, name);
+    if (entry.type === "text") return this.text(entry, path, name);
+    return this.numbers(entry, path, name);
+  }
+
+  inner(entry, path, name, value) {
+    const box = element("div", "inner");
+    box.append(element("h3", "", name));
+    const on = input("checkbox", path + "!", `Use: ${name}`);
+    if (!entry.needed) {
+      on.checked = value != null;
+      on.onchange = () => this.change(path, on.checked ? this.fresh(entry.group) : undefined, true);
+      box.append(field("Use", on));
+    }
+    if (value != null) box.append(...this.table(entry.group, value, path));
+    return box;
+  }
+
+  signal(entry, path, name, value) {
+    const box = element("div", "inner");
+    const kinds = ["number", ...Object.keys(this.groups.signal)];
+    const none = entry.key === "then" ? ["none"] : [];
+    const kind = value === undefined || value === null ? (none[0] ?? "number")
+      : typeof value === "number" ? "number" : Array.isArray(value) ? "a sum" : (value.kind ?? value);
+    const shown = kind === "a sum" ? [...none, ...kinds, "a sum"] : [...none, ...kinds];
+    const choice = select(shown, kind, path + "!", name);
+    choice.onchange = () => {
+      const fresh = choice.value === "number" ? 0 : choice.value === "none" ? undefined
+        : this.fresh("signal", choice.value);
+      this.change(path, fresh, true);
+    };
+    box.append(field(name, choice, entry.about));
+    if (kind === "a sum") box.append(this.numbers(entry, path, "as JSON"));
+    else if (kind === "number") box.append(this.number({ ...entry, type: "number", default: 0 }, path, "value"));
+    else if (kind !== "none") {
+      box.append(...this.table("signal", value, path).slice(1).filter((part) => part.className !== "about"));
+    }
+    return box;
+  }
+
+  list(entry, path, name, value) {
+    const box = element("div", "inner");
+    box.append(element("h3", "", entry.key === "disturbances" ? "Disturbances of the plant" : name));
+    (value ?? []).forEach((part, i) => {
+      const where = `${path}[${i}]`;
+      if (entry.list_of === "signal") box.append(this.signal(entry, where, `${name} ${i + 1}`, part));
+      else box.append(...this.table(entry.list_of, part, where));
+      const remove = element("button", "", `Remove ${i + 1}`);
+      remove.onclick = () => this.change(where, undefined, true);
+      box.append(remove);
+    });
+    const add = element("button", "", "Add");
+    add.setAttribute("aria-label", `Add to ${name}`);
+    const fresh = () => (entry.list_of === "signal" ? this.fresh("signal", "step") : this.fresh(entry.list_of));
+    add.onclick = () => this.change(path, [...(value ?? []), fresh()], true);
+    box.append(add);
+    return box;
+  }
+
+  flag(entry, path, name, value) {
+    const on = input("checkbox", path, name);
+    on.showValue = (now) => (on.checked = now ?? entry.default ?? false);
+    on.showValue(value);
+    on.onchange = () => this.change(path, on.checked, false, on);
+    return field(name, on, entry.about);
+  }
+
+  text(entry, path, name) {
+    const box = input("text", path, name);
+    box.showValue = (now) => (box.value = now ?? entry.default ?? "");
+    box.showValue(at(this.setup, path));
+    box.onchange = () => this.change(path, box.value || undefined, false, box);
+    return field(name, box, entry.about);
+  }
+
+  numbers(entry, path, name) {
+    const box = input("text", path, name);
+    box.placeholder = "[1, 2, 3]";
+    box.showValue = (now) => (box.value = now === undefined ? "" : JSON.stringify(now));
+    box.showValue(at(this.setup, path));
+    box.oninput = () => {
+      try {
+        const value = box.value.trim() ? JSON.parse(box.value) : undefined;
+        box.setCustomValidity("");
+        this.change(path, value, false, box);
+      } catch {
+        box.setCustomValidity("A number, or a list as [1, 2, 3]");
+      }
+    };
+    return field(name, box, entry.about);
+  }
+
+  // Return a number with, where it can slide, a slider: logarithmic for a positive one.
+  number(entry, path, name, slides = entry.type === "number") {
+    const box = input("number", path, name);
+    box.step = entry.type === WHOLE ? "1" : "any";
+    box.showValue = (now) => {
+      box.value = now ?? (Number.isFinite(entry.default) ? entry.default : "");
+      if (now == null && entry.default === undefined) box.placeholder = "auto";
+    };
+    const value = at(this.setup, path) ?? (Number.isFinite(entry.default) ? entry.default : null);
+    box.showValue(at(this.setup, path));
+    const set = (number, source) => this.change(path, number, false, source);
+    if (!slides || value === null || typeof value !== "number") {
+      box.oninput = () => box.validity.valid && set(box.value === "" ? undefined : Number(box.value), box);
+      return field(name, box, entry.about);
+    }
+    const slider = input("range", path, `${name}, slider`);
+    const scale = this.scale(path, value);
+    [slider.min, slider.max, slider.step] = scale.logarithmic ? [-1, 1, 0.005] : [-1, 1, 0.01];
+    slider.showValue = (now) => {
+      const shown = now ?? entry.default ?? value;
+      slider.value = scale.place(shown);
+      slider.setAttribute("aria-valuetext", String(shown));
+    };
+    slider.showValue(value);
+    slider.oninput = () => {
+      const number = scale.value(Number(slider.value));
+      box.value = number;
+      slider.setAttribute("aria-valuetext", String(number));
+      set(number, slider);
+    };
+    box.oninput = () => {
+      if (!box.validity.valid) return;
+      set(box.value === "" ? undefined : Number(box.value), box);
+      if (box.value !== "") slider.showValue(Number(box.value));
+    };
+    const row = field(name, slider, entry.about);
+    row.classList.add("slides");
+    row.append(box);
+    return row;
+  }
+
+  // A slider goes a decade up and down from the value that it had first.
+  scale(path, value) {
+    let anchor = this.anchors.get(path);
+    const usable = anchor !== undefined && Math.sign(anchor) === Math.sign(value)
+      && Math.abs(Math.log10(Math.abs(value / anchor))) <= 1;
+    if (!usable) this.anchors.set(path, (anchor = value));
+    if (anchor !== 0) {
+      return {
+        logarithmic: true,
+        place: (v) => (v / anchor > 0 ? Math.log10(v / anchor) : -1),
+        value: (p) => Number((anchor * 10 ** p).toPrecision(4)),
+      };
+    }
+    return { logarithmic: false, place: (v) => v / 10, value: (p) => Number((10 * p).toPrecision(4)) };
+  }
+
+  // Return a table of a kind with values for what it needs.
+  fresh(group, kind) {
+    const kinds = this.groups[group];
+    const names = Object.keys(kinds);
+    const chosen = kind ?? { learner: "kalman", observer: "model-free", feature: "state" }[group] ?? names[0];
+    const before = at(this.setup, group) ?? {};
+    const table = names.length > 1 ? { kind: chosen } : {};
+    for (const entry of kinds[chosen].keys) {
+      if (before[entry.key] !== undefined && entry.needed) table[entry.key] = before[entry.key];
+      else if (entry.needed) table[entry.key] = this.guess(entry);
+    }
+    if (chosen === "linear") Object.assign(table, { num: [1], den: [1, 1, 0] });
+    if (group === "controller") {
+      for (const key of ["u_min", "u_max"]) if (before[key] !== undefined) table[key] = before[key];
+    }
+    for (const entry of kinds[chosen].keys) {
+      const plain = group === "plant" || group === "signal";
+      if (plain && entry.type === "number" && Number.isFinite(entry.default)) table[entry.key] ??= entry.default;
+    }
+    return table;
+  }
+
+  guess(entry) {
+    if (entry.group) return this.fresh(entry.group, entry.group === "plant" ? "linear" : undefined);
+    const usual = {
+      order: 2, b0: 1, omega_o: 20, omega_c: 4, delay: 0.01, counts: 4096, noise_variance: 1e-6,
+      drift: 1, delta: 0.1, kp: 1, theta: 0.05, gain: 1, tau1: 1, period: 1, horizon: 0.1,
+    };
+    if (entry.type.includes("number") && !entry.type.includes("numbers")) return usual[entry.key] ?? 1;
+    return entry.type === "list" || entry.type === "numbers" ? [0, 1] : "";
+  }
+}
+
+export function element(tag, className = "", text = "") {
+  const made = document.createElement(tag);
+  if (className) made.className = className;
+  if (text) made.textContent = text;
+  return made;
+}
+
+function input(type, path, label) {
+  const made = element("input");
+  made.type = type;
+  made.dataset.path = path;
+  made.setAttribute("aria-label", label);
+  return made;
+}
+
+function select(names, chosen, path, label) {
+  const made = element("select");
+  made.dataset.path = path;
+  made.setAttribute("aria-label", label);
+  for (const name of names) made.append(new Option(name, name, false, name === chosen));
+  return made;
+}
+
+export function field(name, control, about = "") {
+  const row = element("div", "field");
+  const label = element("label", "", name);
+  label.title = about ? `${name}: ${about.replaceAll("`", "")}` : name;
+  row.append(label, control);
+  label.onclick = () => control.focus();
+  return row;
+}

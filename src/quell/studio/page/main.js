@@ -1,0 +1,421 @@
+// The page: state, server and views together.
+
+import { Connection } from "./connection.js";
+import { Designs } from "./design.js";
+import { element, Forms } from "./forms.js";
+import { boundFields, showNumbers, usual } from "./numbers.js";
+import { DASHES, palette } from "./palette.js";
+import { short } from "./plots.js";
+import { changed, Store } from "./store.js";
+import { Tours } from "./tours.js";
+import { Views } from "./views.js";
+import { Watch } from "./watch.js";
+
+const home = (id) => document.getElementById(id);
+const MOST_PINS = 5;
+const BAND_PAUSE = 150; // the band is computed when nothing has moved for this time [ms]
+
+const now = { arrays: {}, loopArrays: {}, run: null, loop: null, band: null, bandId: null, input: null, watching: false };
+const studio = { times: [], frames: 0, compiled: 0, now }; // for measurements from outside
+window.studio = studio;
+let pins = [];
+let presets = [];
+let tours = null;
+let store = null;
+
+const views = new Views();
+const forms = new Forms(home("forms"), (path, value, structure, source) => {
+  now.input = performance.now();
+  const state = { ...store.state, setup: changed(store.state.setup, path, value) };
+  now.source = source;
+  store.set(state, structure, "form");
+});
+
+// ---- state
+
+function onState(state, structure, source) {
+  if (source === "history") {
+    home("undo").disabled = !store.past.length;
+    home("redo").disabled = !store.future.length;
+    return;
+  }
+  if (structure) {
+    forms.build(state.setup);
+    boundFields(home("bounds"), state.bounds, (bounds) => store.set({ ...store.state, bounds }, false, "bounds"));
+    home("frequency").value = state.frequency;
+    home("band").checked = state.band;
+    home("percent").value = state.percent;
+    syncPins(state);
+  } else if (source === "form") forms.refresh(state.setup, now.source);
+  ask();
+}
+
+function fill(state) {
+  return { bounds: usual(), frequency: "rad", band: false, percent: 20, pins: [], ...state };
+}
+
+function ask() {
+  if (now.watching || !store) return;
+  const message = { do: "run", setup: store.state.setup, columns: width(), local: { input: now.input } };
+  now.input = null;
+  server.run(message);
+  clearTimeout(now.bandTimer);
+  if (store.state.band) now.bandTimer = setTimeout(askBand, BAND_PAUSE);
+  else now.band = null;
+}
+
+function askBand() {
+  const { setup, percent } = store.state;
+  now.bandId = server.send({ do: "band", setup, percent, columns: width() });
+}
+
+function width() {
+  return Math.max(200, Math.min(2000, home("plot-y").clientWidth || 600));
+}
+
+// ---- frames of the server
+
+const server = new Connection(onFrame, (text) => {
+  home("state").textContent = text === "connected" ? "connected" : "connection lost; trying again …";
+  home("state").dataset.connection = text;
+});
+
+async function onFrame(header, arrays, bytes, asked) {
+  if (header.kind === "hello") return begin(header);
+  if (designs.take(header, arrays)) return undefined;
+  if (header.kind === "run" && asked) return takeRun(header, arrays, asked);
+  if (header.kind === "loop" && asked) return takeLoop(header, arrays, asked);
+  if (header.kind === "band" && header.id === now.bandId) {
+    now.band = { ...arrays, about: header };
+    drawRun();
+  } else if (header.kind === "wait") {
+    home("state").textContent = header.compiles ? "compiling this kind of loop, once …" : "working …";
+  } else if (header.kind === "error") {
+    message(header.text.join("\n"));
+    if (asked?.local?.pin) asked.local.pin.failed = true;
+  } else if (header.kind === "texts") showTexts(header);
+  else if (header.kind === "file") {
+    download(header.name, bytes);
+    home("state").textContent = `${header.name} is downloaded`;
+  } else if (header.kind === "opened") {
+    store.set({ ...store.state, setup: header.setup });
+  }
+  return undefined;
+}
+
+function takeRun(header, arrays, asked) {
+  if (asked.local?.pin) {
+    asked.local.pin.arrays = arrays;
+    return;
+  }
+  now.arrays = arrays;
+  now.run = header;
+  studio.compiled += header.compiled;
+  const notes = [header.message, ...header.warnings].filter(Boolean);
+  message(notes.join("\n"), header.message.includes("diverged") || header.message.includes("beyond"));
+  if (!now.watching) drawRun();
+}
+
+function takeLoop(header, arrays, asked) {
+  if (asked.local?.pin) {
+    Object.assign(asked.local.pin.arrays, arrays);
+    redraw();
+    askPins();
+    return;
+  }
+  now.loop = header.loop;
+  now.loopArrays = arrays;
+  home("loop-reason").textContent = header.loop.reason ?? "";
+  drawLoop();
+  const ms = 1e3 * (now.run.seconds + header.seconds);
+  const compiled = now.run.compiled > 1 ? `, compiled for ${short(now.run.compiled)} s` : "";
+  home("state").textContent = `${ms.toFixed(0)} ms${compiled}`;
+  studio.frames += 1;
+  if (asked.local?.input) {
+    requestAnimationFrame(() => studio.times.push(performance.now() - asked.local.input));
+  }
+  askPins();
+}
+
+function drawRun() {
+  views.showRun(now.arrays, pins, store.state.band ? now.band : null, store.state.setup);
+  const unit = (name) => (now.run?.units?.[name] ? `[${now.run.units[name]}]` : "");
+  for (const [name, key] of [["y", "y"], ["u", "u"], ["f", "f_hat"]]) {
+    document.querySelector(`[data-unit="${name}"]`).textContent = unit(key);
+  }
+  numbers();
+}
+
+function drawLoop() {
+  views.showLoop(now.loopArrays, pins, now.loop ?? {});
+  numbers();
+}
+
+function numbers() {
+  showNumbers(home("numbers"), now.run, now.loop, store.state.bounds, store.state.setup.dt);
+}
+
+function redraw() {
+  drawRun();
+  drawLoop();
+}
+
+function message(text, bad = true) {
+  home("message").hidden = !text;
+  home("message").textContent = text;
+  home("message").classList.toggle("bad", bad);
+}
+
+// ---- pins
+
+function addPin(pin) {
+  const used = new Set(pins.map((each) => each.place));
+  pin.place = [...Array(MOST_PINS).keys()].find((place) => !used.has(place)) ?? 0;
+  pins = [...pins, pin].slice(-MOST_PINS);
+  listPins();
+}
+
+function pinNow(label) {
+  if (!now.arrays.t) return;
+  const setup = store.state.setup;
+  const name = label ?? `${setup.title ?? "design"} ${pins.length + 1}`;
+  addPin({ label: name, setup, arrays: { ...now.arrays, ...now.loopArrays } });
+  keepPins();
+  redraw();
+}
+
+function keepPins() {
+  const kept = pins.filter((pin) => pin.setup).map(({ label, setup }) => ({ label, setup }));
+  store.set({ ...store.state, pins: kept }, false, "pins");
+}
+
+// Make the pins those of a state, after undo or a visit by an address.
+function syncPins(state) {
+  const key = (pin) => JSON.stringify([pin.label, pin.setup]);
+  const have = new Map(pins.map((pin) => [key(pin), pin]));
+  const others = pins.filter((pin) => !pin.setup);
+  pins = [];
+  for (const pin of [...state.pins, ...others]) addPin(have.get(key(pin)) ?? { ...pin });
+  listPins();
+}
+
+function askPins() {
+  const next = pins.find((pin) => !pin.arrays && !pin.failed && pin.setup);
+  if (next && !server.waiting) server.run({ do: "run", setup: next.setup, columns: width(), local: { pin: next } });
+}
+
+function listPins() {
+  home("pins").replaceChildren(
+    ...pins.map((pin) => {
+      const box = element("span", "pin");
+      const swatch = element("span", "swatch");
+      swatch.style.borderColor = palette().pins[pin.place];
+      swatch.style.borderTopStyle = DASHES[pin.place][0] > 3 ? "dashed" : "dotted";
+      const remove = element("button", "", "✕");
+      remove.setAttribute("aria-label", `Remove ${pin.label}`);
+      remove.onclick = () => {
+        pins = pins.filter((each) => each !== pin);
+        listPins();
+        keepPins();
+        redraw();
+      };
+      const back = element("button", "", pin.label);
+      back.title = pin.setup ? "Go back to this design" : pin.label;
+      back.disabled = !pin.setup;
+      back.onclick = () => store.set({ ...store.state, setup: pin.setup });
+      box.append(swatch, back, remove);
+      return box;
+    }),
+  );
+}
+
+const designs = new Designs(
+  (task) => server.send({ ...task, setup: store.state.setup, columns: width() }),
+  () => server.send({ do: "cancel" }),
+  (setup) => {
+    pinNow("before tuning");
+    store.set({ ...store.state, setup });
+  },
+  (header, arrays) => {
+    const old = pins.find((pin) => pin.label === header.pin && !pin.setup);
+    if (header.kind === "run") {
+      pins = pins.filter((pin) => pin !== old);
+      addPin({ label: header.pin, arrays });
+    } else if (old) Object.assign(old.arrays, arrays);
+    redraw();
+  },
+);
+
+// ---- text and files
+
+let texts = null;
+
+function showTexts(header) {
+  if (now.saving) {
+    now.saving = false;
+    const name = (store.state.setup.title ?? "setup").toLowerCase().replaceAll(/[^a-z0-9]+/g, "_") || "setup";
+    download(`${name}.toml`, new TextEncoder().encode(header.toml));
+    return;
+  }
+  texts = header;
+  chooseText("toml");
+  home("texts").showModal();
+}
+
+function chooseText(which) {
+  home("text").textContent = texts[which];
+  home("as-toml").setAttribute("aria-pressed", which === "toml");
+  home("as-python").setAttribute("aria-pressed", which === "python");
+}
+
+function download(name, content) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([content]));
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+function askText(saving) {
+  now.saving = saving;
+  server.send({ do: "toml", setup: store.state.setup });
+}
+
+function askExport(to) {
+  home("state").textContent = "translating to C …";
+  server.send({ do: "export", to, setup: store.state.setup });
+}
+
+// ---- watch
+
+const watch = new Watch(
+  (arrays, values) => {
+    views.showRun({ ...arrays, watched: true }, [], null, null);
+    home("watch-values").replaceChildren(
+      ...Object.entries(values).map(([name, value]) => {
+        const box = element("div");
+        box.append(element("dt", "", name.replace("_", " ")), element("dd", "", short(value)));
+        return box;
+      }),
+    );
+  },
+  (text) => (home("watch-state").textContent = text),
+);
+
+function chooseTab(name) {
+  for (const each of ["design", "learn", "watch"]) {
+    home(`tab-${each}`).setAttribute("aria-selected", each === name);
+    home(`tab-${each}`).tabIndex = each === name ? 0 : -1;
+  }
+  // The tours change the design: its form stays below them.
+  home("learn").hidden = name !== "learn";
+  home("watch").hidden = name !== "watch";
+  home("design").hidden = name === "watch";
+  document.querySelector(".loop").hidden = name === "watch";
+  document.querySelector(".choices").hidden = name === "watch";
+  home("numbers").hidden = name === "watch";
+  now.watching = name === "watch";
+  if (!now.watching) {
+    watch.stop();
+    if (store) redraw();
+  }
+}
+
+// ---- beginning
+
+async function begin(hello) {
+  forms.groups = hello.forms;
+  if (store) {
+    server.flying = null;
+    ask(); // the connection was lost
+    return;
+  }
+  const [presetList, tourList] = await Promise.all(["presets.json", "tours.json"].map((name) => fetch(name).then((r) => r.json())));
+  presets = presetList;
+  home("preset").replaceChildren(new Option("your setup", ""), ...presets.map((preset, i) => new Option(preset.name, i)));
+  tours = new Tours(tourList, presets, (setup, pin) => {
+    if (pin !== undefined) {
+      pins = [];
+      listPins();
+    }
+    store.set({ ...store.state, setup, pins: pin ? [{ label: pin, setup }] : pin === null ? [] : store.state.pins });
+  });
+  store = new Store(onState);
+  const fromFile = hello.setup && location.hash.length < 2;
+  const found = fromFile ? { setup: hello.setup } : Store.found();
+  if (!found) choosePreset(0);
+  else store.set(fill(found));
+  store.commit();
+  if (found?.frequency) views.setFrequency(found.frequency);
+}
+
+function choosePreset(number) {
+  home("preset").value = number;
+  home("preset-about").textContent = presets[number].about;
+  forms.anchors.clear();
+  store.set(fill({ ...(store.state ?? {}), setup: presets[number].setup }));
+}
+
+function setTheme(dark) {
+  document.documentElement.dataset.theme = dark ? "dark" : "light";
+  home("theme").textContent = dark ? "Light" : "Dark";
+  if (store) {
+    redraw();
+    views.redraw();
+    listPins();
+  }
+}
+
+const prefersDark = matchMedia("(prefers-color-scheme: dark)");
+prefersDark.addEventListener("change", (event) => setTheme(event.matches));
+setTheme(prefersDark.matches);
+
+home("preset").onchange = () => home("preset").value !== "" && choosePreset(Number(home("preset").value));
+home("undo").onclick = () => store.undo();
+home("redo").onclick = () => store.redo();
+home("pin").onclick = () => pinNow();
+home("theme").onclick = () => setTheme(document.documentElement.dataset.theme !== "dark");
+home("save").onclick = () => askText(true);
+home("show-text").onclick = () => askText(false);
+home("export-c").onclick = () => askExport("c");
+home("export-fmu").onclick = () => askExport("fmu");
+home("open").onclick = () => home("file").click();
+home("file").onchange = async () => {
+  const [file] = home("file").files;
+  if (file) server.send({ do: "open", text: await file.text() });
+  home("file").value = "";
+};
+home("as-toml").onclick = () => chooseText("toml");
+home("as-python").onclick = () => chooseText("python");
+home("copy").onclick = () => navigator.clipboard.writeText(home("text").textContent);
+home("close-texts").onclick = () => home("texts").close();
+home("watch-go").onclick = () => watch.start(Number(home("watch-port").value));
+home("frequency").onchange = () => {
+  views.setFrequency(home("frequency").value);
+  store.set({ ...store.state, frequency: home("frequency").value }, false, "choice");
+};
+home("band").onchange = () => store.set({ ...store.state, band: home("band").checked }, false, "choice");
+home("percent").oninput = () => store.set({ ...store.state, percent: Number(home("percent").value) }, false, "choice");
+for (const name of ["design", "learn", "watch"]) {
+  home(`tab-${name}`).onclick = () => chooseTab(name);
+  home(`tab-${name}`).onkeydown = (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (!step) return;
+    const names = ["design", "learn", "watch"];
+    const next = names[(names.indexOf(name) + step + 3) % 3];
+    chooseTab(next);
+    home(`tab-${next}`).focus();
+  };
+}
+document.addEventListener("keydown", (event) => {
+  const typing = event.target.matches("input:not([type=range]):not([type=checkbox]), textarea");
+  const command = event.ctrlKey || event.metaKey;
+  if (command && !typing && event.key.toLowerCase() === "z") {
+    event.preventDefault();
+    if (event.shiftKey) store.redo();
+    else store.undo();
+  } else if (command && !typing && event.key.toLowerCase() === "y") {
+    event.preventDefault();
+    store.redo();
+  } else if (event.key === "p" && !command && !typing && !event.target.matches("select")) pinNow();
+});

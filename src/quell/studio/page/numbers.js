@@ -1,0 +1,85 @@
+// Margins and metrics as numbers that turn red outside of their bounds.
+
+import { element, field } from "./forms.js";
+import { short } from "./plots.js";
+
+// Usual bounds: M_s = 2 and a phase margin of 30° are the least that Åström & Hägglund (Advanced PID
+// Control, 2006, section 4.6) advise; the others are chosen by hand.
+export const BOUNDS = {
+  m_s: { name: "largest M_s", value: 2 },
+  gain: { name: "least gain margin (factor)", value: 2 },
+  phase: { name: "least phase margin [°]", value: 30 },
+  samples: { name: "least delay margin [samples]", value: 2 },
+  overshoot: { name: "largest overshoot [%]", value: 20 },
+};
+
+export function usual() {
+  return Object.fromEntries(Object.entries(BOUNDS).map(([key, bound]) => [key, bound.value]));
+}
+
+export function boundFields(home, bounds, change) {
+  home.replaceChildren(
+    ...Object.entries(BOUNDS).map(([key, bound]) => {
+      const box = element("input");
+      box.type = "number";
+      box.step = "any";
+      box.value = bounds[key];
+      box.setAttribute("aria-label", bound.name);
+      box.oninput = () => box.value !== "" && change({ ...bounds, [key]: Number(box.value) });
+      return field(bound.name, box);
+    }),
+  );
+}
+
+export function showNumbers(home, run, loop, bounds, dt) {
+  home.replaceChildren(...[...margins(loop, bounds, dt), ...metrics(run, bounds)].map(box));
+}
+
+function margins(loop, bounds, dt) {
+  if (!loop) return [];
+  if (loop.reason) return [];
+  if (!loop.stable) return [["loop", "unstable", true, `largest pole at |z| = ${short(loop.largest_pole)}`]];
+  const [low, high] = loop.gain_margin.map((each) => each ?? Infinity);
+  const b = loop.b_range?.map((each) => each ?? Infinity);
+  const delay = loop.delay_margin ?? Infinity;
+  const phase = loop.phase_margin ?? Infinity;
+  return [
+    ["M_s", short(loop.m_s), loop.m_s > bounds.m_s, "largest sensitivity: the least distance from −1 is 1/M_s"],
+    ["gain margin", `${low > 0 ? short(low) + " … " : ""}${short(high)}`, high < bounds.gain || low > 1 / bounds.gain, "factor of the gain up to which the loop is stable"],
+    ["phase margin", `${short(phase)}°`, phase < bounds.phase, ""],
+    ["delay margin", delay >= 1 ? `${short(delay)} s` : `${short(1e3 * delay)} ms`, delay < bounds.samples * dt, "additional dead time up to which the loop is stable"],
+    ["stable for b/b0", b ? `${short(b[0])} … ${short(b[1])}` : "–", false, "range of the plant's gain over b0"],
+    ["noise → u", short(loop.noise_to_control), false, "RMS of u for white noise of RMS 1 in y"],
+  ];
+}
+
+function metrics(run, bounds) {
+  if (!run) return [];
+  const found = [];
+  for (const window of run.metrics) {
+    const where = `from ${short(window.start ?? 0)} s`;
+    if (window.reason) {
+      found.push([where, "–", false, window.reason]);
+      continue;
+    }
+    if (window.overshoot != null) {
+      found.push(["overshoot", `${short(100 * window.overshoot)} %`, 100 * window.overshoot > bounds.overshoot, where]);
+    }
+    if (window.settling_time !== undefined) {
+      found.push(["settling", window.settling_time == null ? "never" : `${short(window.settling_time)} s`, window.settling_time == null, where]);
+    }
+    found.push([`peak |r − y| ${where}`, short(window.peak_error), false, where]);
+    found.push([`IAE ${where}`, short(window.iae), false, `integral of |r − y| ${where}`]);
+    found.push([`variation u ${where}`, short(window.control_variation), false, `sum of |Δu| ${where}`]);
+  }
+  return found;
+}
+
+function box([name, value, bad, about]) {
+  const home = element("div", bad ? "bad" : "");
+  home.title = [name, about].filter(Boolean).join(": ");
+  const shown = element("dd", "", value);
+  if (bad) shown.setAttribute("aria-label", `${value}, outside of its bound`);
+  home.append(element("dt", "", name), shown);
+  return home;
+}

@@ -1,0 +1,182 @@
+"""A run of a setup and the analysis of its loop, as frames for the page."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from quell.analysis import LoopAnalysis, analyse
+from quell.kernels.compile_time import compile_time
+from quell.plants.linear_part import linear_model, linear_part
+from quell.records.channels import describe
+from quell.records.trajectory import Trajectory
+from quell.setup.description import describe as tables_of
+from quell.setup.load import Known, Setup, assembled
+from quell.simulation import simulate
+from quell.studio.frames import Columns, frame
+from quell.types import Vector
+
+NAME = "studio"
+"""Stands for the name of the file in messages about a setup."""
+
+# Longest time of one run without what it compiles [s]; chosen by hand: a run of the longest
+# duration takes 0.3 s, with a large learner some seconds.
+_LONGEST = 20.0
+_CHANNELS = ("r", "y", "u", "f_hat", "f_learned", "authority")
+_MARGIN_FREQUENCIES = 400  # of the Bode diagram, chosen by hand: a point for each second pixel
+
+
+class StoppedError(Exception):
+    """The run was stopped: a newer message came, or the page is gone."""
+
+
+class Maker:
+    """Builds setups from tables, and builds again only what changed since the last one."""
+
+    def __init__(self, name: str = NAME) -> None:
+        self.name = name
+        self._known: Known = {}
+
+    def __call__(self, tables: Mapping[str, Any]) -> Setup:
+        """Return the setup; raise a ``SetupError`` for tables that do not fit."""
+        setup = assembled(self.name, tables_of(self.name, tables), self._known)
+        for table in ("plant", "scenario"):
+            setup.needed(table)
+        return setup
+
+
+def run_frames(
+    setup: Setup, columns: int, about: Mapping[str, Any], stale: Callable[[], bool]
+) -> Iterator[bytes]:
+    """Yield two frames for a setup: the run, and the analysis of its loop.
+
+    Parameters
+    ----------
+    setup
+        with plant and scenario.
+    columns
+        pixels across a plot; a curve gets two points for each.
+    about
+        added to the headers.
+    stale
+        returns whether nobody waits for the result any more; ``StoppedError`` is raised then.
+    """
+    began, compiled = time.perf_counter(), compile_time.seconds
+    plant, scenario = setup.needed("plant"), setup.needed("scenario")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run = simulate(plant, setup.controller, scenario, progress=watched(stale))
+    header: dict[str, Any] = {
+        "kind": "run",
+        "plant": run.plant,
+        "status": int(run.status),
+        "message": run.message if run.diverged or run.status else "",
+        "warnings": sorted({" ".join(str(each.message).split()) for each in caught}),
+        "metrics": _metrics(run, setup),
+        "units": {name: describe(name)[1] for name in _CHANNELS},
+        "seconds": time.perf_counter() - began,
+        "compiled": compile_time.seconds - compiled,
+    }
+    yield frame(header | dict(about), _curves(run, columns))
+    if stale():
+        raise StoppedError
+    began = time.perf_counter()
+    try:
+        loop = loop_of(setup)
+        numbers, curves = _analysis(loop)
+    except (ValueError, ArithmeticError) as error:
+        numbers, curves = {"reason": " ".join(str(error).split())}, {}
+    more = {"kind": "loop", "loop": numbers, "seconds": time.perf_counter() - began}
+    yield frame(more | dict(about), curves)
+
+
+def loop_of(setup: Setup) -> LoopAnalysis:
+    """Return the analysis of the loop of a setup: the linear part of its plant."""
+    dt = float(setup.controller.dt)
+    plant, delay = linear_part(linear_model(setup.plant), dt)
+    late = delay + dt * int(getattr(setup.plant, "late", 0) or 0)
+    return analyse(plant, setup.controller, delay=late)
+
+
+def watched(stale: Callable[[], bool]) -> Callable[[float], None]:
+    """Return a callback for progress that ends a run which takes too long or is not needed."""
+    began: list[float] = []
+
+    def progress(_: float) -> None:
+        now = time.monotonic()
+        if not began:  # what compiles does so before the first call
+            began.append(now)
+        if stale():
+            raise StoppedError
+        if now - began[0] > _LONGEST:
+            raise ValueError(
+                f"the run took more than {_LONGEST:g} s: shorten scenario.duration, or take a "
+                "smaller learner"
+            )
+
+    return progress
+
+
+def _curves(run: Trajectory, columns: int) -> dict[str, Vector]:
+    """Return the curves of a run for a plot of some columns of pixels."""
+    names = [name for name in _CHANNELS if name in run.names]
+    t = np.asarray(run.t, dtype=np.float64)
+    cut = Columns(len(run), columns)
+    return {"t": cut.times(t)} | {name: cut.points(run[name]) for name in names}
+
+
+def _metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
+    """Return the metrics of the windows of a setup; of the whole run by default."""
+    found = []
+    for window in setup.windows or ({},):
+        try:
+            numbers = run.metrics(**window)
+        except ValueError as error:
+            found.append({**window, "reason": " ".join(str(error).split())})
+            continue
+        found.append({**window, **dict(numbers), "missing": dict(numbers.missing)})
+    return found
+
+
+def _analysis(loop: LoopAnalysis) -> tuple[dict[str, Any], dict[str, Vector]]:
+    """Return the numbers and the curves of a loop."""
+    omega = loop.omega
+    if omega.size > _MARGIN_FREQUENCIES:
+        omega = omega[:: math.ceil(omega.size / _MARGIN_FREQUENCIES)]
+    L = loop.response("L", omega)
+    S = 1.0 / (1.0 + L)
+    with np.errstate(divide="ignore"):
+        curves: dict[str, Any] = {
+            "omega": omega,
+            "gain": 20.0 * np.log10(np.abs(L)),
+            "phase": np.degrees(np.unwrap(np.angle(L))),
+            "S": 20.0 * np.log10(np.abs(S)),
+            "T": 20.0 * np.log10(np.abs(L * S)),
+            "re": np.real(L),
+            "im": np.imag(L),
+        }
+    largest = float(np.abs(loop.poles).max())
+    numbers: dict[str, Any] = {"stable": loop.stable, "largest_pole": largest}
+    if loop.stable:
+        m = loop.margins
+        numbers |= {
+            "m_s": 1.0 / m.modulus,
+            "m_s_omega": m.modulus_omega,
+            "gain_margin": list(m.gain),
+            "phase_margin": m.phase,
+            "phase_omega": m.phase_omega,
+            "delay_margin": m.delay,
+            "disk_margin": m.disk,
+            "b_range": list(loop.b_range),
+            "b_over_b0": loop.b_over_b0,
+            "noise_to_control": loop.noise_to_control,
+        }
+    # The phase starts within one turn, so that the curve of one design lies on that of another.
+    turns = math.floor((float(curves["phase"][0]) + 360.0) / 360.0) * 360.0
+    curves["phase"] = curves["phase"] - turns
+    return numbers, curves

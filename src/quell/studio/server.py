@@ -1,0 +1,210 @@
+"""The server of the studio: static files and one WebSocket, for this computer only.
+
+The address contains a random token as its first part, without which nothing is answered. Requests
+for another host, which a page of the web could make by rebinding its name (DNS rebinding), and
+WebSockets of pages from elsewhere (their Origin header, RFC 6455 section 10.2) are refused. A page
+can reach no file: the few files of the page itself are in memory.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import secrets
+import socket
+from collections.abc import Callable, Mapping
+from importlib.resources import files
+from typing import Any
+
+from quell import checks
+from quell.optional import import_extra
+from quell.parallel import one_blas_thread
+from quell.studio.forms import forms
+from quell.studio.frames import frame
+from quell.studio.messages import MOST_BYTES
+from quell.studio.pages import Page, Workers
+
+HOST = "127.0.0.1"
+PORT = 8770
+"""The usual port. A page that is opened again at the same port finds what it last had."""
+
+# Most pages at once; chosen by hand: a person opens a few.
+_MOST_PAGES = 32
+# Messages of one page that wait in the server before its connection is no longer read.
+_QUEUE = 8
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".svg": "image/svg+xml",
+}
+# The page loads nothing from elsewhere, and connects to this computer only: to this server, and, to
+# watch a rig, to the port of its telemetry.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' data:; connect-src 'self' ws://127.0.0.1:*; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+# Policy violation, and try again later (RFC 6455, section 7.4.1).
+_REFUSED, _TOO_MANY = 1008, 1013
+
+
+def page_files() -> dict[str, tuple[str, bytes]]:
+    """Return type and content of each file of the page by its path."""
+    found: dict[str, tuple[str, bytes]] = {}
+
+    def collect(folder: Any, before: str) -> None:
+        for entry in folder.iterdir():
+            name = before + entry.name
+            if entry.is_dir():
+                collect(entry, f"{name}/")
+            else:
+                suffix = entry.name[entry.name.rfind(".") :] if "." in entry.name else ""
+                kind = _TYPES.get(suffix, "text/plain; charset=utf-8")
+                found[name] = kind, entry.read_bytes()
+
+    collect(files("quell.studio") / "page", "")
+    return found
+
+
+class Studio:
+    """The application: who may connect, what the page gets, and the threads that work for it.
+
+    Parameters
+    ----------
+    port
+        the port at which it is served: part of the host that requests must name.
+    setup
+        tables of the setup that the page starts with; its own by default.
+    token
+        the first part of the path of the address; random by default.
+    """
+
+    def __init__(
+        self, port: int = PORT, setup: Mapping[str, Any] | None = None, token: str | None = None
+    ) -> None:
+        self.token = secrets.token_urlsafe(24) if token is None else token
+        self.host = f"{HOST}:{port}"
+        self._setup, self._files, self._workers = setup, page_files(), Workers()
+        self._pages = 0
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return f"http://{self.host}/{self.token}/"
+
+    def app(self) -> Any:
+        """Return the application for a server (ASGI)."""
+        applications = import_extra("starlette.applications", "studio", "the studio")
+        routing = import_extra("starlette.routing", "studio", "the studio")
+        routes = [
+            routing.Route("/{token}/{path:path}", self._file, methods=["GET"]),
+            routing.WebSocketRoute("/{token}/socket", self._socket),
+        ]
+        return applications.Starlette(routes=routes)
+
+    def close(self) -> None:
+        """End the threads."""
+        self._workers.close()
+
+    def _is_welcome(self, request: Any, origin_needed: bool) -> bool:
+        """Return whether host, origin and token of a request are those of the studio's page."""
+        headers = request.headers
+        origins = headers.getlist("origin")
+        own = f"http://{self.host}"
+        if headers.getlist("host") != [self.host] or any(each != own for each in origins):
+            return False
+        if origin_needed and len(origins) != 1:
+            return False
+        given = str(request.path_params["token"]).encode("utf-8", "replace")
+        return hmac.compare_digest(given, self.token.encode())
+
+    async def _file(self, request: Any) -> Any:
+        from starlette.responses import Response
+
+        if not self._is_welcome(request, origin_needed=False):
+            return Response("Not for you.\n", 403, _HEADERS, "text/plain")
+        found = self._files.get(request.path_params["path"] or "index.html")
+        if found is None:
+            return Response("No such file.\n", 404, _HEADERS, "text/plain")
+        kind, content = found
+        return Response(content, 200, _HEADERS | {"Content-Type": kind})
+
+    async def _socket(self, websocket: Any) -> None:
+        if not self._is_welcome(websocket, origin_needed=True):
+            await websocket.close(_REFUSED)
+            return
+        if self._pages >= _MOST_PAGES:
+            await websocket.close(_TOO_MANY)
+            return
+        self._pages += 1
+        try:
+            await websocket.accept()
+            hello = {"kind": "hello", "forms": forms()}
+            await websocket.send_bytes(frame({**hello, "setup": self._setup}))
+            await Page(websocket, self._workers).serve()
+        finally:
+            self._pages -= 1
+
+
+def serve(
+    setup: Mapping[str, Any] | None = None,
+    port: int = PORT,
+    ready: Callable[[str], None] | None = None,
+) -> None:
+    """Serve the studio until it is interrupted.
+
+    Parameters
+    ----------
+    setup
+        tables of the setup that the page starts with.
+    port
+        TCP port; 0 takes any free one.
+    ready
+        called with the address when the server listens.
+
+    Raises
+    ------
+    ValueError
+        for a port out of range, or one at which another program listens.
+    ImportError
+        without the packages of the extra ``studio``.
+    """
+    checks.whole("port", port, 0, 65535)
+    uvicorn = import_extra("uvicorn", "studio", "the studio")
+    import_extra("websockets", "studio", "the studio")
+    try:
+        listener = socket.create_server((HOST, port), backlog=128)
+    except OSError as error:
+        raise ValueError(
+            f"port = {port}: can't listen there ({error.strerror or error}); choose another port, "
+            "or 0 for a free one"
+        ) from None
+    with listener:
+        studio = Studio(listener.getsockname()[1], setup)
+        config = uvicorn.Config(
+            studio.app(),
+            ws="websockets-sansio",
+            ws_max_size=MOST_BYTES,
+            ws_max_queue=_QUEUE,
+            ws_per_message_deflate=False,
+            lifespan="off",
+            access_log=False,
+            log_level="error",
+            server_header=False,
+            timeout_graceful_shutdown=1,
+        )
+        server = uvicorn.Server(config)
+        try:
+            with one_blas_thread():
+                if ready is not None:
+                    ready(studio.url)
+                asyncio.run(server.serve(sockets=[listener]))
+        finally:
+            studio.close()
