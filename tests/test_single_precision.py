@@ -18,9 +18,11 @@ from quell.kernels import functions
 from quell.kernels.dispatch import is_finite
 from quell.kernels.functions import is_single
 from quell.kernels.single import in_single
+from quell.kernels.sums import add_small
 from quell.learners.base import commit
 from quell.learners.kalman.search import ENTRIES, advance_search
 from quell.learners.least_squares import reduce_row
+from quell.learners.noise_gate import grown
 from quell.observers.base import begin, expected_measurement, observe
 from quell.observers.delta import delta_form
 
@@ -97,6 +99,23 @@ def test_carried_sums_lose_nothing() -> None:
         plain += step * np.float32(1e-4) * one
     assert float(z[0]) + float(z[2]) == pytest.approx(16.0 + 1e-4, abs=2e-6)
     assert plain == 16.0
+
+
+def test_slow_averages_reach_their_goal() -> None:
+    """Where an increment is below the last digit: means with their carries, and the sum of weights."""
+    mean = np.array([0.0, 1.0, 0.0, 0.0], np.float32)
+    for _ in range(20_000):
+        add_small(mean, 2, 1, np.float32(1e-3) * (np.float32(1.0 + 1e-5) - mean[1]))
+    assert float(mean[1]) + float(mean[3]) == pytest.approx(1.0 + 1e-5, abs=3e-7)
+    double = np.array([1.0])
+    add_small(double, 1, 0, 0.5)
+    assert double.tolist() == [1.5]
+    weight, usual = np.float32(0.0), 0.0
+    for _ in range(20_000):
+        weight = np.float32(grown(weight, np.float32(1e-3)))
+        usual = grown(usual, 1e-3)
+    assert weight == 1.0
+    assert 0.0 < 1.0 - usual < 1e-8
 
 
 def test_a_pi_controller_integrates_what_is_below_its_last_digit() -> None:

@@ -94,11 +94,19 @@ def resolution(like: float) -> float:
 
 
 @kernel
+def grown(weight: float, forget: float) -> float:
+    """Return the sum of weights of an exponential mean after a sample; it grows from 0 to 1."""
+    more = weight + forget * (1.0 - weight)
+    # Rounding would stop it before, and all means would be too large.
+    return 1.0 if is_single(weight) and more == weight else more
+
+
+@kernel
 def update_gate(gate: NoiseGate, memory: NoiseGateMemory, seen: Vector, y: float, u: float) -> bool:
     """Update the means with a sample; return whether any state moves."""
     rounding, error = resolution(gate.forget) * y, y - seen[0]
     memory.noise[0] += gate.forget * (error * error + rounding * rounding - memory.noise[0])
-    memory.noise[1] += gate.forget * (1.0 - memory.noise[1])
+    memory.noise[1] = grown(memory.noise[1], gate.forget)
     size = memory.variance.size
     order = size - 1
     moves = False

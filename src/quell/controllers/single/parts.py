@@ -15,6 +15,7 @@ from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels.single import in_single
 from quell.learners.adapters.kernels import PythonDesign
 from quell.learners.kalman.kernels import KalmanDesign, KalmanMemory
+from quell.learners.lag import Lag
 from quell.learners.noise_gate import NoiseGate, NoiseGateMemory
 from quell.observers.delta import delta_form
 
@@ -27,6 +28,8 @@ _RATES: dict[type, tuple[str, ...]] = {
     NoiseGate: ("forget",),
 }
 _LEAST_RATE = 2.0**-21
+# What decays to zero needs a unit of the last digit in a sample.
+_LEAST_DECAY = 2.0**-23
 
 
 def single_design(design: Any) -> Any:
@@ -46,6 +49,10 @@ def _in_delta_form(design: Any) -> Any:
         return form
     if isinstance(design, LinearLaw):
         return delta_law(design)
+    if isinstance(design, Lag):
+        # β is rounded first, so that the gain of a stage at rest, (1−β)/(1−β), remains one.
+        pole = float(np.float32(design.pole))
+        return design._replace(pole=pole, rise=1.0 - pole)
     if hasattr(design, "_fields"):
         return type(design)(*map(_in_delta_form, design))
     return design
@@ -67,12 +74,14 @@ def _check(value: Any, name: str) -> None:
     for field, part in zip(getattr(value, "_fields", ()), value, strict=False):
         if isinstance(part, tuple):
             _check(part, f"{name}.{field}" if name else field)
-        elif field in _RATES.get(type(value), ()) and 0.0 < part < _LEAST_RATE:
-            raise ValueError(
-                f"{name}.{field} = {part:.3g} a sample: must be at least {_LEAST_RATE:.3g} in "
-                "single precision, or the average stands still; raise dt or omega_o, or stay in "
-                "double precision"
-            )
+        elif field in _RATES.get(type(value), ()):
+            least = _LEAST_DECAY if field == "decay" else _LEAST_RATE
+            if 0.0 < part < least:
+                raise ValueError(
+                    f"{name}.{field} = {part:.3g} a sample: must be at least {least:.3g} in single "
+                    "precision, or the average stands still; raise dt or omega_o, or stay in "
+                    "double precision"
+                )
 
 
 def _with_carries(design: Any, state: Any) -> Any:

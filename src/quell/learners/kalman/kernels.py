@@ -58,7 +58,7 @@ from quell.learners.kalman.search import advance_search, is_locked, start_search
 from quell.learners.kalman.search_verdict import LEARN_ANEW
 from quell.learners.lag import STARTUP_LAGS, lag_push, reset_lag
 from quell.learners.least_squares import reduce_row
-from quell.learners.noise_gate import resolution
+from quell.learners.noise_gate import grown, resolution
 from quell.types import Matrix, Vector
 
 # Least share of f that counts as unexplained by a linear model; chosen by hand, not tuned further.
@@ -102,7 +102,7 @@ class KalmanAverages(Scalars):
     noise: float  # squares of y − x̂_1
     unexplained: float  # squares of what the model does not explain
     weight: float  # ones: it grows from 0 to 1
-    time: float  # since the start from rest [s]
+    time: float  # since the start from rest [s]; in single precision [samples]
 
 
 class KalmanMemory(NamedTuple):
@@ -146,7 +146,8 @@ def _adapt(
         return
     weight = 1.0 / deviation
     _update_regressor(learner, memory, noise, weight)
-    if averages.time <= STARTUP_LAGS * learner.lag_time:
+    time = averages.time * learner.dt if is_single(learner.dt) else averages.time
+    if time <= STARTUP_LAGS * learner.lag_time:
         return
     result = advance_search(learner.search, memory.search, f_plain, memory.omega)
     # Many orders that are learned anew at once upset the loop: they explain almost anything.
@@ -201,8 +202,8 @@ def _update_averages(
     averages.noise += learner.forget * (error * error + rounding * rounding - averages.noise)
     square = innovation * innovation + doubt * doubt
     averages.unexplained += learner.forget * (square - averages.unexplained)
-    averages.weight += learner.forget * (1.0 - averages.weight)
-    averages.time += learner.dt
+    averages.weight = grown(averages.weight, learner.forget)
+    averages.time += 1.0 if is_single(learner.dt) else learner.dt
     unexplained = averages.unexplained + learner.f_noise * averages.noise
     deviation = sqrt(learner.lag_time * unexplained / averages.weight)
     return averages.noise / averages.weight, deviation
