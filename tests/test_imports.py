@@ -13,7 +13,8 @@ import pytest
 # the file that gathers the public names of folder x and its subfolders. A new folder needs an entry
 # here.
 ROWS = (
-    ("types", "checks", "files", "reading", "parallel", "optional", "executors", "kernels"),
+    ("types", "checks", "files", "reading", "parallel", "optional", "executors", "quantities"),
+    ("kernels",),
     ("lti", "signals", "observers", "plants", "features"),
     (
         "learners",
@@ -35,6 +36,9 @@ ROWS = (
     ("sweeping",),
     ("tuning.constraints", "tuning.structures", "tuning.optimiser", "tuning.simulated"),
     ("tuning.result", "tuning"),
+    # Plants from tables, which twins and rigs are made of.
+    ("setup.docstrings", "setup.schema", "setup.errors", "setup.toml_file", "setup.build"),
+    ("setup.plants",),
     ("realtime.system", "realtime.telemetry", "realtime.devices", "realtime.wire"),
     ("realtime.loop", "realtime.rig", "realtime.__init__"),
     ("export.translate", "export", "setup"),

@@ -21,6 +21,13 @@ def whole_number(kind: Any, tokens: Sequence[Token]) -> int:
 
 Whole = Annotated[int, Parameter(converter=whole_number)]
 WholeOrNone = Annotated[int | None, Parameter(converter=whole_number)]
+Trust = Annotated[
+    bool,
+    Parameter(
+        negative="",
+        help="Run the Python file that a plant names (file.py:name), with all your rights.",
+    ),
+]
 MaxSize = Annotated[
     float,
     Parameter(name="--max-size", help="Limit of what the file that is read may unpack to [MB]."),

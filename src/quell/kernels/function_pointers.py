@@ -26,14 +26,22 @@ class Origin(NamedTuple):
 
     function: Callable[..., Any]
     c_function: str | None  # name of the same function in C, if the user has one
+    # Where its own parameters begin in the array that is passed, and how many there are. With none
+    # no such array is passed.
+    numbers: tuple[int, int] = (0, 0)
 
 
 _origins: dict[int, Origin] = {}
 
 
-def set_origin(address: int, function: Callable[..., Any], c_function: str | None = None) -> None:
+def set_origin(
+    address: int,
+    function: Callable[..., Any],
+    c_function: str | None = None,
+    numbers: tuple[int, int] = (0, 0),
+) -> None:
     """Note what the function at an address was made of, for its translation to C."""
-    _origins[address] = Origin(function, c_function)
+    _origins[address] = Origin(function, c_function, numbers)
 
 
 def origin_of(address: Any) -> Origin | None:

@@ -11,6 +11,7 @@ from quell.plants.dc_motor import DcMotor, dc_motor
 from quell.plants.delay import delayed
 from quell.plants.encoder import encoded
 from quell.plants.fmu.plant import FMU
+from quell.plants.labelled import labelled, signals_of
 from quell.plants.linear import LinearPlant
 from quell.plants.linearise import linearised
 from quell.plants.nonlinear import NonlinearPlant
@@ -19,6 +20,7 @@ from quell.plants.two_mass_spring import two_mass_spring
 
 __all__ = [
     "FMU", "CubicSpringPlant", "DcMotor", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch",
-    "TorsionalPlant", "batch", "dc_motor", "delayed", "encoded", "lagged_two_mass_spring",
-    "linearised", "torsional", "torsional_identified", "two_mass_spring",
+    "TorsionalPlant", "batch", "dc_motor", "delayed", "encoded", "labelled",
+    "lagged_two_mass_spring", "linearised", "signals_of", "torsional",
+    "torsional_identified", "two_mass_spring",
 ]  # fmt: skip

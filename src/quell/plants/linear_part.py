@@ -3,26 +3,55 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
+
+import numpy as np
 
 from quell.lti.models import is_linear_model
 from quell.plants.delay import DelayedPlant
 from quell.plants.encoder import EncodedPlant
 from quell.plants.linearise import linearised
-from quell.plants.nonlinear import NonlinearPlant
+from quell.plants.nonlinear import NonlinearPlant, checked_point
+from quell.plants.nonlinear_kernels import value_or_nan
 
 
 def linear_model(plant: Any) -> Any:
-    """Return the part of a plant that a design can use, for example the one without friction."""
+    """Return the part of a plant that a design can use, for example the one without friction.
+
+    That of a nonlinear plant is the one about its operating point, if it has one and its equation
+    has a derivative there; else the plant is returned as it is.
+    """
+    if isinstance(plant, NonlinearPlant):
+        with suppress(ValueError):
+            return linearised(plant, *operating_point_of(plant))
     return getattr(plant, "linear", plant)
+
+
+def operating_point_of(plant: NonlinearPlant) -> tuple[Any, float]:
+    """Return the operating point (x, u) of a nonlinear plant; zero if that is a state of rest.
+
+    Raises ``ValueError`` if it has none.
+    """
+    if plant.operating_point is not None:
+        return checked_point(plant.operating_point)
+    rest, model = np.zeros(plant.order), plant.sampled(1.0, interpret=True)
+    with np.errstate(all="ignore"):
+        rate = value_or_nan(model.rate, 0.0, rest, 0.0, np.zeros(plant.disturbances))
+    if np.all(np.asarray(rate) == 0.0):
+        return rest, 0.0
+    raise ValueError(
+        f"plant = {plant.name!r} is nonlinear, and zero is no state of rest: give the point at "
+        "which it is linearised, operating_point=(x, u)"
+    )
 
 
 def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any, float]:
     """Return a linear plant and the delay [s] of its input, for ``analyse``.
 
     An encoder is left out: its steps are no gain. A nonlinear plant is linearised at the
-    ``operating_point`` (x, u). Raises ``ValueError`` for a delay that was made for another sample
-    time, and for a nonlinear plant without operating point.
+    ``operating_point`` (x, u), by default its own. Raises ``ValueError`` for a delay that was made
+    for another sample time, and for a nonlinear plant without operating point.
     """
     delay = 0.0
     while isinstance(plant, DelayedPlant | EncodedPlant):
@@ -36,15 +65,10 @@ def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any
             delay += plant.samples * dt
         plant = plant.plant
     if operating_point is not None:
-        try:
-            x, u = operating_point
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"operating_point = {operating_point!r}: must be a state and a control signal, "
-                "(x, u)"
-            ) from None
-        return linearised(plant, x, u), delay
-    if isinstance(plant, NonlinearPlant) or hasattr(plant, "k_cubic"):
+        return linearised(plant, *checked_point(operating_point)), delay
+    if isinstance(plant, NonlinearPlant):
+        return linearised(plant, *operating_point_of(plant)), delay
+    if hasattr(plant, "k_cubic"):
         raise ValueError(
             f"plant = {plant.name!r} is nonlinear: give the point at which it is linearised, "
             "operating_point=(x, u)"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
@@ -15,10 +15,16 @@ from numba.core import types as nb_types
 
 from quell import checks
 from quell.kernels import function_pointers, validation
-from quell.kernels.dispatch import generic
-from quell.kernels.function_pointers import POINTER, call, evaluate
-from quell.plants.base import advance, measure
-from quell.types import DesignWarning, Matrix, Vector
+from quell.kernels.function_pointers import POINTER
+from quell.plants import equations
+from quell.plants.labelled import labelled, signals_of
+from quell.plants.nonlinear_kernels import (
+    CompiledNonlinear,
+    CompiledParametric,
+    PythonNonlinear,
+    value_or_nan,
+)
+from quell.types import DesignWarning, Matrix
 
 # Largest h |λ| of a sub-step h, λ an eigenvalue of the linearised plant. The error of a sub-step is
 # then below (h λ)^5 / 120 = 0.8 % of that mode; Runge-Kutta of order 4 is stable up to 2.8 (Hairer
@@ -34,111 +40,21 @@ _RATE_SIGNATURE = nb_types.void(nb_types.float64, POINTER, nb_types.float64, POI
 _OUTPUT_SIGNATURE = nb_types.float64(POINTER)
 
 
-class CompiledNonlinear(NamedTuple):
-    """A nonlinear plant with compiled functions.
-
-    They are given by address, so one compiled driver serves all of them.
-    """
-
-    rate: int
-    output: int
-    step: float  # length of a sub-step [s]
-    substeps: int
-
-
-class PythonNonlinear(NamedTuple):
-    """A nonlinear plant whose functions only Python can run; fields as ``CompiledNonlinear``."""
-
-    rate: Callable[..., Any]
-    output: Callable[..., Any]
-    step: float
-    substeps: int
-
-
-@generic
-def derivatives(plant: Any, t: float, x: Vector, u: float, w: Vector, dx: Vector) -> None:
-    """Write the derivatives of the state into ``dx`` (n,)."""
-    raise TypeError
-
-
-@advance.register(CompiledNonlinear)
-@advance.register(PythonNonlinear)
-def _runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
-    """Take ``substeps`` classical Runge-Kutta steps.
-
-    Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, table II.1.2.
-    """
-    n = x.size
-    k1, k2, k3 = scratch[:n], scratch[n : 2 * n], scratch[2 * n : 3 * n]
-    k4, inner = scratch[3 * n : 4 * n], scratch[4 * n : 5 * n]
-    h = plant.step
-    for i in range(plant.substeps):
-        now = t + i * h
-        derivatives(plant, now, x, u, w, k1)
-        for j in range(n):
-            inner[j] = x[j] + 0.5 * h * k1[j]
-        derivatives(plant, now + 0.5 * h, inner, u, w, k2)
-        for j in range(n):
-            inner[j] = x[j] + 0.5 * h * k2[j]
-        derivatives(plant, now + 0.5 * h, inner, u, w, k3)
-        for j in range(n):
-            inner[j] = x[j] + h * k3[j]
-        derivatives(plant, now + h, inner, u, w, k4)
-        for j in range(n):
-            x[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
-
-
-@measure.register(CompiledNonlinear)
-def _measure(plant: CompiledNonlinear, x: Vector) -> float:
-    return evaluate(plant.output, x)
-
-
-@derivatives.register(CompiledNonlinear)
-def _derivatives(
-    plant: CompiledNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
-) -> None:
-    call(plant.rate, t, x, u, w, dx)
-
-
-@measure.register(PythonNonlinear)
-def _measure_python(plant: PythonNonlinear, x: Vector) -> float:
-    return float(_value_or_nan(plant.output, x))
-
-
-@derivatives.register(PythonNonlinear)
-def _derivatives_python(
-    plant: PythonNonlinear, t: float, x: Vector, u: float, w: Vector, dx: Vector
-) -> None:
-    dx[:] = _value_or_nan(plant.rate, t, x, u, w)
-
-
-def _value_or_nan(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the function's value, or NaN as compiled code does, for example for log(-1.0).
-
-    A run with NaN ends as diverged.
-    """
-    try:
-        return function(*arguments)
-    except Exception as error:
-        if isinstance(error, ArithmeticError) or "math domain" in str(error):
-            return np.nan
-        raise
-
-
 @dataclass(frozen=True, eq=False)
 class NonlinearPlant:
-    """A plant ``x' = f(t, x, u, w)``, solved by Runge-Kutta of order 4 with a fixed sub-step.
+    """A plant ``x' = f(t, x, u, w, …)``, solved by Runge-Kutta of order 4 with a fixed sub-step.
 
     Parameters
     ----------
     f
         ``f(t, x, u, w)`` returns the n derivatives as a tuple, list or array; t [s], x (n,), u a
         number, w (m,). Numba compiles it if it can; else it runs as Python, about a hundred times
-        slower, and a warning says why.
+        slower, and a warning says why. Further arguments are parameters.
     order
         number of states n.
     output
         the output y: a function ``h(x)``, or the row C of ``y = C x``; the first state by default.
+        It may take parameters, too.
     disturbances
         number m of disturbance inputs.
     substeps
@@ -148,6 +64,12 @@ class NonlinearPlant:
         the run and reports ``Status.POORLY_INTEGRATED`` if there are too few.
     name
         for tables and plots.
+    parameters
+        numbers by name that f and output take as further arguments; ``with_parameters`` changes
+        them, and compiles nothing.
+    operating_point
+        state and control signal (x, u) about which designs and ``analyse`` take the plant as
+        linear. By default x and u are zero if that is a state of rest.
 
     Raises
     ------
@@ -159,6 +81,14 @@ class NonlinearPlant:
     --------
     >>> import math
     >>> pendulum = NonlinearPlant(lambda t, x, u, w: (x[1], u - 9.81 * math.sin(x[0])), order=2)
+
+    With parameters:
+
+    >>> def swing(t, x, u, w, m, length):
+    ...     return x[1], u / (m * length**2) - 9.81 / length * math.sin(x[0])
+    >>> pendulum = NonlinearPlant(swing, order=2, parameters={"m": 1.0, "length": 0.5})
+    >>> pendulum.with_parameters(m=2.0).parameters
+    {'m': 2.0, 'length': 0.5}
     """
 
     f: Callable[..., Any]
@@ -167,6 +97,8 @@ class NonlinearPlant:
     disturbances: int = 1
     substeps: int | None = None
     name: str = "nonlinear plant"
+    parameters: Mapping[str, float] | None = None
+    operating_point: Any = None
 
     def __post_init__(self) -> None:
         n = checks.whole("order", self.order, 1)
@@ -174,9 +106,18 @@ class NonlinearPlant:
         checks.optional(checks.whole, "substeps", self.substeps, 1)
         if not callable(self.f):
             raise ValueError(f"f = {self.f!r}: must be a function f(t, x, u, w)")
-        rule = "f takes (t, x, u, w), output takes (x), with arrays x and w of the plant's sizes"
+        rule = (
+            "f takes (t, x, u, w) and the names in parameters, output takes (x), with arrays x and "
+            "w of the plant's sizes"
+        )
+        if self.parameters is not None:
+            own, more = self._numbers
+            object.__setattr__(self, "parameters", {**own, **more})
+        if self.operating_point is not None:
+            x, _ = checked_point(self.operating_point)
+            checks.vector("operating_point[0]", x, n)
         returned = validation.attempt_kernel(
-            "f(0.0, zeros, 0.0, zeros)", rule, self.f, 0.0, np.zeros(n), 0.0, np.zeros(m)
+            "f(0.0, zeros, 0.0, zeros)", rule, self._rate, 0.0, np.zeros(n), 0.0, np.zeros(m)
         )
         if returned is not validation.UNKNOWN and np.shape(returned) != (n,):
             raise ValueError(
@@ -184,8 +125,33 @@ class NonlinearPlant:
             )
         if not callable(self.output):
             checks.vector("output", self._row, n)
-        elif np.shape(validation.attempt_kernel("output(zeros)", rule, self.output, np.zeros(n))):
+        elif np.shape(
+            validation.attempt_kernel("output(zeros)", rule, self._measured, np.zeros(n))
+        ):
             raise ValueError("output(x) must return one number")
+
+    def with_parameters(self, **values: float) -> NonlinearPlant:
+        """Return the plant with other numbers for some parameters; nothing is compiled again."""
+        made = replace(self, parameters={**(self.parameters or {}), **values})
+        signals = signals_of(self)
+        return labelled(made, *signals) if signals.known else made
+
+    @property
+    def _numbers(self) -> tuple[dict[str, float], dict[str, float]]:
+        """The numbers that f and the output take, in their order."""
+        if self.parameters is None:
+            return {}, {}
+        return equations.checked_parameters(self.parameters, self.f, self.output)
+
+    @cached_property
+    def _rate(self) -> Callable[..., Any]:
+        """The function f(t, x, u, w), with the parameters in it."""
+        return equations.bound(self.f, self._numbers[0])
+
+    @cached_property
+    def _measured(self) -> Callable[..., Any]:
+        """The function h(x), with the parameters in it."""
+        return equations.bound(self._output_function, self._numbers[1])
 
     @property
     def _row(self) -> Any:
@@ -195,15 +161,7 @@ class NonlinearPlant:
     def _output_function(self) -> Callable[..., Any]:
         if callable(self.output):
             return self.output
-        row = tuple(np.asarray(self._row, dtype=float).tolist())
-
-        def linear(x: Vector) -> float:
-            y = 0.0
-            for i in range(len(row)):
-                y += row[i] * x[i]
-            return y
-
-        return linear
+        return equations.row_output(tuple(np.asarray(self._row, dtype=float).tolist()))
 
     @cached_property
     def _machine_code(self) -> tuple[Any, Any] | None:
@@ -220,6 +178,10 @@ class NonlinearPlant:
             return h(numba.carray(px, (n,)))
 
         try:
+            if self.parameters is not None:
+                own, more = self._numbers
+                both, counts = (self.f, self._output_function), (len(own), len(more))
+                return equations.machine_code(*both, (n, m), counts)
             f = function_pointers.jit_user_function(self.f)
             h = function_pointers.jit_user_function(self._output_function)
             compile_cfunc = function_pointers.compile_cfunc
@@ -237,16 +199,21 @@ class NonlinearPlant:
         """Whether Numba could compile the functions."""
         return self._machine_code is not None
 
-    def sampled(self, dt: float, interpret: bool = False) -> CompiledNonlinear | PythonNonlinear:
+    def sampled(self, dt: float, interpret: bool = False) -> Any:
         """Return the parameters for a sample time ``dt`` [s]; see ``Plant.sampled``."""
         checks.positive("dt", dt, "s")
         substeps = self._chosen_substeps(dt) if self.substeps is None else self.substeps
         step = dt / substeps
         if interpret or self._machine_code is None:
-            return PythonNonlinear(self.f, self._output_function, step, substeps)
+            return PythonNonlinear(self._rate, self._measured, step, substeps)
         rate, output = self._machine_code
-        function_pointers.set_origin(rate.address, self.f)
-        function_pointers.set_origin(output.address, self._output_function)
+        own, more = (len(each) for each in self._numbers)
+        set_origin = function_pointers.set_origin
+        set_origin(rate.address, self.f, numbers=(0, own))
+        set_origin(output.address, self._output_function, numbers=(own, more))
+        if self.parameters is not None:
+            numbers = equations.as_array(*self._numbers)
+            return CompiledParametric(rate.address, output.address, step, substeps, numbers)
         return CompiledNonlinear(rate.address, output.address, step, substeps)
 
     def _chosen_substeps(self, dt: float) -> int:
@@ -278,11 +245,17 @@ class NonlinearPlant:
         slopes = np.full((n, n), np.nan)
         with np.errstate(all="ignore"):
             for j, shift in enumerate(by * np.eye(n)):
-                ends = [_value_or_nan(self.f, 0.0, x, 0.0, w) for x in (shift, -shift)]
+                ends = [value_or_nan(self._rate, 0.0, x, 0.0, w) for x in (shift, -shift)]
                 slopes[:, j] = (np.asarray(ends[0]) - np.asarray(ends[1])) / (2.0 * by)
         return slopes
 
 
-def refined(model: Any, factor: int) -> Any:
-    """Return a sampled nonlinear plant with ``factor`` times as many sub-steps."""
-    return model._replace(step=model.step / factor, substeps=model.substeps * factor)
+def checked_point(given: Any) -> tuple[Any, float]:
+    """Return the state and the control signal of an operating point."""
+    try:
+        x, u = given
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"operating_point = {given!r}: must be a state and a control signal, (x, u)"
+        ) from None
+    return x, u

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from quell import checks
 from quell.plants.base import Plant
 from quell.plants.cubic_spring import lagged_two_mass_spring
 from quell.plants.dc_motor import dc_motor
 from quell.plants.delay import delayed
 from quell.plants.encoder import encoded
 from quell.plants.fmu.plant import FMU
+from quell.plants.identified_file import identified
 from quell.plants.linear import LinearPlant
+from quell.plants.python_file import python_plant
 from quell.plants.torsional import torsional, torsional_identified
 from quell.plants.two_mass_spring import two_mass_spring
 
@@ -45,7 +46,7 @@ TESTBEDS: Mapping[str, Callable[[], Plant]] = {
     "torsional-identified": torsional_identified,
     "two-mass": two_mass_spring,
 }
-"""Plants that a rig or a twin can be, by the name in its URL; made without arguments."""
+"""Plants of testbeds, which are made without arguments."""
 
 PLANTS: Mapping[str, Callable[..., Plant]] = {
     **TESTBEDS,
@@ -55,10 +56,7 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
     "delayed": delayed,
     "encoded": encoded,
     "fmu": FMU,
+    "identified": identified,
+    "python": python_plant,
 }
 """Plants that a setup file can have, by their ``kind``."""
-
-
-def named_plant(name: str, argument: str = "plant") -> Plant:
-    """Return the plant of ``TESTBEDS`` with this name; errors call the name ``argument``."""
-    return TESTBEDS[checks.one_of(argument, name, tuple(TESTBEDS))]()

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.quantities import UNKNOWN, Signals
 from quell.reading import MAX_SIZE
 from quell.records.measures import BatchMetrics
 from quell.records.metrics import SETTLING_BAND
@@ -57,6 +58,7 @@ class BatchTrajectory(Record):
     parameters: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
     final_states: tuple[Any, ...] = ()
+    signals: Signals = UNKNOWN  #: names and units of y, u and disturbances
 
     @property
     def diverged(self) -> NDArray[np.bool_]:
@@ -94,6 +96,7 @@ class BatchTrajectory(Record):
             limit=float(self.limit[i]),
             plant=self.plant,
             features=self.features,
+            signals=self.signals,
             final_state=self.final_states[i] if self.final_states else None,
         )
 

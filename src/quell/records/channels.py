@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from quell.quantities import UNKNOWN, Signals
 from quell.types import Channels
 
 # Channels that are vectors even if their width is one.
@@ -37,9 +38,24 @@ _DESCRIPTIONS = {
 }
 
 
-def describe(name: str) -> tuple[str, str]:
-    """Return a channel's description and unit."""
-    return _DESCRIPTIONS.get(name, (name, "1"))
+# The words of descriptions that a signal's name stands for.
+_NAMED = {"y": "output", "y_measured": "output"} | dict.fromkeys(("u", "u_wished"), "control signal")
+    "y": "output",
+    "y_measured": "output",
+    "u": "control signal",
+    "u_wished": "control signal",
+}
+
+
+def describe(name: str, signals: Signals = UNKNOWN) -> tuple[str, str]:
+    """Return a channel's description and unit, those of the plant's ``signals`` if known."""
+    text, unit = _DESCRIPTIONS.get(name, (name, "1"))
+    if name in _NAMED:
+        known = signals.y if name.startswith("y") else signals.u
+        text = text.replace(_NAMED[name], known.name or _NAMED[name])
+    elif name == "w" and any(each.name for each in signals.w):
+        text = f"{text}: {', '.join(map(str, signals.w))}"
+    return text, signals.unit(unit)
 
 
 def is_vector(name: str, width: int) -> bool:

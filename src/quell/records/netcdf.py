@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.quantities import UNKNOWN, Signals, signals_from
 from quell.reading import TooLargeError, bytes_of, check_regular, check_size
 from quell.records import netcdf_reader
 from quell.records.sample_times import check_times
@@ -138,6 +139,14 @@ def _received(answer: IO[bytes], most: int) -> Stored:
     return Stored(told["attributes"], dims, values, parameters)
 
 
+def _signals(text: Any) -> Signals:
+    """Return the names and units that a file tells; none for a text that is not theirs."""
+    try:
+        return signals_from(json.loads(text)) if isinstance(text, str) else UNKNOWN
+    except (ValueError, RecursionError):
+        return UNKNOWN
+
+
 def _record_fields(stored: Stored, axes: tuple[str, ...], besides: set[str]) -> dict[str, Any]:
     """Return the fields of ``Record``; all variables but these ``besides`` are channels."""
     named = {name for over in stored.dims.values() for name in over}
@@ -166,4 +175,5 @@ def _record_fields(stored: Stored, axes: tuple[str, ...], besides: set[str]) -> 
         "every": every,
         "plant": str(stored.attributes["plant"]),
         "features": tuple(map(str, stored.values.get("theta_index", ()))),
+        "signals": _signals(stored.attributes.get("signals")),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from quell import checks
 from quell.files import check_writable, written_atomically
+from quell.quantities import Signals
 from quell.records.channels import columns_of, describe, is_vector, readable_names
 from quell.records.sample_times import first_sample_at
 from quell.types import Channels, Matrix, Vector
@@ -26,6 +28,7 @@ class Record:
     dt: float
     every: int
     features: tuple[str, ...]
+    signals: Signals
 
     @property
     def t(self) -> Vector:
@@ -72,7 +75,7 @@ class Record:
         coordinates: dict[str, Any] = {"time": ("time", self.t, {"units": "s"})}
         for name in self.names:
             values = np.ascontiguousarray(self[name])
-            about, unit = describe(name)
+            about, unit = describe(name, self.signals)
             of_channel = axes
             if values.ndim > len(axes):
                 axis = f"{name}_index"
@@ -81,6 +84,8 @@ class Record:
                 of_channel = (*axes, axis)
             variables[name] = (of_channel, values, {"long_name": about, "units": unit})
         attributes = {"dt": self.dt, "every": self.every, **attributes}
+        if self.signals.known:
+            attributes["signals"] = json.dumps(self.signals.texts())
         return xarray.Dataset(variables, coordinates, attrs=attributes)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quell.quantities import UNKNOWN, Signals
 from quell.reading import MAX_SIZE
 from quell.records.measures import MEASURES, Metrics, Window, measured
 from quell.records.metrics import SETTLING_BAND
@@ -47,6 +48,7 @@ class Trajectory(Record):
     plant: str = ""  #: name of the plant
     features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
     final_state: Any = None
+    signals: Signals = UNKNOWN  #: names and units of y, u and disturbances
 
     @property
     def diverged(self) -> bool:

@@ -3,9 +3,11 @@
 May import every folder below; only ``cli`` imports this one.
 """
 
-from quell.setup.description import Description, read
+from quell.setup.description import Description
 from quell.setup.errors import SetupError
 from quell.setup.load import EXAMPLES, Setup, load, made
+from quell.setup.plants import plant_given, plant_of
+from quell.setup.toml_file import read
 from quell.setup.vary import controllers_of, varied
 
 __all__ = [
@@ -16,6 +18,8 @@ __all__ = [
     "controllers_of",
     "load",
     "made",
+    "plant_given",
+    "plant_of",
     "read",
     "varied",
 ]

@@ -9,6 +9,7 @@ from operator import add
 from typing import Any
 
 from quell.features.base import Features
+from quell.plants.labelled import labelled
 from quell.plants.linear_part import linear_model
 from quell.setup.errors import SetupError, with_path
 from quell.setup.schema import CallTable
@@ -25,10 +26,14 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
 
 
 class Builder:
-    """A builder of the tables of one file, whose ``name`` stands at the beginning of its errors."""
+    """A builder of the tables of one file, whose ``name`` stands at the beginning of its errors.
 
-    def __init__(self, name: str) -> None:
+    With ``trust`` it runs the Python files that plants are in.
+    """
+
+    def __init__(self, name: str, trust: bool = False) -> None:
         self.name = name
+        self.trust = trust
 
     def build(self, table: CallTable, path: str, **context: Any) -> Any:
         """Return the object that a table describes; ``path`` is its place in the file.
@@ -37,6 +42,7 @@ class Builder:
         function takes, and that the table does not have itself, become arguments.
         """
         takes = parameters_of(table.function)
+        context["trust"] = self.trust
         arguments = {
             key: value for key, value in context.items() if key in takes and value is not None
         }
@@ -47,7 +53,11 @@ class Builder:
             needed = parameter.default is parameter.empty
             if needed and key not in arguments and parameter.kind is not parameter.VAR_KEYWORD:
                 raise SetupError([f"{self.name}: {path}: {key} is missing; give a table [{key}]"])
-        return self.attempt(path, [*arguments], partial(table.function, **arguments))
+        made = self.attempt(path, [*arguments], partial(table.function, **arguments))
+        signals = getattr(table, "signals", None) if "signals" in table.beside else None
+        if signals is None:
+            return made
+        return self.attempt(f"{path}.signals", "yuw", partial(labelled, made, **signals.written()))
 
     def attempt(
         self, path: str, keys: Sequence[str], action: Callable[..., Any], *arguments: Any

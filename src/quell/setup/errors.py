@@ -67,6 +67,8 @@ def from_validation(name: str, error: ValidationError, data: Any) -> SetupError:
 def _hint(key: str, known: Sequence[str]) -> str:
     if key in CONTEXT:
         top = f"{key} belongs at the top of the file"
+        if key == "trust":
+            return "a file can't ask for trust; give --trust"
         return top if key == "dt" else f"[{key}] is a table of its own"
     return nearest(key, known)
 

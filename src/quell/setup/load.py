@@ -14,12 +14,14 @@ from quell.controllers.base import Controller
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.files import nonfinite_to_none
 from quell.plants.base import Plant
+from quell.plants.labelled import signals_of
 from quell.plants.linear_part import linear_model
 from quell.records.metrics import SETTLING_BAND
 from quell.setup.build import Builder, parameters_of
-from quell.setup.description import Description, describe, read
+from quell.setup.description import Description, describe
 from quell.setup.errors import SetupError
 from quell.setup.schema import CallTable, Table
+from quell.setup.toml_file import read
 from quell.simulation.scenario import Scenario
 
 Known: TypeAlias = dict[str, tuple[tuple[Any, ...], Any]]
@@ -46,6 +48,7 @@ class Setup:
     windows: tuple[dict[str, Any], ...]  #: arguments of ``Trajectory.metrics`` for each window
     description: Description  #: the file's own tables
     tune: dict[str, Any] | None = None  #: arguments of ``quell.tune``
+    trust: bool = False  #: whether Python files that it names were run
 
     def tables(self) -> dict[str, Any]:
         """Return the file's tables and keys as dictionaries, which ``made`` accepts."""
@@ -63,10 +66,11 @@ class Setup:
         return getattr(self, table)
 
 
-def load(path: str | os.PathLike[str]) -> Setup:
+def load(path: str | os.PathLike[str], trust: bool = False) -> Setup:
     r"""Read a TOML file and build the objects that it describes.
 
-    A ``SetupError`` has a line for each error: file, path of the key, value and rule, or the
+    A plant of the kind ``python`` runs a Python file, which is refused without ``trust``. A
+    ``SetupError`` has a line for each error: file, path of the key, value and rule, or the
     nearest known name.
 
     Examples
@@ -83,10 +87,10 @@ def load(path: str | os.PathLike[str]) -> Setup:
         ...
     quell.setup.errors.SetupError: rig.toml: observer.omega_0: unknown; did you mean omega_o?
     """
-    return made(*read(path))
+    return made(*read(path), trust)
 
 
-def made(name: str, data: Mapping[str, Any]) -> Setup:
+def made(name: str, data: Mapping[str, Any], trust: bool = False) -> Setup:
     """Build the objects that ``data`` describes: the content of a TOML file called ``name``.
 
     Raises
@@ -94,15 +98,17 @@ def made(name: str, data: Mapping[str, Any]) -> Setup:
     SetupError
         as ``load``.
     """
-    return assembled(name, describe(name, data))
+    return assembled(name, describe(name, data), trust=trust)
 
 
-def assembled(name: str, tables: Description, known: Known | None = None) -> Setup:
+def assembled(
+    name: str, tables: Description, known: Known | None = None, trust: bool = False
+) -> Setup:
     """Build the objects of the tables of a file.
 
     ``known`` has inputs and objects of an earlier call: what is the same is not built again.
     """
-    builder = Builder(name)
+    builder = Builder(name, trust)
     made_once = partial(_made_once, {} if known is None else known)
     dt = builder.attempt("", (), checks.positive, "dt", tables.dt, "s")
 
@@ -125,6 +131,8 @@ def assembled(name: str, tables: Description, known: Known | None = None) -> Set
         raise SetupError([f"{name}: {key}: {rule}" for key in unused])
     controller = build("controller", plant=model, **parts)
     prefilter, scenario, rig = build("prefilter"), build("scenario"), build("rig")
+    if rig is not None and plant is not None and signals_of(plant).known:
+        rig = {"signals": signals_of(plant), **rig}
     sweep = build("sweep")
     if prefilter is not None:
         join = partial(builder.attempt, "prefilter", (), Prefiltered, controller, prefilter)
@@ -139,7 +147,8 @@ def assembled(name: str, tables: Description, known: Known | None = None) -> Set
         builder.attempt(f"metrics[{i}]", [*window], partial(_check_window, **window))
     title = tables.title or name.removesuffix(".toml").replace("_", " ")
     tune = build("tune")
-    return Setup(name, title, controller, plant, scenario, rig, sweep, windows, tables, tune)
+    built = controller, plant, scenario, rig, sweep, windows
+    return Setup(name, title, *built, tables, tune, trust)
 
 
 def _check_ranges(name: str, plant: CallTable | None) -> None:
@@ -149,7 +158,7 @@ def _check_ranges(name: str, plant: CallTable | None) -> None:
         for step in path.split("."):
             key = step.partition("[")[0]
             known = [*type(table).model_fields] if isinstance(table, Table) else []
-            known = [each for each in known if each not in ("kind", "uncertain")]
+            known = [each for each in known if each not in ("kind", "uncertain", "signals")]
             if key not in known:
                 where = f"{name}: plant.uncertain: plant.{path}"
                 raise SetupError([f"{where}: unknown; {checks.nearest(key, known)}"])

@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from pydantic import Field
-
 from quell import features, guard, learners, signals
 from quell.controllers import (
     ADRC,
@@ -21,10 +19,11 @@ from quell.controllers import (
 )
 from quell.controllers.baselines import LQG, PID, ZV, ZVD, NotchPID, ResonanceRatio, Shaper, notch
 from quell.observers import ESO
-from quell.plants import registry as plants
+from quell.quantities import Signals
 from quell.realtime.loop.run import run_rig
 from quell.realtime.loop.safety import Safety as RigSafety
 from quell.records.trajectory import Trajectory
+from quell.setup.plants import PLANTS, Plant
 from quell.setup.schema import CallTable, call_table, list_of, one_of
 from quell.setup.sweep_table import sweep_table
 from quell.simulation.scenario import Scenario as SimulationScenario
@@ -39,7 +38,7 @@ def rig(device: str, live: int | None = None, **options: Any) -> dict[str, Any]:
     ----------
     device
         URL of the device: ``udp://127.0.0.1:5005``, ``serial:///dev/ttyACM0``, ``ni://``,
-        ``twin:torsional``, …
+        ``twin:torsional``, ``twin:model.json``, … or ``twin:`` for the plant of this file.
     live
         port at which Foxglove and PlotJuggler can watch, 8765 for instance; none by default.
     telemetry
@@ -117,21 +116,16 @@ def _switchable(cls: type[signals.Signal]) -> Callable[..., signals.Signal]:
     return make
 
 
-# A plant may contain a plant, and a signal a signal: their types are names until all tables exist.
-_RANGES = Field(None, description="ranges [low, high] of its keys, for `quell tune` and sweeps.")
-_UNCERTAIN = {"uncertain": (dict[str, tuple[float, float]] | None, _RANGES)}
-_OF_AN_FMU = {"path": str, "start": dict[str, float | int | bool | str] | None}
-PLANTS = _call_tables(plants.PLANTS, {"plant": "Plant", **_OF_AN_FMU}, beside=_UNCERTAIN)
 _SWITCHING = {
     "until": "time at which `then` takes over [s].",
     "then": "signal or number from `until` on.",
 }
 _SWITCHABLE = {kind: _switchable(cls) for kind, cls in signals.KINDS.items()}
 SIGNALS = _call_tables(_SWITCHABLE, {"then": "Signal | None", "cycle": "Signal"}, _SWITCHING)
-Plant: Any = one_of(PLANTS)
+# A signal may contain a signal: its type is a name until all tables exist.
 Signal: Any = one_of(SIGNALS, number=True, many=one_of(SIGNALS, number=True))
-for _model in (*PLANTS.values(), *SIGNALS.values()):
-    _model.model_rebuild(_types_namespace={"Plant": Plant, "Signal": Signal})
+for _model in SIGNALS.values():
+    _model.model_rebuild(_types_namespace={"Signal": Signal})
 
 # A controller's or observer's own model of the plant.
 _MODEL = {
@@ -180,8 +174,10 @@ Guard = call_table("guard", guard.Guard, only=True, types=_CERTIFIED)
 _SIGNALS = {"reference": Signal, "noise": Signal, "disturbances": list_of(Signal)}
 Scenario = call_table("scenario", SimulationScenario, only=True, types=_SIGNALS)
 Metrics = call_table("metrics", Trajectory.metrics, only=True)
+_Y_AND_U = {"y": str, "u": str}
 Safety = call_table("safety", RigSafety, only=True)
-_RIG = {"safety": Safety | None, "telemetry": list_of(str)}
+Labels = call_table("signals", Signals.of, only=True, types={"w": list_of(str)} | _Y_AND_U)
+_RIG = {"safety": Safety | None, "telemetry": list_of(str), "signals": Labels | None}
 _BOUNDS = tuple(inspect.signature(Constraints).parameters)
 _NOT_IN_FILES = (
     *("constraints", "operating_point", "uncertain", "setup", "progress"),

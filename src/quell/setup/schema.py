@@ -25,8 +25,8 @@ from pydantic_core import PydanticCustomError
 
 from quell.setup.docstrings import is_reference, parameter_descriptions, summary
 
-CONTEXT = ("dt", "observer", "learner", "guard")
-"""Parameters that are no keys of a table, because other tables of the file give them."""
+CONTEXT = ("dt", "observer", "learner", "guard", "trust")
+"""Parameters that are no keys of a table: other tables of the file give them, or the user."""
 
 _VARIABLE = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 

@@ -12,10 +12,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from quell import checks
 from quell.files import nonfinite_to_none
-from quell.setup.description import Description, describe, immutable
+from quell.setup.description import Description, describe
 from quell.setup.errors import SetupError
 from quell.setup.load import Setup, assembled
+from quell.setup.plants import contents_of
 from quell.setup.sweep_table import CASE
+from quell.setup.toml_file import immutable
 from quell.setup.vary import changed, steps_of
 from quell.sweeping.measures import Measure
 from quell.sweeping.store import hash_of
@@ -37,7 +39,7 @@ def sweep_of(setup: Setup) -> dict[str, Any]:
     for needed in ("plant", "scenario", "sweep"):
         setup.needed(needed)
     table: dict[str, Any] = dict(setup.sweep or {})
-    build = Variation(setup.file, setup.tables(), table.pop("cases"))
+    build = Variation(setup.file, setup.tables(), table.pop("cases"), setup.trust)
     for name in build.cases:
         _attempt(build, f"sweep.cases.{name}", {CASE: name})
     for path, given in table["parameters"].items():
@@ -127,22 +129,28 @@ class Variation:
     """
 
     def __init__(
-        self, name: str, data: Mapping[str, Any], cases: Mapping[str, Mapping[str, Any]]
+        self,
+        name: str,
+        data: Mapping[str, Any],
+        cases: Mapping[str, Mapping[str, Any]],
+        trust: bool = False,
     ) -> None:
-        self.name, self.cases = name, cases
+        self.name, self.cases, self.trust = name, cases, trust
         self.data = {key: value for key, value in data.items() if key not in _NOT_USED}
 
     def __getstate__(self) -> tuple[Any, ...]:
-        return self.name, self.data, self.cases
+        return self.name, self.data, self.cases, self.trust
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self.name, self.data, self.cases = state
+        self.name, self.data, self.cases, self.trust = state
 
     @property
     def identity(self) -> Any:
         """Name and contents of this function, for the folder of a sweep."""
         told = nonfinite_to_none([self.data, self.cases])
-        return {"setup": told[0], "cases": told[1], "hash": hash_of([self.data, self.cases])}
+        found = {"setup": told[0], "cases": told[1], "hash": hash_of([self.data, self.cases])}
+        files = {name: digest for part in told for name, digest in contents_of(part)}
+        return {**found, "files": files} if files else found
 
     def __call__(self, **values: Any) -> Setup:
         """Return the setup; values are by path, and ``case`` is the name of a case."""
@@ -150,7 +158,7 @@ class Variation:
         changes = {**({} if case is None else self.cases[case]), **values}
         data = changed(self.name, self.data, changes)
         tables = self._described(data, {str(steps_of(self.name, path)[0]) for path in changes})
-        return assembled(self.name, tables, self._known)
+        return assembled(self.name, tables, self._known, self.trust)
 
     def _described(self, data: dict[str, Any], keys: set[str]) -> Description:
         """Return the tables of ``data``, of which only some keys were changed."""

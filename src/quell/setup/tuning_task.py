@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from quell.plants.linear_part import linear_model
-from quell.setup.description import read
 from quell.setup.errors import SetupError
 from quell.setup.load import Setup, made
+from quell.setup.toml_file import read
 from quell.setup.vary import changed
 
 # What a tuning replaces. A law without effect stands in for the controller.
@@ -27,7 +27,7 @@ class TuningTask(NamedTuple):
 
 
 def tuning_task(
-    path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None
+    path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None, trust: bool = False
 ) -> TuningTask:
     """Read a setup file for ``quell.tune``; ``changes`` are values of ``[tune]`` by name.
 
@@ -47,7 +47,7 @@ def tuning_task(
     table = data.get("tune", {})
     if isinstance(table, Mapping) and changes:
         kept["tune"] = {**table, **changes}
-    setup = made(name, kept)
+    setup = made(name, kept, trust)
     plant, ranges = setup.needed("plant"), _ranges(setup)
     options = dict(setup.tune or {})
     if isinstance(given, Mapping):
@@ -60,10 +60,10 @@ def tuning_task(
     if not ranges:
         return TuningTask(part(plant), setup.controller.dt, options, setup)
     for key in ranges:
-        _with(setup.file, kept, {key: ranges[key][0]})  # an unknown key is an error now
+        _with(setup.file, kept, {key: ranges[key][0]}, trust)  # an unknown key is an error now
 
     def make(**values: float) -> Any:
-        return part(_with(name, kept, values).plant)
+        return part(_with(name, kept, values, trust).plant)
 
     return TuningTask(make, setup.controller.dt, {**options, "uncertain": ranges}, setup)
 
@@ -72,9 +72,9 @@ def _whole(plant: Any) -> Any:
     return plant
 
 
-def _with(name: str, data: Mapping[str, Any], values: Mapping[str, float]) -> Setup:
+def _with(name: str, data: Mapping[str, Any], values: Mapping[str, float], trust: bool) -> Setup:
     changes = {f"plant.{key}": value for key, value in values.items()}
-    return made(name, changed(name, data, changes))
+    return made(name, changed(name, data, changes), trust)
 
 
 def _ranges(setup: Setup) -> dict[str, tuple[float, float]]:

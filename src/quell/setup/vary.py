@@ -43,7 +43,7 @@ def varied(setup: Setup, changes: Mapping[str, Any]) -> Setup:
     """
     if not isinstance(setup, Setup):
         raise ValueError(f"setup = {setup!r:.80}: must be a Setup, as quell.setup.load returns it")
-    return made(setup.file, changed(setup.file, setup.tables(), changes))
+    return made(setup.file, changed(setup.file, setup.tables(), changes), setup.trust)
 
 
 def controllers_of(setup: Setup) -> Callable[[Mapping[str, float]], Controller]:
@@ -64,11 +64,13 @@ def controllers_of(setup: Setup) -> Callable[[Mapping[str, float]], Controller]:
     >>> build({"observer.omega_o": 9.0, "learner.prior": 1.0}).learner.prior
     1.0
     """
-    return partial(_controller, setup.file, setup.tables())
+    return partial(_controller, setup.file, setup.tables(), trust=setup.trust)
 
 
-def _controller(name: str, tables: Mapping[str, Any], values: Mapping[str, float]) -> Controller:
-    return made(name, changed(name, tables, values)).controller
+def _controller(
+    name: str, tables: Mapping[str, Any], values: Mapping[str, float], trust: bool
+) -> Controller:
+    return made(name, changed(name, tables, values), trust).controller
 
 
 def changed(name: str, data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from quell.kernels.sized import layout_of
 from quell.parallel import in_parallel, one_blas_thread, part_of
 from quell.plants.base import Plant, check_plant
 from quell.plants.batch import PlantBatch
+from quell.plants.labelled import signals_of
 from quell.records.batch_trajectory import BatchTrajectory
 from quell.records.channels import columns_of, readable_names
 from quell.simulation.divergence import judge_integration
@@ -92,6 +93,7 @@ def simulate_batch(
         plant=name,
         parameters=plants.parameters if isinstance(plants, PlantBatch) else {},
         features=controllers[0].features,
+        signals=signals_of(plants[0]),
         final_states=tuple(loop.state for loop in loops.values()) if exact else (),
     )
 

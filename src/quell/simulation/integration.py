@@ -16,7 +16,12 @@ from quell.kernels.dispatch import call_specialised, compiled, interpreted
 from quell.plants.base import advance
 from quell.plants.delay import DelayedPlantModel
 from quell.plants.encoder import EncodedPlantModel
-from quell.plants.nonlinear import CompiledNonlinear, PythonNonlinear, refined
+from quell.plants.nonlinear_kernels import (
+    CompiledNonlinear,
+    CompiledParametric,
+    PythonNonlinear,
+    refined,
+)
 from quell.types import Matrix, Vector
 
 # Largest error of a state in a sample, as a share of the state's largest value. A linear mode
@@ -75,7 +80,8 @@ class IntegrationCheck:
             if isinstance(model, DelayedPlantModel):
                 self._size, self._delay = model.size, 1
             model = model.inner
-        self.needed = isinstance(model, CompiledNonlinear | PythonNonlinear)
+        kinds = CompiledNonlinear | CompiledParametric | PythonNonlinear
+        self.needed = isinstance(model, kinds)
         self.model, self.error, self.enough = model, 0.0, 0
         self._step_differences = (
             interpreted(step_differences)

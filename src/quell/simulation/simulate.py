@@ -14,6 +14,7 @@ from quell.controllers.single import in_single_precision
 from quell.kernels import dispatch
 from quell.lti.models import is_linear_model
 from quell.plants.base import Plant, check_plant
+from quell.plants.labelled import signals_of
 from quell.plants.linear import LinearPlant
 from quell.records.batch_trajectory import BatchTrajectory
 from quell.records.trajectory import Trajectory
@@ -171,6 +172,7 @@ def simulate(
         limit=sampled.limit,
         plant=plant.name,
         features=controller.features,
+        signals=signals_of(plant),
         final_state=loop.state,
     )
 

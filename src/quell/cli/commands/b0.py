@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from quell.cli.options import MaxSize, Overwrite, WholeOrNone
+from quell.cli.options import MaxSize, Overwrite, Trust, WholeOrNone
 from quell.cli.output import print_line
 from quell.cli.records import measured
 from quell.reading import MAX_SIZE
@@ -26,6 +26,7 @@ def b0(
     ratio: float | None = None,
     max_size: MaxSize = MAX_SIZE,
     json: Path | None = None,
+    trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Find b0, lag and delay in a record of a running loop, and the omega_c for a phase margin.
@@ -62,7 +63,7 @@ def b0(
     if json is not None:
         check_writable(json, overwrite)
     read = measured(record, columns, dt, time_unit, max_size)
-    ran = {} if loop is None else _of_loop(loop, read.dt)
+    ran = {} if loop is None else _of_loop(loop, read.dt, trust)
     order = ran.get("order") if order is None else order
     if order is None:
         raise ValueError(
@@ -87,13 +88,13 @@ def b0(
         print_line(console, f"Results: {json}")
 
 
-def _of_loop(path: Path, dt: float) -> dict[str, Any]:
+def _of_loop(path: Path, dt: float, trust: bool) -> dict[str, Any]:
     """Return order, b0 and omega_o over omega_c of a setup's controller, if it has them."""
     from quell.controllers.adrc.adrc import ADRC
     from quell.controllers.prefilters.prefilter import without_prefilters
     from quell.setup import load
 
-    setup = load(path)
+    setup = load(path, trust)
     controller = without_prefilters(setup.controller)
     if abs(controller.dt - dt) > 1e-3 * dt:
         rule = f"must be the sample time of the record, {dt:g} s"

@@ -16,13 +16,14 @@ from quell.cli.commands.compare_report import (
     print_two_mass,
 )
 from quell.cli.exit_codes import exit_if_diverged
-from quell.cli.options import OUTPUTS, Outputs, Whole
+from quell.cli.options import OUTPUTS, Outputs, Trust, Whole
 from quell.cli.output import COMPILING, check_outputs, progress_bar, write_results
 
 if TYPE_CHECKING:
     from quell.analysis import Certificate
     from quell.controllers import Controller
     from quell.experiments.compare import Benchmark, Entry
+    from quell.setup import Setup
 
 
 def compare(
@@ -39,6 +40,7 @@ def compare(
     m_t: float | None = None,
     m_ks: float | None = None,
     load_at: float | None = None,
+    trust: Trust = False,
     outputs: Outputs = OUTPUTS,
 ) -> None:
     """Compare controllers: by published rules, and tuned under the same constraints.
@@ -79,8 +81,11 @@ def compare(
         which one of the scenario's begins.
     """
     if setup is not None:
+        from quell.setup import load
+
         _only_for(setup=False, m1=m1, m2=m2, k=k, dt=dt, u_max=u_max, seed=seed)
-        _compare_setup(setup, controllers, (m_s, m_t, m_ks), load_at, outputs)
+        given = load(setup, trust)
+        _compare_setup(setup.stem, given, controllers, (m_s, m_t, m_ks), load_at, outputs)
         return
     _only_for(setup=True, m_s=m_s, m_t=m_t, m_ks=m_ks, load_at=load_at)
     from quell.experiments.compare import STRUCTURES, benchmark, figures, sensitivities
@@ -123,7 +128,8 @@ def compare(
 
 
 def _compare_setup(
-    path: Path,
+    stem: str,
+    given: Setup,
     controllers: str | None,
     limits: tuple[float | None, float | None, float | None],
     load_at: float | None,
@@ -131,11 +137,10 @@ def _compare_setup(
 ) -> None:
     from quell.experiments import compare as experiment
     from quell.experiments.compare import STRUCTURES, figures, of_setup
-    from quell.setup import SetupError, load
+    from quell.setup import SetupError
 
-    given = load(path)
     names = _names(controllers, ("setup", *STRUCTURES))
-    outputs = check_outputs(outputs, [f"{path.stem}-compare"])
+    outputs = check_outputs(outputs, [f"{stem}-compare"])
     console = Console()
     with progress_bar(console, COMPILING) as report:
         try:
@@ -156,7 +161,7 @@ def _compare_setup(
     print_gains(console, gains, run.entries, run.constraints)
     paths = []
     if outputs.figures:
-        name = f"{path.stem}-compare"
+        name = f"{stem}-compare"
         paths = figures.save(run.result, outputs.figures, outputs.overwrite, name)
     results = as_json(run.result, stable, gains, run.entries, run.constraints)
     about = {"setup": given.as_json(), "load_at": run.load_at}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 
-from quell.cli.options import Overwrite, Switch
+from quell.cli.options import Overwrite, Switch, Trust
 from quell.cli.output import print_line
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ def export(
     what: Literal["controller", "plant", "loop"] = "controller",
     resolution: float | None = None,
     accept: Switch = False,
+    trust: Trust = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write the controller of a setup for another machine: as C files, or as an FMU.
@@ -59,11 +60,11 @@ def export(
         if precision != "double" or accept or resolution is not None:
             rule = "are for --to c; an FMU is in double"
             raise ValueError(f"--precision, --resolution and --accept: {rule}")
-        _to_fmu(setup, what, out, name, overwrite)
+        _to_fmu(load(setup, trust), what, out, name or "", overwrite)
         return
     if what != "controller":
         raise ValueError(f"--what = {what}: is for --to fmu; C files are those of the controller")
-    given = load(setup)
+    given = load(setup, trust)
     if precision == "single" and not accept:
         given.needed("plant")
         given.needed("scenario")
@@ -81,18 +82,16 @@ def export(
     _print(given.title, exported)
 
 
-def _to_fmu(setup: Path, what: str, out: Path, name: str | None, overwrite: bool) -> None:
+def _to_fmu(given: Setup, what: str, out: Path, name: str, overwrite: bool) -> None:
     from quell.export import fmu
-    from quell.setup import load
 
-    given = load(setup)
     controller, dt = given.controller, given.controller.dt
     part = controller if what == "controller" else given.needed("plant")
     if what == "loop":
         part = part, controller
     scenario = given.scenario
     x0 = None if what == "controller" or scenario is None else scenario.x0
-    fmu(part, out, name=name or "", dt=dt, x0=x0, overwrite=overwrite)
+    fmu(part, out, name=name, dt=dt, x0=x0, overwrite=overwrite)
     print_line(Console(), f"FMU of the {what}: {out}")
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
-from quell.cli.options import RUN_OUTPUTS, MaxSize, RunOutputs
+from quell.cli.options import RUN_OUTPUTS, MaxSize, RunOutputs, Trust
 from quell.cli.output import check_outputs, number, print_line, table, write_record, write_results
 from quell.cli.report import print_outcome, save_run_figure
 from quell.reading import MAX_SIZE
@@ -24,6 +24,7 @@ def replay(
     setup: Path | None = None,
     *,
     max_size: MaxSize = MAX_SIZE,
+    trust: Trust = False,
     outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
     """Run a setup's observer and learner on a recorded run, and compare the estimates.
@@ -43,7 +44,7 @@ def replay(
     from quell.setup import EXAMPLES, load
     from quell.setup.errors import with_path
 
-    given = load(setup or EXAMPLES / "torsional_rig.toml")
+    given = load(setup or EXAMPLES / "torsional_rig.toml", trust)
     name = f"{record.stem}-replayed"
     outputs = check_outputs(outputs, [name])
     recorded = load_record(record, max_size)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from quell.cli.interrupt import exit_on_signal
-from quell.cli.options import Overwrite, Whole, WholeOrNone
+from quell.cli.options import Overwrite, Trust, Whole, WholeOrNone
 from quell.realtime.devices.registry import examples
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def rig(
     overwrite: Overwrite = False,
     priority: Whole = 50,
     cpu: WholeOrNone = None,
+    trust: Trust = False,
 ) -> None:
     """Run a simulated plant as the device at the other end of a wire.
 
@@ -45,7 +46,9 @@ def rig(
     Parameters
     ----------
     plant
-        Name of the plant, for example torsional; the message for an unknown name lists all names.
+        The plant: a name as torsional or two-mass, a setup file with [plant] (setup.toml), an
+        identified model (model.json), an FMU (motor.fmu), a Python function that returns a plant
+        (file.py:name, with --trust), or a table, '{kind = "linear", num = [1], den = [1, 1]}'.
     dt
         Length of a tick [s].
     watchdog
@@ -69,13 +72,13 @@ def rig(
     cpu
         Number of the processor for the ticks; any by default.
     """
-    from quell.plants.registry import named_plant
     from quell.realtime.devices.registry import listen
     from quell.realtime.rig.server import Rig, checked_seconds
     from quell.realtime.system.interrupts import termination_handler
     from quell.realtime.system.scheduling import checked_cpu, checked_priority
+    from quell.setup.plants import plant_given
 
-    model = named_plant(plant, "--plant")
+    model = plant_given(plant, dt, argument="--plant", trust=trust)
     if seconds is not None:
         checked_seconds("--seconds", seconds)
     checked_priority(priority)

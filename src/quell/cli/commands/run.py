@@ -8,13 +8,17 @@ from pathlib import Path
 from rich.console import Console
 
 from quell.cli.exit_codes import exit_if_diverged
-from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch
+from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, Trust
 from quell.cli.output import COMPILING, check_outputs, progress_bar, write_record, write_results
 from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
 
 
 def run(
-    setup: Path | None = None, *, example: Switch = False, outputs: RunOutputs = RUN_OUTPUTS
+    setup: Path | None = None,
+    *,
+    example: Switch = False,
+    trust: Trust = False,
+    outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
     """Simulate the plant, controller and scenario of a setup file.
 
@@ -35,7 +39,7 @@ def run(
         return
     if setup is None:
         raise ValueError("setup: missing; must be a TOML file, and quell run --example prints one")
-    given = load(setup)
+    given = load(setup, trust)
     plant, scenario = given.needed("plant"), given.needed("scenario")
     late = [
         f"{given.file}: metrics[{i}].start = {window['start']:g}: "

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from quell.cli.exit_codes import ExitCode
 from quell.cli.interrupt import exit_on_signal
-from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, WholeOrNone
+from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, Trust, WholeOrNone
 from quell.cli.output import check_outputs, print_line, table, write_record, write_results
 from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
 from quell.realtime.devices.registry import examples
@@ -39,6 +39,7 @@ def run_rig(
     csv: Path | None = None,
     live: WholeOrNone = None,
     live_origin: list[str] | None = None,
+    trust: Trust = False,
     outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
     """Run a setup in real time around a device, for instance the twin that `quell rig` is.
@@ -74,7 +75,7 @@ def run_rig(
         Web page that may watch, too, such as https://app.foxglove.dev; by default only programs and
         pages of this computer may.
     """
-    from quell.setup import EXAMPLES
+    from quell.setup import EXAMPLES, made, read
 
     file = setup or EXAMPLES / "torsional_rig.toml"
     if example:
@@ -89,27 +90,25 @@ def run_rig(
         ("observer", "omega_o"): omega_o,
     }
     files = [path for path in (mcap, csv) if path is not None]
-    if code := _run(file, changes, files, (live, live_origin or []), outputs):
+    name, data = read(file)
+    given = made(name, _changed(data, changes), trust)
+    if code := _run(given, files, (live, live_origin or []), outputs):
         sys.exit(code)
 
 
 def _run(
-    file: Path,
-    changes: Mapping[tuple[str, str], Any],
+    setup: Setup,
     files: list[Path],
     viewers: tuple[int | None, list[str]],
     outputs: RunOutputs,
 ) -> int:
     """Run the loop, print and write its results; return the exit code."""
     from quell.realtime import LiveSink
-    from quell.setup import made, read
 
-    name, data = read(file)
-    setup = made(name, _changed(data, changes))
     scenario, options = setup.needed("scenario"), dict(setup.needed("rig"))
     files = [*map(Path, options.pop("telemetry", ())), *files]
     check_recordings(files, outputs.overwrite)
-    outputs = check_outputs(outputs, [Path(name).stem, "timing"], files)
+    outputs = check_outputs(outputs, [Path(setup.file).stem, "timing"], files)
     options["overwrite"] = outputs.overwrite
     (port, origins), live = viewers, options.pop("live")
     port = live if port is None else port
@@ -164,7 +163,7 @@ def _close_loop(
     console: Console, setup: Setup, url: str, options: dict[str, Any], sinks: list[Any]
 ) -> RigRun | None:
     """Run the loop and print each change of mode; return None if the device failed."""
-    from quell.realtime import LiveSink, Safety, open_device, run_rig
+    from quell.realtime import LiveSink, Safety, run_rig
     from quell.setup.errors import with_path
 
     began = False
@@ -182,7 +181,7 @@ def _close_loop(
     try:
         rules = (options.get("safety") or Safety()).rules(controller, scenario)
         print_line(console, f"Safety: {rules.text(controller.dt)}.")
-        device = open_device(url, controller.dt)
+        device = _device(url, setup)
         with exit_on_signal(device.close):
             return run_rig(device, controller, scenario, **settings)
     except ValueError as error:
@@ -192,6 +191,15 @@ def _close_loop(
             raise
         print(f"quell: {error}", file=sys.stderr)
         return None
+
+
+def _device(url: str, setup: Setup) -> Any:
+    """Return the device; ``twin:`` is the plant of the setup itself."""
+    from quell import realtime
+
+    if url == "twin:":
+        return realtime.TwinDevice(setup.needed("plant"), setup.controller.dt)
+    return realtime.open_device(url, setup.controller.dt, *((True,) if setup.trust else ()))
 
 
 def _changed(data: Mapping[str, Any], changes: Mapping[tuple[str, str], Any]) -> dict[str, Any]:

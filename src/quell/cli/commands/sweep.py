@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from quell.cli.exit_codes import exit_if_diverged
-from quell.cli.options import RUN_OUTPUTS, RunOutputs, Whole, WholeOrNone
+from quell.cli.options import RUN_OUTPUTS, RunOutputs, Trust, Whole, WholeOrNone
 from quell.cli.output import (
     COMPILING,
     check_outputs,
@@ -41,6 +41,7 @@ def sweep(
     workers: WholeOrNone = None,
     repeat: WholeOrNone = None,
     worst: Whole = 5,
+    trust: Trust = False,
     outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
     """Do the runs of a setup's table [sweep], and store their measures.
@@ -66,7 +67,7 @@ def sweep(
     from quell.setup import load
     from quell.setup.sweep import sweep_of
 
-    given = load(setup)
+    given = load(setup, trust)
     plan = sweep_of(given)
     where = Path(f"{setup.stem}-sweep") if folder is None else folder
     console = Console()

@@ -24,7 +24,7 @@ from quell.cli.commands.tune_sources import (
     with_rig_table,
 )
 from quell.cli.exit_codes import ExitCode
-from quell.cli.options import OUTPUTS, Outputs, WholeOrNone
+from quell.cli.options import OUTPUTS, Outputs, Trust, WholeOrNone
 from quell.cli.output import check_outputs, print_line, progress_bar, table, write_results
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ def tune(
     trials: WholeOrNone = None,
     out: Path | None = None,
     save_record: Path | None = None,
+    trust: Trust = False,
     record: RecordOptions = RECORD_OPTIONS,
     rig: RigOptions = RIG_OPTIONS,
     outputs: Outputs = OUTPUTS,
@@ -116,7 +117,7 @@ def tune(
     if trials is not None and (measured or setup is None):
         raise ValueError(f"--trials = {trials}: needs a setup file with a scenario")
     if not measured:
-        plant, dt, options, name = _plant(setup, num, den, dt, options)
+        plant, dt, options, name = _plant(setup, num, den, dt, options, trust)
         tuned = _tuned(console, plant, dt, options)
         _print(console, tuned, name)
         _write(console, tuned, out, outputs)
@@ -128,7 +129,7 @@ def tune(
     options |= {key: value for key, value in limits.items() if value is not None}
     place: Rig | None = None
     if rig.device is not None:
-        place = rig_at(rig, dt)
+        place = rig_at(rig, dt, trust)
         shown = from_rig(console, place, float(dt or 0.0), record, save_record, outputs.overwrite)
         if shown is None:
             return ExitCode.DONE
@@ -192,7 +193,12 @@ def _progress(report: Any, part: str, share: float) -> None:
 
 
 def _plant(
-    setup: Path | None, num: str, den: str, dt: float | None, options: dict[str, Any]
+    setup: Path | None,
+    num: str,
+    den: str,
+    dt: float | None,
+    options: dict[str, Any],
+    trust: bool,
 ) -> tuple[Any, float, dict[str, Any], str]:
     """Return the plant, the sample time, the options of ``tune``, and the plant's name."""
     from quell.setup.tuning_task import tuning_task
@@ -200,7 +206,7 @@ def _plant(
     if setup is not None:
         if num or den or dt is not None:
             raise ValueError("setup: goes without --num, --den and --dt, which are in the file")
-        task = tuning_task(setup, options)
+        task = tuning_task(setup, options, trust)
         return task.plant, task.dt, task.options, task.setup.title
     if not num or not den or dt is None:
         raise ValueError(

@@ -149,7 +149,7 @@ class Rig:
     how: dict[str, Any]  # further arguments of ``experiment`` and ``verify``
 
 
-def rig_at(options: RigOptions, dt: float | None) -> Rig:
+def rig_at(options: RigOptions, dt: float | None, trust: bool) -> Rig:
     """Return the rig of the options, all of them checked.
 
     Raises ``ValueError`` for limits that are missing.
@@ -166,11 +166,11 @@ def rig_at(options: RigOptions, dt: float | None) -> Rig:
     values = {name: getattr(options, name) for name in names}
     limits = Limits(**values, duration=options.seconds, u_rest=options.u_rest)
     url = str(options.device)
-    first = open_device(url, float(dt or 0.0))
+    first = open_device(url, float(dt or 0.0), trust)
     if isinstance(first, TwinDevice):  # it keeps its state between the parts
         return Rig(url, limits, options, lambda: first, {"safety": dict(_TWIN), "priority": 0})
     first.close()
-    return Rig(url, limits, options, lambda: open_device(url, float(dt or 0.0)), {})
+    return Rig(url, limits, options, lambda: open_device(url, float(dt or 0.0), trust), {})
 
 
 def from_rig(

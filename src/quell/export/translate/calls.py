@@ -192,7 +192,7 @@ class Calls:
         origin = origin_of(arguments[0].constant)
         if origin is None:
             raise body.fail(node, "calls a function by its address")
-        given = arguments[1:]
+        given = _with_numbers(arguments[1:], origin.numbers, returns)
         if origin.c_function is not None:
             return self._c_function(body, origin.c_function, given)
         if returns:
@@ -213,3 +213,22 @@ class Calls:
         if isinstance(value.kind, Array):
             return f"{'' if written else 'const '}{real} *"
         return real
+
+
+def _with_numbers(given: list[Value], numbers: tuple[int, int], returns: bool) -> list[Value]:
+    """Return arguments with the function's own parameters in place of the array of all of them.
+
+    The array is the last argument, or the last but one of a function that ``returns`` nothing.
+    """
+    first, count = numbers
+    at = len(given) - 1 - (not returns)
+    takes = 2 if returns else 6
+    if len(given) != takes:
+        return given
+    array = given[at]
+    kind = array.kind.element
+    own = [
+        Value(kind, f"{array.at(ATOM)}[{i}]", ATOM, root=array.root, mutable=array.mutable)
+        for i in range(first, first + count)
+    ]
+    return [*given[:at], *own, *given[at + 1 :]]

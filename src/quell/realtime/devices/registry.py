@@ -42,18 +42,20 @@ def examples(listening: bool = False) -> str:
     return ", ".join(f"{scheme.example} ({scheme.description})" for scheme in schemes)
 
 
-def open_device(device: str | Device, dt: float) -> Any:
+def open_device(device: str | Device, dt: float, trust: bool = False) -> Any:
     """Return the device of a URL.
 
     Parameters
     ----------
     device
         a URL: ``udp://HOST:PORT``, ``shm://NAME``, ``serial:///dev/…``, ``ni://…``, or
-        ``twin:NAME`` for a plant in this process, on which u acts at once (``twin:torsional``; the
-        names are in ``quell.plants.registry.TESTBEDS``). An object with ``read``, ``write`` and
-        ``close`` is returned as it is.
+        ``twin:PLANT`` for a plant in this process, on which u acts at once: ``twin:torsional``,
+        ``twin:setup.toml``, ``twin:model.json`` and whatever else ``quell.setup.plant_given``
+        takes. An object with ``read``, ``write`` and ``close`` is returned as it is.
     dt
         sample time [s].
+    trust
+        whether the Python file of ``twin:file.py:name`` may be run.
 
     Raises
     ------
@@ -67,7 +69,8 @@ def open_device(device: str | Device, dt: float) -> Any:
     if not isinstance(device, str):
         handle_of(device)
         return device
-    return _end(device, listening=False)(device, dt)
+    more = (trust,) if device.startswith("twin:") else ()
+    return _end(device, listening=False)(device, dt, *more)
 
 
 def listen(url: str) -> Listener:

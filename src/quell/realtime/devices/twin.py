@@ -11,7 +11,7 @@ from quell import checks
 from quell.kernels.dispatch import call_specialised, compiled
 from quell.plants.base import Plant, advance, begin_run, check_plant, check_run, measure
 from quell.plants.destroyed import is_destroyed
-from quell.plants.registry import named_plant
+from quell.plants.labelled import signals_of
 from quell.realtime.devices.base import read_measurement, write_command
 from quell.types import Vector
 
@@ -80,6 +80,7 @@ class TwinDevice:
         scratch, w = np.zeros(6 * order), np.zeros(plant.disturbances)
         model = plant.sampled(dt, not plant.compiled)
         self._x0 = x.copy()
+        self.signals = signals_of(plant)
         begin_run(model, x, scratch)
         self._handle = TwinHandle(model, x, scratch, w, np.array([0.0, dt]))
         # Without a public handle the loop runs as Python.
@@ -117,6 +118,9 @@ class TwinDevice:
             begin_run(plant, x, scratch)
 
 
-def twin_device(url: str, dt: float) -> TwinDevice:
-    """Return the device ``twin:NAME``: a plant of ``quell.plants.registry.TESTBEDS``."""
-    return TwinDevice(named_plant(url.partition(":")[2], "device"), dt)
+def twin_device(url: str, dt: float, trust: bool = False) -> TwinDevice:
+    """Return the device ``twin:PLANT``; PLANT is what ``quell.setup.plants.plant_given`` takes."""
+    from quell.setup.plants import plant_given
+
+    text = url.partition(":")[2]
+    return TwinDevice(plant_given(text, dt, argument="device", trust=trust), dt)

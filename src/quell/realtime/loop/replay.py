@@ -105,6 +105,7 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
         ended=(len(run) - 1) * run.dt,
         plant=run.plant,
         features=controller.features,
+        signals=run.signals,
         final_state=state,
     )
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.controllers.base import Controller, check_controller
+from quell.quantities import UNKNOWN, Signals
 from quell.realtime.devices.base import Device, PythonHandle, handle_of
 from quell.realtime.loop.control_loop import ControlLoop
 from quell.realtime.loop.modes import Request
@@ -63,6 +64,7 @@ def run_rig(
     cpu: int | None = None,
     on_change: Callable[[ModeChange], None] | None = None,
     overwrite: bool = False,
+    signals: Signals | None = None,
 ) -> RigRun:
     """Close a controller's loop around a device in real time, at the controller's sample time.
 
@@ -104,6 +106,9 @@ def run_rig(
         called with each change of the supervisor's mode, soon after it, in this thread.
     overwrite
         whether files of ``telemetry`` that exist are replaced; they are refused otherwise.
+    signals
+        names and units of y and u for records, telemetry and plots, `{y = "angle [rad]", u =
+        "voltage [V]"}`; those of the device, or of the plant in the setup, by default.
 
     Raises
     ------
@@ -128,7 +133,7 @@ def run_rig(
         priority, cpu = checked_priority(priority), checked_cpu(cpu)
         memory = MemorySink()
         writer = TelemetryWriter(
-            _header(device, controller), [memory, *_sinks(telemetry, overwrite)]
+            _header(device, controller, signals), [memory, *_sinks(telemetry, overwrite)]
         )
         if isinstance(handle, PythonHandle):
             device.read()  # an error of the driver comes before compiling
@@ -163,13 +168,15 @@ def run_rig(
     )
 
 
-def _header(device: Device, controller: Controller) -> Header:
+def _header(device: Device, controller: Controller, signals: Signals | None) -> Header:
+    known = getattr(device, "signals", UNKNOWN) if signals is None else signals
     return Header(
         channels=row_channels(controller.channels),
         dt=controller.dt,
         features=tuple(controller.features),
         device=getattr(device, "name", type(device).__name__),
         controller=getattr(controller, "name", type(controller).__name__),
+        notes={"signals": known.texts()} if known.known else {},
     )
 
 

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from quell import checks
+from quell.quantities import Signals, signals_from
 from quell.realtime.telemetry.channels import LOOP_CHANNELS
 from quell.records.channels import is_vector
 from quell.types import Channels
@@ -60,6 +61,11 @@ class Header:
             raise ValueError(f"channels = {self.channels!r}: must begin with {first}")
 
     @property
+    def signals(self) -> Signals:
+        """Names and units of y and u, which ``notes`` may have."""
+        return signals_from(self.notes.get("signals"))
+
+    @property
     def width(self) -> int:
         """Number of values in a row."""
         return sum(width for _, width in self.channels)
@@ -88,6 +94,8 @@ class Header:
             fields["device"] = str(fields["device"])
             if version != VERSION:
                 raise ValueError(f"its layout has version {version!r}, this quell reads {VERSION}")
+            if not isinstance(fields.get("notes", {}), dict):
+                raise TypeError("notes")
             return cls(**fields)
         except RecursionError:
             raise ValueError("its header is nested too deeply") from None

@@ -84,6 +84,7 @@ def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * MAX_SIZE
         ended=(log.shape[0] - 1) * header.dt,
         plant=header.device,
         features=header.features,
+        signals=header.signals,
     )
 
 

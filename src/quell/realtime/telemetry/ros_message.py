@@ -24,7 +24,7 @@ def definition(header: Header) -> str:
     lines = []
     for name, width in header.channels:
         if width:
-            text, unit = describe(name)
+            text, unit = describe(name, header.signals)
             kind = f"float64[{width}]" if is_vector(name, width) else "float64"
             lines.append(f"{kind} {name}  # {text} [{header.units.get(name, unit)}]")
     return "\n".join(lines) + "\n"

@@ -1,0 +1,58 @@
+"""Plants from the results of an identification."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from quell import checks
+from quell.plants.base import Plant
+from quell.plants.delay import delayed
+from quell.plants.linear import LinearPlant
+from quell.reading import whole_text
+
+
+def identified(path: str | os.PathLike[str], dt: float) -> Plant:
+    """Return the plant that `quell identify --json` or `quell tune --json` found in a record.
+
+    It is the transfer function with its delay. Constant force and dry friction are left out.
+
+    Parameters
+    ----------
+    path
+        the file of results, in JSON; relative to the folder where the command is run.
+    dt
+        sample time of the loop [s]; the delay is rounded to a whole number of samples.
+
+    Raises
+    ------
+    ValueError
+        for a file that can't be read or has no model, and for a model with direct feedthrough.
+    """
+    found = _model(path)
+    numbers: dict[str, Any] = {}
+    for name in ("num", "den"):
+        numbers[name] = checks.vector(f"{path}: {name}", found[name])
+    delay = checks.non_negative(f"{path}: delay", found.get("delay", 0.0), "s")
+    name = f"identified plant ({Path(path).name})"
+    plant = LinearPlant.of((numbers["num"], numbers["den"]), name=name)
+    late = round(delay / checks.positive("dt", dt, "s"))
+    return delayed(plant, late * dt, dt) if late else plant
+
+
+def _model(path: str | os.PathLike[str]) -> Mapping[str, Any]:
+    where = f"path = {os.fspath(path)!r}"
+    try:
+        content = json.loads(whole_text(path))
+    except OSError as error:
+        raise ValueError(f"{where}: can't be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{where}: must be a file of results in JSON ({reason})") from None
+    for found in (content, content.get("model") if isinstance(content, dict) else None):
+        if isinstance(found, dict) and {"num", "den"} <= found.keys():
+            return found
+    raise ValueError(f"{where}: has no model; must be written by quell identify --json")

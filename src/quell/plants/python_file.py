@@ -1,0 +1,160 @@
+"""Plants from a file of Python code, which is run only if the user trusts it."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from quell import checks
+from quell.plants.base import Plant, check_plant
+from quell.plants.nonlinear import NonlinearPlant
+
+# Modules by path and content: a sweep makes the same plant many times, and the same functions need
+# to be compiled only once.
+_MODULES: dict[tuple[Path, str], Any] = {}
+
+
+def python_plant(
+    source: str,
+    order: int | None = None,
+    parameters: Mapping[str, float] | None = None,
+    output: str | None = None,
+    disturbances: int = 1,
+    substeps: int | None = None,
+    operating_point: Mapping[str, Any] | None = None,
+    trust: bool = False,
+) -> Plant:
+    """Return the plant of a Python function, ``file.py:name``; this runs the file.
+
+    With ``order`` the function is the equation of a ``NonlinearPlant``, ``f(t, x, u, w, …)``. Else
+    it returns a plant, and is called with the parameters; it may also be a plant itself.
+
+    Parameters
+    ----------
+    source
+        file and name with a colon between, `pendulum.py:pendulum`; the file is relative to the
+        folder where the command is run.
+    order
+        number of states of an equation.
+    parameters
+        numbers by name for the function, `{m = 1.0}`.
+    output
+        of an equation: name of a function h(x, …) in the same file; the first state by default.
+    disturbances
+        of an equation: number of disturbance inputs.
+    substeps
+        of an equation: Runge-Kutta steps in a sample; chosen by default.
+    operating_point
+        of an equation: `{x = [3.14, 0.0], u = 0.0}`, about which designs take it as linear; zero by
+        default, if that is a state of rest.
+    trust
+        whether the file may be run.
+
+    Raises
+    ------
+    ValueError
+        without trust, for a file that can't be run, a name that it does not have, or a function
+        that returns no plant.
+    """
+    found, module = _named(source, trust)
+    numbers = dict(parameters or {})
+    only = {"output": output, "substeps": substeps, "operating_point": operating_point}
+    if order is None:
+        for key, value in only.items():
+            if value is not None:
+                raise ValueError(f"{key} = {value!r:.60}: is for an equation, which also has order")
+        return _made(source, found, numbers)
+    point = None
+    if operating_point is not None:
+        unknown = [key for key in operating_point if key not in ("x", "u")]
+        if unknown or "x" not in operating_point:
+            raise ValueError(f"operating_point = {operating_point!r}: must have x, and may have u")
+        point = list(operating_point["x"]), float(operating_point.get("u", 0.0))
+    return NonlinearPlant(
+        found,
+        order,
+        None if output is None else _attribute(module, output, source),
+        disturbances,
+        substeps,
+        source.rpartition(":")[2],
+        numbers or None,
+        point,
+    )
+
+
+def _made(text: str, found: Any, numbers: dict[str, float]) -> Plant:
+    if callable(found) and not hasattr(found, "sampled"):
+        try:
+            found = found(**numbers)
+        except Exception as error:
+            raise ValueError(
+                f"source = {text!r}: fails with {type(error).__name__}: {error}; without order "
+                "it must return a plant, called with the parameters"
+            ) from None
+    elif numbers:
+        raise ValueError(f"parameters: {text!r} is a plant already; make it a function of them")
+    plant: Plant = found
+    try:
+        check_plant(plant, "it")
+    except ValueError:
+        raise ValueError(
+            f"source = {text!r}: returns {type(plant).__name__}, must return a plant; for an "
+            "equation f(t, x, u, w) give order, too"
+        ) from None
+    return plant
+
+
+def _named(text: str, trust: bool) -> tuple[Any, Any]:
+    """Return what ``file.py:name`` names, and the file's module."""
+    path, _, name = text.rpartition(":")
+    if not path.endswith(".py") or not name.isidentifier():
+        raise ValueError(f"source = {text!r}: must be a file and a name, like motor.py:motor")
+    if not trust:
+        raise ValueError(
+            f"source = {text!r}: would run this Python file; give --trust (in Python trust=True) "
+            "if you trust it"
+        )
+    module = _module(Path(path), text)
+    return _attribute(module, name, text), module
+
+
+def _attribute(module: Any, name: str, text: str) -> Any:
+    known = [key for key in vars(module) if not key.startswith("_")]
+    if name not in known:
+        raise ValueError(f"source = {text!r}: {name} is not in it; {checks.nearest(name, known)}")
+    return getattr(module, name)
+
+
+def _module(path: Path, text: str) -> Any:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"source = {text!r}: can't be read ({error.strerror})") from None
+    key = path.resolve(), hashlib.sha256(content).hexdigest()
+    if key in _MODULES:
+        return _MODULES[key]
+    name = f"quell_plant_{path.stem}_{key[1][:12]}"
+    spec = importlib.util.spec_from_file_location(name, key[0])
+    if spec is None or spec.loader is None:
+        raise ValueError(f"source = {text!r}: can't be imported")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[name]
+        if not isinstance(error, Exception):
+            raise
+        lines = [each.lineno for each in traceback.extract_tb(error.__traceback__)]
+        line = getattr(error, "lineno", None) or lines[-1]
+        raise ValueError(
+            f"source = {text!r}: {path.name} fails in line {line} with "
+            f"{type(error).__name__}: {' '.join(str(error).split())}"
+        ) from None
+    _MODULES[key] = module
+    return module

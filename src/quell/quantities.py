@@ -1,0 +1,97 @@
+"""Names and units of the signals of a loop: output y, control signal u and disturbances w."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+_TEXT = re.compile(r"\s*([^\[\]]*?)\s*(?:\[([^\[\]]*)\])?\s*")
+# A unit that needs brackets before "/s".
+_COMPOUND = re.compile(r"[\s/*·]")
+
+
+class Quantity(NamedTuple):
+    """A name and a unit; both may be empty."""
+
+    name: str = ""
+    unit: str = ""
+
+    def label(self, default: str) -> str:
+        """Return the text for an axis: ``angle [rad]``; the ``default`` stands for no name."""
+        name = self.name or default
+        return f"{name} [{self.unit}]" if self.unit else name
+
+    def __str__(self) -> str:
+        return self.label("").strip()
+
+
+class Signals(NamedTuple):
+    """What the signals of a plant are.
+
+    ``Signals.of(y="angle [rad]", u="voltage [V]", w=["load torque [N m]"])`` makes it of texts.
+    """
+
+    y: Quantity = Quantity()
+    u: Quantity = Quantity()
+    w: tuple[Quantity, ...] = ()
+
+    @classmethod
+    def of(cls, y: Any = "", u: Any = "", w: Any = ()) -> Signals:
+        """Return the signals of texts ``name [unit]``, of which w has one for each disturbance.
+
+        Raises
+        ------
+        ValueError
+            for a text that is not like ``name [unit]``.
+        """
+        if isinstance(w, str):
+            w = (w,)
+        many = tuple(_quantity(f"w[{i}]", each) for i, each in enumerate(w))
+        return cls(_quantity("y", y), _quantity("u", u), many)
+
+    @property
+    def known(self) -> bool:
+        """Whether any name or unit is given."""
+        return any(each != Quantity() for each in (self.y, self.u, *self.w))
+
+    def unit(self, of: str) -> str:
+        """Return a unit in which ``y-unit``, ``u-unit`` and ``w-unit`` stand for those known."""
+        units = {"y-unit": self.y.unit, "u-unit": self.u.unit, "w-unit": self._common_unit}
+        for placeholder, unit in units.items():
+            if unit and placeholder in of:
+                whole = of == placeholder
+                text = f"({unit})" if _COMPOUND.search(unit) and not whole else unit
+                of = of.replace(placeholder, text)
+        return of
+
+    @property
+    def _common_unit(self) -> str:
+        units = {each.unit for each in self.w}
+        return units.pop() if len(units) == 1 else ", ".join(each.unit or "1" for each in self.w)
+
+    def texts(self) -> dict[str, Any]:
+        """Return the arguments of ``of``: texts by signal, without those that are empty."""
+        found: dict[str, Any] = {"y": str(self.y), "u": str(self.u), "w": [*map(str, self.w)]}
+        return {key: value for key, value in found.items() if any(value)}
+
+
+UNKNOWN = Signals()
+"""The signals of a plant that has no names and units."""
+
+
+def signals_from(texts: Any) -> Signals:
+    """Return the signals that ``Signals.texts`` gave; ``UNKNOWN`` for anything else."""
+    try:
+        return Signals.of(**texts) if isinstance(texts, Mapping) else UNKNOWN
+    except (ValueError, TypeError):
+        return UNKNOWN
+
+
+def _quantity(argument: str, given: Any) -> Quantity:
+    if isinstance(given, Quantity):
+        return given
+    found = _TEXT.fullmatch(given) if isinstance(given, str) else None
+    if found is None:
+        raise ValueError(f"{argument} = {given!r:.60}: must be a name and a unit, like angle [rad]")
+    return Quantity(found[1], (found[2] or "").strip())
