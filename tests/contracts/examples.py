@@ -28,10 +28,19 @@ _ARGUMENTS: dict[str, dict[str, Any]] = {
     "delayed": {"plant": _LAG, "delay": 0.02, "dt": 0.01},
     "encoded": {"plant": _LAG, "counts": 16_000},
 }
+
+
+def _swing(
+    t: float, x: Any, u: float, w: Any, m: float, length: float = 0.5
+) -> tuple[float, float]:
+    return x[1], (u + w[0]) / (m * length) - math.sin(x[0]) - 0.1 * x[1]
+
+
 PLANTS: dict[str, Any] = {
     name: make(**_ARGUMENTS.get(name, {}))
     for name, make in registry.PLANTS.items()
-    if name != "fmu"  # needs a file, and a compiler for it: tests/test_fmu.py
+    # These need files: tests/test_fmu.py, tests/test_any_plant.py.
+    if name not in ("fmu", "identified", "python")
 } | {
     "torsional, late": ql.plants.torsional(late=2),
     "torsional, not rounded": ql.plants.torsional(dac_bits=None, counts=None),
@@ -41,6 +50,9 @@ PLANTS: dict[str, Any] = {
     ),
     "NonlinearPlant": ql.plants.NonlinearPlant(
         lambda t, x, u, w: (x[1], u + w[0] - math.sin(x[0]) - 0.1 * x[1]), order=2
+    ),
+    "NonlinearPlant, parameters": ql.plants.NonlinearPlant(
+        _swing, 2, lambda x, gain: gain * x[0], parameters={"m": 2.0, "gain": 1.5}
     ),
 }
 CHAIN = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])

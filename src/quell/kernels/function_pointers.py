@@ -26,9 +26,9 @@ class Origin(NamedTuple):
 
     function: Callable[..., Any]
     c_function: str | None  # name of the same function in C, if the user has one
-    # Where its own parameters begin in the array that is passed, and how many there are. With none
-    # no such array is passed.
-    numbers: tuple[int, int] = (0, 0)
+    # Where its own parameters begin in the array of numbers that is passed, and how many there are;
+    # None if no such array is passed.
+    numbers: tuple[int, int] | None = None
 
 
 _origins: dict[int, Origin] = {}
@@ -38,7 +38,7 @@ def set_origin(
     address: int,
     function: Callable[..., Any],
     c_function: str | None = None,
-    numbers: tuple[int, int] = (0, 0),
+    numbers: tuple[int, int] | None = None,
 ) -> None:
     """Note what the function at an address was made of, for its translation to C."""
     _origins[address] = Origin(function, c_function, numbers)

@@ -207,14 +207,16 @@ class NonlinearPlant:
         if interpret or self._machine_code is None:
             return PythonNonlinear(self._rate, self._measured, step, substeps)
         rate, output = self._machine_code
-        own, more = (len(each) for each in self._numbers)
         set_origin = function_pointers.set_origin
+        if self.parameters is None:
+            set_origin(rate.address, self.f)
+            set_origin(output.address, self._output_function)
+            return CompiledNonlinear(rate.address, output.address, step, substeps)
+        own, more = (len(each) for each in self._numbers)
         set_origin(rate.address, self.f, numbers=(0, own))
         set_origin(output.address, self._output_function, numbers=(own, more))
-        if self.parameters is not None:
-            numbers = equations.as_array(*self._numbers)
-            return CompiledParametric(rate.address, output.address, step, substeps, numbers)
-        return CompiledNonlinear(rate.address, output.address, step, substeps)
+        numbers = equations.as_array(*self._numbers)
+        return CompiledParametric(rate.address, output.address, step, substeps, numbers)
 
     def _chosen_substeps(self, dt: float) -> int:
         """Return the number of sub-steps for which ``h |λ|`` is small enough at rest."""

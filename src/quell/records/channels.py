@@ -39,7 +39,7 @@ _DESCRIPTIONS = {
 
 
 # The words of descriptions that a signal's name stands for.
-_NAMED = {"y": "output", "y_measured": "output"} | dict.fromkeys(("u", "u_wished"), "control signal")
+_NAMED = {
     "y": "output",
     "y_measured": "output",
     "u": "control signal",

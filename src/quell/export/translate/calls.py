@@ -192,7 +192,9 @@ class Calls:
         origin = origin_of(arguments[0].constant)
         if origin is None:
             raise body.fail(node, "calls a function by its address")
-        given = _with_numbers(arguments[1:], origin.numbers, returns)
+        given = arguments[1:]
+        if origin.numbers is not None:
+            given = _with_numbers(given, origin.numbers, returns)
         if origin.c_function is not None:
             return self._c_function(body, origin.c_function, given)
         if returns:
@@ -221,10 +223,7 @@ def _with_numbers(given: list[Value], numbers: tuple[int, int], returns: bool) -
     The array is the last argument, or the last but one of a function that ``returns`` nothing.
     """
     first, count = numbers
-    at = len(given) - 1 - (not returns)
-    takes = 2 if returns else 6
-    if len(given) != takes:
-        return given
+    at = len(given) - (1 if returns else 2)
     array = given[at]
     kind = array.kind.element
     own = [
