@@ -23,7 +23,8 @@ from quell.quantities import Signals
 from quell.realtime.loop.run import run_rig
 from quell.realtime.loop.safety import Safety as RigSafety
 from quell.records.trajectory import Trajectory
-from quell.setup.plants import PLANTS, Plant
+from quell.setup.plants import PLANTS as PLANTS
+from quell.setup.plants import Plant
 from quell.setup.schema import CallTable, call_table, list_of, one_of
 from quell.setup.sweep_table import sweep_table
 from quell.simulation.scenario import Scenario as SimulationScenario

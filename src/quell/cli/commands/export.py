@@ -12,6 +12,7 @@ from quell.cli.output import print_line
 
 if TYPE_CHECKING:
     from quell.export import Comparison, Exported
+    from quell.setup import Setup
 
 
 def export(
