@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from quell import (
         analysis,
         controllers,
+        envs,
         experiments,
         export,
         features,
@@ -78,9 +79,9 @@ _MODULES = {"baselines": "quell.controllers.baselines", "metrics": "quell.record
 __all__ = [
     "ADRC", "ESO", "BatchTrajectory", "DesignWarning", "Estimate", "Guard", "Reason", "Scenario",
     "Status", "Trajectory", "Tuned", "analysis", "baselines", "canonical", "controllers",
-    "experiments", "export", "features", "identification", "identify", "learners", "metrics",
-    "observers", "omega_c_for", "plants", "realtime", "setup", "signals", "simulate", "sweep",
-    "sweeping", "tune", "tuning",
+    "envs", "experiments", "export", "features", "identification", "identify", "learners",
+    "metrics", "observers", "omega_c_for", "plants", "realtime", "setup", "signals", "simulate",
+    "sweep", "sweeping", "tune", "tuning",
 ]  # fmt: skip
 
 
