@@ -86,6 +86,7 @@ def script(samples: int, single: bool) -> np.ndarray:
     rows[k % 997 < 5, 2] = np.nan  # also before the first sample
     rows[k % 4001 == 17, 2] = np.inf
     rows[k % 9973 == 400, 2] = 1e30 if single else 1e300
+    rows[k % 49_999 == 45_000, 2] = 1e11 if single else 1e55  # usable, and absurd all the same
     rows[k % 1511 < 2, 1] = np.nan
     rows[k % 101 == 50, 0] = Action.APPLIED
     manual = (k % 5000 >= 2000) & (k % 5000 < 2100)
