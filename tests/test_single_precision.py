@@ -12,9 +12,10 @@ import quell as ql
 from quell.controllers import in_single_precision
 from quell.controllers.linear.delta import delta_law
 from quell.controllers.single import SinglePrecision
+from quell.controllers.single import single as single_module
 from quell.controllers.stateful import named_arrays
 from quell.features import Bias, Custom, State
-from quell.kernels import functions
+from quell.kernels import dispatch, functions
 from quell.kernels.dispatch import is_finite
 from quell.kernels.functions import is_single
 from quell.kernels.single import in_single
@@ -315,3 +316,17 @@ def test_batches_run_in_single_precision() -> None:
             np.testing.assert_array_equal(run, alone["u"])
     with pytest.raises(ValueError, match="precision = 'half'"):
         ql.simulate(CHAIN, controller, SCENARIO, precision="half")
+
+
+def test_a_numba_that_would_calculate_in_double_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without our compiler's pass, literals would make compiled code double; interpreted runs work."""
+    monkeypatch.setattr(single_module, "KERNEL_OPTIONS", {})
+    monkeypatch.setattr(dispatch, "interpret_all", False)
+    plant = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
+    controller = ql.baselines.PID(1.0, dt=0.01)
+    scenario = ql.Scenario(duration=0.05, reference=1.0)
+    with pytest.raises(ValueError, match="is compiled with Numba 0.68 only"):
+        ql.simulate(plant, controller, scenario, precision="single")
+    with pytest.raises(ValueError, match="is compiled with Numba 0.68 only"):
+        ql.controllers.in_single_precision(controller).step(1.0, 0.0)
+    assert len(ql.simulate(plant, controller, scenario, precision="single", interpret=True)) == 6

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.base import Controller, check_controller
-from quell.controllers.single import in_single_precision
+from quell.controllers.single import check_compilable, in_single_precision
 from quell.kernels import dispatch
 from quell.lti.models import is_linear_model
 from quell.plants.base import Plant, check_plant
@@ -132,6 +132,8 @@ def simulate(
     if not hasattr(plant, "sampled") and is_linear_model(plant):
         plant = LinearPlant.of(plant)
     if checks.one_of("precision", precision, ("double", "single")) == "single":
+        if not interpret:
+            check_compilable()
         several = checks.is_sequence(controller)
         controller = _in_single(controller) if several else in_single_precision(controller)
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from quell import checks
@@ -30,7 +31,9 @@ from quell.controllers.limits import Limits, RateLimit
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.controllers.single.parts import single_design, single_state
 from quell.controllers.stateful import StatefulController
+from quell.kernels import dispatch
 from quell.kernels.functions import single
+from quell.kernels.linking import KERNEL_OPTIONS
 from quell.kernels.single_literals import in_both_precisions
 from quell.observers.eso import ESO
 from quell.types import Channels, Status, Vector
@@ -81,6 +84,18 @@ def _bumpless_transfer(design: SingleDesign, state: Any) -> None:
     bumpless_transfer(design.controller, state)
 
 
+def check_compilable() -> None:
+    """Raise a ``ValueError`` if this Numba would compile single precision as double.
+
+    Literals of kernels become single by a pass of our compiler, which other versions do without.
+    """
+    if not KERNEL_OPTIONS:
+        raise ValueError(
+            f"precision = 'single': is compiled with Numba 0.68 only, and this is "
+            f"{numba.__version__}; install that, or run with interpret=True"
+        )
+
+
 def in_single_precision(controller: Controller) -> SinglePrecision:
     """Return a controller that calculates what ``controller`` does, in single precision.
 
@@ -115,6 +130,12 @@ class SinglePrecision(StatefulController):
         check_controller(controller)
         self.controller: Any = copy.deepcopy(controller)  # in double: it designs the parameters
         self._initialise()
+
+    def prepare(self) -> None:
+        """Compile ``step``, or load it from the disk cache, so that its first call is fast."""
+        if not dispatch.interpret_all:
+            check_compilable()
+        super().prepare()
 
     def _update_parameters(self) -> None:
         self.parameters = SingleDesign(single_design(self.controller.parameters))

@@ -66,7 +66,7 @@ _UNEXPLAINED_SHARE = 0.1
 # Variance of amplitudes that are to be learned anew, in units of R: they may be 10⁴ times what is
 # unexplained. Chosen by hand: a hundred times less delays the result, more changes nothing. In
 # single precision P then shrinks to less than what rounding leaves of the difference, and θ is
-# lost; with 10⁴ it is not (benchmarks/single_precision.py).
+# lost; with 10⁴ it was not in three loops.
 _UNKNOWN, _UNKNOWN_SINGLE = 1e8, 1e4
 
 
