@@ -89,6 +89,35 @@ def test_a_residual_environment_with_the_action_zero_is_the_loop_without_learner
     assert math.isclose(coarse["rewards"].sum(), found["rewards"].sum(), rel_tol=1e-12)
 
 
+def pendulum(t: float, x: Any, u: float, w: Any) -> Any:
+    """Derivatives of angle and speed."""
+    return x[1], 8.0 * u + w[0] - 9.81 * np.sin(x[0])
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        ql.plants.NonlinearPlant(pendulum, order=2, output=[1.0, 0.0], disturbances=2),
+        ql.plants.delayed(ql.plants.LinearPlant.of(([2.0], [1.0, 1.0, 0.0])), 3 * DT, DT),
+        ql.plants.dc_motor(),
+    ],
+    ids=lambda plant: type(plant).__name__,
+)
+def test_any_plant_can_be_driven(plant: Any) -> None:
+    """Nonlinear, delayed, with friction and an encoder: with the action zero as in ``simulate``."""
+    dt = DT if plant.name != "DC motor" else 1e-3
+    observer = ql.ESO.model_free(order=2, b0=8.0, omega_o=25.0, dt=dt)
+    limits = {"u_min": -9.0, "u_max": 9.0, "feedforward": True}
+    reference = ql.signals.Sinusoid(amplitude=0.5, omega=3.0)
+    scenario = ql.Scenario(reference, duration=50 * dt, x0=0.1 * np.eye(plant.order)[0])
+    run = ql.simulate(plant, ql.ADRC(observer, 8.0, **limits), scenario)
+    env = Env(plant, scenario, ql.ADRC(observer, 8.0, learner=Policy(), guard=ql.Guard(), **limits))
+    for _ in range(2):
+        found = episode(env, np.zeros((50, 1)))
+        assert np.array_equal(found["y"], run["y"])
+        assert np.array_equal(found["u"][1:], run["u"][:-1])
+
+
 def test_without_a_guard_the_action_is_what_is_fed_forward() -> None:
     """And with one nothing is, at first: the policy has earned no authority."""
     env = Env(two_mass_spring(), NOISY, law(Policy(most=2.0)))
