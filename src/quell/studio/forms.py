@@ -41,7 +41,7 @@ def forms() -> dict[str, Any]:
     }
     return {
         group: {
-            kind: {"about": table.__doc__ or "", "keys": _keys(table)}
+            kind: {"about": _plain(table.__doc__ or ""), "keys": _keys(table)}
             for kind, table in kinds.items()
             if kind not in _WITHOUT.get(group, ()) and not kind.startswith("python")
         }
@@ -56,7 +56,7 @@ def _keys(table: type[CallTable]) -> list[dict[str, Any]]:
             continue
         default = table.model_fields[key].default
         needed = default is PydanticUndefined
-        entry: dict[str, Any] = {"key": key, "type": kind, "about": about, "needed": needed}
+        entry: dict[str, Any] = {"key": key, "type": kind, "about": _plain(about), "needed": needed}
         if not needed and isinstance(default, bool | int | float | str | tuple):
             entry["default"] = list(default) if isinstance(default, tuple) else default
         if key in _NESTED:
@@ -65,3 +65,9 @@ def _keys(table: type[CallTable]) -> list[dict[str, Any]]:
             entry["list_of"] = _LISTS[key]
         found.append(entry)
     return found
+
+
+def _plain(text: str) -> str:
+    """Return a text without marks of code, its first letter a capital."""
+    text = text.replace("`", "").removeprefix("Return ").removeprefix("Design ")
+    return text[:1].upper() + text[1:]

@@ -145,7 +145,8 @@ def _metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
 
 def _analysis(loop: LoopAnalysis) -> tuple[dict[str, Any], dict[str, Vector]]:
     """Return the numbers and the curves of a loop."""
-    omega = loop.omega
+    # At half the sampling rate L is real, and its phase jumps: the curves end just below.
+    omega = loop.omega[loop.omega < 0.97 * math.pi / loop.dt]
     if omega.size > _MARGIN_FREQUENCIES:
         omega = omega[:: math.ceil(omega.size / _MARGIN_FREQUENCIES)]
     L = loop.response("L", omega)

@@ -13,6 +13,7 @@ import hmac
 import secrets
 import socket
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from importlib.resources import files
 from typing import Any
 
@@ -153,12 +154,8 @@ class Studio:
             self._pages -= 1
 
 
-def serve(
-    setup: Mapping[str, Any] | None = None,
-    port: int = PORT,
-    ready: Callable[[str], None] | None = None,
-) -> None:
-    """Serve the studio until it is interrupted.
+def listen(setup: Mapping[str, Any] | None = None, port: int = PORT) -> tuple[Any, Studio, Any]:
+    """Return a listening socket, the application for it, and the configuration of its server.
 
     Parameters
     ----------
@@ -166,8 +163,6 @@ def serve(
         tables of the setup that the page starts with.
     port
         TCP port; 0 takes any free one.
-    ready
-        called with the address when the server listens.
 
     Raises
     ------
@@ -186,7 +181,7 @@ def serve(
             f"port = {port}: can't listen there ({error.strerror or error}); choose another port, "
             "or 0 for a free one"
         ) from None
-    with listener:
+    try:
         studio = Studio(listener.getsockname()[1], setup)
         config = uvicorn.Config(
             studio.app(),
@@ -200,11 +195,24 @@ def serve(
             server_header=False,
             timeout_graceful_shutdown=1,
         )
-        server = uvicorn.Server(config)
-        try:
-            with one_blas_thread():
-                if ready is not None:
-                    ready(studio.url)
-                asyncio.run(server.serve(sockets=[listener]))
-        finally:
-            studio.close()
+    except BaseException:
+        listener.close()
+        raise
+    return listener, studio, config
+
+
+def serve(
+    setup: Mapping[str, Any] | None = None,
+    port: int = PORT,
+    ready: Callable[[str], None] | None = None,
+) -> None:
+    """Serve the studio until it is interrupted; arguments and errors as those of ``listen``.
+
+    ``ready`` is called with the address when the server listens.
+    """
+    listener, studio, config = listen(setup, port)
+    server = import_extra("uvicorn", "studio", "the studio").Server(config)
+    with listener, closing(studio), one_blas_thread():
+        if ready is not None:
+            ready(studio.url)
+        asyncio.run(server.serve(sockets=[listener]))

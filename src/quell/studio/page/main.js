@@ -307,6 +307,7 @@ function chooseTab(name) {
     home(`tab-${each}`).setAttribute("aria-selected", each === name);
     home(`tab-${each}`).tabIndex = each === name ? 0 : -1;
   }
+  document.body.dataset.tab = name;
   // The tours change the design: its form stays below them.
   home("learn").hidden = name !== "learn";
   home("watch").hidden = name !== "watch";

@@ -57,7 +57,7 @@ function metrics(run, bounds) {
   if (!run) return [];
   const found = [];
   for (const window of run.metrics) {
-    const where = `from ${short(window.start ?? 0)} s`;
+    const where = `t ≥ ${short(window.start ?? 0)} s`;
     if (window.reason) {
       found.push([where, "–", false, window.reason]);
       continue;
@@ -68,9 +68,9 @@ function metrics(run, bounds) {
     if (window.settling_time !== undefined) {
       found.push(["settling", window.settling_time == null ? "never" : `${short(window.settling_time)} s`, window.settling_time == null, where]);
     }
-    found.push([`peak |r − y| ${where}`, short(window.peak_error), false, where]);
-    found.push([`IAE ${where}`, short(window.iae), false, `integral of |r − y| ${where}`]);
-    found.push([`variation u ${where}`, short(window.control_variation), false, `sum of |Δu| ${where}`]);
+    found.push([`peak e, ${where}`, short(window.peak_error), false, `largest |r − y|, ${where}`]);
+    found.push([`IAE, ${where}`, short(window.iae), false, `integral of |r − y| ${where}`]);
+    found.push([`TV of u, ${where}`, short(window.control_variation), false, `sum of |Δu| ${where}`]);
   }
   return found;
 }

@@ -9,7 +9,7 @@ export function short(value) {
   if (value == null || Number.isNaN(value)) return "–";
   if (!Number.isFinite(value)) return value > 0 ? "∞" : "−∞";
   const size = Math.abs(value);
-  const text = size !== 0 && (size >= 1e5 || size < 1e-3) ? value.toExponential(2) : String(Number(value.toPrecision(4)));
+  const text = size !== 0 && (size > 1e5 || size < 1e-3) ? value.toExponential(2) : String(Number(value.toPrecision(4)));
   return text.replace("-", "−");
 }
 
@@ -83,7 +83,7 @@ export class Plot {
       width: Math.max(this.home.clientWidth, 200), height: HEIGHT, series, bands,
       scales: { x: { time: false, ...log }, y: { range: this.options.range ?? padded } },
       axes: [
-        { ...axis, size: 34, values: (_, ticks) => ticks.map((t) => (t == null ? "" : short(t))), filter: this.x.log ? decades : undefined },
+        { ...axis, size: 34, values: (_, ticks) => ticks.map(short), ...(this.x.log ? { splits: decades } : {}) },
         { ...axis, size: 56, values: (_, ticks) => ticks.map(short) },
       ],
       legend: { live: true }, cursor: { sync: { key: this.x.sync }, points: { size: 6 } },
@@ -115,8 +115,10 @@ function padded(_, low, high) {
   return [low - room, high + room];
 }
 
-function decades(_, ticks) {
-  return ticks.map((tick) => (Number.isInteger(Math.round(1e6 * Math.log10(tick)) / 1e6) ? tick : null));
+function decades(_, axis, low, high) {
+  const found = [];
+  for (let k = Math.ceil(Math.log10(low) - 1e-9); k <= Math.floor(Math.log10(high) + 1e-9); k++) found.push(10 ** k);
+  return found;
 }
 
 // Return values at the places x, from others at the places `from` (both increase, ties allowed).

@@ -40,7 +40,9 @@ export class Views {
     const learns = setup?.learner != null || arrays.watched;
     if (!learns) delete data.f_learned;
     home("fig-authority").hidden = !data.authority;
-    home("plot-f").closest("figure").hidden = !data.f_hat;
+    const f = home("plot-f").closest("figure");
+    f.hidden = !data.f_hat;
+    f.classList.toggle("wide", !data.authority);
     const limits = ["u_min", "u_max"].map((key) => setup?.controller?.[key]).filter(Number.isFinite);
     this.time.y.show(data, kept, band?.y_low ? { t: band.t, low: band.y_low, high: band.y_high } : null);
     this.time.u.show(data, kept, band?.u_low ? { t: band.t, low: band.u_low, high: band.u_high } : null, limits);

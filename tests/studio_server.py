@@ -1,0 +1,92 @@
+"""A studio on a free port in a thread of the tests, and a client of its WebSocket."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+
+from quell.studio.frames import parsed
+from quell.types import Vector
+
+TABLES = {
+    "title": "A loop",
+    "dt": 0.001,
+    "plant": {"kind": "linear", "num": [50.0], "den": [1.0, 4.0, 0.0]},
+    "observer": {"kind": "model-free", "order": 2, "b0": 50.0, "omega_o": 40.0},
+    "controller": {"kind": "adrc", "omega_c": 8.0, "u_min": -10.0, "u_max": 10.0},
+    "scenario": {
+        "duration": 2.0,
+        "reference": {"kind": "step", "height": 1.0, "at": 0.1},
+        "disturbances": [{"kind": "step", "height": 0.5, "at": 1.0}],
+    },
+}
+"""A setup whose loop compiles quickly."""
+
+
+@contextmanager
+def running(tables: Any = None, port: int = 0) -> Iterator[str]:
+    """Serve a studio in a thread, and yield its address."""
+    uvicorn = pytest.importorskip("uvicorn")
+    pytest.importorskip("starlette")
+    from quell.studio.server import listen
+
+    listener, studio, config = listen(tables, port)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    try:
+        while not server.started and thread.is_alive():
+            time.sleep(0.01)
+        yield studio.url
+    finally:
+        server.should_exit = True
+        thread.join(20.0)
+        listener.close()
+        studio.close()
+
+
+class Client:
+    """A page without a browser."""
+
+    def __init__(self, url: str, **headers: Any) -> None:
+        from websockets.sync.client import connect
+
+        host = "/".join(url.split("/")[:3])
+        options = {"origin": host, "max_size": None, "compression": None} | headers
+        self._stack = ExitStack()
+        address = f"ws{url.removeprefix('http')}socket"
+        self.socket = self._stack.enter_context(connect(address, **options))
+        self.hello = self.next()[0]
+        self.count = 0
+
+    def next(self) -> tuple[dict[str, Any], dict[str, Vector], bytes]:
+        """Return the next frame."""
+        data = self.socket.recv(timeout=120.0)
+        assert isinstance(data, bytes)
+        return parsed(data)
+
+    def send(self, **message: Any) -> int:
+        """Send a message with the next id, and return the id."""
+        self.count += 1
+        self.socket.send(json.dumps({"id": self.count, **message}))
+        return self.count
+
+    def ask(self, last: str, **message: Any) -> dict[str, Any]:
+        """Send a message; return its frames by kind, up to the one of the kind ``last``."""
+        number = self.send(**message)
+        found: dict[str, Any] = {}
+        while last not in found and "error" not in found:
+            header, arrays, content = self.next()
+            if header.get("id") == number:
+                found[header["kind"]] = header, arrays, content
+        return found
+
+    def close(self) -> None:
+        """Leave."""
+        self._stack.close()

@@ -1,0 +1,260 @@
+"""The studio's server: who may connect, what frames contain, and what messages can do."""
+
+from __future__ import annotations
+
+import json
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell.analysis import analyse
+from quell.kernels.compile_time import compile_time
+from quell.setup import load, made
+from quell.setup.vary import changed
+from quell.studio import messages
+from quell.studio.frames import Columns, frame, parsed
+from quell.studio.texts import python_of, toml_of
+
+from .studio_server import TABLES, Client, running
+
+PAGE = Path(ql.__file__).parent / "studio" / "page"
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    """The address of a studio."""
+    with running(TABLES) as address:
+        yield address
+
+
+@pytest.fixture
+def client(url: str) -> Iterator[Client]:
+    """A page of it."""
+    page = Client(url)
+    yield page
+    page.close()
+
+
+def status(address: str, **headers: str) -> int:
+    """Return the status of the answer to a request."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers)) as answer:
+            code: int = answer.status
+            return code
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def with_values(**values: Any) -> dict[str, Any]:
+    """Return ``TABLES`` with values by path, a double underscore for each dot."""
+    changes = {path.replace("__", "."): value for path, value in values.items()}
+    return changed("tables", TABLES, changes)
+
+
+def test_a_run_and_its_loop_are_those_of_simulate_and_analyse(client: Client) -> None:
+    """In float32: the ends of each pixel column, the margins, the metrics."""
+    found = client.ask("loop", do="run", setup=TABLES, columns=300)
+    setup = made("tables", TABLES)
+    assert setup.plant is not None
+    assert setup.scenario is not None
+    run = ql.simulate(setup.plant, setup.controller, setup.scenario)
+    header, arrays, _ = found["run"]
+    for name in ("y", "u", "f_hat"):
+        assert arrays[name].size == 600
+        assert np.max(arrays[name]) == np.float32(np.max(run[name]))
+        assert np.min(arrays[name]) == np.float32(np.min(run[name]))
+    assert header["metrics"][0]["iae"] == pytest.approx(run.metrics()["iae"], rel=1e-12)
+    loop = analyse(setup.plant, setup.controller)
+    numbers, curves = found["loop"][0]["loop"], found["loop"][1]
+    assert numbers["m_s"] == pytest.approx(1.0 / loop.margins.modulus, rel=1e-12)
+    assert numbers["phase_margin"] == pytest.approx(loop.margins.phase, rel=1e-12)
+    S = np.abs(loop.response("S", curves["omega"]))
+    assert 20.0 * np.log10(S) == pytest.approx(curves["S"], abs=1e-3)
+
+
+def test_moving_a_slider_compiles_nothing(client: Client) -> None:
+    """Bandwidths, b0 and the plant's parameters change values, not types."""
+    client.ask("loop", do="run", setup=TABLES)
+    before = compile_time.seconds
+    tables = with_values(observer__omega_o=55.0, observer__b0=40.0, controller__omega_c=6.0)
+    tables["plant"] = {"kind": "linear", "num": [45], "den": [1, 3.5, 0.25]}
+    found = client.ask("loop", do="run", setup=tables)
+    assert found["run"][0]["compiled"] == 0.0
+    assert compile_time.seconds == before
+
+
+def test_only_the_page_with_the_token_is_answered(url: str) -> None:
+    """Another token, host or origin gets nothing; no path leads to files."""
+    host = "/".join(url.split("/")[:3])
+    assert status(url) == 200
+    assert status(url + "main.js") == 200
+    assert status(host + "/wrong/") == 403
+    assert status(url, Host="evil.example") == 403
+    assert status(url, Origin="http://evil.example") == 403
+    for path in ("../server.py", "%2e%2e/server.py", "..%2fserver.py", "/etc/passwd", "page"):
+        assert status(url + path) in (403, 404)
+    from websockets.exceptions import InvalidStatus
+
+    for wrong in ({"origin": "http://evil.example"}, {"origin": "null"}, {"origin": None}):
+        with pytest.raises(InvalidStatus):
+            Client(url, **wrong)
+    with pytest.raises(InvalidStatus):
+        Client(host + "/wrong/")
+
+
+HOSTILE = (
+    "", "{", "[]", "null", '{"do": "run"}', '{"do": "rm", "id": 1}', '{"do": "run", "id": -1}',
+    '{"do": "run", "id": 1, "setup": 3}', '{"do": "run", "id": 1, "setup": {"dt": NaN}}',
+    "[" * 5000, '{"do": "run", "id": ' + "9" * 5000 + "}", '{"do": "open", "id": 1, "text": "a = "}',
+    '{"do": "export", "id": 1, "to": "/etc"}',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_a_malformed_message_gives_an_error_and_no_more(client: Client, text: str) -> None:
+    """The next message is answered as if nothing had been."""
+    client.socket.send(text)
+    assert client.next()[0]["kind"] == "error"
+    assert "texts" in client.ask("texts", do="toml", setup=TABLES)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("plant", {"kind": "fmu", "path": "/tmp/evil.fmu"}, "an FMU is a program"),
+        ("tune", {"storage": "/tmp/file"}, "the studio opens no files"),
+        ("scenario.duration", 1e9, "must be at most"),
+        ("observer.order", 1_000_000, "must be at most"),
+        ("plant", {"kind": "delayed", "delay": 1e6, "plant": TABLES["plant"]}, "10000 samples"),
+        ("observer.omega_o", "1", "observer.omega_o"),
+        ("observer.omega_o", None, "observer.omega_o"),
+        ("dt", 0.0, "dt"),
+        ("plant.num", [0.0] * 2000, "entries"),
+    ],
+)
+def test_a_setup_beyond_its_limits_names_its_key(
+    client: Client, path: str, value: Any, words: str
+) -> None:
+    """Files, programs, and sizes that take memory or time are refused with a sentence."""
+    found = client.ask("loop", do="run", setup=changed("tables", TABLES, {path: value}))
+    assert words in " ".join(found["error"][0]["text"])
+
+
+def test_a_message_that_is_too_large_is_refused(url: str) -> None:
+    """The connection ends, and another one is served."""
+    from websockets.exceptions import ConnectionClosed
+
+    page = Client(url)
+    with pytest.raises(ConnectionClosed):
+        page.ask("loop", do="toml", setup=TABLES, more="x" * (messages.MOST_BYTES + 1))
+    page = Client(url)
+    assert "texts" in page.ask("texts", do="toml", setup=TABLES)
+    page.close()
+
+
+def test_the_newest_of_many_messages_is_answered(client: Client) -> None:
+    """A burst is not worked off one by one."""
+    client.ask("loop", do="run", setup=TABLES)
+    for omega_o in range(40, 140):
+        last = client.send(do="run", setup=with_values(observer__omega_o=float(omega_o)))
+    answered = []
+    while not answered or answered[-1] != last:
+        header = client.next()[0]
+        if header["kind"] == "loop":
+            answered.append(header["id"])
+    assert len(answered) < 90
+
+
+def test_toml_and_python_are_the_same_setup(client: Client, tmp_path: Path) -> None:
+    """Both build what the page runs; a file that is opened is what was saved."""
+    header = client.ask("texts", do="toml", setup=TABLES)["texts"][0]
+    path = tmp_path / "setup.toml"
+    path.write_text(header["toml"], encoding="utf-8")
+    assert json.loads(json.dumps(load(path).tables())) == TABLES
+    assert header["toml"] == toml_of(TABLES)
+    assert header["python"] == python_of(TABLES, "A loop", True, 0.0)
+    compile(header["python"], "setup.py", "exec")
+    opened = client.ask("opened", do="open", text=header["toml"])["opened"][0]
+    assert opened["setup"] == TABLES
+
+
+def test_exported_c_is_that_of_the_command_line(client: Client, tmp_path: Path) -> None:
+    """Each file in the archive has the bytes of ``quell export``."""
+    from quell.cli.commands.export import export
+
+    path = tmp_path / "setup.toml"
+    path.write_text(toml_of(TABLES), encoding="utf-8")
+    export(path, out=tmp_path / "c")
+    header, _, content = client.ask("file", do="export", to="c", setup=TABLES)["file"]
+    assert header["name"] == "controller.zip"
+    with zipfile.ZipFile(BytesIO(content)) as archive:
+        found = {name: archive.read(name) for name in archive.namelist()}
+    wanted = [each for each in sorted((tmp_path / "c").rglob("*")) if each.is_file()]
+    expected = {
+        f"controller/{each.relative_to(tmp_path / 'c').as_posix()}": each.read_bytes()
+        for each in wanted
+    }
+    assert found == expected
+
+
+def test_a_band_contains_the_run_of_the_nominal_plant(client: Client) -> None:
+    """It is the range over plants around it."""
+    run = client.ask("loop", do="run", setup=TABLES, columns=100)["run"][1]
+    header, band, _ = client.ask("band", do="band", setup=TABLES, columns=100, percent=20)["band"]
+    assert header["diverged"] == 0
+    inside = (band["y_low"] <= run["y"] + 2e-2) & (run["y"] <= band["y_high"] + 2e-2)
+    assert np.all(inside)
+    assert np.max(band["y_high"] - band["y_low"]) > 0.01
+
+
+def test_columns_keep_the_extrema_of_each_pixel() -> None:
+    """A single sample that stands out is not lost."""
+    values = np.zeros(10_000)
+    values[7654], values[1234] = 3.0, -2.0
+    cut = Columns(values.size, 100)
+    points, t = cut.points(values), cut.times(np.arange(10_000.0))
+    assert points.size == t.size == 200
+    assert np.max(points) == 3.0
+    assert np.min(points) == -2.0
+    assert abs(t[np.argmax(points)] - 7654) <= 100
+    assert np.all(np.diff(t) > 0)
+    assert np.array_equal(Columns(50, 100).points(values[:50]), values[:50])
+
+
+def test_a_frame_has_header_arrays_and_null_for_infinity() -> None:
+    """The arrays begin at a multiple of four bytes."""
+    header, arrays, rest = parsed(frame({"kind": "run", "m": float("inf")}, {"y": [1.0, 2.5]}))
+    assert header["m"] is None
+    assert np.array_equal(arrays["y"], [1.0, 2.5])
+    assert rest == b""
+
+
+def test_presets_and_tours_are_setups_that_can_be_built() -> None:
+    """Each step of each tour, too; there are six tours."""
+    presets = json.loads((PAGE / "presets.json").read_text(encoding="utf-8"))
+    tours = json.loads((PAGE / "tours.json").read_text(encoding="utf-8"))
+    assert len(tours) == 6
+    for preset in presets:
+        made(preset["name"], messages.checked(preset["setup"]))
+    for tour in tours:
+        tables = presets[tour["preset"]]["setup"]
+        for step in tour["steps"]:
+            tables = changed(tour["title"], tables, step["changes"])
+            made(tour["title"], messages.checked(tables))
+
+
+def test_the_page_loads_nothing_from_elsewhere() -> None:
+    """Its files name no other host, and the licence of uPlot is beside it."""
+    assert "MIT" in (PAGE / "vendor" / "LICENSE-uPlot").read_text(encoding="utf-8")
+    for path in (*PAGE.glob("*.js"), *PAGE.glob("*.html"), *PAGE.glob("*.css")):
+        text = path.read_text(encoding="utf-8")
+        assert "https://" not in text, path
+        assert text.count("http://") == 0, path
