@@ -30,13 +30,13 @@ TABLES = {
 
 
 @contextmanager
-def running(tables: Any = None, port: int = 0) -> Iterator[str]:
+def running(tables: Any = None, port: int = 0, token: str | None = None) -> Iterator[str]:
     """Serve a studio in a thread, and yield its address."""
     uvicorn = pytest.importorskip("uvicorn")
     pytest.importorskip("starlette")
     from quell.studio.server import listen
 
-    listener, studio, config = listen(tables, port)
+    listener, studio, config = listen(tables, port, token)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()

@@ -47,16 +47,15 @@ def tuned_frames(
 ) -> Iterator[bytes]:
     """Yield the tuned controller's tables, and then the trade-off between M_s and load rejection.
 
-    The message has ``structure``, ``m_s`` and ``m_t``.
+    The message has ``structure``, ``m_s``, ``m_t`` and, if noise is bounded, ``m_ks``.
     """
     structure = checks.one_of("structure", message.get("structure", "freed"), STRUCTURES)
-    m_s = number(message, "m_s", 1.6, 1.05, 5.0)
-    m_t = number(message, "m_t", 1.6, 1.05, 5.0)
+    bounds = _bounds(message)
     dt = float(setup.controller.dt)
     plant, delay = linear_part(linear_model(setup.plant), dt)
     options: dict[str, Any] = {"structure": structure, "delay": delay, "compare": ()}
     options["progress"] = stoppable(report, stale)
-    best = tune(plant, dt, constraints=Constraints(m_s=m_s, m_t=m_t), **options, **_limits(setup))
+    best = tune(plant, dt, constraints=bounds, **options, **_limits(setup))
     design = best.design
     tables = setup.tables() | {key: dict(table) for key, table in design.tables.items()}
     limits = _limits(setup)
@@ -78,10 +77,10 @@ def tuned_frames(
             "constraints": str(best.constraints),
         }
     )
-    bounds = dataclasses.replace(best.constraints)
-    for at in sorted({*_TRADEOFF, m_s}):
+    for at in sorted({*_TRADEOFF, bounds.m_s or _TRADEOFF[0]}):
+        other = dataclasses.replace(best.constraints, m_s=at)
         try:
-            one = tune(plant, dt, constraints=dataclasses.replace(bounds, m_s=at), **options)
+            one = tune(plant, dt, constraints=other, **options)
         except ValueError:
             continue  # no loop satisfies these bounds: the curve has no point there
         point = {"m_s": at, "k_i": one.design.k_i, "iae": one.design.measures.get("iae")}
@@ -93,17 +92,16 @@ def compared_frames(
 ) -> Iterator[bytes]:
     """Yield runs and loops of PID and LQG controllers that were tuned for the same plant.
 
-    The bounds ``m_s`` and ``m_t`` are the message's.
+    The bounds ``m_s``, ``m_t`` and ``m_ks`` are the message's.
     """
-    m_s = number(message, "m_s", 1.6, 1.05, 5.0)
-    m_t = number(message, "m_t", 1.6, 1.05, 5.0)
+    bounds = _bounds(message)
     wide, dt = columns(message), float(setup.controller.dt)
     plant, delay = linear_part(linear_model(setup.plant), dt)
     entries, _ = tuned_references(
         plant,
         dt,
         tuple(_COMPARED),
-        Constraints(m_s=m_s, m_t=m_t),
+        bounds,
         limits=_limits(setup),
         delay=delay,
         progress=stoppable(report, stale),
@@ -191,3 +189,10 @@ def _limits(setup: Setup) -> dict[str, Any]:
     table = setup.tables().get("controller", {})
     given = table if isinstance(table, Mapping) else {}
     return {key: given[key] for key in _LIMITS if given.get(key) is not None}
+
+
+def _bounds(message: Mapping[str, Any]) -> Constraints:
+    """Return the constraints that a message asks for."""
+    m_ks = None if message.get("m_ks") is None else number(message, "m_ks", 1.0, 1e-9, 1e12)
+    m_s, m_t = (number(message, name, 1.6, 1.05, 5.0) for name in ("m_s", "m_t"))
+    return Constraints(m_s=m_s, m_t=m_t, m_ks=m_ks)

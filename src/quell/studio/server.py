@@ -154,7 +154,9 @@ class Studio:
             self._pages -= 1
 
 
-def listen(setup: Mapping[str, Any] | None = None, port: int = PORT) -> tuple[Any, Studio, Any]:
+def listen(
+    setup: Mapping[str, Any] | None = None, port: int = PORT, token: str | None = None
+) -> tuple[Any, Studio, Any]:
     """Return a listening socket, the application for it, and the configuration of its server.
 
     Parameters
@@ -163,6 +165,8 @@ def listen(setup: Mapping[str, Any] | None = None, port: int = PORT) -> tuple[An
         tables of the setup that the page starts with.
     port
         TCP port; 0 takes any free one.
+    token
+        first part of the path of the address; random by default.
 
     Raises
     ------
@@ -182,7 +186,7 @@ def listen(setup: Mapping[str, Any] | None = None, port: int = PORT) -> tuple[An
             "or 0 for a free one"
         ) from None
     try:
-        studio = Studio(listener.getsockname()[1], setup)
+        studio = Studio(listener.getsockname()[1], setup, token)
         config = uvicorn.Config(
             studio.app(),
             ws="websockets-sansio",

@@ -4,6 +4,7 @@ import uPlot from "./vendor/uPlot.js";
 import { palette } from "./palette.js";
 import { short } from "./plots.js";
 
+const BOUNDS = [["tune-ms", "m_s"], ["tune-mt", "m_t"], ["tune-mks", "m_ks"]];
 const home = (id) => document.getElementById(id);
 
 export class Designs {
@@ -23,7 +24,7 @@ export class Designs {
     home("tradeoff").hidden = true;
     home("tune-result").textContent = "";
     this.task = task;
-    this.id = this.ask({ do: task, m_s: Number(home("tune-ms").value), m_t: Number(home("tune-mt").value), ...more });
+    this.id = this.ask({ do: task, ...BOUNDS.reduce((all, [id, name]) => (home(id).value === "" ? all : { ...all, [name]: Number(home(id).value) }), {}), ...more });
     this.busy(true);
   }
 

@@ -17,6 +17,9 @@ const BAND_PAUSE = 150; // the band is computed when nothing has moved for this 
 
 const now = { arrays: {}, loopArrays: {}, run: null, loop: null, band: null, bandId: null, input: null, watching: false };
 const studio = { times: [], frames: 0, compiled: 0, now }; // for measurements from outside
+studio.busy = () => server.flying !== null || server.waiting !== null;
+studio.pins = () => pins;
+studio.saved = () => store.committed === JSON.stringify(store.state);
 window.studio = studio;
 let pins = [];
 let presets = [];
@@ -89,8 +92,10 @@ async function onFrame(header, arrays, bytes, asked) {
     now.band = { ...arrays, about: header };
     drawRun();
   } else if (header.kind === "wait") {
+    home("plots").classList.add("old");
     home("state").textContent = header.compiles ? "compiling this kind of loop, once …" : "working …";
   } else if (header.kind === "error") {
+    home("plots").classList.add("old"); // they do not show the present values
     message(header.text.join("\n"));
     if (asked?.local?.pin) asked.local.pin.failed = true;
   } else if (header.kind === "texts") showTexts(header);
@@ -108,6 +113,7 @@ function takeRun(header, arrays, asked) {
     asked.local.pin.arrays = arrays;
     return;
   }
+  home("plots").classList.remove("old");
   now.arrays = arrays;
   now.run = header;
   studio.compiled += header.compiled;
@@ -354,7 +360,8 @@ function choosePreset(number) {
   home("preset").value = number;
   home("preset-about").textContent = presets[number].about;
   forms.anchors.clear();
-  store.set(fill({ ...(store.state ?? {}), setup: presets[number].setup }));
+  pins = [];
+  store.set(fill({ ...(store.state ?? {}), pins: [], setup: presets[number].setup }));
 }
 
 function setTheme(dark) {

@@ -1,0 +1,211 @@
+"""The studio's page in a browser: sliders move curves, pins stay, a lost connection recovers."""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quell.realtime import LiveSink
+from quell.realtime.telemetry.channels import LOOP_WIDTH, K, R, U, Y, row_channels
+from quell.realtime.telemetry.header import Header
+
+from .studio_server import TABLES, Client, running
+
+CHROMIUM = Path("/usr/bin/chromium")
+OPTIONS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+]
+pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"there is no browser at {CHROMIUM}")
+OMEGA_O = 'input[type=range][data-path="observer.omega_o"]'
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Debian's Chromium."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=str(CHROMIUM), args=OPTIONS)
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    """The address of a studio."""
+    with running(TABLES) as address:
+        yield address
+
+
+@pytest.fixture
+def page(browser: Any, url: str) -> Iterator[Any]:
+    """A page that shows the first run; an error in its scripts fails the test."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    opened = context.new_page()
+    errors: list[str] = []
+    opened.on("pageerror", lambda error: errors.append(str(error)))
+    opened.goto(url)
+    wait_for(lambda: opened.evaluate("window.studio.frames") > 0)
+    yield opened
+    context.close()
+    assert not errors
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 60.0) -> None:
+    """Wait until a condition holds, and fail if it does not."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def curve(page: Any, name: str) -> Any:
+    """Return a curve that the page shows."""
+    return np.array(page.evaluate(f"Array.from(window.studio.now.arrays.{name})"))
+
+
+def slide(page: Any, key: str, times: int) -> None:
+    """Press an arrow key on the slider of omega_o, and wait for the picture."""
+    before = page.evaluate("window.studio.times.length")
+    for _ in range(times):
+        page.locator(OMEGA_O).press(key)
+    wait_for(lambda: page.evaluate("window.studio.times.length") > before)
+    wait_for(lambda: not page.evaluate("window.studio.busy()"))
+
+
+def pixels(page: Any, plot: str) -> bytes:
+    """Return a picture of a plot."""
+    data: bytes = page.locator(plot).screenshot()
+    return data
+
+
+def test_a_slider_moves_the_curves_and_a_pinned_one_stays(page: Any) -> None:
+    """By arrow keys; the pin has the curve of before, and nothing is compiled."""
+    before, picture = curve(page, "y"), pixels(page, "#plot-y canvas")
+    page.click("#pin")
+    slide(page, "ArrowLeft", 40)
+    after = curve(page, "y")
+    assert np.max(np.abs(after - before)) > 0.02
+    assert pixels(page, "#plot-y canvas") != picture
+    assert page.locator(".pin").count() == 1
+    pinned = np.array(page.evaluate("Array.from(window.studio.pins()[0].arrays.y)"))
+    assert np.array_equal(pinned, before)
+    page.keyboard.press("Control+z")
+    wait_for(lambda: np.array_equal(curve(page, "y"), before))
+
+
+def test_the_address_holds_the_state(page: Any, browser: Any) -> None:
+    """Another page at the same address shows the same curves and pins."""
+    page.click("#pin")
+    slide(page, "ArrowRight", 30)
+    shown = curve(page, "y")
+    wait_for(lambda: len(page.evaluate("location.hash")) > 100)
+    wait_for(lambda: page.evaluate("window.studio.saved()"))
+    context = browser.new_context()
+    other = context.new_page()
+    other.set_viewport_size({"width": 1280, "height": 900})
+    other.goto(page.evaluate("location.href"))
+    wait_for(lambda: other.evaluate("window.studio.frames") > 0)
+    wait_for(lambda: other.evaluate("window.studio.pins().every((pin) => pin.arrays?.omega)"))
+    assert other.locator(".pin").count() == 1
+    assert curve(other, "y").max() == pytest.approx(shown.max(), abs=1e-4)
+    context.close()
+
+
+def test_exported_files_are_those_of_the_server(page: Any, url: str) -> None:
+    """Which are those of the command line (test_studio)."""
+    with page.expect_download() as download:
+        page.click("#export-c")
+    saved = Path(download.value.path()).read_bytes()
+    client = Client(url)
+    wanted = client.ask("file", do="export", to="c", setup=TABLES)["file"][2]
+    client.close()
+    with zipfile.ZipFile(BytesIO(saved)) as one, zipfile.ZipFile(BytesIO(wanted)) as other:
+        assert one.namelist() == other.namelist()
+        for name in one.namelist():
+            assert one.read(name) == other.read(name)
+
+
+def test_a_wrong_value_is_explained_and_the_next_one_works(page: Any) -> None:
+    """The message names the key."""
+    box = page.locator('input[type=number][data-path="observer.omega_o"]')
+    box.fill("-5")
+    wait_for(lambda: "omega_o" in page.inner_text("#message"))
+    frames = page.evaluate("window.studio.frames")
+    box.fill("50")
+    wait_for(lambda: page.evaluate("window.studio.frames") > frames)
+    wait_for(lambda: page.is_hidden("#message"))
+
+
+def test_a_lost_connection_recovers(browser: Any) -> None:
+    """The server is killed and started again: the page goes on with what it had."""
+    context = browser.new_context()
+    page = context.new_page()
+    with running(TABLES, token="same") as url:
+        page.goto(url)
+        wait_for(lambda: page.evaluate("window.studio.frames") > 0)
+        slide(page, "ArrowRight", 10)
+        value = page.locator(OMEGA_O).get_attribute("aria-valuetext")
+    wait_for(lambda: "lost" in page.inner_text("#state"))
+    frames = page.evaluate("window.studio.frames")
+    with running(TABLES, int(url.split(":")[2].split("/")[0]), "same"):
+        wait_for(lambda: page.evaluate("window.studio.frames") > frames)
+        assert page.locator(OMEGA_O).get_attribute("aria-valuetext") == value
+        slide(page, "ArrowRight", 2)
+        context.close()
+
+
+def test_the_watch_tab_shows_a_running_loop(page: Any) -> None:
+    """It connects to the live port of quell run-rig, as Foxglove does."""
+    header = Header(row_channels((("status", 1),)), dt=1e-3, device="a lift", started=10**18)
+    sink = LiveSink(port=0, rate=1000.0)
+    sink.open(header)
+    try:
+        page.click("#tab-watch")
+        page.fill("#watch-port", sink.url.rsplit(":", 1)[1])
+        page.click("#watch-go")
+        wait_for(lambda: "connected to a lift" in page.inner_text("#watch-state"))
+        rows = np.zeros((1, LOOP_WIDTH + 1))
+
+        def shown() -> bool:
+            rows[0, [K, R, Y, U]] = rows[0, K] + 1.0, 1.0, 0.25, -0.5
+            sink.write(rows)
+            sink.flush()
+            return "0.25" in page.inner_text("#watch-values")
+
+        wait_for(shown)
+        page.click("#tab-design")
+    finally:
+        sink.close()
+
+
+def test_tours_set_the_sliders(page: Any) -> None:
+    """Each next step changes the design, and says what to look at."""
+    page.click("#tab-learn")
+    page.locator("#tours button").nth(1).click()
+    page.click("#tour-next")
+    wait_for(lambda: page.input_value('input[type=number][data-path="observer.omega_o"]') == "15")
+    assert "pinned" in page.inner_text("#tour-text")
+    assert page.locator(".pin").count() == 1
+
+
+def test_all_controls_have_names_and_the_page_fits_a_phone(page: Any) -> None:
+    """For screen readers and keyboards; without scrolling sideways."""
+    nameless = page.evaluate(
+        "[...document.querySelectorAll('input, select, button')].filter((e) => !(e.labels?.length"
+        " || e.getAttribute('aria-label') || e.textContent.trim())).map((e) => e.outerHTML)"
+    )
+    assert nameless == []
+    page.set_viewport_size({"width": 375, "height": 812})
+    wait_for(lambda: page.evaluate("document.documentElement.scrollWidth <= 375"))
