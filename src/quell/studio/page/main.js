@@ -13,10 +13,11 @@ import { Watch } from "./watch.js";
 
 const home = (id) => document.getElementById(id);
 const MOST_PINS = 5;
+const MOST_TIMES = 10_000;
 const BAND_PAUSE = 150; // the band is computed when nothing has moved for this time [ms]
 
 const now = { arrays: {}, loopArrays: {}, run: null, loop: null, band: null, bandId: null, input: null, watching: false };
-const studio = { times: [], frames: 0, compiled: 0, now }; // for measurements from outside
+const studio = { times: [], firstTimes: [], frames: 0, compiled: 0, now }; // for measurements from outside
 studio.busy = () => server.flying !== null || server.waiting !== null;
 studio.pins = () => pins;
 studio.saved = () => store.committed === JSON.stringify(store.state);
@@ -120,6 +121,16 @@ function takeRun(header, arrays, asked) {
   const notes = [header.message, ...header.warnings].filter(Boolean);
   message(notes.join("\n"), header.message.includes("diverged") || header.message.includes("beyond"));
   if (!now.watching) drawRun();
+  timed(studio.firstTimes, asked);
+}
+
+// Note the time from the input until its picture; a page that stays open keeps the last ones.
+function timed(times, asked) {
+  if (!asked.local?.input) return;
+  requestAnimationFrame(() => {
+    times.push(performance.now() - asked.local.input);
+    if (times.length > MOST_TIMES) times.shift();
+  });
 }
 
 function takeLoop(header, arrays, asked) {
@@ -137,9 +148,8 @@ function takeLoop(header, arrays, asked) {
   const compiled = now.run.compiled > 1 ? `, compiled for ${short(now.run.compiled)} s` : "";
   home("state").textContent = `${ms.toFixed(0)} ms${compiled}`;
   studio.frames += 1;
-  if (asked.local?.input) {
-    requestAnimationFrame(() => studio.times.push(performance.now() - asked.local.input));
-  }
+  timed(studio.times, asked);
+  now.lastLoop = header.seconds;
   askPins();
 }
 

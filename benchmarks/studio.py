@@ -1,0 +1,242 @@
+"""The studio: time from input to picture, hostile messages, many pages, memory.
+
+    python benchmarks/studio.py                     # all parts: 2000 inputs, 10⁵ messages, 20 pages
+    python benchmarks/studio.py --inputs 200 --messages 2000 --pages 5
+
+1. A browser (Chromium, headless) moves the slider of ω_o, 20 times a second; the page notes the
+   time from each input until the frame with its run (10 s at 1 kHz) and its loop plots is drawn.
+2. A client sends malformed messages, and well-formed ones with values that make no sense; each must
+   be answered with an error, or a result, and a page beside it must go on as if nothing had been.
+3. Pages at once, each with runs of its own, that are killed and opened again.
+
+Memory is that of the server's process; it is compared after a first tenth and at the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import resource
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quell.studio.frames import parsed
+
+CHROMIUM = "/usr/bin/chromium"
+OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+OPTIONS += ["--disable-component-update", "--disable-sync", "--no-first-run"]
+PAGE = Path(__file__).parents[1] / "src/quell/studio/page"
+PRESETS = json.loads((PAGE / "presets.json").read_text(encoding="utf-8"))
+TABLES: dict[str, Any] = PRESETS[0]["setup"]
+PERIOD = 0.05  # time between two inputs [s]
+BAR = 50.0  # 95 % of the pictures within this time [ms]
+
+
+def main() -> None:
+    """Run all parts and print a table for each."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--inputs", type=int, default=2000)
+    parser.add_argument("--messages", type=int, default=100_000)
+    parser.add_argument("--pages", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    load = os.getloadavg()[0]
+    print(f"{os.cpu_count()} cores, load of the last minute before: {load:.1f}")
+    command = [sys.executable, "-m", "quell", "studio", "--no-browser", "--port", "0"]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        found = re.search(r"http\S+", server.stdout.readline())
+        assert found is not None, "the studio did not start"
+        url = found.group()
+        good = [given.inputs == 0 or pictures(url, given.inputs)]
+        good.append(given.messages == 0 or hostile(url, server.pid, given.messages, given.seed))
+        good.append(given.pages == 0 or many(url, server.pid, given.pages))
+    finally:
+        server.terminate()
+        server.wait(10)
+    sys.exit(0 if all(good) else 1)
+
+
+def pictures(url: str, count: int) -> bool:
+    """Move a slider in a browser; return whether 95 % of the pictures came in time."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.goto(url)
+        while page.evaluate("window.studio.frames") == 0:
+            time.sleep(0.1)
+        slider = page.locator('input[type=range][data-path="observer.omega_o"]')
+        slider.focus()
+        compiled = page.evaluate("window.studio.compiled")
+        began = time.perf_counter()
+        for i in range(count):
+            page.keyboard.press("ArrowRight" if i // 40 % 2 else "ArrowLeft")
+            time.sleep(max(0.0, began + PERIOD * (i + 1) - time.perf_counter()))
+        time.sleep(1.0)
+        times = np.array(page.evaluate("window.studio.times"))
+        first = np.array(page.evaluate("window.studio.firstTimes"))
+        compiled = page.evaluate("window.studio.compiled") - compiled
+        seconds = page.evaluate("[window.studio.now.run.seconds, window.studio.now.lastLoop]")
+        browser.close()
+    print(f"\ntime from input to picture, {count} inputs, {1 / PERIOD:.0f} a second [ms]")
+    print(f"{'':24}{'pictures':>9}{'50 %':>8}{'95 %':>8}{'99 %':>8}{'largest':>9}")
+    for name, each in (("response", first), ("response and loop plots", times)):
+        ends = np.percentile(each, [50, 95, 99, 100])
+        print(f"{name:24}{each.size:>9}" + "".join(f"{end:8.1f}" for end in ends))
+    print(f"compiled meanwhile: {compiled:.1f} s; last run and analysis: {seconds} s")
+    share = float(np.mean(times <= BAR))
+    print(f"within {BAR:.0f} ms: {100 * share:.1f} % (bar: 95 %)")
+    return share >= 0.95
+
+
+class Client:
+    """A page without a browser."""
+
+    def __init__(self, url: str) -> None:
+        from contextlib import ExitStack
+
+        from websockets.sync.client import connect
+
+        self.stack, self.count = ExitStack(), 0
+        origin: Any = "/".join(url.split("/")[:3])
+        address = f"ws{url.removeprefix('http')}socket"
+        made = connect(address, origin=origin, max_size=None, compression=None)
+        self.socket = self.stack.enter_context(made)
+        self.next()
+
+    def next(self) -> dict[str, Any]:
+        """Return the header of the next frame."""
+        data = self.socket.recv(timeout=300.0)
+        assert isinstance(data, bytes)
+        return parsed(data)[0]
+
+    def run(self, tables: dict[str, Any]) -> list[dict[str, Any]]:
+        """Ask for a run, and return the headers of the answer."""
+        self.count += 1
+        message = {"do": "run", "id": self.count, "setup": tables, "columns": 300}
+        self.socket.send(json.dumps(message))
+        found: list[dict[str, Any]] = []
+        while not found or found[-1]["kind"] not in ("loop", "error", "stopped"):
+            header = self.next()
+            if header.get("id") == self.count:
+                found.append(header)
+        return found
+
+
+def memory(process: int) -> float:
+    """Return the resident memory of a process [MB]."""
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+ODD = (0, -1, 1e308, -1e308, 5e-324, 2**60, "x", "", None, [], {}, [[]], True, {"kind": "step"})
+
+
+def attack(choose: random.Random) -> str:
+    """Return a message that is broken, or has a value that makes no sense."""
+    text = json.dumps({"do": "run", "id": 7, "setup": TABLES, "columns": 300})
+    kind = choose.randrange(5)
+    if kind == 0:
+        return "".join(chr(choose.randrange(1, 0x250)) for _ in range(choose.randrange(200)))
+    if kind == 1:
+        return text[: choose.randrange(len(text))]
+    if kind == 2:
+        place = choose.randrange(len(text))
+        return text[:place] + chr(choose.randrange(32, 127)) + text[place + 1 :]
+    tables = json.loads(json.dumps(TABLES))
+    where: Any = tables
+    while True:
+        key = choose.choice(list(where) if isinstance(where, dict) else range(len(where)))
+        inner = where[key]
+        if not isinstance(inner, dict | list) or not inner or choose.random() < 0.2:
+            break
+        where = inner
+    where[key] = choose.choice(ODD)
+    do = "run" if kind == 3 else choose.choice(("toml", "band", "export", "tune", "x", 3, None))
+    if do == "tune":
+        do = "cancel"
+    return json.dumps({"do": do, "id": choose.choice((7, -1, "7", 1.5, None)), "setup": tables})
+
+
+def hostile(url: str, process: int, count: int, seed: int) -> bool:
+    """Send hostile messages beside a page at work; return whether only they were affected."""
+    choose, attacker, page = random.Random(seed), Client(url), Client(url)
+    wanted = page.run(TABLES)[-1]["loop"]
+    before, began, wrong = memory(process), time.perf_counter(), 0
+    received = [0]
+    ended = threading.Event()
+
+    def drain() -> None:
+        while not ended.is_set():
+            try:
+                attacker.socket.recv(timeout=0.5)
+                received[0] += 1
+            except TimeoutError:
+                continue
+
+    draining = threading.Thread(target=drain)
+    draining.start()
+    for i in range(count):
+        attacker.socket.send(attack(choose))
+        if i % 100 == 99:
+            found = page.run(TABLES)[-1]
+            wrong += found["kind"] != "loop" or found["loop"] != wanted
+        if i == count // 10:
+            before = memory(process)
+    ended.set()
+    draining.join()
+    after, seconds = memory(process), time.perf_counter() - began
+    print(f"\n{count} hostile messages in {seconds:.0f} s, {received[0]} frames in answer")
+    print(f"runs of the page beside: {count // 100}, of which wrong: {wrong}")
+    print(f"memory: {before:.0f} MB after a tenth, {after:.0f} MB at the end")
+    attacker.stack.close()
+    page.stack.close()
+    return wrong == 0
+
+
+def many(url: str, process: int, count: int) -> bool:
+    """Open pages at once, three times over; return whether each gets its own answers."""
+    wrong, slowest = [0], [0.0]
+
+    def work(number: int) -> None:
+        page = Client(url)
+        for k in range(20):
+            tables = json.loads(json.dumps(TABLES))
+            tables["scenario"]["reference"]["height"] = 1.0 + number
+            tables["observer"]["omega_o"] = 30.0 + k
+            began = time.perf_counter()
+            found = page.run(tables)
+            slowest[0] = max(slowest[0], time.perf_counter() - began)
+            peak = next(each for each in found if each["kind"] == "run")["metrics"][0]["peak_error"]
+            wrong[0] += abs(peak - (1.0 + number)) > 0.05
+        page.socket.socket.close()  # killed: without a goodbye
+
+    before = memory(process)
+    for _ in range(3):
+        threads = [threading.Thread(target=work, args=(number,)) for number in range(count)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    after = memory(process)
+    print(f"\n{count} pages at once, three times, 20 runs each: wrong answers {wrong[0]}")
+    print(f"slowest answer {1e3 * slowest[0]:.0f} ms; memory {before:.0f} MB, then {after:.0f} MB")
+    return wrong[0] == 0
+
+
+if __name__ == "__main__":
+    main()
