@@ -37,6 +37,7 @@ from rich.table import Table
 import quell as ql
 from quell.controllers import in_single_precision
 from quell.controllers.adrc.handover import samples_to_settle
+from quell.controllers.base import reset_loop
 from quell.experiments.two_mass_spring import setup as study
 from quell.export import TranslationError
 from quell.export.library.vectors import Action, Player, limits_path
@@ -55,6 +56,9 @@ COMPILERS = {
     "coverage": ("gcc", "-std=c99", "-O0", "-ffp-contract=off", "--coverage"),
 }  # fmt: skip
 NAMES = ("r", "y", "given", "u", "status")
+
+# Samples of the comparison with compiled kernels: each is a call from Python.
+_COMPILED_SAMPLES = 30_000
 
 
 def cases() -> Iterator[tuple[str, Any]]:
@@ -167,16 +171,30 @@ def available(action: Action, names: set[str], path: str) -> Action:
     return action if needs.get(action, True) else Action.STEP
 
 
-def compiled_difference(controller: Any, rows: np.ndarray, given: np.ndarray) -> float:
-    """Return the largest difference of u to the compiled kernels in the first steps of the run.
-
-    They are the samples before the first that is not a step, the longest part without NaN.
-    """
-    ends = np.flatnonzero(rows[:, 0] != Action.STEP)
-    count = int(ends[0]) if ends.size else len(rows)
-    runner = copy.deepcopy(controller)
-    derivatives = int(getattr(controller, "derivatives", 0))
-    u = [runner.step(row["r"], row["y"], *[0.5 * row["r"]] * derivatives) for row in given[:count]]
+def compiled_difference(
+    controller: Any, rows: np.ndarray, given: np.ndarray, names: set[str]
+) -> float:
+    """Return the largest difference of u to the compiled methods, relative to the RMS of u."""
+    runner, path = copy.deepcopy(controller), limits_path(controller)
+    count = min(len(rows), _COMPILED_SAMPLES)
+    derivatives = int(getattr(controller, "derivatives", 0)) if "set_derivatives" in names else 0
+    u = np.empty(count)
+    for k, row in enumerate(given[:count]):
+        action = available(Action(int(rows[k, 0])), names, path)
+        r, y = row["r"], row["y"]
+        more = [0.5 * r] * derivatives
+        if action is Action.APPLIED:
+            runner.applied(row["given"])
+        elif action is Action.HAND_OVER:
+            runner.hand_over()
+        elif action in (Action.LIMIT, Action.FREE):
+            runner.set_limits(u_max=0.5 if action is Action.LIMIT else controller.limits.high)
+        elif action is Action.RESET:
+            reset_loop(runner.parameters, runner._state)  # reset() would forget what was learned
+        elif action is Action.START:
+            runner.start(y, row["given"], r)
+        track = action is Action.TRACK
+        u[k] = runner.track(r, y, row["given"], *more) if track else runner.step(r, y, *more)
     size = float(np.sqrt(np.mean(np.square(given["u"][:count])))) or 1.0
     return float(np.max(np.abs(u - given["u"][:count]))) / size
 
@@ -209,7 +227,7 @@ def judged(name: str, controller: Any, precision: str, options: argparse.Namespa
     count, wrong = replayed(shown, rows, given, options.seconds, names)
     compiled = "–"
     if options.compiled:
-        compiled = f"{compiled_difference(shown, rows, given):.0e}"
+        compiled = f"{compiled_difference(shown, rows, given, names):.0e}"
     flags = ql.Status(int(np.bitwise_or.reduce(given["status"].astype(int))))
     cells = [name, precision, f"{count}", f"{wrong}", f"{others}", compiled, taken]
     return [*cells, f"{int(flags)}"]
