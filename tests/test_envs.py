@@ -237,11 +237,19 @@ def test_each_loop_can_have_a_plant_of_its_own() -> None:
     )
     with pytest.raises(ValueError, match="has 3 entries, num_envs = 4"):
         VectorEnv(4, plants, NOISY, **OPEN)
-    motors = [ql.plants.dc_motor(resistance=value) for value in (0.5, 0.5)]
-    VectorEnv(2, motors, QUIET, **OPEN | {"dt": 1e-3})
-    motors = [ql.plants.dc_motor(coulomb=value) for value in (0.01, 0.02)]
-    with pytest.raises(ValueError, match=r"plant\[1\] differs"):
-        VectorEnv(2, motors, QUIET, **OPEN | {"dt": 1e-3})
+
+
+@pytest.mark.compiled
+def test_plants_that_differ_in_numbers_are_refused_where_code_is_compiled_for_all() -> None:
+    """Two equal motors fit together; two with different friction do not."""
+    for friction in (0.01, 0.02):
+        motors = [ql.plants.dc_motor(coulomb=value) for value in (0.01, friction)]
+        if friction == 0.01:
+            VectorEnv(2, motors, QUIET, **OPEN | {"dt": 1e-3}).close()
+        else:
+            with pytest.raises(ValueError, match=r"plant\[1\] differs"):
+                VectorEnv(2, motors, QUIET, **OPEN | {"dt": 1e-3})
+            VectorEnv(2, motors, QUIET, **OPEN | {"dt": 1e-3}, interpret=True)
 
 
 def test_scenarios_are_drawn_from_the_generator_of_the_episode() -> None:

@@ -89,7 +89,10 @@ class Loops:
         self.channels: Channels = logged_channels(plant, controller)
         self._as_python = interpret or dispatch.interpret_all or not plant.compiled
         models = [p.sampled(controller.dt, interpret) for p in (each or [plant])]
-        self._models = _stacked_models(models)
+        self._models, self._plant_stride = models, int(len(models) > 1)
+        if not self._as_python:
+            stack = _stacked_models(models)
+            self._models, self._plant_stride = stack.members, self._plant_stride * stack.stride
         self._lanes = Stacked([self._at_rest()] * count)
         self._rest = self._lanes.memory[0].copy()
         self._begins = type(models[0]) in begin_run.implementations
@@ -139,21 +142,19 @@ class Loops:
                 begin_run(self._model(i), lane.x, lane.scratch)
 
     def _model(self, i: int) -> Any:
-        models = self._models.members
-        return models[i if len(models) > 1 else 0]
+        return self._models[i if self._plant_stride else 0]
 
     def advance(self, actions: Vector, active: Any) -> None:
         """Take the active loops through a step; write ``step``."""
-        models, lanes = self._models, self._lanes
-        plant_stride = models.stride if len(models.members) > 1 else 0
+        models, plant_stride, lanes = self._models, self._plant_stride, self._lanes
         inputs = self.controller.parameters, self.rules, actions, active, self._signals, self.step
         if self._as_python:
             run: Any = interpreted(run_step)
-            stacks: tuple[Any, ...] = models.members, plant_stride, lanes.members, lanes.stride
+            stacks: tuple[Any, ...] = models, plant_stride, lanes.members, lanes.stride
         else:
-            stacks = models.members[0], plant_stride, lanes.members[0], lanes.stride
+            stacks = models[0], plant_stride, lanes.members[0], lanes.stride
             if self._run is None:
-                with explain_compile_errors(models.members[0], inputs[0]):
+                with explain_compile_errors(models[0], inputs[0]):
                     self._run = specialised(run_step, *stacks, *inputs, 0, 1)
             run = self._run
         edges = [self.count * part // self._shares for part in range(self._shares + 1)]

@@ -35,7 +35,8 @@ class VectorEnv(vector.VectorEnv):  # type: ignore[misc, name-defined, unused-ig
         number of loops N.
     plant
         one plant for all loops, or a sequence with one for each, as from ``quell.plants.batch``:
-        linear plants of one order, or others that differ only in arrays.
+        linear plants of one order, nonlinear ones that differ in their ``parameters``, or others
+        that differ only in arrays.
     scenario, controller
         as for ``Env``. Scenarios that are drawn, or have noise, take 8 bytes for each loop, sample
         and signal: 64 MB for 1000 loops, 2000 samples, r, noise and two disturbances.
