@@ -5,6 +5,7 @@ import os
 import quell
 
 # Override the environment: with another backend the figures would be missing, without a warning.
+os.environ["QUELL_QUIET"] = "1"
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
 
 project = "quell"

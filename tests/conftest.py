@@ -12,6 +12,8 @@ from typing import Any
 
 # Two workers share two cores, and in small matrices the threads of BLAS mostly wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Tests read the standard error: no announcements of long compilations.
+os.environ["QUELL_QUIET"] = "1"
 
 import numpy as np
 import pytest

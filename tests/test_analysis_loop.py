@@ -168,7 +168,7 @@ def test_what_can_not_be_analysed_is_said_in_a_line() -> None:
     """By name, value and rule."""
     controller = adrc(2, learner=ql.learners.MLP(hidden=2))
     run = ql.simulate(chain(2), controller, TRAINING)
-    pendulum = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - np.sin(x[0])), order=2)
+    pendulum = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - np.cos(x[0])), order=2)
     outside = adrc(2, learner=ql.learners.PythonModel(Python()))
     other = ql.simulate(chain(2), adrc(2, learner=ql.learners.Kalman()), TRAINING)
     for message, call in (
@@ -270,10 +270,9 @@ def test_a_nonlinear_plant_is_analysed_about_its_operating_point() -> None:
         direct = analysis.analyse((expected, [0.0, 2.0], [slope, 0.0]), adrc(2))
         assert loop.margins.phase == pytest.approx(direct.margins.phase, rel=1e-6)
         assert loop.b_over_b0 == pytest.approx(2.0 * slope, rel=1e-8)
-    with pytest.raises(
-        ValueError, match=r"is nonlinear: give the point .* operating_point=\(x, u\)"
-    ):
-        analysis.analyse(pendulum, adrc(2))
+    pushed = ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], u - 1.0), order=2)
+    with pytest.raises(ValueError, match=r"is nonlinear, .* give the point .* operating_point=\(x"):
+        analysis.analyse(pushed, adrc(2))
     with pytest.raises(ValueError, match=r"is a function: pass quell\.plants\.NonlinearPlant\(f"):
         analysis.analyse(pendulum.f, adrc(2))
     with pytest.raises(ValueError, match=r"operating_point = 3\.0: must be a state and a control"):

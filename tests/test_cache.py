@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -211,3 +212,37 @@ def test_code_that_another_user_could_have_written_is_not_loaded(
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "other" / "quell-compiled").symlink_to(tmp_path / "elsewhere")
     assert cache.cache_path.__wrapped__() is None
+
+
+def test_a_long_compilation_is_announced_with_what_and_how_long(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While it goes on, and at its end; short ones, and those that nobody wants to hear of, are not."""
+    from types import SimpleNamespace
+    from typing import NamedTuple
+
+    from numba import typeof
+
+    from quell.kernels import compile_time as module
+
+    class RlsModel(NamedTuple):
+        rate: float
+
+    def run_block() -> None:
+        pass
+
+    data = {"dispatcher": SimpleNamespace(py_func=run_block), "args": (typeof(RlsModel(1.0)),)}
+    told = SimpleNamespace(data=data)
+    listener = module.CompileTime()
+    monkeypatch.setattr(module, "_LONG", 0.02)
+    for on in (True, False):
+        listener.announced = on
+        listener.on_start(told)
+        time.sleep(0.1)
+        listener.on_end(told)
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == (2 if on else 0)
+        if on:
+            assert lines[0] == "quell: compiling run block for Rls: takes up to a minute, once"
+            assert lines[1].startswith("quell: compiled in 0.")
+    assert listener.seconds > listener.told > 0.0

@@ -427,7 +427,7 @@ def test_status_and_reason_say_what_happened() -> None:
     assert {"authority", "error_plain", "error_learned", "reason"} <= set(run.names)
     assert run.to_xarray()["error_plain"].attrs["units"] == "y-unit/s^n"
     axes = run.plot()
-    assert len(axes) == 4
+    assert len(axes) == 5
     assert "not finite" in axes[3].get_legend_handles_labels()[1]
 
 

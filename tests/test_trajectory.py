@@ -270,18 +270,81 @@ def test_a_place_that_cannot_be_written_is_named(run: ql.Trajectory, tmp_path: P
         run.save(tmp_path)
 
 
-def test_a_plot_has_three_axes_and_draws_into_given_ones(run: ql.Trajectory) -> None:
-    """Output, control signal and estimates."""
+def test_a_plot_has_an_error_panel_and_draws_into_given_axes(run: ql.Trajectory) -> None:
+    """Output, control signal, estimates, and the error, which three given axes have no place for."""
     import matplotlib
 
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
 
     axes = run.plot()
-    assert [len(ax.lines) for ax in axes] == [2, 1, 3]
+    learner = bool(run.features)
+    assert [len(ax.lines) for ax in axes] == [2, 1, 3 if learner else 1, 2]
+    assert axes[3].get_position().y0 > axes[1].get_position().y0  # below the output
     _, mine = plt.subplots(3, 1)
     assert run.plot(mine) is mine
+    _, four = plt.subplots(4, 1)
+    assert run.plot(ax=four) is four
+    with pytest.raises(ValueError, match="axes and ax: are two names of the same"):
+        run.plot(mine, ax=four)
     plt.close("all")
+
+
+def test_a_plot_marks_limits_and_saturation_and_has_names_and_units() -> None:
+    """Lines at the limits, spans where u is at one; r is drawn above y."""
+    import matplotlib.pyplot as plt
+
+    plant = ql.plants.labelled(ql.plants.two_mass_spring(), y="position [m]", u="force [N]")
+    observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=0.01)
+    controller = ql.ADRC(observer, omega_c=1.0, u_min=-0.2, u_max=0.2)
+    run = ql.simulate(plant, controller, ql.Scenario(1.0, 2.0))
+    axes = run.plot()
+    assert [ax.get_ylabel() for ax in axes[[0, 1, 3]]] == ["position [m]", "force [N]", "error [m]"]
+    y, r = axes[0].lines
+    assert (r.get_label(), r.get_zorder() >= y.get_zorder()) == ("r", True)
+    heights = [line.get_ydata()[0] for line in axes[1].lines[1:]]
+    assert heights == [-0.2, 0.2]
+    (spans,) = axes[1].collections
+    assert spans.get_label() == "saturated"
+    held = (run["status"].astype(int) & int(ql.Status.SATURATED)) != 0
+    assert spans.get_paths()[0].get_extents().x0 == pytest.approx(run.t[np.argmax(held)])
+    plt.close("all")
+
+
+def test_a_data_frame_has_a_row_for_each_sample_and_units(
+    run: ql.Trajectory, tmp_path: Path
+) -> None:
+    """From xarray, by to_pandas and in CSV: the same numbers under the same names."""
+    frame, direct = run.to_xarray().to_dataframe(), run.to_pandas()
+    assert len(frame) == len(direct) == len(run)
+    assert set(frame.columns) == set(direct.columns)
+    np.testing.assert_array_equal(frame[direct.columns].to_numpy(), direct.to_numpy())
+    np.testing.assert_array_equal(direct["x[1]"], run["x"][:, 1])
+    assert direct.attrs["units"]["u"] == "u-unit"
+    path = tmp_path / "run.csv"
+    run.to_csv(path)
+    head, *lines = path.read_text().splitlines()
+    assert head.split(",")[:3] == ["time [s]", "r", "y"]
+    table = np.array([[float(cell) for cell in line.split(",")] for line in lines])
+    np.testing.assert_array_equal(table[:, 1:], direct.to_numpy())
+    with pytest.raises(ValueError, match="exists"):
+        run.to_csv(path)
+
+
+def test_names_and_units_are_in_files_and_come_back(tmp_path: Path) -> None:
+    """In NetCDF, xarray and CSV; the limits of u, too."""
+    plant = ql.plants.labelled(ql.plants.two_mass_spring(), "position [m]", "force [N]", "push [N]")
+    observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=0.01)
+    controller = ql.ADRC(observer, omega_c=1.0, u_min=-0.2, u_max=0.3)
+    run = ql.simulate(plant, controller, ql.Scenario(1.0, 0.1))
+    run.save(tmp_path / "run.nc")
+    again = ql.Trajectory.load(tmp_path / "run.nc")
+    assert (again.signals, again.u_limits) == (run.signals, (-0.2, 0.3))
+    data = again.to_xarray()
+    assert data["y"].attrs == {"long_name": "position", "units": "m"}
+    assert data["f_hat"].attrs["units"] == "m/s^n"
+    run.to_csv(tmp_path / "run.csv")
+    assert "y [m],y_measured [m],u [N]" in (tmp_path / "run.csv").read_text().splitlines()[0]
 
 
 def test_a_thinned_line_keeps_its_extremes_and_ends(rng: np.random.Generator) -> None:

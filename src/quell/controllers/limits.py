@@ -32,6 +32,12 @@ class Limits(NamedTuple):
 NO_LIMITS = Limits(-math.inf, math.inf, math.inf, -math.inf)
 
 
+def limits_of(controller: Any) -> tuple[float, float]:
+    """Return the limits of u of a controller, also behind a prefilter; infinite if it has none."""
+    limits = getattr(controller, "limits", None)
+    return (-math.inf, math.inf) if limits is None else (float(limits.low), float(limits.high))
+
+
 def checked_limits(u_min: float, u_max: float, rate_limit: RateLimit, dt: float) -> Limits:
     """Check and return limits; ``rate_limit`` in u-units a second."""
     low, high = checks.interval("u_min", u_min, "u_max", u_max)

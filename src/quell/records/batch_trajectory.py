@@ -149,17 +149,17 @@ class BatchTrajectory(Record):
                 missing.setdefault(name, {})[i] = reason
         return BatchMetrics(found, missing, band)
 
-    def plot(self, axes: Any = None) -> Any:
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw output and control signal: median, bands of the runs, and when others diverged.
 
         Parameters
         ----------
-        axes
+        axes, ax
             two matplotlib axes; a new figure by default.
         """
-        from quell.records.plotting import plot_batch
+        from quell.records.plotting import given_axes, plot_batch
 
-        return plot_batch(self, self.diverged, self.ended, axes)
+        return plot_batch(self, self.diverged, self.ended, given_axes(axes, ax))
 
     def to_xarray(self) -> xarray.Dataset:
         """Return the record as an ``xarray.Dataset`` over ``run`` and ``time``.

@@ -46,6 +46,12 @@ def processor_time(most: int) -> float:
     return _START + _PER_BYTE * most
 
 
+_ATTRIBUTES = (
+    *("dt", "every", "status", "ended", "limit", "plant"),
+    *("signals", "u_min", "u_max"),
+)
+
+
 def main(path: str, most: int, axes: list[str], attributes: list[str], needed: list[str]) -> None:
     """Write what a file holds to the standard output, or the reason why it is refused.
 
@@ -121,11 +127,7 @@ def _names(file: Any) -> list[str]:
 
 def _checked(file: Any, found: dict[str, Any], axes: list[str], most: int) -> dict[str, Any]:
     """Return attributes and variables; nothing but attributes and labels is read."""
-    attributes = {
-        name: _attribute(file, name)
-        for name in ("dt", "every", "status", "ended", "limit", "plant")
-        if name in file.attrs
-    }
+    attributes = {name: _attribute(file, name) for name in _ATTRIBUTES if name in file.attrs}
     size, variables = 0, []
     for name, dataset in found.items():
         if _text_of(dataset, "NAME").startswith(_NO_VARIABLE):

@@ -8,13 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.guard import Reason
+from quell.quantities import Quantity
 from quell.records.record import Record
-from quell.types import Vector
+from quell.types import Status, Vector
 
 # Share of the runs in a band [%], its label and opacity; chosen by hand.
 _BANDS = ((100.0, "all", 0.15), (90.0, "90 %", 0.25), (50.0, "50 %", 0.4))
 # About two points for each pixel of a wide figure.
 _POINTS = 2000
+# A limit farther away than so many times the largest |u| would hide the signal. Chosen by hand.
+_NEAR_LIMIT = 3.0
 _ESTIMATES = {"f_hat": "estimate of f", "f_learned": "learned share", "f_residual": "residual"}
 # Reasons for a reduced authority that are marked in the plot of the guard.
 _MARKED = (
@@ -43,35 +46,104 @@ def draw_line(ax: Any, t: Vector, values: Vector, **style: Any) -> None:
     ax.plot(*thinned(t, values), **style)
 
 
-def plot_run(run: Record, diverged_at: float | None, axes: Any = None) -> Any:
-    """Draw output and reference, control signal, estimates of f and, with a guard, its authority.
+def given_axes(axes: Any, ax: Any) -> Any:
+    """Return the axes of a call that takes them by either name.
 
-    ``diverged_at`` is the time at which the run diverged [s], if it did. Returns the axes.
+    Raises
+    ------
+    ValueError
+        if both are given.
     """
-    guarded = "authority" in run.names
-    if axes is None:
-        axes = _new_axes(4 if guarded else 3, 2.3)
-    if np.size(axes) not in ((3, 4) if guarded else (3,)):
-        rule = "must be three matplotlib axes, or four for a run with a guard"
+    if axes is not None and ax is not None:
+        raise ValueError("axes and ax: are two names of the same; give one")
+    return ax if axes is None else axes
+
+
+def plot_run(run: Any, diverged_at: float | None, axes: Any = None) -> Any:
+    """Draw output and reference, control signal, estimates of f, the guard's authority, the error.
+
+    ``run`` is a ``Trajectory``, ``diverged_at`` the time at which it diverged [s], if it did.
+    Returns the axes in this order, without those that the run has nothing for.
+    """
+    panels = [_draw_output, _draw_control, _draw_estimates]
+    panels += [_draw_guard] if "authority" in run.names else []
+    new = axes is None
+    if new:
+        if not any(name in run.names for name in _ESTIMATES):
+            panels.remove(_draw_estimates)
+        panels.append(_draw_error)
+        count = len(panels)
+        # The error is below the output, and last in the array.
+        below = _new_axes(count, 2.0)
+        axes = below[[0, *range(2, count), 1]]
+    elif np.size(axes) == len(panels) + 1:
+        panels.append(_draw_error)
+    if np.size(axes) != len(panels):
+        more = len(panels)
+        rule = f"must be {more} matplotlib axes for this run, or {more + 1} with the error"
         raise ValueError(f"axes: {rule}, got {np.size(axes)}")
-    t = run.t
-    draw_line(axes[0], t, run["y"], label="y", color="C0")
-    draw_line(axes[0], t, run["r"], label="r", color="0.3", linestyle="--", linewidth=1.0)
-    draw_line(axes[1], t, run["u"], label="u", color="C1")
-    for name, label in _ESTIMATES.items():
-        if name in run.names:
-            draw_line(axes[2], t, run[name], label=label, linewidth=1.0)
-    if len(axes) == 4:
-        _draw_guard(run, axes[3])
-    labels = ("output", "control signal", "total disturbance", "guard")
-    for ax, label in zip(axes, labels, strict=False):
-        ax.set_ylabel(label)
-        ax.legend(loc="upper right", fontsize="small", ncols=3 if label == "guard" else 1)
+    for ax, draw in zip(axes, panels, strict=True):
+        draw(run, ax)
+        # Beside the axes, where it hides no data.
+        ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), fontsize="small", frameon=False)
         ax.grid(alpha=0.3)
-    axes[len(axes) - 1].set_xlabel("time [s]")
+    axes[-2 if new else -1].set_xlabel("time [s]")
     if diverged_at is not None:
         axes[0].set_title(f"ended at {diverged_at:.3g} s: diverged", color="C3")
     return axes
+
+
+def _draw_output(run: Any, ax: Any) -> None:
+    draw_line(ax, run.t, run["y"], label="y", color="C0")
+    # Above y, so that it is seen where both are equal.
+    draw_line(ax, run.t, run["r"], label="r", color="0.2", linestyle=(0, (4, 3)), linewidth=1.2)
+    ax.set_ylabel(run.signals.y.label("output"))
+
+
+def _draw_error(run: Any, ax: Any) -> None:
+    draw_line(ax, run.t, run["r"] - run["y"], label="r − y", color="C3", linewidth=1.0)
+    ax.axhline(0.0, color="0.6", linewidth=0.8)
+    ax.set_ylabel(Quantity("error", run.signals.y.unit).label("error"))
+
+
+def _draw_control(run: Any, ax: Any) -> None:
+    u = run["u"]
+    draw_line(ax, run.t, u, label="u", color="C1")
+    reach = float(np.max(np.abs(u), initial=0.0))
+    shown = [at for at in run.u_limits if np.isfinite(at) and abs(at) <= _NEAR_LIMIT * reach]
+    for i, at in enumerate(shown):
+        label = None if i else "limit"
+        ax.axhline(at, color="0.4", linestyle=":", linewidth=1.2, label=label)
+    if "status" in run.names:
+        held = (run["status"].astype(np.int64) & int(Status.SATURATED)) != 0
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(np.int8)))
+        spans = edges.reshape(-1, 2)
+        if len(spans):
+            step = run.every * run.dt
+            bars = [(low * step, (high - low) * step) for low, high in _joined(spans, len(run))]
+            style = {"transform": ax.get_xaxis_transform(), "color": "C3", "alpha": 0.15}
+            ax.broken_barh(bars, (0.0, 1.0), label="saturated", linewidth=0.0, **style)
+    ax.set_ylabel(run.signals.u.label("control signal"))
+
+
+def _joined(spans: NDArray[np.int64], samples: int) -> list[tuple[int, int]]:
+    """Return spans of samples, those joined whose gap is too small to be seen."""
+    gap, found = samples / _POINTS, [tuple(spans[0].tolist())]
+    for low, high in spans[1:].tolist():
+        if low - found[-1][1] < gap:
+            found[-1] = (found[-1][0], high)
+        else:
+            found.append((low, high))
+    return found
+
+
+def _draw_estimates(run: Any, ax: Any) -> None:
+    learner = "f_learned" in run.names and (bool(run.features) or np.any(run["f_learned"]))
+    for name, label in _ESTIMATES.items():
+        if name in run.names and (name == "f_hat" or learner):
+            draw_line(ax, run.t, run[name], label=label, linewidth=1.0)
+    unit = run.signals.unit("y-unit/s^n") if run.signals.y.unit else ""
+    ax.set_ylabel(Quantity("total disturbance", unit).label(""))
 
 
 def plot_batch(runs: Record, diverged: NDArray[np.bool_], ended: Vector, axes: Any = None) -> Any:
@@ -91,7 +163,8 @@ def plot_batch(runs: Record, diverged: NDArray[np.bool_], ended: Vector, axes: A
     ):
         if not np.all(diverged):
             _draw_bands(ax, t, runs[name][~diverged, some], color)
-        ax.set_ylabel(label)
+        known = runs.signals.y if name == "y" else runs.signals.u
+        ax.set_ylabel(known.label(label))
         ax.grid(alpha=0.3)
     if "r" in runs.names:
         axes[0].plot(t, runs["r"][0, some], color="0.3", linestyle="--", linewidth=1.0, label="r")
@@ -100,7 +173,8 @@ def plot_batch(runs: Record, diverged: NDArray[np.bool_], ended: Vector, axes: A
         # The lines of runs that diverged would cover all others: mark their ends only.
         heights, transform = np.full(lost.size, 0.02), axes[0].get_xaxis_transform()
         axes[0].plot(lost, heights, "|", color="C3", transform=transform, label="diverged")
-    axes[0].legend(loc="upper right", fontsize="small", ncols=3)
+    beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.02), "frameon": False}
+    axes[0].legend(fontsize="small", **beside)
     axes[1].set_xlabel("time [s]")
     title = f"{diverged.size} runs, {lost.size} diverged"
     axes[0].set_title(title, color="C3" if lost.size else "0.2", fontsize="medium")
@@ -130,7 +204,7 @@ def _draw_bands(ax: Any, t: Vector, values: Vector, color: str) -> None:
     ax.set_ylim(bottom - margin, top + margin)
 
 
-def _draw_guard(run: Record, ax: Any) -> None:
+def _draw_guard(run: Any, ax: Any) -> None:
     """Draw the authority, the error left by the learner, and why the authority was reduced.
 
     The error is a share of that of an observer without learner.
@@ -147,4 +221,5 @@ def _draw_guard(run: Record, ax: Any) -> None:
             heights = np.full(at.size, -0.08 - 0.06 * i)
             label = reason.name.lower().replace("_", " ")
             ax.plot(at, heights, "|", markersize=4.0, color=f"C{5 + i}", label=label)
-    ax.set_ylim(-0.45, 2.1)  # room for the legend
+    ax.set_ylim(-0.45, 1.6)
+    ax.set_ylabel("guard")

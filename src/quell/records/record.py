@@ -69,7 +69,7 @@ class Record:
 
     def _dataset(self, axes: tuple[str, ...], attributes: dict[str, Any]) -> xarray.Dataset:
         """Return the channels over ``axes``, with more ``attributes`` of the dataset."""
-        import xarray
+        from quell.records.dataset import RecordDataset
 
         variables: dict[str, Any] = {}
         coordinates: dict[str, Any] = {"time": ("time", self.t, {"units": "s"})}
@@ -86,7 +86,7 @@ class Record:
         attributes = {"dt": self.dt, "every": self.every, **attributes}
         if self.signals.known:
             attributes["signals"] = json.dumps(self.signals.texts())
-        return xarray.Dataset(variables, coordinates, attrs=attributes)
+        return RecordDataset(variables, coordinates, attrs=attributes)
 
 
 def _netcdf(dataset: xarray.Dataset) -> bytes:

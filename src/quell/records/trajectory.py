@@ -49,6 +49,7 @@ class Trajectory(Record):
     features: tuple[str, ...] = ()  #: names of the features that the entries of ``theta`` multiply
     final_state: Any = None
     signals: Signals = UNKNOWN  #: names and units of y, u and disturbances
+    u_limits: tuple[float, float] = (-math.inf, math.inf)  #: limits of the controller [u-unit]
 
     @property
     def diverged(self) -> bool:
@@ -158,17 +159,45 @@ class Trajectory(Record):
             )
         return part
 
-    def plot(self, axes: Any = None) -> Any:
-        """Draw output, control signal, estimates of f and, with a guard, its authority.
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
+        """Draw output, control signal with its limits, estimates of f, guard, and the error.
+
+        Estimates are drawn if there are any, the learned share if there is a learner, the authority
+        if there is a guard. Samples at a limit of u are marked.
 
         Parameters
         ----------
-        axes
-            three matplotlib axes, or four for a run with a guard; a new figure by default.
-        """
-        from quell.records.plotting import plot_run
+        axes, ax
+            matplotlib axes: three (output, control signal, estimates), four for a run with a guard,
+            and one more for the error; a new figure by default.
 
-        return plot_run(self, self.ended if self.diverged else None, axes)
+        Returns
+        -------
+        numpy.ndarray
+            the axes in this order; in a new figure the error is drawn below the output.
+        """
+        from quell.records.plotting import given_axes, plot_run
+
+        return plot_run(self, self.ended if self.diverged else None, given_axes(axes, ax))
+
+    def to_pandas(self) -> Any:
+        """Return a ``pandas.DataFrame`` with a row for each sample; needs the extra ``pandas``.
+
+        The entries of vector channels are columns of their own, ``x[0]`` and ``theta[x1]``; its
+        ``attrs["units"]`` has the unit of each column.
+        """
+        from quell.records.table import to_pandas
+
+        return to_pandas(self)
+
+    def to_csv(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Write all channels as CSV, a line for each sample, with units in the line of names.
+
+        A ``ValueError`` says that the file exists, unless ``overwrite`` allows to replace it.
+        """
+        from quell.records.table import write_csv
+
+        write_csv(self, path, overwrite)
 
     def to_xarray(self) -> xarray.Dataset:
         """Return an ``xarray.Dataset`` over ``time``, with units and descriptions as attributes."""
@@ -179,6 +208,9 @@ class Trajectory(Record):
             "limit": self.limit,
             "message": self.message,
         }
+        for name, limit in zip(("u_min", "u_max"), self.u_limits, strict=True):
+            if math.isfinite(limit):
+                attributes[name] = limit
         return self._dataset(("time",), attributes)
 
     @classmethod
@@ -208,6 +240,10 @@ class Trajectory(Record):
                 status=Status(int(stored.attributes["status"])),
                 ended=float(stored.attributes["ended"]),
                 limit=float(stored.attributes.get("limit", math.inf)),
+                u_limits=(
+                    float(stored.attributes.get("u_min", -math.inf)),
+                    float(stored.attributes.get("u_max", math.inf)),
+                ),
             )
 
         attributes = {"dt", "every", "status", "ended", "plant"}

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.base import Controller, check_controller
+from quell.controllers.limits import limits_of
 from quell.controllers.single import check_compilable, in_single_precision
 from quell.kernels import dispatch
 from quell.lti.models import is_linear_model
@@ -175,6 +176,7 @@ def simulate(
         plant=plant.name,
         features=controller.features,
         signals=signals_of(plant),
+        u_limits=limits_of(controller),
         final_state=loop.state,
     )
 

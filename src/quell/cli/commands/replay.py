@@ -125,4 +125,4 @@ def _draw_wished(run: Trajectory, axes: Any) -> None:
     from quell.records.plotting import draw_line
 
     draw_line(axes[1], run.t, run["u_wished"], label="u wished", color="C3", linewidth=0.8)
-    axes[1].legend(loc="upper right", fontsize="small")
+    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), fontsize="small", frameon=False)

@@ -106,6 +106,7 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
         plant=run.plant,
         features=controller.features,
         signals=run.signals,
+        u_limits=run.u_limits,
         final_state=state,
     )
 

@@ -155,7 +155,7 @@ def run_rig(
         count, last = int(handle.faults[0]), handle.errors[0]
         notes.append(f"the device raised {count} errors, the last of them: {last!r}")
     notes += [*lost_changes(supervisor, dt), *(f"telemetry: {p}" for p in writer.problems)]
-    record = memory.trajectory()
+    record = replace(memory.trajectory(), u_limits=(rules.low, rules.high))
     return RigRun(
         trajectory=scenario_part(record, supervisor, reference.r.size),
         record=record,
