@@ -129,7 +129,9 @@ def test_a_malformed_message_gives_an_error_and_no_more(client: Client, text: st
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
-        ("plant", {"kind": "fmu", "path": "/tmp/evil.fmu"}, "an FMU is a program"),
+        ("plant", {"kind": "fmu", "path": "/tmp/evil.fmu"}, "opens no files"),
+        ("plant", {"kind": "python", "source": "evil.py:plant"}, "opens no files"),
+        ("observer.plant", {"kind": "identified", "path": "/etc/passwd"}, "opens no files"),
         ("tune", {"storage": "/tmp/file"}, "the studio opens no files"),
         ("scenario.duration", 1e9, "must be at most"),
         ("observer.order", 1_000_000, "must be at most"),
@@ -258,3 +260,19 @@ def test_the_page_loads_nothing_from_elsewhere() -> None:
         text = path.read_text(encoding="utf-8")
         assert "https://" not in text, path
         assert text.count("http://") == 0, path
+
+
+def test_a_page_may_name_only_the_files_of_the_command_line(tmp_path: Path) -> None:
+    """The plant of the setup that it began with, with other parameters."""
+    path = tmp_path / "plants.py"
+    path.write_text("import quell as ql\ndef motor(gain=1.0):\n    return ([gain], [1.0, 1.0])\n")
+    plant = {"kind": "python", "source": f"{path}:motor", "parameters": {"gain": 2.0}}
+    tables = TABLES | {"plant": plant}
+    granted = messages.Granted(messages.files_of(tables), trust=True)
+    assert messages.checked(tables, granted) == tables
+    other = TABLES | {"plant": plant | {"parameters": {"gain": 3.0}}}
+    assert messages.checked(other, granted) == other
+    with pytest.raises(ValueError, match="opens no files"):
+        messages.checked(TABLES | {"plant": plant | {"source": "other.py:motor"}}, granted)
+    with pytest.raises(ValueError, match="opens no files"):
+        messages.checked(other)

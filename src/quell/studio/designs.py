@@ -125,7 +125,7 @@ def band_frames(
     Ranges ``plant.uncertain`` of the setup are used in place of the percentage, if it has them.
     """
     percent = number(message, "percent", 20.0, 0.0, _MOST_PERCENT)
-    make, wide = Maker(), columns(message)
+    make, wide = Maker(trust=setup.trust), columns(message)
     random = np.random.default_rng(0)
     ranges = tables["plant"].get("uncertain") if isinstance(tables["plant"], dict) else None
     found: dict[str, list[Any]] = {"y": [], "u": []}

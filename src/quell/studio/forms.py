@@ -9,8 +9,8 @@ from pydantic_core import PydanticUndefined
 
 from quell.setup import reference, registry
 from quell.setup.schema import CallTable
+from quell.studio.messages import FILE_KINDS, Granted
 
-_WITHOUT = {"plant": ("fmu",), "learner": ("no-learner",)}
 # Keys that are tables of another group, and lists of them.
 _NESTED = {
     "plant": "plant",
@@ -23,8 +23,13 @@ _LISTS = {"disturbances": "signal", "features": "feature"}
 _HIDDEN = ("uncertain", "certified_for", "name")
 
 
-def forms() -> dict[str, Any]:
-    """Return for each group of tables its kinds, and for each kind its keys."""
+def forms(granted: Granted) -> dict[str, Any]:
+    """Return for each group of tables its kinds, and for each kind its keys.
+
+    Plants that are files are left out if they are not granted.
+    """
+    files = {each[0] for each in granted.files}
+    without = {*FILE_KINDS, "no-learner"} - files
     groups: Mapping[str, Mapping[str, type[CallTable]]] = {
         "plant": registry.PLANTS,
         "observer": registry.OBSERVERS,
@@ -43,7 +48,7 @@ def forms() -> dict[str, Any]:
         group: {
             kind: {"about": _plain(table.__doc__ or ""), "keys": _keys(table)}
             for kind, table in kinds.items()
-            if kind not in _WITHOUT.get(group, ()) and not kind.startswith("python")
+            if kind not in without
         }
         for group, kinds in groups.items()
     }

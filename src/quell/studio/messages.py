@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from quell import checks
 
@@ -24,9 +24,39 @@ _MOST_ENTRIES, _MOST_DELAYED = 1000, 10_000
 _COLUMNS = (50, 4000)
 # Tables that reach devices, files or other processes.
 _NOT_HERE = ("rig", "sweep")
-# Keys that name files, or functions in them.
-_FILES = ("path", "storage", "telemetry", "function", "file")
+# Keys that name files, in tables of any kind; and those of plants from files.
+_FILES = ("path", "storage", "telemetry", "function", "file", "source")
+_FROM_FILES = {"fmu": ("path",), "identified": ("path",), "python": ("source", "output")}
+FILE_KINDS = tuple(_FROM_FILES)
+"""Kinds of plants that are files, some of them programs."""
+
 TASKS = ("run", "band", "compare", "tune", "export", "toml", "open", "cancel")
+
+
+class Granted(NamedTuple):
+    """Files that the user named on the command line; a page can name no others."""
+
+    files: frozenset[tuple[Any, ...]] = frozenset()  #: from ``files_of``
+    trust: bool = False  #: whether Python files may be run
+
+
+_NOTHING = Granted()
+
+
+def files_of(tables: Any) -> frozenset[tuple[Any, ...]]:
+    """Return kind and file of each plant in the tables of a setup that is from a file."""
+    parts = tables.values() if isinstance(tables, dict) else tables
+    found: set[tuple[Any, ...]] = set()
+    if isinstance(tables, dict) and tables.get("kind") in FILE_KINDS:
+        found.add(_file_of(tables))
+    if isinstance(tables, dict | list | tuple):
+        found = found.union(*map(files_of, parts))
+    return frozenset(found)
+
+
+def _file_of(table: Mapping[str, Any]) -> tuple[Any, ...]:
+    kind = table["kind"]
+    return (kind, *(str(table.get(key)) for key in _FROM_FILES[kind]))
 
 
 def parsed(text: str | bytes) -> dict[str, Any]:
@@ -78,15 +108,15 @@ def number(message: Mapping[str, Any], key: str, usual: float, low: float, high:
     return float(value)
 
 
-def setup_tables(message: Mapping[str, Any]) -> dict[str, Any]:
+def setup_tables(message: Mapping[str, Any], granted: Granted) -> dict[str, Any]:
     """Return the tables of the setup in a message; raise a ``ValueError`` for too large ones."""
     tables = message.get("setup")
     if not isinstance(tables, dict):
         raise ValueError("setup: must be a table, as a setup file has it")
-    return checked(tables)
+    return checked(tables, granted)
 
 
-def checked(tables: dict[str, Any]) -> dict[str, Any]:
+def checked(tables: dict[str, Any], granted: Granted = _NOTHING) -> dict[str, Any]:
     """Return the tables of a setup that the studio can take, or raise a ``ValueError``."""
     tables = {key: table for key, table in tables.items() if key not in _NOT_HERE}
     dt = tables.get("dt")
@@ -99,6 +129,13 @@ def checked(tables: dict[str, Any]) -> dict[str, Any]:
             f"scenario.duration = {duration:g} s: must be at most {_MOST_SAMPLES} samples, "
             f"{_MOST_SAMPLES * dt:g} s at dt = {dt:g} s"
         )
+    named = files_of(tables) - granted.files
+    if named:
+        what = ", ".join(" ".join(each) for each in sorted(named))
+        raise ValueError(
+            f"{what}: the studio opens no files that a page names; name the setup on the command "
+            "line, quell studio setup.toml"
+        )
     _check_sizes(tables, "", float(dt))
     return tables
 
@@ -107,10 +144,9 @@ def _check_sizes(value: Any, path: str, dt: float) -> None:
     """Check all numbers and lists of a setup that decide how much memory and time it takes."""
     key = path.rpartition(".")[2].partition("[")[0]
     if isinstance(value, dict):
-        if value.get("kind") == "fmu":
-            raise ValueError(f"{path}: an FMU is a program, which the studio does not run")
+        from_file = value.get("kind") in FILE_KINDS  # granted, or refused before
         for each, part in value.items():
-            if each in _FILES:
+            if each in _FILES and not from_file:
                 raise ValueError(f"{path}.{each}: the studio opens no files")
             _check_sizes(part, f"{path}.{each}" if path else str(each), dt)
     elif isinstance(value, list | tuple):

@@ -49,12 +49,15 @@ class Page:
         an accepted connection of Starlette.
     workers
         the threads.
+    granted
+        the files that it may name.
     """
 
-    def __init__(self, websocket: Any, workers: Workers) -> None:
+    def __init__(self, websocket: Any, workers: Workers, granted: messages.Granted) -> None:
         self._websocket, self._workers = websocket, workers
         self._lanes = {"short": Lane(), "long": Lane()}
-        self._makers = {"short": Maker(), "long": Maker()}
+        self._granted = granted
+        self._makers = {name: Maker(trust=granted.trust) for name in self._lanes}
         self._sending = asyncio.Lock()
 
     async def serve(self) -> None:
@@ -91,7 +94,8 @@ class Page:
         while True:
             message = await lane.next()
             report = self._reporter(message["id"])
-            found = frames_for(message, self._makers[name], lane.stale, report)
+            make = self._makers[name]
+            found = frames_for(message, make, self._granted, lane.stale, report)
             try:
                 await self._send_all(found, name, message["id"])
             except StoppedError:

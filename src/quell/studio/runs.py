@@ -38,13 +38,13 @@ class StoppedError(Exception):
 class Maker:
     """Builds setups from tables, and builds again only what changed since the last one."""
 
-    def __init__(self, name: str = NAME) -> None:
-        self.name = name
+    def __init__(self, name: str = NAME, trust: bool = False) -> None:
+        self.name, self.trust = name, trust
         self._known: Known = {}
 
     def __call__(self, tables: Mapping[str, Any]) -> Setup:
         """Return the setup; raise a ``SetupError`` for tables that do not fit."""
-        setup = assembled(self.name, tables_of(self.name, tables), self._known)
+        setup = assembled(self.name, tables_of(self.name, tables), self._known, self.trust)
         for table in ("plant", "scenario"):
             setup.needed(table)
         return setup

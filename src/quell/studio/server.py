@@ -22,7 +22,7 @@ from quell.optional import import_extra
 from quell.parallel import one_blas_thread
 from quell.studio.forms import forms
 from quell.studio.frames import frame
-from quell.studio.messages import MOST_BYTES
+from quell.studio.messages import MOST_BYTES, Granted, files_of
 from quell.studio.pages import Page, Workers
 
 HOST = "127.0.0.1"
@@ -85,14 +85,21 @@ class Studio:
         tables of the setup that the page starts with; its own by default.
     token
         the first part of the path of the address; random by default.
+    trust
+        whether the Python file of a plant in ``setup`` may be run.
     """
 
     def __init__(
-        self, port: int = PORT, setup: Mapping[str, Any] | None = None, token: str | None = None
+        self,
+        port: int = PORT,
+        setup: Mapping[str, Any] | None = None,
+        token: str | None = None,
+        trust: bool = False,
     ) -> None:
         self.token = secrets.token_urlsafe(24) if token is None else token
         self.host = f"{HOST}:{port}"
         self._setup, self._files, self._workers = setup, page_files(), Workers()
+        self._granted = Granted(files_of(setup), trust)
         self._pages = 0
 
     @property
@@ -147,15 +154,18 @@ class Studio:
         self._pages += 1
         try:
             await websocket.accept()
-            hello = {"kind": "hello", "forms": forms()}
+            hello = {"kind": "hello", "forms": forms(self._granted)}
             await websocket.send_bytes(frame({**hello, "setup": self._setup}))
-            await Page(websocket, self._workers).serve()
+            await Page(websocket, self._workers, self._granted).serve()
         finally:
             self._pages -= 1
 
 
 def listen(
-    setup: Mapping[str, Any] | None = None, port: int = PORT, token: str | None = None
+    setup: Mapping[str, Any] | None = None,
+    port: int = PORT,
+    token: str | None = None,
+    trust: bool = False,
 ) -> tuple[Any, Studio, Any]:
     """Return a listening socket, the application for it, and the configuration of its server.
 
@@ -167,6 +177,8 @@ def listen(
         TCP port; 0 takes any free one.
     token
         first part of the path of the address; random by default.
+    trust
+        whether the Python file of a plant in ``setup`` may be run.
 
     Raises
     ------
@@ -186,7 +198,7 @@ def listen(
             "or 0 for a free one"
         ) from None
     try:
-        studio = Studio(listener.getsockname()[1], setup, token)
+        studio = Studio(listener.getsockname()[1], setup, token, trust)
         config = uvicorn.Config(
             studio.app(),
             ws="websockets-sansio",
@@ -209,12 +221,13 @@ def serve(
     setup: Mapping[str, Any] | None = None,
     port: int = PORT,
     ready: Callable[[str], None] | None = None,
+    trust: bool = False,
 ) -> None:
     """Serve the studio until it is interrupted; arguments and errors as those of ``listen``.
 
     ``ready`` is called with the address when the server listens.
     """
-    listener, studio, config = listen(setup, port)
+    listener, studio, config = listen(setup, port, trust=trust)
     server = import_extra("uvicorn", "studio", "the studio").Server(config)
     with listener, closing(studio), one_blas_thread():
         if ready is not None:

@@ -9,7 +9,7 @@ from quell.plants.linear_part import linear_model
 from quell.studio.designs import band_frames, compared_frames, tuned_frames
 from quell.studio.downloads import exported
 from quell.studio.frames import file_frame, frame
-from quell.studio.messages import columns, setup_tables
+from quell.studio.messages import Granted, columns, setup_tables
 from quell.studio.runs import Maker, run_frames
 from quell.studio.texts import python_of, tables_of_text, toml_of
 
@@ -20,6 +20,7 @@ LONG = ("compare", "tune", "export")
 def frames_for(
     message: Mapping[str, Any],
     make: Maker,
+    granted: Granted,
     stale: Callable[[], bool],
     report: Callable[[str, float], None],
 ) -> Iterator[bytes]:
@@ -34,11 +35,11 @@ def frames_for(
     """
     task, about = message["do"], {"id": message["id"]}
     if task == "open":
-        tables = tables_of_text(message.get("text"))
+        tables = tables_of_text(message.get("text"), granted)
         make(tables)
         yield frame({"kind": "opened", "setup": tables, **about})
         return
-    tables = setup_tables(message)
+    tables = setup_tables(message, granted)
     setup = make(tables)
     if task == "run":
         yield from run_frames(setup, columns(message), about, stale)

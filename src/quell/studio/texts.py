@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from quell.setup.description import parsed
-from quell.studio.messages import MOST_BYTES, checked
+from quell.studio.messages import MOST_BYTES, Granted, checked
 from quell.studio.runs import NAME
 from quell.tuning.result.setup_file import toml_text
 
@@ -46,11 +46,11 @@ def python_of(tables: Mapping[str, Any], title: str, is_linear: bool, delay: flo
     )
 
 
-def tables_of_text(text: Any) -> dict[str, Any]:
+def tables_of_text(text: Any, granted: Granted) -> dict[str, Any]:
     """Return the tables of the text of a setup file; raise a ``SetupError`` or ``ValueError``."""
     if not isinstance(text, str) or len(text) > MOST_BYTES:
         raise ValueError(f"text: must be the content of a TOML file, at most {MOST_BYTES} bytes")
-    return checked(parsed(NAME, text))
+    return checked(parsed(NAME, text), granted)
 
 
 def _without_none(value: Any) -> Any:
