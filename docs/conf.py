@@ -1,12 +1,19 @@
 """Sphinx configuration."""
 
 import os
+import runpy
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
 
 import quell
 
 # Override the environment: with another backend the figures would be missing, without a warning.
 os.environ["QUELL_QUIET"] = "1"
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
+# Tutorials call the command line of the same installation.
+os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
 project = "quell"
 author = "The quell developers"
@@ -21,15 +28,22 @@ extensions = [
 ]
 html_theme = "pydata_sphinx_theme"
 html_title = "quell"
-html_theme_options = {"show_prev_next": False, "secondary_sidebar_items": ["page-toc"]}
+html_theme_options = {
+    "show_prev_next": False,
+    "navbar_center": [],  # the sidebar has all pages
+    "secondary_sidebar_items": ["page-toc"],
+}
 html_show_sourcelink = False
-html_sidebars = {"**": []}
+templates_path = ["_templates"]
+html_sidebars = {"**": ["pages.html"]}
 exclude_patterns = ["_build", "jupyter_execute"]
 
 # All code cells are run during the build; a cell that fails stops it.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
+nb_execution_in_temp = True  # tutorials write files
+nb_merge_streams = True  # else the lines of a command become many boxes
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
 
@@ -39,3 +53,20 @@ autodoc_member_order = "bysource"
 autodoc_class_signature = "mixed"
 napoleon_numpy_docstring = True
 napoleon_google_docstring = False
+
+
+def draw_gallery() -> None:
+    """Run the scripts of the gallery, and save their figures for the pages."""
+    here = Path(__file__).parent
+    folder = here / "images" / "gallery"
+    folder.mkdir(exist_ok=True)
+    plt.switch_backend("agg")
+    for script in sorted((here.parent / "examples" / "gallery").glob("*.py")):
+        picture = folder / f"{script.stem}.png"
+        if not picture.exists() or picture.stat().st_mtime < script.stat().st_mtime:
+            runpy.run_path(str(script))
+            plt.gcf().savefig(picture, dpi=100)
+            plt.close("all")
+
+
+draw_gallery()

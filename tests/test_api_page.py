@@ -1,4 +1,4 @@
-"""The page of all names has all names."""
+"""The pages of all names have all names."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 
 import quell as ql
 
-PAGE = Path(__file__).parents[1] / "docs" / "api.rst"
+FOLDER = Path(__file__).parents[1] / "docs" / "api"
+PAGES = sorted(FOLDER.glob("*.rst"))
 ROOMS = (
     "analysis",
     "controllers",
@@ -23,13 +24,18 @@ ROOMS = (
 )
 
 pytestmark = pytest.mark.skipif(
-    not PAGE.exists(), reason="the pages are in the repository, not in what is built of it"
+    not PAGES, reason="the pages are in the repository, not in what is built of it"
 )
 
 
+def text() -> str:
+    """Return the text of all pages."""
+    return "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+
+
 def listed() -> set[str]:
-    """Return the names that the page's directives document, and the last part of the modules."""
-    page = PAGE.read_text(encoding="utf-8")
+    """Return the names that the pages' directives document, and the last part of the modules."""
+    page = text()
     targets = re.findall(r"^\.\. auto\w+:: (\S+)$", page, re.MULTILINE)
     members = [
         name.strip()
@@ -40,17 +46,17 @@ def listed() -> set[str]:
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_every_public_name_of_a_room_is_on_the_page(room: str) -> None:
+def test_every_public_name_of_a_room_is_on_a_page(room: str) -> None:
     """By a directive of its own, or among a module's members."""
     names = set(importlib.import_module(f"quell.{room}").__all__)
     assert names
     assert sorted(names - listed()) == []
 
 
-def test_every_name_of_the_package_is_on_the_page_and_every_target_exists() -> None:
+def test_every_name_of_the_package_is_on_a_page_and_every_target_exists() -> None:
     """Rooms too; and nothing is documented that is gone."""
     assert sorted(set(ql.__all__) - listed()) == []
-    page = PAGE.read_text(encoding="utf-8")
+    page = text()
     for kind, target, members in re.findall(
         r"^\.\. auto(\w+):: (\S+)$(?:\n   :members: (.+)$)?", page, re.MULTILINE
     ):
@@ -63,3 +69,12 @@ def test_every_name_of_the_package_is_on_the_page_and_every_target_exists() -> N
         for member in filter(None, members.split(", ")):
             annotated = getattr(thing, "__annotations__", {})
             assert hasattr(thing, member) or member in annotated, f"{target} has no {member}"
+
+
+@pytest.mark.parametrize("room", [room for room in ROOMS if "." not in room])
+def test_a_room_has_a_page_with_names_of_its_own(room: str) -> None:
+    """Readers find a folder's names under the folder's name, and no page is empty."""
+    page = (FOLDER / f"{room}.rst").read_text(encoding="utf-8")
+    assert page.startswith(f"quell.{room}\n")
+    assert ".. auto" in page
+    assert f":: quell.{room}" in page
