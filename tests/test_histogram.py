@@ -39,13 +39,17 @@ def test_a_histogram_as_text_and_plot() -> None:
         .splitlines()[0]
         .startswith("lateness: p50 20.5 µs, p99 20.5 µs, p99.9 300 µs, max 300 µs of 1000")
     )
-    assert [int(line.split()[4]) for line in histogram.text().splitlines()[1:]] == [
+    assert [int(line.split()[4]) for line in histogram.text().splitlines()[1:-1]] == [
         990,
         0,
         0,
         0,
         10,
     ]
+    *_, lowest, scale = histogram.text().splitlines()
+    assert [int(mark) for mark in scale.split("|")[1:]] == [1, 10, 100, 1000]
+    # The mark of 10 is at the end of the bar of 10.
+    assert scale.index("|10 ") == len(lowest) - 1
     ax = histogram.plot()
     assert ax.get_xlabel() == "duration [µs]"
     empty = Histogram.of(empty_counts())

@@ -7,6 +7,7 @@ from quell.analysis.advice import advise
 from quell.analysis.certificate import Certificate, certify
 from quell.analysis.frozen_learner import Frozen, frozen
 from quell.analysis.linearise import linear_law
+from quell.analysis.loci import plot_nyquist, plot_root_locus
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.analysis.margins import Margins
 from quell.analysis.observer_error import observer_error
@@ -37,4 +38,6 @@ __all__ = [
     "plot_gang_of_four",
     "plot_margins_against_omega_o",
     "plot_margins_over_time",
+    "plot_nyquist",
+    "plot_root_locus",
 ]

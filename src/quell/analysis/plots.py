@@ -11,6 +11,7 @@ from quell import checks
 from quell.analysis.loop import LoopAnalysis
 from quell.analysis.sweeps import loops_over_omega_o
 from quell.controllers.base import Controller
+from quell.records.plotting import given_axes
 from quell.types import Vector
 
 if TYPE_CHECKING:
@@ -19,17 +20,30 @@ if TYPE_CHECKING:
 _AID: dict[str, Any] = {"color": "0.5", "linewidth": 0.8}
 
 
-def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
+def plot_bode(
+    loop: LoopAnalysis,
+    axes: Any = None,
+    *,
+    ax: Any = None,
+    decibels: bool = False,
+    hertz: bool = False,
+    **style: Any,
+) -> list[Axes]:
     """Plot gain and phase of the loop ``L = P C_y`` with its margins; return the axes.
 
-    The margins' numbers are written only into a new figure: with a second loop they would overlap.
+    The margins' numbers are written above the axes, and only into a new figure: with a second loop
+    they would overlap.
 
     Parameters
     ----------
     loop
         from ``analyse``.
-    axes
+    axes, ax
         two matplotlib axes; a new figure by default.
+    decibels
+        draw the gain in dB.
+    hertz
+        draw over the frequency in Hz; over ω in rad/s by default.
     style
         of the lines, for example ``label``.
 
@@ -38,7 +52,10 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
     ValueError
         for another number of axes.
     """
+    axes = given_axes(axes, ax)
     new_figure = axes is None
+    scale = 1.0 / (2.0 * np.pi) if hertz else 1.0
+    gain: Any = _in_decibels if decibels else np.asarray
     top, low = axes = _axes(axes, 2, 1)
     # At half the sampling rate itself a sampled plant may have a zero, and no phase.
     omega = loop.omega[:-1]
@@ -47,32 +64,53 @@ def plot_bode(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
     margins = loop.margins
     crossing = margins.phase_omega if np.isfinite(margins.phase_omega) else omega[-1]
     phase -= 360.0 * np.ceil(np.interp(crossing, omega, phase) / 360.0)
-    (line,) = top.loglog(omega, np.abs(L), **style)
-    low.semilogx(omega, phase, color=line.get_color())
-    top.axhline(1.0, **_AID)
+    (line,) = top.semilogx(scale * omega, gain(np.abs(L)), **style)
+    low.semilogx(scale * omega, phase, color=line.get_color())
+    top.axhline(gain(1.0), **_AID)
     low.axhline(-180.0, **_AID)
 
-    def mark(ax: Axes, omega: float, ends: tuple[float, float], text: str, middle: float) -> None:
-        ax.vlines(omega, *ends, color=line.get_color(), linewidth=2.5, alpha=0.6)
-        if new_figure:
-            ax.annotate(text, (omega, middle), xytext=(5, -3), textcoords="offset points")
+    unit = "Hz" if hertz else "rad/s"
+
+    def mark(ax: Axes, omega: float, ends: tuple[Any, Any]) -> None:
+        ax.vlines(scale * omega, *ends, color=line.get_color(), linewidth=2.5, alpha=0.6)
 
     if np.isfinite(margins.phase_omega):
         at = float(np.interp(margins.phase_omega, omega, phase))
-        mark(low, margins.phase_omega, (-180.0, at), f"{margins.phase:.0f}°", 0.5 * (at - 180.0))
+        mark(low, margins.phase_omega, (-180.0, at))
+        if new_figure:
+            text = f"phase margin {margins.phase:.0f}° at {scale * margins.phase_omega:.3g} {unit}"
+            low.set_title(text, loc="right", fontsize="small")
+    found = []
     for factor, at in zip(margins.gain, margins.gain_omega, strict=True):
         if np.isfinite(at):
             ends = min(1.0, 1.0 / factor), max(1.0, 1.0 / factor)
-            mark(top, at, ends, f"{factor:.2g}", factor**-0.5)
-    _limit_ratio(top, np.abs(L))
+            mark(top, at, (gain(ends[0]), gain(ends[1])))
+            size = f"{_in_decibels(factor):.1f} dB" if decibels else f"{factor:.2g}"
+            found.append(f"{size} at {scale * at:.3g} {unit}")
+    if found and new_figure:
+        top.set_title(f"gain margin {', '.join(found)}", loc="right", fontsize="small")
+    low_end, high_end = _ratio_limits(np.abs(L))
+    top.set_ylim(gain(low_end), gain(high_end))
+    if not decibels:
+        top.set_yscale("log")
     low.set_ylim(max(float(np.min(phase)), -720.0) - 20.0, min(float(np.max(phase)), 180.0) + 20.0)
-    for ax, label in zip(axes, ("|L|", "phase of L [°]"), strict=True):
-        _finish(ax, label, loop)
-    low.set_xlabel("ω [rad/s]")
+    for each, label in zip(
+        axes, ("|L| [dB]" if decibels else "|L|", "phase of L [°]"), strict=True
+    ):
+        _finish(each, label, loop, scale)
+    low.set_xlabel("frequency [Hz]" if hertz else "ω [rad/s]")
     return axes
 
 
-def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> list[Axes]:
+def plot_gang_of_four(
+    loop: LoopAnalysis,
+    axes: Any = None,
+    *,
+    ax: Any = None,
+    decibels: bool = False,
+    hertz: bool = False,
+    **style: Any,
+) -> list[Axes]:
     """Plot the gains of S, T, PS (load to y) and CS (noise to u); return these four axes.
 
     The parameters are those of ``plot_bode``, but with four axes.
@@ -82,18 +120,22 @@ def plot_gang_of_four(loop: LoopAnalysis, axes: Any = None, **style: Any) -> lis
     ValueError
         for another number of axes.
     """
-    axes = _axes(axes, 2, 2)
+    axes = _axes(given_axes(axes, ax), 2, 2)
+    scale = 1.0 / (2.0 * np.pi) if hertz else 1.0
     meanings = ("", "", ": load at the plant's input to y", ": measurement noise to u")
     for ax, name, meaning in zip(axes, ("S", "T", "PS", "CS"), meanings, strict=True):
         gain = np.abs(loop.response(name, loop.omega))
-        ax.loglog(loop.omega, gain, **style)
-        _limit_ratio(ax, gain)
+        shown: Any = _in_decibels if decibels else np.asarray
+        ax.semilogx(scale * loop.omega, shown(gain), **style)
+        if not decibels:
+            ax.set_yscale("log")
+        ax.set_ylim(*(shown(end) for end in _ratio_limits(gain)))
         if name in ("S", "T"):
-            ax.axhline(1.0, **_AID)
+            ax.axhline(shown(1.0), **_AID)
         ax.set_title(f"|{name}|{meaning}", fontsize="medium")
-        _finish(ax, "", loop)
+        _finish(ax, "dB" if decibels else "", loop, scale)
     for ax in axes[2:]:
-        ax.set_xlabel("ω [rad/s]")
+        ax.set_xlabel("frequency [Hz]" if hertz else "ω [rad/s]")
     return axes
 
 
@@ -191,17 +233,21 @@ def _axes(axes: Any, rows: int, columns: int) -> list[Axes]:
     return axes
 
 
-def _limit_ratio(ax: Axes, size: Vector) -> None:
-    """Limit the axis to six decades about the median, to leave out undamped poles and zeros."""
+def _in_decibels(size: Any) -> Any:
+    return 20.0 * np.log10(size)
+
+
+def _ratio_limits(size: Vector) -> tuple[float, float]:
+    """Return limits of six decades about the median, to leave out undamped poles and zeros."""
     finite = size[np.isfinite(size) & (size > 0.0)]
     middle = float(np.median(finite))
     low, high = 0.5 * float(np.min(finite)), 2.0 * float(np.max(finite))
-    ax.set_ylim(max(low, 1e-6 * middle), min(high, 1e6 * middle))
+    return max(low, 1e-6 * middle), min(high, 1e6 * middle)
 
 
-def _finish(ax: Axes, label: str, loop: LoopAnalysis | None = None) -> None:
+def _finish(ax: Axes, label: str, loop: LoopAnalysis | None = None, scale: float = 1.0) -> None:
     """Add label and grid and, for a ``loop``, a line at half its sampling rate."""
     if loop is not None:
-        ax.axvline(np.pi / loop.dt, color="0.7", linestyle=":", linewidth=1.0)
+        ax.axvline(scale * np.pi / loop.dt, color="0.7", linestyle=":", linewidth=1.0)
     ax.set_ylabel(label)
     ax.grid(alpha=0.3)

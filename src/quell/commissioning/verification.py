@@ -19,6 +19,7 @@ from quell.identification.validation import nrmse
 from quell.realtime.loop.result import RigRun
 from quell.realtime.loop.run import run_rig
 from quell.realtime.loop.safety import Safety
+from quell.records.plotting import given_axes
 from quell.records.trajectory import Trajectory
 from quell.signals import Step
 from quell.simulation.scenario import Scenario
@@ -67,8 +68,9 @@ class Verification:
         about |= {"completed": self.run.completed, "verdict": self.run.verdict}
         return dict(nonfinite_to_none(about | scores))
 
-    def plot(self, axes: Any = None) -> Any:
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw y and u, measured and predicted, into two axes; return them."""
+        axes = given_axes(axes, ax)
         if axes is None:
             import matplotlib.pyplot as plt
 
@@ -76,11 +78,11 @@ class Verification:
         t = np.arange(self.y.size) * self.predicted.dt
         reference = np.where(t >= self.at, self.height, 0.0)
         axes[0].plot(t, reference, color="0.6", linewidth=1.0, label="reference")
-        for name, ax, value in (("y", axes[0], self.y), ("u", axes[1], self.u)):
-            ax.plot(t, value, label="measured")
-            ax.plot(self.predicted.t, self.predicted[name], "--", label="predicted")
-            ax.set_ylabel(f"{name}, from its value before the step on")
-            ax.grid(alpha=0.3)
+        for name, each, value in (("y", axes[0], self.y), ("u", axes[1], self.u)):
+            each.plot(t, value, label="measured")
+            each.plot(self.predicted.t, self.predicted[name], "--", label="predicted")
+            each.set_ylabel(f"{name}, from its value before the step on")
+            each.grid(alpha=0.3)
         axes[0].legend()
         axes[1].set_xlabel("time [s]")
         return axes

@@ -15,6 +15,7 @@ from quell.identification.model.roots import Root
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
 from quell.plants.linear import LinearPlant
+from quell.records.plotting import given_axes
 from quell.types import Matrix, Vector
 
 # A pole and a zero within three standard deviations may be equal (99.7 %).
@@ -122,21 +123,21 @@ class Identified:
         r = self.reference
         return frequency_response(self.u, self.y, self.dt, reference=r, segments=segments)
 
-    def plot(self, axes: Any = None) -> Any:
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw Bode plot, coherence, output, error, and the tests of the error; return the axes.
 
         Parameters
         ----------
-        axes
+        axes, ax
             seven matplotlib axes: gain, phase, coherence, output, error, autocorrelation,
             cross-correlation; those of a new figure by default.
         """
-        axes, split = plots.seven_axes(axes), self.held_from
+        axes, split = plots.seven_axes(given_axes(axes, ax)), self.held_from
         plots.draw_bode(axes[:3], self.empirical(), self.response)
         plots.draw_output(axes[3:5], self.t, self.y, self.simulated, split, self.fits)
         plots.draw_tests(axes[5:], self.residuals, (self.y.size - split) or self.y.size)
-        for ax in axes:
-            ax.grid(alpha=0.3)
+        for each in axes:
+            each.grid(alpha=0.3)
         return axes
 
     def describe(self) -> str:

@@ -13,6 +13,7 @@ from quell.analysis.loop import LoopAnalysis
 from quell.controllers.base import Controller
 from quell.files import nonfinite_to_none, written_atomically
 from quell.parallel import one_blas_thread
+from quell.records.plotting import given_axes
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, tradeoff
 from quell.tuning.optimiser.loops import PlantSet
@@ -116,7 +117,7 @@ class Tuned:
             lines.append(f"{name} on {each.samples} fresh samples: {each.value:.4g} ({ends})")
         return "\n".join([*lines, self.analysis.summary()])
 
-    def plot(self, axes: Any = None) -> Any:
+    def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw Bode diagram, sensitivities with their bounds, step and load responses.
 
         The references are beside the tuned controller. Returns the array of axes; ``axes`` are four
@@ -126,7 +127,7 @@ class Tuned:
         chosen = {"tuned": self.design}
         others = {key: named[key] for key in ("pi", "pid") if key in named}
         others = {key: each for key, each in others.items() if each is not self.design}
-        return draw(self.plants, chosen | others, self.constraints, axes)
+        return draw(self.plants, chosen | others, self.constraints, given_axes(axes, ax))
 
     def toml(self) -> str:
         """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``."""

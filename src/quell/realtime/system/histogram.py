@@ -57,6 +57,16 @@ def _edges() -> Vector:
     return np.concatenate([first, *rest]) * 1e-9
 
 
+def _scale(total: int) -> str:
+    """Return marks below logarithmic bars: 1, 10, 100, …, at the ends of bars of as many."""
+    line = ""
+    for power in range(int(math.log10(total)) + 1):
+        at = math.ceil(_BAR * math.log1p(10**power) / math.log1p(total)) - 1
+        if at >= len(line) + (power > 0):  # else there is no room for it
+            line = f"{line:<{at}}|{10**power}"
+    return line
+
+
 @dataclass(frozen=True, eq=False)
 class Histogram:
     """Durations of many cycles."""
@@ -115,7 +125,7 @@ class Histogram:
             inside = int(self.counts[step == part].sum())
             bar = "#" * math.ceil(_BAR * math.log1p(inside) / math.log1p(len(self)))
             lines.append(f"  up to {1e6 * 10 ** ((part + 1) / 4):9.3g} µs {inside:9d} {bar}")
-        return "\n".join(lines)
+        return "\n".join([*lines, f"{'number:':>30} {_scale(len(self))}"])
 
     def plot(self, ax: Any = None, label: str | None = None) -> Any:
         """Plot the share of cycles that took longer than a duration, both logarithmic.
