@@ -36,6 +36,7 @@ class CompileTime(event.Listener):
 
     def __init__(self) -> None:
         self.seconds = 0.0
+        self.running = 0  # threads that compile now
         self.told = 0.0  # share of it that was announced
         self.announced = not os.environ.get("QUELL_QUIET")
         self._own = threading.local()
@@ -45,6 +46,7 @@ class CompileTime(event.Listener):
         self._own.depth = getattr(self._own, "depth", 0) + 1
         if self._own.depth == 1:
             self._own.began = time.perf_counter()
+            self.running += 1
             # Of several processes only the first speaks.
             if self.announced and multiprocessing.parent_process() is None:
                 self._own.timer = threading.Timer(_LONG, _announce, (event.data,))
@@ -58,6 +60,7 @@ class CompileTime(event.Listener):
             # Numba compiles in one thread at a time, so the sum is safe.
             took = time.perf_counter() - self._own.began
             self.seconds += took
+            self.running -= 1
             timer, self._own.timer = getattr(self._own, "timer", None), None
             if timer is not None:
                 timer.cancel()

@@ -78,7 +78,7 @@ def run_frames(
         "message": run.message if run.diverged or run.status else "",
         "warnings": sorted({" ".join(str(each.message).split()) for each in caught}),
         "metrics": _metrics(run, setup),
-        "units": {name: describe(name)[1] for name in _CHANNELS},
+        "units": {name: describe(name, run.signals)[1] for name in _CHANNELS},
         "seconds": time.perf_counter() - began,
         "compiled": compile_time.seconds - compiled,
     }

@@ -155,7 +155,11 @@ function takeLoop(header, arrays, asked) {
 
 function drawRun() {
   views.showRun(now.arrays, pins, store.state.band ? now.band : null, store.state.setup);
-  const unit = (name) => (now.run?.units?.[name] ? `[${now.run.units[name]}]` : "");
+  // Without units of the plant the names of units only repeat those of the signals.
+  const unit = (name) => {
+    const known = now.run?.units?.[name] ?? "";
+    return known && !known.includes("-unit") ? `[${known}]` : "";
+  };
   for (const [name, key] of [["y", "y"], ["u", "u"], ["f", "f_hat"]]) {
     document.querySelector(`[data-unit="${name}"]`).textContent = unit(key);
   }
