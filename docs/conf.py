@@ -12,6 +12,7 @@ import quell
 # Override the environment: with another backend the figures would be missing, without a warning.
 os.environ["QUELL_QUIET"] = "1"
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
+os.environ["QUELL_QUIET"] = "1"  # pages do not show what is compiled
 # Tutorials call the command line of the same installation.
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
