@@ -16,6 +16,7 @@ from quell.records.measures import MEASURES
 from quell.records.metrics import SETTLING_BAND
 
 if TYPE_CHECKING:
+    from quell.quantities import Signals
     from quell.records.trajectory import Trajectory
     from quell.setup import Setup
 
@@ -78,9 +79,23 @@ def _nothing_to_judge(run: Trajectory, start: float, stop: float, cut_off: bool)
     return ""
 
 
-def print_metrics(console: Console, title: str, windows: list[dict[str, Any]]) -> None:
-    """Print a table with a row for each window, the settling band, and reasons for dashes."""
-    headings = (column.heading for column in COLUMNS)
+def _heading(column: Column, units: dict[str, str]) -> str:
+    """Return the heading of a column with the unit of its signal, if that is known."""
+    which = "u" if "variation" in column.key else "y"
+    in_unit = column.key in ("peak_error", "rms", "control_variation", "total_variation")
+    known = in_unit and units[which] not in ("", f"{which}-unit")
+    return f"{column.heading}\n[{units[which]}]" if known else column.heading
+
+
+def print_metrics(
+    console: Console, title: str, windows: list[dict[str, Any]], signals: Signals | None = None
+) -> None:
+    """Print a table with a row for each window, the settling band, and reasons for dashes.
+
+    ``signals`` has the units of y and u.
+    """
+    units = {key: signals.unit(f"{key}-unit") if signals else "" for key in "yu"}
+    headings = [_heading(column, units) for column in COLUMNS]
     rows = table(title, "from … to\n[s]", *headings, padding=(0, 1, 0, 0), pad_edge=False)
     for scores in windows:
         cells = [column.cell(scores) for column in COLUMNS]

@@ -47,16 +47,12 @@ def plot_over(
     failed: NDArray[np.bool_],
     measures: Mapping[str, Vector],
     figure: Any = None,
+    ax: Any = None,
 ) -> Any:
-    """Draw failure rate and quantiles of each measure over a parameter."""
-    import matplotlib.pyplot as plt
-
-    columns = min(3, 1 + len(measures))
-    rows = -(-(1 + len(measures)) // columns)
-    if figure is None:
-        figure = plt.figure(figsize=(3.6 * columns, 2.9 * rows), layout="constrained")
-    figure.suptitle("failures; median and 5 to 95 % of the runs that did not diverge", fontsize=10)
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    """Draw failure rate and quantiles of each measure over a parameter; return the axes."""
+    axes = _new_axes(len(measures), figure) if ax is None else np.ravel(ax)
+    if axes.size < 1 + len(measures):
+        raise ValueError(f"ax: must be {1 + len(measures)} matplotlib axes, got {axes.size}")
     _plot_failures(axes[0], failed, groups)
     for axis, (name, values) in zip(axes[1:], measures.items(), strict=False):
         _plot_quantiles(axis, values, groups)
@@ -69,7 +65,19 @@ def plot_over(
         axis.grid(alpha=0.3)
         if groups.texts is not None:
             axis.set_xticks(groups.centres, groups.texts)
-    return figure
+    return axes[: 1 + len(measures)]
+
+
+def _new_axes(measures: int, figure: Any) -> Any:
+    """Return axes for the failures and for so many measures, in a figure or in a new one."""
+    columns = min(3, 1 + measures)
+    rows = -(-(1 + measures) // columns)
+    if figure is None:
+        import matplotlib.pyplot as plt
+
+        figure = plt.figure(figsize=(3.6 * columns, 2.9 * rows), layout="constrained")
+    figure.suptitle("failures; median and 5 to 95 % of the runs that did not diverge", fontsize=10)
+    return figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
 
 
 def _plot_failures(axis: Any, failed: NDArray[np.bool_], groups: Groups) -> None:

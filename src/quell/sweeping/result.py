@@ -130,8 +130,8 @@ class Sweep:
         """
         return simulate(*self.parts(run))
 
-    def plot(self, parameter: str, figure: Any = None) -> Any:
-        """Draw failure rate and quantiles of each measure over a parameter; return the figure.
+    def plot(self, parameter: str, figure: Any = None, *, ax: Any = None) -> Any:
+        """Draw failure rate and quantiles of each measure over a parameter; return the axes.
 
         The quantiles are those of runs that did not diverge.
 
@@ -141,6 +141,8 @@ class Sweep:
             name of the parameter.
         figure
             a matplotlib figure; a new one by default.
+        ax
+            axes to draw into: one for the failures, then one for each measure.
         """
         from quell.sweeping.figures import groups_of, plot_over
 
@@ -151,4 +153,4 @@ class Sweep:
             title = name if unit == "1" else f"{name} [{unit}]"
             measures[title] = np.where(self.complete, self.dataset[name].values, np.nan)
         groups = groups_of(values, texts, self.done)
-        return plot_over(parameter, groups, self.failed, measures, figure)
+        return plot_over(parameter, groups, self.failed, measures, figure, ax)

@@ -58,7 +58,9 @@ def run(
         except ValueError as error:
             raise SetupError([f"{given.file}: {error}"]) from None
     scores = windowed_metrics(result, given)
-    print_metrics(console, f"{given.title}: {result.plant}, dt = {result.dt:g} s", scores)
+    print_metrics(
+        console, f"{given.title}: {result.plant}, dt = {result.dt:g} s", scores, result.signals
+    )
     learned = print_outcome(console, result)
     paths = save_run_figure(result, given.title, outputs, setup.stem)
     write_record(console, result, outputs, "Record")

@@ -124,7 +124,7 @@ def _run(
     record = run.trajectory
     scores = windowed_metrics(record, setup)
     _print_timing(console, run)
-    print_metrics(console, f"{setup.title}: the scenario", scores)
+    print_metrics(console, f"{setup.title}: the scenario", scores, record.signals)
     learned = print_outcome(console, record)
     code = exit_code(run)
     results = {

@@ -67,9 +67,12 @@ def figure_files(folder: str | os.PathLike[str], names: Iterable[str]) -> list[P
 def save_figure(
     figure: Any, folder: str | os.PathLike[str], name: str, overwrite: bool = False
 ) -> list[Path]:
-    """Write a figure into ``folder`` as PNG and SVG, close it, and return the paths."""
+    """Write a figure, or that of some axes, as PNG and SVG, close it, and return the paths."""
     import matplotlib
+    import numpy as np
 
+    if not hasattr(figure, "savefig"):
+        figure = np.ravel(figure)[0].figure
     try:
         written = figure_files(make_folder(folder), [name])
         for path in written:

@@ -9,15 +9,33 @@ from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import new_figure, save_figures
+from quell.experiments.common.figures import save_figures
 from quell.experiments.compare.study import Comparison
-from quell.records.plotting import draw_line
+from quell.records.plotting import draw_line, given_axes
 
 
-def draw(result: Comparison) -> Any:
-    """Return the figure: y and r above, u below; quiet signals in front, extreme values cut off."""
-    figure = new_figure(10.0, 7.0)
-    above, below = figure.subplots(2, 1, sharex=True)
+def draw(result: Comparison, axes: Any = None, *, ax: Any = None) -> Any:
+    """Draw y and r above, u below; quiet signals in front, extreme values cut off.
+
+    Parameters
+    ----------
+    result
+        of ``compare``.
+    axes, ax
+        two matplotlib axes; those of a new figure by default.
+
+    Returns
+    -------
+    numpy.ndarray
+        the axes.
+    """
+    axes = given_axes(axes, ax)
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        size = (10.0, 7.0)
+        axes = plt.subplots(2, 1, sharex=True, figsize=size, layout="constrained")[1]
+    above, below = axes
     first = next(iter(result.runs.values()))
     draw_line(above, first.t, first["r"], color="0.3", linestyle="--", linewidth=1.0, label="r")
     variation = {name: np.sum(np.abs(np.diff(run["u"]))) for name, run in result.runs.items()}
@@ -28,13 +46,14 @@ def draw(result: Comparison) -> Any:
         depth = 3.0 - quietest_first.index(name) / len(quietest_first)
         draw_line(above, run.t, run["y"], label=label, **style)
         draw_line(below, run.t, run["u"], zorder=depth, **style)
-    for ax, channel, title in ((above, "y", "output"), (below, "u", "control signal")):
+    y, u = first.signals.y.label("output"), first.signals.u.label("control signal")
+    for each, channel, title in ((above, "y", y), (below, "u", u)):
         limits = _limits([run[channel] for run in result.runs.values()])
-        ax.set(ylim=limits, ylabel=title)
-        ax.grid(alpha=0.3)
+        each.set(ylim=limits, ylabel=title)
+        each.grid(alpha=0.3)
     above.legend(fontsize="small", ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     below.set_xlabel("time [s]")
-    return figure
+    return axes
 
 
 def save(
