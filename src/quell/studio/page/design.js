@@ -61,7 +61,9 @@ export class Designs {
   tuned(header) {
     const values = Object.entries(header.values).map(([name, value]) => `${name} = ${short(value)}`);
     const active = header.active.length ? `Active: ${header.active.join(", ")}.` : "No constraint is active.";
-    home("tune-result").textContent = `${header.name}: ${values.join(", ")}; integral gain ${short(header.k_i)}. ${active} Computing the trade-off …`;
+    const noise = header.active.some((text) => text.startsWith("M_ks"));
+    const hint = noise ? "More noise in u (a larger M_ks) would allow better load rejection. " : "";
+    home("tune-result").textContent = `${header.name}: ${values.join(", ")}; integral gain ${short(header.k_i)}. ${active} ${hint}Computing the trade-off …`;
     this.use(header.setup);
   }
 
