@@ -91,6 +91,14 @@ def test_moving_a_slider_compiles_nothing(client: Client) -> None:
     assert compile_time.seconds == before
 
 
+def test_warnings_of_the_design_reach_the_page_each_time(client: Client) -> None:
+    """An observer that is too fast for the sample time, also when something else moves."""
+    for omega_c in (8.0, 9.0):
+        tables = with_values(observer__omega_o=2000.0, controller__omega_c=omega_c)
+        found = client.ask("loop", do="run", setup=tables)
+        assert "omega_o * dt" in " ".join(found["run"][0]["warnings"])
+
+
 def test_only_the_page_with_the_token_is_answered(url: str) -> None:
     """Another token, host or origin gets nothing; no path leads to files."""
     host = "/".join(url.split("/")[:3])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -35,23 +37,48 @@ class StoppedError(Exception):
     """The run was stopped: a newer message came, or the page is gone."""
 
 
+_CATCHING = threading.Lock()  # Python's filters of warnings belong to all threads
+
+
+@contextmanager
+def caught_warnings() -> Iterator[list[str]]:
+    """Yield a list that has the texts of all warnings at the end, each once."""
+    texts: list[str] = []
+    with _CATCHING, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield texts
+        texts += sorted({" ".join(str(each.message).split()) for each in caught})
+
+
 class Maker:
-    """Builds setups from tables, and builds again only what changed since the last one."""
+    """Builds setups from tables, and builds again only what changed since the last one.
+
+    ``warnings`` has the texts of the warnings of the last setup.
+    """
 
     def __init__(self, name: str = NAME, trust: bool = False) -> None:
         self.name, self.trust = name, trust
+        self.warnings: list[str] = []
         self._known: Known = {}
 
     def __call__(self, tables: Mapping[str, Any]) -> Setup:
         """Return the setup; raise a ``SetupError`` for tables that do not fit."""
-        setup = assembled(self.name, tables_of(self.name, tables), self._known, self.trust)
+        described = tables_of(self.name, tables)
+        with caught_warnings() as self.warnings:
+            setup = assembled(self.name, described, self._known, self.trust)
+        if self.warnings:
+            self._known = {}  # what is not built again would not warn again
         for table in ("plant", "scenario"):
             setup.needed(table)
         return setup
 
 
 def run_frames(
-    setup: Setup, columns: int, about: Mapping[str, Any], stale: Callable[[], bool]
+    setup: Setup,
+    columns: int,
+    about: Mapping[str, Any],
+    stale: Callable[[], bool],
+    design_warnings: Sequence[str] = (),
 ) -> Iterator[bytes]:
     """Yield two frames for a setup: the run, and the analysis of its loop.
 
@@ -65,18 +92,19 @@ def run_frames(
         added to the headers.
     stale
         returns whether nobody waits for the result any more; ``StoppedError`` is raised then.
+    design_warnings
+        warnings of the setup, which stand before those of the run.
     """
     began, compiled = time.perf_counter(), compile_time.seconds
     plant, scenario = setup.needed("plant"), setup.needed("scenario")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with caught_warnings() as caught:
         run = simulate(plant, setup.controller, scenario, progress=watched(stale))
     header: dict[str, Any] = {
         "kind": "run",
         "plant": run.plant,
         "status": int(run.status),
         "message": run.message if run.diverged or run.status else "",
-        "warnings": sorted({" ".join(str(each.message).split()) for each in caught}),
+        "warnings": [*design_warnings, *caught],
         "metrics": _metrics(run, setup),
         "units": {name: describe(name, run.signals)[1] for name in _CHANNELS},
         "seconds": time.perf_counter() - began,

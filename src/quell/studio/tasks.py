@@ -42,7 +42,7 @@ def frames_for(
     tables = setup_tables(message, granted)
     setup = make(tables)
     if task == "run":
-        yield from run_frames(setup, columns(message), about, stale)
+        yield from run_frames(setup, columns(message), about, stale, make.warnings)
     elif task == "band":
         yield from band_frames(setup, tables, message, stale)
     elif task in ("compare", "tune"):
