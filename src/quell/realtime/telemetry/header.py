@@ -25,8 +25,8 @@ class Header:
 
     Parameters
     ----------
-    channels : tuple of (name, width)
-        contents of a row, in order; the first ones are ``LOOP_CHANNELS``.
+    channels : tuple of pairs
+        names and widths in a row, in order; the first ones are ``LOOP_CHANNELS``.
     dt
         sample time [s]: row k belongs to the time ``k dt``.
     features
