@@ -140,18 +140,18 @@ def test_errors_of_an_fmu_end_the_run_with_its_message(
         twin.write(0.0)
 
 
-def test_a_setup_file_can_name_an_fmu(files: dict[int, Path]) -> None:
-    """The keys of the table are the arguments."""
-    loaded = setup.made(
-        "loop.toml",
-        {
-            "dt": DT,
-            "plant": {"kind": "fmu", "path": str(files[3]), "w": ["w"], "start": {"gain": 2.0}},
-            "observer": {"kind": "model-free", "order": 2, "b0": 1.0, "omega_o": 20.0},
-            "controller": {"omega_c": 3.0},
-            "scenario": {"reference": 1.0, "duration": 0.1},
-        },
-    )
+def test_a_setup_file_can_name_an_fmu_if_it_is_trusted(files: dict[int, Path]) -> None:
+    """The keys of the table are the arguments; without trust nothing is unpacked or run."""
+    tables: dict[str, Any] = {
+        "dt": DT,
+        "plant": {"kind": "fmu", "path": str(files[3]), "w": ["w"], "start": {"gain": 2.0}},
+        "observer": {"kind": "model-free", "order": 2, "b0": 1.0, "omega_o": 20.0},
+        "controller": {"omega_c": 3.0},
+        "scenario": {"reference": 1.0, "duration": 0.1},
+    }
+    with pytest.raises(setup.SetupError, match=r"plant: path = .*would run this program.*--trust"):
+        setup.made("loop.toml", tables)
+    loaded = setup.made("loop.toml", tables, trust=True)
     run = ql.simulate(loaded.needed("plant"), loaded.controller, loaded.needed("scenario"))
     assert run["y"][-1] > 0.0
 

@@ -60,3 +60,6 @@ PLANTS: Mapping[str, Callable[..., Plant]] = {
     "python": python_plant,
 }
 """Plants that a setup file can have, by their ``kind``."""
+
+RUN_CODE: tuple[Callable[..., Plant], ...] = (FMU,)
+"""Plants that are programs: a setup file can only have them if the user trusts it."""

@@ -11,6 +11,7 @@ from typing import Any
 from quell.features.base import Features
 from quell.plants.labelled import labelled
 from quell.plants.linear_part import linear_model
+from quell.plants.registry import RUN_CODE
 from quell.setup.errors import SetupError, with_path
 from quell.setup.schema import CallTable
 from quell.signals.base import Signal
@@ -28,7 +29,7 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
 class Builder:
     """A builder of the tables of one file, whose ``name`` stands at the beginning of its errors.
 
-    With ``trust`` it runs the Python files that plants are in.
+    With ``trust`` it runs the Python files and FMUs that plants are in.
     """
 
     def __init__(self, name: str, trust: bool = False) -> None:
@@ -42,6 +43,11 @@ class Builder:
         function takes, and that the table does not have itself, become arguments.
         """
         takes = parameters_of(table.function)
+        if table.function in RUN_CODE and not self.trust:
+            rule = "would run this program; give --trust (in Python trust=True) if you trust it"
+            raise SetupError(
+                [f"{self.name}: {path}: path = {table.written().get('path')!r}: {rule}"]
+            )
         context["trust"] = self.trust
         arguments = {
             key: value for key, value in context.items() if key in takes and value is not None
