@@ -65,9 +65,9 @@ def test_a_run_that_diverges_is_shown_as_one() -> None:
     assert result.runs["wrong sign"].diverged
     assert set(result.scores["wrong sign"].values()) == {None}
     assert result.scores["right"]["settling_time"] is not None
-    figure = compare.draw(result)
-    assert "wrong sign (diverged)" in figure.axes[0].get_legend_handles_labels()[1]
-    assert figure.axes[0].get_ylim()[1] < 1e5
+    axes = compare.draw(result)
+    assert "wrong sign (diverged)" in axes[0].get_legend_handles_labels()[1]
+    assert axes[0].get_ylim()[1] < 1e5
 
 
 def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() -> None:

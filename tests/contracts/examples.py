@@ -36,11 +36,11 @@ def _swing(
     return x[1], (u + w[0]) / (m * length) - math.sin(x[0]) - 0.1 * x[1]
 
 
+FROM_FILES = ("fmu", "identified", "python")
 PLANTS: dict[str, Any] = {
     name: make(**_ARGUMENTS.get(name, {}))
     for name, make in registry.PLANTS.items()
-    # These need files: tests/test_fmu.py, tests/test_any_plant.py.
-    if name not in ("fmu", "identified", "python")
+    if name not in FROM_FILES
 } | {
     "torsional, late": ql.plants.torsional(late=2),
     "torsional, not rounded": ql.plants.torsional(dac_bits=None, counts=None),
