@@ -1,4 +1,4 @@
-"""What the exported controller can do besides a step, as kernels that are translated to C.
+"""Operations of the exported controller besides a step, as kernels that are translated to C.
 
 Each is the method of the same name of a controller in Python.
 """

@@ -24,6 +24,7 @@ class Line:
     calls: bool = False  # whether a function is called
     updates: bool = False  # whether the target is read, too: ``target += code``
     declares: str = ""  # the declaration of the target, if it is declared here
+    returns_several: bool = False  # whether the code is the list of numbers to be returned
 
 
 @dataclass
@@ -57,22 +58,11 @@ def words(code: str) -> set[str]:
     return set(_WORD.findall(code))
 
 
-def names_in(item: Item) -> set[str]:
-    """Return all names that a statement uses or sets."""
-    if isinstance(item, Line):
-        return words(item.code) | ({item.target} if item.target else set())
+def _parts(item: Branch | Loop) -> tuple[str, list[Block]]:
+    """Return the code at the head of a branch or loop, and the blocks in it."""
     if isinstance(item, Branch):
-        inner = names_in_block(item.body) | names_in_block(item.orelse)
-        return words(item.test) | inner
-    return words(item.header) | names_in_block(item.body)
-
-
-def names_in_block(block: Block) -> set[str]:
-    """Return all names in a block."""
-    found: set[str] = set()
-    for item in block:
-        found |= names_in(item)
-    return found
+        return item.test, [item.body, item.orelse]
+    return item.header, [item.body]
 
 
 def lines_of(block: Block) -> Iterator[Line]:
@@ -80,23 +70,22 @@ def lines_of(block: Block) -> Iterator[Line]:
     for item in block:
         if isinstance(item, Line):
             yield item
-        elif isinstance(item, Branch):
-            yield from lines_of(item.body)
-            yield from lines_of(item.orelse)
         else:
-            yield from lines_of(item.body)
+            for part in _parts(item)[1]:
+                yield from lines_of(part)
 
 
 def _read_names(block: Block) -> set[str]:
     found: set[str] = set()
     for item in block:
-        if isinstance(item, Line):
-            found |= words(item.code)
-        elif isinstance(item, Branch):
-            found |= words(item.test) | _read_names(item.body) | _read_names(item.orelse)
-        else:
-            found |= words(item.header) | _read_names(item.body)
+        head, inner = (item.code, []) if isinstance(item, Line) else _parts(item)
+        found |= words(head).union(*map(_read_names, inner))
     return found
+
+
+def names_in_block(block: Block) -> set[str]:
+    """Return all names that a block uses or sets."""
+    return _read_names(block) | {line.target for line in lines_of(block) if line.target}
 
 
 def remove_unused(block: Block, local: set[str]) -> Block:
@@ -152,18 +141,14 @@ def _place(
     block: Block, local: set[str], counts: dict[str, int], declare: Callable[[str, bool], str]
 ) -> None:
     for name in sorted(local):
-        places = [i for i, item in enumerate(block) if name in names_in(item)]
+        places = [i for i, item in enumerate(block) if name in names_in_block([item])]
         if not places:
             continue
         first = block[places[0]]
-        if len(places) == 1 and not isinstance(first, Line):
-            inner = [first.body, first.orelse] if isinstance(first, Branch) else [first.body]
-            head = first.test if isinstance(first, Branch) else first.header
-            used = [part for part in inner if name in names_in_block(part)]
-            if name not in words(head) and all(_sets_first(part, name) for part in used):
-                for part in used:
-                    _place(part, {name}, counts, declare)
-                continue
+        if len(places) == 1 and not isinstance(first, Line) and _is_inside(first, name):
+            for part in _parts(first)[1]:
+                _place(part, {name}, counts, declare)
+            continue
         if isinstance(first, Line) and _sets(first, name):
             first.declares = declare(name, counts.get(name, 0) == 1)
         else:
@@ -176,20 +161,17 @@ def _sets(line: Line, name: str) -> bool:
 
 def _sets_first(block: Block, name: str) -> bool:
     """Return whether a block sets a variable before it reads it, whatever happens."""
-    for item in block:
-        if name not in names_in(item):
+    for i, item in enumerate(block):
+        if name not in names_in_block([item]):
             continue
         if isinstance(item, Line):
             return _sets(item, name)
-        if isinstance(item, Loop):
-            return (
-                name not in words(item.header)
-                and _sets_first(item.body, name)
-                and not any(name in names_in(later) for later in block[block.index(item) + 1 :])
-            )
-        arms = [item.body, item.orelse]
-        later = any(name in names_in(each) for each in block[block.index(item) + 1 :])
-        used = [arm for arm in arms if name in names_in_block(arm)]
-        head = name in words(item.test)
-        return not head and not later and all(_sets_first(arm, name) for arm in used)
+        return name not in names_in_block(block[i + 1 :]) and _is_inside(item, name)
     return False
+
+
+def _is_inside(item: Branch | Loop, name: str) -> bool:
+    """Return whether each block of a branch or loop that has a variable sets it first."""
+    head, inner = _parts(item)
+    used = [part for part in inner if name in names_in_block(part)]
+    return name not in words(head) and all(_sets_first(part, name) for part in used)

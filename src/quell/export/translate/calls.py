@@ -12,6 +12,7 @@ from quell.export.translate.expressions import Expressions
 from quell.export.translate.interfaces import Translation
 from quell.export.translate.values import (
     ATOM,
+    EQUAL,
     NOTHING,
     SUM,
     Array,
@@ -62,7 +63,7 @@ class Calls:
             if one.kind is Number.BOOL or one.is_constant:
                 return one if one.kind is Number.BOOL else body.constant(bool(one.constant))
             zero = body.as_kind(body.constant(0), one.kind)
-            return Value(Number.BOOL, f"{one.at(SUM)} != {zero.code}", 6, calls=one.calls)
+            return Value(Number.BOOL, f"{one.at(SUM)} != {zero.code}", EQUAL, calls=one.calls)
         if name == "int":
             if one.kind is not Number.REAL:
                 return Value(Number.INT, one.code, one.level, one.constant, calls=one.calls)

@@ -1,4 +1,4 @@
-"""What a translation of a program has found, for the next one.
+"""Results of a translation of a program, for the next one.
 
 The translator assumes as much as possible to be constant. Where it finds the opposite, it notes
 that here, and the program is translated again, until nothing new is found.
@@ -14,7 +14,7 @@ from quell.export.translate.values import Number
 
 @dataclass
 class Findings:
-    """What is not constant.
+    """Numbers and parameters that are not constant.
 
     Attributes
     ----------

@@ -21,7 +21,6 @@ from quell.export.translate.statements import Body, ends
 from quell.export.translate.values import (
     ATOM,
     NOTHING,
-    UNKNOWN,
     Array,
     Kind,
     Number,
@@ -65,9 +64,8 @@ class Function:
             name: _parameter(name, argument, node.annotation)
             for name, argument, node in zip(names, arguments, source.tree.args.args, strict=True)
         }
-        self.constants: dict[
-            str, Any
-        ] = {}  # of parameters that have the same value in all calls so far
+        # Values of the parameters that are the same in all calls so far.
+        self.constants: dict[str, Any] = {}
         stored = {part.id for part in ast.walk(source.tree)
                   if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}  # fmt: skip
         for name, argument in zip(names, arguments, strict=True):
@@ -75,7 +73,12 @@ class Function:
                 continue
             if argument.is_constant and (key, name) not in program.findings.parameters:
                 self.constants[name] = argument.constant
-                parameters[name] = replace(parameters[name], **_known(program, argument))
+                parameters[name] = replace(
+                    parameters[name],
+                    code=argument.code,
+                    level=argument.level,
+                    constant=argument.constant,
+                )
         known = Assumptions()
         while True:
             try:
@@ -102,6 +105,7 @@ class Function:
     def _find_result(self, body: Body, block: Block, hints: tuple[str, ...]) -> None:
         """Set what the function returns, and complete its return statements."""
         self.inline: Value | None = None  # what a call is, if nothing else happens
+        self.constant: Value | None = None  # what all calls return
         self.kind: Kind = NOTHING
         self.items: tuple[Value, ...] = ()
         self.result_members: list[tuple[str, Number]] = []
@@ -132,13 +136,9 @@ class Function:
             kind = join(kind, value.kind, body.expressions.where)
         self.kind = kind
         for line, value in body.returns:
-            line.code = (
-                f"return {body.expressions.as_kind(value, kind).code}" if value.is_number else ""
-            )
             if not value.is_number:
                 raise TranslationError(f"{body.expressions.where}: returns an array")
-
-    constant: Value | None = None
+            line.code = f"return {body.expressions.as_kind(value, kind).code}"
 
     def _find_items(self, body: Body, block: Block, hints: tuple[str, ...]) -> None:
         values = [value for _, value in body.returns]
@@ -177,7 +177,8 @@ class Function:
                 for item, kept in zip(value.items, items, strict=True)
                 if kept.code.startswith(".")
             ]
-            line.code = f"return {parts[0]}" if single else "RESULT " + "\0".join(parts)
+            line.code = f"return {parts[0]}" if single else ", ".join(parts)
+            line.returns_several = not single
 
     def _return_nothing(self, body: Body, block: Block) -> None:
         for line, _ in body.returns:
@@ -186,11 +187,8 @@ class Function:
             del block[-1]
 
     def _declaration(self, body: Body, name: str, constant: bool) -> str:
-        value = next(
-            v
-            for local, v in body.variables.local.items()
-            if body.variables.names[local].code == name
-        )
+        variables = body.variables
+        value = next(v for key, v in variables.local.items() if variables.names[key].code == name)
         kind = value.kind
         if isinstance(kind, Number):
             return f"{'const ' if constant else ''}{self.program.structs.number(kind)} {name}"
@@ -278,9 +276,4 @@ def _parameter(name: str, argument: Value, annotation: ast.expr | None) -> Value
     kind = argument.kind
     if getattr(annotation, "id", "") == "float" and isinstance(kind, Number):
         kind = Number.REAL
-    return Value(kind, identifier(name), root=name, mutable=argument.mutable, constant=UNKNOWN)
-
-
-def _known(program: Translation, argument: Value) -> dict[str, Any]:
-    """Return the code and the value of a constant argument, for its parameter."""
-    return {"code": argument.code, "level": argument.level, "constant": argument.constant}
+    return Value(kind, identifier(name), root=name, mutable=argument.mutable)

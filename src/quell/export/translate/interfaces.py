@@ -1,4 +1,4 @@
-"""What the parts of the translator need from the program that they write."""
+"""The program as the parts of the translator know it."""
 
 from __future__ import annotations
 

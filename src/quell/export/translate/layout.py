@@ -49,21 +49,15 @@ def wrapped(line: str) -> list[str]:
     if mark and len(code) <= _WIDTH:
         pad = re.match(r" *", code)
         return [*comment_block(comment.removesuffix(" */"), len(pad[0]) if pad else 0), code]
-    place = _break(line)
-    if place is None:
-        return [line]
-    indent = len(line) - len(line.lstrip()) + 4
-    return [line[:place].rstrip(), *wrapped_rest(" " * indent + line[place:].lstrip(), indent)]
+    return _broken(line, len(line) - len(line.lstrip()) + 4)
 
 
-def wrapped_rest(line: str, indent: int) -> list[str]:
-    """Return the rest of a broken line, with the same indentation for each further line."""
-    if len(line) <= _WIDTH:
-        return [line]
-    place = _break(line)
+def _broken(line: str, indent: int) -> list[str]:
+    """Return a line in parts, all but the first with the same indentation."""
+    place = _break(line) if len(line) > _WIDTH else None
     if place is None:
         return [line]
-    return [line[:place].rstrip(), *wrapped_rest(" " * indent + line[place:].lstrip(), indent)]
+    return [line[:place].rstrip(), *_broken(" " * indent + line[place:].lstrip(), indent)]
 
 
 def _break(line: str) -> int | None:
@@ -87,8 +81,8 @@ def _break(line: str) -> int | None:
     return place
 
 
-def block_lines(block: Block, indent: int = 4) -> list[str]:
-    """Return the lines of a block."""
+def block_lines(block: Block, result: str, indent: int = 4) -> list[str]:
+    """Return the lines of a block; ``result`` is the struct that the function returns, if any."""
     lines: list[str] = []
     for item in block:
         pad = " " * indent
@@ -97,24 +91,27 @@ def block_lines(block: Block, indent: int = 4) -> list[str]:
         behind = f" /* {item.behind} */" if item.behind else ""
         if isinstance(item, Line):
             text = item.code
-            if item.target:
+            if item.returns_several:
+                lines += wrapped(f"{pad}const {result} returned = {{{text}}};{behind}")
+                text, behind = "return returned", ""
+            elif item.target:
                 name = item.declares or item.target
                 text = f"{item.code}" if item.updates else f"{name} = {item.code}"
             lines += wrapped(f"{pad}{text};{behind}")
         elif isinstance(item, Branch):
-            lines += _branch(item, indent, behind)
+            lines += _branch(item, result, indent, behind)
         else:
             lines += wrapped(f"{pad}{item.header} {{{behind}")
-            lines += [*block_lines(item.body, indent + 4), f"{pad}}}"]
+            lines += [*block_lines(item.body, result, indent + 4), f"{pad}}}"]
     return lines
 
 
-def _branch(item: Branch, indent: int, behind: str) -> list[str]:
+def _branch(item: Branch, result: str, indent: int, behind: str) -> list[str]:
     pad, lines = " " * indent, []
     opening = f"{pad}if ({item.test}) {{{behind}"
     while True:
         lines += wrapped(opening)
-        lines += block_lines(item.body, indent + 4)
+        lines += block_lines(item.body, result, indent + 4)
         rest = item.orelse
         if not rest:
             return [*lines, f"{pad}}}"]
@@ -124,4 +121,4 @@ def _branch(item: Branch, indent: int, behind: str) -> list[str]:
                 lines += comment_block(comment, indent + 4)
             opening = f"{pad}}} else if ({item.test}) {{"
             continue
-        return [*lines, f"{pad}}} else {{", *block_lines(rest, indent + 4), f"{pad}}}"]
+        return [*lines, f"{pad}}} else {{", *block_lines(rest, result, indent + 4), f"{pad}}}"]

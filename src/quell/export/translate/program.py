@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from quell.export.translate.blocks import lines_of, words
+from quell.export.translate.blocks import words
 from quell.export.translate.calls import Calls
 from quell.export.translate.expressions import Expressions
 from quell.export.translate.findings import Findings
@@ -111,7 +111,6 @@ class Program:
                 self.functions.append(found)
                 if len(found.result_members) > 1:
                     self.results[found.name] = Struct(f"{found.name}_result", tuple, False)
-                    self._complete_results(found)
         return found
 
     def _function_name(
@@ -129,13 +128,6 @@ class Program:
     def has_function(self, name: str) -> bool:
         """Return whether a function has this name."""
         return name in self._names
-
-    def _complete_results(self, function: Function) -> None:
-        """Write the return statements of a function with several results."""
-        for line in lines_of(function.block):
-            if line.code.startswith("RESULT "):
-                parts = line.code.removeprefix("RESULT ").split("\0")
-                line.code = f"RETURN {function.name}_result\0" + "\0".join(parts)
 
     def named_constant(self, name: str, value: Any, module: str) -> str:
         """Return the C name of a constant of a module."""
@@ -233,18 +225,5 @@ class Program:
             origin = f"From {source.module}.{source.name}."
             doc = f"{source.doc}\n\n{origin}" if source.doc else origin
             lines += ["", *comment_block(doc), *wrapped(function.signature()), "{"]
-            lines += [*self._with_results(block_lines(function.block)), "}"]
+            lines += [*block_lines(function.block, function.result_type), "}"]
         return lines
-
-    @staticmethod
-    def _with_results(lines: list[str]) -> list[str]:
-        found = []
-        for line in lines:
-            if "RETURN " not in line:
-                found.append(line)
-                continue
-            pad = line[: len(line) - len(line.lstrip())]
-            name, *parts = line.strip().removeprefix("RETURN ").rstrip(";").split("\0")
-            found += wrapped(f"{pad}const {name} returned = {{{', '.join(parts)}}};")
-            found.append(f"{pad}return returned;")
-        return found

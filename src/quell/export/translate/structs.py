@@ -189,7 +189,7 @@ class Structs:
             layout.members = kept
 
     def rename(self, struct: Struct, name: str) -> Struct:
-        """Give the last struct that was made another name, and return it."""
+        """Rename the last struct that was made, and return it."""
         layout = self.layouts.pop(struct.name)
         layout.struct = Struct(name, struct.python, struct.empty)
         self.layouts[name] = layout

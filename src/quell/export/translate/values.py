@@ -1,4 +1,4 @@
-"""What the translator knows about a Python expression: its kind, its C code, its constant value."""
+"""A translated Python expression: its kind, its C code, its value where that is known."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class WrongAssumptionError(Exception):
 
 @dataclass
 class Assumptions:
-    """What is not as assumed."""
+    """Local variables that are not as assumed."""
 
     varying: set[str] = field(default_factory=set)  # variables that are not always the same
     kinds: dict[str, Number] = field(default_factory=dict)  # of numbers with several kinds
