@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from quell.export.c_files import CFiles, translated
 from quell.export.translate.findings import Findings
+from quell.export.translate.program import Program
 from quell.export.translate.source import ascii_text
 from quell.export.translate.values import TranslationError
 from quell.kernels.dispatch import generic, kernel
@@ -218,6 +219,24 @@ def test_the_c_code_reads_like_the_kernel() -> None:
     assert "static const double LIMIT = 3.5;" in text
     assert "From test_translate.branches. */" in text.replace("tests.", "")
     assert text.isascii()
+
+
+def test_constants_of_one_name_in_several_modules_are_kept_apart() -> None:
+    """Also where the modules have one name, and where the numbers are equal but of another type."""
+    program = Program("t", False, Findings())
+    asked = [
+        ("_LARGEST", 30.0, "quell.a.kernels"),
+        ("_LARGEST", 40.0, "quell.b.kernels"),
+        ("_LARGEST", 50.0, "quell.c.kernels"),
+        ("_LARGEST", 30, "quell.d.kernels"),
+        ("LARGEST", 30.0, "quell.e.other"),
+    ]
+    names = [program.named_constant(*each) for each in asked]
+    assert len(set(names)) == 4
+    assert names[4] == names[0] == "LARGEST"
+    lines = "\n".join(program.constant_lines())
+    for name, (_, value, _) in zip(names, asked, strict=True):
+        assert f"{'int' if isinstance(value, int) else 'double'} {name} = {value};" in lines
 
 
 def recursive(design: Design, state: State, a: float, b: float) -> float:

@@ -24,7 +24,7 @@ from quell.export.translate.source import (
     read_function,
 )
 from quell.export.translate.structs import Structs
-from quell.export.translate.values import Array, Kind, Struct, Value
+from quell.export.translate.values import Array, Kind, Struct, TranslationError, Value
 
 # Helper functions in C; "real" stands for float or double, "" for the suffix of functions.
 _HELPERS = {
@@ -131,12 +131,15 @@ class Program:
 
     def named_constant(self, name: str, value: Any, module: str) -> str:
         """Return the C name of a constant of a module."""
-        name = name.lstrip("_")
-        kept = self._constants.get(name)
-        if kept is not None and kept[0] != value:
-            name = f"{name}_{module.rsplit('.', 1)[-1].upper()}"
-        self._constants.setdefault(name, (value, module))
-        return name
+        plain = name.lstrip("_")
+        candidate = plain
+        for part in reversed(module.split(".")):
+            kept = self._constants.setdefault(candidate, (value, module))
+            if kept[0] == value and type(kept[0]) is type(value):
+                return candidate
+            # Constants of several modules have this name: the module tells them apart.
+            candidate = f"{candidate}_{part.upper()}"
+        raise TranslationError(f"{module}.{name}: its module has no name of its own")
 
     def pointer(self, kind: Kind, name: str, const: bool) -> str:
         """Return the declaration of a variable that points to an array or a struct."""
