@@ -104,3 +104,18 @@ def test_the_name_of_a_c_function_must_be_one() -> None:
     """It would make code that does not compile."""
     with pytest.raises(ValueError, match="c_function = 'my-features'"):
         Custom(pendulum, ("pull", "switch"), c_function="my-features")
+
+
+def test_what_is_no_controller_plant_or_state_is_named() -> None:
+    """One error each, that names the argument."""
+    motor = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
+    for given in (5, ql.ADRC):
+        with pytest.raises(ValueError, match="controller = .*must be a controller"):
+            c_source(given)
+    with pytest.raises(ValueError, match="plant = 5: must be a plant"):
+        plant_source(5, DT)  # type: ignore[arg-type]
+    for x0 in ([1.0, 2.0], [math.nan], "x"):
+        with pytest.raises(ValueError, match="x0"):
+            plant_source(motor, DT, x0=x0)
+    with pytest.raises(TranslationError, match="c_function = 'int': is a keyword"):
+        c_source(learner_on(Custom(pendulum, ("pull", "switch"), c_function="int")))

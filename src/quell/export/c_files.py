@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from quell.export.translate.blocks import words
+from quell.export.translate.calls import implementation_of
 from quell.export.translate.findings import Findings
 from quell.export.translate.initial import initial_lines
 from quell.export.translate.layout import comment_block, wrapped
@@ -81,8 +82,8 @@ class CFiles:
         self.operations: list[str] = []
         self.structs: list[str] = []  # further lines of the header, after the structs
         self.members: list[str] = []  # of the state, besides those of the kernels
+        self.enums: list[str] = []  # the same, before the structs
         self.includes = ["#include <stdbool.h>"]  # of the header
-        self.enums: list[str] = []  # the same, before them
         self._prototypes: list[str] = []
         self._definitions: list[str] = []
 
@@ -97,11 +98,9 @@ class CFiles:
 
     def call(self, kernel: Any, *arguments: Value) -> str:
         """Return the code of a call of a kernel, or of the implementation for its arguments."""
-        head: Any = arguments[0].kind
-        table = getattr(kernel, "implementations", None)
-        function: Callable[..., Any] = kernel
-        if table is not None:
-            function = table.get(head.python) or table[object]
+        function = kernel
+        if hasattr(kernel, "implementations"):
+            function = implementation_of(kernel, arguments[0])
         body = self.program.entry_expressions()
         found = self.program.function(function, list(arguments), kernel)
         value = found.call(body, list(arguments))

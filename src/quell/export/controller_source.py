@@ -7,6 +7,7 @@ from typing import Any
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.handover import samples_to_settle
 from quell.controllers.base import (
+    check_controller,
     control,
     reset_loop,
     set_applied_control,
@@ -62,10 +63,13 @@ def c_source(
 
     Raises
     ------
+    ValueError
+        for what is no controller, and for a name that C can not have.
     TranslationError
         naming a kernel, or a part of the parameters, that has no counterpart in C; and for a
         resolution, if the controller needs the position itself.
     """
+    check_controller(controller)
     _check_parts(controller)
     if resolution is not None:
         check_counts(controller, resolution)

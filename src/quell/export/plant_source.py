@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell import checks
 from quell.export.c_files import CFiles, CSource, translated
 from quell.export.translate.findings import Findings
 from quell.export.translate.values import Array, Number, TranslationError, Value
-from quell.plants.base import Plant, advance, measure
+from quell.plants.base import Plant, advance, check_plant, measure
 from quell.plants.fmu.plant import FMU
 from quell.types import Vector
 
@@ -40,9 +41,12 @@ def plant_source(plant: Plant, dt: float, name: str = "plant", x0: Any = None) -
 
     Raises
     ------
+    ValueError
+        for what is no plant, an x0 of another length, and a name that C can not have.
     TranslationError
         naming what has no counterpart in C.
     """
+    check_plant(plant)
     inner: Any = plant
     while hasattr(inner, "plant"):
         inner = inner.plant
@@ -50,9 +54,9 @@ def plant_source(plant: Plant, dt: float, name: str = "plant", x0: Any = None) -
         called = "an FMU" if isinstance(inner, FMU) else "Python"
         raise TranslationError(f"{plant.name}: it calls {called} at each sample, which C can not")
     parameters = plant.sampled(dt)
+    x = np.zeros(plant.order) if x0 is None else checks.vector("x0", x0, plant.order)
 
     def write(findings: Findings) -> CSource:
-        x = np.zeros(plant.order) if x0 is None else np.array(x0, dtype=np.float64)
         state = PlantState(x, np.zeros(6 * plant.order))
         files = CFiles(name, parameters, state, findings)
         _add_functions(files, plant)

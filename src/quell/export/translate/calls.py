@@ -10,6 +10,7 @@ from typing import Any
 
 from quell.export.translate.expressions import Expressions
 from quell.export.translate.interfaces import Translation
+from quell.export.translate.naming import identifier
 from quell.export.translate.values import (
     ATOM,
     EQUAL,
@@ -34,6 +35,13 @@ _SAME_NAME = (
 )
 _NUMPY = {"abs": "fabs", "absolute": "fabs", "arctan": "atan", "arctan2": "atan2"}
 _INTEGERS = frozenset({"ceil", "floor"})  # they return integers in Python
+
+
+def implementation_of(function: Any, head: Value) -> Callable[..., Any] | None:
+    """Return the implementation of a generic function for its first argument; None without one."""
+    cls = head.kind.python if isinstance(head.kind, Struct) else None
+    found: Callable[..., Any] | None = function.implementations.get(cls)
+    return found or function.implementations.get(object)
 
 
 class Calls:
@@ -140,16 +148,7 @@ class Calls:
     ) -> Value:
         """Return a call of a kernel, or of the implementation of a generic function."""
         if function is clear:
-            record = arguments[0]
-            for field in self.program.structs.layouts[record.kind.name].members:
-                place = self.program.structs.field(record, field)
-                if place is not None and place.is_constant and place.constant != 0:
-                    self.program.structs.vary((record.kind.name, field), Number.BOOL)
-            if not self.program.structs.fields_of(record.kind):
-                return Value(NOTHING)
-            body.written.add(record.root)
-            size = f"sizeof *{record.code}" if record.pointer else f"sizeof {record.code}"
-            return Value(Number.INT, f"memset({record.address}, 0, {size})", calls=True)
+            return self._clear(body, arguments[0])
         if function is is_finite:
             if arguments[0].is_constant:
                 return body.constant(math.isfinite(arguments[0].constant))
@@ -167,16 +166,26 @@ class Calls:
         found = self.program.function(implementation, arguments, declaration, names)
         return found.call(body, arguments)
 
+    def _clear(self, body: Expressions, record: Value) -> Value:
+        """Return the call that sets all numbers of a record to zero."""
+        structs = self.program.structs
+        for field in structs.layouts[record.kind.name].members:
+            place = structs.field(record, field)
+            if place is not None and place.is_constant and place.constant != 0:
+                structs.vary((record.kind.name, field), Number.BOOL)
+        if not structs.fields_of(record.kind):
+            return Value(NOTHING)
+        body.written.add(record.root)
+        size = f"sizeof *{record.code}" if record.pointer else f"sizeof {record.code}"
+        return Value(NOTHING, f"memset({record.address}, 0, {size})", calls=True)
+
     def _resolve(
         self, body: Expressions, node: ast.Call, function: Any, arguments: list[Value]
     ) -> tuple[Callable[..., Any], Callable[..., Any] | None]:
-        table = getattr(function, "implementations", None)
-        if table is not None:
-            kind = arguments[0].kind
-            cls = kind.python if isinstance(kind, Struct) else None
-            implementation = table.get(cls) or table.get(object)
+        if hasattr(function, "implementations"):
+            implementation = implementation_of(function, arguments[0])
             if implementation is None:
-                raise body.fail(node, f"has no implementation for {cls}")
+                raise body.fail(node, f"has no implementation for {arguments[0].kind}")
             return implementation, function
         plain = interpreted(function)
         if not inspect.isfunction(plain):
@@ -206,6 +215,8 @@ class Calls:
 
     def _c_function(self, body: Expressions, name: str, given: list[Value]) -> Value:
         """Return a call of a function that the user has in C."""
+        if identifier(name) != name:
+            raise TranslationError(f"c_function = {name!r}: is a keyword of C or C++")
         body.written.add(given[-1].root)
         kinds = [self._c_parameter(value, value is given[-1]) for value in given]
         self.program.externals[name] = f"void {name}({', '.join(kinds)});"
