@@ -25,14 +25,16 @@ def frame(header: Mapping[str, Any], arrays: Mapping[str, Any] | None = None) ->
     """Return a frame; numbers of the header that are not finite become ``null``."""
     parts = {name: np.asarray(part, dtype="<f4").ravel() for name, part in (arrays or {}).items()}
     about = dict(header) | {"arrays": [[name, part.size] for name, part in parts.items()]}
-    text = json.dumps(nonfinite_to_none(about), allow_nan=False).encode()
-    text += b" " * (-(len(text) + _LENGTH.size) % 4)
-    return _LENGTH.pack(len(text)) + text + b"".join(part.tobytes() for part in parts.values())
+    return _framed(about, b"".join(part.tobytes() for part in parts.values()))
 
 
 def file_frame(header: Mapping[str, Any], content: bytes) -> bytes:
     """Return a frame with the bytes of a file, in place of arrays."""
-    text = json.dumps(dict(header) | {"arrays": [], "bytes": len(content)}).encode()
+    return _framed(dict(header) | {"arrays": [], "bytes": len(content)}, content)
+
+
+def _framed(header: dict[str, Any], content: bytes) -> bytes:
+    text = json.dumps(nonfinite_to_none(header), allow_nan=False).encode()
     text += b" " * (-(len(text) + _LENGTH.size) % 4)
     return _LENGTH.pack(len(text)) + text + content
 
