@@ -123,6 +123,7 @@ HOSTILE = (
     '{"do": "run", "id": 1, "setup": 3}', '{"do": "run", "id": 1, "setup": {"dt": NaN}}',
     "[" * 5000, '{"do": "run", "id": ' + "9" * 5000 + "}", '{"do": "open", "id": 1, "text": "a = "}',
     '{"do": "export", "id": 1, "to": "/etc"}',
+    '{"do": "run", "id": 1, "setup": {"dt": 1, "plant": ' + "[" * 900 + "]" * 900 + "}}",
 )  # fmt: skip
 
 

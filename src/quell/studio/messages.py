@@ -118,6 +118,13 @@ def setup_tables(message: Mapping[str, Any], granted: Granted) -> dict[str, Any]
 
 def checked(tables: dict[str, Any], granted: Granted = _NOTHING) -> dict[str, Any]:
     """Return the tables of a setup that the studio can take, or raise a ``ValueError``."""
+    try:
+        return _checked(tables, granted)
+    except RecursionError:
+        raise ValueError("setup: its tables or lists are nested too deeply") from None
+
+
+def _checked(tables: dict[str, Any], granted: Granted) -> dict[str, Any]:
     tables = {key: table for key, table in tables.items() if key not in _NOT_HERE}
     dt = tables.get("dt")
     if isinstance(dt, bool) or not isinstance(dt, int | float) or not 0.0 < dt < math.inf:
