@@ -21,6 +21,8 @@ from quell.setup import load, made
 from quell.setup.vary import changed
 from quell.studio import messages
 from quell.studio.frames import Columns, frame, parsed
+from quell.studio.runs import Maker, loop_of
+from quell.studio.tasks import frames_for
 from quell.studio.texts import python_of, toml_of
 
 from .studio_server import TABLES, Client, running
@@ -195,6 +197,29 @@ def test_toml_and_python_are_the_same_setup(client: Client, tmp_path: Path) -> N
     compile(header["python"], "setup.py", "exec")
     opened = client.ask("opened", do="open", text=header["toml"])["opened"][0]
     assert opened["setup"] == TABLES
+
+
+def test_the_script_analyses_what_the_page_does(tmp_path: Path) -> None:
+    """The linear part behind friction and late samples, or a plant about its operating point."""
+    path = tmp_path / "plants.py"
+    path.write_text(
+        "import math\nimport quell as ql\ndef swing():\n"
+        "    return ql.plants.NonlinearPlant(lambda t, x, u, w: (x[1], 50.0*u - math.sin(x[0])), 2)\n"
+    )
+    observer = {"kind": "model-free", "order": 4, "b0": 5.5e4, "omega_o": 90.0}
+    changes: tuple[dict[str, Any], ...] = (
+        {"plant": {"kind": "torsional", "late": 3}, "observer": observer},
+        {"plant": {"kind": "python", "source": f"{path}:swing"}},
+    )
+    for each in changes:
+        tables = TABLES | each
+        granted, make = messages.Granted(messages.files_of(tables), trust=True), Maker(trust=True)
+        message = {"id": 1, "do": "toml", "setup": tables}
+        (answer,) = frames_for(message, make, granted, lambda: False, lambda part, share: None)
+        script, setup = parsed(answer)[0]["python"], make(tables)
+        (line,) = (line for line in script.splitlines() if "analyse(" in line)
+        found = eval(line.removeprefix("print(").removesuffix(")"), {"ql": ql, "setup": setup})
+        assert found == loop_of(setup).summary()
 
 
 def test_exported_c_is_that_of_the_command_line(client: Client, tmp_path: Path) -> None:

@@ -10,12 +10,11 @@ import numpy as np
 
 from quell import checks
 from quell.experiments.compare import tuned as tuned_references
-from quell.plants.linear_part import linear_model, linear_part
 from quell.setup.load import Setup
 from quell.simulation import simulate
 from quell.studio.frames import Columns, frame
 from quell.studio.messages import columns, number
-from quell.studio.runs import Maker, StoppedError, run_frames, watched
+from quell.studio.runs import Maker, StoppedError, linear_of, run_frames, watched
 from quell.tuning import Constraints, tune
 
 Stale = Callable[[], bool]
@@ -52,7 +51,7 @@ def tuned_frames(
     structure = checks.one_of("structure", message.get("structure", "freed"), STRUCTURES)
     bounds = _bounds(message)
     dt = float(setup.controller.dt)
-    plant, delay = linear_part(linear_model(setup.plant), dt)
+    plant, delay = linear_of(setup)
     options: dict[str, Any] = {"structure": structure, "delay": delay, "compare": ()}
     options["progress"] = stoppable(report, stale)
     best = tune(plant, dt, constraints=bounds, **options, **_limits(setup))
@@ -96,7 +95,7 @@ def compared_frames(
     """
     bounds = _bounds(message)
     wide, dt = columns(message), float(setup.controller.dt)
-    plant, delay = linear_part(linear_model(setup.plant), dt)
+    plant, delay = linear_of(setup)
     entries, _ = tuned_references(
         plant,
         dt,

@@ -125,10 +125,19 @@ def run_frames(
 
 def loop_of(setup: Setup) -> LoopAnalysis:
     """Return the analysis of the loop of a setup: the linear part of its plant."""
-    dt = float(setup.controller.dt)
-    plant, delay = linear_part(linear_model(setup.plant), dt)
-    late = delay + dt * int(getattr(setup.plant, "late", 0) or 0)
-    return analyse(plant, setup.controller, delay=late)
+    plant, delay = linear_of(setup)
+    return analyse(plant, setup.controller, delay=delay)
+
+
+def linear_of(setup: Setup) -> tuple[Any, float]:
+    """Return the linear part of the plant of a setup, and the delay [s] of its input."""
+    plant, delay = linear_part(linear_model(setup.plant), float(setup.controller.dt))
+    return plant, delay + delay_beside(setup)
+
+
+def delay_beside(setup: Setup) -> float:
+    """Return the delay [s] of u that the plant of a setup has beside its part ``linear``."""
+    return float(setup.controller.dt) * int(getattr(setup.plant, "late", 0) or 0)
 
 
 def watched(stale: Callable[[], bool]) -> Callable[[float], None]:

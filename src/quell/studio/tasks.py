@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from quell.plants.linear_part import linear_model
 from quell.studio.designs import band_frames, compared_frames, tuned_frames
 from quell.studio.downloads import exported
 from quell.studio.frames import file_frame, frame
 from quell.studio.messages import Granted, columns, setup_tables
-from quell.studio.runs import Maker, run_frames
+from quell.studio.runs import Maker, delay_beside, run_frames
 from quell.studio.texts import python_of, tables_of_text, toml_of
 
 LONG = ("compare", "tune", "export")
@@ -53,7 +52,6 @@ def frames_for(
         name, content = exported(setup, message)
         yield file_frame({"kind": "file", "name": name, **about}, content)
     else:
-        linear = linear_model(setup.plant) is setup.plant
-        delay = setup.controller.dt * int(getattr(setup.plant, "late", 0) or 0)
-        script = python_of(tables, setup.title, linear, delay)
+        is_whole = not hasattr(setup.plant, "linear")
+        script = python_of(tables, setup.title, is_whole, delay_beside(setup))
         yield frame({"kind": "texts", "toml": toml_of(tables), "python": script, **about})

@@ -31,17 +31,18 @@ def toml_of(tables: Mapping[str, Any]) -> str:
     return toml_text(_without_none(tables))
 
 
-def python_of(tables: Mapping[str, Any], title: str, is_linear: bool, delay: float) -> str:
+def python_of(tables: Mapping[str, Any], title: str, is_whole: bool, delay: float) -> str:
     """Return a script that builds the same objects, runs them and draws the run.
 
-    ``delay`` [s] is that of a plant whose linear part is analysed.
+    A plant that ``is_whole`` is analysed as it is, others by their part ``linear`` and a ``delay``
+    [s].
     """
     literal = pprint.pformat(_without_none(tables), indent=1, width=92, sort_dicts=False)
     return _SCRIPT.format(
         title=" ".join(title.replace('"', "'").replace("\\", "/").split()) or "A setup",
         name=NAME,
         tables=literal,
-        plant="setup.plant" if is_linear else "setup.plant.linear",
+        plant="setup.plant" if is_whole else "setup.plant.linear",
         delay="" if delay == 0.0 else f", delay={delay!r}",
     )
 
