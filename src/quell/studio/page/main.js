@@ -4,7 +4,7 @@ import { Connection } from "./connection.js";
 import { Designs } from "./design.js";
 import { element, Forms } from "./forms.js";
 import { boundFields, showNumbers, usual } from "./numbers.js";
-import { DASHES, palette } from "./palette.js";
+import { DASHES, isDark, palette } from "./palette.js";
 import { short } from "./plots.js";
 import { changed, Store } from "./store.js";
 import { Tours } from "./tours.js";
@@ -396,7 +396,7 @@ home("preset").onchange = () => home("preset").value !== "" && choosePreset(Numb
 home("undo").onclick = () => store.undo();
 home("redo").onclick = () => store.redo();
 home("pin").onclick = () => pinNow();
-home("theme").onclick = () => setTheme(document.documentElement.dataset.theme !== "dark");
+home("theme").onclick = () => setTheme(!isDark());
 home("save").onclick = () => askText(true);
 home("show-text").onclick = () => askText(false);
 home("export-c").onclick = () => askExport("c");

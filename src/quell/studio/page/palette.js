@@ -2,12 +2,12 @@
 // curves also differ in their dashes.
 
 const LIGHT = {
-  main: "#0072b2", other: "#d55e00", third: "#009e73", quiet: "#6b737c", ink: "#1b1e22", grid: "#e4e7ea",
+  main: "#0072b2", other: "#d55e00", quiet: "#6b737c", ink: "#1b1e22", grid: "#e4e7ea",
   bad: "#b3261e", band: "rgba(0,114,178,0.16)",
   pins: ["#009e73", "#cc79a7", "#b07d00", "#7a52c7", "#8c5a2b"],
 };
 const DARK = {
-  main: "#56b4e9", other: "#ff9040", third: "#2fd0a0", quiet: "#9aa3ad", ink: "#e8eaed", grid: "#2a3037",
+  main: "#56b4e9", other: "#ff9040", quiet: "#9aa3ad", ink: "#e8eaed", grid: "#2a3037",
   bad: "#ff9d94", band: "rgba(86,180,233,0.2)",
   pins: ["#2fd0a0", "#e79ac6", "#f0c419", "#b79bff", "#d6a273"],
 };
