@@ -228,7 +228,9 @@ def test_each_loop_can_have_a_plant_of_its_own() -> None:
     """With the result of that plant alone; what does not fit together is refused."""
     plants = batch(two_mass_spring, k=np.array([0.5, 1.0, 2.0]))
     many = VectorEnv(3, plants, NOISY, **OPEN)
-    many.reset(seed=9)
+    with pytest.raises(ValueError, match="seed = 9.5: must be a whole number"):
+        many.reset(seed=9.5)
+    many.reset(seed=np.int64(9))
     for _ in range(20):
         observations, *_ = many.step(np.full((3, 1), 0.5))
     alone = Env(plants[2], NOISY, **OPEN)
@@ -276,11 +278,14 @@ def test_scenarios_are_drawn_from_the_generator_of_the_episode() -> None:
         ("must be finite", {"controller": law(Policy(), u_max=math.inf)}),
         ("the controller has it", {"controller": law(Policy()), "dt": 0.1}),
         ("must be the sample time", {"dt": None}),
+        ("dt = '1 ms'", {"dt": "1 ms"}),
+        ("u_min and u_max = None, ", {"u_min": None}),
         ("must be finite, the first one smaller", {"u_max": -5.0}),
         ("must be empty", {"scenario": ql.Scenario(duration=2.0, rest_at=(1.0,))}),
         ("action_repeat", {"action_repeat": 0}),
         ("observe", {"observe": ("x_hat",)}),
         ("must be different", {"observe": ("r", "r")}),
+        ("observe = 3", {"observe": 3}),
         ("x_limit has 3 entries", {"x_limit": (1.0, 2.0, 3.0)}),
         ("limit = -1.0", {"limit": -1.0}),
         ("render_mode", {"render_mode": "human"}),

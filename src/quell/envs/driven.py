@@ -69,9 +69,11 @@ class Driven:
         self.observation_space = box(self.observed.low, self.observed.high, dtype=np.float64)
         self.action_space = box(-1.0, 1.0, (1,), np.float64)
 
-    def reset(self, which: Sequence[int], rngs: Sequence[np.random.Generator]) -> None:
-        """Begin an episode in some loops."""
-        self.loops.reset(which, rngs)
+    def begin(self, rngs: Sequence[np.random.Generator]) -> None:
+        """Begin an episode in each loop, and write its first row."""
+        count = self.loops.count
+        self.loops.reset(range(count), rngs)
+        self.loops.advance(np.zeros(count), np.zeros(count, np.int64))
 
     def advance(self, actions: Vector, active: Any) -> None:
         """Take the active loops through a step with actions from −1 to 1, which are clipped."""

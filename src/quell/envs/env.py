@@ -136,8 +136,7 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; return the first observation and ``info``."""
         super().reset(seed=seed)
-        self._driven.reset([0], [self.np_random])
-        self._driven.advance(np.zeros(1), np.zeros(1, np.int64))
+        self._driven.begin([self.np_random])
         self._past, self._ended = [], False
         return self._seen()
 
@@ -173,5 +172,5 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
         return as_text(self._past) if self.render_mode == "ansi" else as_picture(self._past)
 
     def close(self) -> None:
-        """Do nothing more than Gymnasium does."""
+        """End the loop; of a single one nothing is left to release."""
         self._driven.loops.close()

@@ -13,7 +13,7 @@ import numpy as np
 from quell.checks import positive
 from quell.controllers.adrc.law import AdrcDesign, AdrcState
 from quell.controllers.base import control, reset_loop, status_flags, write_row
-from quell.controllers.limits import Limits, checked_limits
+from quell.controllers.limits import Limits
 from quell.kernels.dispatch import generic
 from quell.learners.base import (
     adapt,
@@ -117,7 +117,7 @@ def _set_feedforward(design: AdrcDesign, state: AdrcState, action: float) -> Non
 class GivenDesign(NamedTuple):
     """Parameters of ``GivenControl``."""
 
-    limits: Limits
+    limits: Limits  # of magnitude only
 
 
 class GivenState(NamedTuple):
@@ -131,19 +131,9 @@ class GivenControl:
     """The absence of a controller: u comes from outside, within limits."""
 
     dt: float
-    u_min: float
-    u_max: float
+    parameters: GivenDesign
     features: tuple[str, ...] = ()
     channels: Channels = ()
-
-    def __post_init__(self) -> None:
-        positive("dt", self.dt, "s")
-        checked_limits(self.u_min, self.u_max, float("inf"), self.dt)
-
-    @property
-    def parameters(self) -> GivenDesign:
-        """Parameters of the compiled functions."""
-        return GivenDesign(checked_limits(self.u_min, self.u_max, float("inf"), self.dt))
 
     def initial_state(self) -> GivenState:
         """Return the state before the first sample."""

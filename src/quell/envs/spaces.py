@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,8 +12,9 @@ import numpy as np
 from quell import checks
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.base import Controller
+from quell.controllers.limits import checked_limits
 from quell.envs.loops import Loops
-from quell.envs.policy import GivenControl, Policy
+from quell.envs.policy import GivenControl, GivenDesign, Policy
 from quell.records.channels import columns_of
 from quell.types import Vector
 
@@ -44,16 +46,18 @@ def loop_of(
     if controller is None:
         if dt is None:
             raise ValueError("dt = None: must be the sample time [s] if there is no controller")
+        dt = checks.positive("dt", dt, "s")
         low, high = _limits(u_min, u_max, "u_min and u_max")
         middle, reach = 0.5 * (low + high), 0.5 * (high - low)
-        return GivenControl(float(dt), low, high), Action(middle, reach, low, high)
+        given = GivenDesign(checked_limits(low, high, math.inf, dt))
+        return GivenControl(dt, given), Action(middle, reach, low, high)
     if not isinstance(controller, ADRC) or not isinstance(controller.learner, Policy):
         raise ValueError(
             f"controller = {controller!r}: must be a quell.ADRC with learner=quell.envs.Policy(), "
             "whose output the actions are, or None for actions that are u"
         )
-    given = {"dt": dt is not None, "u_min": u_min != -math.inf, "u_max": u_max != math.inf}
-    for name, is_given in given.items():
+    twice = {"dt": dt is not None, "u_min": u_min != -math.inf, "u_max": u_max != math.inf}
+    for name, is_given in twice.items():
         if is_given:
             raise ValueError(f"{name}: the controller has it; give it there only")
     limits = controller.limits
@@ -64,11 +68,12 @@ def loop_of(
     return controller, Action(0.0, most, low, high)
 
 
-def _limits(low: float, high: float, what: str) -> tuple[float, float]:
-    low, high = float(low), float(high)
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"{what} = {low!r}, {high!r}: must be finite, the first one smaller")
-    return low, high
+def _limits(low: Any, high: Any, what: str) -> tuple[float, float]:
+    with suppress(TypeError, ValueError, OverflowError):
+        ends = float(low), float(high)
+        if -math.inf < ends[0] < ends[1] < math.inf:
+            return ends
+    raise ValueError(f"{what} = {low!r}, {high!r}: must be finite, the first one smaller")
 
 
 class Observed:
@@ -88,7 +93,11 @@ class Observed:
     ) -> None:
         is_adrc = isinstance(loop.controller, ADRC)
         default = OBSERVED_WITH_F if is_adrc else OBSERVED_WITH_U
-        self.names = (names,) if isinstance(names, str) else tuple(names or default)
+        if isinstance(names, str):
+            names = (names,)
+        if names is not None and not checks.is_sequence(names):
+            raise ValueError(f"observe = {names!r}: must be a list of names of channels")
+        self.names = tuple(names or default)
         widths = {name: width for name, width in loop.channels if width}
         for name in self.names:
             checks.one_of("observe", name, tuple(widths))

@@ -95,7 +95,11 @@ class VectorEnv(vector.VectorEnv):  # type: ignore[misc, name-defined, unused-ig
         the generators of the loops go on, and the first time are seeded by the system.
         """
         count = self.num_envs
-        seeds = [seed + i for i in range(count)] if isinstance(seed, int | np.integer) else seed
+        seeds = (
+            [int(seed) + i for i in range(count)] if isinstance(seed, int | np.integer) else seed
+        )
+        if seeds is not None and not checks.is_sequence(seeds):
+            raise ValueError(f"seed = {seed!r}: must be a whole number, or a list of one for each")
         if seeds is not None and len(seeds) != count:
             raise ValueError(f"seed has {len(seeds)} entries, num_envs = {count}: must be equal")
         if seeds is not None or not self._rngs:
@@ -104,8 +108,7 @@ class VectorEnv(vector.VectorEnv):  # type: ignore[misc, name-defined, unused-ig
                 rng if each is None and rng is not None else seeding.np_random(each)[0]
                 for rng, each in zip(before, seeds or [None] * count, strict=True)
             ]
-        self._driven.reset(range(count), self._rngs)
-        self._driven.advance(np.zeros(count), np.zeros(count, np.int64))
+        self._driven.begin(self._rngs)
         self._ended[:] = False
         return self._driven.observations, self._infos()
 
@@ -121,7 +124,7 @@ class VectorEnv(vector.VectorEnv):  # type: ignore[misc, name-defined, unused-ig
             raise ValueError(f"actions have shape {given.shape}: must have ({self.num_envs}, 1)")
         begin = np.flatnonzero(self._ended).tolist()
         if begin:
-            self._driven.reset(begin, self._rngs)
+            self._driven.loops.reset(begin, self._rngs)
         self._driven.advance(given.reshape(-1), (~self._ended).astype(np.int64))
         terminated, truncated = self._driven.ends
         self._ended = terminated | truncated
