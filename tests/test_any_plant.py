@@ -249,6 +249,8 @@ def test_a_nonlinear_plant_is_analysed_at_rest_or_at_its_operating_point() -> No
 
 def test_names_and_units_belong_to_plants_of_all_kinds(files: Path) -> None:
     """In Python and in tables, also behind a delay; too many names are an error."""
+    with pytest.raises(ValueError, match="w = 3: must be a list of names"):
+        labelled(ql.plants.two_mass_spring(), w=3)
     plant = labelled(ql.plants.two_mass_spring(), y="position [m]", u="force [N]", w="load [N]")
     late = ql.plants.delayed(plant, DT, DT)
     names = {"y": "position [m]", "u": "force [N]", "w": ["load [N]"]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 _TEXT = re.compile(r"\s*([^\[\]]*?)\s*(?:\[([^\[\]]*)\])?\s*")
@@ -47,6 +47,8 @@ class Signals(NamedTuple):
         """
         if isinstance(w, str):
             w = (w,)
+        if not isinstance(w, Iterable):
+            raise ValueError(f"w = {w!r:.60}: must be a list of names with units")
         many = tuple(_quantity(f"w[{i}]", each) for i, each in enumerate(w))
         return cls(_quantity("y", y), _quantity("u", u), many)
 
