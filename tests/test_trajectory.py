@@ -285,6 +285,7 @@ def test_a_plot_has_an_error_panel_and_draws_into_given_axes(run: ql.Trajectory)
     assert run.plot(mine) is mine
     _, four = plt.subplots(4, 1)
     assert run.plot(ax=four) is four
+    assert run.plot(four.reshape(2, 2)).tolist() == four.tolist()
     with pytest.raises(ValueError, match="axes and ax: are two names of the same"):
         run.plot(mine, ax=four)
     plt.close("all")

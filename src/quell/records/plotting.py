@@ -47,7 +47,7 @@ def draw_line(ax: Any, t: Vector, values: Vector, **style: Any) -> None:
 
 
 def given_axes(axes: Any, ax: Any) -> Any:
-    """Return the axes of a call that takes them by either name.
+    """Return the axes of a call that takes them by either name; rows of axes in one vector.
 
     Raises
     ------
@@ -56,7 +56,8 @@ def given_axes(axes: Any, ax: Any) -> Any:
     """
     if axes is not None and ax is not None:
         raise ValueError("axes and ax: are two names of the same; give one")
-    return ax if axes is None else axes
+    found = ax if axes is None else axes
+    return np.ravel(found) if np.ndim(found) > 1 else found
 
 
 def plot_run(run: Any, diverged_at: float | None, axes: Any = None) -> Any:
