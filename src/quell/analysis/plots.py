@@ -122,20 +122,20 @@ def plot_gang_of_four(
     """
     axes = _axes(given_axes(axes, ax), 2, 2)
     scale = 1.0 / (2.0 * np.pi) if hertz else 1.0
+    shown: Any = _in_decibels if decibels else np.asarray
     meanings = ("", "", ": load at the plant's input to y", ": measurement noise to u")
-    for ax, name, meaning in zip(axes, ("S", "T", "PS", "CS"), meanings, strict=True):
+    for each, name, meaning in zip(axes, ("S", "T", "PS", "CS"), meanings, strict=True):
         gain = np.abs(loop.response(name, loop.omega))
-        shown: Any = _in_decibels if decibels else np.asarray
-        ax.semilogx(scale * loop.omega, shown(gain), **style)
+        each.semilogx(scale * loop.omega, shown(gain), **style)
         if not decibels:
-            ax.set_yscale("log")
-        ax.set_ylim(*(shown(end) for end in _ratio_limits(gain)))
+            each.set_yscale("log")
+        each.set_ylim(*(shown(end) for end in _ratio_limits(gain)))
         if name in ("S", "T"):
-            ax.axhline(shown(1.0), **_AID)
-        ax.set_title(f"|{name}|{meaning}", fontsize="medium")
-        _finish(ax, "dB" if decibels else "", loop, scale)
-    for ax in axes[2:]:
-        ax.set_xlabel("frequency [Hz]" if hertz else "ω [rad/s]")
+            each.axhline(shown(1.0), **_AID)
+        each.set_title(f"|{name}|{meaning}", fontsize="medium")
+        _finish(each, "dB" if decibels else "", loop, scale)
+    for each in axes[2:]:
+        each.set_xlabel("frequency [Hz]" if hertz else "ω [rad/s]")
     return axes
 
 
