@@ -263,14 +263,18 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference valueR
 }
 
 /* The other types have no variables: only empty lists are right. */
+static fmi3Status none(const Instance *instance, const char *function, size_t count) {
+    if (instance != NULL && count == 0) return fmi3OK;
+    return fail(instance, function, "there is no variable of this type");
+}
+
 #define NONE(name, type)                                                                          \
     fmi3Status name(fmi3Instance instance, const fmi3ValueReference valueReferences[],            \
                     size_t nValueReferences, type values[], size_t nValues) {                     \
         (void)valueReferences;                                                                    \
         (void)values;                                                                             \
         (void)nValues;                                                                            \
-        if (instance != NULL && nValueReferences == 0) return fmi3OK;                             \
-        return fail(instance, #name, "there is no variable of this type");                        \
+        return none(instance, #name, nValueReferences);                                           \
     }
 
 NONE(fmi3GetFloat32, fmi3Float32)
@@ -302,8 +306,7 @@ fmi3Status fmi3GetBinary(fmi3Instance instance, const fmi3ValueReference valueRe
     (void)valueSizes;
     (void)values;
     (void)nValues;
-    if (instance != NULL && nValueReferences == 0) return fmi3OK;
-    return fail(instance, "fmi3GetBinary", "there is no variable of this type");
+    return none(instance, "fmi3GetBinary", nValueReferences);
 }
 
 fmi3Status fmi3SetBinary(fmi3Instance instance, const fmi3ValueReference valueReferences[],
@@ -313,24 +316,21 @@ fmi3Status fmi3SetBinary(fmi3Instance instance, const fmi3ValueReference valueRe
     (void)valueSizes;
     (void)values;
     (void)nValues;
-    if (instance != NULL && nValueReferences == 0) return fmi3OK;
-    return fail(instance, "fmi3SetBinary", "there is no variable of this type");
+    return none(instance, "fmi3SetBinary", nValueReferences);
 }
 
 fmi3Status fmi3GetClock(fmi3Instance instance, const fmi3ValueReference valueReferences[],
                         size_t nValueReferences, fmi3Clock values[]) {
     (void)valueReferences;
     (void)values;
-    if (instance != NULL && nValueReferences == 0) return fmi3OK;
-    return fail(instance, "fmi3GetClock", "there is no variable of this type");
+    return none(instance, "fmi3GetClock", nValueReferences);
 }
 
 fmi3Status fmi3SetClock(fmi3Instance instance, const fmi3ValueReference valueReferences[],
                         size_t nValueReferences, const fmi3Clock values[]) {
     (void)valueReferences;
     (void)values;
-    if (instance != NULL && nValueReferences == 0) return fmi3OK;
-    return fail(instance, "fmi3SetClock", "there is no variable of this type");
+    return none(instance, "fmi3SetClock", nValueReferences);
 }
 
 /* ---- State (2.2.10) ---- */
