@@ -23,10 +23,11 @@ from quell.reading import TooLargeError
 from quell.realtime.devices.twin import TwinDevice
 
 from . import fmus
+from .in_c import needs_gcc
 from .mutations import mutated
 
 pytest.importorskip("fmpy", reason="FMPy, which reads and calls FMUs, is missing")
-pytestmark = fmus.needs_gcc
+pytestmark = needs_gcc
 
 VERSIONS = (2, 3)
 DT = 0.01
@@ -169,6 +170,7 @@ def test_a_copy_and_a_pickle_of_a_plant_unpack_the_file_again(files: dict[int, P
     [
         ({"u": "force"}, "u = 'force': no variable of it; must be one of|did you mean"),
         ({"u": "y"}, "u = 'y': is output of type (Real|Float64); must be an input"),
+        ({"u": ["u"]}, r"u = \['u'\]: no variable of it; must be one of"),
         ({"y": "speed"}, "y = 'speed': no variable"),
         ({"w": ["u"], "u": "u"}, "u and w name one variable twice"),
         ({"w": "w"}, "w = 'w': must be a sequence of names"),
@@ -177,6 +179,7 @@ def test_a_copy_and_a_pickle_of_a_plant_unpack_the_file_again(files: dict[int, P
         ({"start": {"gain": "two"}}, r"start\['gain'\] = 'two': must be a number"),
         ({"start": {"fail_with": 2.5}}, r"start\['fail_with'\] = 2.5: must be a whole number"),
         ({"start": {"fail_with": 2**31}}, "must be a whole number from -2147483648 to 2147483647"),
+        ({"start": ["gain"]}, r"start = \['gain'\]: must be a mapping of names to values"),
         ({"substeps": 0}, "substeps = 0: must be a whole number of at least 1"),
     ],
 )

@@ -95,7 +95,7 @@ def fmu(
     name = checked_name(name or target.stem)
     if name in _OWN_NAMES:
         raise ValueError(f"name = {name!r}: is the name of a file that each FMU has; give another")
-    check_writable(target, overwrite)
+    check_writable(target, checks.flag("overwrite", overwrite))
     plant, controller = _parts(part)
     model, files = _model(plant, controller, name, dt, x0)
     if checks.flag("binary", binary):
@@ -119,7 +119,7 @@ def _parts(part: Any) -> tuple[Any, Any]:
         plant, controller = part, None
     if controller is not None:
         check_controller(controller)
-    if plant is not None:
+    if plant is not None or controller is None:
         if not hasattr(plant, "sampled") and is_linear_model(plant):
             plant = LinearPlant.of(plant)
         check_plant(plant, "part")

@@ -106,13 +106,14 @@ def c(
     checked_name(name)
     single = checks.one_of("precision", precision, ("double", "single")) == "single"
     check_folder(folder, checks.flag("overwrite", overwrite))
+    checks.flag("accept", accept)
     single = single or isinstance(controller, SinglePrecision)
     shown = in_single_precision(controller) if single else controller
     source = c_source(shown, name, resolution=resolution)
     comparison = None
     if single and plant is not None and scenario is not None:
         comparison = compared(plant, controller, scenario)
-    if single and not checks.flag("accept", accept):
+    if single and not accept:
         _check_comparison(comparison)
     vectors = golden_vectors(shown, source.operations)
     files = write_folder(folder, library_files(shown, source, vectors), overwrite)

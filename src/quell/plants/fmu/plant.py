@@ -131,8 +131,10 @@ class FMU:
             names = getattr(self, argument)
             if not checks.is_sequence(names):
                 raise ValueError(f"{argument} = {names!r}: must be a sequence of names")
+        if not isinstance(self.start, Mapping | None):
+            raise ValueError(f"start = {self.start!r}: must be a mapping of names to values")
         library = Library(Path(self.path), bytes_of(self.max_size))
-        variables = Variables(library.description, library.name)
+        variables = Variables(library.description, library.name, library.old)
         own: dict[str, Any] = {
             "_library": library,
             "_ports": variables.ports(self.u, self.y, self.w, self.states),

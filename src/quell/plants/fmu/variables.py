@@ -39,11 +39,11 @@ class Start(NamedTuple):
 
 
 class Variables:
-    """The variables of an FMU, by name; errors begin with ``where``."""
+    """The variables of an FMU, of FMI 2.0 if ``old``, by name; errors begin with ``where``."""
 
-    def __init__(self, description: Any, where: str) -> None:
+    def __init__(self, description: Any, where: str, old: bool) -> None:
         self._where = where
-        self._old = description.fmiVersion == "2.0"
+        self._old = old
         self._by_name = {variable.name: variable for variable in description.modelVariables}
 
     def ports(self, u: str | None, y: str | None, w: Sequence[str], states: Sequence[str]) -> Ports:
@@ -96,7 +96,7 @@ class Variables:
         raise ValueError(f"{self._where}: {argument} is not given, and the FMU {known}: name one")
 
     def _variable(self, argument: str, name: Any) -> Any:
-        if name not in self._by_name:
+        if not isinstance(name, str) or name not in self._by_name:
             rule = checks.nearest(str(name), [*self._by_name]) if self._by_name else "it has none"
             raise ValueError(f"{self._where}: {argument} = {name!r}: no variable of it; {rule}")
         variable = self._by_name[name]
