@@ -155,7 +155,7 @@ class Model:
             dt=repr(self.dt),
             reals=len(variables) - integers,
             integers=integers,
-            places=_indented(f"{place(each)}," for each in variables),
+            places=_indented(f"{each.constant}," for each in variables),
             members=_indented(self._members()),
         )
 
@@ -175,9 +175,11 @@ class Model:
     def _source(self) -> str:
         reals = [variable for variable in self.variables if not variable.whole]
         roles = (f"{_ROLES.get(v.role, 'MODEL_OUTPUT')}, /* {v.name} */" for v in reals)
-        starts = [f"m->real[{place(v)}] = {_c_number(v.start)};" for v in reals if v.role in _ROLES]
-        reset, moved, tune, begin, sample = list[str](), ["(void)m;"], ["(void)m;"], [], []
-        helpers, outputs = "", list[str]()
+        starts = [
+            f"m->real[{v.constant}] = {_c_number(v.start)};" for v in reals if v.role in _ROLES
+        ]
+        reset, moved, tune = list[str](), ["(void)m;"], ["(void)m;", "return NULL;"]
+        helpers, begin, outputs = "", list[str](), list[str]()
         if self.controller:
             name = self.controller.source.name
             helpers = _estimate_function(self.controller)
@@ -195,12 +197,9 @@ class Model:
             name = self.plant.source.name
             moved.append(f"m->plant.parameters = &{name}_default_parameters;")
             reset.append(f"{name}_init(&m->plant);")
-        begin += [f"m->plant.x[{i}] = m->real[AT_X0_{i + 1}];" for i in range(self._order)]
-        sample += self._sample_lines()
-        if self.plant:
+            order = self.plant.order
+            begin = [f"m->plant.x[{i}] = m->real[AT_X0_{i + 1}];" for i in range(order)]
             outputs += _plant_outputs(self.plant)
-        if not tune or tune[-1] != "return NULL;":
-            tune = [*tune, "return NULL;"]
         return _SOURCE.format(
             roles=_indented(roles),
             helpers=helpers,
@@ -208,17 +207,12 @@ class Model:
             moved=_indented(moved),
             tune=_indented(tune),
             begin=_indented([*begin, *outputs]),
-            sample=_indented([*sample, *outputs]),
+            sample=_indented([*self._sample_lines(), *outputs]),
         )
-
-    @property
-    def _order(self) -> int:
-        return self.plant.order if self.plant else 0
 
     def _sample_lines(self) -> list[str]:
         """Return the lines of a sample, without the outputs after it."""
-        lines = []
-        time_used = False
+        lines = [] if self.plant else ["(void)t;"]
         y = "m->real[AT_Y]"
         if self.plant and self.controller:
             lines.append(f"const double y = {self.plant.source.name}_measure(&m->plant);")
@@ -237,13 +231,7 @@ class Model:
             w = ", &m->real[AT_W_1]" if self.plant.disturbances else ""
             name = self.plant.source.name
             lines.append(f"{name}_advance(&m->plant, t, m->real[AT_U]{w});")
-            time_used = True
-        return lines if time_used else ["(void)t;", *lines]
-
-
-def place(variable: Variable) -> str:
-    """Return the C constant for the place of a variable."""
-    return variable.constant
+        return lines
 
 
 def _plant_outputs(plant: PlantPart) -> list[str]:
@@ -255,20 +243,22 @@ def _estimate_function(controller: ControllerPart) -> str:
     """Return the C function that copies the estimate to the outputs."""
     name = controller.source.name
     lines = [f"const {name}_estimate estimate = {name}_get_estimate(&m->controller);"]
-    if "status" not in dict(controller.source.channels):
-        lines.append(f"m->integer[AT_STATUS - MODEL_REALS] = {name}_status(&m->controller);")
-    names = {"f_hat": "f"}
-    for channel, width in controller.channels:
-        if channel == "status" and "status" not in dict(controller.source.channels):
-            continue
-        for i in range(width):
-            counted = width > 1 or channel in ("x_hat", "theta")
-            constant = f"{channel}_{i + 1}" if counted else channel
-            field = f"estimate.{names.get(channel, channel)}" + (f"[{i}]" if width > 1 else "")
-            if channel in ("status", "reason"):
-                lines.append(f"m->integer[AT_{constant.upper()} - MODEL_REALS] = {field};")
-            else:
-                lines.append(f"m->real[AT_{constant.upper()}] = {field};")
+    has_status = "status" in dict(controller.source.channels)
+    fields = (
+        f"estimate.{'f' if channel == 'f_hat' else channel}" + (f"[{i}]" if width > 1 else "")
+        for channel, width in controller.channels
+        for i in range(width)
+    )
+    for output, field in zip(controller.outputs, fields, strict=True):
+        value = field
+        if output.name == "status" and not has_status:
+            value = f"{name}_status(&m->controller)"
+        target = (
+            f"integer[{output.constant} - MODEL_REALS]"
+            if output.whole
+            else f"real[{output.constant}]"
+        )
+        lines.append(f"m->{target} = {value};")
     body = _indented(lines)
     doc = "/* Copy what the controller knows to the outputs. */"
     return f"\n{doc}\nstatic void set_estimate(model *m)\n{{\n{body}\n}}\n"

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from quell.export.fmi.bandwidths import Bandwidths
 from quell.export.fmi.parts import ControllerPart
+from quell.types import Matrix, Vector
 
 
 def tuning_lines(controller: ControllerPart) -> list[str]:
@@ -41,9 +40,9 @@ def tuning_lines(controller: ControllerPart) -> list[str]:
     ]
     if known is not None:
         if known.weights is not None:
-            lines += _omega_c_lines(known, cast)
+            lines += _omega_c_lines(known, known.weights, cast)
         if known.coefficients is not None:
-            lines += _omega_o_lines(known, cast)
+            lines += _omega_o_lines(known, known.coefficients, cast)
     return [
         *lines,
         f"{name}_retune(&m->controller, next);",
@@ -52,9 +51,8 @@ def tuning_lines(controller: ControllerPart) -> list[str]:
     ]
 
 
-def _omega_c_lines(known: Bandwidths, cast: str) -> list[str]:
+def _omega_c_lines(known: Bandwidths, weights: Vector, cast: str) -> list[str]:
     """Return the lines for ``k_i = w_i omega_c^(m−i+1)`` (controllers/adrc/law.py)."""
-    weights = known.weights if known.weights is not None else np.zeros(0)
     count, dt = weights.size, known.dt
     guard = []
     if known.guard is not None:
@@ -78,9 +76,8 @@ def _omega_c_lines(known: Bandwidths, cast: str) -> list[str]:
     ]
 
 
-def _omega_o_lines(known: Bandwidths, cast: str) -> list[str]:
+def _omega_o_lines(known: Bandwidths, coefficients: Matrix, cast: str) -> list[str]:
     """Return the lines for L as a polynomial in ``ω = 1 − exp(−omega_o dt)`` (bandwidths.py)."""
-    coefficients = known.coefficients if known.coefficients is not None else np.zeros((0, 0))
     rows, columns = coefficients.shape
     return [
         f"if (m->real[AT_OMEGA_O] != {known.omega_o!r}) {{ /* else the numbers of the export */",
