@@ -40,7 +40,8 @@ from quell.controllers.adrc.handover import samples_to_settle
 from quell.controllers.base import reset_loop
 from quell.experiments.two_mass_spring import setup as study
 from quell.export import TranslationError
-from quell.export.library.vectors import Action, Player, limits_path
+from quell.export.inspection import limits_path
+from quell.export.library.vectors import Action, Player
 
 HERE = Path(__file__).parent
 STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")

@@ -16,10 +16,10 @@ from quell.controllers.base import (
     write_row,
 )
 from quell.controllers.prefilters.prefilter import Prefiltered, without_prefilters
-from quell.controllers.single.single import SinglePrecision
 from quell.export import operations
 from quell.export.c_files import CFiles, CSource, translated
 from quell.export.counts import check_counts
+from quell.export.inspection import in_double_precision, parameters_of
 from quell.export.translate.findings import Findings
 from quell.export.translate.layout import wrapped
 from quell.export.translate.values import Array, Number, TranslationError, Value
@@ -98,11 +98,8 @@ class _Writer:
         self, controller: Any, name: str, findings: Findings, resolution: float | None
     ) -> None:
         self.controller, self.name, self.resolution = controller, name, resolution
-        parameters = controller.parameters
-        self.described = controller  # the controller in double precision
-        if isinstance(controller, SinglePrecision):
-            self.described, parameters = controller.controller, parameters.controller
-        self.files = CFiles(name, parameters, controller.initial_state(), findings)
+        self.described = in_double_precision(controller)
+        self.files = CFiles(name, parameters_of(controller), controller.initial_state(), findings)
         self.real = self.files.real
         self.state = f"{name}_state *state"
 

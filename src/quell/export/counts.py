@@ -1,4 +1,4 @@
-"""Whether a controller may take y as counts from an origin that moves."""
+"""The check that a controller may take y as counts from an origin that moves."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from quell import checks
 from quell.controllers.base import control
-from quell.controllers.single.single import SinglePrecision
 from quell.export import operations
+from quell.export.inspection import in_double_precision
 from quell.export.translate.values import TranslationError
 
 # Samples of the trial, and the largest change of u that is rounding, relative to the largest u.
@@ -29,8 +29,7 @@ def check_counts(controller: Any, resolution: float) -> None:
         controllers whose origin can't be moved.
     """
     checks.positive("resolution", resolution, "y-unit per count")
-    if isinstance(controller, SinglePrecision):
-        controller = controller.controller
+    controller = in_double_precision(controller)
     design = controller.parameters
     if type(design) not in operations.move_origin.implementations:
         raise TranslationError(

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from quell.controllers.limits import Limits
-from quell.controllers.single.single import SinglePrecision
 from quell.export.c_files import CSource
 from quell.export.fmi.bandwidths import Bandwidths, bandwidths
 from quell.export.fmi.variables import INPUT, OUTPUT, TUNABLE, Variable, several
+from quell.export.inspection import at_path, limits_path, parameters_of
 
 _DESCRIPTIONS = {
     "x_hat": "estimate of y and its derivatives",
@@ -43,9 +42,11 @@ class ControllerPart:
     @classmethod
     def of(cls, controller: Any, source: CSource) -> ControllerPart:
         """Return the part for a controller and its C source."""
-        single = isinstance(controller, SinglePrecision)
-        parameters = controller.parameters.controller if single else controller.parameters
-        path, limits = _limits(parameters)
+        parameters, path = parameters_of(controller), limits_path(controller)
+        if not path:
+            kind = type(parameters).__name__
+            raise ValueError(f"controller has {kind}: it has no limits of u")
+        limits = at_path(parameters, path)
         return cls(
             source,
             controller.derivatives if "set_derivatives" in source.operations else 0,
@@ -116,13 +117,3 @@ class PlantPart:
     order: int
     disturbances: int
     x0: Sequence[float]
-
-
-def _limits(parameters: Any, path: str = "") -> tuple[str, Limits]:
-    """Return the path of the limits of u in the parameters of a controller, and the limits."""
-    for name, part in zip(parameters._fields, parameters, strict=True):
-        if isinstance(part, Limits):
-            return f"{path}{name}", part
-        if name == "controller":
-            return _limits(part, f"{path}{name}.")
-    raise ValueError(f"controller has {type(parameters).__name__}: it has no limits of u")

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quell.controllers.single.single import SinglePrecision
+from quell.export.inspection import in_double_precision
 from quell.plants.base import Plant
 from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
 
-# Largest RMS difference of u that is no reason to think, relative to the RMS of u. Rounding acts on
+# Largest RMS difference of u that is accepted, relative to the RMS of u. Rounding acts on
 # u as noise does. One per cent of it is what a 6-bit converter adds, and does not show in y
 # (METHOD's table: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
 # unless the rounding of y itself, times omega_o^(n+1), is too much for u.
@@ -54,8 +54,7 @@ class Comparison(NamedTuple):
 
 def compared(plant: Plant, controller: Any, scenario: Scenario) -> Comparison:
     """Return what single precision changes in a scenario, and what the measurement noise does."""
-    if isinstance(controller, SinglePrecision):
-        controller = controller.controller
+    controller = in_double_precision(controller)
     double = simulate(plant, controller, scenario)
     single = simulate(plant, controller, scenario, precision="single")
     u_noise = y_noise = None

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from quell.controllers.single import SinglePrecision
 from quell.export.c_files import CSource
+from quell.export.inspection import in_double_precision, limits_path
 from quell.export.library.templates import filled
 from quell.export.library.test_program import TOLERANCE_REASON, test_program
-from quell.export.library.vectors import Vectors, limits_path
+from quell.export.library.vectors import Vectors
 
 # Calls of the functions, and when they belong there; s is &state.
 _OPERATIONS = {
@@ -72,7 +72,6 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
     """
     name, single = source.name, source.precision == "single"
     one = "1.0f" if single else "1.0"
-    described = controller.controller if isinstance(controller, SinglePrecision) else controller
     rows = (
         f"| `{name}_{call}` | {when} |"
         for operation, (call, when) in _OPERATIONS.items()
@@ -85,7 +84,7 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
     values = {
         "name": name,
         "NAME": name.upper(),
-        "title": f"Controller {type(described).__name__}",
+        "title": f"Controller {type(in_double_precision(controller)).__name__}",
         "precision": source.precision,
         "real": source.real,
         "one": one,

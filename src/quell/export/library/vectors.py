@@ -19,10 +19,10 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.limits import Limits
 from quell.controllers.prefilters.prefilter import without_prefilters
 from quell.controllers.single import SinglePrecision
 from quell.export import operations
+from quell.export.inspection import at_path, in_double_precision, limits_path, parameters_of
 from quell.export.library.loop import BLOCK, Loop, Plant, plant_for
 from quell.kernels.dispatch import as_python
 
@@ -96,12 +96,12 @@ class Player:
 
     def __init__(self, controller: Any) -> None:
         single = isinstance(controller, SinglePrecision)
-        self.default = controller.parameters.controller if single else controller.parameters
+        self.default = parameters_of(controller)
         self.design, self.state = self.default, controller.initial_state()
         self.limited = self.default
         self.real: Callable[[Any], Any] = np.float32 if single else float
         self.derivatives = int(getattr(controller, "derivatives", 0))
-        self.described = controller.controller if single else controller
+        self.described = in_double_precision(controller)
         self.rows: list[Row] = []
         self.loop: Loop | None = None
 
@@ -145,7 +145,7 @@ class Player:
 
     def limit_at(self, path: str, high: Any) -> None:
         """Set the parameters of ``LIMIT``: the upper limit at ``path`` is ``high``."""
-        limits = _at_path(self.default, path)
+        limits = at_path(self.default, path)
         limits = limits._replace(high=max(self.real(high), limits.low))
         self.limited = _with_limits(self.default, path, limits)
 
@@ -203,7 +203,7 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
             player.play(Action.LEARN, 0.0, 0.0)
     u = player.u_of(slice(None))
     scale = float(np.sqrt(np.mean(np.square(u[np.isfinite(u)]))))
-    limit = _at_path(player.limited, path).high if path else math.inf
+    limit = at_path(player.limited, path).high if path else math.inf
     row = np.zeros(sum(width for _, width in controller.channels), dtype=type(player.real(0.0)))
     write_row(player.design, player.state, row)
     return Vectors(tuple(player.rows), player.derivatives, path, limit, scale, row, plant)
@@ -212,7 +212,7 @@ def golden_vectors(controller: Any, available: tuple[str, ...]) -> Vectors:
 def _play_limited(player: Player, path: str, signals: _Signals) -> None:
     """Set the upper limit into the middle of the range that u had so far, and back."""
     u = player.u_of(slice(2, _FIRST))
-    limits = _at_path(player.default, path)
+    limits = at_path(player.default, path)
     high = 0.5 * (float(np.min(u)) + float(np.max(u)))
     player.limit_at(path, high if math.isfinite(high) else limits.high)
     for action in (Action.LIMIT, Action.FREE):
@@ -246,26 +246,6 @@ class _Signals:
         return r, self.y + 1e-3 * self.amplitude * float(self.random.standard_normal())
 
 
-def limits_path(controller: Any) -> str:
-    """Return where a controller's parameters have the limits of u, as ``controller.limits``."""
-    single = isinstance(controller, SinglePrecision)
-    design = controller.parameters.controller if single else controller.parameters
-    path = ""
-    while True:
-        fields = getattr(design, "_fields", ())
-        if isinstance(getattr(design, "limits", None), Limits):
-            return f"{path}limits"
-        if "controller" not in fields:
-            return ""
-        design, path = design.controller, f"{path}controller."
-
-
-def _at_path(design: Any, path: str) -> Any:
-    for name in path.split("."):
-        design = getattr(design, name)
-    return design
-
-
 def _with_limits(design: Any, path: str, limits: Any) -> Any:
     name, _, rest = path.partition(".")
     inner = _with_limits(getattr(design, name), rest, limits) if rest else limits
@@ -277,7 +257,7 @@ def _amplitude(controller: Any, path: str) -> float:
     player = Player(controller)
     if not path:
         return 1.0
-    limits = _at_path(player.default, path)
+    limits = at_path(player.default, path)
     low, high = float(limits.low), float(limits.high)
     if not math.isfinite(high - low):
         return 1.0
