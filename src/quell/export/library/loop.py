@@ -14,6 +14,7 @@ import numpy as np
 
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.prefilters.prefilter import without_prefilters
+from quell.export.library.templates import fill
 
 BLOCK = 50
 """Samples of a row: u is compared after the last."""
@@ -84,16 +85,12 @@ class Loop:
 def c_code(plant: Plant, write: Callable[[Any], str], real: str, name: str) -> str:
     """Return the same loop in C, as a function that plays a block of samples."""
     gains = ", ".join(write(gain) for gain in plant.gains)
-    values = {
-        "REAL": real, "NAME": name, "ORDER": str(len(plant.gains)), "GAINS": gains,
+    return fill(_CODE, {
+        "REAL": real, "NAME": name, "ORDER": len(plant.gains), "GAINS": gains,
         "B0": write(plant.b0), "DT": write(plant.dt), "AMPLITUDE": write(plant.amplitude),
-        "NOISE": write(plant.noise), "HALF": str(plant.samples // 4), "BLOCK": str(BLOCK),
-        "MULTIPLIER": str(_MULTIPLIER), "INCREMENT": str(_INCREMENT), "ZERO": write(0.0),
-    }  # fmt: skip
-    text = _CODE
-    for key, value in values.items():
-        text = text.replace(f"@{key}@", value)
-    return text
+        "NOISE": write(plant.noise), "HALF": plant.samples // 4, "BLOCK": BLOCK,
+        "MULTIPLIER": _MULTIPLIER, "INCREMENT": _INCREMENT, "ZERO": write(0.0),
+    })  # fmt: skip
 
 
 _CODE = """

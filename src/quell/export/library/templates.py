@@ -9,5 +9,9 @@ from importlib import resources
 
 def filled(name: str, values: Mapping[str, object]) -> str:
     """Return a template of the folder ``templates`` with its ``@names@`` replaced."""
-    text = (resources.files(__package__) / "templates" / name).read_text(encoding="utf-8")
+    return fill((resources.files(__package__) / "templates" / name).read_text("utf-8"), values)
+
+
+def fill(text: str, values: Mapping[str, object]) -> str:
+    """Return a text with its ``@names@`` replaced."""
     return re.sub(r"@(\w+)@", lambda found: str(values[found[1]]), text)

@@ -45,13 +45,14 @@ def test_program(source: CSource, vectors: Vectors) -> str:
     """Return the text of ``test_NAME.c``."""
     single = source.precision == "single"
     write = Literals(single).write_real
+    derivatives = _derivatives(source.name, vectors, write(0.5))
     used = [action for action in Action if any(row.action == action for row in vectors.rows)]
     limits = Action.LIMIT in used
     cases: list[str] = []
     for action in used:
         lines = _CODE.get(action, ())
         if action is Action.TRACK and vectors.derivatives:
-            lines = (*_derivatives(source.name, vectors, write(0.5)).splitlines(), *lines)
+            lines = (*derivatives.splitlines(), *lines)
         if lines:
             cases.append(f"    case {action.name}:")
             cases += [f"        {line.strip()}" for line in lines]
@@ -81,7 +82,7 @@ def test_program(source: CSource, vectors: Vectors) -> str:
         "limited_variable": f"    static {parameters} limited;\n" if limits else "",
         "limited_argument": ", &limited" if limits else "",
         "variables": _variables(source, vectors),
-        "before_step": _derivatives(source.name, vectors, write(0.5)),
+        "before_step": derivatives,
         "loop": c_code(vectors.plant, write, "real", source.name) if vectors.plant else "",
         "samples": f"count + {blocks * (BLOCK - 1)}" if blocks else "count",
         "tolerance": repr(_TOLERANCE_LEARNING if vectors.plant else _TOLERANCE),
@@ -89,23 +90,21 @@ def test_program(source: CSource, vectors: Vectors) -> str:
     })  # fmt: skip
 
 
-def _places(source: CSource) -> Iterator[tuple[str, slice]]:
-    """Yield the members of the estimate that are compared, and the numbers of their channel."""
+def _places(source: CSource) -> Iterator[tuple[str, int, slice]]:
+    """Yield the members of the estimate that are compared, their place, and their channel's."""
     at = 0
     for channel, width in source.channels:
         if channel != "status":
             for i in range(width):
-                yield f"{channel}[{i}]" if width > 1 else channel, slice(at, at + width)
+                yield f"{channel}[{i}]" if width > 1 else channel, at + i, slice(at, at + width)
         at += width
 
 
 def _expected(source: CSource, vectors: Vectors) -> Iterator[str]:
     """Yield the lines of the estimate: name, value, and the largest size in its channel."""
     write = Literals(source.precision == "single").write_real
-    row, before = vectors.estimate, -1
-    for place, part in _places(source):
-        at = max(part.start, before + 1)
-        before = at
+    row = vectors.estimate
+    for place, at, part in _places(source):
         size = float(np.max(np.abs(np.where(np.isfinite(row[part]), row[part], 0.0))))
         yield f'    {{"{place}", {write(row[at])}, {size!r}}},'
 

@@ -87,12 +87,11 @@ def measured_sizes(name: str, header: str, source: str, precision: str) -> Sizes
 
 def _compiler(precision: str) -> tuple[str, str, tuple[str, ...]]:
     """Return the processor, the prefix of the compiler's programs, and its flags."""
-    if all(shutil.which(_CROSS + program) for program in ("gcc", "size", "nm")):
-        processor, flags = _TARGETS[precision]
-        return processor, _CROSS, flags
-    if not all(shutil.which(program) for program in ("gcc", "size", "nm")):
-        raise NoCompilerError("there is no gcc here")
-    return platform.machine(), "", ()
+    processor, flags = _TARGETS[precision]
+    for found in ((processor, _CROSS, flags), (platform.machine(), "", ())):
+        if all(shutil.which(found[1] + program) for program in ("gcc", "size", "nm")):
+            return found
+    raise NoCompilerError("there is no gcc here")
 
 
 def _run(folder: Path, *command: str) -> str:
