@@ -120,9 +120,7 @@ def measured(
     """Return what a case costs on its target, in instructions and bytes."""
     board = emulator.BOARDS[case.board]
     export(case.controller, case.precision, "counted", folder)
-    real, dtype = {"single": ("float", np.float32), "double": ("double", np.float64)}[
-        case.precision
-    ]
+    real, dtype = TYPES[case.precision]
     r, y, u = run["r"].astype(dtype), run["y_measured"].astype(dtype), run["u"]
     (folder / "samples.bin").write_bytes(r.tobytes() + y.tobytes() + u.tobytes())
     program, flags = folder / "target.elf", (f"-DREAL={real}", f"-DSAMPLES={len(run)}")

@@ -6,6 +6,7 @@ import ctypes
 import itertools
 import shutil
 import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,20 @@ import pytest
 needs_gcc = pytest.mark.skipif(
     shutil.which("gcc") is None, reason="gcc, which compiles exported code, is missing"
 )
-STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+EXACT = ("-O1", "-ffp-contract=off")
+"""Flags with which the code gives the bits of the interpreted kernels."""
 
 # ctypes finds a library that it has loaded by its path, so each has another.
 _numbers = itertools.count()
+
+
+def built(result: Path, sources: Iterable[Path], *flags: str | Path) -> Path:
+    """Compile C files, without a warning; return the program or library ``result``."""
+    command = ["gcc", *STRICT, *EXACT, *flags, *sources, "-o", result, "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return result
 
 
 class InC:
@@ -33,11 +44,7 @@ class InC:
         (folder / f"{name}.h").write_text(source.header)
         size = f"\nextern const unsigned long size;\nconst unsigned long size = sizeof({name}_state);\n"
         (folder / f"{name}.c").write_text(source.source + size + more)
-        library = folder / f"{folder.name}.so"
-        flags = [*STRICT, "-ffp-contract=off", "-shared", "-fPIC", "-o", str(library)]
-        command = ["gcc", *flags, str(folder / f"{name}.c"), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
+        library = built(folder / f"{folder.name}.so", [folder / f"{name}.c"], "-shared", "-fPIC")
         self.name, self.library = name, ctypes.CDLL(str(library))
         self.real = ctypes.c_float if source.precision == "single" else ctypes.c_double
         self.state = ctypes.create_string_buffer(ctypes.c_ulong.in_dll(self.library, "size").value)

@@ -22,12 +22,10 @@ from quell.types import Status
 
 from .commands import in_this_process
 from .contracts.python_models import python_learners
+from .in_c import EXACT, built, needs_gcc
 from .setups import TWO_MASS
 
 GCC, GPP = shutil.which("gcc"), shutil.which("g++")
-needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc, which compiles exported code, is missing")
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
-EXACT = ("-O1", "-ffp-contract=off")
 
 DT = 0.01
 LIMITS = {"u_min": -2.0, "u_max": 3.0, "rate_limit": 60.0}
@@ -54,14 +52,11 @@ def exported(
     return ql.export.c(controller, folder / "out", precision=precision, **given)
 
 
-def built(folder: Path, *flags: str) -> Path:
-    """Compile the test with golden vectors, without warnings; return the program."""
-    program = folder / "test_servo"
-    sources = (folder / "out/test_servo.c", folder / "out/src/servo.c")
-    command = ["gcc", *STRICT, *EXACT, *flags, "-I", folder / "out/src", *sources, "-o", program]
-    done = subprocess.run([*command, "-lm"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return program
+def golden_test(folder: Path) -> Path:
+    """Compile the test with golden vectors; return the program."""
+    source = folder / "out/src"
+    sources = (folder / "out/test_servo.c", source / "servo.c")
+    return built(folder / "test_servo", sources, "-I", source)
 
 
 def outcome(program: Path, *arguments: str) -> tuple[int, str]:
@@ -92,7 +87,7 @@ def test_the_c_code_repeats_the_kernels_bit_for_bit(
 ) -> None:
     """With noise, NaN, saturation, manual operation, retuning and restarts; no warning in C99."""
     exported(tmp_path, controller, precision)
-    code, text = outcome(built(tmp_path), "0")
+    code, text = outcome(golden_test(tmp_path), "0")
     assert code == 0, text
     assert "largest difference 0 ulp" in text
 
@@ -134,7 +129,7 @@ def test_golden_vectors_find_a_wrong_controller(tmp_path: Path) -> None:
     ):
         assert old in text
         source.write_text(text.replace(old, new))
-        code, shown = outcome(built(tmp_path))
+        code, shown = outcome(golden_test(tmp_path))
         assert code == 1
         assert first in shown
         assert "FAILED" in shown
@@ -383,7 +378,7 @@ def test_counts_spare_the_rounding_of_the_position(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     exported(tmp_path / "a", controller, name="exact")
     exported(tmp_path, controller, "single", resolution=1e-7)
-    assert outcome(built(tmp_path), "0")[0] == 0
+    assert outcome(golden_test(tmp_path), "0")[0] == 0
     (tmp_path / "main.c").write_text(COUNTS)
     sources = (tmp_path / "main.c", tmp_path / "a/out/src/exact.c", tmp_path / "out/src/servo.c")
     include = ("-I", tmp_path / "a/out/src", "-I", tmp_path / "out/src")

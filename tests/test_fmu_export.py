@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import subprocess
 import zipfile
 from collections.abc import Callable, Iterator
@@ -19,11 +20,11 @@ from quell.export.fmi import binary
 from quell.export.fmi.bandwidths import bandwidths, gain_coefficients
 from quell.simulation.sampled_scenario import SampledScenario
 
-from . import fmus
 from .fmus import Driven
+from .in_c import STRICT, needs_gcc
 
 pytest.importorskip("fmpy", reason="FMPy, which checks and runs FMUs, is missing")
-pytestmark = fmus.needs_gcc
+pytestmark = needs_gcc
 
 DT = 0.01
 MASS = ql.plants.LinearPlant([[0, 1], [0, 0]], [0, 1], [1, 0], [[0, 0], [1, 0.5]])
@@ -351,14 +352,13 @@ def test_the_sources_compile_without_a_warning(
     compiler: str, name: str, files: dict[str, Path], tmp_path: Path
 ) -> None:
     """Those that the FMU contains, with the strictest options."""
-    if fmus.shutil.which(compiler) is None:
+    if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is missing")
     with zipfile.ZipFile(files[name]) as archive:
         archive.extractall(tmp_path)
-    options = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
     units = sorted(each.name for each in (tmp_path / "sources").glob("*.c"))
     subprocess.run(
-        [compiler, *options, "-fsyntax-only", *units], cwd=tmp_path / "sources", check=True
+        [compiler, *STRICT, "-fsyntax-only", *units], cwd=tmp_path / "sources", check=True
     )
 
 
@@ -444,6 +444,8 @@ def test_functions_in_c_come_along(tmp_path: Path, made: Maker) -> None:
         (lambda: MASS, "mass.fmu", {}, "dt = None: must be a number"),
         (lambda: MASS, "mass.fmu", {"dt": DT, "x0": [1.0]}, "x0 has shape"),
         (lambda: "mass", "mass.fmu", {"dt": DT}, "part = 'mass': must be a plant"),
+        (lambda: None, "mass.fmu", {"dt": DT}, "part = None: must be a plant"),
+        (plain, "servo.fmu", {"overwrite": 3}, "overwrite = 3: must be True or False"),
     ],
 )
 def test_bad_arguments_leave_no_file(
