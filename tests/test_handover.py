@@ -309,6 +309,21 @@ def test_a_controller_behind_a_prefilter_starts_hands_over_and_is_retuned() -> N
         ql.controllers.Prefiltered(ql.baselines.PID(1.0, dt=DT), ql.baselines.ZV(3.0)).start(0.0)
 
 
+def test_a_copy_of_a_prefiltered_controller_leaves_it_as_it_was() -> None:
+    """Also one that another prefilter makes: each has its own state, on which its methods act."""
+    given = ql.controllers.Prefiltered(ql.ADRC(OBSERVER, omega_c=3.0), ql.baselines.ZV(3.0))
+    given.start(0.25)
+    outer = ql.controllers.Prefiltered(given, ql.baselines.ZV(4.0))
+    copied = copy.copy(given)
+    single = ql.controllers.in_single_precision(ql.ADRC(OBSERVER, omega_c=3.0))
+    behind = ql.controllers.Prefiltered(single, ql.baselines.ZV(4.0))
+    for each, y in ((given, 0.5), (outer, 1.5), (copied, 2.5), (single, 3.5), (behind, 4.5)):
+        each.start(y, 3.25)
+    for each, y in ((given, 0.5), (outer, 1.5), (copied, 2.5), (single, 3.5), (behind, 4.5)):
+        assert each.estimate.x[0] == pytest.approx(y, abs=1e-9)
+        assert each.step(y, y) == pytest.approx(3.25, abs=1e-5)
+
+
 def test_derivatives_are_fed_forward_in_manual_operation_too() -> None:
     """What the controller would do is what it does."""
     one, other = (ql.ADRC(OBSERVER, omega_c=3.0, feedforward=True) for _ in range(2))

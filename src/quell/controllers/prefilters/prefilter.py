@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.handover import manual_operation
 from quell.controllers.bad_samples import is_usable
 from quell.controllers.base import (
@@ -29,11 +28,10 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.limits import Limits, RateLimit
+from quell.controllers.prefilters.wrapper import Wrapper
 from quell.controllers.stateful import StatefulController
 from quell.kernels.dispatch import generic, generic_with_default, is_finite
 from quell.kernels.scalars import Scalars, clear
-from quell.observers.eso import ESO
 from quell.types import Channels, Status, Vector
 
 _REFERENCE_HELD = int(Status.REFERENCE_HELD)
@@ -141,7 +139,7 @@ def _bumpless_transfer(design: PrefilteredDesign, state: PrefilteredState) -> No
     bumpless_transfer(design.controller, state.controller)
 
 
-class Prefiltered(StatefulController):
+class Prefiltered(Wrapper):
     """A controller that follows a prefiltered reference.
 
     The prefilter starts at rest at the first finite measurement, so another reference in the first
@@ -187,36 +185,20 @@ class Prefiltered(StatefulController):
         self.prefilter = prefilter
         self._initialise()
 
-    def _initialise(self) -> None:
-        super()._initialise()
+    def _use_state(self, state: PrefilteredState) -> None:
+        super()._use_state(state)
         # The controller shares its part of the running state, so its methods act on it.
         if isinstance(self.controller, StatefulController):
-            self.controller._use_state(self._state.controller)
-
-    @property
-    def _inner(self) -> ADRC | Prefiltered:
-        """The controller; an error if it has no methods for hand-over."""
-        if isinstance(self.controller, ADRC | Prefiltered):
-            return self.controller
-        raise ValueError(
-            f"controller = {type(self.controller).__name__}: must be an ADRC to start under load, "
-            "hand over or retune"
-        )
-
-    @property
-    def _adrc(self) -> ADRC:
-        """The ADRC behind all prefilters."""
-        inner = self._inner
-        return inner if isinstance(inner, ADRC) else inner._adrc
+            self.controller._use_state(state.controller)
 
     def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
         """Start at rest at ``y``, see ``ADRC.start``; the prefilter is at rest there too."""
-        self._inner.start(y, u, r)
+        super().start(y, u, r)
         self._settle_at(float(y), float(y if r is None else r))
 
     def start_at(self, x: Any, f: float = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
         """Start with given estimates, see ``ADRC.start_at``; the prefilter is at rest at x[0]."""
-        self._inner.start_at(x, f, u=u, r=r)
+        super().start_at(x, f, u=u, r=r)
         y = float(np.ravel(x)[0])
         self._settle_at(y, float(y if r is None else r))
 
@@ -233,19 +215,10 @@ class Prefiltered(StatefulController):
             self.step(r, y)
         return float(state.loop[0].u_limited)
 
-    def hand_over(self) -> None:
-        """End manual operation, see ``ADRC.hand_over``."""
-        self._inner.hand_over()
-
     def increment(self, r: float, y: float) -> float:
         """Take one sample and return the change of the control signal, see ``ADRC.increment``."""
         before = float(self._adrc._state.loop[0].u)
         return self.step(r, y) - before
-
-    def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
-        """Change bandwidths while running, see ``ADRC.retune``."""
-        self._inner.retune(omega_c=omega_c, observer=observer)
-        self._take_parameters()
 
     def _take_parameters(self) -> None:
         """Use the parameters that the controller has now."""
@@ -257,35 +230,9 @@ class Prefiltered(StatefulController):
         self.parameters = PrefilteredDesign(self.controller.parameters, design)
 
     @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return float(self.controller.dt)
-
-    @property
-    def limits(self) -> Limits:
-        """Limits of the control signal."""
-        return self.controller.limits
-
-    def set_limits(
-        self,
-        *,
-        u_min: float | None = None,
-        u_max: float | None = None,
-        rate_limit: RateLimit | None = None,
-    ) -> None:
-        """Change limits while running, see ``ADRC.set_limits``."""
-        self.controller.set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
-        self._take_parameters()
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Names of the features whose coefficients the channel ``theta`` has."""
-        return tuple(self.controller.features)
-
-    @property
     def channels(self) -> Channels:
         """Name and width of what ``write_row`` writes, in order."""
-        return (("r_shaped", 1), *self.controller.channels)
+        return (("r_shaped", 1), *super().channels)
 
     def initial_state(self) -> PrefilteredState:
         """Return a state before the first sample, with nothing learned."""
@@ -294,16 +241,6 @@ class Prefiltered(StatefulController):
         inner = self.controller.initial_state()
         memory = self.prefilter.memory(self.parameters.prefilter)
         return PrefilteredState(inner, memory, np.zeros(count), PrefilteredLoop.zeros())
-
-    @property
-    def status(self) -> Status:
-        """Status flags of the last step."""
-        return Status(int(status_flags(self.parameters, self._state)))
-
-    @property
-    def estimate(self) -> Any:
-        """Estimates of the ADRC behind the prefilter after the last step."""
-        return self.read(self._state)
 
     def read(self, state: PrefilteredState) -> Any:
         """Return the estimates of the ADRC in ``state``."""

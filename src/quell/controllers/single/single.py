@@ -14,7 +14,6 @@ import numba
 import numpy as np
 
 from quell import checks
-from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.handover import change_design, manual_operation
 from quell.controllers.base import (
     Controller,
@@ -27,16 +26,15 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.controllers.limits import Limits, RateLimit
 from quell.controllers.prefilters.prefilter import Prefiltered
+from quell.controllers.prefilters.wrapper import Wrapper
 from quell.controllers.single.parts import single_design, single_state
-from quell.controllers.stateful import StatefulController
 from quell.kernels import dispatch
 from quell.kernels.functions import single
 from quell.kernels.linking import KERNEL_OPTIONS
 from quell.kernels.single_literals import in_both_precisions
 from quell.observers.eso import ESO
-from quell.types import Channels, Status, Vector
+from quell.types import Vector
 
 
 class SingleDesign(NamedTuple):
@@ -118,7 +116,7 @@ def in_single_precision(controller: Controller) -> SinglePrecision:
     return SinglePrecision(controller)
 
 
-class SinglePrecision(StatefulController):
+class SinglePrecision(Wrapper):
     """A controller in single precision; make it with ``in_single_precision``.
 
     The given controller is copied and not changed; ``parameters.controller`` and the state are
@@ -145,48 +143,9 @@ class SinglePrecision(StatefulController):
         return single_state(self.parameters.controller, self.controller.initial_state())
 
     @property
-    def dt(self) -> float:
-        """Sample time [s]."""
-        return float(self.controller.dt)
-
-    @property
     def derivatives(self) -> int:
         """Number of derivatives of the reference that are fed forward."""
         return int(getattr(self.controller, "derivatives", 0))
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Names of the features whose coefficients the channel ``theta`` has."""
-        return tuple(self.controller.features)
-
-    @property
-    def channels(self) -> Channels:
-        """Name and width of each recorded channel, in order."""
-        channels: Channels = self.controller.channels
-        return channels
-
-    @property
-    def status(self) -> Status:
-        """Status flags of the last step."""
-        return Status(status_flags(self.parameters, self._state))
-
-    @property
-    def limits(self) -> Limits:
-        """Limits of the control signal."""
-        limits: Limits = self.controller.limits
-        return limits
-
-    def set_limits(
-        self,
-        *,
-        u_min: float | None = None,
-        u_max: float | None = None,
-        rate_limit: RateLimit | None = None,
-    ) -> None:
-        """Change limits while running, see ``ADRC.set_limits``."""
-        self.controller.set_limits(u_min=u_min, u_max=u_max, rate_limit=rate_limit)
-        self._update_parameters()
-        self._pack_again()
 
     def step(self, r: float, y: float, *derivatives: float) -> float:
         """Take one sample: return the control signal [u-unit], see ``ADRC.step``."""
@@ -196,29 +155,8 @@ class SinglePrecision(StatefulController):
         return super().step(r, y)
 
     @property
-    def _runner(self) -> Any:
-        """The ADRC, or the prefilter before it, that acts on this state with these parameters."""
-        if not isinstance(self.controller, ADRC | Prefiltered):
-            kind = type(self.controller).__name__
-            raise ValueError(
-                f"controller = {kind}: must be an ADRC to start under load, hand over or retune"
-            )
-        return _acting_on(self.controller, self.parameters.controller, self._state)
-
-    @property
-    def _adrc(self) -> ADRC:
-        """The ADRC behind all prefilters, acting on this state."""
-        runner = self._runner
-        adrc: ADRC = runner if isinstance(runner, ADRC) else runner._adrc
-        return adrc
-
-    def start(self, y: float, u: float = 0.0, r: float | None = None) -> None:
-        """Start at a plant that rests at ``y`` under ``u``, see ``ADRC.start``."""
-        self._runner.start(y, u, r)
-
-    def start_at(self, x: Any, f: float = 0.0, *, u: float = 0.0, r: float | None = None) -> None:
-        """Start with given estimates, see ``ADRC.start_at``."""
-        self._runner.start_at(x, f, u=u, r=r)
+    def _inner(self) -> Any:
+        return _acting_on(super()._inner, self.parameters.controller, self._state)
 
     def track(self, r: float, y: float, u: float, *derivatives: float) -> float:
         """Take one sample in manual operation, see ``ADRC.track``."""
@@ -227,32 +165,25 @@ class SinglePrecision(StatefulController):
             self.step(r, y, *derivatives)
         return float(state.loop[0].u_limited)
 
-    def hand_over(self) -> None:
-        """End manual operation, see ``ADRC.hand_over``."""
-        self._runner.hand_over()
-
     def retune(self, *, omega_c: float | None = None, observer: ESO | None = None) -> None:
         """Change bandwidths while running, see ``ADRC.retune``."""
         before = self._adrc
         self.controller.retune(omega_c=omega_c, observer=observer)
-        self._update_parameters()
+        self._take_parameters()
         change_design(before.parameters, self._adrc.parameters, before._state)
-        self._pack_again()
-
-    @property
-    def estimate(self) -> Any:
-        """Estimates and status after the last step, see ``ADRC.estimate``."""
-        return self.read(self._state)
 
     def read(self, state: Any) -> Any:
         """Return the estimates and the status in ``state``."""
-        return self._runner.read(state)
+        return self._inner.read(state)
 
 
 def _acting_on(controller: Any, design: Any, state: Any) -> Any:
-    """Return a copy of a controller that acts on ``state`` with the parameters ``design``."""
-    acting = copy.copy(controller)
+    """Return a controller that acts on ``state`` with the parameters ``design``.
+
+    It shares all else with ``controller``: nothing is designed again.
+    """
+    acting = object.__new__(type(controller))
+    vars(acting).update(vars(controller), parameters=design, _state=state, _packed=None)
     if isinstance(controller, Prefiltered):
         acting.controller = _acting_on(controller.controller, design.controller, state.controller)
-    acting.parameters, acting._state, acting._packed = design, state, None
     return acting
