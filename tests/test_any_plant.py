@@ -42,6 +42,7 @@ ready = motor()
 def nothing():
     return 3.0
 """
+SWING = {"source": "mine.py:swing", "order": 2, "parameters": {"m": 1.0}}
 SETUP: dict[str, Any] = {
     "dt": DT,
     "observer": {"kind": "model-free", "order": 2, "b0": 4.0, "omega_o": 20.0},
@@ -173,6 +174,10 @@ def test_python_runs_only_with_trust(files: Path, quell: Callable[..., Shown]) -
             r"parameters\['mass'\]: is no argument of f or output; did you mean m|must be one of m",
         ),
         ({"source": "mine.py:motor", "substeps": 3}, "is for an equation, which also has order"),
+        ({**SWING, "operating_point": {"x": 1.0}}, r"point\[0\] has shape \(1,\)"),
+        ({**SWING, "operating_point": {"x": "none"}}, r"operating_point\[0\]: "),
+        ({**SWING, "operating_point": {"x": [0.0, 0.0], "u": [1.0]}}, r"operating_point\[1\] = "),
+        ({"source": "ends.py:motor"}, "ends.py fails in line 1 with SystemExit: 3"),
     ],
 )
 def test_mistakes_in_python_plants_are_one_line(
@@ -180,6 +185,7 @@ def test_mistakes_in_python_plants_are_one_line(
 ) -> None:
     """Each names the key of the table and what to do."""
     Path("bad.py").write_text("x = 1\ny = x / 0\n")
+    Path("ends.py").write_text("raise SystemExit(3)\n")
     with pytest.raises(SetupError, match=message) as caught:
         plant_of({"kind": "python", **table}, DT, trust=True)
     assert len(caught.value.mistakes) == 1
@@ -264,3 +270,4 @@ def test_names_and_units_belong_to_plants_of_all_kinds(files: Path) -> None:
         plant_of({"kind": "two-mass", "signals": {"w": ["a", "b", "c"]}}, DT)
     with pytest.raises(SetupError, match=r"plant\.signals\.y = 'a\]': must be a name and a unit"):
         plant_of({"kind": "two-mass", "signals": {"y": "a]"}}, DT)
+    assert signals_of(labelled(late, w=signals_of(late).w[0])).texts() == {"w": ["load [N]"]}

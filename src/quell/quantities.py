@@ -45,7 +45,7 @@ class Signals(NamedTuple):
         ValueError
             for a text that is not like ``name [unit]``.
         """
-        if isinstance(w, str):
+        if isinstance(w, str | Quantity):
             w = (w,)
         if not isinstance(w, Iterable):
             raise ValueError(f"w = {w!r:.60}: must be a list of names with units")

@@ -114,8 +114,9 @@ class NonlinearPlant:
             own, more = self._numbers
             object.__setattr__(self, "parameters", {**own, **more})
         if self.operating_point is not None:
-            x, _ = checked_point(self.operating_point)
+            x, u = checked_point(self.operating_point)
             checks.vector("operating_point[0]", x, n)
+            checks.finite("operating_point[1]", u)
         returned = validation.attempt_kernel(
             "f(0.0, zeros, 0.0, zeros)", rule, self._rate, 0.0, np.zeros(n), 0.0, np.zeros(m)
         )

@@ -74,7 +74,7 @@ def python_plant(
         unknown = [key for key in operating_point if key not in ("x", "u")]
         if unknown or "x" not in operating_point:
             raise ValueError(f"operating_point = {operating_point!r}: must have x, and may have u")
-        point = list(operating_point["x"]), float(operating_point.get("u", 0.0))
+        point = operating_point["x"], operating_point.get("u", 0.0)
     return NonlinearPlant(
         found,
         order,
@@ -148,7 +148,7 @@ def _module(path: Path, text: str) -> Any:
         spec.loader.exec_module(module)
     except BaseException as error:
         del sys.modules[name]
-        if not isinstance(error, Exception):
+        if not isinstance(error, Exception | SystemExit):
             raise
         lines = [each.lineno for each in traceback.extract_tb(error.__traceback__)]
         line = getattr(error, "lineno", None) or lines[-1]
