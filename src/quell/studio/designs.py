@@ -28,6 +28,9 @@ _LIMITS = ("u_min", "u_max", "rate_limit")
 # Plants of a band, and the most that their parameters change [%]. Chosen by hand: 24 runs take a
 # quarter of a second.
 _PLANTS, _MOST_PERCENT = 24, 50.0
+# Keys that do not change: whole numbers; delays, which must be whole samples; and weights of the
+# measurement.
+_EXACT = ("counts", "dac_bits", "late", "kind", "delay", "uncertain", "c1", "c2")
 
 
 def stoppable(report: Report, stale: Stale) -> Report:
@@ -54,10 +57,10 @@ def tuned_frames(
     plant, delay = linear_of(setup)
     options: dict[str, Any] = {"structure": structure, "delay": delay, "compare": ()}
     options["progress"] = stoppable(report, stale)
-    best = tune(plant, dt, constraints=bounds, **options, **_limits(setup))
+    limits = _limits(setup)
+    best = tune(plant, dt, constraints=bounds, **options, **limits)
     design = best.design
     tables = setup.tables() | {key: dict(table) for key, table in design.tables.items()}
-    limits = _limits(setup)
     if limits:
         tables["controller"] = tables["controller"] | limits
     if "observer" not in design.tables:
@@ -124,7 +127,7 @@ def band_frames(
     Ranges ``plant.uncertain`` of the setup are used in place of the percentage, if it has them.
     """
     percent = number(message, "percent", 20.0, 0.0, _MOST_PERCENT)
-    make, wide = Maker(trust=setup.trust), columns(message)
+    make, wide, scenario = Maker(trust=setup.trust), columns(message), setup.needed("scenario")
     random = np.random.default_rng(0)
     ranges = tables["plant"].get("uncertain") if isinstance(tables["plant"], dict) else None
     found: dict[str, list[Any]] = {"y": [], "u": []}
@@ -135,7 +138,6 @@ def band_frames(
             raise StoppedError
         other = {**tables, "plant": _varied(tables["plant"], percent, ranges, random)}
         plant = make(other).needed("plant")
-        scenario = setup.needed("scenario")
         run = simulate(plant, setup.controller, scenario, progress=watched(stale))
         if run.diverged:
             diverged += 1
@@ -177,10 +179,6 @@ def _varied(plant: Any, percent: float, ranges: Any, random: np.random.Generator
         elif key not in _EXACT:
             table[key] = other(value)
     return table
-
-
-# Whole numbers; delays, which must be whole samples; and weights of the measurement.
-_EXACT = ("counts", "dac_bits", "late", "kind", "delay", "uncertain", "c1", "c2")
 
 
 def _limits(setup: Setup) -> dict[str, Any]:

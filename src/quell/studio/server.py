@@ -15,6 +15,7 @@ import socket
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from importlib.resources import files
+from pathlib import PurePath
 from typing import Any
 
 from quell import checks
@@ -66,8 +67,7 @@ def page_files() -> dict[str, tuple[str, bytes]]:
             if entry.is_dir():
                 collect(entry, f"{name}/")
             else:
-                suffix = entry.name[entry.name.rfind(".") :] if "." in entry.name else ""
-                kind = _TYPES.get(suffix, "text/plain; charset=utf-8")
+                kind = _TYPES.get(PurePath(entry.name).suffix, "text/plain; charset=utf-8")
                 found[name] = kind, entry.read_bytes()
 
     collect(files("quell.studio") / "page", "")

@@ -28,7 +28,7 @@ export class Forms {
     this.setup = setup;
     const focus = document.activeElement?.dataset?.path;
     const kind = document.activeElement?.type;
-    const parts = [this.sampling(setup)];
+    const parts = [this.sampling()];
     for (const [group, title] of Object.entries(TITLES)) parts.push(this.section(group, title));
     this.home.replaceChildren(...parts);
     if (focus) {

@@ -119,7 +119,7 @@ function takeRun(header, arrays, asked) {
   now.run = header;
   studio.compiled += header.compiled;
   const notes = [header.message, ...header.warnings].filter(Boolean);
-  message(notes.join("\n"), header.message.includes("diverged") || header.message.includes("beyond"));
+  message(notes.join("\n"));
   if (!now.watching) drawRun();
   timed(studio.firstTimes, asked);
 }
@@ -180,10 +180,9 @@ function redraw() {
   drawLoop();
 }
 
-function message(text, bad = true) {
+function message(text) {
   home("message").hidden = !text;
   home("message").textContent = text;
-  home("message").classList.toggle("bad", bad);
 }
 
 // ---- pins
