@@ -15,7 +15,7 @@ import quell as ql
 from quell import analysis
 from quell.export.plant_source import plant_source
 from quell.plants import NonlinearPlant, labelled, signals_of
-from quell.plants.nonlinear_kernels import CompiledParametric
+from quell.plants.nonlinear.kernels import CompiledParametric
 from quell.realtime import open_device
 from quell.setup import SetupError, made, plant_given, plant_of, varied
 from quell.setup.sweep import sweep_of
@@ -225,7 +225,7 @@ def test_parameters_reach_equation_and_output_alike_in_python_c_and_machine_code
     for each, model in zip((plant, other), code, strict=True):
         x, w, dx = np.array([0.3, -0.2]), np.array([0.1]), np.zeros(2)
         from quell.plants.base import measure
-        from quell.plants.nonlinear_kernels import derivatives
+        from quell.plants.nonlinear.kernels import derivatives
 
         derivatives(model, 0.0, x, 0.5, w, dx)
         numbers = dict(each.parameters or {})

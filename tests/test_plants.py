@@ -15,7 +15,7 @@ from scipy.signal import cont2discrete
 
 import quell as ql
 from quell.plants.base import advance, measure
-from quell.plants.nonlinear import CompiledNonlinear, PythonNonlinear
+from quell.plants.nonlinear.plant import CompiledNonlinear, PythonNonlinear
 
 pytestmark = pytest.mark.compiled
 

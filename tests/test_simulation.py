@@ -7,7 +7,7 @@ import pytest
 
 import quell as ql
 from quell.plants.delay import DelayedPlantModel
-from quell.plants.nonlinear import PythonNonlinear
+from quell.plants.nonlinear.plant import PythonNonlinear
 from quell.simulation import sampled_scenario
 from quell.simulation.integration import (
     LARGEST_ERROR,

@@ -26,11 +26,11 @@ from quell.files import nonfinite_to_none
 from quell.guard import Guard, UnguardedDesign
 from quell.guard.certified import gains_of, named_plants
 from quell.guard.correction import CorrectionGains
-from quell.plants.cubic_spring import CubicSpringPlant
 from quell.plants.delay import DelayedPlant
 from quell.plants.encoder import EncodedPlant
 from quell.plants.linear_part import linear_part
-from quell.plants.nonlinear import NonlinearPlant
+from quell.plants.machines.cubic_spring import CubicSpringPlant
+from quell.plants.nonlinear.plant import NonlinearPlant
 from quell.plants.sampled import sampled_plant
 
 

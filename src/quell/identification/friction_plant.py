@@ -9,7 +9,7 @@ import numpy as np
 from quell.identification.model.sampling import observable
 from quell.identification.result import Identified
 from quell.plants.delay import delayed
-from quell.plants.nonlinear import NonlinearPlant
+from quell.plants.nonlinear.plant import NonlinearPlant
 from quell.types import Vector
 
 # Width of the smooth sign of the speed, relative to the RMS speed in the record: by hand, so that

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.plants.cubic_spring import CubicSpringPlant
 from quell.plants.encoder import EncodedPlant
 from quell.plants.linear import LinearPlant
-from quell.plants.nonlinear import NonlinearPlant
+from quell.plants.machines.cubic_spring import CubicSpringPlant
+from quell.plants.nonlinear.plant import NonlinearPlant
 from quell.types import Matrix, Vector
 
 # Step of the central differences, absolute for values below 1, else relative. Its error is 1e-10 by

@@ -6,16 +6,16 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from quell.plants.base import Plant
-from quell.plants.cubic_spring import lagged_two_mass_spring
-from quell.plants.dc_motor import dc_motor
 from quell.plants.delay import delayed
 from quell.plants.encoder import encoded
 from quell.plants.fmu.plant import FMU
 from quell.plants.identified_file import identified
 from quell.plants.linear import LinearPlant
-from quell.plants.python_file import python_plant
-from quell.plants.torsional import torsional, torsional_identified
-from quell.plants.two_mass_spring import two_mass_spring
+from quell.plants.machines.cubic_spring import lagged_two_mass_spring
+from quell.plants.machines.dc_motor import dc_motor
+from quell.plants.machines.torsional import torsional, torsional_identified
+from quell.plants.machines.two_mass_spring import two_mass_spring
+from quell.plants.nonlinear.python_file import python_plant
 
 
 def linear(

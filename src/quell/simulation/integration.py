@@ -16,7 +16,7 @@ from quell.kernels.dispatch import call_specialised, compiled, interpreted
 from quell.plants.base import advance
 from quell.plants.delay import DelayedPlantModel
 from quell.plants.encoder import EncodedPlantModel
-from quell.plants.nonlinear_kernels import (
+from quell.plants.nonlinear.kernels import (
     CompiledNonlinear,
     CompiledParametric,
     PythonNonlinear,

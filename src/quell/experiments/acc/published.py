@@ -2,7 +2,8 @@
 
 Plant and ``u = −C(s) y`` together are one linear system without inputs, ``x' = A x``, and ``x(t +
 h) = exp(A h) x(t)`` has no error; the force of the cubic spring acts between the samples, as in
-``plants.cubic_spring``. None of this is shared with the simulation or a controller of this package.
+``plants.machines.cubic_spring``. None of this is shared with the simulation or a controller of
+this package.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.linear import LinearModel, LinearPlant
-from quell.plants.two_mass_spring import two_mass_matrices
+from quell.plants.machines.two_mass_spring import two_mass_matrices
 from quell.types import Vector
 
 

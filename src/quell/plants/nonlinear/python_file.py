@@ -12,7 +12,7 @@ from typing import Any
 
 from quell import checks
 from quell.plants.base import Plant, check_plant
-from quell.plants.nonlinear import NonlinearPlant
+from quell.plants.nonlinear.plant import NonlinearPlant
 
 # Modules by path and content: a sweep makes the same plant many times, and the same functions need
 # to be compiled only once.

@@ -16,9 +16,9 @@ from numba.core import types as nb_types
 from quell import checks
 from quell.kernels import function_pointers, validation
 from quell.kernels.function_pointers import POINTER
-from quell.plants import equations
 from quell.plants.labelled import labelled, signals_of
-from quell.plants.nonlinear_kernels import (
+from quell.plants.nonlinear import equations
+from quell.plants.nonlinear.kernels import (
     CompiledNonlinear,
     CompiledParametric,
     PythonNonlinear,

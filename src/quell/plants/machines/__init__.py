@@ -1,0 +1,5 @@
+"""Machines with models of their own: two masses and a spring, the torsional testbed, a motor.
+
+May import ``lti``, ``kernels`` and what stands before them, and the files of ``plants`` for linear
+plants, delays and encoders.
+"""
