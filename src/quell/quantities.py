@@ -27,7 +27,7 @@ class Quantity(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """What the signals of a plant are.
+    """Names and units of the signals of a plant.
 
     ``Signals.of(y="angle [rad]", u="voltage [V]", w=["load torque [N m]"])`` makes it of texts.
     """

@@ -33,7 +33,7 @@ class Lane(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What a step writes, for each loop."""
+    """Results of a step, for each loop."""
 
     row: Matrix  # all channels after the step, see ``Lanes.channels`` (N, …)
     cost: Vector  # of the step (N,)

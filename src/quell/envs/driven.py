@@ -1,4 +1,4 @@
-"""What ``Env`` and ``VectorEnv`` share: loops, spaces, and the work of a step."""
+"""Loops, spaces and the work of a step, which ``Env`` and ``VectorEnv`` share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a policy sets in each sample: f_L of an ADRC, or u itself.
+"""The quantity that a policy sets in each sample: f_L of an ADRC, or u itself.
 
 Both are controllers for the loop of ``block.py``, which calls ``set_action`` before each sample.
 """

@@ -1,4 +1,4 @@
-"""What is observed and acted on, with finite bounds."""
+"""Spaces of observations and actions, with finite bounds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FLAGS = 1024.0
 
 
 class Action(NamedTuple):
-    """What the actions −1 and 1 stand for: ``middle ± reach``."""
+    """Values of the actions −1 and 1: ``middle ± reach``."""
 
     middle: float
     reach: float

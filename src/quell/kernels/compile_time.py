@@ -1,4 +1,4 @@
-"""How long this process has compiled, without what it loaded from the disk cache.
+"""Time for which this process has compiled, without what it loaded from the disk cache.
 
 A compilation of more than a second is announced on the standard error, with what is compiled, and
 how long it took. ``announcements(False)`` turns that off, and so does ``QUELL_QUIET=1``.
@@ -80,7 +80,7 @@ def announcements(on: bool) -> Iterator[None]:
 
 
 def _announce(data: Any) -> None:
-    """Say what is being compiled."""
+    """Print what is being compiled."""
     function = getattr(data.get("dispatcher"), "py_func", None)
     name = getattr(function, "__name__", "code").strip("_").replace("_", " ")
     parts = list(dict.fromkeys(_parts(data.get("args", ()))))

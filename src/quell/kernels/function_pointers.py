@@ -22,7 +22,7 @@ POINTER = nb_types.CPointer(nb_types.float64)
 
 
 class Origin(NamedTuple):
-    """What the function at an address was made of."""
+    """Origin of the function at an address."""
 
     function: Callable[..., Any]
     c_function: str | None  # name of the same function in C, if the user has one

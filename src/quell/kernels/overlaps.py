@@ -1,4 +1,4 @@
-"""Whether arguments of a compiled loop share memory that the loop changes."""
+"""Check whether arguments of a compiled loop share memory that the loop changes."""
 
 from __future__ import annotations
 

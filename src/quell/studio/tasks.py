@@ -1,4 +1,4 @@
-"""What a message of the page asks for, as an iterator of frames that runs in a thread."""
+"""Tasks that messages of the page ask for: iterators of frames that run in a thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where ``quell tune`` has its plant from, if not from a setup file: a record, or a rig."""
+"""Sources of the plant for ``quell tune`` other than a setup file: a record, or a rig."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TWIN = {"hold": 10_000, "most_overruns": 10_000}
 @Parameter(name="*")
 @dataclass(frozen=True)
 class RecordOptions:
-    """How a record is read and identified.
+    """Options for reading and identifying a record.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ class GuardTimes(NamedTuple):
 
 
 class Bandwidths(NamedTuple):
-    """What C needs for the bandwidths of an ADRC; None for a bandwidth that is fixed."""
+    """Data that C needs for the bandwidths of an ADRC; None for a bandwidth that is fixed."""
 
     path: str  # of the parameters of the ADRC within those of the controller, with a dot, or empty
     dt: float

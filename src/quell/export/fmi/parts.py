@@ -75,7 +75,7 @@ class ControllerPart:
 
     @property
     def outputs(self) -> list[Variable]:
-        """What the controller knows after a sample, without u."""
+        """Results of the controller after a sample, without u."""
         found = []
         for name, width in self.channels:
             text = _DESCRIPTIONS.get(name, name)

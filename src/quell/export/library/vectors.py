@@ -39,7 +39,7 @@ _EXCESS = 1.5
 
 
 class Action(IntEnum):
-    """What happens in a sample of the run; in the C test the names are those of an enum."""
+    """Events in a sample of the run; in the C test the names are those of an enum."""
 
     STEP = 0
     APPLIED = 1  # another u was applied than the last step returned

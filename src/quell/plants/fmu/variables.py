@@ -24,7 +24,7 @@ class Port(NamedTuple):
 
 
 class Ports(NamedTuple):
-    """What a loop reads and writes at each sample."""
+    """Variables that a loop reads and writes at each sample."""
 
     inputs: tuple[Port, ...]  # u, and then the disturbances
     outputs: tuple[Port, ...]  # y, and then the further states

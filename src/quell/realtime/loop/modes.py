@@ -33,7 +33,7 @@ class Ending(IntEnum):
 
 
 class Cause(IntEnum):
-    """Why the mode changed."""
+    """Cause of a change of mode."""
 
     text: str  #: the cause as a clause
     ending: Ending  #: how it ends the run

@@ -1,4 +1,4 @@
-"""Where the search starts: shapes of a structure, each with the best of many gains."""
+"""Starts of the search: shapes of a structure, each with the best of many gains."""
 
 from __future__ import annotations
 

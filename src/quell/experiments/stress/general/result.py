@@ -49,7 +49,7 @@ class GeneralResult:
 
     @property
     def left_out(self) -> dict[str, int]:
-        """How many runs do not count, by the reason, and how many of these are lost."""
+        """Numbers of runs that do not count, by the reason, and of these the lost ones."""
         low = [o for o in self.outcomes if o.margin < HEALTHY]
         rest = [o for o in self.outcomes if o.margin >= HEALTHY and not o.healthy]
         return {
