@@ -11,6 +11,7 @@ import pytest
 import quell as ql
 from quell.controllers.stateful import named_arrays
 from quell.kernels.dispatch import compilations
+from quell.kernels.sized import layout_of
 from quell.realtime.devices.base import (
     PythonHandle,
     Tick,
@@ -325,6 +326,17 @@ def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> N
     assert compilations(run_cycles) == compiled
     for label, array in controller.state.items():
         np.testing.assert_array_equal(array, before[label])
+
+
+def test_loops_of_any_duration_are_the_same_code() -> None:
+    """Also short ones, with and without derivatives of the reference and an approach."""
+    for derivatives in (0, 1):
+        layouts = {
+            layout_of(reference_samples(as_scenario(1.0, duration), DT, derivatives, approach))
+            for duration in (0.1, 1.0, 10.0)
+            for approach in (0.0, 0.2, 5.0)
+        }
+        assert len(layouts) == 1
 
 
 @pytest.mark.parametrize(

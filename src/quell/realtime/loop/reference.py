@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell import checks
+from quell.kernels.sized import Buffer
 from quell.records.sample_times import in_steps
 from quell.signals import Signal, as_signal
 from quell.simulation.scenario import Scenario
@@ -20,11 +21,11 @@ _LEAST_JERK = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
 
 
 class ReferenceSamples(NamedTuple):
-    """The reference for all samples of a run."""
+    """The reference for all samples of a run: code is not compiled for each duration."""
 
-    r: Vector  # (samples,) [y-unit]
-    derivatives: Matrix  # (samples, d): r', r'', …, as many as the controller uses
-    approach: Matrix  # (·, 1 + d): ``approach_curve`` and its derivatives for a distance of 1
+    r: Buffer  # (samples,) [y-unit]
+    derivatives: Buffer  # (samples, d): r', r'', …, as many as the controller uses
+    approach: Buffer  # (·, 1 + d): ``approach_curve`` and its derivatives for a distance of 1
     current: Vector  # work array: derivatives of one sample (d,)
 
 
