@@ -38,18 +38,22 @@ class Response:
     def __init__(self, system: System) -> None:
         delays = without_delays(system.N, system.B)
         if delays is None:
-            self._system = System.balanced(*system)
-            self._steps = np.zeros(0)
+            self._prepare(System.balanced(*system), np.zeros(0))
             return
         kept = delays.kept
-        self._steps, parts = delayed_parts(delays, np.vstack([system.N[kept], system.C]))
+        steps, parts = delayed_parts(delays, np.vstack([system.N[kept], system.C]))
         N, C = delays.N, system.C[kept]
         scale = _scales(N, parts[:, :-1])
         self._M = parts[:, :-1] * scale[None, None, :] / scale[None, :, None]
-        self._M = self._M.reshape(self._steps.size, -1)
+        self._M = self._M.reshape(steps.size, -1)
         self._C_k = parts[:, -1] * scale
         N = N * scale[None, :] / scale[:, None]
-        self._system = System(N, system.B[kept] / scale, C * scale, system.D)
+        self._prepare(System(N, system.B[kept] / scale, C * scale, system.D), steps)
+
+    def _prepare(self, system: System, steps: Vector) -> None:
+        """Keep the system without delays, the delays in samples, and what each call needs."""
+        self._system, self._steps = system, steps
+        self._identity, self._input = np.eye(system.N.shape[0]), system.B[:, None].astype(complex)
 
     def __call__(self, omega: Any, dt: float) -> Complex:
         """Return the response (k,) at the frequencies ``omega`` (k,) [rad/s].
@@ -63,19 +67,18 @@ class Response:
         return np.concatenate([self._block(part, dt) for part in np.array_split(omega, count)])
 
     def _block(self, omega: Vector, dt: float) -> Complex:
-        N, B, C, D = self._system
+        N, _, C, D = self._system
         zeta = np.expm1(1j * omega * dt)
         if N.shape[0] == 0:
             return np.full(zeta.shape, complex(D))
-        resolvent = zeta[:, None, None] * np.eye(N.shape[0]) - N
+        resolvent = zeta[:, None, None] * self._identity - N
         output: Any = C
         if self._steps.size:
             late = np.exp(-1j * dt * omega[:, None] * self._steps)
             resolvent -= (late @ self._M).reshape(resolvent.shape)
             output = C + late @ self._C_k
-        inputs = np.broadcast_to(B[:, None], (zeta.size, B.size, 1))
         try:
-            solved = np.linalg.solve(resolvent, inputs)[:, :, 0]
+            solved = np.linalg.solve(resolvent, self._input)[:, :, 0]
         except np.linalg.LinAlgError:
             raise ValueError(
                 f"omega = {omega.tolist()!r} rad/s: the response is infinite at one of "

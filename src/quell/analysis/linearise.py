@@ -4,12 +4,14 @@ It is measured, not derived: without limits a controller is a linear map from it
 its next state and u, so unit vectors through its own ``control`` give the matrices, for any form of
 observer. The unit is 2⁻⁶⁰: scaling by it is exact for a linear map, and it is small enough for a
 map that is linear for small errors only. State entries that do not reach u, or that nothing reaches
-(records, filters for learning), are left out.
+(records, filters for learning), are left out. The next sample must have the same law: from a state
+of random numbers it must go where the matrices say.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,9 @@ from quell.learners.base import NoLearnerMemory
 from quell.types import Matrix, Vector
 
 _UNIT = 2.0**-60
+# Share of its terms by which a prediction may miss: far above rounding errors, far below any change
+# of a law that matters. Chosen by hand.
+_SAME = 1e-9
 
 
 def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
@@ -54,50 +59,96 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
     nothing_learned, unguarded = NoLearnerMemory(nothing), UnguardedMemory(nothing)
     state = controller.initial_state()._replace(learner=nothing_learned, guard=unguarded)
     control(design, state, 0.0, 0.0)
-    law = _measured_law(design, state)
-    control(design, state, 0.0, 0.0)
-    pairs = zip(law, _measured_law(design, state), strict=True)
-    if not all(np.array_equal(np.asarray(one), np.asarray(other)) for one, other in pairs):
-        raise ValueError(f"controller = {controller!r}: its law changes from sample to sample")
+    measured = _measured(_Sample(design, state))
+    law = measured.law()
     if not all(np.all(np.isfinite(part)) for part in law):
         raise ValueError(f"controller = {controller!r}: b0 + ∂f_L/∂u is zero with this learner")
+    control(design, state, 0.0, 0.0)
+    if not measured.predicts(_Sample(design, state)):
+        raise ValueError(f"controller = {controller!r}: its law changes from sample to sample")
     return law
 
 
-def _measured_law(design: Any, origin: Any) -> LinearLaw:
-    """Return the law around a state ``origin`` that no limit and no flag is about to change."""
-    fixed_u = [design._replace(limits=NO_LIMITS._replace(low=u, high=u)) for u in (0.0, _UNIT)]
-    # Entries that are not zero are flags and the like, which do not change any more.
-    is_zero = {name: array == 0.0 for name, array in named_arrays(origin).items()}
-    places = [(name, at) for name, zero in is_zero.items() for at in np.argwhere(zero)]
+class _Sample:
+    """One sample of a design from states near ``origin``, where no limit and no flag acts.
 
-    def respond(design: Any, place: Any = None, r: float = 0.0, y: float = 0.0) -> Any:
-        """Return the next state and u, in units, for one entry of the state, r or y."""
-        state = copy_state(origin)
-        arrays = named_arrays(state)
-        if place is not None:
-            arrays[place[0]][tuple(place[1])] = _UNIT
+    Entries of the origin that are not zero are flags and the like; the others are the state x.
+    """
+
+    def __init__(self, design: Any, origin: Any) -> None:
+        self._design, self._state = design, copy_state(origin)
+        self._origin, self._arrays = named_arrays(origin), named_arrays(self._state)
+        self._free = {name: array == 0.0 for name, array in self._origin.items()}
+        entries = ((name, at) for name, free in self._free.items() for at in np.argwhere(free))
+        self._places = [(name, tuple(at)) for name, at in entries]
+        self.size = len(self._places)
+
+    def __call__(
+        self, x: Mapping[int, float], r: float = 0.0, y: float = 0.0, u: float | None = None
+    ) -> tuple[Vector, float]:
+        """Return the next state and u, all in units; limits fix u if it is given."""
+        for name, array in self._arrays.items():
+            array[...] = self._origin[name]
+        for i, value in x.items():
+            name, at = self._places[i]
+            self._arrays[name][at] = value * _UNIT
+        design = self._design
+        if u is not None:
+            design = design._replace(limits=NO_LIMITS._replace(low=u * _UNIT, high=u * _UNIT))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            u = control(design, state, r, y)
-        moved = np.concatenate([arrays[name][zero] for name, zero in is_zero.items()])
+            u = control(design, self._state, r * _UNIT, y * _UNIT)
+        moved = np.concatenate([self._arrays[name][free] for name, free in self._free.items()])
         return moved / _UNIT, u / _UNIT
 
-    # The next state is measured with u fixed at zero by the limits, u without limits.
-    A = np.array([respond(fixed_u[0], place)[0] for place in places]).T
-    C = np.array([respond(design, place)[1] for place in places])
-    B_r, D_r = respond(fixed_u[0], r=_UNIT)[0], respond(design, r=_UNIT)[1]
-    B_y, D_y = respond(fixed_u[0], y=_UNIT)[0], respond(design, y=_UNIT)[1]
-    B_u = respond(fixed_u[1])[0]
-    keep = np.flatnonzero(_reached(A.T, C) & _reached(A, np.abs(B_r) + np.abs(B_y) + np.abs(B_u)))
-    kept_A = np.ascontiguousarray(A[np.ix_(keep, keep)])
-    return LinearLaw(kept_A, B_r[keep], B_y[keep], B_u[keep], C[keep], D_r, D_y)
+
+class _Measured(NamedTuple):
+    """Matrices of the entries ``at`` of a state, all that r, y and u reach."""
+
+    at: NDArray[np.intp]
+    A: Matrix
+    B: Matrix  # from r, y and u, in columns
+    C: Vector
+    D: Vector  # from r, y and u
+
+    def reaching(self) -> NDArray[np.bool_]:
+        """Return which entries reach u."""
+        found: NDArray[np.bool_] = self.C != 0.0
+        while True:
+            more = found | np.any(self.A[found] != 0.0, axis=0)
+            if np.array_equal(more, found):
+                return found
+            found = more
+
+    def law(self) -> LinearLaw:
+        """Return the law of the entries that reach u."""
+        kept = self.reaching()
+        A = np.ascontiguousarray(self.A[np.ix_(kept, kept)])
+        B_r, B_y, B_u = (np.ascontiguousarray(column) for column in self.B[kept].T)
+        return LinearLaw(A, B_r, B_y, B_u, self.C[kept], float(self.D[0]), float(self.D[1]))
+
+    def predicts(self, sample: _Sample) -> bool:
+        """Return whether a sample from a state of random numbers goes where the law says."""
+        inputs = np.random.default_rng(0).uniform(0.5, 1.0, self.at.size + 3)
+        state, (r, y, u) = dict(zip(self.at.tolist(), inputs, strict=False)), inputs[-3:]
+        moved, wished = sample(state, r, y, u)[0][self.at], sample(state, r, y)[1]
+        kept = self.reaching()
+        rows = np.vstack([np.hstack([self.A, self.B])[kept], [*self.C, *self.D]])
+        missed = np.abs(np.append(moved[kept], wished) - rows @ inputs)
+        return bool(np.all(missed <= _SAME * (np.abs(rows) @ inputs)))
 
 
-def _reached(A: Matrix, start: Vector) -> NDArray[np.bool_]:
-    """Return which states those in ``start`` reach along A; with A transposed, which reach them."""
-    found: NDArray[np.bool_] = start != 0.0
-    while True:
-        more = found | np.any(A[:, found] != 0.0, axis=1)
-        if np.array_equal(more, found):
-            return found
-        found = more
+def _measured(sample: _Sample) -> _Measured:
+    """Measure one entry after the other, with u fixed at zero, and without limits for u itself."""
+    from_r, from_y, from_u = sample({}, r=1.0, u=0.0), sample({}, y=1.0, u=0.0), sample({}, u=1.0)
+    D = np.array([sample({}, r=1.0)[1], sample({}, y=1.0)[1], 0.0])
+    B = np.array([from_r[0], from_y[0], from_u[0]]).T
+    columns: dict[int, Vector] = {}
+    new = np.flatnonzero(np.any(B != 0.0, axis=1))
+    while new.size:
+        columns |= {i: sample({i: 1.0}, u=0.0)[0] for i in new.tolist()}
+        reached = np.any([column != 0.0 for column in columns.values()], axis=0)
+        new = np.setdiff1d(np.flatnonzero(reached), [*columns])
+    at = np.array(sorted(columns), dtype=np.intp)
+    A = np.array([columns[i][at] for i in at.tolist()]).reshape(at.size, at.size).T
+    C = np.array([sample({i: 1.0})[1] for i in at.tolist()])
+    return _Measured(at, A, B[at], C, D)

@@ -236,7 +236,7 @@ class LoopAnalysis:
         return S * P if name == "PS" else S * (P * self.response("C_r", omega))
 
     def _loop(self, omega: Any) -> Complex:
-        return self.response("P", omega) * self.response("C_y", omega)
+        return self._open["P"](omega, self.dt) * self._open["C_y"](omega, self.dt)
 
     # ---- margins
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -168,6 +169,7 @@ def _sign_changes(
     """Return the frequencies at which a function changes its sign."""
     from scipy.optimize import brentq
 
+    @cache  # brentq begins with the ends of a bracket, which are known
     def at(x: float) -> float:
         return float(function(np.exp(np.array([x])))[0])
 
