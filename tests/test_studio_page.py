@@ -94,21 +94,26 @@ def test_a_slider_moves_the_curves_and_a_pinned_one_stays(page: Any) -> None:
     """By arrow keys; the pin has the curve of before, and nothing is compiled."""
     before, picture = curve(page, "y"), pixels(page, "#plot-y canvas")
     page.click("#pin")
-    slide(page, "ArrowLeft", 40)
+    slide(page, "PageDown", 1)  # 40 steps
     after = curve(page, "y")
     assert np.max(np.abs(after - before)) > 0.02
     assert pixels(page, "#plot-y canvas") != picture
     assert page.locator(".pin").count() == 1
     pinned = np.array(page.evaluate("Array.from(window.studio.pins()[0].arrays.y)"))
     assert np.array_equal(pinned, before)
-    page.keyboard.press("Control+z")
-    wait_for(lambda: np.array_equal(curve(page, "y"), before))
+
+    def is_undone() -> bool:
+        page.keyboard.press("Control+z")  # a pause between two inputs ends a step of undo
+        wait_for(lambda: not page.evaluate("window.studio.busy()"))
+        return np.array_equal(curve(page, "y"), before)
+
+    wait_for(is_undone)
 
 
 def test_the_address_holds_the_state(page: Any, browser: Any) -> None:
     """Another page at the same address shows the same curves and pins."""
     page.click("#pin")
-    slide(page, "ArrowRight", 30)
+    slide(page, "PageUp", 1)
     shown = curve(page, "y")
     wait_for(lambda: len(page.evaluate("location.hash")) > 100)
     wait_for(lambda: page.evaluate("window.studio.saved()"))
@@ -155,7 +160,7 @@ def test_a_lost_connection_recovers(browser: Any) -> None:
     with running(TABLES, token="same") as url:
         page.goto(url)
         wait_for(lambda: page.evaluate("window.studio.frames") > 0)
-        slide(page, "ArrowRight", 10)
+        slide(page, "ArrowRight", 3)
         value = page.locator(OMEGA_O).get_attribute("aria-valuetext")
     wait_for(lambda: "lost" in page.inner_text("#state"))
     frames = page.evaluate("window.studio.frames")

@@ -1,11 +1,11 @@
 // Tune for me, comparison with PID and LQG, and the trade-off curve.
 
 import uPlot from "./vendor/uPlot.js";
+import { home } from "./dom.js";
 import { palette } from "./palette.js";
 import { short } from "./plots.js";
 
 const BOUNDS = [["tune-ms", "m_s"], ["tune-mt", "m_t"], ["tune-mks", "m_ks"]];
-const home = (id) => document.getElementById(id);
 
 export class Designs {
   // `ask(message)` sends with the present setup; `use(setup)` takes a tuned one; `pin(pin)` adds one.

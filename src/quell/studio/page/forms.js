@@ -1,5 +1,6 @@
 // Forms for the tables of a setup, made from the server's description of their keys.
 
+import { element, field, input, select } from "./dom.js";
 import { at } from "./store.js";
 
 const TITLES = {
@@ -37,11 +38,13 @@ export class Forms {
     }
   }
 
-  // Show other values in the same form.
-  refresh(setup, except) {
+  // Show another value of a path in the same form, in all its controls but the one that set it.
+  refresh(setup, path, except) {
     this.setup = setup;
     for (const input of this.home.querySelectorAll("[data-path]")) {
-      if (input !== except && input.showValue) input.showValue(at(setup, input.dataset.path));
+      const own = input.dataset.path;
+      const related = own.startsWith(path) || path.startsWith(own);
+      if (related && input !== except && input.showValue) input.showValue(at(setup, own));
     }
   }
 
@@ -290,36 +293,4 @@ export class Forms {
     if (entry.type.includes("number") && !entry.type.includes("numbers")) return usual[entry.key] ?? 1;
     return entry.type === "list" || entry.type === "numbers" ? [0, 1] : "";
   }
-}
-
-export function element(tag, className = "", text = "") {
-  const made = document.createElement(tag);
-  if (className) made.className = className;
-  if (text) made.textContent = text;
-  return made;
-}
-
-function input(type, path, label) {
-  const made = element("input");
-  made.type = type;
-  made.dataset.path = path;
-  made.setAttribute("aria-label", label);
-  return made;
-}
-
-function select(names, chosen, path, label) {
-  const made = element("select");
-  made.dataset.path = path;
-  made.setAttribute("aria-label", label);
-  for (const name of names) made.append(new Option(name, name, false, name === chosen));
-  return made;
-}
-
-export function field(name, control, about = "") {
-  const row = element("div", "field");
-  const label = element("label", "", name);
-  label.title = about ? `${name}: ${about.replaceAll("`", "")}` : name;
-  row.append(label, control);
-  label.onclick = () => control.focus();
-  return row;
 }

@@ -2,7 +2,8 @@
 
 import { Connection } from "./connection.js";
 import { Designs } from "./design.js";
-import { element, Forms } from "./forms.js";
+import { element, home, write } from "./dom.js";
+import { Forms } from "./forms.js";
 import { boundFields, showNumbers, usual } from "./numbers.js";
 import { DASHES, isDark, palette } from "./palette.js";
 import { short } from "./plots.js";
@@ -11,12 +12,11 @@ import { Tours } from "./tours.js";
 import { Views } from "./views.js";
 import { Watch } from "./watch.js";
 
-const home = (id) => document.getElementById(id);
 const MOST_PINS = 5;
 const MOST_TIMES = 10_000;
-const BAND_PAUSE = 150; // the band is computed when nothing has moved for this time [ms]
+const REST = 150; // the page is at rest when nothing has moved for this time [ms]
 
-const now = { arrays: {}, loopArrays: {}, run: null, loop: null, band: null, bandId: null, input: null, watching: false };
+const now = { arrays: {}, loopArrays: {}, run: null, loop: null, band: null, bandId: null, input: null, watching: false, numbering: null };
 const studio = { times: [], firstTimes: [], frames: 0, compiled: 0, now }; // for measurements from outside
 studio.busy = () => server.flying !== null || server.waiting !== null;
 studio.pins = () => pins;
@@ -31,7 +31,7 @@ const views = new Views();
 const forms = new Forms(home("forms"), (path, value, structure, source) => {
   now.input = performance.now();
   const state = { ...store.state, setup: changed(store.state.setup, path, value) };
-  now.source = source;
+  now.changed = [path, source];
   store.set(state, structure, "form");
 });
 
@@ -50,7 +50,7 @@ function onState(state, structure, source) {
     home("band").checked = state.band;
     home("percent").value = state.percent;
     syncPins(state);
-  } else if (source === "form") forms.refresh(state.setup, now.source);
+  } else if (source === "form") forms.refresh(state.setup, ...now.changed);
   ask();
 }
 
@@ -64,7 +64,7 @@ function ask() {
   now.input = null;
   server.run(message);
   clearTimeout(now.bandTimer);
-  if (store.state.band) now.bandTimer = setTimeout(askBand, BAND_PAUSE);
+  if (store.state.band) now.bandTimer = setTimeout(askBand, REST);
   else now.band = null;
 }
 
@@ -74,7 +74,7 @@ function askBand() {
 }
 
 function width() {
-  return Math.max(200, Math.min(2000, home("plot-y").clientWidth || 600));
+  return Math.max(200, Math.min(2000, views.width || 600));
 }
 
 // ---- frames of the server
@@ -93,10 +93,10 @@ async function onFrame(header, arrays, bytes, asked) {
     now.band = { ...arrays, about: header };
     drawRun();
   } else if (header.kind === "wait") {
-    home("plots").classList.add("old");
+    write(home("plots"), { className: "old" });
     home("state").textContent = header.compiles ? "compiling this kind of loop, once …" : "working …";
   } else if (header.kind === "error") {
-    home("plots").classList.add("old"); // they do not show the present values
+    write(home("plots"), { className: "old" }); // they do not show the present values
     message(header.text.join("\n"));
     if (asked?.local?.pin) asked.local.pin.failed = true;
   } else if (header.kind === "texts") showTexts(header);
@@ -114,7 +114,7 @@ function takeRun(header, arrays, asked) {
     asked.local.pin.arrays = arrays;
     return;
   }
-  home("plots").classList.remove("old");
+  write(home("plots"), { className: "" });
   now.arrays = arrays;
   now.run = header;
   studio.compiled += header.compiled;
@@ -142,15 +142,21 @@ function takeLoop(header, arrays, asked) {
   }
   now.loop = header.loop;
   now.loopArrays = arrays;
-  home("loop-reason").textContent = header.loop.reason ?? "";
+  write(home("loop-reason"), { textContent: header.loop.reason ?? "" });
   drawLoop();
-  const ms = 1e3 * (now.run.seconds + header.seconds);
-  const compiled = now.run.compiled > 1 ? `, compiled for ${short(now.run.compiled)} s` : "";
-  home("state").textContent = `${ms.toFixed(0)} ms${compiled}`;
+  now.took = now.run.seconds + header.seconds;
+  clearTimeout(now.restTimer);
+  now.restTimer = setTimeout(atRest, REST);
   studio.frames += 1;
   timed(studio.times, asked);
   now.lastLoop = header.seconds;
   askPins();
+}
+
+// What is not for the eye that follows a slider waits until the page is at rest.
+function atRest() {
+  const compiled = now.run.compiled > 1 ? `, compiled for ${short(now.run.compiled)} s` : "";
+  write(home("state"), { textContent: `${(1e3 * now.took).toFixed(0)} ms${compiled}` });
 }
 
 function drawRun() {
@@ -161,7 +167,7 @@ function drawRun() {
     return known && !known.includes("-unit") ? `[${known}]` : "";
   };
   for (const [name, key] of [["y", "y"], ["u", "u"], ["f", "f_hat"]]) {
-    document.querySelector(`[data-unit="${name}"]`).textContent = unit(key);
+    write(home(`unit-${name}`), { textContent: unit(key) });
   }
   numbers();
 }
@@ -171,8 +177,12 @@ function drawLoop() {
   numbers();
 }
 
+// The numbers of run and loop change together, with the next picture.
 function numbers() {
-  showNumbers(home("numbers"), now.run, now.loop, store.state.bounds, store.state.setup.dt);
+  now.numbering ??= requestAnimationFrame(() => {
+    now.numbering = null;
+    showNumbers(home("numbers"), now.run, now.loop, store.state.bounds, store.state.setup.dt);
+  });
 }
 
 function redraw() {
@@ -181,8 +191,7 @@ function redraw() {
 }
 
 function message(text) {
-  home("message").hidden = !text;
-  home("message").textContent = text;
+  write(home("message"), { hidden: !text, textContent: text });
 }
 
 // ---- pins

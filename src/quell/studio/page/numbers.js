@@ -1,6 +1,6 @@
 // Margins and metrics as numbers that turn red outside of their bounds.
 
-import { element, field } from "./forms.js";
+import { element, field, write } from "./dom.js";
 import { short } from "./plots.js";
 
 // Usual bounds: M_s = 2 and a phase margin of 30° are the least that Åström & Hägglund (Advanced PID
@@ -31,8 +31,21 @@ export function boundFields(home, bounds, change) {
   );
 }
 
+// Show all numbers in the boxes of the last ones: while a slider moves only texts change.
 export function showNumbers(home, run, loop, bounds, dt) {
-  home.replaceChildren(...[...margins(loop, bounds, dt), ...metrics(run, bounds)].map(box));
+  const entries = [...margins(loop, bounds, dt), ...metrics(run, bounds)];
+  while (home.children.length > entries.length) home.lastChild.remove();
+  while (home.children.length < entries.length) {
+    const box = element("div");
+    box.append(element("dt"), element("dd"));
+    home.append(box);
+  }
+  entries.forEach(([name, value, bad, about], i) => {
+    const box = home.children[i];
+    write(box, { className: bad ? "bad" : "", title: [name, about].filter(Boolean).join(": ") });
+    write(box.firstChild, { textContent: name });
+    write(box.lastChild, { textContent: value, ariaLabel: bad ? `${value}, outside of its bound` : null });
+  });
 }
 
 function margins(loop, bounds, dt) {
@@ -73,13 +86,4 @@ function metrics(run, bounds) {
     found.push([`TV of u, ${where}`, short(window.control_variation), false, `sum of |Δu| ${where}`]);
   }
   return found;
-}
-
-function box([name, value, bad, about]) {
-  const home = element("div", bad ? "bad" : "");
-  home.title = [name, about].filter(Boolean).join(": ");
-  const shown = element("dd", "", value);
-  if (bad) shown.setAttribute("aria-label", `${value}, outside of its bound`);
-  home.append(element("dt", "", name), shown);
-  return home;
 }

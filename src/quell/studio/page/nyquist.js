@@ -1,5 +1,6 @@
 // The Nyquist diagram: the open loop near −1, the unit circle, and the circle of M_s.
 
+import { write } from "./dom.js";
 import { DASHES, palette } from "./palette.js";
 
 const HEIGHT = 224;
@@ -10,8 +11,13 @@ export class Nyquist {
     this.home = home;
     this.canvas = document.createElement("canvas");
     this.canvas.setAttribute("role", "img");
+    Object.assign(this.canvas.style, { display: "block", width: "100%", height: `${HEIGHT}px` });
     home.append(this.canvas);
-    new ResizeObserver(() => this.redraw()).observe(home);
+    this.width = 0;
+    new ResizeObserver(([entry]) => {
+      this.width = Math.round(entry.contentRect.width);
+      this.redraw();
+    }).observe(home);
   }
 
   show(data, pins, m_s) {
@@ -20,16 +26,14 @@ export class Nyquist {
   }
 
   redraw() {
-    const width = this.home.clientWidth;
+    const width = this.width;
     if (!this.last || width <= 0) return;
     const [data, pins, m_s] = this.last;
     const ratio = window.devicePixelRatio || 1;
-    this.canvas.width = Math.round(width * ratio);
-    this.canvas.height = Math.round(HEIGHT * ratio);
-    this.canvas.style.width = "100%";
-    this.canvas.style.height = `${HEIGHT}px`;
+    write(this.canvas, { width: Math.round(width * ratio), height: Math.round(HEIGHT * ratio) });
     const ctx = this.canvas.getContext("2d");
-    ctx.scale(ratio, ratio);
+    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+    ctx.clearRect(0, 0, width, HEIGHT);
     const scale = HEIGHT / (2 * REACH) * 1.15;
     const place = (re, im) => [width / 2 + (re + 0.5) * scale, HEIGHT / 2 - im * scale];
     const colors = palette();
@@ -46,7 +50,7 @@ export class Nyquist {
     ctx.moveTo(x - 5, y); ctx.lineTo(x + 5, y); ctx.moveTo(x, y - 5); ctx.lineTo(x, y + 5);
     ctx.stroke();
     const nearest = m_s ? `; its least distance from −1 is ${(1 / m_s).toFixed(2)}` : "";
-    this.canvas.setAttribute("aria-label", `Nyquist diagram of the open loop${nearest}`);
+    write(this.canvas, { ariaLabel: `Nyquist diagram of the open loop${nearest}` });
   }
 
   axes(ctx, width, place, colors) {

@@ -18,9 +18,10 @@ export class Plot {
   // `curves`: list of {name, label, color (a key of the palette), dash, pinned}
   constructor(home, x, curves, options = {}) {
     Object.assign(this, { home, x, curves, options, pins: [], layout: "", limits: [] });
-    new ResizeObserver(() => {
-      const width = home.clientWidth;
-      if (this.plot && width > 0 && width !== this.plot.width) this.plot.setSize({ width, height: HEIGHT });
+    this.width = home.clientWidth; // asked for once: asking makes the browser lay out the page
+    new ResizeObserver(([entry]) => {
+      this.width = Math.round(entry.contentRect.width);
+      if (this.plot && this.width > 0 && this.width !== this.plot.width) this.plot.setSize({ width: this.width, height: HEIGHT });
     }).observe(home);
   }
 
@@ -80,7 +81,7 @@ export class Plot {
     const axis = { stroke: colors.ink, grid: { stroke: colors.grid, width: 1 }, ticks: { stroke: colors.grid }, font: "12px system-ui" };
     const log = this.x.log ? { distr: 3 } : {};
     return {
-      width: Math.max(this.home.clientWidth, 200), height: HEIGHT, series, bands,
+      width: Math.max(this.width, 200), height: HEIGHT, series, bands,
       scales: { x: { time: false, ...log }, y: { range: this.options.range ?? padded } },
       axes: [
         { ...axis, size: 34, values: (_, ticks) => ticks.map(short), ...(this.x.log ? { splits: decades } : {}) },

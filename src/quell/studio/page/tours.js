@@ -1,8 +1,7 @@
 // Guided tours: short texts, each of which sets some values of the setup.
 
+import { home } from "./dom.js";
 import { changed } from "./store.js";
-
-const home = (id) => document.getElementById(id);
 
 export class Tours {
   // `show(setup, pin)` is called with the setup of a step, and a name to pin it with.

@@ -1,9 +1,8 @@
 // All plots of the page.
 
+import { home, write } from "./dom.js";
 import { Nyquist } from "./nyquist.js";
 import { Plot } from "./plots.js";
-
-const home = (id) => document.getElementById(id);
 
 export class Views {
   constructor() {
@@ -39,10 +38,8 @@ export class Views {
     const data = { ...arrays };
     const learns = setup?.learner != null || arrays.watched;
     if (!learns) delete data.f_learned;
-    home("fig-authority").hidden = !data.authority;
-    const f = home("plot-f").closest("figure");
-    f.hidden = !data.f_hat;
-    f.classList.toggle("wide", !data.authority);
+    write(home("fig-authority"), { hidden: !data.authority });
+    write(home("fig-f"), { hidden: !data.f_hat, className: data.authority ? "" : "wide" });
     const limits = ["u_min", "u_max"].map((key) => setup?.controller?.[key]).filter(Number.isFinite);
     this.time.y.show(data, kept, band?.y_low ? { t: band.t, low: band.y_low, high: band.y_high } : null);
     this.time.u.show(data, kept, band?.u_low ? { t: band.t, low: band.u_low, high: band.u_high } : null, limits);
@@ -57,6 +54,11 @@ export class Views {
     this.loop.phase.show(arrays, kept, null, [-180]);
     this.loop.s.show(arrays, kept, null, numbers.m_s ? [20 * Math.log10(numbers.m_s), 0] : [0]);
     this.nyquist.show(arrays, kept, numbers.m_s);
+  }
+
+  // The width of the plots in pixels.
+  get width() {
+    return this.time.y.width;
   }
 
   setFrequency(unit) {
