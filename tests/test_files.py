@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import resource
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -77,17 +80,25 @@ def test_a_device_is_not_replaced_by_a_file() -> None:
     assert Path("/dev/null").is_char_device()
 
 
-def test_a_new_folder_gets_the_first_name_that_is_free(tmp_path: Path) -> None:
-    """An empty one is free, and a file is not."""
-    names = []
-    for _ in range(3):
-        folder = new_folder(tmp_path / "figures")
-        (folder / "one.png").touch()
-        names.append(folder.name)
-    (tmp_path / "figures-4").touch()
-    (tmp_path / "figures-5").mkdir()
-    names.append(new_folder(tmp_path / "figures").name)
-    assert names == ["figures", "figures-2", "figures-3", "figures-5"]
+def test_each_new_folder_has_a_name_of_its_own(tmp_path: Path) -> None:
+    """Also if nothing was written yet, as while two commands run at the same time."""
+    (tmp_path / "figures-2").touch()
+    with ThreadPoolExecutor(4) as pool:
+        folders = [pool.submit(new_folder, tmp_path / "figures") for _ in range(4)]
+        names = sorted(each.result().name for each in folders)
+    assert names == ["figures", "figures-3", "figures-4", "figures-5"]
+
+
+def test_a_new_folder_that_stays_empty_is_removed_at_the_end(tmp_path: Path) -> None:
+    """After an error nothing is left; what is written stays."""
+    code = (
+        "from quell.files import new_folder\n"
+        "new_folder('empty'), (new_folder('used') / 'one.png').touch()\n"
+        "raise SystemExit(3)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False)
+    assert ended.returncode == 3
+    assert [each.name for each in tmp_path.iterdir()] == ["used"]
 
 
 def test_a_full_disk_is_named_with_the_file_in_one_line_and_leaves_nothing(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ The rule of all outputs: an existing file is replaced only where the caller asks
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import json
 import math
@@ -13,7 +14,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -138,14 +139,25 @@ def _move_into(part: Path, target: Path, names: Iterable[str]) -> None:
 
 
 def new_folder(path: str | os.PathLike[str]) -> Path:
-    """Create and return the first of ``path``, ``path-2``, ``path-3`` … that holds no file."""
+    """Create and return the first of ``path``, ``path-2``, ``path-3`` … that does not exist.
+
+    A folder that exists is not taken even if it is empty: another program may be about to write
+    into it. If the new folder is still empty when this program ends, it is removed.
+    """
     first = Path(path)
+    first.parent.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(1):
         folder = first if number == 1 else first.with_name(f"{first.name}-{number}")
-        if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
-            folder.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):
+            folder.mkdir()
+            atexit.register(_remove_if_empty, folder.absolute())
             return folder
     raise AssertionError
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def write_json(path: str | os.PathLike[str], value: Any, overwrite: bool = False) -> None:

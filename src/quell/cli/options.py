@@ -38,7 +38,7 @@ Overwrite = Annotated[
 ]
 
 FIGURES = Path("quell-figures")
-"""Folder for figures if none is named; if it holds files, it gets a number."""
+"""Folder for figures if none is named; if it exists, the new one gets a number."""
 
 
 @Parameter(name="*")
@@ -52,7 +52,7 @@ class Outputs:
         Write all results and settings to this file, for programs.
     figures
         Put the figures into this folder, as PNG and SVG; by default into quell-figures, or
-        quell-figures-2 and so on if that holds files.
+        quell-figures-2 and so on if that exists.
     """
 
     json: Annotated[Path | None, Parameter(name="--json")] = None
@@ -71,7 +71,7 @@ class RunOutputs(Outputs):
         Write metrics, events and settings to this file, for programs.
     figures
         Put the figures into this folder, as PNG and SVG; by default into quell-figures, or
-        quell-figures-2 and so on if that holds files.
+        quell-figures-2 and so on if that exists.
     save
         Write the whole record to this file, which `Trajectory.load` reads.
     """
