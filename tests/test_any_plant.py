@@ -212,6 +212,23 @@ def test_a_python_plant_is_varied_tuned_and_swept(files: Path) -> None:
     assert observed.controller.observer.degree == 2
 
 
+def test_ranges_of_the_parameters_of_a_python_plant_are_tuned_for(files: Path) -> None:
+    """Also of one that has its default in the file."""
+    text = (
+        (files / "setup.toml")
+        .read_text()
+        .replace("[plant.parameters]", "uncertain = RANGES\n[plant.parameters]")
+    )
+    ranges = '{"parameters.m" = [0.5, 2.0], "parameters.length" = [0.4, 0.6]}'
+    (files / "setup.toml").write_text(text.replace("RANGES", ranges))
+    task = tuning_task(files / "setup.toml", trust=True)
+    made_of = task.plant(**{"parameters.m": 2.0, "parameters.length": 0.5})
+    np.testing.assert_allclose(made_of.B[:, 0], [0.0, 2.0], rtol=1e-6)
+    (files / "setup.toml").write_text(text.replace("RANGES", '{"parameters.mass" = [0.5, 2.0]}'))
+    with pytest.raises(SetupError, match="mass"):
+        tuning_task(files / "setup.toml", trust=True)
+
+
 def test_parameters_reach_equation_and_output_alike_in_python_c_and_machine_code() -> None:
     """The closed form of the rates; other numbers use the same machine code."""
     plant = NonlinearPlant(

@@ -156,6 +156,8 @@ def _check_ranges(name: str, plant: CallTable | None) -> None:
     for path in getattr(plant, "uncertain", None) or ():
         table: Any = plant
         for step in path.split("."):
+            if isinstance(table, Mapping):  # parameters of a function or an FMU, which know them
+                break
             key = step.partition("[")[0]
             known = [*type(table).model_fields] if isinstance(table, Table) else []
             known = [each for each in known if each not in ("kind", "uncertain", "signals")]
