@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -32,6 +33,19 @@ def test_a_law_does_what_the_controller_does_at_its_limits_too(form: str, learne
         wished = law.C @ x + law.D_r * r + law.D_y * y
         assert min(max(wished, -1.0), 1.6) == pytest.approx(u, abs=1e-9)
         x = law.A @ x + law.B_r * r + law.B_y * y + law.B_u * u
+
+
+def test_a_law_that_changes_from_sample_to_sample_is_refused(monkeypatch: Any) -> None:
+    """The gain of this learner grows a little with each call."""
+    learner, calls = analysis.Frozen(np.ones(4), 0.0, 0.0), itertools.count()
+
+    def grow(learner: Any, memory: Any, seen: Any, u_before: float) -> tuple[float, float]:
+        return (1.0 + 1e-6 * next(calls)) * float(learner.gain @ seen), 0.0
+
+    analysis.linear_law(adrc(3), learner)
+    monkeypatch.setitem(predict.implementations, analysis.Frozen, grow)
+    with pytest.raises(ValueError, match="changes from sample to sample"):
+        analysis.linear_law(adrc(3), learner)
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,8 @@ def test_a_slider_moves_the_curves_and_a_pinned_one_stays(page: Any) -> None:
         return np.array_equal(curve(page, "y"), before)
 
     wait_for(is_undone)
+    page.locator('input[type=range][data-path="plant.den[1]"]').press("PageUp")
+    assert page.input_value('input[data-path="plant.den"]') == "[1,6.34,0]"
 
 
 def test_the_address_holds_the_state(page: Any, browser: Any) -> None:

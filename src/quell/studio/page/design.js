@@ -3,7 +3,7 @@
 import uPlot from "./vendor/uPlot.js";
 import { home } from "./dom.js";
 import { palette } from "./palette.js";
-import { short } from "./plots.js";
+import { labels, short } from "./plots.js";
 
 const BOUNDS = [["tune-ms", "m_s"], ["tune-mt", "m_t"], ["tune-mks", "m_ks"]];
 
@@ -81,7 +81,7 @@ export class Designs {
       {
         width: box.clientWidth || 300, height: 170, scales: { x: { time: false } },
         series: [{ label: "M_s", value }, { label: "integral gain", stroke: colors.main, width: 2, points: { size: 7 }, value }],
-        axes: [{ ...axis, size: 34 }, { ...axis, size: 56, values: (_, ticks) => ticks.map(short) }],
+        axes: [{ ...axis, size: 34, values: labels }, { ...axis, size: 56, values: labels }],
       },
       [this.points.map((p) => p.m_s), this.points.map((p) => p.k_i)],
       box,

@@ -13,6 +13,7 @@ const NAMES = {
 };
 const OPTIONAL = ["observer", "learner", "guard", "prefilter"];
 const OPEN = ["plant", "observer", "controller"];
+const POLYNOMIALS = ["num", "den"];
 const WHOLE = "whole number";
 
 export class Forms {
@@ -202,7 +203,24 @@ export class Forms {
         box.setCustomValidity("A number, or a list as [1, 2, 3]");
       }
     };
-    return field(name, box, entry.about);
+    const row = field(name, box, entry.about);
+    const sliders = this.coefficients(entry, path);
+    if (sliders === null) return row;
+    box.onchange = () => this.change(path, at(this.setup, path), true); // it may have another length
+    const all = element("div");
+    all.append(row, ...sliders);
+    return all;
+  }
+
+  // Return sliders for the coefficients of a polynomial that are not zero; null for another list.
+  coefficients(entry, path) {
+    const values = at(this.setup, path);
+    if (!POLYNOMIALS.includes(entry.key) || !Array.isArray(values) || !values.every(Number.isFinite)) return null;
+    return values.flatMap((value, i) => {
+      const power = values.length - 1 - i;
+      const name = `${entry.key}, ${power > 1 ? `s${[...String(power)].map((digit) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[digit]).join("")}` : power ? "s" : "constant"}`;
+      return value === 0 ? [] : [this.number({ type: "number", about: `Coefficient ${i + 1} of ${entry.key}.` }, `${path}[${i}]`, name)];
+    });
   }
 
   // Return a number with, where it can slide, a slider: logarithmic for a positive one.
@@ -215,7 +233,8 @@ export class Forms {
     };
     const value = at(this.setup, path) ?? (Number.isFinite(entry.default) ? entry.default : null);
     box.showValue(at(this.setup, path));
-    const set = (number, source) => this.change(path, number, false, source);
+    const isEntry = path.endsWith("]"); // of a list, which keeps its length
+    const set = (number, source) => (number !== undefined || !isEntry) && this.change(path, number, false, source);
     if (!slides || value === null || typeof value !== "number") {
       box.oninput = () => box.validity.valid && set(box.value === "" ? undefined : Number(box.value), box);
       return field(name, box, entry.about);

@@ -50,8 +50,9 @@ function onState(state, structure, source) {
     home("band").checked = state.band;
     home("percent").value = state.percent;
     syncPins(state);
-  } else if (source === "form") forms.refresh(state.setup, ...now.changed);
-  ask();
+  }
+  ask(); // before the form is written: the server works meanwhile
+  if (source === "form" && !structure) forms.refresh(state.setup, ...now.changed);
 }
 
 function fill(state) {
@@ -104,6 +105,7 @@ async function onFrame(header, arrays, bytes, asked) {
     download(header.name, bytes);
     home("state").textContent = `${header.name} is downloaded`;
   } else if (header.kind === "opened") {
+    home("preset").value = home("preset-about").textContent = "";
     store.set({ ...store.state, setup: header.setup });
   }
   return undefined;
@@ -140,6 +142,7 @@ function takeLoop(header, arrays, asked) {
     askPins();
     return;
   }
+  write(home("plots"), { className: "" });
   now.loop = header.loop;
   now.loopArrays = arrays;
   write(home("loop-reason"), { textContent: header.loop.reason ?? "" });
@@ -197,9 +200,11 @@ function message(text) {
 // ---- pins
 
 function addPin(pin) {
+  pins = pins.slice(1 - MOST_PINS);
   const used = new Set(pins.map((each) => each.place));
-  pin.place = [...Array(MOST_PINS).keys()].find((place) => !used.has(place)) ?? 0;
-  pins = [...pins, pin].slice(-MOST_PINS);
+  // A pin that comes back keeps its colour.
+  if (pin.place === undefined || used.has(pin.place)) pin.place = [...Array(MOST_PINS).keys()].find((place) => !used.has(place));
+  pins.push(pin);
   listPins();
 }
 
@@ -322,7 +327,7 @@ const watch = new Watch(
     home("watch-values").replaceChildren(
       ...Object.entries(values).map(([name, value]) => {
         const box = element("div");
-        box.append(element("dt", "", name.replace("_", " ")), element("dd", "", short(value)));
+        box.append(element("dt", "", name), element("dd", "", short(value)));
         return box;
       }),
     );
@@ -367,6 +372,7 @@ async function begin(hello) {
       pins = [];
       listPins();
     }
+    home("preset").value = home("preset-about").textContent = "";
     store.set({ ...store.state, setup, pins: pin ? [{ label: pin, setup }] : pin === null ? [] : store.state.pins });
   });
   store = new Store(onState);

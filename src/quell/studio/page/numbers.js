@@ -58,12 +58,17 @@ function margins(loop, bounds, dt) {
   const phase = loop.phase_margin ?? Infinity;
   return [
     ["M_s", short(loop.m_s), loop.m_s > bounds.m_s, "largest sensitivity: the least distance from −1 is 1/M_s"],
-    ["gain margin", `${low > 0 ? short(low) + " … " : ""}${short(high)}`, high < bounds.gain || low > 1 / bounds.gain, "factor of the gain up to which the loop is stable"],
+    ["gain margin", low > 0 ? range(low, high) : short(high), high < bounds.gain || low > 1 / bounds.gain, "factor of the gain up to which the loop is stable"],
     ["phase margin", `${short(phase)}°`, phase < bounds.phase, ""],
     ["delay margin", delay >= 1 ? `${short(delay)} s` : `${short(1e3 * delay)} ms`, delay < bounds.samples * dt, "additional dead time up to which the loop is stable"],
-    ["stable for b/b0", b ? `${short(b[0])} … ${short(b[1])}` : "–", false, "range of the plant's gain over b0"],
+    ["stable for b/b0", b ? range(...b) : "–", false, "range of the plant's gain over b0"],
     ["noise → u", short(loop.noise_to_control), false, "RMS of u for white noise of RMS 1 in y"],
   ];
+}
+
+// Two numbers, short enough for one line of a box.
+function range(low, high) {
+  return [low, high].map((each) => short(Number(each.toPrecision(3)))).join(" … ");
 }
 
 function metrics(run, bounds) {

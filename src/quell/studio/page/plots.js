@@ -31,7 +31,7 @@ export class Plot {
     this.limits = limits;
     const curves = this.curves.filter((curve) => data[curve.name]);
     const pinned = curves.filter((curve) => curve.pinned);
-    const layout = JSON.stringify([curves.map((c) => c.name), pins.map((p) => p.label), Boolean(band), this.x.log]);
+    const layout = JSON.stringify([curves.map((c) => c.name), pins.map((p) => [p.label, p.place]), Boolean(band), this.x.log]);
     const x = this.x.value ? this.x.value(data[this.x.name]) : data[this.x.name];
     if (!x) return;
     const columns = [x, ...curves.map((curve) => data[curve.name])];
@@ -74,7 +74,7 @@ export class Plot {
     const bands = [];
     if (band) {
       const first = series.length;
-      const edge = { stroke: colors.band, width: 1, value, points: { show: false } };
+      const edge = { stroke: colors.edge, width: 1, value, points: { show: false } };
       series.push({ ...edge, label: "band: high" }, { ...edge, label: "low" });
       bands.push({ series: [first, first + 1], fill: colors.band });
     }
@@ -84,8 +84,8 @@ export class Plot {
       width: Math.max(this.width, 200), height: HEIGHT, series, bands,
       scales: { x: { time: false, ...log }, y: { range: this.options.range ?? padded } },
       axes: [
-        { ...axis, size: 34, values: (_, ticks) => ticks.map(short), ...(this.x.log ? { splits: decades } : {}) },
-        { ...axis, size: 56, values: (_, ticks) => ticks.map(short) },
+        { ...axis, size: 34, values: labels, ...(this.x.log ? { splits: decades } : {}) },
+        { ...axis, size: 56, values: labels },
       ],
       legend: { live: true }, cursor: { sync: { key: this.x.sync }, points: { size: 6 } },
       hooks: { draw: [(plot) => this.drawLimits(plot)] },
@@ -108,6 +108,11 @@ export class Plot {
     }
     ctx.restore();
   }
+}
+
+// uPlot leaves out ticks that stand too close: they are null.
+export function labels(_, ticks) {
+  return ticks.map((tick) => (tick == null ? "" : short(tick)));
 }
 
 function padded(_, low, high) {

@@ -2,6 +2,11 @@
 
 const PROTOCOLS = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 const KEPT = 3000; // rows that are shown
+// Last values that are shown: column, label, factor of its unit.
+const SHOWN = [
+  ["k", "sample", 1], ["mode", "mode", 1], ["lateness", "lateness [µs]", 1e6],
+  ["step_time", "time of a step [µs]", 1e6], ["y", "y", 1], ["u", "u", 1],
+];
 const MARK = 4; // bytes before the values: the mark of CDR
 
 export class Watch {
@@ -79,8 +84,8 @@ export class Watch {
     }
     const last = this.rows.at(-1)?.[1];
     const now = {};
-    for (const name of ["k", "mode", "lateness", "step_time", "y", "u"]) {
-      if (last && name in this.columns) now[name] = last[this.columns[name]];
+    for (const [name, label, factor] of SHOWN) {
+      if (last && name in this.columns) now[label] = factor * last[this.columns[name]];
     }
     this.onRows(arrays, now);
   }
