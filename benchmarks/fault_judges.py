@@ -111,10 +111,10 @@ def judge_wire(log: np.ndarray, rig_killed: bool) -> list[str]:
 
 def judge_loss(path: Path, log: np.ndarray, wrong: list[str]) -> float:
     """Return the time that is missing at the end of a killed loop's record [s]."""
-    command = log[:, LOG.index("command")]
-    commands = int(
-        np.flatnonzero(np.isfinite(command))[-1] - np.flatnonzero(np.isfinite(command))[0]
-    )
+    arrived = np.flatnonzero(np.isfinite(log[:, LOG.index("command")]))
+    if arrived.size == 0:  # killed before the first command
+        return math.nan
+    commands = int(arrived[-1] - arrived[0])
     try:
         last = load(path)["k"][-1]
     except ValueError as error:

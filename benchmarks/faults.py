@@ -3,6 +3,9 @@
     python benchmarks/faults.py                # 1000 trials over three wires: about an hour
     python benchmarks/faults.py --trials 30 --seed 7 --wires shm --json faults.json
 
+Results are written after each trial; trials that the JSON file has already are not repeated, so
+the same command goes on where it was stopped.
+
 Each trial runs a loop in one process, a twin in another, and a relay between them. It checks:
 
 * the wire: every command in the rig's log is finite and within the limits;
@@ -22,6 +25,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
+import math
 import os
 import random
 import shutil
@@ -96,7 +101,9 @@ class RigProcess:
             text=True,
         )
         assert self.process.stdout is not None
-        self.url = self.process.stdout.readline().partition(" at ")[2].partition(": ")[0]
+        # Lines before that with the URL tell that something is compiled.
+        said = next((line for line in self.process.stdout if "://" in line), "")
+        self.url = said.partition(" at ")[2].partition(": ")[0]
         self._seen = 0
         deadline = time.monotonic() + 60.0
         while self.log.read_text("utf-8").count("\n") < 2 and time.monotonic() < deadline:
@@ -325,29 +332,34 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     results: list[dict[str, Any]] = []
+    if options.json is not None and options.json.exists():
+        results = json.loads(options.json.read_text("utf-8"))
     with tempfile.TemporaryDirectory() as place, small_disk(Path(place) / "full"):
         for i, wire in enumerate(options.wires):
+            done = {found["trial"] for found in results if found["wire"] == wire}
             count = (options.trials + i) // len(options.wires)
-            draw = random.Random(f"{options.seed} {wire}")
+            numbers = [number for number in range(count) if number not in done]
             kinds = possible(options.kinds, wire, Path(place) / "full")
-            results += trials(wire, count, kinds, Path(place), draw, 60.0 * options.minutes)
-    bad = print_table(results)
-    if options.json is not None:
-        write_json(options.json, nonfinite_to_none(results))
-    sys.exit(1 if bad else 0)
+            found = trials(wire, numbers, kinds, Path(place), options.seed, 60.0 * options.minutes)
+            for one in found:
+                results.append(one)
+                if options.json is not None:
+                    write_json(options.json, nonfinite_to_none(results), overwrite=True)
+    sys.exit(1 if print_table(results) else 0)
 
 
 def trials(
-    wire: str, count: int, kinds: list[str], folder: Path, draw: random.Random, seconds: float
-) -> list[dict[str, Any]]:
+    wire: str, numbers: list[int], kinds: list[str], folder: Path, seed: int, seconds: float
+) -> Iterator[dict[str, Any]]:
     """Run the trials over one wire, as many as fit into the time; print those with errors."""
+    if not numbers:
+        return
     end = time.monotonic() + seconds
-    results = []
     rig = RigProcess(folder, 0, wire)
     try:
         # Compile and import once: the trials are forked from this process.
         close_loop(rig.url, 0.2, [folder / f"{wire}.csv", folder / f"{wire}.mcap"])
-        for number in range(count):
+        for number in numbers:
             if time.monotonic() > end:
                 break
             if rig.process.poll() is not None:
@@ -355,16 +367,18 @@ def trials(
                 rig = RigProcess(folder, number + 1, wire)
             own = folder / f"{wire}-{number}"
             own.mkdir()
+            draw = random.Random(f"{seed} {wire} {number}")
             found = trial(number, wire, draw.choice(kinds), rig, own, draw)
-            results.append(found)
             if found["wrong"]:
                 print(f"{found}", flush=True)
+            yield found
             shutil.rmtree(own)
+            if any(math.isnan(part) for part in found.get("lost", ())):
+                rig.end()  # no command ended the killed loop's session: it would last for a minute
             if number % 50 == 49:
                 print(f"{wire}: {number + 1} trials done", file=sys.stderr, flush=True)
     finally:
         rig.end()
-    return results
 
 
 def print_table(results: list[dict[str, Any]]) -> int:
@@ -380,7 +394,8 @@ def print_table(results: list[dict[str, Any]]) -> int:
         print(f"{kind:<24} {len(mine):>6} {wrong:>6}  {text}")
     lost = [part for found in results for part in found.get("lost", ())]
     if lost:
-        print(f"telemetry lost by a killed loop: at most {np.nanmax(lost):.3f} s")
+        most = np.nanmax(np.array(lost, dtype=float))
+        print(f"telemetry lost by a killed loop: at most {most:.3f} s")
     bad = sum(bool(found["wrong"]) for found in results)
     print(f"{len(results)} trials, {bad} with errors")
     return bad
