@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from quell.controllers import Prefiltered
+from quell.controllers.baselines import PID
 from quell.controllers.prefilters.differentiator import (
     TrackingDesign,
     TrackingDifferentiator,
@@ -78,6 +82,38 @@ def test_it_is_a_kernel_and_the_same_interpreted() -> None:
     interpreted(follow)(design, differentiator.memory(design), np.ones(200), v)
     np.testing.assert_allclose(profile(3.0, 0.01, np.ones(200)), v, atol=1e-12)
     assert fhan(0.0, 0.0, 1.0, 0.1) == 0.0
+
+
+def test_it_starts_again_at_y_when_an_absurd_reference_took_it_far_from_where_the_loop_is() -> None:
+    """After 1000 samples in which y is 100 times nearer to r; at once, it would be 50 000 samples."""
+    shaped = Prefiltered(PID(kp=1.0, dt=0.01, u_min=-1.0, u_max=1.0), TrackingDifferentiator(20.0))
+    shaped.step(0.0, 0.0)
+    memory = shaped._state.prefilter
+    memory.v[:] = 1e6, 1e4
+    for k in range(999):
+        shaped.step(0.0, 1.0 if k % 3 else math.nan)
+    assert memory.v[0] > 1e6
+    for _ in range(333):
+        shaped.step(0.0, 1.0)
+    assert memory.v[0] > 1e6
+    shaped.step(0.0, 1.0)
+    assert 1.0 >= memory.v[0] > 0.9
+    assert memory.loop[0].far == 0.0
+
+
+def test_a_loop_that_follows_it_never_makes_it_start_again() -> None:
+    """Also when r returns to y in motion, and when both are at rest at r exactly."""
+    shaped = Prefiltered(PID(kp=1.0, dt=0.01), TrackingDifferentiator(2.0))
+    y, alone = 0.0, TrackingDifferentiator(2.0)
+    design = alone.design(0.01)
+    memory = alone.memory(design)
+    for k in range(4000):
+        r = 100.0 if k < 500 else 20.0
+        shaped.step(r, y)
+        v = shaped._state.prefilter.v
+        assert v[0] == prefilter(design, memory, r)
+        y += 0.05 * (v[0] - y)
+    assert abs(y - 20.0) < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,10 @@ Han, *IEEE Trans. Industrial Electronics* 56, 2009, eqs. (10) and (11)::
 allows, and for ``h_0 = h`` without overshoot. A larger ``h_0`` gives a smoother transition and
 filters noise in r. The paper prints ``d = h_0 r_0²``, which has the wrong unit: d is compared with
 a position, so it must be ``r_0 h_0²``.
+
+Within its acceleration v_1 may need a long time to return from where an absurd reference took it,
+and a loop at its limits does not follow it there. So it starts again, from rest at y, when y has
+been 100 times nearer to r than v_1 for 1000 samples in a row.
 """
 
 from __future__ import annotations
@@ -16,12 +20,24 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.prefilters.prefilter import prefilter, settle, write_derivatives
+from quell.controllers.prefilters.prefilter import (
+    prefilter,
+    restart_if_astray,
+    settle,
+    write_derivatives,
+)
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import copysign, sqrt
+from quell.kernels.scalars import Scalars
 from quell.types import Vector
+
+# A y that follows v_1 is behind it by a small part of the way, and is nearer to r than v_1 for a
+# moment only, when r returns to y. Both chosen by hand; after a restart v_1 is where y is.
+_FAR = 100.0
+_SAMPLES_FAR = 1000.0
 
 
 class TrackingDesign(NamedTuple):
@@ -32,10 +48,17 @@ class TrackingDesign(NamedTuple):
     dt: float  # h [s]
 
 
+class TrackingLoop(Scalars):
+    """Scalars kept from one sample to the next."""
+
+    far: float  # samples in a row in which y was far nearer to r than v_1
+
+
 class TrackingMemory(NamedTuple):
     """State."""
 
     v: Vector  # v_1 [y-unit] and v_2 [y-unit/s] (2,)
+    loop: NDArray[TrackingLoop]  # (1,)
 
 
 @kernel
@@ -65,6 +88,19 @@ def _write_derivatives(design: TrackingDesign, memory: TrackingMemory, derivativ
 @settle.register(TrackingDesign)
 def _settle(design: TrackingDesign, memory: TrackingMemory, value: float) -> None:
     memory.v[0], memory.v[1] = value, 0.0
+    memory.loop[0].far = 0.0
+
+
+@restart_if_astray.register(TrackingDesign)
+def _restart_if_astray(design: TrackingDesign, memory: TrackingMemory, r: float, y: float) -> None:
+    loop, resolved = memory.loop[0], design.acceleration * design.horizon * design.horizon
+    if not abs(memory.v[0] - r) > _FAR * max(abs(y - r), resolved):
+        loop.far = 0.0
+        return
+    loop.far += 1.0
+    if loop.far >= _SAMPLES_FAR:
+        memory.v[0], memory.v[1] = y, 0.0
+        loop.far = 0.0
 
 
 @dataclass(frozen=True)
@@ -116,4 +152,4 @@ class TrackingDifferentiator:
 
     def memory(self, design: TrackingDesign) -> TrackingMemory:
         """Return the state at rest at zero."""
-        return TrackingMemory(np.zeros(2))
+        return TrackingMemory(np.zeros(2), TrackingLoop.zeros())

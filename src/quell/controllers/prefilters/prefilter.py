@@ -2,7 +2,8 @@
 
 ``prefilter`` and ``settle`` are registered for the type of a prefilter's parameters. A prefilter
 that provides derivatives of the shaped reference has an attribute ``derivatives``, their number,
-and registers ``write_derivatives``.
+and registers ``write_derivatives``. One that would take long to return from an absurd reference
+registers ``restart_if_astray``.
 """
 
 from __future__ import annotations
@@ -64,6 +65,11 @@ def write_derivatives(design: Any, memory: Any, derivatives: Vector) -> None:
     """Write the first, second, … derivative of the last shaped reference."""
 
 
+@generic_with_default
+def restart_if_astray(design: Any, memory: Any, r: float, y: float) -> None:
+    """Start again from rest at ``y`` if the shaped reference is no transition from y to r."""
+
+
 class PrefilteredDesign(NamedTuple):
     """Parameters of a controller behind a prefilter."""
 
@@ -104,6 +110,8 @@ def _control(design: PrefilteredDesign, state: PrefilteredState, r: float, y: fl
         loop.status = _REFERENCE_HELD
     shaped = r
     if loop.started != 0.0 and loop.has_reference != 0.0:
+        if is_usable(y):
+            restart_if_astray(design.prefilter, state.prefilter, loop.r, y)
         shaped = prefilter(design.prefilter, state.prefilter, loop.r)
         if state.derivatives.size > 0:
             write_derivatives(design.prefilter, state.prefilter, state.derivatives)
