@@ -13,7 +13,8 @@ import pytest
 # the file that gathers the public names of folder x and its subfolders. A new folder needs an entry
 # here.
 ROWS = (
-    ("types", "checks", "files", "reading", "parallel", "optional", "executors", "quantities"),
+    ("types", "warn", "suggestions", "checks", "files", "reading", "parallel", "optional"),
+    ("executors", "quantities"),
     ("kernels",),
     ("lti", "signals", "observers", "plants", "features"),
     (

@@ -16,6 +16,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from quell.suggestions import suggesting
+
 if TYPE_CHECKING:
     from quell import (
         analysis,
@@ -89,7 +91,7 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'quell' has no attribute {name!r}")
     if name in _HOME:
-        value = getattr(importlib.import_module(_HOME[name]), name)
+        value = suggesting(getattr(importlib.import_module(_HOME[name]), name), __name__)
     else:
         value = importlib.import_module(_MODULES.get(name, f"quell.{name}"))
     globals()[name] = value

@@ -19,6 +19,7 @@ from quell.analysis.plots import (
 )
 from quell.analysis.sweeps import loops_over_omega_o, loops_over_time
 from quell.controllers.design_checks import Finding
+from quell.suggestions import suggest_names
 
 __all__ = [
     "Certificate",
@@ -41,3 +42,5 @@ __all__ = [
     "plot_nyquist",
     "plot_root_locus",
 ]
+
+suggest_names(__name__, __all__)

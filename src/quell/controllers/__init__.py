@@ -22,6 +22,7 @@ from quell.controllers.prefilters.differentiator import TrackingDifferentiator
 from quell.controllers.prefilters.prefilter import Prefilter, Prefiltered
 from quell.controllers.prefilters.reference_model import ReferenceModel
 from quell.controllers.single import in_single_precision
+from quell.suggestions import suggest_names
 
 __all__ = [
     "ADRC",
@@ -42,3 +43,5 @@ __all__ = [
     "omega_c_for",
     "warn_if_unwise",
 ]
+
+suggest_names(__name__, __all__)

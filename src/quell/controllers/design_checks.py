@@ -20,6 +20,7 @@ from typing import NamedTuple
 from quell.lti.canonical import format_roots
 from quell.observers.eso import ESO
 from quell.types import DesignWarning
+from quell.warn import warn
 
 # Limits of omega_o dt by the form of the observer, of omega_c dt, and of order times omega_c times
 # a known delay of u; measured as described above.
@@ -85,10 +86,16 @@ def sampling_findings(observer: ESO, omega_c: float) -> list[Finding]:
     return found
 
 
-def warn_if_unwise(observer: ESO, omega_c: float, stacklevel: int = 3) -> None:
-    """Issue a ``DesignWarning`` for each finding, with the caller's caller as its source."""
+def warn_if_unwise(observer: ESO, omega_c: float, stacklevel: int | None = None) -> None:
+    """Issue a ``DesignWarning`` for each finding.
+
+    Its source is the nearest line outside of quell, or the one ``stacklevel`` frames above.
+    """
     for finding in sampling_findings(observer, omega_c):
-        warnings.warn(finding.message, DesignWarning, stacklevel=stacklevel)
+        if stacklevel is None:
+            warn(finding.message)
+        else:
+            warnings.warn(finding.message, DesignWarning, stacklevel=stacklevel)
 
 
 def check_zeros(observer: ESO) -> None:

@@ -9,8 +9,11 @@ from quell.export.fmi import fmu
 from quell.export.library import Comparison, Exported, NoCompilerError, Sizes, c
 from quell.export.plant_source import plant_source
 from quell.export.translate.values import TranslationError
+from quell.suggestions import suggest_names
 
 __all__ = [
     "CSource", "Comparison", "Exported", "NoCompilerError", "Sizes", "TranslationError", "c",
     "c_source", "fmu", "plant_source",
 ]  # fmt: skip
+
+suggest_names(__name__, __all__)

@@ -12,6 +12,7 @@ from quell.features.linear import Bias, Input, State
 from quell.features.periodic import Periodic
 from quell.features.polynomial import Polynomial
 from quell.features.radial import RBF
+from quell.suggestions import suggest_names
 
 __all__ = [
     "RBF",
@@ -26,3 +27,5 @@ __all__ = [
     "RandomFourier",
     "State",
 ]
+
+suggest_names(__name__, __all__)

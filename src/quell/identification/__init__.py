@@ -18,6 +18,7 @@ from quell.identification.input_gain import InputGain, identify_b0
 from quell.identification.model.roots import Root
 from quell.identification.result import Identified
 from quell.identification.validation import Residuals
+from quell.suggestions import suggest_names
 
 __all__ = [
     "Alternative",
@@ -38,3 +39,5 @@ __all__ = [
     "read_record",
     "simulated_plant",
 ]
+
+suggest_names(__name__, __all__)

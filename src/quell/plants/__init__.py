@@ -17,6 +17,7 @@ from quell.plants.machines.dc_motor import DcMotor, dc_motor
 from quell.plants.machines.torsional import TorsionalPlant, torsional, torsional_identified
 from quell.plants.machines.two_mass_spring import two_mass_spring
 from quell.plants.nonlinear.plant import NonlinearPlant
+from quell.suggestions import suggest_names
 
 __all__ = [
     "FMU", "CubicSpringPlant", "DcMotor", "LinearPlant", "NonlinearPlant", "Plant", "PlantBatch",
@@ -24,3 +25,5 @@ __all__ = [
     "lagged_two_mass_spring", "linearised", "signals_of", "torsional",
     "torsional_identified", "two_mass_spring",
 ]  # fmt: skip
+
+suggest_names(__name__, __all__)

@@ -9,6 +9,7 @@ from quell.setup.load import EXAMPLES, Setup, load, made
 from quell.setup.plants import plant_given, plant_of
 from quell.setup.toml_file import read
 from quell.setup.vary import controllers_of, varied
+from quell.suggestions import suggest_names
 
 __all__ = [
     "EXAMPLES",
@@ -23,3 +24,5 @@ __all__ = [
     "read",
     "varied",
 ]
+
+suggest_names(__name__, __all__)

@@ -160,9 +160,9 @@ def _annotation(parameter: inspect.Parameter, function: Callable[..., Any]) -> A
     if not isinstance(annotation, str):
         return annotation
     is_class = isinstance(function, type)
-    home = inspect.getattr_static(function, "__init__") if is_class else inspect.unwrap(function)
+    home = inspect.getattr_static(function, "__init__") if is_class else function
     try:
-        return eval(annotation, home.__globals__)
+        return eval(annotation, inspect.unwrap(home).__globals__)
     except (NameError, AttributeError):
         return Any
 

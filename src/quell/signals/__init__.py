@@ -22,6 +22,7 @@ from quell.signals.excitation import PRBS, Multisine
 from quell.signals.noise import BandLimitedNoise
 from quell.signals.repeated import Repeated
 from quell.signals.shapes import Chirp, Ramp, Samples, Sinusoid, SmoothMove, Step, Trapezoid
+from quell.suggestions import suggest_names
 
 __all__ = [
     "KINDS", "PRBS", "BandLimitedNoise", "Chirp", "Constant", "Multisine", "Ramp", "Repeated",
@@ -62,3 +63,6 @@ def make(kind: str, **parameters: Any) -> Signal:
         return cls(**parameters)
     except TypeError as error:
         raise ValueError(f"signal {kind!r}: {str(error).split('() ')[-1]}") from None
+
+
+suggest_names(__name__, __all__)

@@ -8,7 +8,6 @@ defined there.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,7 +17,7 @@ from quell.plants.base import measure
 from quell.simulation.driver import Loop
 from quell.simulation.integration import LARGEST_ERROR, with_substeps
 from quell.simulation.sampled_scenario import segment_bounds
-from quell.types import DesignWarning
+from quell.warn import warn
 
 
 def judge_integration(plant: str, loops: Sequence[Loop]) -> None:
@@ -41,12 +40,10 @@ def judge_integration(plant: str, loops: Sequence[Loop]) -> None:
         if all(check.enough for check in poor)
         else "it is stiff, or f jumps: make f smoother, or give many more substeps"
     )
-    warnings.warn(
+    warn(
         f"{plant}: with {worst.model.substeps} sub-steps in a sample a state has an error of "
         f"{100.0 * worst.error:.2g} % of its range in one sample{runs}, more than "
-        f"{100.0 * LARGEST_ERROR:g} %: {remedy}",
-        DesignWarning,
-        stacklevel=3,
+        f"{100.0 * LARGEST_ERROR:g} %: {remedy}"
     )
 
 
@@ -61,13 +58,11 @@ def _warn_of_undefined_functions(plant: str, loop: Loop) -> None:
         defined = bool(np.all(np.isfinite([*loop.x, measure(loop.model, loop.x)])))
     if defined or not usual:
         return
-    warnings.warn(
+    warn(
         f"{plant}: f or output returns a number that is not finite; the run ended at t = "
         f"{loop.ended * loop.scenario.dt:.9g} s. The last recorded state was "
         f"{[float(f'{value:.4g}') for value in before]}: both must be defined wherever the "
-        "plant goes",
-        DesignWarning,
-        stacklevel=4,
+        "plant goes"
     )
 
 

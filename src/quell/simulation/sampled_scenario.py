@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +19,8 @@ from quell.plants.base import Plant
 from quell.records.sample_times import first_sample_at, in_steps
 from quell.signals import BandLimitedNoise, Constant, Signal
 from quell.simulation.scenario import Scenario
-from quell.types import DesignWarning, Matrix, Vector
+from quell.types import Matrix, Vector
+from quell.warn import warn
 
 # Samples for which signals are evaluated at once: enough that Python's share of the time is small,
 # few enough to stay in the processor's cache. Chosen by hand.
@@ -131,22 +131,18 @@ def _warn_of_times(scenario: Scenario, dt: float, samples: int) -> None:
     """Warn of a duration between two samples, and of noise that is far quicker than the samples."""
     last = (samples - 1) * dt
     if in_steps(scenario.duration, dt) != samples - 1:
-        warnings.warn(
+        warn(
             f"duration = {scenario.duration!r} s with dt = {dt!r} s: is no whole number of "
-            f"samples, so the run ends at {last:.9g} s; {last + dt:.9g} s is the next one",
-            DesignWarning,
-            stacklevel=4,
+            f"samples, so the run ends at {last:.9g} s; {last + dt:.9g} s is the next one"
         )
     for name, value in (("noise", scenario.noise), ("disturbances", scenario.disturbances)):
         for noise in _noises(value):
             if noise.power > 0.0 and noise.sample_time < _QUICKEST_NOISE * dt:
-                warnings.warn(
+                warn(
                     f"{name}: sample_time = {noise.sample_time!r} s is far below dt = {dt!r} s: "
                     "each sample sees one draw, whose variance power/sample_time = "
                     f"{noise.power / noise.sample_time:.3g} is that of a much wider band; "
-                    "give sample_time = dt, or the power for it",
-                    DesignWarning,
-                    stacklevel=4,
+                    "give sample_time = dt, or the power for it"
                 )
 
 

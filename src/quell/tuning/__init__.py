@@ -6,9 +6,12 @@ the frequency responses of a set of plants, ``search`` the optimiser; ``tune`` p
 and returns a ``Tuned``.
 """
 
+from quell.suggestions import suggest_names
 from quell.tuning.constraints import Constraints
 from quell.tuning.structures import STRUCTURES
 from quell.tuning.tune import tune
 from quell.tuning.tuned import Tuned
 
 __all__ = ["STRUCTURES", "Constraints", "Tuned", "tune"]
+
+suggest_names(__name__, __all__)

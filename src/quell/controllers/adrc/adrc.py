@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -31,7 +30,8 @@ from quell.learners.base import Learner, NoLearner, checked_design
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.learners.recovery import LearnerWatch, window_samples
 from quell.observers.eso import ESO
-from quell.types import Channels, DesignWarning
+from quell.types import Channels
+from quell.warn import warn
 
 
 class ADRC(StatefulController):
@@ -124,7 +124,7 @@ class ADRC(StatefulController):
         warn_if_unwise(observer, self.omega_c)
         if guard is not None and isinstance(self.learner, NoLearner):
             message = f"guard = {guard!r} has no effect without a learner; give one, or no guard"
-            warnings.warn(message, DesignWarning, stacklevel=2)
+            warn(message)
 
     def _update_parameters(self) -> None:
         self.parameters = self._design(self.observer, self.omega_c)

@@ -9,6 +9,7 @@ from quell.controllers.baselines.notch import Notch, NotchPID
 from quell.controllers.baselines.pid import PID
 from quell.controllers.baselines.resonance_ratio import ResonanceRatio
 from quell.controllers.prefilters.shaping import ZV, ZVD, Shaper
+from quell.suggestions import suggest_names
 
 __all__ = [
     "LQG",
@@ -21,3 +22,5 @@ __all__ = [
     "Shaper",
     "equivalent_pid",
 ]
+
+suggest_names(__name__, __all__)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
 
 from quell.types import Vector
+from quell.warn import warn
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of times, in seconds."""
@@ -82,10 +82,10 @@ def warn_of_another_step(
             return
         step = float(np.median(np.diff(t))) * UNITS[_unit_in(name) or "s"]
         if step > 0.0 and abs(step - dt) > _JITTER * dt:
-            warnings.warn(
+            warn(
                 f"{where}: dt = {dt:g} s is given, but column {name!r} rises by {step:g}: is dt in "
                 "seconds? Leave it out to take the times of the file.",
-                stacklevel=3,
+                UserWarning,
             )
         return
 
@@ -112,4 +112,4 @@ def _warn_of_another_unit(where: str, t: Vector) -> None:
         hint = "if they are in another unit, give time_unit (--time-unit), 's' if they are seconds"
     else:
         return
-    warnings.warn(f"{where}: the times {reason}: {hint}", stacklevel=4)
+    warn(f"{where}: the times {reason}: {hint}", UserWarning)

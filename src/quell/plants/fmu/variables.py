@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from quell import checks
-from quell.types import DesignWarning
+from quell.warn import warn
 
 _REAL = ("Real", "Float32", "Float64")
 _WHOLE = ("Integer", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")
@@ -173,9 +172,7 @@ def warn_of_step(description: Any, dt: float, substeps: int, where: str) -> None
         return
     ratio = dt / substeps / internal
     if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-9):
-        warnings.warn(
+        warn(
             f"{where}: dt/substeps = {dt / substeps!r} s is no multiple of the FMU's internal step "
-            f"of {internal!r} s: its outputs are then those of an earlier time",
-            DesignWarning,
-            stacklevel=4,
+            f"of {internal!r} s: its outputs are then those of an earlier time"
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +23,8 @@ from quell.plants.nonlinear.kernels import (
     PythonNonlinear,
     value_or_nan,
 )
-from quell.types import DesignWarning, Matrix
+from quell.types import Matrix
+from quell.warn import warn
 
 # Largest h |λ| of a sub-step h, λ an eigenvalue of the linearised plant. The error of a sub-step is
 # then below (h λ)^5 / 120 = 0.8 % of that mode; Runge-Kutta of order 4 is stable up to 2.8 (Hairer
@@ -188,10 +188,10 @@ class NonlinearPlant:
             compile_cfunc = function_pointers.compile_cfunc
             return compile_cfunc(_RATE_SIGNATURE, rate), compile_cfunc(_OUTPUT_SIGNATURE, output)
         except function_pointers.NotCompilableError as error:
-            warnings.warn(
+            warn(
                 f"{self.name}: f or output can't be compiled and runs as Python, which is slow "
                 f"({error})",
-                stacklevel=3,
+                UserWarning,
             )
             return None
 
@@ -224,12 +224,10 @@ class NonlinearPlant:
         wanted = dt * self._largest_eigenvalue / _LARGEST_STEP
         if wanted <= _MOST_SUBSTEPS:
             return max(math.ceil(wanted), 1)
-        warnings.warn(
+        warn(
             f"{self.name}: stiff, it has an eigenvalue of {self._largest_eigenvalue:.3g} 1/s at "
             f"rest and would need {wanted:.3g} sub-steps in dt = {dt!r} s; it gets "
-            f"{_MOST_SUBSTEPS}: leave its fastest part out of f, or give substeps",
-            DesignWarning,
-            stacklevel=3,
+            f"{_MOST_SUBSTEPS}: leave its fastest part out of f, or give substeps"
         )
         return _MOST_SUBSTEPS
 

@@ -14,7 +14,6 @@ import contextlib
 import errno
 import os
 import sys
-import warnings
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
@@ -28,7 +27,7 @@ from quell.realtime.wire.descriptor import Descriptor, descriptor, is_gone, paus
 from quell.realtime.wire.device import WireDevice
 from quell.realtime.wire.frames import LENGTH, Buffer
 from quell.realtime.wire.transport import receive, send, wait_for_frame
-from quell.types import DesignWarning
+from quell.warn import warn
 
 BAUD = 921600
 # The bits of a framed frame on the line: 42 bytes with start and stop bit.
@@ -199,11 +198,9 @@ def _check_rate(baud: int, dt: float) -> None:
             f"or dt from {frame:.3g} s on"
         )
     if 2.0 * frame > dt:
-        warnings.warn(
+        warn(
             f"{needs}, each way; that is longer than a sample: u acts a sample later "
-            f"than it could; it does not from {2.0 * FRAME_BITS / dt:.0f} baud on",
-            DesignWarning,
-            stacklevel=4,
+            f"than it could; it does not from {2.0 * FRAME_BITS / dt:.0f} baud on"
         )
 
 
