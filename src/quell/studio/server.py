@@ -198,6 +198,10 @@ def listen(
             "or 0 for a free one"
         ) from None
     try:
+        # Else the second frame of an answer waits until the first one is acknowledged, which
+        # receivers put off by up to 40 ms (Nagle's algorithm, RFC 896, and delayed
+        # acknowledgements, RFC 1122). Connections have the option from their listener.
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         studio = Studio(listener.getsockname()[1], setup, token, trust)
         config = uvicorn.Config(
             studio.app(),
