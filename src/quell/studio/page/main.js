@@ -3,31 +3,33 @@
 import { Connection } from "./connection.js";
 import { Designs } from "./design.js";
 import { element, home, write } from "./dom.js";
+import { download, Files } from "./files.js";
 import { Forms } from "./forms.js";
 import { boundFields, showNumbers, usual } from "./numbers.js";
-import { DASHES, isDark, palette } from "./palette.js";
+import { isDark } from "./palette.js";
+import { Pins } from "./pins.js";
 import { short } from "./plots.js";
 import { changed, Store } from "./store.js";
+import { tabs } from "./tabs.js";
 import { Tours } from "./tours.js";
 import { Views } from "./views.js";
 import { Watch } from "./watch.js";
 
-const MOST_PINS = 5;
 const MOST_TIMES = 10_000;
 const REST = 150; // the page is at rest when nothing has moved for this time [ms]
 
 const now = { arrays: {}, loopArrays: {}, run: null, loop: null, band: null, bandId: null, input: null, watching: false, numbering: null };
 const studio = { times: [], firstTimes: [], frames: 0, compiled: 0, now }; // for measurements from outside
 studio.busy = () => server.flying !== null || server.waiting !== null;
-studio.pins = () => pins;
+studio.pins = () => pins.list;
 studio.saved = () => store.committed === JSON.stringify(store.state);
 window.studio = studio;
-let pins = [];
 let presets = [];
 let tours = null;
 let store = null;
 
 const views = new Views();
+const pins = new Pins((setup) => store.set({ ...store.state, setup }), () => keepPins());
 const forms = new Forms(home("forms"), (path, value, structure, source) => {
   now.input = performance.now();
   const state = { ...store.state, setup: changed(store.state.setup, path, value) };
@@ -47,9 +49,10 @@ function onState(state, structure, source) {
     forms.build(state.setup);
     boundFields(home("bounds"), state.bounds, (bounds) => store.set({ ...store.state, bounds }, false, "bounds"));
     home("frequency").value = state.frequency;
+    views.setFrequency(state.frequency);
     home("band").checked = state.band;
     home("percent").value = state.percent;
-    syncPins(state);
+    pins.sync(state.pins);
   }
   ask(); // before the form is written: the server works meanwhile
   if (source === "form" && !structure) forms.refresh(state.setup, ...now.changed);
@@ -100,7 +103,7 @@ async function onFrame(header, arrays, bytes, asked) {
     write(home("plots"), { className: "old" }); // they do not show the present values
     message(header.text.join("\n"));
     if (asked?.local?.pin) asked.local.pin.failed = true;
-  } else if (header.kind === "texts") showTexts(header);
+  } else if (header.kind === "texts") files.take(header, store.state.setup.title ?? "setup");
   else if (header.kind === "file") {
     download(header.name, bytes);
     home("state").textContent = `${header.name} is downloaded`;
@@ -163,7 +166,7 @@ function atRest() {
 }
 
 function drawRun() {
-  views.showRun(now.arrays, pins, store.state.band ? now.band : null, store.state.setup);
+  views.showRun(now.arrays, pins.list, store.state.band ? now.band : null, store.state.setup);
   // Without units of the plant the names of units only repeat those of the signals.
   const unit = (name) => {
     const known = now.run?.units?.[name] ?? "";
@@ -176,7 +179,7 @@ function drawRun() {
 }
 
 function drawLoop() {
-  views.showLoop(now.loopArrays, pins, now.loop ?? {});
+  views.showLoop(now.loopArrays, pins.list, now.loop ?? {});
   numbers();
 }
 
@@ -199,67 +202,22 @@ function message(text) {
 
 // ---- pins
 
-function addPin(pin) {
-  pins = pins.slice(1 - MOST_PINS);
-  const used = new Set(pins.map((each) => each.place));
-  // A pin that comes back keeps its colour.
-  if (pin.place === undefined || used.has(pin.place)) pin.place = [...Array(MOST_PINS).keys()].find((place) => !used.has(place));
-  pins.push(pin);
-  listPins();
-}
-
 function pinNow(label) {
   if (!now.arrays.t) return;
   const setup = store.state.setup;
-  const name = label ?? `${setup.title ?? "design"} ${pins.length + 1}`;
-  addPin({ label: name, setup, arrays: { ...now.arrays, ...now.loopArrays } });
+  const name = label ?? `${setup.title ?? "design"} ${pins.list.length + 1}`;
+  pins.add({ label: name, setup, arrays: { ...now.arrays, ...now.loopArrays } });
   keepPins();
-  redraw();
 }
 
 function keepPins() {
-  const kept = pins.filter((pin) => pin.setup).map(({ label, setup }) => ({ label, setup }));
-  store.set({ ...store.state, pins: kept }, false, "pins");
-}
-
-// Make the pins those of a state, after undo or a visit by an address.
-function syncPins(state) {
-  const key = (pin) => JSON.stringify([pin.label, pin.setup]);
-  const have = new Map(pins.map((pin) => [key(pin), pin]));
-  const others = pins.filter((pin) => !pin.setup);
-  pins = [];
-  for (const pin of [...state.pins, ...others]) addPin(have.get(key(pin)) ?? { ...pin });
-  listPins();
+  store.set({ ...store.state, pins: pins.kept() }, false, "pins");
+  redraw();
 }
 
 function askPins() {
-  const next = pins.find((pin) => !pin.arrays && !pin.failed && pin.setup);
+  const next = pins.missing;
   if (next && !server.waiting) server.run({ do: "run", setup: next.setup, columns: width(), local: { pin: next } });
-}
-
-function listPins() {
-  home("pins").replaceChildren(
-    ...pins.map((pin) => {
-      const box = element("span", "pin");
-      const swatch = element("span", "swatch");
-      swatch.style.borderColor = palette().pins[pin.place];
-      swatch.style.borderTopStyle = DASHES[pin.place][0] > 3 ? "dashed" : "dotted";
-      const remove = element("button", "", "✕");
-      remove.setAttribute("aria-label", `Remove ${pin.label}`);
-      remove.onclick = () => {
-        pins = pins.filter((each) => each !== pin);
-        listPins();
-        keepPins();
-        redraw();
-      };
-      const back = element("button", "", pin.label);
-      back.title = pin.setup ? "Go back to this design" : pin.label;
-      back.disabled = !pin.setup;
-      back.onclick = () => store.set({ ...store.state, setup: pin.setup });
-      box.append(swatch, back, remove);
-      return box;
-    }),
-  );
 }
 
 const designs = new Designs(
@@ -270,54 +228,15 @@ const designs = new Designs(
     store.set({ ...store.state, setup });
   },
   (header, arrays) => {
-    const old = pins.find((pin) => pin.label === header.pin && !pin.setup);
-    if (header.kind === "run") {
-      pins = pins.filter((pin) => pin !== old);
-      addPin({ label: header.pin, arrays });
-    } else if (old) Object.assign(old.arrays, arrays);
+    pins.compare(header.pin, header.kind === "run", arrays);
     redraw();
   },
 );
 
-// ---- text and files
-
-let texts = null;
-
-function showTexts(header) {
-  if (now.saving) {
-    now.saving = false;
-    const name = (store.state.setup.title ?? "setup").toLowerCase().replaceAll(/[^a-z0-9]+/g, "_") || "setup";
-    download(`${name}.toml`, new TextEncoder().encode(header.toml));
-    return;
-  }
-  texts = header;
-  chooseText("toml");
-  home("texts").showModal();
-}
-
-function chooseText(which) {
-  home("text").textContent = texts[which];
-  home("as-toml").setAttribute("aria-pressed", which === "toml");
-  home("as-python").setAttribute("aria-pressed", which === "python");
-}
-
-function download(name, content) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob([content]));
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
-}
-
-function askText(saving) {
-  now.saving = saving;
-  server.send({ do: "toml", setup: store.state.setup });
-}
-
-function askExport(to) {
-  home("state").textContent = "translating to C …";
-  server.send({ do: "export", to, setup: store.state.setup });
-}
+const files = new Files(
+  (task) => server.send({ ...task, setup: store.state.setup }),
+  (text) => server.send({ do: "open", text }),
+);
 
 // ---- watch
 
@@ -336,11 +255,6 @@ const watch = new Watch(
 );
 
 function chooseTab(name) {
-  for (const each of ["design", "learn", "watch"]) {
-    home(`tab-${each}`).setAttribute("aria-selected", each === name);
-    home(`tab-${each}`).tabIndex = each === name ? 0 : -1;
-  }
-  document.body.dataset.tab = name;
   // The tours change the design: its form stays below them.
   home("learn").hidden = name !== "learn";
   home("watch").hidden = name !== "watch";
@@ -369,8 +283,7 @@ async function begin(hello) {
   home("preset").replaceChildren(new Option("your setup", ""), ...presets.map((preset, i) => new Option(preset.name, i)));
   tours = new Tours(tourList, presets, (setup, pin) => {
     if (pin !== undefined) {
-      pins = [];
-      listPins();
+      pins.clear();
     }
     home("preset").value = home("preset-about").textContent = "";
     store.set({ ...store.state, setup, pins: pin ? [{ label: pin, setup }] : pin === null ? [] : store.state.pins });
@@ -381,14 +294,13 @@ async function begin(hello) {
   if (!found) choosePreset(0);
   else store.set(fill(found));
   store.commit();
-  if (found?.frequency) views.setFrequency(found.frequency);
 }
 
 function choosePreset(number) {
   home("preset").value = number;
   home("preset-about").textContent = presets[number].about;
   forms.anchors.clear();
-  pins = [];
+  pins.clear();
   store.set(fill({ ...(store.state ?? {}), pins: [], setup: presets[number].setup }));
 }
 
@@ -398,7 +310,7 @@ function setTheme(dark) {
   if (store) {
     redraw();
     views.redraw();
-    listPins();
+    pins.show();
   }
 }
 
@@ -411,20 +323,6 @@ home("undo").onclick = () => store.undo();
 home("redo").onclick = () => store.redo();
 home("pin").onclick = () => pinNow();
 home("theme").onclick = () => setTheme(!isDark());
-home("save").onclick = () => askText(true);
-home("show-text").onclick = () => askText(false);
-home("export-c").onclick = () => askExport("c");
-home("export-fmu").onclick = () => askExport("fmu");
-home("open").onclick = () => home("file").click();
-home("file").onchange = async () => {
-  const [file] = home("file").files;
-  if (file) server.send({ do: "open", text: await file.text() });
-  home("file").value = "";
-};
-home("as-toml").onclick = () => chooseText("toml");
-home("as-python").onclick = () => chooseText("python");
-home("copy").onclick = () => navigator.clipboard.writeText(home("text").textContent);
-home("close-texts").onclick = () => home("texts").close();
 home("watch-go").onclick = () => watch.start(Number(home("watch-port").value));
 home("frequency").onchange = () => {
   views.setFrequency(home("frequency").value);
@@ -432,17 +330,7 @@ home("frequency").onchange = () => {
 };
 home("band").onchange = () => store.set({ ...store.state, band: home("band").checked }, false, "choice");
 home("percent").oninput = () => store.set({ ...store.state, percent: Number(home("percent").value) }, false, "choice");
-for (const name of ["design", "learn", "watch"]) {
-  home(`tab-${name}`).onclick = () => chooseTab(name);
-  home(`tab-${name}`).onkeydown = (event) => {
-    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-    if (!step) return;
-    const names = ["design", "learn", "watch"];
-    const next = names[(names.indexOf(name) + step + 3) % 3];
-    chooseTab(next);
-    home(`tab-${next}`).focus();
-  };
-}
+tabs(["design", "learn", "watch"], chooseTab);
 document.addEventListener("keydown", (event) => {
   const typing = event.target.matches("input:not([type=range]):not([type=checkbox]), textarea");
   const command = event.ctrlKey || event.metaKey;

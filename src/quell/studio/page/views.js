@@ -62,6 +62,8 @@ export class Views {
   }
 
   setFrequency(unit) {
+    if (unit === this.unit) return;
+    this.unit = unit;
     const hertz = unit === "hz";
     this.axis.label = hertz ? "f [Hz]" : "ω [rad/s]";
     this.axis.value = hertz ? (omega) => omega.map((w) => w / (2 * Math.PI)) : undefined;

@@ -1,0 +1,61 @@
+// The setup as text, and files: saved, opened, exported.
+
+import { home } from "./dom.js";
+
+export class Files {
+  // `ask(message)` sends with the present setup; `open(text)` opens the text of a file.
+  constructor(ask, open) {
+    Object.assign(this, { ask, texts: null, saving: false });
+    home("save").onclick = () => this.askText(true);
+    home("show-text").onclick = () => this.askText(false);
+    home("export-c").onclick = () => this.askExport("c");
+    home("export-fmu").onclick = () => this.askExport("fmu");
+    home("open").onclick = () => home("file").click();
+    home("file").onchange = async () => {
+      const [file] = home("file").files;
+      if (file) open(await file.text());
+      home("file").value = "";
+    };
+    home("as-toml").onclick = () => this.choose("toml");
+    home("as-python").onclick = () => this.choose("python");
+    home("copy").onclick = () => navigator.clipboard.writeText(home("text").textContent);
+    home("close-texts").onclick = () => home("texts").close();
+  }
+
+  askText(saving) {
+    this.saving = saving;
+    this.ask({ do: "toml" });
+  }
+
+  askExport(to) {
+    home("state").textContent = "translating to C …";
+    this.ask({ do: "export", to });
+  }
+
+  // Take the texts of the setup with a title: show them, or save the TOML.
+  take(texts, title) {
+    if (this.saving) {
+      this.saving = false;
+      const name = title.toLowerCase().replaceAll(/[^a-z0-9]+/g, "_") || "setup";
+      download(`${name}.toml`, new TextEncoder().encode(texts.toml));
+      return;
+    }
+    this.texts = texts;
+    this.choose("toml");
+    home("texts").showModal();
+  }
+
+  choose(which) {
+    home("text").textContent = this.texts[which];
+    home("as-toml").setAttribute("aria-pressed", which === "toml");
+    home("as-python").setAttribute("aria-pressed", which === "python");
+  }
+}
+
+export function download(name, content) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([content]));
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
