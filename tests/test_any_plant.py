@@ -23,7 +23,8 @@ from quell.setup.tuning_task import tuning_task
 from tests.commands import Shown
 
 DT = 0.01
-MODEL = {"num": [50.0], "den": [1.0, 22.0, 40.0, 0.0], "delay": 0.02, "friction": 0.1}
+MODEL = {"num": [50.0], "den": [1.0, 22.0, 40.0, 0.0], "delay": 0.02}
+MODEL |= {"friction": 0.1, "friction_width": 0.05}
 PYTHON = """
 import math
 import quell as ql
@@ -117,13 +118,26 @@ def _table(text: str) -> Any:
     return text
 
 
-def test_an_identified_model_has_its_delay(files: Path) -> None:
+def test_an_identified_model_has_its_delay_and_friction(files: Path) -> None:
     """``(num, den)`` behind two samples; a file without model says what it should be."""
     plant = plant_of({"kind": "identified", "path": "model.json"}, DT)
     assert plant.order == 3 + 2
     found, delay = analysis_part(plant)
     np.testing.assert_allclose(found.B[:, 0], [0.0, 0.0, 50.0])
     assert delay == pytest.approx(0.02)
+    model = plant.sampled(DT, interpret=True)
+    x, scratch, w = np.zeros(plant.order), np.zeros(6 * plant.order), np.zeros(1)
+    for u in (0.05, 0.3):  # at rest the speed v has 40 v/50 + F tanh(v/0.05) = u
+        for k in range(1000):
+            ql.plants.base.advance(model, x, scratch, k * DT, u, w)
+        before = x[0]
+        ql.plants.base.advance(model, x, scratch, 0.0, u, w)
+        speed = (x[0] - before) / DT
+        assert 0.8 * speed + 0.1 * math.tanh(speed / 0.05) == pytest.approx(u, rel=1e-6)
+    without = {key: value for key, value in MODEL.items() if key != "friction_width"}
+    Path("older.json").write_text(json.dumps(without))
+    with pytest.warns(ql.types.DesignWarning, match=r"older\.json: its friction is left out"):
+        plant_of({"kind": "identified", "path": "older.json"}, DT)
     Path("other.json").write_text("[1, 2]")
     with pytest.raises(SetupError, match=r"plant\.path = 'other\.json': has no model"):
         plant_of({"kind": "identified", "path": "other.json"}, DT)

@@ -48,7 +48,7 @@ def test_a_transfer_function_is_tuned_and_written_as_a_setup(quell: object, tmp_
 
 
 def test_a_setup_with_ranges_is_tuned_for_them(quell: object, tmp_path: Path) -> None:
-    """And checked on fresh samples; the result keeps plant, ranges and [tune]."""
+    """And checked on fresh samples; the result keeps plant, ranges, [tune] and feedforward."""
     path, out = tmp_path / "lag.toml", tmp_path / "tuned.toml"
     path.write_text(SETUP.format(range="friction = [0.5, 2.0]"), encoding="utf-8")
     shown: Shown = quell("tune", str(path), "--no-figures")  # type: ignore[operator]
@@ -59,6 +59,7 @@ def test_a_setup_with_ranges_is_tuned_for_them(quell: object, tmp_path: Path) ->
     )
     text = text.replace("lagged-two-mass", "two-mass").replace('"pi"', '"bandwidths"')
     text = text.replace("m_s = 1.5", "m_s = 2.5\nm_t = 2.5\nm_ks = 3000.0\norder = 4")
+    text += '[observer]\nkind = "model-free"\n[controller]\nfeedforward = true\nomega_c = 1.0\n'
     path.write_text(text, encoding="utf-8")
     shown = quell("tune", str(path), "--out", str(out), "--no-figures")  # type: ignore[operator]
     assert shown.code == 0, shown.err
@@ -66,6 +67,7 @@ def test_a_setup_with_ranges_is_tuned_for_them(quell: object, tmp_path: Path) ->
     setup = load(out)
     assert setup.description.plant.uncertain == {"k": (0.9, 1.1)}
     assert setup.controller.observer.order == 4
+    assert setup.controller.feedforward
 
 
 def test_the_help_names_all_structures(quell: object) -> None:

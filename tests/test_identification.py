@@ -405,6 +405,7 @@ def test_the_report_has_all_of_it() -> None:
     ):
         assert part in str(found)
     told = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert told["friction_width"] == found.friction_width > 0.0
     assert told["poles"][1]["real"] == pytest.approx(found.poles[1].value.real)
     assert set(told["fits"]) == {
         "estimation",

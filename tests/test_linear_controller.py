@@ -10,6 +10,7 @@ import pytest
 
 import quell as ql
 from quell.controllers import LinearController, LinearLaw, Prefiltered
+from quell.controllers.baselines import PID
 from quell.controllers.linear.transfer import anti_windup, as_state_space, realised, tustin
 
 from .contracts.python_models import LeastMeanSquares
@@ -146,6 +147,18 @@ def test_a_law_without_integrator_starts_at_its_own_rest() -> None:
         [1.0, 2.0], [0.1, 1.0], dt=0.01, feedback="output"
     )
     assert [controller.step(0.0, 3.0) for _ in range(3)] == pytest.approx([-6.0] * 3)
+
+
+def test_a_controller_with_integral_action_starts_under_load() -> None:
+    """PID and PI continue from u, also to another reference; a law without integrator says why not."""
+    pid = PID(kp=2.0, ki=1.0, kd=0.5, tf=0.1, dt=0.01)
+    pid.start(3.0, 1.5)
+    assert [pid.step(3.0, 3.0) for _ in range(20)] == pytest.approx([1.5] * 20)
+    pid.start(3.0, 1.5, r=4.0)
+    assert pid.step(4.0, 3.0) == pytest.approx(1.5)
+    assert pid.step(4.0, 3.0) > 1.5
+    with pytest.raises(ValueError, match=r"u = 1.0 at y = 2.0: the law has no integral action"):
+        PID(kp=1.0, dt=0.01).start(2.0, 1.0)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

@@ -210,7 +210,9 @@ def test_the_record_becomes_a_labelled_dataset(run: ql.Trajectory) -> None:
     np.testing.assert_array_equal(data["y"].values, run["y"])
     assert list(data["theta_index"].values) == ["x1", "x2", "x3", "x4", "bias"]
     assert data["time"].attrs["units"] == "s"
-    assert data["u"].attrs["long_name"] == "control signal as applied"
+    assert data["u"].attrs == {"long_name": "force as applied", "units": "N"}
+    assert data["x_hat"].attrs["units"] == "m, m/s, m/s², m/s³"
+    assert data["f_hat"].attrs["units"] == "m/s⁴"
     assert data.attrs["plant"] == "two-mass-spring"
     assert float(data["y"].sel(time=5.0, method="nearest")) == run["y"][1000]
 
@@ -321,7 +323,8 @@ def test_a_data_frame_has_a_row_for_each_sample_and_units(
     assert set(frame.columns) == set(direct.columns)
     np.testing.assert_array_equal(frame[direct.columns].to_numpy(), direct.to_numpy())
     np.testing.assert_array_equal(direct["x[1]"], run["x"][:, 1])
-    assert direct.attrs["units"]["u"] == "u-unit"
+    assert direct.attrs["units"]["u"] == "N"
+    assert direct.attrs["units"] == frame.attrs["units"]
     path = tmp_path / "run.csv"
     run.to_csv(path)
     head, *lines = path.read_text().splitlines()
@@ -343,7 +346,7 @@ def test_names_and_units_are_in_files_and_come_back(tmp_path: Path) -> None:
     assert (again.signals, again.u_limits) == (run.signals, (-0.2, 0.3))
     data = again.to_xarray()
     assert data["y"].attrs == {"long_name": "position", "units": "m"}
-    assert data["f_hat"].attrs["units"] == "m/s^n"
+    assert data["f_hat"].attrs["units"] == "m/s⁴"
     run.to_csv(tmp_path / "run.csv")
     assert "y [m],y_measured [m],u [N]" in (tmp_path / "run.csv").read_text().splitlines()[0]
 

@@ -1,4 +1,4 @@
-"""Names and units of the signals of a loop: output y, control signal u and disturbances w."""
+"""Names and units of the signals of a loop: output y, control signal u, disturbances w, and f."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 _TEXT = re.compile(r"\s*([^\[\]]*?)\s*(?:\[([^\[\]]*)\])?\s*")
 # A unit that needs brackets before "/s".
 _COMPOUND = re.compile(r"[\s/*·]")
+_SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class Quantity(NamedTuple):
@@ -35,10 +36,13 @@ class Signals(NamedTuple):
     y: Quantity = Quantity()
     u: Quantity = Quantity()
     w: tuple[Quantity, ...] = ()
+    f: Quantity = Quantity()
 
     @classmethod
-    def of(cls, y: Any = "", u: Any = "", w: Any = ()) -> Signals:
+    def of(cls, y: Any = "", u: Any = "", w: Any = (), f: Any = "") -> Signals:
         """Return the signals of texts ``name [unit]``, of which w has one for each disturbance.
+
+        f is the total disturbance as the controller estimates it.
 
         Raises
         ------
@@ -50,15 +54,20 @@ class Signals(NamedTuple):
         if not isinstance(w, Iterable):
             raise ValueError(f"w = {w!r:.60}: must be a list of names with units")
         many = tuple(_quantity(f"w[{i}]", each) for i, each in enumerate(w))
-        return cls(_quantity("y", y), _quantity("u", u), many)
+        return cls(_quantity("y", y), _quantity("u", u), many, _quantity("f", f))
 
     @property
     def known(self) -> bool:
         """Whether any name or unit is given."""
-        return any(each != Quantity() for each in (self.y, self.u, *self.w))
+        return any(each != Quantity() for each in (self.y, self.u, *self.w, self.f))
 
     def unit(self, of: str) -> str:
-        """Return a unit in which ``y-unit``, ``u-unit`` and ``w-unit`` stand for those known."""
+        """Return a unit in which ``y-unit``, ``u-unit`` and ``w-unit`` stand for those known.
+
+        So does ``y-unit/s^n``, the unit of f.
+        """
+        if self.f.unit:
+            of = of.replace("y-unit/s^n", self.f.unit)
         units = {"y-unit": self.y.unit, "u-unit": self.u.unit, "w-unit": self._common_unit}
         for placeholder, unit in units.items():
             if unit and placeholder in of:
@@ -66,6 +75,18 @@ class Signals(NamedTuple):
                 text = f"({unit})" if _COMPOUND.search(unit) and not whole else unit
                 of = of.replace(placeholder, text)
         return of
+
+    def derivative(self, order: int) -> str:
+        """Return the unit of a derivative of y by time; empty if that of y is unknown."""
+        if not (self.y.unit and order):
+            return self.y.unit
+        power = str(order).translate(_SUPERSCRIPT) if order > 1 else ""
+        return self.unit(f"y-unit/s{power}")
+
+    def with_f(self, degree: int | None) -> Signals:
+        """Return the signals with f in the unit of the derivative of y of this order."""
+        unit = "" if degree is None else self.derivative(degree)
+        return self._replace(f=Quantity("", unit)) if unit else self
 
     @property
     def _common_unit(self) -> str:
@@ -75,6 +96,7 @@ class Signals(NamedTuple):
     def texts(self) -> dict[str, Any]:
         """Return the arguments of ``of``: texts by signal, without those that are empty."""
         found: dict[str, Any] = {"y": str(self.y), "u": str(self.u), "w": [*map(str, self.w)]}
+        found["f"] = str(self.f)
         return {key: value for key, value in found.items() if any(value)}
 
 

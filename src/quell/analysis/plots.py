@@ -140,7 +140,7 @@ def plot_gang_of_four(
 
 
 def plot_margins_over_time(
-    times: Any, loops: Sequence[LoopAnalysis], axes: Any = None, **style: Any
+    times: Any, loops: Sequence[LoopAnalysis], axes: Any = None, *, ax: Any = None, **style: Any
 ) -> list[Axes]:
     """Plot the margins of the loop with its learner frozen at each instant; return the axes.
 
@@ -150,7 +150,7 @@ def plot_margins_over_time(
         instants [s].
     loops
         one for each, from ``loops_over_time``.
-    axes, style
+    axes, ax, style
         as for ``plot_bode``, but with three axes.
 
     Raises
@@ -158,7 +158,7 @@ def plot_margins_over_time(
     ValueError
         for another number of loops than instants, or of axes.
     """
-    axes = _plot_margins(checks.vector("times", times), loops, axes, style)
+    axes = _plot_margins(checks.vector("times", times), loops, given_axes(axes, ax), style)
     axes[-1].set_xlabel("learner frozen at [s]")
     return axes
 
@@ -168,6 +168,8 @@ def plot_margins_against_omega_o(
     make_controller: Callable[[float], Controller],
     omegas: Any,
     axes: Any = None,
+    *,
+    ax: Any = None,
     **lags: float,
 ) -> list[Axes]:
     """Plot the margins, and the noise in u, over the observer's bandwidth; return the axes.
@@ -176,7 +178,7 @@ def plot_margins_against_omega_o(
     ----------
     plant, make_controller, omegas, lags
         as for ``loops_over_omega_o``.
-    axes
+    axes, ax
         four matplotlib axes; a new figure by default.
 
     Raises
@@ -186,12 +188,12 @@ def plot_margins_against_omega_o(
     """
     loops = loops_over_omega_o(plant, make_controller, omegas, **lags)
     omegas = checks.vector("omegas", omegas)
-    axes = _axes(axes, 4, 1)
+    axes = _axes(given_axes(axes, ax), 4, 1)
     _plot_margins(omegas, loops, axes[:3], {})
     axes[3].loglog(omegas, [loop.noise_to_control if loop.stable else np.nan for loop in loops])
     _finish(axes[3], "RMS of u per\nRMS of noise")
-    for ax in axes:
-        ax.set_xscale("log")
+    for each in axes:
+        each.set_xscale("log")
     axes[3].set_xlabel("omega_o [rad/s]")
     return axes
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from quell.identification.validation import nrmse
 from quell.realtime.loop.result import RigRun
 from quell.realtime.loop.run import run_rig
 from quell.realtime.loop.safety import Safety
-from quell.records.plotting import given_axes
+from quell.records.plotting import given_axes, grid_of_axes, new_figure
 from quell.records.trajectory import Trajectory
 from quell.signals import Step
 from quell.simulation.scenario import Scenario
@@ -70,11 +71,8 @@ class Verification:
 
     def plot(self, axes: Any = None, *, ax: Any = None) -> Any:
         """Draw y and u, measured and predicted, into two axes; return them."""
-        axes = given_axes(axes, ax)
-        if axes is None:
-            import matplotlib.pyplot as plt
-
-            _, axes = plt.subplots(2, 1, sharex=True, figsize=(8.0, 6.0), layout="constrained")
+        make = partial(new_figure, 8.0, 6.0)
+        axes = grid_of_axes(given_axes(axes, ax), make, 2, sharex=True)[:, 0]
         t = np.arange(self.y.size) * self.predicted.dt
         reference = np.where(t >= self.at, self.height, 0.0)
         axes[0].plot(t, reference, color="0.6", linewidth=1.0, label="reference")

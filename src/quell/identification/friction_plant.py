@@ -4,17 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from quell.identification.model.sampling import observable
 from quell.identification.result import Identified
 from quell.plants.delay import delayed
-from quell.plants.nonlinear.plant import NonlinearPlant
-from quell.types import Vector
-
-# Width of the smooth sign of the speed, relative to the RMS speed in the record: by hand, so that
-# creeping within it is far slower than motion.
-_WIDTH = 0.02
+from quell.plants.nonlinear.friction import FrictionPlant
 
 
 def simulated_plant(found: Identified) -> Any:
@@ -35,24 +27,9 @@ def simulated_plant(found: Identified) -> Any:
         for direct feedthrough.
     """
     plant: Any = found.plant
-    order = found.den.size - 1
-    if (found.friction or 0.0) > 0.0 and found.num.size < order:  # else y' jumps with u
-        plant = _with_friction(found)
+    width = found.friction_width
+    if found.friction is not None and width is not None:
+        plant = FrictionPlant(plant, found.num, found.den, found.friction, width, plant.name)
     if late := round(found.delay / found.dt):
         plant = delayed(plant, late * found.dt, found.dt)
     return plant
-
-
-def _with_friction(found: Identified) -> NonlinearPlant:
-    order, force = found.den.size - 1, float(found.friction or 0.0)
-    A = observable(found.den[:0:-1].copy())
-    B = np.zeros(order)
-    B[order - found.num.size :] = found.num
-    speed = np.diff(found.simulated[: found.held_from]) / found.dt
-    width = _WIDTH * float(np.sqrt(np.mean(speed**2)))
-
-    def rate(t: float, x: Vector, u: float, w: Vector) -> Vector:
-        dx = A @ x
-        return dx + B * (u + w[0] - force * np.tanh(dx[0] / width))
-
-    return NonlinearPlant(rate, order, lambda x: x[0], disturbances=1, name="identified plant")

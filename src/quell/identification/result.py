@@ -18,6 +18,9 @@ from quell.plants.linear import LinearPlant
 from quell.records.plotting import given_axes
 from quell.types import Matrix, Vector
 
+# Width of the smooth sign of the speed, relative to the RMS speed in the record: by hand, so that
+# creeping within it is far slower than motion.
+_FRICTION_WIDTH = 0.02
 # A pole and a zero within three standard deviations may be equal (99.7 %).
 _DEVIATIONS = 3.0
 
@@ -179,6 +182,17 @@ class Identified:
         order = self.den.size - 1
         return f"Identified(order={order}, poles {poles} rad/s, fit {percent(fit, 2)} %)"
 
+    @property
+    def friction_width(self) -> float | None:
+        """Speed around which the sign of the friction is smooth in simulations [y-unit/s].
+
+        None for a model without friction, or whose speed jumps with u.
+        """
+        if not self.friction or self.friction < 0.0 or self.num.size >= self.den.size - 1:
+            return None
+        speed = np.diff(self.simulated[: self.held_from]) / self.dt
+        return _FRICTION_WIDTH * float(np.sqrt(np.mean(speed**2))) or None
+
     def to_json(self) -> dict[str, Any]:
         """Return the results without the record, for JSON; None for numbers that are not finite."""
         from quell.files import nonfinite_to_none
@@ -193,6 +207,7 @@ class Identified:
             "delay": self.delay,
             "bias": self.bias,
             "friction": self.friction,
+            "friction_width": self.friction_width,
             "dt": self.dt,
             "samples": self.y.size,
             "held_from": self.held_from,

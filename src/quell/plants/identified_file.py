@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,18 @@ from typing import Any
 from quell import checks
 from quell.plants.base import Plant
 from quell.plants.delay import delayed
+from quell.plants.nonlinear.friction import FrictionPlant
 from quell.plants.linear import LinearPlant
 from quell.reading import whole_text
+from quell.types import DesignWarning
 
 
 def identified(path: str | os.PathLike[str], dt: float) -> Plant:
     """Return the plant that `quell identify --json` or `quell tune --json` found in a record.
 
-    It is the transfer function with its delay. Constant force and dry friction are left out.
+    It is the transfer function with its delay and its dry friction, as
+    ``quell.identification.simulated_plant`` has it; designs use its part without friction. The
+    constant force is left out.
 
     Parameters
     ----------
@@ -38,7 +43,16 @@ def identified(path: str | os.PathLike[str], dt: float) -> Plant:
         numbers[name] = checks.vector(f"{path}: {name}", found[name])
     delay = checks.non_negative(f"{path}: delay", found.get("delay", 0.0), "s")
     name = f"identified plant ({Path(path).name})"
-    plant = LinearPlant.of((numbers["num"], numbers["den"]), name=name)
+    linear = LinearPlant.of((numbers["num"], numbers["den"]), name=name)
+    plant: Plant = linear
+    force, width = found.get("friction"), found.get("friction_width")
+    if force and width:
+        force = checks.positive(f"{path}: friction", force, "u-unit")
+        width = checks.positive(f"{path}: friction_width", width, "y-unit/s")
+        plant = FrictionPlant(linear, numbers["num"], numbers["den"], force, width, name)
+    elif force and "friction_width" not in found:
+        text = f"{path}: its friction is left out: the file is of an older quell; identify again"
+        warnings.warn(text, DesignWarning, stacklevel=2)
     late = round(delay / checks.positive("dt", dt, "s"))
     return delayed(plant, late * dt, dt) if late else plant
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from quell.lti.models import is_linear_model
 from quell.plants.delay import DelayedPlant
 from quell.plants.encoder import EncodedPlant
+from quell.plants.nonlinear.friction import FrictionPlant
 from quell.plants.linearise import linearised
 from quell.plants.nonlinear.kernels import value_or_nan
 from quell.plants.nonlinear.plant import NonlinearPlant, checked_point
@@ -25,6 +27,9 @@ def linear_model(plant: Any) -> Any:
     if isinstance(plant, NonlinearPlant):
         with suppress(ValueError):
             return linearised(plant, *operating_point_of(plant))
+    if isinstance(plant, DelayedPlant | EncodedPlant):
+        inner = linear_model(plant.plant)
+        return plant if inner is plant.plant else replace(plant, plant=inner)
     return getattr(plant, "linear", plant)
 
 
@@ -49,9 +54,10 @@ def operating_point_of(plant: NonlinearPlant) -> tuple[Any, float]:
 def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any, float]:
     """Return a linear plant and the delay [s] of its input, for ``analyse``.
 
-    An encoder is left out: its steps are no gain. A nonlinear plant is linearised at the
-    ``operating_point`` (x, u), by default its own. Raises ``ValueError`` for a delay that was made
-    for another sample time, and for a nonlinear plant without operating point.
+    An encoder is left out: its steps are no gain. So is the friction of an identified model. A
+    nonlinear plant is linearised at the ``operating_point`` (x, u), by default its own. Raises
+    ``ValueError`` for a delay that was made for another sample time, and for a nonlinear plant
+    without operating point.
     """
     delay = 0.0
     while isinstance(plant, DelayedPlant | EncodedPlant):
@@ -68,6 +74,8 @@ def linear_part(plant: Any, dt: float, operating_point: Any = None) -> tuple[Any
         return linearised(plant, *checked_point(operating_point)), delay
     if isinstance(plant, NonlinearPlant):
         return linearised(plant, *operating_point_of(plant)), delay
+    if isinstance(plant, FrictionPlant):  # an identified one: its model is the linear part
+        return plant.linear, delay
     if hasattr(plant, "k_cubic"):
         raise ValueError(
             f"plant = {plant.name!r} is nonlinear: give the point at which it is linearised, "

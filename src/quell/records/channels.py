@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from quell.quantities import UNKNOWN, Signals
 from quell.types import Channels
 
@@ -56,6 +58,25 @@ def describe(name: str, signals: Signals = UNKNOWN) -> tuple[str, str]:
     elif name == "w" and any(each.name for each in signals.w):
         text = f"{text}: {', '.join(map(str, signals.w))}"
     return text, signals.unit(unit)
+
+
+def units_of(name: str, width: int, signals: Signals = UNKNOWN) -> list[str]:
+    """Return the unit of each entry of a channel with ``width`` entries."""
+    if name == "x_hat" and signals.y.unit:
+        return [signals.derivative(i) for i in range(width)]
+    if name == "w" and len(signals.w) == width:
+        return [each.unit or "w-unit" for each in signals.w]
+    return [describe(name, signals)[1]] * width
+
+
+def signals_of_loop(signals: Signals, controller: Any) -> Signals:
+    """Return the plant's signals with the unit of the controller's f, if it has an observer."""
+    while controller is not None:
+        observer = getattr(controller, "observer", None)
+        if observer is not None:
+            return signals.with_f(getattr(observer, "f_degree", None))
+        controller = getattr(controller, "controller", None)
+    return signals
 
 
 def is_vector(name: str, width: int) -> bool:

@@ -20,17 +20,20 @@ class RecordDataset(xarray.Dataset):  # type: ignore[no-untyped-call]
         ``attrs["units"]`` has the unit of each column.
         """
         flat: dict[Hashable, Any] = {}
+        units: dict[str, str] = {}
         for name, values in self.data_vars.items():
             axis = f"{name}_index"
+            unit = values.attrs.get("units", "1")
             if axis not in values.dims:
-                flat[name] = values
+                flat[name], units[str(name)] = values, unit
                 continue
             labels = values[axis].values.tolist()
             texts = [label if isinstance(label, str) else str(i) for i, label in enumerate(labels)]
+            several = unit.split(", ")
+            each = several if len(several) == len(texts) else [unit] * len(texts)
             for i, text in enumerate(texts):
                 flat[f"{name}[{text}]"] = values.isel({axis: i}, drop=True)
+                units[f"{name}[{text}]"] = each[i]
         frame = xarray.Dataset(flat).to_dataframe(dim_order)
-        frame.attrs["units"] = {
-            str(key): each.attrs.get("units", "1") for key, each in flat.items()
-        }
+        frame.attrs["units"] = units
         return frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,31 @@ def given_axes(axes: Any, ax: Any) -> Any:
         raise ValueError("axes and ax: are two names of the same; give one")
     found = ax if axes is None else axes
     return np.ravel(found) if np.ndim(found) > 1 else found
+
+
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure [inch] of ``pyplot`` that is laid out automatically."""
+    import matplotlib.pyplot as plt
+
+    return plt.figure(figsize=(width, height), layout="constrained")
+
+
+def grid_of_axes(
+    ax: Any, make: Callable[[], Any], rows: int, columns: int = 1, **shared: Any
+) -> Any:
+    """Return axes (rows, columns): those given, or new ones in a figure that ``make`` returns.
+
+    Raises
+    ------
+    ValueError
+        for another number of axes.
+    """
+    if ax is None:
+        return make().subplots(rows, columns, squeeze=False, **shared)
+    found = np.ravel(np.asarray(ax, dtype=object))
+    if found.size != rows * columns:
+        raise ValueError(f"ax: must be {rows * columns} matplotlib axes, got {found.size}")
+    return found.reshape(rows, columns)
 
 
 def plot_run(run: Any, diverged_at: float | None, axes: Any = None) -> Any:
@@ -144,7 +170,7 @@ def _draw_estimates(run: Any, ax: Any) -> None:
         if name in run.names and (name == "f_hat" or learner):
             draw_line(ax, run.t, run[name], label=label, linewidth=1.0)
     unit = run.signals.unit("y-unit/s^n") if run.signals.y.unit else ""
-    ax.set_ylabel(Quantity("total disturbance", unit).label(""))
+    ax.set_ylabel(Quantity(run.signals.f.name, unit).label("total disturbance"))
 
 
 def plot_batch(runs: Record, diverged: NDArray[np.bool_], ended: Vector, axes: Any = None) -> Any:

@@ -12,7 +12,13 @@ import numpy as np
 from quell import checks
 from quell.files import check_writable, written_atomically
 from quell.quantities import Signals
-from quell.records.channels import columns_of, describe, is_vector, readable_names
+from quell.records.channels import (
+    columns_of,
+    describe,
+    is_vector,
+    readable_names,
+    units_of,
+)
 from quell.records.sample_times import first_sample_at
 from quell.types import Channels, Matrix, Vector
 
@@ -82,6 +88,8 @@ class Record:
                 labels: list[Any] = list(self.features) if name == "theta" else []
                 coordinates[axis] = (axis, labels or list(range(1, values.shape[-1] + 1)), {})
                 of_channel = (*axes, axis)
+                units = units_of(name, values.shape[-1], self.signals)
+                unit = units[0] if len(set(units)) == 1 else ", ".join(units)
             variables[name] = (of_channel, values, {"long_name": about, "units": unit})
         attributes = {"dt": self.dt, "every": self.every, **attributes}
         if self.signals.known:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from quell.files import check_writable, written_atomically
-from quell.records.channels import describe
+from quell.records.channels import units_of
 from quell.records.record import Record
 from quell.types import Matrix
 
@@ -21,7 +21,6 @@ def columns(run: Record) -> tuple[list[str], list[str], Matrix]:
     names, units, parts = ["time"], ["s"], [run.t[:, None]]
     for name in run.names:
         values = np.asarray(run[name])
-        unit = describe(name, run.signals)[1]
         if values.ndim == 1:
             values, own = values[:, None], [name]
         else:
@@ -29,7 +28,7 @@ def columns(run: Record) -> tuple[list[str], list[str], Matrix]:
             entries = range(values.shape[1])
             own = [f"{name}[{labels[i] if i < len(labels) else i}]" for i in entries]
         names += own
-        units += [unit] * len(own)
+        units += units_of(name, len(own), run.signals)
         parts.append(values)
     return names, units, np.hstack(parts)
 

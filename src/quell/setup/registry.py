@@ -177,7 +177,8 @@ Scenario = call_table("scenario", SimulationScenario, only=True, types=_SIGNALS)
 Metrics = call_table("metrics", Trajectory.metrics, only=True)
 _Y_AND_U = {"y": str, "u": str}
 Safety = call_table("safety", RigSafety, only=True)
-Labels = call_table("signals", Signals.of, only=True, types={"w": list_of(str)} | _Y_AND_U)
+_LABELS = {"w": list_of(str)} | _Y_AND_U
+Labels = call_table("signals", Signals.of, only=True, types=_LABELS, without=("f",))
 _RIG = {"safety": Safety | None, "telemetry": list_of(str), "signals": Labels | None}
 _BOUNDS = tuple(inspect.signature(Constraints).parameters)
 _NOT_IN_FILES = (

@@ -32,8 +32,8 @@ def tuning_task(
     """Read a setup file for ``quell.tune``; ``changes`` are values of ``[tune]`` by name.
 
     Observer, controller, learner, guard and prefilter of the file are left out: they are what is
-    tuned. Dry friction and limits of the plant are left out, too, unless the tuning is by
-    simulation (``trials``); its limits of u stay.
+    tuned. The limits of u stay, and the controller's feedforward. Dry friction and limits of the
+    plant are left out, too. A tuning by simulation (``trials``) has them, and no feedforward.
 
     Raises
     ------
@@ -54,6 +54,8 @@ def tuning_task(
         limits = ("u_min", "u_max", "rate_limit")
         options = {key: given[key] for key in limits if key in given} | options
     options["setup"] = {key: value for key, value in data.items() if key not in _REPLACED}
+    if isinstance(given, Mapping) and "feedforward" in given and "search" not in options:
+        options["setup"]["controller"] = {"feedforward": given["feedforward"]}
     part = linear_model
     if "search" in options:
         options["scenario"], part = setup.needed("scenario"), _whole

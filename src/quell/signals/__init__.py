@@ -40,6 +40,7 @@ KINDS: Mapping[str, type[Signal]] = {
     "multisine": Multisine,
     "trapezoid": Trapezoid,
     "move": SmoothMove,
+    "smooth-move": SmoothMove,  # the same, by the name of the class
     "samples": Samples,
     "repeated": Repeated,
     "noise": BandLimitedNoise,

@@ -17,7 +17,7 @@ from quell.plants.base import Plant, check_plant
 from quell.plants.batch import PlantBatch
 from quell.plants.labelled import signals_of
 from quell.records.batch_trajectory import BatchTrajectory
-from quell.records.channels import columns_of, readable_names
+from quell.records.channels import columns_of, readable_names, signals_of_loop
 from quell.simulation.divergence import judge_integration
 from quell.simulation.driver import SIGNALS, Loop, logged_channels
 from quell.simulation.lane_batch import Outcome, run_over_lanes
@@ -93,7 +93,7 @@ def simulate_batch(
         plant=name,
         parameters=plants.parameters if isinstance(plants, PlantBatch) else {},
         features=controllers[0].features,
-        signals=signals_of(plants[0]),
+        signals=signals_of_loop(signals_of(plants[0]), controllers[0]),
         final_states=tuple(loop.state for loop in loops.values()) if exact else (),
     )
 

@@ -16,6 +16,7 @@ from quell.kernels.dispatch import call_specialised, compiled, interpreted
 from quell.plants.base import advance
 from quell.plants.delay import DelayedPlantModel
 from quell.plants.encoder import EncodedPlantModel
+from quell.plants.nonlinear.friction import FrictionModel
 from quell.plants.nonlinear.kernels import (
     CompiledNonlinear,
     CompiledParametric,
@@ -80,7 +81,7 @@ class IntegrationCheck:
             if isinstance(model, DelayedPlantModel):
                 self._size, self._delay = model.size, 1
             model = model.inner
-        kinds = CompiledNonlinear | CompiledParametric | PythonNonlinear
+        kinds = CompiledNonlinear | CompiledParametric | PythonNonlinear | FrictionModel
         self.needed = isinstance(model, kinds)
         self.model, self.error, self.enough = model, 0.0, 0
         self._step_differences = (

@@ -18,6 +18,7 @@ from quell.plants.base import Plant, check_plant
 from quell.plants.labelled import signals_of
 from quell.plants.linear import LinearPlant
 from quell.records.batch_trajectory import BatchTrajectory
+from quell.records.channels import signals_of_loop
 from quell.records.trajectory import Trajectory
 from quell.simulation.batch import simulate_batch
 from quell.simulation.divergence import judge_integration
@@ -175,7 +176,7 @@ def simulate(
         limit=sampled.limit,
         plant=plant.name,
         features=controller.features,
-        signals=signals_of(plant),
+        signals=signals_of_loop(signals_of(plant), controller),
         u_limits=limits_of(controller),
         final_state=loop.state,
     )

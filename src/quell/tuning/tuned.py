@@ -130,12 +130,19 @@ class Tuned:
         return draw(self.plants, chosen | others, self.constraints, given_axes(axes, ax))
 
     def toml(self) -> str:
-        """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``."""
+        """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``.
+
+        An ADRC has the feedforward of the setup that was tuned: it is no matter of the loop.
+        """
         comment = f"{self.design.name}, tuned by quell\nconstraints: {self.constraints}\n"
         comment += f"active: {', '.join(self.active) or 'none'}"
         replaced = ("observer", "controller")
         tables = {key: value for key, value in self.setup.items() if key not in replaced}
-        return toml_text({**tables, **self.design.tables}, comment)
+        designed = {key: dict(table) for key, table in self.design.tables.items()}
+        before, law = self.setup.get("controller", {}), designed["controller"]
+        if law["kind"] == "adrc" and "feedforward" in before:
+            law["feedforward"] = before["feedforward"]
+        return toml_text({**tables, **designed}, comment)
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write ``toml()`` into a file, whole or not at all; an existing one is not replaced."""

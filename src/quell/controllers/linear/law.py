@@ -67,21 +67,21 @@ def checked_law(law: Any) -> LinearLaw:
     return LinearLaw(A, B_r, B_y, B_u, C, D_r, D_y)
 
 
-def rest_state(law: LinearLaw) -> Vector:
-    """Return the state (m,) of a law at rest at r = y = 1, with u = 0 or as close as possible.
+def rest_state(law: LinearLaw, y: float = 1.0, u: float = 0.0) -> Vector:
+    """Return the state (m,) of a law at rest at r = y, with ``u`` or as close as possible.
 
-    Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y))`` it is the one whose u
-    is closest to zero: an integrator balances the rest of the law. Without such a state, it is the
-    least-squares solution.
+    Of all states with ``x = (A + B_u C) x + (B_r + B_y + B_u (D_r + D_y)) y`` it is the one whose
+    control signal is closest to u: an integrator balances the rest of the law. Without such a
+    state, it is the least-squares solution.
     """
     if law.C.size == 0:
         return np.zeros(0)
     D = law.D_r + law.D_y
     difference = np.eye(law.C.size) - law.A - np.outer(law.B_u, law.C)
-    x = np.linalg.pinv(difference, rcond=_RANK) @ (law.B_r + law.B_y + law.B_u * D)
+    x = np.linalg.pinv(difference, rcond=_RANK) @ ((law.B_r + law.B_y + law.B_u * D) * y)
     _, singular, rows = np.linalg.svd(difference)
     free = rows[singular <= _RANK * np.max(singular)]
     output = free @ law.C
     if output @ output > 0.0:
-        x = x - free.T @ output * ((law.C @ x + D) / (output @ output))
+        x = x - free.T @ output * ((law.C @ x + D * y - u) / (output @ output))
     return np.ascontiguousarray(x)

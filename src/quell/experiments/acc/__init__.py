@@ -6,7 +6,7 @@ May import ``tuning``, ``experiments.common`` and ``experiments.compare``.
 from quell.experiments.acc.cases import CaseResult, study_cases
 from quell.experiments.acc.controllers import DT, PUBLISHED, TransferFunction, designs
 from quell.experiments.acc.criteria import Judged, judge
-from quell.experiments.acc.figures import against_spread, save
+from quell.experiments.acc.figures import against_spread, draw, save
 from quell.experiments.acc.published import judge_published
 from quell.experiments.acc.samples import boxed, generated, plant, read, widened
 from quell.experiments.acc.stability import unstable
@@ -24,6 +24,7 @@ __all__ = [
     "against_spread",
     "boxed",
     "designs",
+    "draw",
     "generated",
     "interval",
     "judge",

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from quell import checks
 from quell.experiments.acc.controllers import DT, MF, MOST_U, OURS, PUBLISHED, designs
 from quell.experiments.acc.criteria import DURATION, MOST_Y, SETTLED_AT
 from quell.experiments.acc.published import judge_published
 from quell.experiments.acc.samples import generated, plant
 from quell.experiments.acc.study import SPRINGS, Result, judge_sampled, records
-from quell.experiments.common.figures import new_figure, save_figures
+from quell.experiments.common.figures import save_figures
+from quell.records.plotting import grid_of_axes, new_figure
 from quell.sweeping.shares import share_interval as interval
 from quell.types import Matrix, Progress
 
@@ -33,13 +35,37 @@ def save(
     result: Result, folder: str | os.PathLike[str], progress: Progress, overwrite: bool = False
 ) -> list[Path]:
     """Draw the figures into ``folder``, created if missing; return the paths."""
-    drawings: tuple[Callable[[], Any], ...] = (
-        partial(_failures, result),
-        partial(_responses, result.samples[:_RESPONSES]),
-        lambda: _spread(against_spread(progress)),
-    )
-    named = dict(zip(NAMES, drawings, strict=True))
+    named = {name: partial(draw, result, name, progress=progress) for name in NAMES}
     return save_figures(named, folder, progress, overwrite=overwrite)
+
+
+def draw(
+    result: Result, name: str, ax: Any = None, *, progress: Progress = lambda part, share: None
+) -> Any:
+    """Draw one of the figures ``NAMES`` and return its axes.
+
+    Parameters
+    ----------
+    result
+        of ``run``.
+    name
+        ``"acc-failures"`` with one axes, ``"acc-responses"`` with two for each of our three
+        controllers, ``"acc-spread"`` with two; the last one is simulated for a minute.
+    ax
+        axes to draw into; those of a new figure by default.
+    progress
+        is told about that minute.
+
+    Raises
+    ------
+    ValueError
+        for another name or number of axes.
+    """
+    if checks.one_of("name", name, NAMES) == "acc-failures":
+        return _failures(result, ax)
+    if name == "acc-responses":
+        return _responses(result.samples[:_RESPONSES], ax)
+    return _spread(against_spread(progress), ax)
 
 
 def against_spread(
@@ -61,10 +87,10 @@ def against_spread(
     return found
 
 
-def _failures(result: Result) -> Any:
+def _failures(result: Result, given: Any) -> Any:
     """Draw the failure rates with their intervals."""
-    figure = new_figure(9.0, 5.2)
-    ax = figure.subplots()
+    axes = grid_of_axes(given, partial(new_figure, 9.0, 5.2), 1)[0]
+    (ax,) = axes
     for k, (spring, judged) in enumerate(result.judged.items()):
         rows = [one.to_json() for one in judged.values()]
         rates = np.array([row["failure_rate"] for row in rows], dtype=float)
@@ -81,14 +107,14 @@ def _failures(result: Result) -> Any:
     title = f"ACC benchmark, {len(result.samples)} plants ({result.source})"
     ax.set_title(title, fontsize="medium")
     ax.legend(loc="lower right", fontsize="small")
-    return figure
+    return axes
 
 
-def _responses(samples: Matrix) -> Any:
+def _responses(samples: Matrix, given: Any) -> Any:
     """Draw y and u of our controllers with cubic springs: median, 90 % of the runs, and all."""
     ours = {name: controller for name, controller in designs(DT).items() if name in OURS}
-    figure = new_figure(9.0, 5.2)
-    axes = figure.subplots(2, len(ours), sharex=True, sharey="row")
+    make = partial(new_figure, 9.0, 5.2)
+    axes = grid_of_axes(given, make, 2, len(ours), sharex=True, sharey="row")
     plants = [plant(sample, cubic=True) for sample in samples]
     ended = 0
     for j, (name, controller) in enumerate(ours.items()):
@@ -119,14 +145,14 @@ def _responses(samples: Matrix) -> Any:
         f"Impulse on m2, the first {len(samples)} plants with cubic springs; "
         f"dashed: what is required{lost}"
     )
-    figure.suptitle(title, fontsize="medium")
-    return figure
+    if given is None:
+        axes[0, 0].figure.suptitle(title, fontsize="medium")
+    return axes
 
 
-def _spread(rates: Rates) -> Any:
+def _spread(rates: Rates, given: Any) -> Any:
     """Draw failure rates against the spread of the samples."""
-    figure = new_figure(9.0, 4.0)
-    axes = figure.subplots(1, len(rates), sharey=True)
+    axes = grid_of_axes(given, partial(new_figure, 9.0, 4.0), 1, len(rates), sharey=True)[0]
     for ax, (spring, found) in zip(axes, rates.items(), strict=True):
         for i, (name, points) in enumerate(found.items()):
             rate, low, high = 100.0 * np.array(points).T
@@ -140,6 +166,8 @@ def _spread(rates: Rates) -> Any:
         ax.set_xlabel("spread of the plants (1: as published)")
         ax.grid(alpha=0.3)
     axes[0].set_ylabel(f"of {_COUNT} drawn plants fail [%]")
-    handles = axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=5, fontsize="small")
-    return figure
+    if given is None:
+        handles = axes[0].get_legend_handles_labels()
+        place = {"loc": "outside lower center", "ncols": 5, "fontsize": "small"}
+        axes[0].figure.legend(*handles, **place)
+    return axes

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from quell.files import check_free, written_atomically
 from quell.records.trajectory import Trajectory
 from quell.types import Progress
@@ -24,22 +26,14 @@ PAPER_STYLE = {"font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}
 """Settings of matplotlib for the figures of the paper's experiments."""
 
 
-def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure [inch] that is laid out automatically, independent of ``pyplot``."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def wide_figure(height: float) -> Any:
+def wide_figure(height: float, **margins: float) -> Any:
     """Return an empty figure with fixed margins; an automatic layout takes longer than drawing."""
-    from matplotlib.figure import Figure
+    import matplotlib.pyplot as plt
 
-    figure = Figure(figsize=(9.0, height))
+    figure = plt.figure(figsize=(9.0, height))
     margin = 0.5 / height
-    figure.subplots_adjust(
-        left=0.08, right=0.98, bottom=margin, top=1.0 - 0.65 * margin, hspace=0.3, wspace=0.2
-    )
+    usual = {"left": 0.08, "right": 0.98, "bottom": margin, "top": 1.0 - 0.65 * margin}
+    figure.subplots_adjust(**(usual | {"hspace": 0.3, "wspace": 0.2} | margins))
     return figure
 
 
@@ -69,7 +63,6 @@ def save_figure(
 ) -> list[Path]:
     """Write a figure, or that of some axes, as PNG and SVG, close it, and return the paths."""
     import matplotlib
-    import numpy as np
 
     if not hasattr(figure, "savefig"):
         figure = np.ravel(figure)[0].figure
@@ -98,8 +91,9 @@ def save_figures(
 ) -> list[Path]:
     """Draw figures and write each as PNG and SVG; return the paths.
 
-    ``drawings`` has a function that returns a figure for each name of a file, ``style`` settings of
-    matplotlib. Nothing is drawn if a file exists, unless ``overwrite`` allows to replace it.
+    ``drawings`` has a function that returns a figure or its axes for each name of a file, ``style``
+    settings of matplotlib. Nothing is drawn if a file exists, unless ``overwrite`` allows to
+    replace it.
     """
     import matplotlib
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from quell.experiments.common.figures import save_figures
 from quell.experiments.compare.study import Comparison
-from quell.records.plotting import draw_line, given_axes
+from quell.records.plotting import draw_line, given_axes, grid_of_axes, new_figure
 
 
 def draw(result: Comparison, axes: Any = None, *, ax: Any = None) -> Any:
@@ -29,13 +29,8 @@ def draw(result: Comparison, axes: Any = None, *, ax: Any = None) -> Any:
     numpy.ndarray
         the axes.
     """
-    axes = given_axes(axes, ax)
-    if axes is None:
-        import matplotlib.pyplot as plt
-
-        size = (10.0, 7.0)
-        axes = plt.subplots(2, 1, sharex=True, figsize=size, layout="constrained")[1]
-    above, below = axes
+    make = partial(new_figure, 10.0, 7.0)
+    above, below = axes = grid_of_axes(given_axes(axes, ax), make, 2, sharex=True)[:, 0]
     first = next(iter(result.runs.values()))
     draw_line(above, first.t, first["r"], color="0.3", linestyle="--", linewidth=1.0, label="r")
     variation = {name: np.sum(np.abs(np.diff(run["u"]))) for name, run in result.runs.items()}

@@ -3,51 +3,56 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from quell.experiments.common.figures import new_figure, save_figures
+from quell.experiments.common.figures import save_figures
 from quell.experiments.stress.general.result import GeneralResult
 from quell.experiments.stress.general.trial import HONEST as HONEST_LEARNERS
 from quell.experiments.stress.study import HONEST, Result
+from quell.records.plotting import grid_of_axes, new_figure
 
 _PANELS = {"ratio": "whole run", "load_ratio": "60 s of load"}
 _GENERAL_PANELS = {"rms": "whole run", "window": "worst window", "peak": "largest error"}
 
 
-def draw(result: Result) -> Any:
-    """Return the figure: for each kind the share of runs whose ratio is below x."""
-    groups = {kind: result.of(kind) for kind in result.kinds}
-    return _draw(groups, _PANELS, "RMS error over that of MF-ESO", lambda kind: kind == HONEST)
+def draw(result: Result | GeneralResult, ax: Any = None) -> Any:
+    """Draw for each kind of learner the share of runs whose ratio is below x; return the axes.
 
-
-def draw_general(result: GeneralResult) -> Any:
-    """Return the same figure of the trial in general loops."""
+    Parameters
+    ----------
+    result
+        of ``run``, or of the trial in general loops.
+    ax
+        axes to draw into, two, or three for general loops; those of a new figure by default.
+    """
+    if isinstance(result, Result):
+        groups: Mapping[str, Sequence[Any]] = {kind: result.of(kind) for kind in result.kinds}
+        return _draw(groups, _PANELS, "RMS error over that of MF-ESO", (HONEST,), ax)
     groups = result.grouped(result.healthy, "kind")
-    return _draw(
-        groups, _GENERAL_PANELS, "over that of MF-ESO", lambda kind: kind in HONEST_LEARNERS
-    )
+    return _draw(groups, _GENERAL_PANELS, "over that of MF-ESO", HONEST_LEARNERS, ax)
 
 
 def _draw(
     groups: Mapping[str, Sequence[Any]],
     panels: Mapping[str, str],
     xlabel: str,
-    honest: Callable[[str], bool],
+    honest: Collection[str],
+    given: Any,
 ) -> Any:
-    figure = new_figure(5.5 * len(panels), 4.8)
-    axes = figure.subplots(1, len(panels), sharey=True)
+    make = partial(new_figure, 5.5 * len(panels), 4.8)
+    axes = grid_of_axes(given, make, 1, len(panels), sharey=True)[0]
     for ax, (name, title) in zip(axes, panels.items(), strict=True):
         for i, (kind, outcomes) in enumerate(groups.items()):
             values = np.sort([getattr(outcome, name) for outcome in outcomes])
             values = values[np.isfinite(values)]
             if values.size:
                 shares = (np.arange(values.size) + 1.0) / values.size
-                color, width = ("black", 2.0) if honest(kind) else (f"C{i % 10}", 1.0)
+                color, width = ("black", 2.0) if kind in honest else (f"C{i % 10}", 1.0)
                 style = {"color": color, "linewidth": width, "linestyle": "-" if i < 10 else "--"}
                 ax.step(values, shares, where="post", label=kind, **style)
         ax.axvline(1.0, color="0.5", linewidth=0.8)
@@ -55,12 +60,11 @@ def _draw(
         ax.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("share of runs")
     axes[1].legend(fontsize="small", loc="upper left")
-    return figure
+    return axes
 
 
 def save(
     result: Result | GeneralResult, folder: str | os.PathLike[str], overwrite: bool = False
 ) -> list[Path]:
     """Write the figure into ``folder``, created if missing; return the paths."""
-    chosen = partial(draw, result) if isinstance(result, Result) else partial(draw_general, result)
-    return save_figures({"stress": chosen}, folder, overwrite=overwrite)
+    return save_figures({"stress": partial(draw, result)}, folder, overwrite=overwrite)

@@ -3,7 +3,7 @@
 May import ``experiments.common``.
 """
 
-from quell.experiments.torsional.figures import save
+from quell.experiments.torsional.figures import draw, save
 from quell.experiments.torsional.setup import (
     CASES,
     NAMES,
@@ -28,6 +28,7 @@ __all__ = [
     "Result",
     "Settings",
     "controllers",
+    "draw",
     "model_off",
     "plant",
     "run",

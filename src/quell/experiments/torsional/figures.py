@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from quell import checks
 from quell.experiments.common.figures import (
     ESTIMATES,
     PAPER_STYLE,
@@ -32,9 +33,9 @@ from quell.experiments.torsional.setup import (
     TARGET,
     L,
 )
-from quell.experiments.torsional.study import Case, Result
+from quell.experiments.torsional.study import Result
 from quell.plants import torsional_identified
-from quell.records.plotting import draw_line
+from quell.records.plotting import draw_line, grid_of_axes
 from quell.records.trajectory import Trajectory
 from quell.types import Progress, Vector
 
@@ -60,20 +61,36 @@ def save(
     result: Result, folder: str | os.PathLike[str], progress: Progress, overwrite: bool = False
 ) -> list[Path]:
     """Draw all figures into ``folder``, created if missing; return the paths."""
-    drawings = (
-        partial(_position, result),
-        partial(_control, result),
-        partial(_learning, result.cases[-1]),
-    )
-    named = dict(zip(NAMES, drawings, strict=True))
+    named = {name: partial(draw, result, name) for name in NAMES}
     return save_figures(named, folder, progress, PAPER_STYLE, overwrite)
 
 
-def _position(result: Result) -> Any:
+def draw(result: Result, name: str, ax: Any = None) -> Any:
+    """Draw one of the figures ``NAMES`` and return its axes.
+
+    Parameters
+    ----------
+    result
+        of ``run``.
+    name
+        ``"torsional-position"`` with three axes for each case, ``"torsional-control"`` with two for
+        each case, ``"torsional-learning"`` with two.
+    ax
+        axes to draw into; those of a new figure by default.
+
+    Raises
+    ------
+    ValueError
+        for another name or number of axes.
+    """
+    drawings = dict(zip(NAMES, (_position, _control, _learning), strict=True))
+    return drawings[checks.one_of("name", name, NAMES)](result, ax)
+
+
+def _position(result: Result, given: Any) -> Any:
     """Draw the upper disk's angle: the move, and the arrival on both plants."""
-    figure = wide_figure(8.4)
-    figure.subplots_adjust(top=0.93, hspace=0.2)
-    rows = figure.subplots(len(result.cases), 3, squeeze=False)
+    make = partial(wide_figure, 8.4, top=0.93, hspace=0.2)
+    rows = grid_of_axes(given, make, len(result.cases), 3)
     for case, (move, *arrivals) in zip(result.cases, rows, strict=True):
         runs = case.outcomes[FRICTION].records
         for name, style in _STYLES.items():
@@ -95,15 +112,15 @@ def _position(result: Result) -> Any:
     for ax in rows[-1]:
         ax.set_xlabel("time from the profile's start [s]")
     title = "Upper disk along the trapezoid to π, for each omega_c/omega_o [rad/s]; grey: ±0.2 %"
-    figure.suptitle(title, fontsize="medium", y=0.995)
-    return figure
+    if given is None:
+        rows[0, 0].figure.suptitle(title, fontsize="medium", y=0.995)
+    return rows
 
 
-def _control(result: Result) -> Any:
+def _control(result: Result, given: Any) -> Any:
     """Draw the control signal on both plants."""
-    figure = wide_figure(8.4)
-    figure.subplots_adjust(left=0.1, hspace=0.1, wspace=0.05)
-    rows = figure.subplots(len(result.cases), 2, squeeze=False, sharex=True, sharey="row")
+    make = partial(wide_figure, 8.4, left=0.1, hspace=0.1, wspace=0.05)
+    rows = grid_of_axes(given, make, len(result.cases), 2, sharex=True, sharey="row")
     for case, axes in zip(result.cases, rows, strict=True):
         for ax, kind in zip(axes, PLANTS, strict=True):
             for name in (MF, L, MB):  # the quietest in front
@@ -116,15 +133,14 @@ def _control(result: Result) -> Any:
     rows[0, 0].legend(fontsize="small", loc="upper right", ncols=3)
     for ax in rows[-1]:
         ax.set_xlabel("time from the profile's start [s]")
-    return figure
+    return rows
 
 
-def _learning(case: Case) -> Any:
+def _learning(result: Result, given: Any) -> Any:
     """Draw the coefficients of L-ESO with friction, and the parts of its estimate of f."""
+    case = result.cases[-1]
     run = case.outcomes[FRICTION].records[L]
-    figure = wide_figure(7.2)
-    figure.subplots_adjust(left=0.1)
-    above, below = figure.subplots(2, 1)
+    above, below = axes = grid_of_axes(given, partial(wide_figure, 7.2, left=0.1), 2)[:, 0]
     # The identified plant's own coefficients, f = −(b0/b) a·x + (1 − b0/b)(…), as its gain is b and
     # not b0.
     numbers = -torsional_identified().A[-1] * B0 / float(torsional_identified().B[-1, 0])
@@ -146,7 +162,7 @@ def _learning(case: Case) -> Any:
         ax.axvline(PROFILE_AT, color="0.3", linewidth=1.0, linestyle="--")
         ax.set_xlim(0.0, END)
         ax.legend(fontsize="small", ncols=3, loc="upper right")
-    return figure
+    return axes
 
 
 def _smooth(values: Vector, dt: float) -> Vector:

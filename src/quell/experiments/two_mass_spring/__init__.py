@@ -3,7 +3,7 @@
 May import ``experiments.common``.
 """
 
-from quell.experiments.two_mass_spring.figures import save
+from quell.experiments.two_mass_spring.figures import draw, save
 from quell.experiments.two_mass_spring.gradient_range import Trial, stable_up_to, trials
 from quell.experiments.two_mass_spring.setup import (
     Settings,
@@ -21,6 +21,7 @@ __all__ = [
     "Trial",
     "controller",
     "controllers",
+    "draw",
     "gradient_rate",
     "run",
     "save",

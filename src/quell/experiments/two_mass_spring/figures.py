@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from quell import checks
 from quell.experiments.common.figures import (
     ESTIMATES,
     PAPER_STYLE,
@@ -21,7 +22,7 @@ from quell.experiments.common.figures import (
 from quell.experiments.two_mass_spring.gradient_range import HORIZON
 from quell.experiments.two_mass_spring.setup import END, FORCE_AT, L1, MB, MF, STEP_AT, L
 from quell.experiments.two_mass_spring.study import Result
-from quell.records.plotting import draw_line
+from quell.records.plotting import draw_line, grid_of_axes
 from quell.records.trajectory import Trajectory
 from quell.types import Progress, Vector
 
@@ -46,29 +47,46 @@ def save(
     result: Result, folder: str | os.PathLike[str], progress: Progress, overwrite: bool = False
 ) -> list[Path]:
     """Draw all figures into ``folder``, created if missing; return the paths."""
-    drawings = (
-        partial(_comparison, result, "y", "position of m2 [m]"),
-        partial(_comparison, result, "u", "control force [N]"),
-        partial(_learning, result),
-        partial(_algorithm_1, result),
-    )
-    named = dict(zip(NAMES, drawings, strict=True))
+    named = {name: partial(draw, result, name) for name in NAMES}
     return save_figures(named, folder, progress, PAPER_STYLE, overwrite)
 
 
-def _comparison(result: Result, channel: str, label: str) -> Any:
+def draw(result: Result, name: str, ax: Any = None) -> Any:
+    """Draw one of the figures ``NAMES`` and return its axes.
+
+    Parameters
+    ----------
+    result
+        of ``run``.
+    name
+        ``"position"`` or ``"control"`` with three axes (whole run, two zooms), ``"learning"`` with
+        three, ``"algorithm-1"`` with two.
+    ax
+        axes to draw into; those of a new figure by default.
+
+    Raises
+    ------
+    ValueError
+        for another name or number of axes.
+    """
+    return _DRAWINGS[checks.one_of("name", name, NAMES)](result, ax)
+
+
+def _comparison(channel: str, label: str, result: Result, ax: Any) -> Any:
     """Draw one channel of the controllers of equal bandwidth: whole, and the paper's two zooms."""
-    figure = wide_figure(6.4)
-    axes = figure.subplot_mosaic([["all", "all"], ["step", "force"]])
+    if ax is None:
+        axes = wide_figure(6.4).subplot_mosaic([["all", "all"], ["step", "force"]])
+    else:
+        axes = dict(zip(("all", "step", "force"), grid_of_axes(ax, dict, 3)[:, 0], strict=True))
     spans = {"all": (_FROM, END), "step": _ZOOMS[0], "force": _ZOOMS[1]}
     for place, (start, stop) in spans.items():
-        ax = axes[place]
+        one = axes[place]
         for name, style in _STYLES.items():
             run, label_of_run = result.runs[name], legend_label(name, result.runs[name])
             part = run.window(start, stop)
             if part.stop > part.start:
-                draw_line(ax, run.t[part], run[channel][part], label=label_of_run, **style)
-        ax.set(xlim=(start, stop), xlabel="time [s]")
+                draw_line(one, run.t[part], run[channel][part], label=label_of_run, **style)
+        one.set(xlim=(start, stop), xlabel="time [s]")
     whole = axes["all"]
     whole.set_ylabel(label)
     whole.set_title(
@@ -80,14 +98,13 @@ def _comparison(result: Result, channel: str, label: str) -> Any:
         whole.axvspan(start, stop, color="0.9", zorder=0)
     for place in ("step", "force"):
         axes[place].set_title("zoom {:g} s to {:g} s".format(*spans[place]), fontsize="medium")
-    return figure
+    return np.array([axes[place] for place in spans])
 
 
-def _learning(result: Result) -> Any:
+def _learning(result: Result, ax: Any) -> Any:
     """Draw the coefficients of L-ESO, its estimate of f, and the errors of the three observers."""
     run = result.runs[L]
-    figure = wide_figure(8.0)
-    axes = figure.subplots(3, 1, sharex=True)
+    axes = grid_of_axes(ax, partial(wide_figure, 8.0), 3, sharex=True)[:, 0]
     for i, feature in enumerate(run.features):
         draw_line(axes[0], run.t, run["theta"][:, i], label=feature, color=f"C{i}", linewidth=1.2)
         if feature in _TRUE_THETA:
@@ -106,13 +123,13 @@ def _learning(result: Result) -> Any:
     title = "error of the three estimates of f (MB-ESO estimates what its model leaves)"
     axes[2].set_title(title, fontsize="medium")
     axes[2].set_xlabel("time [s]")
-    for ax in axes[1:]:
-        ax.set_ylabel("f [m/s⁴]")
-    for ax in axes:
-        ax.legend(ncols=5, loc="lower left", fontsize="small")
+    for each in axes[1:]:
+        each.set_ylabel("f [m/s⁴]")
+    for each in axes:
+        each.legend(ncols=5, loc="lower left", fontsize="small")
     axes[2].set_ylim(-0.6, 0.6)
     axes[1].set_ylim(-1.8, 1.4)
-    return figure
+    return axes
 
 
 def _true_disturbance(run: Trajectory, known: bool = False) -> Vector:
@@ -124,10 +141,9 @@ def _true_disturbance(run: Trajectory, known: bool = False) -> Vector:
     return np.asarray(external if known else external - 2.0 * y2)
 
 
-def _algorithm_1(result: Result) -> Any:
+def _algorithm_1(result: Result, ax: Any) -> Any:
     """Draw when Algorithm 1 diverges, and its disturbance peak if it does not."""
-    figure = wide_figure(6.0)
-    above, below = axes = figure.subplots(2, 1, sharex=True)
+    above, below = axes = grid_of_axes(ax, partial(wide_figure, 6.0), 2, sharex=True)[:, 0]
     batches = sorted({trial.batch for trial in result.gradient_trials})
     for marker, batch in zip("osx", batches, strict=False):
         trials = [trial for trial in result.gradient_trials if trial.batch == batch]
@@ -145,6 +161,14 @@ def _algorithm_1(result: Result) -> Any:
             below.axhline(peak, color=color, linestyle="--", linewidth=1.0, label=name)
     below.set_ylim(bottom=0.0)
     below.set(ylabel="disturbance peak, 170–250 s [m]", xlabel="rate · batch / dt [1/s]")
-    for ax in axes:
-        ax.legend(fontsize="small")
-    return figure
+    for each in axes:
+        each.legend(fontsize="small")
+    return axes
+
+
+_DRAWINGS: Mapping[str, Callable[[Result, Any], Any]] = {
+    "position": partial(_comparison, "y", "position of m2 [m]"),
+    "control": partial(_comparison, "u", "control force [N]"),
+    "learning": _learning,
+    "algorithm-1": _algorithm_1,
+}

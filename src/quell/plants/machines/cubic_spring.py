@@ -19,8 +19,9 @@ import numpy as np
 from quell import checks
 from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
+from quell.plants.labelled import labelled
 from quell.plants.linear import LinearModel, LinearPlant
-from quell.plants.machines.two_mass_spring import two_mass_matrices
+from quell.plants.machines.two_mass_spring import SIGNALS, two_mass_matrices
 from quell.types import Vector
 
 
@@ -68,6 +69,7 @@ class CubicSpringPlant:
     k_cubic: float
     name: str = "two-mass-spring with cubic spring"
     compiled = True
+    signals = SIGNALS
 
     @property
     def order(self) -> int:
@@ -127,7 +129,7 @@ def lagged_two_mass_spring(
     A[:4, :4], E[:4] = masses, forces
     A[2, 4], A[4, 4] = effectiveness / float(m1), -1.0 / lag
     B, C = [0.0, 0.0, 0.0, 0.0, 1.0 / lag], [0.0, 1.0, 0.0, 0.0, 0.0]
-    linear = LinearPlant(A, B, C, E, name="two-mass-spring with lag")
+    linear = labelled(LinearPlant(A, B, C, E, name="two-mass-spring with lag"), *SIGNALS[:3])
     if k_cubic is None:
         return linear
     return CubicSpringPlant(linear, float(m1), float(m2), checks.finite("k_cubic", k_cubic))

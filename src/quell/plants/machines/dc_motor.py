@@ -36,7 +36,9 @@ from quell.kernels.dispatch import kernel
 from quell.kernels.sized import Buffer
 from quell.plants.base import advance, measure
 from quell.plants.encoder import EncodedPlantModel
+from quell.plants.labelled import labelled
 from quell.plants.linear import LinearModel, LinearPlant
+from quell.quantities import Signals
 from quell.types import Vector
 
 # Longest sub-step [s]: 84 cogging waves a revolution at 2 revolutions a second then pass in 60 of
@@ -48,6 +50,7 @@ _LONGEST_SAMPLE = 1.0
 # interpolation has an error of 2e-4 of the amplitude.
 _POINTS, _POINTS_A_WAVE = 4096, 32
 _HIGHEST_ORDER = 10_000
+_SIGNALS = Signals.of("angle [rad]", "voltage [V]", ("torque [N m]", "shift of the cogging [rad]"))
 
 
 class DcMotorModel(NamedTuple):
@@ -122,6 +125,7 @@ class DcMotor:
     counts: int | None
     name: str = "DC motor"
     compiled = True
+    signals = _SIGNALS
 
     @property
     def order(self) -> int:
@@ -244,6 +248,7 @@ def dc_motor(
     n = len(B)
     ends = np.eye(n)
     linear = LinearPlant(A, B, ends[0], ends[:, 1:2] / J, name="DC motor without friction")
+    linear = labelled(linear, _SIGNALS.y, _SIGNALS.u, _SIGNALS.w[:1])
     return DcMotor(
         linear=linear,
         coulomb=dry,

@@ -35,7 +35,9 @@ from quell.kernels.dispatch import kernel
 from quell.plants.base import advance, measure
 from quell.plants.delay import DelayedPlantModel
 from quell.plants.encoder import EncodedPlantModel, quantized
+from quell.plants.labelled import labelled
 from quell.plants.linear import LinearModel, LinearPlant
+from quell.quantities import Signals
 from quell.types import Vector
 
 # Longest sub-step [s]: short against the period of the disks' mode at about 6.5 Hz. Chosen by hand.
@@ -45,6 +47,8 @@ _LONGEST_SAMPLE = 1.0
 # Each iteration reduces the error of the two friction torques by six digits, the square of the
 # disks' coupling within a sub-step.
 _ITERATIONS = 3
+_TORQUES = ("torque on the lower disk [N m]", "torque on the upper disk [N m]")
+_SIGNALS = Signals.of("angle [rad]", "voltage [V]", _TORQUES)
 # The converter's range in both directions [V] (module docstring).
 _RANGE = 10.0
 
@@ -108,6 +112,7 @@ class TorsionalPlant:
     late: int  # delay of u in samples
     name: str = "torsional plant"
     compiled = True
+    signals = _SIGNALS
 
     @property
     def order(self) -> int:
@@ -254,7 +259,9 @@ def torsional(
     A[3] = k / j2, -k / j2, d / j2, -(c2 + d) / j2
     E[2, 0], E[3, 1] = 1.0 / j1, 1.0 / j2
     B, C = ratio * k_t * k_a * E[:, 0], [0.0, 1.0, 0.0, 0.0]
-    linear = LinearPlant(A, B, C, E, name="torsional plant without friction")
+    linear = labelled(
+        LinearPlant(A, B, C, E, name="torsional plant without friction"), *_SIGNALS[:3]
+    )
     u_max = min(_RANGE, i_max / k_a)
     return TorsionalPlant(linear, (dry_lower, dry_upper), u_max, step, counts, late)
 
@@ -265,6 +272,6 @@ def torsional_identified() -> LinearPlant:
     ``4.6e4 / (s⁴ + 1.901 s³ + 1683 s² + 1812 s + 0.1032)``. States: the upper disk's angle [rad]
     and its derivatives [rad/s, …]. There is one disturbance, which enters as u [V] does.
     """
-    return LinearPlant.of(
-        ([4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032]), name="torsional plant as identified"
-    )
+    model = [4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032]
+    plant = LinearPlant.of(model, name="torsional plant as identified")
+    return labelled(plant, _SIGNALS.y, _SIGNALS.u, w=_SIGNALS.u)

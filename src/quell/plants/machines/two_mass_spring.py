@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from quell import checks
+from quell.plants.labelled import labelled
 from quell.plants.linear import LinearPlant
+from quell.quantities import Signals
 from quell.types import Matrix
+
+SIGNALS = Signals.of("position [m]", "force [N]", ("force on m1 [N]", "force on m2 [N]"))
+"""Names and units of the signals of two masses that a force drives."""
 
 
 def two_mass_matrices(m1: float, m2: float, k: float) -> tuple[Matrix, Matrix]:
@@ -53,4 +58,5 @@ def two_mass_spring(
         raise ValueError(
             "c1 = 0.0, c2 = 0.0: at least one must differ from zero, or nothing is measured"
         )
-    return LinearPlant(A, B=E[:, 0], C=[c1, c2, 0.0, 0.0], E=E, name="two-mass-spring")
+    C = [c1, c2, 0.0, 0.0]
+    return labelled(LinearPlant(A, E[:, 0], C, E, name="two-mass-spring"), *SIGNALS[:3])

@@ -53,7 +53,7 @@ def derivatives(plant: Any, t: float, x: Vector, u: float, w: Vector, dx: Vector
 @advance.register(CompiledNonlinear)
 @advance.register(CompiledParametric)
 @advance.register(PythonNonlinear)
-def _runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
+def runge_kutta(plant: Any, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
     """Take ``substeps`` classical Runge-Kutta steps.
 
     Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, table II.1.2.

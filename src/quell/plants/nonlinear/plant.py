@@ -135,7 +135,7 @@ class NonlinearPlant:
         """Return the plant with other numbers for some parameters; nothing is compiled again."""
         made = replace(self, parameters={**(self.parameters or {}), **values})
         signals = signals_of(self)
-        return labelled(made, *signals) if signals.known else made
+        return labelled(made, *signals[:3]) if signals.known else made
 
     @property
     def _numbers(self) -> tuple[dict[str, float], dict[str, float]]:

@@ -27,6 +27,7 @@ from quell.controllers.base import (
 from quell.kernels.dispatch import call_specialised, compiled
 from quell.kernels.user_types import explain_compile_errors
 from quell.realtime.loop.modes import Mode
+from quell.records.channels import signals_of_loop
 from quell.records.trajectory import Trajectory
 from quell.types import Matrix, Status, Vector
 
@@ -52,8 +53,8 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     controller
         any controller with the run's sample time.
     u_before
-        control signal under which the plant rested before the first sample [u-unit]. An ADRC then
-        starts as by ``controller.start(y, u_before)``; by default it starts as by its first sample.
+        control signal under which the plant rested before the first sample [u-unit]. The controller
+        then starts as by ``controller.start(y, u_before)``; by default as by its first sample.
 
     Returns
     -------
@@ -64,7 +65,7 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
     ------
     ValueError
         for a run without r, y, y_measured or u, with samples left out, without measurements, or
-        with another sample time; for ``u_before`` with a controller other than an ADRC.
+        with another sample time; for ``u_before`` with a controller that can't start under load.
     """
     check_controller(controller)
     if not isinstance(run, Trajectory):
@@ -105,7 +106,7 @@ def replay(run: Trajectory, controller: Controller, *, u_before: float | None = 
         ended=(len(run) - 1) * run.dt,
         plant=run.plant,
         features=controller.features,
-        signals=run.signals,
+        signals=signals_of_loop(run.signals, controller),
         u_limits=run.u_limits,
         final_state=state,
     )
@@ -115,7 +116,7 @@ def _started(controller: Any, y: float, u: float, r: float) -> tuple[Any, Any]:
     """Return parameters and initial state for a plant that rests at ``y`` under ``u``."""
     if not hasattr(controller, "start"):
         kind = type(controller).__name__
-        raise ValueError(f"u_before = {u!r}: only an ADRC starts under load; leave it out ({kind})")
+        raise ValueError(f"u_before = {u!r}: {kind} has no start under load; leave it out")
     follower = copy.copy(controller)
     follower.reset()
     follower.start(y, u, r if math.isfinite(r) else None)

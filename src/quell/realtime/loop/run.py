@@ -40,6 +40,7 @@ from quell.realtime.telemetry.channels import row_channels
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.sinks import MemorySink, Sink, file_sink
 from quell.realtime.telemetry.writer import TelemetryWriter
+from quell.records.channels import signals_of_loop
 from quell.signals import Signal
 from quell.simulation.scenario import Scenario
 
@@ -170,6 +171,7 @@ def run_rig(
 
 def _header(device: Device, controller: Controller, signals: Signals | None) -> Header:
     known = getattr(device, "signals", UNKNOWN) if signals is None else signals
+    known = signals_of_loop(known, controller)
     return Header(
         channels=row_channels(controller.channels),
         dt=controller.dt,

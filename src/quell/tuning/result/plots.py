@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from quell.records.plotting import grid_of_axes, new_figure
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.requirements import sizes
@@ -31,10 +33,7 @@ def draw(
 
     The phase of L, dashed and for the first plant only, has an axis of its own at the right.
     """
-    if axes is None:
-        import matplotlib.pyplot as plt
-
-        axes = plt.subplots(2, 2, figsize=(10.0, 7.5), layout="constrained")[1]
+    axes = grid_of_axes(axes, partial(new_figure, 10.0, 7.5), 2, 2)
     bode, sensitivity, step, load = np.ravel(axes)
     phase = bode.twinx()
     omega, shown = plants.omega, range(min(len(plants.plants), _DRAWN))

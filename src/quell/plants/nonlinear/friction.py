@@ -1,0 +1,115 @@
+"""A transfer function whose input acts against Coulomb friction, as identification finds it.
+
+::
+
+    x' = A x + B (u + w − F tanh(y'/v)),      y = x_1
+
+v is small against the speeds of motion. The sign of the speed is smooth, so that Runge-Kutta steps
+solve the equation; a plant at rest creeps slowly under less than F.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from quell import checks
+from quell.kernels.functions import tanh
+from quell.plants.base import advance, measure
+from quell.plants.linear import LinearPlant
+from quell.plants.nonlinear.kernels import derivatives, runge_kutta
+from quell.types import Matrix, Vector
+
+# Largest h |λ| of a sub-step h with the eigenvalue of largest magnitude at rest, as for nonlinear
+# plants, and most sub-steps: beyond, friction is stiffer than any sample shows. By hand.
+_LARGEST_STEP, _MOST_SUBSTEPS = 1.0, 1000
+
+
+class FrictionModel(NamedTuple):
+    """Parameters of a transfer function with friction."""
+
+    A: Matrix  # observable companion form (n, n)
+    B: Vector  # (n,)
+    force: float  # F [u-unit]
+    width: float  # v [y-unit/s]
+    step: float  # length of a sub-step [s]
+    substeps: int
+
+
+@measure.register(FrictionModel)
+def _measure(plant: FrictionModel, x: Vector) -> float:
+    return x[0]
+
+
+@derivatives.register(FrictionModel)
+def _derivatives(
+    plant: FrictionModel, t: float, x: Vector, u: float, w: Vector, dx: Vector
+) -> None:
+    n = x.size
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += plant.A[i, j] * x[j]
+        dx[i] = total
+    drive = u + w[0] - plant.force * tanh(dx[0] / plant.width)
+    for i in range(n):
+        dx[i] += plant.B[i] * drive
+
+
+advance.register(FrictionModel)(runge_kutta)
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionPlant:
+    """A transfer function of relative degree 2 or more with Coulomb friction.
+
+    Parameters
+    ----------
+    linear
+        the plant without friction: for design.
+    num, den
+        its transfer function, highest power of s first.
+    force
+        Coulomb friction F [u-unit].
+    width
+        speed v at which three quarters of it act [y-unit/s].
+    """
+
+    linear: LinearPlant
+    num: Vector
+    den: Vector
+    force: float
+    width: float
+    name: str = "plant with friction"
+    disturbances = 1
+    compiled = True
+
+    def __post_init__(self) -> None:
+        checks.positive("force", self.force, "u-unit")
+        checks.positive("width", self.width, "y-unit/s")
+        if len(self.num) > self.order - 1:
+            raise ValueError(
+                f"num has {len(self.num)} coefficients, den {len(self.den)}: the relative degree "
+                "must be 2 or more, or u moves the speed at once"
+            )
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.den) - 1
+
+    def sampled(self, dt: float, interpret: bool = False) -> FrictionModel:
+        """Return the parameters for a sample time ``dt`` [s]."""
+        n, lead = self.order, float(self.den[0])
+        A = np.diag(np.ones(n - 1), 1)
+        A[:, 0] -= np.asarray(self.den[1:], dtype=np.float64) / lead
+        B = np.zeros(n)
+        B[n - len(self.num) :] = np.asarray(self.num, dtype=np.float64) / lead
+        at_rest = A - self.force / self.width * np.outer(B, A[0])
+        fastest = float(np.max(np.abs(np.linalg.eigvals(at_rest))))
+        wanted = checks.positive("dt", dt, "s") * fastest / _LARGEST_STEP
+        substeps = min(max(math.ceil(wanted), 1), _MOST_SUBSTEPS)
+        return FrictionModel(A, B, self.force, self.width, dt / substeps, substeps)

@@ -1,0 +1,209 @@
+"""What holds for every function that draws: it takes axes, returns them, and pyplot can save it."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import quell as ql
+from quell import analysis
+from quell.commissioning.verification import Verification
+from quell.experiments import acc, compare, stress, torsional, two_mass_spring
+from quell.experiments.acc import figures as acc_figures
+from quell.experiments.acc.criteria import Judged
+from quell.experiments.torsional.setup import FRICTION, LINEAR
+from quell.experiments.torsional.setup import NAMES as TORSIONAL
+from quell.realtime.system.histogram import Histogram, Timing, count_duration, empty_counts
+from quell.sweeping import sweep
+
+plt = importlib.import_module("matplotlib.pyplot")
+
+DT = 0.05
+LAG = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
+ROOT = Path(str(ql.__file__)).parent
+
+
+class Case(NamedTuple):
+    """A function that draws, and the number of its axes."""
+
+    draw: Callable[..., Any]
+    axes: int
+
+
+def adrc(omega_o: float = 5.0, learner: Any = None) -> ql.ADRC:
+    """Return a controller of the lag."""
+    observer = ql.ESO.model_free(order=1, b0=1.0, omega_o=omega_o, dt=DT)
+    return ql.ADRC(observer, omega_c=1.0, learner=learner, guard=learner and ql.Guard())
+
+
+def manual() -> ql.controllers.LinearController:
+    """Return u = r."""
+    law = ql.controllers.LinearLaw(np.zeros((0, 0)), *[np.zeros(0)] * 4, 1.0, 0.0)
+    return ql.controllers.LinearController(law, DT)
+
+
+def built(b: float) -> Any:
+    """Return the parts of a run of the sweep."""
+    return ql.plants.LinearPlant([[-1.0]], [b], [1.0]), adrc(), ql.Scenario(1.0, 1.0)
+
+
+def studies() -> dict[str, Case]:
+    """Return the figures of the experiments, of results made from one run."""
+    observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=5.0, dt=DT)
+    law = ql.ADRC(observer, 0.5, learner=ql.learners.RLS(ql.features.State()))
+    scenario = ql.Scenario(ql.signals.Sinusoid(omega=0.2), duration=180.0)
+    run = ql.simulate(ql.plants.two_mass_spring(), law, scenario)
+    names = [*two_mass_spring.controllers(two_mass_spring.Settings()), "MF-ESO", "MB-ESO", "L-ESO"]
+    names += ["L-ESO (Algorithm 1)"]
+    trial = two_mass_spring.Trial(1, 0.1, 10.0, True, 0.1)
+    scores: Any = {name: {"disturbance_peak": 0.1} for name in names}
+    two = two_mass_spring.Result(
+        two_mass_spring.Settings(), dict.fromkeys(names, run), scores, (), (trial,)
+    )
+    outcome = torsional.Outcome(dict.fromkeys(TORSIONAL, run), {}, {}, ())
+    case = torsional.Case(20.0, 90.0, {FRICTION: outcome, LINEAR: outcome})
+    disks = torsional.Result(torsional.Settings(), (case,))
+    judged = Judged(np.array([0.05, 1.0]), np.array([0.1, 0.1]))
+    springs = {spring: {"MF-ESO": judged} for spring in acc.SPRINGS}
+    masses = acc.Result(acc.generated(2), "drawn", springs, {}, 1.0, 1.0)
+    loop = stress.draw_loops(1, np.random.default_rng(0))[0]
+    one = stress.Outcome("honest", loop, "rls", False, False, 1.0, 0.9, 0.8)
+    trial_of_guard = stress.Result({}, [one])
+    rates = {spring: {"MF-ESO": [(0.1, 0.0, 0.2)] * 7} for spring in acc.SPRINGS}
+
+    def spread(ax: Any = None) -> Any:
+        return acc_figures._spread(rates, ax)
+
+    found = {"stress": Case(lambda ax=None: stress.draw(trial_of_guard, ax=ax), 2)}
+    for name, axes in (("position", 3), ("control", 3), ("learning", 3), ("algorithm-1", 2)):
+        found[name] = Case(lambda ax=None, n=name: two_mass_spring.draw(two, n, ax=ax), axes)
+    for name, axes in (("position", 3), ("control", 2), ("learning", 2)):
+        name = f"torsional-{name}"
+        found[name] = Case(lambda ax=None, n=name: torsional.draw(disks, n, ax=ax), axes)
+    found["acc-failures"] = Case(lambda ax=None: acc.draw(masses, "acc-failures", ax=ax), 1)
+    return found | {"acc-spread": Case(spread, 2)}
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
+    """Every figure, of small results."""
+    scenario = ql.Scenario(ql.signals.Sinusoid(), duration=5.0)
+    features = ql.features.State() + ql.features.Bias()
+    run = ql.simulate(LAG, adrc(learner=ql.learners.RLS(features)), scenario)
+    plain = ql.simulate(LAG, adrc(), scenario)
+    batch = ql.simulate(LAG, adrc(), [scenario] * 2)
+    loop = analysis.analyse(LAG, adrc())
+    swept = sweep(
+        built, {"b": [0.8, 1.2]}, folder=tmp_path_factory.mktemp("sweep") / "s", metrics=["iae"]
+    )
+    tuned = ql.tune(LAG, DT, structure="pi", compare=())
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([-1.0, 1.0], 80), 5)
+    samples = ql.signals.Samples(np.arange(u.size) * DT, u)
+    measured = ql.simulate(LAG, manual(), ql.Scenario(samples, duration=u.size * DT))
+    model = ql.identify(measured["u"], measured["y"], DT, order=1)
+    counts = empty_counts()
+    for duration in (1_000, 2_000, 50_000):
+        count_duration(counts, duration)
+    histogram = Histogram.of(counts)
+    step = Verification(None, plain, 1.0, 1.0, plain["y"], plain["u"])  # type: ignore[arg-type]
+    compared = compare.compare(LAG, {"ADRC": adrc()}, scenario)
+    omegas = [4.0, 8.0]
+    plots = {
+        "Trajectory": Case(run.plot, 5),
+        "BatchTrajectory": Case(batch.plot, 2),
+        "Tuned": Case(tuned.plot, 4),
+        "Identified": Case(model.plot, 7),
+        "Verification": Case(step.plot, 2),
+        "Sweep": Case(lambda ax=None: swept.plot("b", ax=ax), 2),
+        "Histogram": Case(histogram.plot, 1),
+        "Timing": Case(Timing(histogram, histogram).plot, 1),
+        "compare": Case(lambda ax=None: compare.draw(compared, ax=ax), 2),
+        "bode": Case(lambda ax=None: analysis.plot_bode(loop, ax=ax), 2),
+        "gang": Case(lambda ax=None: analysis.plot_gang_of_four(loop, ax=ax), 4),
+        "nyquist": Case(lambda ax=None: analysis.plot_nyquist(loop, ax=ax), 1),
+        "locus": Case(lambda ax=None: analysis.plot_root_locus(LAG, adrc, omegas, ax=ax), 1),
+        "over time": Case(
+            lambda ax=None: analysis.plot_margins_over_time([0.0, 1.0], [loop] * 2, ax=ax), 3
+        ),
+        "over omega_o": Case(
+            lambda ax=None: analysis.plot_margins_against_omega_o(LAG, adrc, omegas, ax=ax), 4
+        ),
+    }
+    return plots | studies()
+
+
+def drawn_axes(returned: Any) -> list[Any]:
+    """Return the axes that a function returned as a list."""
+    return list(np.ravel(np.asarray(returned, dtype=object)))
+
+
+def test_every_figure_takes_and_returns_axes_and_pyplot_saves_it(cases: dict[str, Case]) -> None:
+    """A new figure is pyplot's current one; given axes come back; another number is an error."""
+    for name, (draw, count) in cases.items():
+        plt.close("all")
+        new = drawn_axes(draw())
+        assert len(new) == count, name
+        assert all(each.figure is plt.gcf() for each in new), name
+        if name == "Trajectory":  # the others take time, and are figures of pyplot all the same
+            plt.savefig(io.BytesIO(), dpi=10)
+        given = plt.figure().subplots(1, count, squeeze=False)[0]
+        back = drawn_axes(draw(ax=given if count > 1 else given[0]))
+        assert back == list(given), name
+        assert all(each.has_data() for each in given), name
+        if count > 1:
+            with pytest.raises(ValueError, match="axes"):
+                draw(ax=plt.figure().subplots(1, 1 if name == "Sweep" else count + 3))
+    plt.close("all")
+
+
+_DRAWS = re.compile(r"^ *def (plot(?:_\w+)?|draw)\(", re.MULTILINE)
+# Files of functions that draw, and those that are drawn above.
+_PUBLIC = {
+    "records/trajectory.py plot": "Trajectory",
+    "records/batch_trajectory.py plot": "BatchTrajectory",
+    "tuning/tuned.py plot": "Tuned",
+    "identification/result.py plot": "Identified",
+    "commissioning/verification.py plot": "Verification",
+    "sweeping/result.py plot": "Sweep",
+    "realtime/system/histogram.py plot": "Timing",
+    "experiments/compare/figures.py draw": "compare",
+    "experiments/stress/figures.py draw": "stress",
+    "experiments/two_mass_spring/figures.py draw": "position",
+    "experiments/torsional/figures.py draw": "torsional-position",
+    "experiments/acc/figures.py draw": "acc-failures",
+    "analysis/plots.py plot_bode": "bode",
+    "analysis/plots.py plot_gang_of_four": "gang",
+    "analysis/plots.py plot_margins_over_time": "over time",
+    "analysis/plots.py plot_margins_against_omega_o": "over omega_o",
+    "analysis/loci.py plot_nyquist": "nyquist",
+    "analysis/loci.py plot_root_locus": "locus",
+}
+# What those call, and what is no figure.
+_INSIDE = {
+    "records/plotting.py plot_run",
+    "records/plotting.py plot_batch",
+    "sweeping/figures.py plot_over",
+    "tuning/result/plots.py draw",
+    "envs/episodes.py draw",  # draws random numbers
+}
+
+
+def test_no_function_that_draws_is_forgotten(cases: dict[str, Case]) -> None:
+    """All public functions ``plot``, ``plot_…`` and ``draw`` of the package are in the list."""
+    found = set()
+    for path in ROOT.rglob("*.py"):
+        file = path.relative_to(ROOT).as_posix()
+        if file.startswith("studio/"):
+            continue
+        text = path.read_text(encoding="utf-8")
+        found |= {f"{file} {name}" for name in _DRAWS.findall(text)}
+    assert found == {*_PUBLIC, *_INSIDE}
+    assert set(_PUBLIC.values()) <= set(cases)
