@@ -17,6 +17,6 @@ for name, learner in (("MF-ESO", None), ("L-ESO", ql.learners.Harmonic())):
     axes[0].plot(run.t, run["y"].ravel(), label=name)
     axes[1].plot(run.t, run["f_learned"].ravel(), label=name)
 axes[0].set_ylim(0.8, 1.2)
-axes[0].set_ylabel("y [m]"), axes[1].set_ylabel("learned share of f [m/s⁴]")
+axes[0].set_ylabel("y [m]"), axes[1].set_ylabel("learned f [m/s⁴]")
 axes[1].set_xlabel("t [s]"), axes[0].legend(loc="lower right")
 plt.show()

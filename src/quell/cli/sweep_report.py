@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
 from quell.cli.output import print_line, table
 
@@ -97,7 +98,7 @@ def print_summary(
     for name, each in results["measures"].items():
         numbers = [*each["quantiles"], each["largest"]]
         cells = ["–" if value is None else f"{value:.4g}" for value in numbers]
-        rows.add_row(name, str(each["runs"]), *cells)
+        rows.add_row(escape(found.label(name)), str(each["runs"]), *cells)
     console.print(rows)
     messages = Counter(text for text in found.dataset["message"].values.tolist() if text)
     for text, count in messages.most_common(_MESSAGES):

@@ -12,8 +12,8 @@ from typing import Any
 from quell import checks
 from quell.plants.base import Plant
 from quell.plants.delay import delayed
-from quell.plants.nonlinear.friction import FrictionPlant
 from quell.plants.linear import LinearPlant
+from quell.plants.nonlinear.friction import FrictionPlant
 from quell.reading import whole_text
 from quell.types import DesignWarning
 

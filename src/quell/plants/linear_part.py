@@ -12,8 +12,8 @@ import numpy as np
 from quell.lti.models import is_linear_model
 from quell.plants.delay import DelayedPlant
 from quell.plants.encoder import EncodedPlant
-from quell.plants.nonlinear.friction import FrictionPlant
 from quell.plants.linearise import linearised
+from quell.plants.nonlinear.friction import FrictionPlant
 from quell.plants.nonlinear.kernels import value_or_nan
 from quell.plants.nonlinear.plant import NonlinearPlant, checked_point
 

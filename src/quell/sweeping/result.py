@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
+from quell.plants.labelled import signals_of
+from quell.quantities import UNKNOWN, Signals
 from quell.records.trajectory import Trajectory
 from quell.simulation.simulate import simulate
 from quell.sweeping.lazy import NOT_DONE, lazy_dataset
@@ -130,6 +133,18 @@ class Sweep:
         """
         return simulate(*self.parts(run))
 
+    @cached_property
+    def signals(self) -> Signals:
+        """Names and units of the plant of the first run; unknown if the sweep was opened."""
+        with suppress(Exception):  # of the user's function that makes the plant
+            return signals_of(self.parts(0).plant)
+        return UNKNOWN
+
+    def label(self, measure: str) -> str:
+        """Return the name of a measure with its unit: ``rms [m]``."""
+        unit = self.signals.unit(self.store.measures[measure].get("units", "1"))
+        return measure if unit == "1" else f"{measure} [{unit}]"
+
     def plot(self, parameter: str, figure: Any = None, *, ax: Any = None) -> Any:
         """Draw failure rate and quantiles of each measure over a parameter; return the axes.
 
@@ -148,9 +163,7 @@ class Sweep:
 
         values, texts = self.parameter(parameter).values, self.store.labels[parameter]
         measures = {}
-        for name, about in self.store.measures.items():
-            unit = about.get("units", "1")
-            title = name if unit == "1" else f"{name} [{unit}]"
-            measures[title] = np.where(self.complete, self.dataset[name].values, np.nan)
+        for name in self.store.measures:
+            measures[self.label(name)] = np.where(self.complete, self.dataset[name].values, np.nan)
         groups = groups_of(values, texts, self.done)
         return plot_over(parameter, groups, self.failed, measures, figure, ax)
