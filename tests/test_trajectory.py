@@ -327,8 +327,8 @@ def test_a_data_frame_has_a_row_for_each_sample_and_units(
     assert direct.attrs["units"] == frame.attrs["units"]
     path = tmp_path / "run.csv"
     run.to_csv(path)
-    head, *lines = path.read_text().splitlines()
-    assert head.split(",")[:3] == ["time [s]", "r", "y"]
+    head, *lines = path.read_text(encoding="utf-8").splitlines()
+    assert head.split(",")[:3] == ["time [s]", "r [m]", "y [m]"]
     table = np.array([[float(cell) for cell in line.split(",")] for line in lines])
     np.testing.assert_array_equal(table[:, 1:], direct.to_numpy())
     with pytest.raises(ValueError, match="exists"):

@@ -153,7 +153,7 @@ def _compare_setup(
     gains = {name: experiment.sensitivities(plant, d) for name, d in run.controllers.items()}
     stable = {name: _is_stable(d, plant) for name, d in run.controllers.items()}
     title = f"{given.title}: {run.plant}, dt = {run.dt:g} s"
-    print_scores(console, title, run.result, stable, si_units=False)
+    print_scores(console, title, run.result, stable)
     scored = "" if run.load_at is None else f"; the disturbance is scored from {run.load_at:g} s on"
     console.print(
         f"In the units of the setup{scored}. –: not settled, no step, or diverged before."

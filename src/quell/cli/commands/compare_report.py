@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from quell.experiments.compare import Benchmark, Comparison, Entry
     from quell.tuning import Constraints
 
-# Key, heading, factor and most decimals.
+# Key, heading, unit, factor and most decimals.
 _COLUMNS = (
-    ("overshoot", "over-\nshoot\n[%]", 100.0, 2),
-    ("settling_time", "settling\n[s]", 1.0, 2),
-    ("disturbance_peak", "peak\n[m]", 1.0, 4),
-    ("rms", "RMS\n[m]", 1.0, 4),
-    ("control_variation", "vari-\nation\n[N]", 1.0, 2),
+    ("overshoot", "over-\nshoot", "%", 100.0, 2),
+    ("settling_time", "settling", "s", 1.0, 2),
+    ("disturbance_peak", "peak", "y-unit", 1.0, 4),
+    ("rms", "RMS", "y-unit", 1.0, 4),
+    ("control_variation", "vari-\nation", "u-unit", 1.0, 2),
 )
 _GAINS = (("m_s", "M_s", 3), ("m_t", "M_t", 3), ("m_ks", "M_ks", 1), ("k_i", "k_i", 3))
 # Characters of a number, so that the table fits into a terminal of 80 columns.
@@ -54,18 +54,20 @@ def print_scores(
     title: str,
     result: Comparison,
     stable: Mapping[str, bool | None],
-    si_units: bool = True,
 ) -> None:
-    """Print a row for each run."""
-    headings = [heading for _, heading, _, _ in _COLUMNS]
-    if not si_units:
-        headings = [text.replace("\n[m]", "").replace("\n[N]", "") for text in headings]
+    """Print a row for each run, with the units of the plant that are known."""
+    signals = next(iter(result.runs.values())).signals
+    units = [signals.unit(unit) for _, _, unit, _, _ in _COLUMNS]
+    headings = [
+        heading if unit.endswith("-unit") else f"{heading}\n[{unit}]"
+        for (_, heading, *_), unit in zip(_COLUMNS, units, strict=True)
+    ]
     rows = table(title, "controller", *headings, padding=(0, 1, 0, 0), pad_edge=False)
     rows.add_column("status")
     for name, score in result.scores.items():
         cells = [
             "–" if (value := score[key]) is None else _short(factor * value, decimals)
-            for key, _, factor, decimals in _COLUMNS
+            for key, _, _, factor, decimals in _COLUMNS
         ]
         run = result.runs[name]
         status = (run.status.name or "OK").lower().replace("_", " ").replace("|", ", ")
