@@ -15,8 +15,9 @@ PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0]
 
 
 def controller(**options: object) -> ql.ADRC:
-    """Return an ADRC with a guarded learner, which has all kinds of channels."""
-    return ql.ADRC(OBSERVER, omega_c=3.0, learner=ql.learners.Kalman(), guard=ql.Guard(), **options)  # type: ignore[arg-type]
+    """Return an ADRC, by default with a guarded learner, which has all kinds of channels."""
+    learns = {"learner": ql.learners.Kalman(), "guard": ql.Guard()}
+    return ql.ADRC(OBSERVER, omega_c=3.0, **(learns | options))  # type: ignore[arg-type]
 
 
 def simulated(duration: float = 10.0, **options: object) -> ql.Trajectory:

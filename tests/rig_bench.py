@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.kernels.dispatch import as_python
 from quell.realtime.devices.base import ask
 from quell.realtime.devices.registry import listen
 from quell.realtime.rig.kernel import APPLIED
@@ -67,14 +68,33 @@ def packed(
     return head + struct.pack("<I", zlib.crc32(head))
 
 
+class PlainRig(Rig):
+    """A rig that ticks as plain Python, whether or not its devices are compiled."""
+
+    def prepare(self) -> None:
+        """Compile nothing."""
+
+    def tick(self, count: int = 1) -> None:
+        """Perform ticks."""
+        with as_python():
+            super().tick(count)
+
+
 class Bench:
     """A rig, and the devices that are opened on it."""
 
-    def __init__(self, stack: ExitStack, wire: str = "udp", url: str = "", **settings: Any) -> None:
+    def __init__(
+        self,
+        stack: ExitStack,
+        wire: str = "udp",
+        url: str = "",
+        kind: type[Rig] = Rig,
+        **settings: Any,
+    ) -> None:
         if wire == "serial":
             pytest.importorskip("serial")
         self._stack = stack
-        self.rig = stack.enter_context(Rig(PLANT, DT, listen(url or url_of(wire)), **settings))
+        self.rig = stack.enter_context(kind(PLANT, DT, listen(url or url_of(wire)), **settings))
         self.rig.prepare()
         self.url = self.rig.listener.url
 

@@ -55,7 +55,7 @@ def test_a_known_plant_answers_a_step_as_the_ideal_loop_does() -> None:
     "learner",
     [
         None,
-        pytest.param(ql.learners.Kalman(), marks=pytest.mark.compiled),
+        ql.learners.Kalman(),
         ql.learners.BatchGradient(rate=1e-5),
     ],
 )

@@ -16,30 +16,22 @@ from quell.kernels.compile_time import compile_time
 from .commands import Shown, in_its_own_process
 
 
-def test_help_and_version_answer(tmp_path: Path) -> None:
+def test_help_and_version_answer(quell: Callable[..., Shown], tmp_path: Path) -> None:
     """The commands are listed."""
     shown = in_its_own_process("--help", cwd=tmp_path)
     assert shown.code == 0
     assert "reproduce" in shown.out
-    assert "two-mass" in in_its_own_process("reproduce", "--help", cwd=tmp_path).out
-    assert (
-        in_its_own_process("--version", cwd=tmp_path).out.strip() == __import__("quell").__version__
-    )
+    assert "two-mass" in quell("reproduce", "--help").out
+    assert quell("--version").out.strip() == __import__("quell").__version__
 
 
-def test_the_study_is_printed_written_and_drawn(tmp_path: Path) -> None:
+@pytest.mark.compiled
+def test_the_study_is_printed_written_and_drawn(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """Tables, JSON in its fixed form, figures as PNG and SVG; without a terminal."""
-    shown = in_its_own_process(
-        "reproduce",
-        "two-mass",
-        "--dt",
-        "0.01",
-        "--json",
-        "out.json",
-        "--figures",
-        "pictures",
-        cwd=tmp_path,
-    )
+    places = ("--json", "out.json", "--figures", "pictures")
+    shown = quell("reproduce", "two-mass", "--dt", "0.01", *places)
     assert shown.code == 0, shown.err
     assert "Claims of section IV" in shown.out
     assert "nan" not in shown.out.lower()

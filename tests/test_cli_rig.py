@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,9 @@ import pytest
 
 from quell.cli.commands.rig import rig as run_rig
 from quell.realtime.devices.registry import listen, open_device
+
+from .commands import Shown
+from .rig_bench import connect
 
 # A tick so long that a machine with much else to do still keeps the session alive.
 DT = 0.01
@@ -91,7 +94,7 @@ def test_a_rig_that_is_killed_is_noticed_and_replaced() -> None:
         device.read()
         assert np.isnan(device.read())
     with pytest.raises(ConnectionError, match="start one with: quell rig"):
-        open_device(url, DT)
+        connect(url, timeout=0.3)
     with rig("--device", url) as (process, ready):
         assert ready
         with open_device(url, DT) as device:
@@ -134,12 +137,11 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert rows["state"][last + 30] == 3
 
 
-def test_bad_input_is_a_line_and_exit_code_2() -> None:
+def test_bad_input_is_a_line_and_exit_code_2(quell: Callable[..., Shown]) -> None:
     """Before anything is opened."""
-    with rig("--device", "udp://127.0.0.1") as (process, ready):
-        said = process.communicate(timeout=60)[1]
-        assert (ready, process.returncode, said.count("\n")) == ("", 2, 1)
-    assert "must be udp://HOST:PORT" in said
+    shown = quell("rig", "--plant", "two-mass", "--dt", "0.01", "--device", "udp://127.0.0.1")
+    assert (shown.out, shown.code, shown.err.count("\n")) == ("", 2, 1)
+    assert "must be udp://HOST:PORT" in shown.err
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -428,17 +427,13 @@ def test_a_run_that_is_ended_while_it_is_compiled_gives_the_device_free(
     assert signal.getsignal(number) is before
 
 
-def test_an_extra_that_is_not_installed_is_named_in_a_line(tmp_path: Path) -> None:
+def test_an_extra_that_is_not_installed_is_named_in_a_line(
+    quell: Callable[..., Shown], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With what to install, and no traceback."""
-    program = """import sys
-sys.modules["serial"] = None
-from quell.cli import main
-sys.argv = ["quell", "run-rig", "--device", "serial:///dev/none", "--no-figures"]
-main()"""
-    tried = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert tried.returncode == 2
-    assert tried.stderr.startswith("quell: a serial line needs serial, which")
-    assert tried.stderr.count("\n") == 1
-    assert "quell[serial]" in tried.stderr
+    monkeypatch.setitem(sys.modules, "serial", None)
+    tried = quell("run-rig", "--device", "serial:///dev/none", "--no-figures")
+    assert tried.code == 2
+    assert tried.err.startswith("quell: a serial line needs serial, which")
+    assert tried.err.count("\n") == 1
+    assert "quell[serial]" in tried.err

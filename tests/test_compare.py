@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,8 @@ import quell as ql
 from quell.cli.app import app
 from quell.experiments import compare
 from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
+
+from .commands import Shown
 
 pytestmark = pytest.mark.compiled
 
@@ -118,17 +119,6 @@ def test_a_mistake_is_named(wrong: object, message: str) -> None:
         wrong()  # type: ignore[operator]
 
 
-def quell(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "quell", "compare", *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
 def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -179,27 +169,17 @@ def test_what_is_proved_of_a_guarded_learner_is_told_for_the_real_plant(
     assert "guarded-l-eso: no certificate" in shown
 
 
-def test_the_comparison_is_printed_written_and_drawn(tmp_path: Path) -> None:
+def test_the_comparison_is_printed_written_and_drawn(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
     """A table a line a controller, JSON, a figure as PNG and SVG; a mistake is one line, and nothing is written."""
-    shown = quell(
-        "--dt",
-        "0.01",
-        "--k",
-        "1.2",
-        "--u-max",
-        "1",
-        "--controllers",
-        "lqg, pid",
-        "--json",
-        "out.json",
-        "--figures",
-        "p",
-        cwd=tmp_path,
-    )
-    assert shown.returncode == 0, shown.stderr
-    assert "lqg" in shown.stdout
-    assert "…" not in shown.stdout, "a column is cut"
-    assert "nan" not in shown.stdout.lower()
+    where = ("--json", "out.json", "--figures", "p")
+    benchmark = ("--dt", "0.01", "--k", "1.2", "--u-max", "1")
+    shown = quell("compare", *benchmark, "--controllers", "lqg, pid", *where)
+    assert shown.code == 0, shown.err
+    assert "lqg" in shown.out
+    assert "…" not in shown.out, "a column is cut"
+    assert "nan" not in shown.out.lower()
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["settings"] == {
         "m1": 1.0,
@@ -211,10 +191,10 @@ def test_the_comparison_is_printed_written_and_drawn(tmp_path: Path) -> None:
     }
     assert list(result["controllers"]) == ["lqg", "pid"]
     assert {p.name for p in (tmp_path / "p").iterdir()} == {"compare.png", "compare.svg"}
-    wrong = quell("--controllers", "lqg,nonsense", "--json", "other.json", cwd=tmp_path)
-    assert wrong.returncode == 2
-    assert wrong.stderr.startswith("quell: controllers: 'nonsense' must be one of mf-eso")
-    assert len(wrong.stderr.strip().splitlines()) == 1
+    wrong = quell("compare", "--controllers", "lqg,nonsense", "--json", "other.json")
+    assert wrong.code == 2
+    assert wrong.err.startswith("quell: controllers: 'nonsense' must be one of mf-eso")
+    assert len(wrong.err.strip().splitlines()) == 1
     assert {p.name for p in tmp_path.iterdir()} == {"out.json", "p"}
 
 

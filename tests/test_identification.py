@@ -52,6 +52,12 @@ def twin_record(
 
 
 @cache
+def found_twin(band: tuple[float, float], amplitude: float) -> Identified:
+    """Return the model of such a record, with friction."""
+    return ql.identify(*twin_record(band, amplitude), DT, friction=True)
+
+
+@cache
 def twin_loop() -> tuple[np.ndarray, np.ndarray]:
     """Return u and y of the twin in a loop with an ADRC that knows no model, its reference a multisine within ±3 rad."""
     reference = excitation("multisine", (0.3, 40.0), 60.0, DT, -3.0, 3.0).signal
@@ -111,7 +117,7 @@ def test_the_testbed_is_found_through_its_encoder() -> None:
 @pytest.mark.parametrize(("band", "amplitude"), [((0.2, 20.0), 2.0), ((0.2, 60.0), 5.0)])
 def test_the_twin_is_found_with_its_friction(band: tuple[float, float], amplitude: float) -> None:
     """Open loop, all friction and quantisation: held-out fit ≥ 99.9 %, poles within 0.5 %, friction within 3 %."""
-    found = ql.identify(*twin_record(band, amplitude), DT, friction=True)
+    found = found_twin(band, amplitude)
     assert found.fits["held out"] > 99.9
     assert np.max(off(found)) < 5e-3
     assert found.integrators == 1
@@ -164,7 +170,7 @@ def test_friction_of_a_single_inertia_is_found() -> None:
 def test_the_delay_is_found(friction: bool) -> None:
     """Of up to 20 samples, by itself."""
     u, y = (
-        twin_record((0.2, 20.0), 2.0)
+        (part[:20_000] for part in twin_record((0.2, 20.0), 2.0))
         if friction
         else (excitation("prbs", (0.2, 60.0), 30.0, DT).u, np.zeros(0))
     )
@@ -211,12 +217,12 @@ def test_a_reference_frees_a_closed_loop_of_bias() -> None:
     dt, plant = 0.02, ql.plants.LinearPlant.of(([3.0], [1.0, 0.6, 4.0]))
     controller = ql.ADRC(ql.ESO.model_free(order=2, b0=3.0, omega_o=15.0, dt=dt), omega_c=5.0)
     plain, freed = [], []
-    for seed in range(3):
+    for seed in range(2):
         scenario = ql.Scenario(
-            reference=excitation("prbs", (0.2, 10.0), 200.0, dt, seed=seed).signal,
+            reference=excitation("prbs", (0.2, 10.0), 150.0, dt, seed=seed).signal,
             disturbances=(ql.signals.BandLimitedNoise(power=0.2, sample_time=0.3),),
             noise=ql.signals.BandLimitedNoise(power=1e-6, sample_time=dt),
-            duration=200.0,
+            duration=150.0,
             seed=seed,
         )
         run = ql.simulate(plant, controller, scenario)
@@ -275,7 +281,7 @@ def test_the_deviation_of_a_root_is_its_derivative() -> None:
 
 def test_the_result_is_a_plant_for_an_observer() -> None:
     """A loop designed on the identified twin, friction and all, moves it to π as one with the true model does."""
-    found = ql.identify(*twin_record((0.2, 20.0), 2.0), DT, friction=True)
+    found = found_twin((0.2, 20.0), 2.0)
     twin = ql.plants.torsional()
     scenario = ql.Scenario(reference=ql.signals.Trapezoid(np.pi, 2.0), duration=5.0)
     ends = []
@@ -327,7 +333,7 @@ def test_prediction_beats_simulation_and_both_are_told() -> None:
     assert "white: no" in str(found)
 
 
-@pytest.mark.parametrize(("order", "noise"), [(2, 0.0), (3, 0.01), (4, 0.0), (6, 0.01)])
+@pytest.mark.parametrize(("order", "noise"), [(2, 0.0), (6, 0.01)])
 def test_a_higher_order_than_the_plants_finds_it_too(order: int, noise: float) -> None:
     """A lag by a model of up to six poles: it is fitted as well as by one, and the report says which poles no sample shows."""
     u = excitation("prbs", (0.2, 40.0), 20.0, 0.01, seed=3).u
@@ -393,7 +399,7 @@ def test_a_record_that_ends_at_rest_is_refused_with_what_to_do() -> None:
 
 def test_the_report_has_all_of_it() -> None:
     """As text, as JSON without gaps, as a picture."""
-    found = ql.identify(*twin_record((0.2, 20.0), 2.0), DT, friction=True)
+    found = found_twin((0.2, 20.0), 2.0)
     for part in (
         "G(s) =",
         "pole [rad/s]",

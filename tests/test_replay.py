@@ -37,8 +37,18 @@ def check_same_estimates(again: ql.Trajectory, run: ql.Trajectory, tolerance: fl
         )
 
 
-@pytest.mark.compiled
-@pytest.mark.parametrize("options", [{}, {"u_min": -0.3, "u_max": 0.4}], ids=["free", "limited"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, id="free"),
+        pytest.param({"u_min": -0.3, "u_max": 0.4}, id="limited"),
+        pytest.param(
+            {"u_max": 0.4, "learner": None, "guard": None},
+            id="compiled",
+            marks=pytest.mark.compiled,
+        ),
+    ],
+)
 def test_the_controller_that_made_a_run_gives_the_same_estimates(options: dict[str, Any]) -> None:
     """Estimates and u are equal to the last bit."""
     run = simulated(**options)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.kernels.dispatch import call_specialised, compiled, kernel
+from quell.kernels.sized import Buffer
 from quell.realtime.system.atomics import load_acquire, store_release
 from quell.types import Matrix, Vector
 
@@ -28,7 +29,7 @@ _WORDS = 48
 class Ring(NamedTuple):
     """Rows on their way from one thread to another."""
 
-    rows: Matrix  #: (capacity, width); row number k is stored at k modulo capacity
+    rows: Buffer  #: (capacity, width); row number k is stored at k modulo capacity
     ends: NDArray[np.int64]  #: rows written (at ``HEAD``), read (``TAIL``), dropped (``DROPPED``)
 
 
