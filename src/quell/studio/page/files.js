@@ -18,7 +18,10 @@ export class Files {
     };
     home("as-toml").onclick = () => this.choose("toml");
     home("as-python").onclick = () => this.choose("python");
-    home("copy").onclick = () => navigator.clipboard.writeText(home("text").textContent);
+    home("copy").onclick = async () => {
+      await navigator.clipboard.writeText(home("text").textContent);
+      home("copy").textContent = "Copied";
+    };
     home("close-texts").onclick = () => home("texts").close();
   }
 
@@ -49,6 +52,7 @@ export class Files {
     home("text").textContent = this.texts[which];
     home("as-toml").setAttribute("aria-pressed", which === "toml");
     home("as-python").setAttribute("aria-pressed", which === "python");
+    home("copy").textContent = "Copy";
   }
 }
 

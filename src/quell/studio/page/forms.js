@@ -204,18 +204,20 @@ export class Forms {
       }
     };
     const row = field(name, box, entry.about);
-    const sliders = this.coefficients(entry, path);
-    if (sliders === null) return row;
-    box.onchange = () => this.change(path, at(this.setup, path), true); // it may have another length
+    if (!POLYNOMIALS.includes(entry.key)) return row;
+    const shape = () => JSON.stringify([at(this.setup, path)].flat().map(Boolean));
+    const before = shape();
+    // Other coefficients have other sliders: the form is made again, when the focus has moved on.
+    box.onchange = () => setTimeout(() => shape() !== before && this.change(path, at(this.setup, path), true));
     const all = element("div");
-    all.append(row, ...sliders);
+    all.append(row, ...this.coefficients(entry, path));
     return all;
   }
 
-  // Return sliders for the coefficients of a polynomial that are not zero; null for another list.
+  // Return sliders for the coefficients of a polynomial that are not zero.
   coefficients(entry, path) {
     const values = at(this.setup, path);
-    if (!POLYNOMIALS.includes(entry.key) || !Array.isArray(values) || !values.every(Number.isFinite)) return null;
+    if (!Array.isArray(values) || !values.every(Number.isFinite)) return [];
     return values.flatMap((value, i) => {
       const power = values.length - 1 - i;
       const name = `${entry.key}, ${power > 1 ? `s${[...String(power)].map((digit) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[digit]).join("")}` : power ? "s" : "constant"}`;
