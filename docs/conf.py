@@ -10,7 +10,6 @@ import matplotlib.pyplot as plt
 import quell
 
 # Override the environment: with another backend the figures would be missing, without a warning.
-os.environ["QUELL_QUIET"] = "1"
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
 os.environ["QUELL_QUIET"] = "1"  # pages do not show what is compiled
 # Tutorials call the command line of the same installation.
