@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import gc
 import math
 import pickle
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -53,14 +55,19 @@ def deviation(learner: Any) -> float:
     return float(np.sqrt(np.mean((run["y"] - ideal["y"])[window] ** 2)))
 
 
+plain_deviation = cache(lambda: deviation(None))
+
+
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_python_model_learns_a_hard_spring_in_the_compiled_loop(name: str) -> None:
     """It takes two thirds of what the plain ESO leaves of a spring and drag it was told nothing of."""
-    assert deviation(LEARNERS[name]) < deviation(None) / 3.0
+    assert deviation(LEARNERS[name]) < plain_deviation() / 3.0
 
 
-@pytest.mark.parametrize("form", ["current", "predictor"])
-@pytest.mark.parametrize("library", ["none", "sklearn", "river"])
+@pytest.mark.parametrize(
+    ("library", "form"),
+    [("none", "current"), ("none", "predictor"), ("sklearn", "current"), ("river", "current")],
+)
 def test_what_a_linear_model_learns_has_no_lag_bias(library: str, form: str) -> None:
     """A load −6 x_1 − x_2 is found to 2 %; pairing f̂ with the x̂ of the same moment misses the second by more than its whole size."""
     if library != "none" and not has({"sklearn": "sklearn", "river": "river"}[library]):
@@ -96,8 +103,11 @@ def test_what_a_linear_model_learns_has_no_lag_bias(library: str, form: str) -> 
     theta = np.array(read(learner.trained(run.final_state.learner))) * scale[3] / scale[:2]
     np.testing.assert_allclose(theta, [-6.0, -1.0], rtol=0.02, atol=0.05)
 
-    seen = ql.simulate(plant, ql.ADRC(observer, omega_c=4.0), scenario)
-    late = run.window(20.0, 120.0)
+    if library != "none":
+        return
+    shorter = dataclasses.replace(scenario, duration=60.0)
+    seen = ql.simulate(plant, ql.ADRC(observer, omega_c=4.0), shorter, interpret=True)
+    late = seen.window(20.0, 60.0)
     naive = np.linalg.lstsq(seen["x_hat"][late], seen["f_hat"][late], rcond=None)[0]
     assert abs(naive[1] + 1.0) > 1.0
 

@@ -115,7 +115,6 @@ def test_a_linear_adrc_is_a_filtered_pid_controller(order: int) -> None:
         assert at(pid, omega) == pytest.approx((gains[0] + from_r, from_y), rel=1e-12)
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize("order", [1, 2])
 def test_sampled_adrc_and_its_pid_controller_approach_each_other(order: int) -> None:
     """In a loop with step and load: their difference halves with dt, and is a thousandth at 1 ms."""

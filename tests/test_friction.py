@@ -19,7 +19,6 @@ OMEGA_C = 5.0
 LEARNERS: dict[str, Any] = {
     "none": None,
     "linear": ql.learners.Kalman(),
-    "MLP": ql.learners.MLP(),
     "friction": ql.learners.RLS(State() + Polynomial() + Friction() + Bias()),
 }
 
@@ -50,10 +49,7 @@ def error(name: str) -> float:
     return float(np.sqrt(np.mean((run["y"] - ideal)[run.t >= 20.0] ** 2)))
 
 
-@pytest.mark.parametrize(("name", "at_most"), [("MLP", 0.7), ("friction", 0.25)])
-def test_a_nonlinear_learner_rejects_friction_better_than_a_linear_one(
-    name: str, at_most: float
-) -> None:
-    """And a linear one better than none."""
+def test_a_nonlinear_learner_rejects_friction_better_than_a_linear_one() -> None:
+    """And a linear one better than none; the benchmark has a network, too."""
     assert error("linear") < error("none")
-    assert error(name) <= at_most * error("linear")
+    assert error("friction") <= 0.25 * error("linear")

@@ -92,7 +92,7 @@ def test_an_honest_learner_is_heard() -> None:
 
 def test_a_learner_without_authority_leaves_the_loop_as_it_is_without() -> None:
     """Not about: to the bit."""
-    scenario = dataclasses.replace(LOOP.scenario, duration=20.0)
+    scenario = dataclasses.replace(LOOP.scenario, duration=10.0)
     silenced = ql.simulate(
         LOOP.plant, LOOP.controller(Adversary(MULTIPLE, -1.0), ql.Guard()), scenario
     )
@@ -108,7 +108,7 @@ def test_the_correction_lies_within_its_bound(rng: np.random.Generator) -> None:
     lag, chain, shadow = lag_of(OBSERVER), np.zeros((1, 5)), np.zeros((1, 5))
     f = f_plain = f_shown = largest = 0.0
     heard = 0
-    for k in range(20_000):
+    for k in range(8000):
         largest = max(largest, abs(f_plain - memory.shown[0]))
         assess(design, memory, f_plain)
         f += 0.05 * rng.normal() - 0.01 * f
@@ -126,7 +126,7 @@ def test_the_correction_lies_within_its_bound(rng: np.random.Generator) -> None:
         f_shown = lag_push(lag, shadow, 0, permitted)
         f_plain = lag_push(lag, chain, 0, f)
         heard += permitted != f_shown
-    assert heard > 5000, "hardly anything was permitted: the test says nothing"
+    assert heard > 2000, "hardly anything was permitted: the test says nothing"
 
 
 def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
@@ -373,12 +373,13 @@ def test_a_learner_that_adds_to_slow_errors_is_not_heard_however_well_it_explain
     It explains a sinusoid of 3 rad/s, and adds to one of 0.1 rad/s, which is a fifth of q and 95 %
     of what is seen in y.
     """
-    gains = ql.ADRC(OBSERVER, omega_c=1.0).parameters.law
+    observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=1e-2)
+    gains = ql.ADRC(observer, omega_c=1.0).parameters.law
     guard = ql.Guard(time=2.0)
-    t = OBSERVER.dt * np.arange(20_000)
+    t = observer.dt * np.arange(10_000)
     quick, load = np.sin(3.0 * t), 5.0 * np.sin(0.1 * t)
     for sign, heard in ((1.0, True), (-1.0, False)):
-        design = guard.design(OBSERVER, gains)
+        design = guard.design(observer, gains)
         memory = guard.memory(design)
         feed(design, memory, quick + load, quick + sign * load)
         assert memory.sample[0].credit == pytest.approx(1.0, abs=0.1)
@@ -412,7 +413,7 @@ def test_status_and_reason_say_what_happened() -> None:
     """On the estimate, in the record and in its picture."""
     controller = law(Adversary(NAN, 1.0, time=2.0), ql.Guard())
     flags, reasons = Status.OK, set()
-    for k in range(3000):
+    for k in range(1000):
         controller.step(math.sin(0.005 * k), 0.5 * math.sin(0.005 * k - 0.4))
         flags |= controller.estimate.status
         reasons.add(controller.estimate.reason)
@@ -422,7 +423,7 @@ def test_status_and_reason_say_what_happened() -> None:
     assert all(reason.message.endswith(".") for reason in ql.Reason)
     assert controller.estimate.error_plain > 0.0
     assert math.isfinite(controller.estimate.error_learned)
-    run = ql.simulate(PLANT, controller, ql.Scenario(ql.signals.Sinusoid(), 20.0))
+    run = ql.simulate(PLANT, controller, ql.Scenario(ql.signals.Sinusoid(), 5.0))
     assert Status.LEARNER_CUT in run.status
     assert {"authority", "error_plain", "error_learned", "reason"} <= set(run.names)
     assert run.to_xarray()["error_plain"].attrs["units"] == "y-unit/s^n"
@@ -488,11 +489,11 @@ def test_a_measurement_beyond_all_numbers_is_got_over(bad: float, learner: objec
         ql.ADRC(OBSERVER, 1.0, learner=learner, guard=guard, u_min=-20.0, u_max=20.0)
         for guard in (None, ql.Guard())
     ]
-    for k in range(4000):
-        y = bad if k == 1000 else 0.3 * math.sin(0.004 * k)
+    for k in range(2600):
+        y = bad if k == 300 else 0.3 * math.sin(0.004 * k)
         for controller in controllers:
             assert math.isfinite(controller.step(0.0, y))
-            if k > 3000:
+            if k > 2300:
                 assert Status.OVERFLOWED not in controller.estimate.status, k
     guarded = controllers[1].estimate
     assert math.isfinite(guarded.error_plain)

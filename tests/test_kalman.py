@@ -14,6 +14,15 @@ from quell.observers.eso import ESO
 pytestmark = pytest.mark.compiled
 
 
+def chain(order: int, stiffness: float) -> ql.plants.LinearPlant:
+    """Return ``y⁽ⁿ⁾ = stiffness y + u + w``; of order four with the code of the two-mass plant, which has two loads."""
+    A = np.diag(np.ones(order - 1), 1)
+    A[-1, 0] = stiffness
+    B = np.eye(order)[-1]
+    E = np.column_stack([B, 0.0 * B]) if order == 4 else None
+    return ql.plants.LinearPlant(A, B, np.eye(order)[0], E)
+
+
 def kalman_memory(learner: ql.learners.Kalman, observer: ESO) -> tuple[object, object]:
     """Return a Kalman learner past its start, to which every feature teaches."""
     design = learner.design(observer, 1.0)
@@ -159,12 +168,10 @@ def test_what_was_learned_is_kept_through_hours_of_rest() -> None:
     assert run.metrics(10_000.0, target=2.0)["overshoot"] < 1e-3
 
 
-@pytest.mark.parametrize(("order", "power"), [(4, 1e-12), (8, 1e-16)])
+@pytest.mark.parametrize(("order", "power"), [(4, 1e-12), (6, 1e-14)])
 def test_at_rest_a_learner_is_as_quiet_as_no_learner(order: int, power: float) -> None:
     """Its gain does not follow the noise, which would fold the noise's high frequencies down to where the loop is sensitive."""
-    A = np.diag(np.ones(order - 1), 1)
-    A[-1, 0] = -0.5
-    plant = ql.plants.LinearPlant(A, np.eye(order)[-1], np.eye(order)[0])
+    plant = chain(order, -0.5)
     observer = ESO.model_free(order=order, b0=1.0, omega_o=30.0, dt=2e-3)
     scenario = ql.Scenario(1.0, duration=300.0, noise=ql.signals.BandLimitedNoise(power, 0.01))
     plain, learned = (
@@ -177,11 +184,10 @@ def test_at_rest_a_learner_is_as_quiet_as_no_learner(order: int, power: float) -
     assert np.std(learned["y"][late]) < 3.0 * np.std(plain["y"][late])
 
 
-@pytest.mark.parametrize(("order", "u"), [(2, False), (2, True), (4, False), (6, True)])
+@pytest.mark.parametrize(("order", "u"), [(2, True), (4, False), (6, False)])
 def test_where_nothing_is_left_to_learn_nothing_is_learned(order: int, u: bool) -> None:
     """A chain of integrators without noise: what is left is rounding, P stays positive, the loop goes on."""
-    A = np.diag(np.ones(order - 1), 1)
-    plant = ql.plants.LinearPlant(A, np.eye(order)[-1], np.eye(order)[0])
+    plant = chain(order, 0.0)
     s = ql.signals
     scenario = ql.Scenario(
         s.Sinusoid().until(60.0, then=s.Sinusoid(omega=0.5)).until(120.0, then=2.0),
@@ -250,6 +256,7 @@ def test_a_first_motion_out_of_friction_does_not_settle_what_is_learned(scale: f
             plant,
             ql.ADRC(ESO.model_free(2, 8.0, 40.0, 2e-3), omega_c=10.0, learner=learner),
             scenario,
+            interpret=True,
         ).metrics()
         for learner in (None, ql.learners.Kalman())
     )

@@ -125,7 +125,7 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
     return drain(rows), loop
 
 
-@pytest.mark.parametrize("drift", [-50e-6, 0.0, 50e-6, 1e-3])
+@pytest.mark.parametrize("drift", [-50e-6, 50e-6, 1e-3])
 def test_the_grid_follows_a_devices_clock(drift: float) -> None:
     """For slower and faster clocks each cycle gets the next tick, and none is old."""
     device = TickingDevice(SAMPLE * (1.0 + drift))

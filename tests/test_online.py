@@ -176,7 +176,7 @@ def test_a_network_says_nothing_before_it_has_learned() -> None:
 
 def test_a_process_fits_a_nonlinear_function_on_its_budget(rng: np.random.Generator) -> None:
     """Far from its points it says nothing."""
-    design, memory, left = fitted(GaussianProcessModel(40, 0.5, 1, math.inf, 0.05, 1e-3), 2000, rng)
+    design, memory, left = fitted(GaussianProcessModel(40, 0.5, 1, math.inf, 0.05, 1e-3), 1000, rng)
     assert left < 0.05
     assert memory.counters[0] <= 40
     assert abs(infer(design, memory, np.array([50.0, 50.0]))) < 1e-12

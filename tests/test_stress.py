@@ -24,17 +24,18 @@ def test_without_a_guard_the_trial_is_lost() -> None:
 @pytest.mark.compiled
 def test_the_same_seed_gives_the_same_trial() -> None:
     """All that is random is drawn from it."""
-    one, again, other = (stress.run(12, 2, seed, guard=ql.Guard()) for seed in (1, 1, 2))
+    one, again, other = (stress.run(2, 1, seed, guard=ql.Guard()) for seed in (1, 1, 2))
     assert [o.ratio for o in one.outcomes] == [o.ratio for o in again.outcomes]
     assert [o.ratio for o in one.outcomes] != [o.ratio for o in other.outcomes]
-    assert one.kinds == [*stress.KINDS, stress.HONEST]
 
 
 @pytest.mark.compiled
 def test_results_are_plain_data() -> None:
     """For ``json.dump``, with counts for each kind and quantiles of the ratios."""
     shares: list[float] = []
-    found = stress.run(12, 1, seed=5, guard=ql.Guard(), progress=shares.append).to_json()
+    result = stress.run(12, 1, seed=5, guard=ql.Guard(), progress=shares.append)
+    assert result.kinds == [*stress.KINDS, stress.HONEST]
+    found = result.to_json()
     assert json.loads(json.dumps(found)) == found
     assert set(found) == {"settings", "adversarial", "honest", "kinds", "worst"}
     assert found["adversarial"]["runs"] == 12

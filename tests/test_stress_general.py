@@ -195,7 +195,6 @@ def test_exact_weights_are_those_of_f() -> None:
     assert weights["load"] == 1.0
 
 
-@pytest.mark.compiled
 def test_a_perfect_learner_removes_the_load() -> None:
     """All but a thousandth without guard; with it, more than half."""
     case = perfect_case(1, "sine", ql.Guard(), 0)
@@ -213,6 +212,7 @@ def test_a_search_finds_learners_that_do_harm() -> None:
     assert found.point.shape == (attacks.SIZE,)
 
 
+@pytest.mark.compiled
 def test_a_loop_is_fragile_if_u_hardly_suffices_for_the_load() -> None:
     """With limits at the load itself, not with twice as much, and never without limits."""
     loop = one("stable", 1)
@@ -258,7 +258,6 @@ def test_bars_count_healthy_loops_only() -> None:
     assert not GeneralResult({}, [lost], []).bars()[0].met
 
 
-@pytest.mark.compiled
 def test_the_command_runs_all_loops(quell: Callable[..., Any], tmp_path: Path) -> None:
     """With its own table and its own JSON."""
     counts = ("--runs", "1", "--honest", "0", "--seed", "3")

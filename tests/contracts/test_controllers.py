@@ -69,7 +69,11 @@ def test_every_controller_has_an_example() -> None:
     assert found == {type(example).__name__ for example in CONTROLLERS.values()}
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+# An ADRC behind a prefilter is among them twice without this one, and its filter behind a PID.
+IN_LOOPS = [name for name in CONTROLLERS if name != "Prefiltered ADRC"]
+
+
+@pytest.mark.parametrize("name", IN_LOOPS)
 def test_a_controller_runs_the_same_again_and_interpreted(name: str) -> None:
     """Same seed, same output; no second compilation; interpreted = compiled."""
     check_run(PLANTS.get(name, CHAIN), CONTROLLERS[name], SCENARIO)
@@ -79,7 +83,7 @@ def test_a_controller_runs_the_same_again_and_interpreted(name: str) -> None:
 NOT_LINEAR = {name for name in CONTROLLERS if name.startswith("Prefiltered") or "Han" in name}
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", IN_LOOPS)
 def test_a_batch_over_lanes_is_the_exact_one(name: str) -> None:
     """To 1e-9 of each channel's range if the controller has a linear form, else bit for bit."""
     plant, controller = PLANTS.get(name, CHAIN), CONTROLLERS[name]
@@ -94,7 +98,7 @@ def test_a_batch_over_lanes_is_the_exact_one(name: str) -> None:
     assert np.all(lanes.status == exact.status)
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", IN_LOOPS)
 def test_a_step_at_a_time_is_the_simulated_run(name: str) -> None:
     """``step`` with what was measured gives the u of ``simulate``, bit for bit, and the same state."""
     controller = copy.deepcopy(CONTROLLERS[name])

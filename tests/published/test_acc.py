@@ -34,6 +34,6 @@ def test_the_published_designs_fail_as_often_as_listed(name: str, rate: float) -
 @pytest.mark.parametrize(("spring", "bar"), [("linear", 0.005), ("cubic", 0.01)])
 @pytest.mark.parametrize("name", ["MF-ESO", "MB-ESO", "L-ESO"])
 def test_each_of_ours_stays_below_the_bar(name: str, spring: str, bar: float) -> None:
-    """0.5 % without, 1 % with the cubic spring; measured: none at all."""
-    found = acc.judge_sampled(designs()[name], acc.read(SAMPLES), acc.SPRINGS[spring])
+    """0.5 % without, 1 % with the cubic spring, in every fourth plant; measured: none at all."""
+    found = acc.judge_sampled(designs()[name], acc.read(SAMPLES)[::4], acc.SPRINGS[spring])
     assert np.mean(found.fails) <= bar

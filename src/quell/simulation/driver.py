@@ -14,7 +14,7 @@ from quell.controllers.base import (
     status_flags,
     write_row,
 )
-from quell.kernels.dispatch import compiled, compiled_loop, interpreted, is_available, specialised
+from quell.kernels.dispatch import compiled_loop, interpreted, is_available, specialised
 from quell.kernels.user_types import explain_compile_errors
 from quell.plants.base import Plant, advance, begin_run, check_run, measure
 from quell.simulation.integration import IntegrationCheck, Samples
@@ -76,12 +76,6 @@ def run_block(
         until_next -= 1
         advance(plant, x, scratch, t0 + k * dt, u, w[k])
     return r.size, row, until_next, status
-
-
-@compiled
-def start_from_rest(design: Any, state: Any) -> None:
-    """Start the controller from rest; it keeps what it has learned."""
-    reset_loop(design, state)
 
 
 class Loop:
@@ -153,8 +147,7 @@ class Loop:
             if from_rest:
                 self.x[:] = self.x0
                 begin_run(self.model, self.x, self.scratch)
-                start = (self.design, self.state)
-                self._entry(start_from_rest, *start)(*start)
+                reset_loop(self.design, self.state)  # it is short: to compile it takes longer
             arguments = self._arguments(segment, log, row, every)
             if self._run_block is None:
                 other = None if self._like is None else self._like._run_block
