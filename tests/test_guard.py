@@ -481,8 +481,10 @@ def test_mistakes_are_named(make: object, message: str) -> None:
         make()
 
 
-@pytest.mark.parametrize("bad", [1.7e308, 1e160])
-@pytest.mark.parametrize("learner", [ql.learners.Kalman(), ql.learners.Harmonic(state=False)])
+@pytest.mark.parametrize(
+    ("bad", "learner"),
+    [(1.7e308, ql.learners.Kalman()), (1e160, ql.learners.Harmonic(state=False))],
+)
 def test_a_measurement_beyond_all_numbers_is_got_over(bad: float, learner: object) -> None:
     """After it the guarded loop goes on as the one without a guard does."""
     controllers = [

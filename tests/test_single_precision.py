@@ -171,9 +171,12 @@ def test_rounded_parameters_keep_shared_memory_and_kinds() -> None:
 
 
 @pytest.mark.parametrize(
-    "learner", [None, ql.learners.Kalman(), ql.learners.RLS(), ql.learners.MLP(3)]
+    ("learner", "rests"),
+    [
+        *[(None, True), (None, False), (ql.learners.Kalman(), True), (ql.learners.Kalman(), False)],
+        *[(ql.learners.RLS(), False), (ql.learners.MLP(3), False)],
+    ],
 )
-@pytest.mark.parametrize("rests", [True, False])
 def test_bad_samples_do_what_they_do_in_double_precision(learner: Any, rests: bool) -> None:
     """Measurements that are missing, infinite or absurd, on a motionless signal and in motion: the state stays finite, and u follows that of double precision."""
     guard = None if learner is None else ql.Guard()
