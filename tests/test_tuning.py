@@ -155,6 +155,21 @@ def test_freed_poles_are_better_than_bandwidths_and_pid(tuned: ql.Tuned) -> None
     assert "best" in tuned.costs[-1]
 
 
+def test_a_result_does_not_depend_on_what_it_is_compared_with(tuned: ql.Tuned) -> None:
+    """A freed ADRC starts at the optimal PID controller also if that is not shown."""
+    alone = ql.tune(LAGS, DT, compare=())
+    assert set(alone.designs) == {"freed"}
+    assert alone.design.k_i == pytest.approx(tuned.design.k_i, rel=1e-3)
+
+
+def test_the_integral_gain_of_a_design_with_a_model_stands_for_its_load_response() -> None:
+    """Without a bound a second slow pole gave a motor k_i = 19 000, with y swinging."""
+    motor = ([50.0], [1.0, 22.0, 40.0, 0.0])
+    found = ql.tune(motor, 1e-3, structure="model-based", compare=()).design
+    assert 1.0 <= found.k_i * found.measures["iae"] <= 3.0
+    assert "k_i |P S/ω|" in [each.name for each in found.active]
+
+
 def test_the_law_of_a_freed_adrc_is_well_damped(tuned: ql.Tuned) -> None:
     """Its poles are those of the ideal response to the reference."""
     poles = tuned.design.solution.structure.poles(tuned.design.solution.values[None, :])[0][0]

@@ -32,8 +32,16 @@ _NEARBY_ROUNDS = 6
 _ROUNDS = 15
 # Factors by which contradicting limits are relaxed, and steps of the bisection between them.
 _RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0), 6
-# References come before what starts at their equivalents.
-_FIRST = ("pi-unfiltered", "pi", "pid", "bandwidths")
+# Structures whose optima stand for starts of another one. They are always tuned before it, so that
+# a result does not depend on what it is compared with.
+_GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
+    "pid": ("pi",),
+    "freed": ("pi", "pid", "bandwidths"),
+    "delay-freed": ("pi", "pid", "bandwidths", "delay"),
+    "model-based-freed": ("model-based",),
+}
+# Largest order of an ADRC that has an equivalent PI or PID controller.
+_LIKE_PID = 2
 
 
 @dataclass(frozen=True)
@@ -79,15 +87,18 @@ def tuned_designs(
 ) -> dict[str, Design]:
     """Return a design for each name of a structure, in that order."""
     problem = task.problem()
-    order = sorted(names, key=lambda name: _FIRST.index(name) if name in _FIRST else len(_FIRST))
+    order = _order(names, task)
     solved: dict[str, list[Solution]] = {}
     designs = {}
     for i, name in enumerate(order):
         progress(name, i / len(order))
+        known = {key: solved[key] for key in _GIVES_STARTS.get(name, ()) if key in solved}
         try:
-            solved[name] = _solutions(name, task, solved)
+            solved[name] = _solutions(name, task, known)
         except ValueError as error:
             designs[name] = impossible(name, str(error))
+            continue
+        if name not in names:
             continue
         best = min(solved[name], key=_rank, default=None)
         if best is None:
@@ -99,6 +110,16 @@ def tuned_designs(
             made = (problem, best, task.constraints, task.u)
             designs[name] = design_of(best.structure.name, *made)
     return {name: designs[name] for name in names}
+
+
+def _order(names: Sequence[str], task: Task) -> list[str]:
+    """Return the structures to tune: each behind those that it starts at."""
+    found: list[str] = []
+    for name in names:
+        found += [*_order(_GIVES_STARTS.get(name, ()), task), name]
+    if task.order is not None and task.order > _LIKE_PID:
+        found = [name for name in found if name in names or name not in ("pi", "pid")]
+    return list(dict.fromkeys(found))
 
 
 def _rank(solution: Solution) -> tuple[bool, float, float]:

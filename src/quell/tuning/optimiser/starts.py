@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quell.analysis.frequency_response import Complex
+from quell.tuning.optimiser.extras import MOST_SWING, load_swing
 from quell.tuning.optimiser.objectives import load_cost
 from quell.tuning.optimiser.problem import Problem, limits
 from quell.tuning.optimiser.requirements import worst_ratio
@@ -74,4 +75,8 @@ def _gains_of(
     values = np.repeat(row[None, :], int(np.sum(good)), axis=0)
     values[:, 0] = gains[good] ** structure.gain_power
     cost = load_cost(structure, values) if values.size else np.zeros(0)
-    return values, cost, ratio[good]
+    ratio = ratio[good]
+    if structure.may_swing and values.size:
+        swing = load_swing(plants, tried[good], structure.integral_gain(values))
+        ratio = np.maximum(ratio, swing / MOST_SWING)
+    return values, cost, ratio

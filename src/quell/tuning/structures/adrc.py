@@ -55,6 +55,9 @@ class AdrcStructure:
 
     def __init__(self, model: Model, name: str, order: int, form: Form) -> None:
         self.name, self.model, self.form = name, model, form
+        # With s^(n+1) A + b0 B = p_law p_observer the poles of 1/A are as fast as the loop's. With
+        # a model, D s A + b0 N B has A less the model's own poles: it may have a slow one.
+        self.may_swing = form.based
         self.plant: Canonical = (
             canonical(model.plant) if form.based else canonical((np.zeros(order), 1.0))
         )

@@ -47,6 +47,7 @@ class Structure(Protocol):
     name: str
     parameters: tuple[Parameter, ...]
     gain_power: int  # 1 if C_y is proportional to the first parameter, −1 if to its inverse
+    may_swing: bool  # whether a second slow pole can make k_i large, so that this must be bounded
 
     def shapes(self) -> Matrix:
         """Return values (k, p) of the parameters to start from; their first one is replaced."""

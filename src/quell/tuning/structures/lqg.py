@@ -48,6 +48,7 @@ class LqgStructure:
 
     name = "lqg"
     gain_power = -1
+    may_swing = False
 
     def __init__(self, model: Model) -> None:
         self.model, self.plant = model, LinearPlant.of(model.plant)

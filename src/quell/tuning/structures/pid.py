@@ -34,6 +34,7 @@ class FilteredPID:
     """
 
     gain_power = 1
+    may_swing = False
 
     def __init__(self, model: Model, *, derivative: bool, filtered: bool) -> None:
         self.name = ("pid" if derivative else "pi") + ("" if filtered else "-unfiltered")
