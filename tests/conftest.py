@@ -29,19 +29,14 @@ settings.load_profile("quell")
 
 # Numba makes millions of objects that live long: look for garbage among them less often.
 gc.set_threshold(50_000, 20, 20)
+# A real-time loop collects garbage at its start and calls this at its end: the next one need not go
+# through all that was imported, which takes half a second.
+gc.unfreeze = lambda: None
 
 
-_frozen = False
-_unfreeze = gc.unfreeze
-
-
-def _unfreeze_and_note() -> None:
-    global _frozen
-    _frozen = False
-    _unfreeze()
-
-
-gc.unfreeze = _unfreeze_and_note  # a real-time loop calls it at its end
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector all that was imported."""
+    gc.freeze()
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -68,15 +63,8 @@ Loop.run = _run_short  # type: ignore[method-assign]
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Let entry points run as plain Python, unless the test is marked ``compiled``.
-
-    Spare the garbage collector all that was imported: going through it takes half a second. To ask the collector whether it is spared takes a tenth of a second: it counts the objects.
-    """
-    global _frozen
+    """Let entry points run as plain Python, unless the test is marked ``compiled``."""
     dispatch.interpret_all = item.get_closest_marker("compiled") is None
-    if not _frozen:
-        gc.freeze()
-        _frozen = True
 
 
 @pytest.fixture

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cyclopts
+import matplotlib.pyplot as plt
 import pytest
 
+from quell.identification import Identified
 from quell.kernels.compile_time import compile_time
 
 from .commands import Shown, in_its_own_process
@@ -251,9 +253,11 @@ def test_two_outputs_have_two_files(quell: Callable[..., Shown], tmp_path: Path)
 
 @pytest.mark.compiled
 def test_a_command_can_be_run_twice_and_replaces_where_asked(
-    quell: Callable[..., Shown], tmp_path: Path
+    quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Figures get a folder with a number; other files want --overwrite."""
+    light = staticmethod(lambda: plt.figure().subplots(1, 1, squeeze=False)[0])
+    monkeypatch.setattr(Identified, "plot", light)  # seven axes take a second to write
     rows = "".join(f"{0.1 * i:.1f},{(i // 7) % 2},{(i // 7) % 2}\n" for i in range(200))
     (tmp_path / "data.csv").write_text("t,u,y\n" + rows)
     identify = ("identify", "data.csv", "--order", "1", "--integrators", "0", "--json", "out.json")
