@@ -1,29 +1,30 @@
 """Exported controllers on this machine: bits, compilers, sanitizers, coverage, speed, long runs.
 
-    python benchmarks/exported.py [--samples 100000] [--seconds 20] [--only TEXT] [--part PART]
+    python benchmarks/exported.py [--samples 100000] [--only TEXT] [--part PART] [--results FILE]
 
 Every controller, observer, learner and feature of the contract tests is exported in double and in
 single precision, compiled without a warning by gcc, clang and as C++, and run in a loop with a
 plant (``exported.c``): noise, saturation, bursts of NaN, absurd values, manual operation, retuning,
-restarts. The interpreted kernels replay what the C code was given, for so many seconds each; the
-column has the number of samples, and how many of them differ in a bit. "compiled" is the largest
-difference of u to the compiled kernels, relative to the RMS of u. Branches are those of ``servo.c``
-that the run has taken (gcov). The parts are ``bits``, ``speed`` (the exported learner against
-``reference.c``) and ``long`` (10^8 samples in single and in double
-precision).
+restarts. The interpreted kernels replay what the C code was given; the columns have the number of
+samples, and how many of them differ in a bit. "compiled" is the largest difference of u to the
+compiled kernels, relative to the RMS of u. Branches are those of ``servo.c`` that the run has taken
+(gcov). All rows take 35 minutes of a core, MLP four of them: ``--results`` names a file to which
+each row is added when it is ready, and whose rows are not run again. The parts are ``bits``,
+``speed`` (the exported learner against ``reference.c``) and ``long`` (10^8 samples in single and in
+double precision).
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,9 +58,6 @@ COMPILERS = {
     "coverage": ("gcc", "-std=c99", "-O0", "-ffp-contract=off", "--coverage"),
 }  # fmt: skip
 NAMES = ("r", "y", "given", "u", "status")
-
-# Samples of the comparison with compiled kernels: each is a call from Python.
-_COMPILED_SAMPLES = 30_000
 
 
 def cases() -> Iterator[tuple[str, Any]]:
@@ -142,22 +140,18 @@ def branches(folder: Path) -> str:
 
 
 def replayed(
-    controller: Any, rows: np.ndarray, given: np.ndarray, seconds: float, names: set[str]
+    controller: Any, rows: np.ndarray, given: np.ndarray, names: set[str]
 ) -> tuple[int, int]:
     """Return how many samples the interpreted kernels replayed, and how many of them differ."""
-    player, path, began = Player(controller), limits_path(controller), time.process_time()
+    player, path = Player(controller), limits_path(controller)
     if path:
         player.limit_at(path, 0.5)
     for k, row in enumerate(given):
-        if time.process_time() - began > seconds:
-            break
         action = available(Action(int(rows[k, 0])), names, path)
         player.play(action, row["r"], row["y"], row["given"])
-    count = len(player.rows)
-    u = player.u_of(slice(None))
     status = np.array([row.status for row in player.rows])
-    same = (u == given["u"][:count]) & (status == given["status"][:count])
-    return count, int(np.sum(~same))
+    same = (player.u_of(slice(None)) == given["u"]) & (status == given["status"])
+    return same.size, int(np.sum(~same))
 
 
 def available(action: Action, names: set[str], path: str) -> Action:
@@ -177,10 +171,9 @@ def compiled_difference(
 ) -> float:
     """Return the largest difference of u to the compiled methods, relative to the RMS of u."""
     runner, path = copy.deepcopy(controller), limits_path(controller)
-    count = min(len(rows), _COMPILED_SAMPLES)
     derivatives = int(getattr(controller, "derivatives", 0)) if "set_derivatives" in names else 0
-    u = np.empty(count)
-    for k, row in enumerate(given[:count]):
+    u = np.empty(given.size)
+    for k, row in enumerate(given):
         action = available(Action(int(rows[k, 0])), names, path)
         r, y = row["r"], row["y"]
         more = [0.5 * r] * derivatives
@@ -196,8 +189,8 @@ def compiled_difference(
             runner.start(y, row["given"], r)
         track = action is Action.TRACK
         u[k] = runner.track(r, y, row["given"], *more) if track else runner.step(r, y, *more)
-    size = float(np.sqrt(np.mean(np.square(given["u"][:count])))) or 1.0
-    return float(np.max(np.abs(u - given["u"][:count]))) / size
+    size = float(np.sqrt(np.mean(np.square(given["u"])))) or 1.0
+    return float(np.max(np.abs(u - given["u"]))) / size
 
 
 def judged(name: str, controller: Any, precision: str, options: argparse.Namespace) -> list[str]:
@@ -225,10 +218,8 @@ def judged(name: str, controller: Any, precision: str, options: argparse.Namespa
         taken = branches(folder / "coverage")
     given = runs["gcc"]
     others = sum(not same_bits(each, given) for each in runs.values())
-    count, wrong = replayed(shown, rows, given, options.seconds, names)
-    compiled = "–"
-    if options.compiled:
-        compiled = f"{compiled_difference(shown, rows, given, names):.0e}"
+    count, wrong = replayed(shown, rows, given, names)
+    compiled = f"{compiled_difference(shown, rows, given, names):.0e}"
     flags = ql.Status(int(np.bitwise_or.reduce(given["status"].astype(int))))
     cells = [name, precision, f"{count}", f"{wrong}", f"{others}", compiled, taken]
     return [*cells, f"{int(flags)}"]
@@ -238,25 +229,40 @@ def bits(options: argparse.Namespace, console: Console) -> None:
     """Print the table of all combinations."""
     heads = ("controller", "precision", "replayed", "differ", "compilers that differ", "compiled")
     table = Table(*heads, "branches taken", "flags seen")
-    wrong = 0
+    known, wrong = earlier_rows(options.results), 0
     for name, controller in cases():
         if options.only not in name:
             continue
         for precision in ("double", "single"):
-            try:
-                cells = judged(name, controller, precision, options)
-                wrong += cells[3:5] != ["0", "0"]
-            except TranslationError as error:
-                cells = [name, precision, "refused", str(error)[:40], "", "", "", ""]
-            except (RuntimeError, ValueError) as error:
-                cells, wrong = (
-                    [name, precision, "FAILED", str(error)[:200], "", "", "", ""],
-                    wrong + 1,
-                )
+            cells = known.get((name, precision))
+            if cells is None:
+                cells = row_of(name, controller, precision, options)
+                if options.results:
+                    with options.results.open("a", encoding="utf-8") as file:
+                        print(json.dumps(cells), file=file)
+            wrong += cells[2] != "refused" and cells[3:5] != ["0", "0"]
             console.print(" | ".join(cells), highlight=False)
             table.add_row(*cells)
     console.print(table)
     console.print(f"{wrong} rows have an error" if wrong else "all rows are as they must be")
+
+
+def row_of(name: str, controller: Any, precision: str, options: argparse.Namespace) -> list[str]:
+    """Return a row of the table, also for what is refused or fails."""
+    try:
+        return judged(name, controller, precision, options)
+    except TranslationError as error:
+        return [name, precision, "refused", str(error)[:40], "", "", "", ""]
+    except (RuntimeError, ValueError) as error:
+        return [name, precision, "FAILED", str(error)[:200], "", "", "", ""]
+
+
+def earlier_rows(file: Path | None) -> dict[tuple[str, str], list[str]]:
+    """Return the rows in a file by controller and precision."""
+    if file is None or not file.exists():
+        return {}
+    rows = map(json.loads, file.read_text(encoding="utf-8").splitlines())
+    return {(row[0], row[1]): row for row in rows}
 
 
 def speed(console: Console) -> None:
@@ -329,10 +335,9 @@ def main() -> None:
     """Run the parts."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--samples", type=int, default=100_000, help="samples of each run in C")
-    parser.add_argument("--seconds", type=float, default=20.0, help="time of each replay")
     parser.add_argument("--only", default="", help="controllers whose name has this text")
     parser.add_argument("--part", choices=("bits", "speed", "long"), help="one part only")
-    parser.add_argument("--compiled", action="store_true", help="compare with compiled kernels")
+    parser.add_argument("--results", type=Path, help="file of rows that are ready")
     parser.add_argument("--long", type=float, default=1e8, help="samples of the long runs")
     options = parser.parse_args()
     console = Console(width=max(160, int(os.environ.get("COLUMNS", "0"))))
