@@ -19,7 +19,7 @@ from quell.kernels import dispatch, functions
 from quell.kernels.dispatch import is_finite
 from quell.kernels.functions import is_single
 from quell.kernels.single import in_single
-from quell.kernels.sums import add_small
+from quell.kernels.sums import add_small, add_to_diagonal
 from quell.learners.base import commit
 from quell.learners.kalman.search import ENTRIES, advance_search
 from quell.learners.least_squares import reduce_row
@@ -103,7 +103,7 @@ def test_carried_sums_lose_nothing() -> None:
 
 
 def test_slow_averages_reach_their_goal() -> None:
-    """Where an increment is below the last digit: means with their carries, and the sum of weights."""
+    """Where an increment is below the last digit: means and variances with their carries, and the sum of weights."""
     mean = np.array([0.0, 1.0, 0.0, 0.0], np.float32)
     for _ in range(20_000):
         add_small(mean, 2, 1, np.float32(1e-3) * (np.float32(1.0 + 1e-5) - mean[1]))
@@ -111,6 +111,10 @@ def test_slow_averages_reach_their_goal() -> None:
     double = np.array([1.0])
     add_small(double, 1, 0, 0.5)
     assert double.tolist() == [1.5]
+    P = np.array([[1.0, 0.0]], np.float32)
+    for _ in range(10_000):
+        add_to_diagonal(P, 0, np.float32(-1e-8))
+    assert float(P[0, 0]) + float(P[0, 1]) == pytest.approx(1.0 - 1e-4, abs=1e-9)
     weight, usual = np.float32(0.0), 0.0
     for _ in range(20_000):
         weight = np.float32(grown(weight, np.float32(1e-3)))
@@ -250,14 +254,14 @@ def test_a_search_for_frequencies_counts_its_entries_without_end() -> None:
 
 def test_covariance_stays_symmetric() -> None:
     """In single precision the lower triangle counts."""
-    P = np.array([[1.0, 2.0], [3.0, 4.0]], np.float32)
+    P = np.array([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]], np.float32)
     gain = np.array([0.5, 1.0], np.float32)
     for i in range(2):
         reduce_row(P, i, gain[i], gain)
-    assert P.tolist() == [[0.75, 2.5], [2.5, 3.0]]
+    assert P.tolist() == [[0.75, 2.5, 0.0], [2.5, 3.0, 0.0]]
     controller = ql.ADRC(ORDER_2, 1.5, learner=ql.learners.Kalman())
     run = ql.simulate(CHAIN, controller, SCENARIO, precision="single")
-    covariance = run.final_state.learner.covariance
+    covariance = run.final_state.learner.covariance[:, :-1]
     np.testing.assert_array_equal(covariance, covariance.T)
 
 

@@ -19,7 +19,7 @@ from quell.export.translate.source import ascii_text
 from quell.export.translate.values import TranslationError
 from quell.kernels.dispatch import generic, kernel
 from quell.kernels.scalars import Scalars, clear
-from quell.kernels.sized import Flag, Size
+from quell.kernels.sized import Flag, Scratch, Size
 from quell.types import Matrix, Vector
 
 from .in_c import InC, needs_gcc
@@ -57,7 +57,7 @@ class State(NamedTuple):
     count: NDArray[Count]
 
 
-def source_of(function: Callable[..., Any], design: Design, state: State) -> Any:
+def source_of(function: Callable[..., Any], design: Design, state: Any) -> Any:
     """Return the C files with ``function(design, state, a, b)`` as the operation ``run``."""
 
     def write(findings: Findings) -> Any:
@@ -97,6 +97,54 @@ def check_equal(tmp_path: Path, function: Callable[..., Any], **changes: Any) ->
             expected = float(function(design, state, np.float64(a), np.float64(b)))
             found = in_c(a, b)
             assert found == expected or (found != found and expected != expected), (a, b)
+
+
+class WithScratch(NamedTuple):
+    """A state with an array that only one call needs."""
+
+    x: Vector
+    scratch: Scratch
+
+
+@kernel
+def swapped(state: WithScratch, a: float) -> float:
+    """Exchange the halves of x, by way of the scratch array."""
+    x, scratch = state.x, state.scratch
+    for i in range(4):
+        scratch[i] = x[(i + 2) % 4] + a
+    for i in range(4):
+        x[i] = scratch[i]
+    return x[0]
+
+
+def run_swapped(design: Design, state: WithScratch, a: float, b: float) -> float:
+    """Return an entry of x, and clear the scratch array."""
+    found = swapped(state, a)
+    for i in range(4):
+        state.scratch[i] = 0.0
+    return found + b
+
+
+def with_scratch() -> WithScratch:
+    """Return a state."""
+    return WithScratch(np.arange(4.0), np.zeros(4))
+
+
+@needs_gcc
+def test_a_scratch_array_is_a_local_variable_in_c(tmp_path: Path) -> None:
+    """It is no part of the C state; a kernel that reads it without a name is refused."""
+    source = source_of(run_swapped, new_design(), with_scratch())
+    assert "scratch" not in source.header
+    assert "double scratch[4];" in source.source
+    in_c, state = InC(source, tmp_path), with_scratch()
+    for a in (1.0, 2.5, -3.0):
+        assert in_c.run("run", a, 0.5) == run_swapped(new_design(), state, a, 0.5)
+
+    def unnamed(design: Design, state: WithScratch, a: float, b: float) -> float:
+        return state.scratch[0] + a
+
+    with pytest.raises(TranslationError, match="annotated with Scratch needs a name"):
+        source_of(unnamed, new_design(), with_scratch())
 
 
 @kernel

@@ -161,7 +161,7 @@ class GuardMemory(NamedTuple):
 
     chain: Matrix  # lag filters of f_plain, g and v (3, …)
     fed: Matrix  # lag filter of f_L (1, …), if it is not that of the observer, else (0, …)
-    # Their outputs f_plain^F, g^F, p and f_L^F (4,); in single precision carries, too (6,).
+    # Their outputs f_plain^F, g^F, p and f_L^F (4,); in single precision carries, too (7,).
     shown: Vector
     effects: Matrix  # what q and p̄ do to y, stage by stage (2, n) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)
@@ -171,8 +171,8 @@ class GuardMemory(NamedTuple):
 # Rows of GuardMemory.chain and, with the last, entries of GuardMemory.shown.
 _F_PLAIN, _G, _V, _F_L = range(4)
 # Carries of sums in single precision, the last entries of GuardMemory.shown there.
-_TARGET, _SHARE = 4, 5
-CARRIES = 2
+_TARGET, _SHARE, _PEAK = 4, 5, 6
+CARRIES = 3
 
 
 @kernel
@@ -181,7 +181,8 @@ def _sum(
 ) -> float:
     """Return ``value + increment``; in single precision what rounding takes is carried over.
 
-    Share and target move by so little in a sample that rounding would stop them.
+    Share, target and P move by so little in a sample that rounding would stop them, or change their
+    speed.
     """
     if is_single(guard.forget):
         increment += memory.shown[place]
@@ -218,7 +219,7 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
     if sample.unsettled > 0.0:
         sample.unsettled -= 1.0
         return
-    _update_bound(guard, sample, abs(q))
+    _update_bound(guard, memory, abs(q))
     energy = qq + pp
     if energy < _tiny(guard):
         return
@@ -271,14 +272,16 @@ def _earned(q: float, p: float, mean_square: float, tiny: float) -> float:
 
 
 @kernel
-def _update_bound(guard: GuardDesign, sample: GuardSample, error: float) -> None:
+def _update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
     """Update P, o and e with |q|."""
+    sample = memory.sample[0]
     peak, size, own = sample.peak, sample.typical_error, sample.own_peak
     # After T an outlier counts for 5 P at most: one bad measurement must not open all bounds.
     if sample.samples * guard.forget >= 1.0:
         error = min(error, _OUTLIER * peak)
     most_own = own if error > _SUDDEN * peak else _MOST_OWN * own
-    peak += guard.rise * (error - peak) if error > peak else -guard.decay * peak
+    more = guard.rise * (error - peak) if error > peak else -guard.decay * peak
+    peak = _sum(guard, memory, _PEAK, peak, more)
     sample.peak = max(peak, _tiny(guard))
     larger = guard.rise * (error - guard.own * own - size)
     if larger > 0.0:

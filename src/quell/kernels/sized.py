@@ -42,6 +42,10 @@ Flag: TypeAlias = Annotated[bool, "constant"]
 Buffer: TypeAlias = Annotated[NDArray[np.float64], "variable"]
 """Annotates an array in a NamedTuple whose length is a parameter: its shape is no constant."""
 
+Scratch: TypeAlias = Annotated[NDArray[np.float64], "scratch"]
+"""Annotates an array in a state that one call fills and only the same call reads: exported code has
+a local variable in its place. A kernel gives it a name before it uses it."""
+
 # Larger arrays are passed in Numba's own way: loops over them are not unrolled, and buffers of
 # many lengths would each be compiled for. 16 × 16 is a Kalman learner with 16 features.
 _MOST_ELEMENTS = 256
@@ -225,6 +229,7 @@ class _Annotations(NamedTuple):
 
     constants: tuple[int, ...]  # indices of constants
     sized: tuple[bool, ...]  # for each field, whether an array in it has a known shape
+    scratch: tuple[int, ...]  # indices of arrays that no later call reads
 
 
 def constant_fields(kind: type) -> tuple[str, ...]:
@@ -233,10 +238,18 @@ def constant_fields(kind: type) -> tuple[str, ...]:
     return tuple(names[i] for i in _annotations(kind).constants)
 
 
+def scratch_fields(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a NamedTuple that are annotated with Scratch."""
+    names = getattr(kind, "_fields", ())
+    return tuple(names[i] for i in _annotations(kind).scratch)
+
+
 @functools.cache
 def _annotations(kind: Any) -> _Annotations:
     notes = getattr(kind, "__annotations__", {})
     fields = [notes.get(name) for name in getattr(kind, "_fields", ())]
     names = [getattr(note, "__forward_arg__", note) for note in fields]
     constants = tuple(i for i, name in enumerate(names) if name in ("Size", "Flag", Size, Flag))
-    return _Annotations(constants, tuple(name not in ("Buffer", Buffer) for name in names))
+    sized = tuple(name not in ("Buffer", Buffer) for name in names)
+    scratch = tuple(i for i, name in enumerate(names) if name in ("Scratch", Scratch))
+    return _Annotations(constants, sized, scratch)

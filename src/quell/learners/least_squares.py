@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import is_single
+from quell.kernels.sums import add_to_diagonal
 from quell.types import Matrix, Vector
 
 # A larger φ·Pφ could overflow in what follows; in single precision earlier.
@@ -39,9 +40,10 @@ def reduce_row(covariance: Matrix, i: int, share: float, gain: Vector) -> None:
     calculated.
     """
     if is_single(share):
-        for j in range(i + 1):
+        for j in range(i):
             value = covariance[i, j] - share * gain[j]
             covariance[i, j] = covariance[j, i] = value
+        add_to_diagonal(covariance, i, -share * gain[i])
     else:
         for j in range(covariance.shape[0]):
             covariance[i, j] -= share * gain[j]

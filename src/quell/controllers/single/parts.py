@@ -101,5 +101,8 @@ def _with_longer(state: Any) -> Any:
     if isinstance(state, GuardMemory):
         return state._replace(shown=np.append(state.shown, np.zeros(CARRIES)))
     if isinstance(state, KalmanMemory | NoiseGateMemory):
-        return state._replace(mean=np.zeros(2 * state.mean.size))
+        state = state._replace(mean=np.zeros(2 * state.mean.size))
+    if isinstance(state, KalmanMemory):
+        carries = np.zeros((state.theta.size, 1))
+        return state._replace(covariance=np.hstack([state.covariance, carries]))
     return state

@@ -174,6 +174,8 @@ class Expressions:
             raise self.fail(node, "a record has only the index 0")
         if not isinstance(base.kind, Array):
             raise self.fail(node, "is not an array")
+        if not base.code:
+            raise self.fail(node, "an array annotated with Scratch needs a name first")
         if isinstance(node.slice, ast.Slice):
             return self._slice(node, base, node.slice)
         indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]

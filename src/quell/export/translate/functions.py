@@ -66,10 +66,8 @@ class Function:
         }
         # Values of the parameters that are the same in all calls so far.
         self.constants: dict[str, Any] = {}
-        stored = {part.id for part in ast.walk(source.tree)
-                  if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}  # fmt: skip
         for name, argument in zip(names, arguments, strict=True):
-            if name in stored or not isinstance(argument.kind, Number):
+            if name in source.stored or not isinstance(argument.kind, Number):
                 continue
             if argument.is_constant and (key, name) not in program.findings.parameters:
                 self.constants[name] = argument.constant
@@ -194,6 +192,8 @@ class Function:
             return f"{'const ' if constant else ''}{self.program.structs.number(kind)} {name}"
         if value.calls and isinstance(kind, Struct):
             return f"const {kind.name} {name}"
+        if not value.code:
+            return self.program.structs.declaration(kind, name)
         is_const = not value.mutable or value.root not in self.written
         return self.program.pointer(kind, name, is_const)
 

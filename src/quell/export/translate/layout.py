@@ -96,7 +96,7 @@ def block_lines(block: Block, result: str, indent: int = 4) -> list[str]:
                 text, behind = "return returned", ""
             elif item.target:
                 name = item.declares or item.target
-                text = f"{item.code}" if item.updates else f"{name} = {item.code}"
+                text = item.code if item.updates else f"{name} = {item.code}" if item.code else name
             lines += wrapped(f"{pad}{text};{behind}")
         elif isinstance(item, Branch):
             lines += _branch(item, result, indent, behind)

@@ -94,6 +94,20 @@ class Source:
     name: str
     names: dict[str, Any]  # what global names stand for
 
+    @functools.cached_property
+    def occurring(self) -> frozenset[str]:
+        """All names in the function."""
+        return frozenset(part.id for part in ast.walk(self.tree) if isinstance(part, ast.Name))
+
+    @functools.cached_property
+    def stored(self) -> frozenset[str]:
+        """The names that the function sets."""
+        return frozenset(
+            part.id
+            for part in ast.walk(self.tree)
+            if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)
+        )
+
 
 @functools.cache
 def read_function(function: Callable[..., Any]) -> Source:

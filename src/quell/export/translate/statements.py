@@ -23,6 +23,7 @@ from quell.export.translate.values import (
     NOTHING,
     SHIFT,
     UNARY,
+    Array,
     Number,
     Several,
     Value,
@@ -238,6 +239,10 @@ class Body:
         if isinstance(target, ast.Name):
             self.variables.set(target.id, value, block)
             return
+        if isinstance(target, ast.Subscript) and isinstance(target.value, ast.Attribute):
+            array = self.expressions.translate(target.value)
+            if isinstance(array.kind, Array) and not array.code:  # a scratch array is not kept
+                return
         place = self.expressions.translate(target)
         if place.member is not None:
             same = value.is_constant and float(value.constant) == place.constant

@@ -24,7 +24,7 @@ from quell.export.translate.values import (
 )
 from quell.kernels.function_pointers import origin_of
 from quell.kernels.scalars import Scalars
-from quell.kernels.sized import constant_fields
+from quell.kernels.sized import constant_fields, scratch_fields
 
 # Name of the union of arrays that lie in the same memory.
 _SHARED = "shared"
@@ -40,6 +40,7 @@ class Layout:
     constants: dict[str, Any] = field(default_factory=dict)
     absent: dict[str, Kind] = field(default_factory=dict)  # empty arrays and structs
     shared: tuple[str, ...] = ()  # members in the same memory
+    scratch: dict[str, Kind] = field(default_factory=dict)  # arrays that are local variables
 
 
 class Structs:
@@ -121,13 +122,18 @@ class Structs:
         signature = (cls, tuple(kinds.items()), tuple(constants.items()), shared)
         found = self._by_signature.get(signature)
         if found is None:
-            members = {part: kind for part, kind in kinds.items() if not is_empty(Value(kind))}
+            found_parts = {part: kind for part, kind in kinds.items() if not is_empty(Value(kind))}
+            scratch = {
+                part: kind for part, kind in found_parts.items() if part in scratch_fields(cls)
+            }
+            members = {part: kind for part, kind in found_parts.items() if part not in scratch}
             base = snake_case(cls.__name__).removesuffix("_design")
             found = self._new(cls, base, not members)
             self._by_signature[signature] = found
             layout = self.layouts[found.name]
             layout.members, layout.constants, layout.shared = members, constants, shared
-            layout.absent = {part: kind for part, kind in kinds.items() if part not in members}
+            layout.scratch = scratch
+            layout.absent = {part: kind for part, kind in kinds.items() if part not in found_parts}
         return found
 
     def _new(self, kind: type, base: str, empty: bool) -> Struct:
@@ -143,6 +149,8 @@ class Structs:
             constant = layout.constants[name]
             number = Number.BOOL if isinstance(constant, bool) else Number.INT
             return Value(number, self.literals.write(constant), constant=constant)
+        if name in layout.scratch:  # without code: the variable that is set to it is the array
+            return Value(layout.scratch[name], root=owner.root, mutable=True)
         kind = layout.members.get(name, layout.absent.get(name))
         if kind is None:
             return None

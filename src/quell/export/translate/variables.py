@@ -7,7 +7,6 @@ again. The same holds for the kind of a number: an integer that is real elsewher
 
 from __future__ import annotations
 
-import ast
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -65,7 +64,7 @@ class Variables:
         self.names.update(arguments)
         self.local: dict[str, Value] = {}  # what the variables that exist in C were set to first
         self._parameters = set(arguments)
-        self._taken = {part.id for part in ast.walk(source.tree) if isinstance(part, ast.Name)}
+        self._taken = set(source.occurring)
 
     def fresh(self, name: str) -> str:
         """Return a name that no variable of the function has, for another one."""

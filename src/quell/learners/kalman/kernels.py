@@ -43,8 +43,8 @@ from numpy.typing import NDArray
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
 from quell.kernels.scalars import Scalars, clear
-from quell.kernels.sized import Flag, Size
-from quell.kernels.sums import add_small
+from quell.kernels.sized import Flag, Scratch, Size
+from quell.kernels.sums import add_small, add_to_diagonal
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.kalman.oscillators import (
     Oscillators,
@@ -109,12 +109,13 @@ class KalmanMemory(NamedTuple):
     """State of the learner, with p features and m oscillators."""
 
     theta: Vector  # θ in scaled units (p,)
-    covariance: Matrix  # P (p, p); for the bias in units of R
+    # P (p, p), for the bias in units of R; in single precision with carries (p, p + 1).
+    covariance: Matrix
     chain: Matrix  # lag filters of the features (p, …)
     filtered: Vector  # φ^F (p,); from ``adapt`` to the next ``commit`` φ̃ in its place
     mean: Vector  # running means of φ^F (p,); in single precision with carries (2p,)
     variance: Vector  # running variances of φ^F (p,)
-    gain: Vector  # P φ̃ (p,)
+    gain: Scratch  # P φ̃ (p,)
     phase: Vector  # ψ of each oscillator [rad] (m,)
     omega: Vector  # ω̂ of each oscillator [rad/s] (m,)
     averages: NDArray[KalmanAverages]  # (1,)
@@ -169,7 +170,7 @@ def _adapt(
         reduce_row(covariance, i, share, gain)
         if learner.threshold[i] == 0.0:
             theta[i] += share * innovation
-            covariance[i, i] += learner.walk[i] * learner.dt
+            add_to_diagonal(covariance, i, learner.walk[i] * learner.dt)
         else:
             updated = theta[i] + share * innovation * weight
             if learner.with_u and i == size - 1:
@@ -179,9 +180,8 @@ def _adapt(
             if learner.bias:
                 theta[learner.states] -= change * memory.mean[i]
             if regressor[i] != 0.0:
-                covariance[i, i] += (
-                    learner.walk[i] * learner.dt * deviation * deviation / memory.variance[i]
-                )
+                grown_by = learner.walk[i] * learner.dt * deviation * deviation / memory.variance[i]
+                add_to_diagonal(covariance, i, grown_by)
     step, unexplained = inverse * innovation, averages.unexplained
     for j in range(memory.omega.size):
         if not is_locked(learner.search, memory.search, j):
@@ -300,7 +300,7 @@ def _forget(learner: KalmanDesign, memory: KalmanMemory) -> None:
     for i in range(memory.theta.size):
         memory.theta[i] = memory.variance[i] = 0.0
         memory.gain[i] = 0.0
-        for j in range(memory.theta.size):
+        for j in range(memory.covariance.shape[1]):
             memory.covariance[i, j] = learner.prior[i] ** 2 if i == j else 0.0
 
 

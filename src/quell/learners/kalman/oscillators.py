@@ -100,6 +100,7 @@ def open_pairs(oscillators: Oscillators, covariance: Matrix, variance: float) ->
     for i in range(first, first + 2 * oscillators.omega.size * oscillators.orders.size):
         for j in range(covariance.shape[0]):
             covariance[i, j] = covariance[j, i] = 0.0
+        covariance[i, covariance.shape[1] - 1] = 0.0  # its carry in single precision
         covariance[i, i] = variance
 
 
