@@ -176,6 +176,8 @@ def test_limits_and_bandwidths_change_while_the_fmu_runs(name: str, made: Maker)
     law: Any = plain() if name == "servo" else learning()
     running = made(name).begin()
     assert ("omega_o" in running.references) == (name == "servo")
+    fixed = "omega_o = 20 rad/s, fixed" in running.description.description
+    assert fixed == (name == "learner")
     for k in range(300):
         if k == 60:
             law.set_limits(u_max=1.5)

@@ -90,7 +90,7 @@ def check_compilable() -> None:
     if not KERNEL_OPTIONS:
         raise ValueError(
             f"precision = 'single': is compiled with Numba 0.68 only, and this is "
-            f"{numba.__version__}; install that, or run with interpret=True"
+            f"{numba.__version__}; pip install 'numba==0.68.*', or run with interpret=True"
         )
 
 

@@ -169,7 +169,8 @@ def _model(
         }
         plant_part = PlantPart(translated, plant.order, plant.disturbances, start.tolist())
     what = [type(each).__name__ for each in (controller, plant) if each is not None]
-    return Model(controller_part, plant_part, float(dt or 0.0), " with ".join(what)), files
+    title = " with ".join(what) + (controller_part.fixed if controller_part else "")
+    return Model(controller_part, plant_part, float(dt or 0.0), title), files
 
 
 def _content(

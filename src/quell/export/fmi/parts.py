@@ -108,6 +108,23 @@ class ControllerPart:
             found.append(Variable("omega_o", TUNABLE, text, known.omega_o, "rad/s"))
         return found
 
+    @property
+    def fixed(self) -> str:
+        """Which bandwidths are no parameters, as the end of a sentence; empty if all are."""
+        known = self.bandwidths
+        if known is None:
+            return ""
+        names = {
+            "omega_c": (known.omega_c, known.weights),
+            "omega_o": (known.omega_o, known.coefficients),
+        }
+        fixed = [
+            f"{name} = {value:g} rad/s" for name, (value, found) in names.items() if found is None
+        ]
+        if not fixed:
+            return ""
+        return f"; {' and '.join(fixed)}, fixed: without a closed form for another; export again"
+
 
 @dataclass(frozen=True)
 class PlantPart:
