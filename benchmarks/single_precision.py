@@ -89,7 +89,7 @@ def cases() -> Iterator[Case]:
         (1e-6, 0.0, 1e-3, 1e-4),
         (1e-4, 10.0, 1e-3, 1.1e-3),
         (1e-6, 10.0, 1e-3, math.nan),
-        (1e-4, 0.0, 1e-4, math.nan),
+        (1e-4, 0.0, 1e-4, 8e-5),  # with one of the two; it is not known with which
         (1e-6, 0.0, 1e-4, 8e-5),
     ):
         usual = study.scenario(study.Settings(dt=dt))
