@@ -386,7 +386,7 @@ def test_a_learner_stays_bounded_without_excitation(name: str, rng: np.random.Ge
 def test_a_learner_stays_bounded_whatever_it_is_shown(name: str, rng: np.random.Generator) -> None:
     """1e5 finite samples of very different size: state and output stay finite and repeatable."""
     # Models that are Python objects take their time.
-    samples = 10_000 if name in PYTHON_LEARNERS else 100_000
+    samples = 4_000 if name in PYTHON_LEARNERS else 100_000
     # From rest to wild and back, in blocks, with spikes.
     size = np.repeat(10.0 ** rng.uniform(-6.0, 3.0, 100), samples // 100) * np.where(
         rng.random(samples) < 1e-3, 1e3, 1.0
