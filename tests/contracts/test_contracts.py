@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import inspect
 import math
 import pickle
 from functools import partial
@@ -80,7 +81,9 @@ def test_every_plant_has_an_example() -> None:
     Plants from files are tested in tests/test_fmu.py and tests/test_any_plant.py.
     """
     no_plants = {"Plant", "PlantBatch", "batch", "labelled", "linearised", "signals_of"}
-    public = {getattr(plant_room, name) for name in set(plant_room.__all__) - no_plants}
+    public = {
+        inspect.unwrap(getattr(plant_room, name)) for name in set(plant_room.__all__) - no_plants
+    }
     classes = {thing for thing in public if isinstance(thing, type)}
     made = {make for name, make in registry.PLANTS.items() if name not in FROM_FILES}
     assert public - classes == made - {registry.linear}
