@@ -426,7 +426,7 @@ def test_status_and_reason_say_what_happened() -> None:
     run = ql.simulate(PLANT, controller, ql.Scenario(ql.signals.Sinusoid(), 5.0))
     assert Status.LEARNER_CUT in run.status
     assert {"authority", "error_plain", "error_learned", "reason"} <= set(run.names)
-    assert run.to_xarray()["error_plain"].attrs["units"] == "y-unit/s^n"
+    assert run.to_xarray()["error_plain"].attrs["units"] == "m/s⁴"
     axes = run.plot()
     assert len(axes) == 5
     assert "not finite" in axes[3].get_legend_handles_labels()[1]
