@@ -138,6 +138,9 @@ def test_an_identified_model_has_its_delay_and_friction(files: Path) -> None:
     Path("older.json").write_text(json.dumps(without))
     with pytest.warns(ql.types.DesignWarning, match=r"older\.json: its friction is left out"):
         plant_of({"kind": "identified", "path": "older.json"}, DT)
+    Path("zero.json").write_text(json.dumps(MODEL | {"den": [0.0, *MODEL["den"]]}))
+    with pytest.raises(SetupError, match=r"den\[0\] = 0\.0: must not be zero"):
+        plant_of({"kind": "identified", "path": "zero.json"}, DT)
     Path("other.json").write_text("[1, 2]")
     with pytest.raises(SetupError, match=r"plant\.path = 'other\.json': has no model"):
         plant_of({"kind": "identified", "path": "other.json"}, DT)

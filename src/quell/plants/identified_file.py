@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from quell.plants.delay import delayed
 from quell.plants.linear import LinearPlant
 from quell.plants.nonlinear.friction import FrictionPlant
 from quell.reading import whole_text
-from quell.types import DesignWarning
+from quell.warn import warn
 
 
 def identified(path: str | os.PathLike[str], dt: float) -> Plant:
@@ -52,7 +51,7 @@ def identified(path: str | os.PathLike[str], dt: float) -> Plant:
         plant = FrictionPlant(linear, numbers["num"], numbers["den"], force, width, name)
     elif force and "friction_width" not in found:
         text = f"{path}: its friction is left out: the file is of an older quell; identify again"
-        warnings.warn(text, DesignWarning, stacklevel=2)
+        warn(text)
     late = round(delay / checks.positive("dt", dt, "s"))
     return delayed(plant, late * dt, dt) if late else plant
 

@@ -90,6 +90,8 @@ class FrictionPlant:
     def __post_init__(self) -> None:
         checks.positive("force", self.force, "u-unit")
         checks.positive("width", self.width, "y-unit/s")
+        if self.den[0] == 0.0:
+            raise ValueError(f"den[0] = {self.den[0]}: must not be zero; leave it out")
         if len(self.num) > self.order - 1:
             raise ValueError(
                 f"num has {len(self.num)} coefficients, den {len(self.den)}: the relative degree "
