@@ -313,6 +313,7 @@ def test_plants_that_do_not_fit_are_refused(plant: Any, message: str) -> None:
     ("arguments", "message"),
     [
         ({"limit": 1.0}, "limit: tune has no such argument, did you mean rate_limit"),
+        ({"constraint": {}}, "constraint: tune has no such argument, did you mean constraints"),
         ({"uncertain": {"a": (1.0, 2.0)}}, "plant = .*: with uncertain it must be a function"),
         (
             {"plant": lambda a: ([a], [1.0, 1.0]), "uncertain": {"b": (1.0, 2.0)}},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -150,7 +151,8 @@ def tune(
     _check_names(structure, compare, objective)
     for name in limits:
         if name not in _LIMITS:
-            raise ValueError(f"{name}: tune has no such argument, {checks.nearest(name, _LIMITS)}")
+            known = [*inspect.signature(tune).parameters][:-1] + list(_LIMITS)
+            raise ValueError(f"{name}: tune has no such argument, {checks.nearest(name, known)}")
     if not 0.0 < checks.finite("quantile", quantile) <= 1.0:
         raise ValueError(f"quantile = {quantile!r}: must be above 0 and at most 1, the worst case")
     report = progress or (lambda part, share: None)
