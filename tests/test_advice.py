@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import math
 import warnings
 from types import SimpleNamespace
 from typing import Any
@@ -90,6 +91,7 @@ def test_a_slow_sample_time_is_warned_of_with_its_number() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         design(adrc(100.0, 10.0, 0.01).observer, 10.0)
+        design(adrc(10.0, 50.0, 0.01).observer, math.nextafter(50.0, math.inf))
     assert sampling_findings(adrc(30.0, 10.0, 0.01, form="predictor").observer, 10.0) == []
 
 

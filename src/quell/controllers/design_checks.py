@@ -27,6 +27,9 @@ from quell.warn import warn
 _OBSERVER_LIMIT = {"current": 1.0, "predictor": 0.3}
 _LAW_LIMIT = 0.5
 _DELAY_LIMIT = 0.5
+# A product that rounding alone puts above its limit keeps to it, as that of a tuner which ends at
+# the limit.
+_ROUNDING = 1.0 + 1e-9
 
 
 class Finding(NamedTuple):
@@ -51,7 +54,7 @@ def sampling_findings(observer: ESO, omega_c: float) -> list[Finding]:
     dt, form = observer.dt, observer.form
     found = []
     value, limit = observer.omega_o * dt, _OBSERVER_LIMIT.get(form, _OBSERVER_LIMIT["current"])
-    if value > limit:
+    if value > _ROUNDING * limit:
         current_helps = form == "predictor" and value <= _OBSERVER_LIMIT["current"]
         cost = "there sampling costs up to a sixth of the modulus margin, beyond it more"
         if value >= math.pi:
@@ -66,7 +69,7 @@ def sampling_findings(observer: ESO, omega_c: float) -> list[Finding]:
         )
         found.append(Finding("sampling", value, limit, message))
     value = omega_c * dt
-    if value > _LAW_LIMIT:
+    if value > _ROUNDING * _LAW_LIMIT:
         message = (
             f"omega_c * dt = {value:.3g} is above {_LAW_LIMIT:g}: the law's gains are made for "
             "faster sampling, the loop may be unstable; "
@@ -76,7 +79,7 @@ def sampling_findings(observer: ESO, omega_c: float) -> list[Finding]:
         found.append(Finding("sampling", value, _LAW_LIMIT, message))
     delay = dt * known_samples(observer)
     value = observer.degree * omega_c * delay
-    if value > _DELAY_LIMIT:
+    if value > _ROUNDING * _DELAY_LIMIT:
         message = (
             f"order * omega_c * delay = {value:.3g} is above {_DELAY_LIMIT:g}: the delay stays in "
             "the loop, which becomes unstable soon after 1; "
