@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from quell.identification.result import Identified
-from quell.plants.delay import delayed
-from quell.plants.nonlinear.friction import FrictionPlant
+from quell.plants.friction_and_delay import with_friction_and_delay
 
 
 def simulated_plant(found: Identified) -> Any:
@@ -26,10 +25,7 @@ def simulated_plant(found: Identified) -> Any:
     ValueError
         for direct feedthrough.
     """
-    plant: Any = found.plant
-    width = found.friction_width
-    if found.friction is not None and width is not None:
-        plant = FrictionPlant(plant, found.num, found.den, found.friction, width, plant.name)
-    if late := round(found.delay / found.dt):
-        plant = delayed(plant, late * found.dt, found.dt)
-    return plant
+    friction = found.friction, found.friction_width
+    return with_friction_and_delay(
+        found.plant, found.num, found.den, *friction, found.delay, found.dt
+    )

@@ -10,9 +10,8 @@ from typing import Any
 
 from quell import checks
 from quell.plants.base import Plant
-from quell.plants.delay import delayed
+from quell.plants.friction_and_delay import with_friction_and_delay
 from quell.plants.linear import LinearPlant
-from quell.plants.nonlinear.friction import FrictionPlant
 from quell.reading import whole_text
 from quell.warn import warn
 
@@ -43,17 +42,15 @@ def identified(path: str | os.PathLike[str], dt: float) -> Plant:
     delay = checks.non_negative(f"{path}: delay", found.get("delay", 0.0), "s")
     name = f"identified plant ({Path(path).name})"
     linear = LinearPlant.of((numbers["num"], numbers["den"]), name=name)
-    plant: Plant = linear
     force, width = found.get("friction"), found.get("friction_width")
     if force and width:
         force = checks.positive(f"{path}: friction", force, "u-unit")
         width = checks.positive(f"{path}: friction_width", width, "y-unit/s")
-        plant = FrictionPlant(linear, numbers["num"], numbers["den"], force, width, name)
     elif force and "friction_width" not in found:
         text = f"{path}: its friction is left out: the file is of an older quell; identify again"
         warn(text)
-    late = round(delay / checks.positive("dt", dt, "s"))
-    return delayed(plant, late * dt, dt) if late else plant
+    dt = checks.positive("dt", dt, "s")
+    return with_friction_and_delay(linear, **numbers, force=force, width=width, delay=delay, dt=dt)
 
 
 def _model(path: str | os.PathLike[str]) -> Mapping[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,3 +108,16 @@ def save_figures(
             written += save_figure(draw(), folder, name, overwrite)
     report("figures", 1.0)
     return written
+
+
+def save_paper_figures(
+    draw: Callable[[Any, str], Any],
+    names: Iterable[str],
+    result: Any,
+    folder: str | os.PathLike[str],
+    progress: Progress,
+    overwrite: bool,
+) -> list[Path]:
+    """Draw each of the named figures of a result as the paper's are, and write them."""
+    drawings = {name: partial(draw, result, name) for name in names}
+    return save_figures(drawings, folder, progress, PAPER_STYLE, overwrite)

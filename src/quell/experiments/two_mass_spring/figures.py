@@ -13,10 +13,9 @@ import numpy as np
 from quell import checks
 from quell.experiments.common.figures import (
     ESTIMATES,
-    PAPER_STYLE,
     STYLES,
     legend_label,
-    save_figures,
+    save_paper_figures,
     wide_figure,
 )
 from quell.experiments.two_mass_spring.gradient_range import HORIZON
@@ -47,8 +46,7 @@ def save(
     result: Result, folder: str | os.PathLike[str], progress: Progress, overwrite: bool = False
 ) -> list[Path]:
     """Draw all figures into ``folder``, created if missing; return the paths."""
-    named = {name: partial(draw, result, name) for name in NAMES}
-    return save_figures(named, folder, progress, PAPER_STYLE, overwrite)
+    return save_paper_figures(draw, NAMES, result, folder, progress, overwrite)
 
 
 def draw(result: Result, name: str, ax: Any = None) -> Any:
