@@ -13,6 +13,7 @@ from quell.envs.driven import Driven
 from quell.envs.episodes import Draw
 from quell.envs.rendering import MODES, as_picture, as_text
 from quell.optional import import_extra
+from quell.plants.labelled import signals_of
 from quell.simulation.scenario import Scenario
 
 gymnasium = import_extra("gymnasium", "envs", "quell.envs.Env")
@@ -169,7 +170,8 @@ class Env(gymnasium.Env):  # type: ignore[misc, name-defined, unused-ignore]
         """Return the episode so far, as ``render_mode`` says; None without one."""
         if self.render_mode is None or not self._past:
             return None
-        return as_text(self._past) if self.render_mode == "ansi" else as_picture(self._past)
+        draw = as_text if self.render_mode == "ansi" else as_picture
+        return draw(self._past, signals_of(self._driven.loops.plant))
 
     def close(self) -> None:
         """End the loop; of a single one nothing is left to release."""
