@@ -9,7 +9,7 @@
    be answered with an error, or a result, and a page beside it must go on as if nothing had been.
 3. Pages at once, each with runs of its own, that are killed and opened again.
 
-Memory is that of the server's process; it is compared after a first tenth and at the end.
+Memory is that of the server's process; it is shown after each tenth of the messages.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def hostile(url: str, process: int, count: int, seed: int) -> bool:
     """Send hostile messages beside a page at work; return whether only they were affected."""
     choose, attacker, page = random.Random(seed), Client(url), Client(url)
     wanted = page.run(TABLES)[-1]["loop"]
-    before, began, wrong = memory(process), time.perf_counter(), 0
+    used, began, wrong = [], time.perf_counter(), 0
     received = [0]
     ended = threading.Event()
 
@@ -195,14 +195,14 @@ def hostile(url: str, process: int, count: int, seed: int) -> bool:
         if i % 100 == 99:
             found = page.run(TABLES)[-1]
             wrong += found["kind"] != "loop" or found["loop"] != wanted
-        if i == count // 10:
-            before = memory(process)
+        if (i + 1) % max(count // 10, 1) == 0:
+            used.append(memory(process))
     ended.set()
     draining.join()
-    after, seconds = memory(process), time.perf_counter() - began
+    seconds = time.perf_counter() - began
     print(f"\n{count} hostile messages in {seconds:.0f} s, {received[0]} frames in answer")
     print(f"runs of the page beside: {count // 100}, of which wrong: {wrong}")
-    print(f"memory: {before:.0f} MB after a tenth, {after:.0f} MB at the end")
+    print(f"memory after each tenth [MB]: {', '.join(f'{each:.0f}' for each in used)}")
     attacker.stack.close()
     page.stack.close()
     return wrong == 0
