@@ -77,20 +77,22 @@ def pictures(url: str, count: int) -> bool:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.goto(url)
-        while page.evaluate("window.studio.frames") == 0:
+        while page.evaluate("window.studio.picture.frames") == 0:
             time.sleep(0.1)
         slider = page.locator('input[type=range][data-path="observer.omega_o"]')
         slider.focus()
-        compiled = page.evaluate("window.studio.compiled")
+        compiled = page.evaluate("window.studio.picture.compiled")
         began = time.perf_counter()
         for i in range(count):
             page.keyboard.press("ArrowRight" if i // 40 % 2 else "ArrowLeft")
             time.sleep(max(0.0, began + PERIOD * (i + 1) - time.perf_counter()))
         time.sleep(1.0)
-        times = np.array(page.evaluate("window.studio.times"))
-        first = np.array(page.evaluate("window.studio.firstTimes"))
-        compiled = page.evaluate("window.studio.compiled") - compiled
-        seconds = page.evaluate("[window.studio.now.run.seconds, window.studio.now.lastLoop]")
+        times = np.array(page.evaluate("window.studio.picture.times"))
+        first = np.array(page.evaluate("window.studio.picture.firstTimes"))
+        compiled = page.evaluate("window.studio.picture.compiled") - compiled
+        seconds = page.evaluate(
+            "[window.studio.picture.run.seconds, window.studio.picture.lastLoop]"
+        )
         browser.close()
     print(f"\ntime from input to picture, {count} inputs, {1 / PERIOD:.0f} a second [ms]")
     print(f"{'':24}{'pictures':>9}{'50 %':>8}{'95 %':>8}{'99 %':>8}{'largest':>9}")

@@ -56,7 +56,7 @@ def page(browser: Any, url: str) -> Iterator[Any]:
     errors: list[str] = []
     opened.on("pageerror", lambda error: errors.append(str(error)))
     opened.goto(url)
-    wait_for(lambda: opened.evaluate("window.studio.frames") > 0)
+    wait_for(lambda: opened.evaluate("window.studio.picture.frames") > 0)
     yield opened
     context.close()
     assert not errors
@@ -72,15 +72,15 @@ def wait_for(condition: Callable[[], Any], seconds: float = 60.0) -> None:
 
 def curve(page: Any, name: str) -> Any:
     """Return a curve that the page shows."""
-    return np.array(page.evaluate(f"Array.from(window.studio.now.arrays.{name})"))
+    return np.array(page.evaluate(f"Array.from(window.studio.picture.arrays.{name})"))
 
 
 def slide(page: Any, key: str, times: int) -> None:
     """Press an arrow key on the slider of omega_o, and wait for the picture."""
-    before = page.evaluate("window.studio.times.length")
+    before = page.evaluate("window.studio.picture.times.length")
     for _ in range(times):
         page.locator(OMEGA_O).press(key)
-    wait_for(lambda: page.evaluate("window.studio.times.length") > before)
+    wait_for(lambda: page.evaluate("window.studio.picture.times.length") > before)
     wait_for(lambda: not page.evaluate("window.studio.busy()"))
 
 
@@ -123,7 +123,7 @@ def test_the_address_holds_the_state(page: Any, browser: Any) -> None:
     other = context.new_page()
     other.set_viewport_size({"width": 1280, "height": 900})
     other.goto(page.evaluate("location.href"))
-    wait_for(lambda: other.evaluate("window.studio.frames") > 0)
+    wait_for(lambda: other.evaluate("window.studio.picture.frames") > 0)
     wait_for(lambda: other.evaluate("window.studio.pins().every((pin) => pin.arrays?.omega)"))
     assert other.locator(".pin").count() == 1
     assert curve(other, "y").max() == pytest.approx(shown.max(), abs=1e-4)
@@ -149,9 +149,9 @@ def test_a_wrong_value_is_explained_and_the_next_one_works(page: Any) -> None:
     box = page.locator('input[type=number][data-path="observer.omega_o"]')
     box.fill("-5")
     wait_for(lambda: "omega_o" in page.inner_text("#message"))
-    frames = page.evaluate("window.studio.frames")
+    frames = page.evaluate("window.studio.picture.frames")
     box.fill("50")
-    wait_for(lambda: page.evaluate("window.studio.frames") > frames)
+    wait_for(lambda: page.evaluate("window.studio.picture.frames") > frames)
     wait_for(lambda: page.is_hidden("#message"))
 
 
@@ -161,13 +161,13 @@ def test_a_lost_connection_recovers(browser: Any) -> None:
     page = context.new_page()
     with running(TABLES, token="same") as url:
         page.goto(url)
-        wait_for(lambda: page.evaluate("window.studio.frames") > 0)
+        wait_for(lambda: page.evaluate("window.studio.picture.frames") > 0)
         slide(page, "ArrowRight", 3)
         value = page.locator(OMEGA_O).get_attribute("aria-valuetext")
     wait_for(lambda: "lost" in page.inner_text("#state"))
-    frames = page.evaluate("window.studio.frames")
+    frames = page.evaluate("window.studio.picture.frames")
     with running(TABLES, int(url.split(":")[2].split("/")[0]), "same"):
-        wait_for(lambda: page.evaluate("window.studio.frames") > frames)
+        wait_for(lambda: page.evaluate("window.studio.picture.frames") > frames)
         assert page.locator(OMEGA_O).get_attribute("aria-valuetext") == value
         slide(page, "ArrowRight", 2)
         context.close()

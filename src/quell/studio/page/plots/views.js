@@ -1,6 +1,6 @@
 // All plots of the page.
 
-import { home, write } from "./dom.js";
+import { home, write } from "../dom.js";
 import { Nyquist } from "./nyquist.js";
 import { Plot } from "./plots.js";
 

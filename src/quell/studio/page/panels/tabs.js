@@ -1,6 +1,6 @@
 // The tabs of the page: one is chosen, by a click or by the arrow keys.
 
-import { home } from "./dom.js";
+import { home } from "../dom.js";
 
 export function tabs(names, onChosen) {
   const choose = (name) => {

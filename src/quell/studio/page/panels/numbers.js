@@ -1,7 +1,7 @@
 // Margins and metrics as numbers that turn red outside of their bounds.
 
-import { element, field, write } from "./dom.js";
-import { short } from "./plots.js";
+import { element, field, write } from "../dom.js";
+import { short } from "../plots/plots.js";
 
 // Usual bounds: M_s = 2 and a phase margin of 30° are the least that Åström & Hägglund (Advanced PID
 // Control, 2006, section 4.6) advise; the others are chosen by hand.

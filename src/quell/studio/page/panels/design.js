@@ -1,9 +1,9 @@
 // Tune for me, comparison with PID and LQG, and the trade-off curve.
 
-import uPlot from "./vendor/uPlot.js";
-import { home } from "./dom.js";
-import { palette } from "./palette.js";
-import { labels, short } from "./plots.js";
+import uPlot from "../vendor/uPlot.js";
+import { home } from "../dom.js";
+import { palette } from "../plots/palette.js";
+import { labels, short } from "../plots/plots.js";
 
 const BOUNDS = [["tune-ms", "m_s"], ["tune-mt", "m_t"], ["tune-mks", "m_ks"]];
 

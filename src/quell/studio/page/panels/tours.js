@@ -1,7 +1,7 @@
 // Guided tours: short texts, each of which sets some values of the setup.
 
-import { home } from "./dom.js";
-import { changed } from "./store.js";
+import { home } from "../dom.js";
+import { changed } from "../store.js";
 
 export class Tours {
   // `show(setup, pin)` is called with the setup of a step, and a name to pin it with.

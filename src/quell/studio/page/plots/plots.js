@@ -1,6 +1,6 @@
 // Plots over time and over frequency, drawn by uPlot.
 
-import uPlot from "./vendor/uPlot.js";
+import uPlot from "../vendor/uPlot.js";
 import { DASHES, palette } from "./palette.js";
 
 const HEIGHT = 190;

@@ -1,6 +1,6 @@
 // The setup as text, and files: saved, opened, exported.
 
-import { home } from "./dom.js";
+import { home } from "../dom.js";
 
 export class Files {
   // `ask(message)` sends with the present setup; `open(text)` opens the text of a file.

@@ -1,6 +1,6 @@
 // The Nyquist diagram: the open loop near −1, the unit circle, and the circle of M_s.
 
-import { write } from "./dom.js";
+import { write } from "../dom.js";
 import { DASHES, palette } from "./palette.js";
 
 const HEIGHT = 224;

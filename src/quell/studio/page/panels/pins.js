@@ -1,7 +1,7 @@
 // Pinned designs: their curves stay in the plots to compare with.
 
-import { element, home } from "./dom.js";
-import { DASHES, palette } from "./palette.js";
+import { element, home } from "../dom.js";
+import { DASHES, palette } from "../plots/palette.js";
 
 const MOST = 5; // pins: a colour and dashes for each
 

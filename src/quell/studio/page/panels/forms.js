@@ -1,7 +1,7 @@
 // Forms for the tables of a setup, made from the server's description of their keys.
 
-import { element, field, input, select } from "./dom.js";
-import { at } from "./store.js";
+import { element, field, input, select } from "../dom.js";
+import { at } from "../store.js";
 
 const TITLES = {
   plant: "Plant", observer: "Observer", controller: "Controller", learner: "Learner",

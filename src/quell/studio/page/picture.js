@@ -1,0 +1,121 @@
+// What the server last sent, drawn with the pins: a run, its loop, a band of runs, and their numbers.
+
+import { home, write } from "./dom.js";
+import { showNumbers } from "./panels/numbers.js";
+import { short } from "./plots/plots.js";
+import { Views } from "./plots/views.js";
+
+const MOST_TIMES = 10_000;
+const REST = 150; // the page is at rest when nothing has moved for this time [ms]
+
+export class Picture {
+  // `state()` returns the state of the page, and `pins` has the designs to compare with.
+  constructor(state, pins) {
+    Object.assign(this, { state, pins, views: new Views(), watching: false });
+    Object.assign(this, { arrays: {}, loopArrays: {}, run: null, loop: null, band: null });
+    // For measurements from outside: times from an input to its pictures [ms], pictures, compilation [s].
+    Object.assign(this, { firstTimes: [], times: [], frames: 0, compiled: 0 });
+  }
+
+  // Columns that a run has in the plots.
+  get columns() {
+    return Math.max(200, Math.min(2000, this.views.width || 600));
+  }
+
+  // Mark the curves as those of values that are not the present ones.
+  age() {
+    write(home("plots"), { className: "old" });
+  }
+
+  message(text) {
+    write(home("message"), { hidden: !text, textContent: text });
+  }
+
+  takeRun(header, arrays, asked) {
+    const pin = asked.local?.pin;
+    if (pin) {
+      pin.arrays = arrays;
+      return;
+    }
+    write(home("plots"), { className: "" });
+    this.arrays = arrays;
+    this.run = header;
+    this.compiled += header.compiled;
+    this.message([header.message, ...header.warnings].filter(Boolean).join("\n"));
+    if (!this.watching) this.drawRun();
+    timed(this.firstTimes, asked);
+  }
+
+  takeLoop(header, arrays, asked) {
+    const pin = asked.local?.pin;
+    if (pin) {
+      Object.assign(pin.arrays, arrays);
+      this.draw();
+      return;
+    }
+    write(home("plots"), { className: "" });
+    this.loop = header.loop;
+    this.loopArrays = arrays;
+    write(home("loop-reason"), { textContent: header.loop.reason ?? "" });
+    this.drawLoop();
+    this.lastLoop = header.seconds;
+    clearTimeout(this.restTimer);
+    this.restTimer = setTimeout(() => this.rest(), REST);
+    this.frames += 1;
+    timed(this.times, asked);
+  }
+
+  takeBand(header, arrays) {
+    this.band = { ...arrays, about: header };
+    this.drawRun();
+  }
+
+  // What is not for the eye that follows a slider waits until the page is at rest.
+  rest() {
+    const took = 1e3 * (this.run.seconds + this.lastLoop);
+    const compiled = this.run.compiled > 1 ? `, compiled for ${short(this.run.compiled)} s` : "";
+    write(home("state"), { textContent: `${took.toFixed(0)} ms${compiled}` });
+  }
+
+  draw() {
+    this.drawRun();
+    this.drawLoop();
+  }
+
+  drawRun() {
+    const { band, setup } = this.state();
+    this.views.showRun(this.arrays, this.pins.list, band ? this.band : null, setup);
+    // Without units of the plant the names of units only repeat those of the signals.
+    const unit = (name) => {
+      const known = this.run?.units?.[name] ?? "";
+      return known && !known.includes("-unit") ? `[${known}]` : "";
+    };
+    for (const [name, key] of [["y", "y"], ["u", "u"], ["f", "f_hat"]]) {
+      write(home(`unit-${name}`), { textContent: unit(key) });
+    }
+    this.number();
+  }
+
+  drawLoop() {
+    this.views.showLoop(this.loopArrays, this.pins.list, this.loop ?? {});
+    this.number();
+  }
+
+  // The numbers of run and loop change together, with the next picture.
+  number() {
+    this.numbering ??= requestAnimationFrame(() => {
+      this.numbering = null;
+      const { bounds, setup } = this.state();
+      showNumbers(home("numbers"), this.run, this.loop, bounds, setup.dt);
+    });
+  }
+}
+
+// Note the time from the input until its picture; a page that stays open keeps the last ones.
+function timed(times, asked) {
+  if (!asked.local?.input) return;
+  requestAnimationFrame(() => {
+    times.push(performance.now() - asked.local.input);
+    if (times.length > MOST_TIMES) times.shift();
+  });
+}
