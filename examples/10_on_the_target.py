@@ -33,11 +33,12 @@ def on_target(board: emulator.Board, controller: ql.ADRC, precision: str) -> ql.
         parts = [emulator.HERE / part for part in ("serial_target.c", "mps2_uart.c")]
         parts += [folder / "plant.c", folder / "src" / "servo.c"]
         program = folder / "servo.elf"
-        flags = (f"-DLOAD_AT={round(LOAD_AT / DT)}", f"-DLOAD=({LOAD})", "-DMOST_WAIT=1000")
+        flags = (f"-DLOAD_AT={round(LOAD_AT / DT)}", f"-DLOAD=({LOAD})", "-DMOST_WAIT=60000")
         emulator.build(board, program, parts, f"-I{folder}", f"-I{folder}/src", *flags)
         channels = (("r", 1), ("u", 1), *controller.channels)  # as serial_target.c sends them
-        with emulator.serial_line(board, program) as url, open_device(url, DT) as device:
-            return record_target(device, REFERENCE, channels, DURATION)
+        line = emulator.serial_line(board, program)
+        with line as url, open_device(url, DT) as device:
+            return record_target(device, REFERENCE, channels, DURATION, timeout=60.0)
 
 
 if tool := emulator.missing_tool():

@@ -12,7 +12,7 @@ import quell as ql
 from quell.export import plant_source
 from quell.realtime import open_device, record_target
 from quell.realtime.wire import frames
-from quell.realtime.wire.serial_line import SerialListener
+from quell.realtime.wire.serial_line import SerialDevice, SerialListener
 from quell.realtime.wire.transport import receive, send, wait_for_frame
 from quell.signals import Sinusoid, Step
 from quell.types import Status
@@ -214,17 +214,21 @@ def test_a_timer_interrupt_controls_a_drive(table, tmp_path):
 
 
 def test_a_target_in_double_precision_equals_the_simulation(table, tmp_path):
-    """Reference, output, control signal and estimates over the serial line, bit for bit."""
+    """Reference, output, control signal and estimates over the serial line, bit for bit.
+
+    Target and record wait for each other for a minute: a busy machine may stop either of them.
+    """
     board, reference = table.emulator.BOARDS["Cortex-M7"], Sinusoid(amplitude=0.5, omega=20.0)
     parts = ("serial_target.c", "mps2_uart.c")
-    flags = ("-DMOST_WAIT=1000", "-DLOAD_AT=50", "-DLOAD=(-3.0)")
+    flags = ("-DMOST_WAIT=60000", "-DLOAD_AT=50", "-DLOAD=(-3.0)")
     program = built(table, tmp_path, board, "double", parts, *flags)
     load = Step(height=-3.0, at=50 * DT)
     scenario = ql.Scenario(reference=reference, disturbances=(load,), duration=0.15)
     simulated = ql.simulate(DRIVE, servo(), scenario, interpret=True)
     channels = (("r", 1), ("u", 1), *servo().channels)
-    with table.emulator.serial_line(board, program) as url, open_device(url, DT) as device:
-        run = record_target(device, reference, channels, scenario.duration)
+    line = table.emulator.serial_line(board, program)
+    with line as url, SerialDevice(url, DT, timeout=60.0) as device:
+        run = record_target(device, reference, channels, scenario.duration, timeout=60.0)
     for name in run.names:
         assert np.array_equal(run[name], simulated[name]), name
 
