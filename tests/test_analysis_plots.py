@@ -55,6 +55,9 @@ def test_a_bode_plot_in_decibels_and_hertz_has_the_same_curve() -> None:
     assert not [*plain[0].texts, *plain[1].texts]
     four = analysis.plot_gang_of_four(loop, ax=plt.subplots(2, 2)[1], decibels=True, hertz=True)
     assert four[2].get_xlabel() == "frequency [Hz]"
+    low, high = four[2].get_ylim()
+    analysis.plot_gang_of_four(analysis.analyse(PLANT, design(100.0)), four, decibels=True)
+    assert four[2].get_ylim()[0] <= low and four[2].get_ylim()[1] >= high  # both loops are seen
     plt.close("all")
 
 

@@ -64,6 +64,7 @@ def plot_bode(
     margins = loop.margins
     crossing = margins.phase_omega if np.isfinite(margins.phase_omega) else omega[-1]
     phase -= 360.0 * np.ceil(np.interp(crossing, omega, phase) / 360.0)
+    others = [_limits_of_others(each) for each in axes]
     (line,) = top.semilogx(scale * omega, gain(np.abs(L)), **style)
     low.semilogx(scale * omega, phase, color=line.get_color())
     top.axhline(gain(1.0), **_AID)
@@ -89,11 +90,11 @@ def plot_bode(
             found.append(f"{size} at {scale * at:.3g} {unit}")
     if found and new_figure:
         top.set_title(f"gain margin {', '.join(found)}", loc="right", fontsize="small")
-    low_end, high_end = _ratio_limits(np.abs(L))
-    top.set_ylim(gain(low_end), gain(high_end))
+    _show(top, [gain(end) for end in _ratio_limits(np.abs(L))], others[0])
     if not decibels:
         top.set_yscale("log")
-    low.set_ylim(max(float(np.min(phase)), -720.0) - 20.0, min(float(np.max(phase)), 180.0) + 20.0)
+    ends = max(float(np.min(phase)), -720.0) - 20.0, min(float(np.max(phase)), 180.0) + 20.0
+    _show(low, ends, others[1])
     for each, label in zip(
         axes, ("|L| [dB]" if decibels else "|L|", "phase of L [°]"), strict=True
     ):
@@ -126,10 +127,11 @@ def plot_gang_of_four(
     meanings = ("", "", ": load at the plant's input to y", ": measurement noise to u")
     for each, name, meaning in zip(axes, ("S", "T", "PS", "CS"), meanings, strict=True):
         gain = np.abs(loop.response(name, loop.omega))
+        others = _limits_of_others(each)
         each.semilogx(scale * loop.omega, shown(gain), **style)
         if not decibels:
             each.set_yscale("log")
-        each.set_ylim(*(shown(end) for end in _ratio_limits(gain)))
+        _show(each, [shown(end) for end in _ratio_limits(gain)], others)
         if name in ("S", "T"):
             each.axhline(shown(1.0), **_AID)
         each.set_title(f"|{name}|{meaning}", fontsize="medium")
@@ -237,6 +239,18 @@ def _axes(axes: Any, rows: int, columns: int) -> list[Axes]:
 
 def _in_decibels(size: Any) -> Any:
     return 20.0 * np.log10(size)
+
+
+def _limits_of_others(ax: Any) -> tuple[float, float] | None:
+    """Return the limits that curves of other loops have given the axes; None if it has none."""
+    low, high = ax.get_ylim()
+    return (low, high) if ax.lines else None
+
+
+def _show(ax: Any, ends: Sequence[float], others: tuple[float, float] | None) -> None:
+    """Limit y to the two ``ends``, and to what the axes show of other loops."""
+    low, high = others or ends
+    ax.set_ylim(min(low, ends[0]), max(high, ends[1]))
 
 
 def _ratio_limits(size: Vector) -> tuple[float, float]:
