@@ -17,6 +17,7 @@ _NESTED = {
     **dict.fromkeys(("reference", "noise", "then", "cycle"), "signal"),
     "notch": "notch",
     "feedback": "feedback",
+    "signals": "labels",
 }
 _LISTS = {"disturbances": "signal", "features": "feature"}
 # Keys for later: a page has no place for them.
@@ -40,6 +41,7 @@ def forms(granted: Granted) -> dict[str, Any]:
         "feature": registry.FEATURES,
         "notch": {"": registry.Notch},
         "feedback": {"": registry.Feedback},
+        "labels": {"": registry.Labels},
         "guard": {"": registry.Guard},
         "scenario": {"": registry.Scenario},
         "metrics": {"": registry.Metrics},

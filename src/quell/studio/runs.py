@@ -106,6 +106,7 @@ def run_frames(
         "message": run.message if run.diverged or run.status else "",
         "warnings": [*design_warnings, *caught],
         "metrics": _metrics(run, setup),
+        "signals": {"y": str(run.signals.y), "u": str(run.signals.u)},
         "units": {name: describe(name, run.signals)[1] for name in _CHANNELS},
         "seconds": time.perf_counter() - began,
         "compiled": compile_time.seconds - compiled,

@@ -1,7 +1,7 @@
 // What the server last sent, drawn with the pins: a run, its loop, a band of runs, and their numbers.
 
 import { home, write } from "./dom.js";
-import { showNumbers } from "./panels/numbers.js";
+import { showNumbers, unit } from "./panels/numbers.js";
 import { short } from "./plots/plots.js";
 import { Views } from "./plots/views.js";
 
@@ -85,14 +85,9 @@ export class Picture {
   drawRun() {
     const { band, setup } = this.state();
     this.views.showRun(this.arrays, this.pins.list, band ? this.band : null, setup);
-    // Without units of the plant the names of units only repeat those of the signals.
-    const unit = (name) => {
-      const known = this.run?.units?.[name] ?? "";
-      return known && !known.includes("-unit") ? `[${known}]` : "";
-    };
-    for (const [name, key] of [["y", "y"], ["u", "u"], ["f", "f_hat"]]) {
-      write(home(`unit-${name}`), { textContent: unit(key) });
-    }
+    const f = unit(this.run, "f_hat");
+    const known = { ...this.run?.signals, f: f && `[${f}]` };
+    for (const name of ["y", "u", "f"]) write(home(`signal-${name}`), { textContent: known[name] ?? "" });
     this.number();
   }
 

@@ -10,6 +10,7 @@ const TITLES = {
 const NAMES = {
   omega_c: "ω_c [rad/s]", omega_o: "ω_o [rad/s]", u_min: "u_min", u_max: "u_max",
   disturbances: "disturbance", at: "at [s]", duration: "duration [s]", delay: "delay [s]",
+  signals: "names and units",
 };
 const OPTIONAL = ["observer", "learner", "guard", "prefilter"];
 const OPEN = ["plant", "observer", "controller"];
@@ -95,7 +96,7 @@ export class Forms {
     const rest = [];
     for (const entry of about.keys) {
       const found = this.entry(entry, `${path}.${entry.key}`, given[entry.key]);
-      const shown = entry.needed || given[entry.key] !== undefined;
+      const shown = entry.needed || (given[entry.key] !== undefined && entry.group !== "labels");
       (shown ? parts : rest).push(found);
     }
     if (rest.length) {

@@ -68,12 +68,13 @@ function margins(loop, bounds, dt) {
 
 // Two numbers, short enough for one line of a box.
 function range(low, high) {
-  return [low, high].map((each) => short(Number(each.toPrecision(3)))).join(" … ");
+  return [low, high].map((each) => short(Number(each.toPrecision(3)))).join("…");
 }
 
 function metrics(run, bounds) {
   if (!run) return [];
   const found = [];
+  const [y, u] = ["y", "u"].map((name) => unit(run, name));
   for (const window of run.metrics) {
     const where = `t ≥ ${short(window.start ?? 0)} s`;
     if (window.reason) {
@@ -86,9 +87,15 @@ function metrics(run, bounds) {
     if (window.settling_time !== undefined) {
       found.push(["settling", window.settling_time == null ? "never" : `${short(window.settling_time)} s`, window.settling_time == null, where]);
     }
-    found.push([`peak e, ${where}`, short(window.peak_error), false, `largest |r − y|, ${where}`]);
-    found.push([`IAE, ${where}`, short(window.iae), false, `integral of |r − y| ${where}`]);
-    found.push([`TV of u, ${where}`, short(window.control_variation), false, `sum of |Δu| ${where}`]);
+    found.push([`peak e, ${where}`, `${short(window.peak_error)} ${y}`, false, `largest |r − y|, ${where}`]);
+    found.push([`IAE, ${where}`, `${short(window.iae)} ${y && `${y} s`}`, false, `integral of |r − y| ${where}`]);
+    found.push([`TV of u, ${where}`, `${short(window.control_variation)} ${u}`, false, `sum of |Δu| ${where}`]);
   }
   return found;
+}
+
+// The unit of a signal of a run; empty where the plant has none: "y-unit" says nothing more than y.
+export function unit(run, name) {
+  const known = run?.units?.[name] ?? "";
+  return known.includes("-unit") ? "" : known;
 }
