@@ -12,6 +12,8 @@ import quell
 # Override the environment: with another backend the figures would be missing, without a warning.
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"
 os.environ["QUELL_QUIET"] = "1"  # pages do not show what is compiled
+# Optuna's progress bar has no widgets here, and would show a warning with a path of this machine.
+os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"
 # Tutorials call the command line of the same installation.
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
@@ -65,7 +67,7 @@ def draw_gallery() -> None:
         picture = folder / f"{script.stem}.png"
         if not picture.exists() or picture.stat().st_mtime < script.stat().st_mtime:
             runpy.run_path(str(script))
-            plt.gcf().savefig(picture, dpi=100)
+            plt.gcf().savefig(picture, dpi=100, bbox_inches="tight")
             plt.close("all")
 
 

@@ -17,5 +17,6 @@ for name, learner in (("MF-ESO", None), ("L-ESO", ql.learners.RLS(waves))):
     )
     run = ql.simulate(motor, controller, ql.Scenario(reference=move, duration=40.0))
     axes.plot(run.t, np.degrees(run["r"] - run["y"]).ravel(), label=name, linewidth=0.7)
-axes.set_xlabel("t [s]"), axes.set_ylabel("r − y [°]"), axes.legend()
+axes.set_xlabel("t [s]"), axes.set_ylabel("r − y [°]")
+axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
 plt.show()

@@ -18,5 +18,5 @@ for name, learner in (("MF-ESO", None), ("L-ESO", ql.learners.Harmonic())):
     axes[1].plot(run.t, run["f_learned"].ravel(), label=name)
 axes[0].set_ylim(0.8, 1.2)
 axes[0].set_ylabel("y [m]"), axes[1].set_ylabel("learned f [m/s⁴]")
-axes[1].set_xlabel("t [s]"), axes[0].legend(loc="lower right")
+axes[1].set_xlabel("t [s]"), axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
 plt.show()

@@ -12,6 +12,7 @@ def pendulum(t, x, u, w):
 
 
 plant = ql.plants.NonlinearPlant(pendulum, order=2, name="pendulum")
+plant = ql.plants.labelled(plant, y="angle [rad]", u="torque [N m]", w=["push [rad/s²]"])
 observer = ql.ESO.model_free(order=2, b0=8.0, omega_o=40.0, dt=2e-3)
 scenario = ql.Scenario(
     reference=ql.signals.Trapezoid(distance=np.pi, duration=1.5, start=0.5),
