@@ -57,7 +57,9 @@ def test_a_bode_plot_in_decibels_and_hertz_has_the_same_curve() -> None:
     assert four[2].get_xlabel() == "frequency [Hz]"
     low, high = four[2].get_ylim()
     analysis.plot_gang_of_four(analysis.analyse(PLANT, design(100.0)), four, decibels=True)
-    assert four[2].get_ylim()[0] <= low and four[2].get_ylim()[1] >= high  # both loops are seen
+    both = four[2].get_ylim()  # both loops are seen
+    assert both[0] <= low
+    assert both[1] >= high
     plt.close("all")
 
 
