@@ -280,6 +280,9 @@ def test_single_precision_is_compared_and_refused_where_it_differs(
     assert not any(tmp_path.iterdir())
     accepted = exported(tmp_path, hasty, "single", **loop | {"accept": True})
     assert accepted.comparison.u > 0.01
+    chooses = ql.ADRC(OBSERVER, 1.5, learner=ql.learners.GaussianProcess())
+    with pytest.raises(ValueError, match="which points .* double precision or another learner"):
+        accepted.comparison.check(ql.controllers.Prefiltered(chooses, ql.baselines.ZV(3.0)))
 
 
 def test_single_precision_without_a_loop_must_be_accepted(tmp_path: Path) -> None:

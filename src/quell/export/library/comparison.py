@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quell.controllers.prefilters.prefilter import without_prefilters
 from quell.export.inspection import in_double_precision
+from quell.learners.online.gaussian_process import GaussianProcess
 from quell.plants.base import Plant
 from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
@@ -18,6 +20,17 @@ from quell.simulation.simulate import simulate
 # (METHOD's table: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
 # unless the rounding of y itself, times omega_o^(n+1), is too much for u.
 LIMIT = 0.01
+
+# What helps, see docs/single_precision.md, "Limits".
+_ABOUT_ROUNDING = (
+    "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with resolution=, "
+    "--resolution), or double precision would help"
+)
+_ABOUT_POINTS = (
+    "rounding changes which points the learner GaussianProcess keeps, at every omega_o; double "
+    "precision or another learner (Kalman, RLS) would help, and in most loops a budget of at most "
+    "6 points with a guard"
+)
 
 
 class Comparison(NamedTuple):
@@ -39,16 +52,16 @@ class Comparison(NamedTuple):
     y_noise: float | None
     diverged: bool
 
-    def check(self) -> None:
-        """Raise a ``ValueError`` if single precision differs too much."""
+    def check(self, controller: Any) -> None:
+        """Raise a ``ValueError`` if single precision differs too much; say what would help."""
         if not self.diverged and self.u <= LIMIT:
             return
         what = "diverges" if self.diverged else f"changes u by {100 * self.u:.2g} % RMS"
+        learner = getattr(without_prefilters(controller), "learner", None)
         raise ValueError(
             f"precision = 'single': {what} in this scenario, and {100 * LIMIT:g} % is the limit; "
-            "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with "
-            "resolution=, --resolution), or double precision would help; accept=True (--accept) "
-            "writes it all the same"
+            f"{_ABOUT_POINTS if isinstance(learner, GaussianProcess) else _ABOUT_ROUNDING}; "
+            "accept=True (--accept) writes it all the same"
         )
 
 

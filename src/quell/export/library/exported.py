@@ -114,16 +114,16 @@ def c(
     if single and plant is not None and scenario is not None:
         comparison = compared(plant, controller, scenario)
     if single and not accept:
-        _check_comparison(comparison)
+        _check_comparison(comparison, controller)
     vectors = golden_vectors(shown, source.operations)
     files = write_folder(folder, library_files(shown, source, vectors), overwrite)
     return Exported(Path(folder), files, source, comparison)
 
 
-def _check_comparison(comparison: Comparison | None) -> None:
+def _check_comparison(comparison: Comparison | None, controller: Any) -> None:
     if comparison is None:
         raise ValueError(
             "precision = 'single': needs plant and scenario, to compare it with double precision; "
             "or accept=True (--accept)"
         )
-    comparison.check()
+    comparison.check(controller)

@@ -277,11 +277,6 @@ class GaussianProcess(Online):
     ValueError
         for an argument out of range.
 
-    References ---------- Van Vaerenbergh, Lázaro-Gredilla & Santamaría, *Kernel recursive
-    least-squares tracker for time-varying regression*, IEEE Trans. Neural Networks and Learning
-    Systems 23 (2012); Csató & Opper, *Sparse on-line Gaussian processes*, Neural Computation 14
-    (2002).
-
     References
     ----------
     Van Vaerenbergh, Lázaro-Gredilla & Santamaría, *Kernel recursive least-squares tracker for
