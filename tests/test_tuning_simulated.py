@@ -23,8 +23,8 @@ from quell.tuning.simulated import (
     Objective,
     Problem,
     Quantile,
-    Range,
     Search,
+    SearchRange,
     Worst,
     search,
 )
@@ -33,7 +33,7 @@ from quell.types import Matrix
 
 pytest.importorskip("optuna")
 
-SPACE = {"a": Range(0.1, 10.0), "b": Range(-3.0, 3.0)}
+SPACE = {"a": SearchRange(0.1, 10.0), "b": SearchRange(-3.0, 3.0)}
 SAMPLES = np.linspace(-0.5, 0.5, 16).tolist()
 
 
@@ -124,7 +124,7 @@ def test_cma_finds_a_valley_that_is_not_along_an_axis() -> None:
         x = np.array([*values.values()])
         return np.full((1, 1), np.sum(100.0 * (x[1:] - x[:-1] ** 2) ** 2 + (1.0 - x[:-1]) ** 2))
 
-    space = {f"x{i}": Range(-2.0, 2.0) for i in range(3)}
+    space = {f"x{i}": SearchRange(-2.0, 2.0) for i in range(3)}
     problem = Problem([0.0], rosenbrock, {"f": Mean()})
     best = {
         sampler: search(build, space, problem, trials=300, sampler=sampler, workers=1).best
@@ -168,7 +168,7 @@ def test_a_file_of_another_search_or_of_none_is_refused_and_left_alone(tmp_path:
     file, text = tmp_path / "journal.log", tmp_path / "notes.txt"
     search(build, SPACE, BOWL, trials=2, storage=file)
     before = file.read_bytes()
-    other = SPACE | {"a": Range(0.1, 20.0)}
+    other = SPACE | {"a": SearchRange(0.1, 20.0)}
     with pytest.raises(ValueError, match="holds another search, with other ranges: give another"):
         search(build, other, BOWL, trials=2, storage=file)
     with pytest.raises(ValueError, match="holds another search, with other seed"):
@@ -254,14 +254,14 @@ def test_numbers_of_a_learner_and_its_guard_are_searched_by_their_paths(tmp_path
     make = pickle.loads(pickle.dumps(controllers_of(setup)))
     problem = Problem.of_runs([setup.plant], setup.scenario, "iae")
     own = {"learner.rate": 0.1, "guard.bound": 0.5, "observer.omega_o": 4.0}
-    space = {name: Range(0.5 * value, 2.0 * value) for name, value in own.items()}
+    space = {name: SearchRange(0.5 * value, 2.0 * value) for name, value in own.items()}
     found = search(make, space, problem, trials=6, starts=[own])
     best = varied(setup, found.best.parameters)
     assert best.controller.learner.rate == found.best.parameters["learner.rate"]
     assert best.controller.guard.bound == found.best.parameters["guard.bound"]
     run = ql.simulate(setup.plant, best.controller, setup.scenario)
     assert run.metrics()["iae"] == found.best.values["iae"] < found.candidates[0].values["iae"]
-    none = search(make, {"learner.speed": Range(0.1, 1.0)}, problem, trials=2)
+    none = search(make, {"learner.speed": SearchRange(0.1, 1.0)}, problem, trials=2)
     with pytest.raises(ValueError, match=r"values are rejected.*learner.speed: unknown"):
         _ = none.best
 
@@ -314,7 +314,7 @@ def test_a_search_beats_its_start_on_fresh_samples_too() -> None:
         plants = [ql.plants.LinearPlant(DOUBLE.A, [0.0, g], [1.0, 0.0]) for g in gains.tolist()]
         return Problem.of_runs(plants, ql.Scenario(reference=1.0, duration=1.5), "iae")
 
-    space = {"omega_c": Range(1.0, 8.0), "omega_o": Range(8.0, 40.0)}
+    space = {"omega_c": SearchRange(1.0, 8.0), "omega_o": SearchRange(8.0, 40.0)}
     start = {"omega_c": 2.0, "omega_o": 20.0}
     found = search(adrc, space, problem(1), trials=16, starts=[start], seed=1).best
     before = problem(1000).check(adrc(start))["iae"]
@@ -329,8 +329,8 @@ def test_a_search_beats_its_start_on_fresh_samples_too() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"space": {}}, "at least one Range, by name"),
-        ({"space": {"a": 3.0}}, r"space\['a'\] = 3.0: must be a Range"),
+        ({"space": {}}, "at least one SearchRange, by name"),
+        ({"space": {"a": 3.0}}, r"space\['a'\] = 3.0: must be a SearchRange"),
         ({"trials": 0}, "trials = 0: must be"),
         ({"sampler": "best"}, "sampler = 'best': must be one of"),
         ({"pruner": "all"}, "pruner = 'all': must be one of"),
@@ -349,9 +349,9 @@ def test_bad_arguments_are_named(change: dict[str, Any], message: str) -> None:
 def test_bad_problems_and_ranges_are_named() -> None:
     """Before anything runs."""
     for make, message in (
-        (lambda: Range(2.0, 1.0), "low must be below high"),
-        (lambda: Range(-1.0, 1.0, log=True), "must be above zero in a logarithmic range"),
-        (lambda: Range(0.5, 2.0, whole=True), "must be whole numbers"),
+        (lambda: SearchRange(2.0, 1.0), "low must be below high"),
+        (lambda: SearchRange(-1.0, 1.0, log=True), "must be above zero in a logarithmic range"),
+        (lambda: SearchRange(0.5, 2.0, whole=True), "must be whole numbers"),
         (lambda: Quantile(1.0), "level = 1.0: must be between 0 and 1"),
         (lambda: Problem([], bowl, {"bowl": Mean()}), "samples is empty"),
         (
@@ -368,7 +368,7 @@ def test_bad_problems_and_ranges_are_named() -> None:
 
 def test_whole_numbers_stay_whole() -> None:
     """As a parameter of a design that counts."""
-    space = {"a": Range(1.0, 9.0, whole=True), "b": Range(-3.0, 3.0)}
+    space = {"a": SearchRange(1.0, 9.0, whole=True), "b": SearchRange(-3.0, 3.0)}
     found = search(build, space, BOWL, trials=8)
     assert isinstance(found, Search)
     assert all(float(c.parameters["a"]).is_integer() for c in found.candidates)

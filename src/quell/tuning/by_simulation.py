@@ -29,7 +29,7 @@ from quell.tuning.optimiser.problem import Solution
 from quell.tuning.optimiser.requirements import bounds_of, worst_ratio
 from quell.tuning.plants import as_list
 from quell.tuning.result.design import Design, design_of
-from quell.tuning.simulated import Problem, Range, Search, search
+from quell.tuning.simulated import Problem, Search, SearchRange, search
 from quell.tuning.structures.base import Structure, vector
 from quell.tuning.tuned import Tuned
 from quell.tuning.uncertain import Uncertain
@@ -89,7 +89,9 @@ def tune_structure(
     return search(build, space, problem, starts=[start], **options)
 
 
-def _around(structure: Structure, values: Mapping[str, float], factor: float) -> dict[str, Range]:
+def _around(
+    structure: Structure, values: Mapping[str, float], factor: float
+) -> dict[str, SearchRange]:
     """Return the ranges around values, within the structure's bounds."""
     found = {}
     for name, _, low, high in structure.parameters:
@@ -97,7 +99,7 @@ def _around(structure: Structure, values: Mapping[str, float], factor: float) ->
         if not (1.0 - _ROUNDING) * low <= value <= (1.0 + _ROUNDING) * high:
             raise ValueError(f"start: {name} = {value!r}: must lie within {low:g} … {high:g}")
         ends = max(low, value / factor), min(high, value * factor)
-        found[name] = Range(min(ends[0], value), max(ends[1], value))
+        found[name] = SearchRange(min(ends[0], value), max(ends[1], value))
     return found
 
 

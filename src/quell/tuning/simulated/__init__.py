@@ -8,7 +8,7 @@ from quell.suggestions import suggest_names
 from quell.tuning.simulated.problem import Checked, Objective, Problem, Sample
 from quell.tuning.simulated.result import Candidate, Search
 from quell.tuning.simulated.search import search
-from quell.tuning.simulated.space import Range, Space
+from quell.tuning.simulated.space import SearchRange, Space
 from quell.tuning.simulated.statistics import FailureRate, Mean, Quantile, Statistic, Worst
 
 __all__ = [
@@ -19,9 +19,9 @@ __all__ = [
     "Objective",
     "Problem",
     "Quantile",
-    "Range",
     "Sample",
     "Search",
+    "SearchRange",
     "Space",
     "Statistic",
     "Worst",

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from quell.optional import import_extra
-from quell.tuning.simulated.space import Range, Space
+from quell.tuning.simulated.space import SearchRange, Space
 from quell.types import Vector
 
 # First standard deviation in units of the ranges: the tutorial recommends about 0.3 of a range in
@@ -70,7 +70,7 @@ class Generations:
         return np.array([share_of(each, values[name]) for name, each in self.space.items()])
 
 
-def value_at(each: Range, share: float) -> float:
+def value_at(each: SearchRange, share: float) -> float:
     """Return the value at a share of a range, rounded to a whole number if it must be one."""
     if each.is_logarithmic:
         value = math.exp(math.log(each.low) + share * math.log(each.high / each.low))
@@ -80,7 +80,7 @@ def value_at(each: Range, share: float) -> float:
     return min(max(value, each.low), each.high)
 
 
-def share_of(each: Range, value: float) -> float:
+def share_of(each: SearchRange, value: float) -> float:
     """Return the share of a range at which a value lies."""
     if each.is_logarithmic:
         return math.log(value / each.low) / math.log(each.high / each.low)

@@ -10,7 +10,7 @@ from quell import checks
 
 
 @dataclass(frozen=True)
-class Range:
+class SearchRange:
     """The range of one parameter.
 
     Parameters
@@ -56,17 +56,19 @@ class Range:
         return float(trial.suggest_float(name, self.low, self.high, log=self.is_logarithmic))
 
 
-Space = Mapping[str, Range]
+Space = Mapping[str, SearchRange]
 """The ranges of all parameters, by name."""
 
 
 def checked_space(space: Any) -> Space:
     """Return ``space`` if it maps names to ranges and is not empty."""
     if not isinstance(space, Mapping) or not space:
-        raise ValueError(f"space = {space!r}: must be a dictionary of at least one Range, by name")
+        raise ValueError(
+            f"space = {space!r}: must be a dictionary of at least one SearchRange, by name"
+        )
     for name, value in space.items():
-        if not isinstance(value, Range):
-            raise ValueError(f"space[{name!r}] = {value!r}: must be a Range(low, high)")
+        if not isinstance(value, SearchRange):
+            raise ValueError(f"space[{name!r}] = {value!r}: must be a SearchRange(low, high)")
     return space
 
 
