@@ -159,7 +159,7 @@ def test_the_verifying_step_is_as_predicted() -> None:
     assert step.height > 0.0
     assert "fit of the prediction" in step.describe()
     assert step.fit > 85.0
-    assert len(step.plot()) == 2
+    assert [axis.get_ylabel()[:2] for axis in step.plot()] == ["y\n", "u\n"]
 
 
 def test_the_deviations_of_a_model_are_plants_around_it() -> None:

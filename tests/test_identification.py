@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from quell.identification import Identified, excitation, excited, frequency_resp
 from quell.identification.model.roots import poles_of, root_covariance
 from quell.identification.model.structure import Structure, gradient, output
 from quell.identification.search.output_error import refine
+from quell.quantities import Signals
 
 from .commands import Shown
 
@@ -419,8 +421,12 @@ def test_the_report_has_all_of_it() -> None:
         "held out",
         "held out, predicted",
     }
-    axes = found.plot()
+    named = replace(found, signals=Signals.of(y="angle [rad]", u="voltage [V]"))
+    assert str(ql.plants.signals_of(named.plant).u) == "voltage [V]"
+    axes = named.plot()
     assert len(axes) == 7
+    labels = [axes[i].get_ylabel() for i in (0, 3, 4)]
+    assert labels == ["|G| [rad/V]", "angle [rad]", "error [rad]"]
     plt.close(axes[0].figure)
     with pytest.raises(ValueError, match="axes: must be 7 matplotlib axes"):
         found.plot([None])

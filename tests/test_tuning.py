@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse
+from quell.quantities import Signals
 from quell.setup import load
 from quell.tuning import Constraints
 from quell.tuning.optimiser.requirements import sizes
@@ -259,10 +261,13 @@ def test_the_setup_of_a_result_has_the_same_controller(tuned: ql.Tuned, tmp_path
 
 
 def test_a_result_is_drawn_beside_its_references(tuned: ql.Tuned) -> None:
-    """Four axes: loop, sensitivities with two bounds, two responses."""
-    axes = np.ravel(tuned.plot())
+    """Four axes: loop, sensitivities with two bounds, two responses, in the plant's units."""
+    signals = Signals.of(y="angle [rad]", u="voltage [V]")
+    axes = np.ravel(replace(tuned, signals=signals).plot())
+    assert [axis.get_ylabel() for axis in axes[2:]] == ["angle [rad]"] * 2
+    assert axes[3].get_title().endswith("by 1 V")
     assert len(axes) == 4
-    labels = [text.get_text() for text in axes[0].get_legend().get_texts()]
+    labels = [text.get_text() for text in axes[3].get_legend().get_texts()]
     assert len(labels) == 3
     assert "pid" in labels[2]
 
@@ -270,7 +275,7 @@ def test_a_result_is_drawn_beside_its_references(tuned: ql.Tuned) -> None:
 def test_the_bode_diagram_has_the_phase_of_the_margin(tuned: ql.Tuned) -> None:
     """At the frequency where |L| is 1, on an axis at the right; the chosen design comes first."""
     bode = np.ravel(tuned.plot())[0]
-    (phase,) = [axis for axis in bode.figure.axes if axis.get_ylabel() == "phase [°]"]
+    (phase,) = [axis for axis in bode.figure.axes if axis.get_ylabel() == "phase of L [°]"]
     omega, degrees = phase.lines[0].get_data()
     margins = tuned.analysis.margins
     at = np.interp(np.log(margins.phase_omega), np.log(omega), degrees)

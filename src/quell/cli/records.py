@@ -53,4 +53,5 @@ def _of_run(run: Trajectory) -> Measured:
     if "mode" in run.names and np.any(run["mode"] == Mode.RUN):
         running = np.flatnonzero(run["mode"] == Mode.RUN)
         part = slice(int(running[0]), int(running[-1]) + 1)
-    return Measured(u[part].copy(), y[part].copy(), run.every * run.dt, r[part].copy())
+    known = run.every * run.dt, r[part].copy(), run.signals
+    return Measured(u[part].copy(), y[part].copy(), *known)

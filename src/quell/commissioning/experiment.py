@@ -130,7 +130,9 @@ def experiment(
         )
     u, y = samples_of(run, rig.has_no_clock)
     name, runs = "relay" if relay else "prbs", (listened, probed, run)
-    return Experiment(name, Measured(u, y, dt, None), runs, y_rest, noise, shown.sign)
+    return Experiment(
+        name, Measured(u, y, dt, None, run.record.signals), runs, y_rest, noise, shown.sign
+    )
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,8 @@ class Verification:
             found = record.metrics(start=self.at)
             settling = found.get("settling_time", math.nan)
             overshoot = 100.0 * found.get("overshoot", math.nan)
-            rows.append(f"{name}: overshoot {overshoot:.1f} %, settling time {settling:.3g} s")
+            settled = f"settling time {settling:.3g} s" if settling < math.inf else "not settled"
+            rows.append(f"{name}: overshoot {overshoot:.1f} %, {settled}")
         return "\n".join([*rows, f"fit of the prediction {self.fit:.1f} %"])
 
     def to_json(self) -> dict[str, Any]:
@@ -76,10 +77,14 @@ class Verification:
         t = np.arange(self.y.size) * self.predicted.dt
         reference = np.where(t >= self.at, self.height, 0.0)
         axes[0].plot(t, reference, color="0.6", linewidth=1.0, label="reference")
-        for name, each, value in (("y", axes[0], self.y), ("u", axes[1], self.u)):
+        signals = self.run.trajectory.signals
+        for name, each, value, known in (
+            ("y", axes[0], self.y, signals.y),
+            ("u", axes[1], self.u, signals.u),
+        ):
             each.plot(t, value, label="measured")
             each.plot(self.predicted.t, self.predicted[name], "--", label="predicted")
-            each.set_ylabel(f"{name}, from its value before the step on")
+            each.set_ylabel(f"{known.label(name)}\nfrom its value before the step on")
             each.grid(alpha=0.3)
         axes[0].legend()
         axes[1].set_xlabel("time [s]")

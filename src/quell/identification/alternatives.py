@@ -127,7 +127,7 @@ def alternatives(
         "delay": found.delay if delay is None else delay,
         "held_out": 1.0 - found.held_from / found.y.size,
     }
-    options |= {"reference": found.reference, "horizon": found.horizon}
+    options |= {"reference": found.reference, "horizon": found.horizon, "signals": found.signals}
     models = []
     for name, smaller, change in tried:
         try:

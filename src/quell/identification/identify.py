@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from quell.identification.validation import (
     simulate_fit,
 )
 from quell.parallel import one_blas_thread
+from quell.quantities import UNKNOWN, Signals
 from quell.types import Matrix, Vector
 
 _METHODS = (
@@ -53,6 +55,7 @@ def identify(
     horizon: int = 10,
     reference: Any = None,
     validation: tuple[Any, Any] | None = None,
+    signals: Signals = UNKNOWN,
 ) -> Identified:
     """Fit a continuous transfer function to recorded input and output.
 
@@ -100,6 +103,8 @@ def identify(
     validation
         u and y of another record with the same sample time, on which the model is judged, too; then
         the tests of the error are those of this record.
+    signals
+        names and units of u and y, as a run has them (``run.signals``): for the plot and the plant.
 
     Raises
     ------
@@ -163,7 +168,8 @@ def identify(
             y_fit, r_fit = y[:held_from], reference[:held_from]
             estimate = instrumental_variables(structure, theta, v, y_fit, r_fit)
             fitted = fitted._replace(estimate=estimate)
-        return _validated(fitted, u, y, reference, dt, held_from, horizon, other)
+        found = _validated(fitted, u, y, reference, dt, held_from, horizon, other)
+    return replace(found, signals=Signals(signals.y, signals.u))
 
 
 def _validated(

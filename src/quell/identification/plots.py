@@ -10,6 +10,7 @@ import numpy as np
 
 from quell.identification.experiment.frequency_response import FrequencyResponse
 from quell.identification.validation import Residuals
+from quell.quantities import Quantity, Signals
 from quell.records.plotting import draw_line
 from quell.types import Vector
 
@@ -36,7 +37,12 @@ def seven_axes(axes: Any) -> list[Any]:
     return axes
 
 
-def draw_bode(axes: list[Any], measured: FrequencyResponse, response: Callable[[Any], Any]) -> None:
+def draw_bode(
+    axes: list[Any],
+    measured: FrequencyResponse,
+    response: Callable[[Any], Any],
+    signals: Signals,
+) -> None:
     """Draw gain, phase and coherence of the empirical response, and the model's response."""
     gain, phase, coherence = axes
     good = measured.coherence > _COHERENT
@@ -54,7 +60,9 @@ def draw_bode(axes: list[Any], measured: FrequencyResponse, response: Callable[[
     phase.semilogx(omega, degrees, color="C0")
     coherence.semilogx(measured.omega, measured.coherence, color="0.4", linewidth=0.8)
     coherence.set_ylim(0.0, 1.05)
-    for ax, label in ((gain, "|G|"), (phase, "phase of G [°]"), (coherence, "coherence")):
+    unit = signals.unit("y-unit/u-unit") if signals.y.unit and signals.u.unit else ""
+    size_of_G = Quantity("|G|", unit).label("")
+    for ax, label in ((gain, size_of_G), (phase, "phase of G [°]"), (coherence, "coherence")):
         ax.set(ylabel=label, xlim=(omega[0], omega[-1]))
     if points.size:
         largest = max(np.max(size), np.max(np.abs(model[omega >= points[0]])))
@@ -66,7 +74,13 @@ def draw_bode(axes: list[Any], measured: FrequencyResponse, response: Callable[[
 
 
 def draw_output(
-    axes: list[Any], t: Vector, y: Vector, simulated: Vector, split: int, fits: dict[str, float]
+    axes: list[Any],
+    t: Vector,
+    y: Vector,
+    simulated: Vector,
+    split: int,
+    fits: dict[str, float],
+    quantity: Quantity,
 ) -> None:
     """Draw output and error; the samples from ``split`` on were held out."""
     output, error = axes
@@ -79,9 +93,9 @@ def draw_output(
             label = f"{label}, {fits[fit]:.2f} %"
             draw_line(output, t[part], simulated[part], color=color, linewidth=1.0, label=label)
             draw_line(error, t[part], (y - simulated)[part], color=color, linewidth=0.8)
-    output.set_ylabel("output")
+    output.set_ylabel(quantity.label("output"))
     output.legend(fontsize="small")
-    error.set(xlabel="time [s]", ylabel="error")
+    error.set(xlabel="time [s]", ylabel=Quantity("error", quantity.unit).label(""))
     error.sharex(output)
 
 

@@ -14,7 +14,9 @@ from quell.identification.experiment.frequency_response import FrequencyResponse
 from quell.identification.model.roots import Root
 from quell.identification.validation import Residuals
 from quell.lti.canonical import format_roots
+from quell.plants.labelled import labelled
 from quell.plants.linear import LinearPlant
+from quell.quantities import UNKNOWN, Signals
 from quell.records.plotting import given_axes
 from quell.types import Matrix, Vector
 
@@ -55,6 +57,7 @@ class Identified:
     reference: Vector | None
     converged: bool  #: whether the search ended at a minimum that a second start or tests confirm
     method: str
+    signals: Signals = UNKNOWN  #: names and units of u and y
 
     @cached_property
     def plant(self) -> LinearPlant:
@@ -71,7 +74,8 @@ class Identified:
                 "once; observers and simulated loops need a plant without it. Identify with fewer "
                 "zeros, or use num, den and response"
             )
-        return LinearPlant.of((self.num, self.den), name="identified plant")
+        plant = LinearPlant.of((self.num, self.den), name="identified plant")
+        return labelled(plant, self.signals.y, self.signals.u)
 
     @property
     def shortcomings(self) -> tuple[str, ...]:
@@ -136,8 +140,9 @@ class Identified:
             cross-correlation; those of a new figure by default.
         """
         axes, split = plots.seven_axes(given_axes(axes, ax)), self.held_from
-        plots.draw_bode(axes[:3], self.empirical(), self.response)
-        plots.draw_output(axes[3:5], self.t, self.y, self.simulated, split, self.fits)
+        signals = self.signals
+        plots.draw_bode(axes[:3], self.empirical(), self.response, signals)
+        plots.draw_output(axes[3:5], self.t, self.y, self.simulated, split, self.fits, signals.y)
         plots.draw_tests(axes[5:], self.residuals, (self.y.size - split) or self.y.size)
         for each in axes:
             each.grid(alpha=0.3)

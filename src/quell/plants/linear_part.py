@@ -12,6 +12,7 @@ import numpy as np
 from quell.lti.models import is_linear_model
 from quell.plants.delay import DelayedPlant
 from quell.plants.encoder import EncodedPlant
+from quell.plants.labelled import labelled, signals_of
 from quell.plants.linearise import linearised
 from quell.plants.nonlinear.friction import FrictionPlant
 from quell.plants.nonlinear.kernels import value_or_nan
@@ -26,11 +27,17 @@ def linear_model(plant: Any) -> Any:
     """
     if isinstance(plant, NonlinearPlant):
         with suppress(ValueError):
-            return linearised(plant, *operating_point_of(plant))
+            return _named_as(plant, linearised(plant, *operating_point_of(plant)))
     if isinstance(plant, DelayedPlant | EncodedPlant):
         inner = linear_model(plant.plant)
         return plant if inner is plant.plant else replace(plant, plant=inner)
-    return getattr(plant, "linear", plant)
+    return _named_as(plant, getattr(plant, "linear", plant))
+
+
+def _named_as(plant: Any, part: Any) -> Any:
+    """Return the part of a plant with the names and units that the plant's y and u have."""
+    known = signals_of(plant)
+    return labelled(part, known.y, known.u) if known.known and part is not plant else part
 
 
 def operating_point_of(plant: NonlinearPlant) -> tuple[Any, float]:

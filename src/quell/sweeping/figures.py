@@ -14,6 +14,8 @@ from quell.types import Vector
 QUANTILES = (0.05, 0.5, 0.95)
 # Groups of values of a parameter: enough to show a shape, few enough that each has runs. By hand.
 _MOST_GROUPS = 20
+# Quantiles that go beyond so many times the median are drawn on a logarithmic scale. By hand.
+_WIDE = 50.0
 
 
 class Groups(NamedTuple):
@@ -65,12 +67,13 @@ def plot_over(
         axis.grid(alpha=0.3)
         if groups.texts is not None:
             axis.set_xticks(groups.centres, groups.texts)
+            axis.set_xlim(-0.5, len(groups.texts) - 0.5)
     return axes[: 1 + len(measures)]
 
 
 def _new_axes(measures: int, figure: Any) -> Any:
     """Return axes for the failures and for so many measures, in a figure or in a new one."""
-    columns = min(3, 1 + measures)
+    columns = 2 if measures == 3 else min(3, 1 + measures)
     rows = -(-(1 + measures) // columns)
     if figure is None:
         import matplotlib.pyplot as plt
@@ -97,6 +100,9 @@ def _plot_quantiles(axis: Any, values: Vector, groups: Groups) -> None:
         if there.size:
             found[:, i] = np.quantile(there, QUANTILES)
     low, median, high = found
+    known = found[np.isfinite(found)]
+    if known.size and np.min(known) > 0.0 and np.max(known) > _WIDE * np.nanmedian(median):
+        axis.set_yscale("log")  # a few runs near divergence would hide all others
     if groups.texts is None:
         axis.fill_between(groups.centres, low, high, color="#2a6f97", alpha=0.25, linewidth=0)
         axis.plot(groups.centres, median, color="#2a6f97")

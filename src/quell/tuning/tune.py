@@ -12,6 +12,7 @@ import numpy as np
 from quell import checks
 from quell.analysis.loop import LoopAnalysis, analyse
 from quell.parallel import one_blas_thread
+from quell.plants.labelled import signals_of
 from quell.plants.linear import LinearPlant
 from quell.tuning.by_simulation import tune_by_simulation
 from quell.tuning.constraints import Constraints
@@ -19,7 +20,7 @@ from quell.tuning.designs import Task, tuned_designs, with_noise_bound
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.objectives import OBJECTIVES
 from quell.tuning.optimiser.time_responses import Inputs, load_step
-from quell.tuning.plants import Given, given_plants, model_of, plant_set
+from quell.tuning.plants import Given, as_list, given_plants, model_of, plant_set
 from quell.tuning.result.design import Design
 from quell.tuning.result.setup_file import plant_table
 from quell.tuning.structures.registry import STRUCTURES
@@ -187,6 +188,7 @@ def tune(
         check=check,
         setup=_setup(given, dt, plants, setup),
         noise_bound=noise_bound,
+        signals=signals_of(as_list(plant)[0]),
     )
 
 

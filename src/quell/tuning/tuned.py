@@ -13,6 +13,7 @@ from quell.analysis.loop import LoopAnalysis
 from quell.controllers.base import Controller
 from quell.files import nonfinite_to_none, written_atomically
 from quell.parallel import one_blas_thread
+from quell.quantities import UNKNOWN, Signals
 from quell.records.plotting import given_axes
 from quell.tuning.constraints import Constraints
 from quell.tuning.designs import Task, tradeoff
@@ -51,6 +52,8 @@ class Tuned:
         the trials, if the tuning was by simulation; ``search.front`` with several objectives.
     simulated_check : Mapping or None
         the objectives on fresh samples, if the plant has ranges and the tuning was by simulation.
+    signals : Signals
+        names and units of the plant's u and y.
     """
 
     design: Design
@@ -64,6 +67,7 @@ class Tuned:
     noise_bound: str = ""
     search: Search | None = None
     simulated_check: Mapping[str, Checked] | None = None
+    signals: Signals = UNKNOWN
 
     @property
     def controller(self) -> Controller:
@@ -127,7 +131,8 @@ class Tuned:
         chosen = {"tuned": self.design}
         others = {key: named[key] for key in ("pi", "pid") if key in named}
         others = {key: each for key, each in others.items() if each is not self.design}
-        return draw(self.plants, chosen | others, self.constraints, given_axes(axes, ax))
+        drawn = self.plants, chosen | others, self.constraints, self.signals
+        return draw(*drawn, given_axes(axes, ax))
 
     def toml(self) -> str:
         """Return a setup file with plant and controller, for ``quell run`` and ``run-rig``.

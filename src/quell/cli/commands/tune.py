@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -137,7 +138,7 @@ def tune(
     else:
         assert setup is not None
         plant, dt, more, model = from_record(console, setup, dt, record)
-    tuned = _tuned(console, plant, dt, options | more)
+    tuned = replace(_tuned(console, plant, dt, options | more), signals=model.signals)
     _print(console, tuned, rig.device or str(setup))
     step = None
     if place is not None:
@@ -227,7 +228,9 @@ def _numbers(name: str, text: str) -> list[float]:
 def _print(console: Console, tuned: Tuned, name: str) -> None:
     from quell.tuning.result import report
 
-    print_line(console, f"{name}, dt = {tuned.plants.dt:g} s, {len(tuned.plants.plants)} plants")
+    count = len(tuned.plants.plants)
+    plants = "1 plant" if count == 1 else f"{count} plants"
+    print_line(console, f"{name}, dt = {tuned.plants.dt:g} s, {plants}")
     print_line(console, f"constraints: {tuned.constraints}")
     if tuned.noise_bound:
         print_line(console, tuned.noise_bound)

@@ -107,7 +107,9 @@ def identified(console: Console, record: Measured, options: RecordOptions) -> tu
     most = _MOST_DELAY * dt if options.max_delay is None else options.max_delay
     delays = (0.0, round(most / dt) * dt)
     with console.status("Identifying, with other orders and friction where the record shows it."):
-        first = identify(record.u, record.y, dt, options.model_order, delay=delays)
+        first = identify(
+            record.u, record.y, dt, options.model_order, delay=delays, signals=record.signals
+        )
         model: Identified = decided(first, delays)
     print_line(console, model.describe())
     if model.shortcomings:
