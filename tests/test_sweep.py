@@ -459,6 +459,7 @@ def test_the_command_does_a_sweep_and_repeats_a_run(
         (("--repeat", "16"), "run = 16: must be a whole number from 0 to 15"),
         (("--save", "a.nc"), "--save is for the record of one run"),
         (("--dask", "tcp://127.0.0.1", "--folder", "other"), "no scheduler answers there"),
+        (("--dask", "127.0.0.1", "--folder", "other"), "dask = '127.0.0.1': must be the address"),
     ):
         refused = quell("sweep", "drive.toml", "--no-figures", *arguments)
         assert refused.code == 2

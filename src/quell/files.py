@@ -150,9 +150,14 @@ def new_folder(path: str | os.PathLike[str]) -> Path:
         folder = first if number == 1 else first.with_name(f"{first.name}-{number}")
         with suppress(FileExistsError):
             folder.mkdir()
-            atexit.register(_remove_if_empty, folder.absolute())
+            remove_if_empty_at_exit(folder)
             return folder
     raise AssertionError
+
+
+def remove_if_empty_at_exit(folder: Path) -> None:
+    """Remove a folder when this program ends, if it is empty then."""
+    atexit.register(_remove_if_empty, folder.absolute())
 
 
 def _remove_if_empty(folder: Path) -> None:

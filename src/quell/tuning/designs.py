@@ -102,7 +102,8 @@ def tuned_designs(
             continue
         best = min(solved[name], key=_rank, default=None)
         if best is None:
-            reason = "no controller of this structure was found that stabilises all plants"
+            which = "the plant" if len(task.plants.plants) == 1 else "all plants"
+            reason = f"no controller of this structure was found that stabilises {which}"
             designs[name] = impossible(name, reason)
         elif not best.feasible:
             designs[name] = impossible(name, contradiction(problem, best, task.constraints))
@@ -201,8 +202,11 @@ def contradiction(problem: Problem, solution: Solution, constraints: Constraints
         else:
             low = middle
     _, active = measured(relaxed(problem, high), found, constraints)
-    limits = {each.name: each.limit for each in active}
-    reached = ", ".join(f"{name} {limit / high:.4g}" for name, limit in limits.items())
+    given = {bound.kind: bound.limit for bound in problem.bounds}
+    given |= {extra.name: extra.limit for extra in problem.extras}
+    # Bounds of parameters, as |p| dt, are not relaxed.
+    limits = {each.name: given.get(each.name, each.limit) for each in active}
+    reached = ", ".join(f"{name} {limit:.4g}" for name, limit in limits.items())
     return (
         f"the constraints contradict each other for this structure: {reached or 'all'}; the least "
         f"excess that was found is {100.0 * (high - 1.0):.3g} % for each"

@@ -82,6 +82,8 @@ def sweep(
     figures = {name: f"{setup.stem}-{_slug(name)}" for name in varied}
     outputs = check_outputs(outputs, list(figures.values()))
     # One process does no more than one thread of this one, and takes longer to start.
+    if dask is not None and "://" not in dask:
+        raise ValueError(f"dask = {dask!r}: must be the address of a scheduler, tcp://HOST:PORT")
     executor = dask or ("threads" if workers == 1 else "processes")
     with _progress(console) as report:
         try:

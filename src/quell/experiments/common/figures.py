@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from quell.files import check_free, written_atomically
+from quell.files import check_free, remove_if_empty_at_exit, written_atomically
 from quell.records.trajectory import Trajectory
 from quell.types import Progress
 
@@ -44,10 +44,15 @@ def legend_label(name: str, run: Trajectory) -> str:
 
 
 def make_folder(folder: str | os.PathLike[str]) -> Path:
-    """Create a folder for figures if it does not exist; raise a ``ValueError`` if that fails."""
+    """Create a folder for figures if it does not exist; raise a ``ValueError`` if that fails.
+
+    A new one is removed when this program ends, if it is empty then.
+    """
     path = Path(folder)
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        if not path.is_dir():
+            path.mkdir(parents=True, exist_ok=True)
+            remove_if_empty_at_exit(path)
     except OSError as error:
         rule = f"must be a folder that can be made ({error.strerror})"
         raise ValueError(f"figures = {str(path)!r}: {rule}") from None
