@@ -172,12 +172,14 @@ def run_rig(
 def _header(device: Device, controller: Controller, signals: Signals | None) -> Header:
     known = getattr(device, "signals", UNKNOWN) if signals is None else signals
     known = signals_of_loop(known, controller)
+    units = {"y": known.y.unit, "u": known.u.unit}
     return Header(
         channels=row_channels(controller.channels),
         dt=controller.dt,
         features=tuple(controller.features),
         device=getattr(device, "name", type(device).__name__),
         controller=getattr(controller, "name", type(controller).__name__),
+        units={name: unit for name, unit in units.items() if unit},
         notes={"signals": known.texts()} if known.known else {},
     )
 

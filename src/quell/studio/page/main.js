@@ -158,8 +158,10 @@ const files = new Files(send, (text) => server.send({ do: "open", text }));
 // ---- tabs
 
 const watch = new Watch(
-  (arrays, values) => {
+  (arrays, values, units) => {
+    picture.age(false);
     picture.views.showRun({ ...arrays, watched: true }, [], null, null);
+    picture.caption(units);
     home("watch-values").replaceChildren(
       ...Object.entries(values).map(([name, value]) => {
         const box = element("div");
@@ -180,9 +182,11 @@ function chooseTab(name) {
   document.querySelector(".choices").hidden = name === "watch";
   home("numbers").hidden = name === "watch";
   picture.watching = name === "watch";
-  if (!picture.watching) {
+  if (picture.watching) picture.age(); // until rows come, the curves are those of the design
+  else {
     watch.stop();
     if (store) picture.draw();
+    ask();
   }
 }
 

@@ -22,9 +22,9 @@ export class Picture {
     return Math.max(200, Math.min(2000, this.views.width || 600));
   }
 
-  // Mark the curves as those of values that are not the present ones.
-  age() {
-    write(home("plots"), { className: "old" });
+  // Mark the curves as those of values that are not the present ones, or as those that are.
+  age(old = true) {
+    write(home("plots"), { className: old ? "old" : "" });
   }
 
   message(text) {
@@ -37,7 +37,7 @@ export class Picture {
       pin.arrays = arrays;
       return;
     }
-    write(home("plots"), { className: "" });
+    if (!this.watching) this.age(false);
     this.arrays = arrays;
     this.run = header;
     this.compiled += header.compiled;
@@ -53,7 +53,7 @@ export class Picture {
       this.draw();
       return;
     }
-    write(home("plots"), { className: "" });
+    if (!this.watching) this.age(false);
     this.loop = header.loop;
     this.loopArrays = arrays;
     write(home("loop-reason"), { textContent: header.loop.reason ?? "" });
@@ -86,9 +86,13 @@ export class Picture {
     const { band, setup } = this.state();
     this.views.showRun(this.arrays, this.pins.list, band ? this.band : null, setup);
     const f = unit(this.run, "f_hat");
-    const known = { ...this.run?.signals, f: f && `[${f}]` };
-    for (const name of ["y", "u", "f"]) write(home(`signal-${name}`), { textContent: known[name] ?? "" });
+    this.caption({ ...this.run?.signals, f: f && `[${f}]` });
     this.number();
+  }
+
+  // Write names and units of y, u and f above their plots.
+  caption(signals) {
+    for (const name of ["y", "u", "f"]) write(home(`signal-${name}`), { textContent: signals[name] ?? "" });
   }
 
   drawLoop() {

@@ -49,11 +49,14 @@ export class Watch {
     const channel = message.op === "advertise" ? message.channels.find((each) => each.topic === "/loop") : null;
     if (!channel) return;
     this.columns = {};
+    this.units = {};
     let place = 0;
     for (const line of channel.schema.split("\n")) {
-      const found = /^float64(?:\[(\d+)\])? (\w+)/.exec(line);
+      const found = /^float64(?:\[(\d+)\])? (\w+)(?:.*(\[.*\]))?/.exec(line);
       if (!found) continue;
       this.columns[found[2]] = place;
+      // "y-unit" stands for a unit that is not known.
+      this.units[found[2]] = found[3]?.includes("-unit") ? "" : (found[3] ?? "");
       place += Number(found[1] ?? 1);
     }
     this.socket.send(JSON.stringify({ op: "subscribe", subscriptions: [{ id: 1, channelId: channel.id }] }));
@@ -85,8 +88,10 @@ export class Watch {
     const last = this.rows.at(-1)?.[1];
     const now = {};
     for (const [name, label, factor] of SHOWN) {
-      if (last && name in this.columns) now[label] = factor * last[this.columns[name]];
+      const unit = ["y", "u"].includes(name) && this.units[name];
+      if (last && name in this.columns) now[unit ? `${label} ${unit}` : label] = factor * last[this.columns[name]];
     }
-    this.onRows(arrays, now);
+    const { y, u, f_residual: f } = this.units;
+    this.onRows(arrays, now, { y, u, f });
   }
 }
