@@ -117,13 +117,20 @@ def _gain_margin(
     change, so one test between them is enough.
     """
 
+    def inverse(w: float) -> complex:
+        """Return 1/L(ω), which is zero at a pole of an undamped plant."""
+        try:
+            return complex(1.0 / loop(np.array([w]))[0])
+        except ValueError:
+            return 0.0
+
     def imaginary_part(w: Vector) -> Vector:
-        return np.imag(1.0 / loop(w))
+        return np.array([inverse(float(w[0])).imag])
 
     crossings = _sign_changes(imaginary_part, omega, np.imag(1.0 / L))
     candidates = {}
     for at in [*crossings, float(omega[0]) * _TOWARDS_ZERO, math.pi / dt]:
-        factor = -float(np.real(1.0 / loop(np.array([at])))[0])
+        factor = -inverse(at).real
         if _LEAST_FACTOR < factor < _LARGEST_FACTOR:
             candidates[factor] = at
 
