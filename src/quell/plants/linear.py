@@ -26,17 +26,18 @@ class LinearModel(NamedTuple):
 @measure.register(LinearModel)
 def _measure(plant: LinearModel, x: Vector) -> float:
     y = 0.0
-    for i in range(x.size):
+    for i in range(plant.output.size):
         y += plant.output[i] * x[i]
     return y
 
 
 @advance.register(LinearModel)
 def _advance(plant: LinearModel, x: Vector, scratch: Vector, t: float, u: float, w: Vector) -> None:
-    size = x.size
+    # The sizes of a model's arrays are known to the compiler, those of x and w are not.
+    size, inputs = plant.disturbance.shape
     for i in range(size):
         total = 0.0
-        for j in range(w.size):
+        for j in range(inputs):
             total += plant.disturbance[i, j] * w[j]
         for j in range(size):
             total += plant.transition[i, j] * x[j]

@@ -83,7 +83,7 @@ def _advance(
         advance(plant.linear, x, scratch, t, applied, w[:1])
         gain = plant.linear.disturbance  # of a torque
         torque += min(max(-x[1] / gain[1, 0] - torque, -friction), friction)
-        for i in range(x.size):
+        for i in range(gain.shape[0]):
             x[i] += gain[i, 0] * torque
 
 

@@ -87,7 +87,7 @@ def _apply_coulomb_friction(plant: TorsionalModel, x: Vector) -> None:
     for _ in range(_ITERATIONS):
         lower = _stopping_torque(x[2] + gamma[2, 1] * upper, gamma[2, 0], plant.coulomb[0])
         upper = _stopping_torque(x[3] + gamma[3, 0] * lower, gamma[3, 1], plant.coulomb[1])
-    for i in range(x.size):
+    for i in range(gamma.shape[0]):
         x[i] += gamma[i, 0] * lower + gamma[i, 1] * upper
 
 

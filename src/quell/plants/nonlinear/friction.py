@@ -48,7 +48,7 @@ def _measure(plant: FrictionModel, x: Vector) -> float:
 def _derivatives(
     plant: FrictionModel, t: float, x: Vector, u: float, w: Vector, dx: Vector
 ) -> None:
-    n = x.size
+    n = plant.B.size
     for i in range(n):
         total = 0.0
         for j in range(n):
