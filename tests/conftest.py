@@ -18,6 +18,7 @@ os.environ["QUELL_QUIET"] = "1"
 import numpy as np
 import pytest
 from hypothesis import settings
+from numba.core import event
 
 import quell as ql
 from quell.kernels import dispatch
@@ -27,8 +28,23 @@ from quell.simulation.driver import Loop
 settings.register_profile("quell", deadline=None, derandomize=True)
 settings.load_profile("quell")
 
-# Numba makes millions of objects that live long: look for garbage among them less often.
+# Numba makes millions of objects that live long: look for garbage among them less often, and never
+# again among those of a compilation.
 gc.set_threshold(50_000, 20, 20)
+
+
+class _FrozenCode(event.Listener):
+    """What Numba tells of its compilations."""
+
+    def on_start(self, event: Any) -> None:
+        """Do nothing."""
+
+    def on_end(self, event: Any) -> None:
+        """Spare the garbage collector all that is here."""
+        gc.freeze()
+
+
+event.register("numba:compile", _FrozenCode())
 # A real-time loop collects garbage at its start and calls this at its end: the next one need not go
 # through all that was imported, which takes half a second.
 gc.unfreeze = lambda: None

@@ -59,9 +59,10 @@ def test_the_time_of_compiling_counts_once_for_an_entry_point_and_not_for_calls(
     """What an entry point calls is compiled within it; a second call compiles nothing."""
 
     @dispatch.compiled
-    def doubled(one: Any) -> float:
+    def with_cache(one: Any) -> float:
         return 2.0 * total(one, one)
 
+    doubled = with_cache.uncached  # type: ignore[attr-defined]
     before, began = compile_time.seconds, time.perf_counter()
     assert doubled(Circle(1.0)) == 18.0
     took = compile_time.seconds - before

@@ -30,6 +30,14 @@ _ENVIRONMENT = "_ZN08NumbaEnv"
 class KernelLibrary(JITCodeLibrary):
     """The code of a kernel, to be linked into other code."""
 
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Do as Numba does, but not for declarations: most of a module are the kernels it calls."""
+        ll_module.data_layout = self._codegen._data_layout
+        passes, builder = self._codegen._function_pass_manager()
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
     def _optimize_final_module(self) -> None:
         """Do nothing: the entry point is optimised as a whole."""
 
