@@ -211,7 +211,6 @@ def test_a_slope_is_permitted_while_the_effective_gain_is_half_to_twice_b0(b0: f
         assert found == (pytest.approx(expected[0]), expected[1], False), share
 
 
-@pytest.mark.compiled
 def test_the_bound_holds_for_the_u_of_the_sample() -> None:
     """With u as a feature the correction that the observer receives is within βκe, too."""
     controller = law(ql.learners.Kalman(u=True), ql.Guard())

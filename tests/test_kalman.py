@@ -97,9 +97,8 @@ def test_the_kalman_learner_finds_a_wrong_gain() -> None:
             u=True, bias=True, bias_bandwidth=0.05, gain_interval=(0.3, 3.0)
         ),
     )
-    run = ql.simulate(
-        plant, controller, ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-10, 0.01))
-    )
+    scenario = ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-10, 0.01))
+    run = ql.simulate(plant, controller, scenario, interpret=True)
     theta = controller.read(run.final_state).theta
     assert 1.0 + theta["u"] == pytest.approx(2.0, rel=0.05)
     assert theta["x1"] == pytest.approx(-3.0, rel=0.1)

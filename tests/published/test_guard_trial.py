@@ -1,15 +1,18 @@
-"""The bars for learners and guard, on few runs: ``quell stress --runs 10000 --honest 1000`` has all, ``.ci/run`` some."""
+"""Figures of learners and guard on the benchmark.
+
+The trial of hostile and of honest learners, with its bars, is a command, ``quell stress``, of which ``.ci/run``
+runs a part.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 import pytest
 
 import quell as ql
-from quell.experiments import stress
 from quell.experiments.two_mass_spring import setup as study
 from quell.parallel import in_parallel
 
@@ -17,30 +20,6 @@ pytestmark = pytest.mark.compiled
 
 SETTINGS = study.Settings()
 SINE = ql.signals.Sinusoid
-
-
-@cache
-def trial() -> stress.Result:
-    """Two hostile runs of each kind, and 24 honest ones."""
-    return stress.run(2 * len(stress.KINDS), 24, seed=3, guard=ql.Guard())
-
-
-def test_no_hostile_learner_harms_a_loop() -> None:
-    """None is lost, and all ratios are at most 1.5; a quantile of 99 % needs more runs."""
-    found = stress.summary(trial().hostile)
-    assert found["unstable_where_plain_is_stable"] == 0
-    assert found["ratio"]["max"] <= 1.5
-    assert found["load_ratio"]["p99"] <= 1.5
-
-
-def test_one_untuned_learner_serves_all_loops() -> None:
-    """Median 0.2 under load, 1.05 and 1.2 at worst; 0.02 late."""
-    found = stress.summary(trial().of(stress.HONEST))
-    assert found["unstable"] == 0
-    assert found["load_ratio"]["median"] <= 0.20
-    assert found["load_ratio"]["p99"] <= 1.05
-    assert found["load_ratio"]["max"] <= 1.2
-    assert found["late_ratio"]["median"] <= 0.02
 
 
 def late_peaks(learners: list[object], guard: ql.Guard | None, scenario: ql.Scenario) -> np.ndarray:
