@@ -122,10 +122,10 @@ def measured(
         if ratio >= 1.0 - _ACTIVE:
             value = extra.limit / ratio if extra.name == "delay margin" else extra.limit * ratio
             active.append(Active(extra.name, value, extra.limit, math.nan, 0))
-    rules = structure.rules(values)[0]
-    fastest = _fastest(solution, constraints, plants)
-    if fastest >= (1.0 - _ACTIVE) * constraints.omega_o_dt or np.any(rules < _ACTIVE):
-        limit = constraints.omega_o_dt
+    limit, fastest = constraints.omega_o_dt, _fastest(solution, constraints, plants)
+    if np.any(structure.rules(values)[0] < _ACTIVE):  # the faster real pole of a pair
+        fastest = limit
+    if fastest >= (1.0 - _ACTIVE) * limit:
         active.append(Active("|p| dt", min(fastest, limit), limit, math.nan, 0))
     return measures, tuple(active)
 
