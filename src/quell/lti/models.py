@@ -79,10 +79,13 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
         if size != (1, 1):
             raise ValueError(f"plant has {size} outputs and inputs: must have one of each")
         return _transfer_function(plant.num[0][0], plant.den[0][0])
+    named = repr(getattr(plant, "name", None) or plant)
     raise ValueError(
-        f"plant = {plant!r}: must be a linear plant or control.StateSpace (with A, B, C), matrices "
+        f"plant = {named}: must be a linear plant or control.StateSpace (with A, B, C), matrices "
         "(A, B, C) or (A, B, E, C), a control.TransferFunction, (numerator, denominator) or "
-        "(a, b); linearise a nonlinear plant first, quell.plants.linearised(plant, x, u)"
+        "(a, b); linearise a nonlinear plant first, quell.plants.linearised(plant, x, u); for "
+        "one without equation, as an FMU, tune from a record: quell run SETUP --save run.nc, and "
+        "quell tune run.nc"
     )
 
 
