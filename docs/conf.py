@@ -37,6 +37,8 @@ html_theme_options = {
 }
 html_show_sourcelink = False
 templates_path = ["_templates"]
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
 html_sidebars = {"**": ["pages.html"]}
 exclude_patterns = ["_build", "jupyter_execute"]
 
