@@ -22,6 +22,7 @@ from quell.kernels.compile_time import compile_time
 from quell.setup import load, made
 from quell.setup.vary import changed
 from quell.studio import messages
+from quell.studio.designs import varied
 from quell.studio.frames import Columns, frame, parsed
 from quell.studio.runs import Maker, loop_of
 from quell.studio.tasks import frames_for
@@ -264,6 +265,17 @@ def test_a_band_contains_the_run_of_the_nominal_plant(client: Client) -> None:
     inside = (band["y_low"] <= run["y"] + 2e-2) & (run["y"] <= band["y_high"] + 2e-2)
     assert np.all(inside)
     assert np.max(band["y_high"] - band["y_low"]) > 0.01
+
+
+def test_a_band_changes_parameters_and_no_whole_numbers() -> None:
+    """The parameters of a Python function, but not its order."""
+    plant = {"kind": "python", "source": "a.py:f", "order": 2, "parameters": {"m": 1.0, "l": 2}}
+    other = varied(plant, 20.0, None, np.random.default_rng(0))
+    assert {key: other[key] for key in ("kind", "source", "order")} == {
+        key: plant[key] for key in ("kind", "source", "order")
+    }
+    assert other["parameters"]["m"] != 1.0
+    assert other["parameters"]["l"] == pytest.approx(2.0, rel=0.2)
 
 
 def test_columns_keep_the_extrema_of_each_pixel() -> None:

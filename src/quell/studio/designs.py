@@ -28,9 +28,12 @@ _LIMITS = ("u_min", "u_max", "rate_limit")
 # Plants of a band, and the most that their parameters change [%]. Chosen by hand: 24 runs take a
 # quarter of a second.
 _PLANTS, _MOST_PERCENT = 24, 50.0
-# Keys that do not change: whole numbers; delays, which must be whole samples; and weights of the
-# measurement.
-_EXACT = ("counts", "dac_bits", "late", "kind", "delay", "uncertain", "c1", "c2")
+# Keys that do not change: whole numbers, or lists with some; delays, which must be whole samples;
+# weights of the measurement; and where a plant starts or is linearised.
+_EXACT = (
+    *("counts", "dac_bits", "late", "order", "substeps", "max_size", "cogging", "delay"),
+    *("kind", "uncertain", "c1", "c2", "start", "operating_point"),
+)
 
 
 def stoppable(report: Report, stale: Stale) -> Report:
@@ -136,7 +139,7 @@ def band_frames(
     for _ in range(_PLANTS):
         if stale():
             raise StoppedError
-        other = {**tables, "plant": _varied(tables["plant"], percent, ranges, random)}
+        other = {**tables, "plant": varied(tables["plant"], percent, ranges, random)}
         plant = make(other).needed("plant")
         run = simulate(plant, setup.controller, scenario, progress=watched(stale))
         if run.diverged:
@@ -156,7 +159,7 @@ def band_frames(
     yield frame({"kind": "band", "id": message["id"], **about}, curves)
 
 
-def _varied(plant: Any, percent: float, ranges: Any, random: np.random.Generator) -> Any:
+def varied(plant: Any, percent: float, ranges: Any, random: np.random.Generator) -> Any:
     """Return the table of a plant with other parameters."""
 
     def other(value: Any) -> Any:
@@ -164,6 +167,8 @@ def _varied(plant: Any, percent: float, ranges: Any, random: np.random.Generator
             return float(value) * (1.0 + 0.01 * percent * random.uniform(-1.0, 1.0))
         if isinstance(value, list | tuple):
             return [other(part) for part in value]
+        if isinstance(value, Mapping):  # parameters of a Python function
+            return {key: other(part) for key, part in value.items()}
         return value
 
     if not isinstance(plant, Mapping):
@@ -175,7 +180,7 @@ def _varied(plant: Any, percent: float, ranges: Any, random: np.random.Generator
         }
     for key, value in plant.items():
         if key == "plant":
-            table[key] = _varied(value, percent, None, random)
+            table[key] = varied(value, percent, None, random)
         elif key not in _EXACT:
             table[key] = other(value)
     return table
