@@ -100,12 +100,13 @@ def plot_root_locus(
     colors: dict[str, Any] = {"c": np.repeat(numbers, counts), "cmap": "viridis", "norm": LogNorm()}
     shown = one.scatter(points.real, points.imag, s=9.0, **colors)
     one.axvline(0.0, color="C3", linewidth=1.0)
+    unit = "rad/s" if parameter in ("omega_o", "omega_c") else ""
     for at, marker in ((0, "x"), (-1, "o")):
         ends = poles[at][np.abs(poles[at]) <= far]
         style = {"color": "0.2", "markersize": 6.0, "fillstyle": "none", "linestyle": "none"}
-        label = f"{parameter} = {numbers[at]:.3g}"
+        label = f"{parameter} = {numbers[at]:.3g} {unit}"
         one.plot(ends.real, ends.imag, marker, label=label, **style)
-    one.figure.colorbar(shown, ax=one, label=parameter)
+    one.figure.colorbar(shown, ax=one, label=f"{parameter} [{unit}]" if unit else parameter)
     one.set(xlabel="Re s [1/s]", ylabel="Im s [rad/s]")
     above: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "frameon": False}
     one.legend(ncols=2, fontsize="small", **above)
