@@ -104,7 +104,7 @@ def plot_root_locus(
     for at, marker in ((0, "x"), (-1, "o")):
         ends = poles[at][np.abs(poles[at]) <= far]
         style = {"color": "0.2", "markersize": 6.0, "fillstyle": "none", "linestyle": "none"}
-        label = f"{parameter} = {numbers[at]:.3g} {unit}"
+        label = f"{parameter} = {numbers[at]:.3g} {unit}".rstrip()
         one.plot(ends.real, ends.imag, marker, label=label, **style)
     one.figure.colorbar(shown, ax=one, label=f"{parameter} [{unit}]" if unit else parameter)
     one.set(xlabel="Re s [1/s]", ylabel="Im s [rad/s]")
