@@ -66,9 +66,13 @@ function margins(loop, bounds, dt) {
   ];
 }
 
-// Two numbers, short enough for one line of a box.
+// A number with three digits, and two of them: short enough for one line of a box.
+function brief(value) {
+  return short(value == null ? value : Number(value.toPrecision(3)));
+}
+
 function range(low, high) {
-  return [low, high].map((each) => short(Number(each.toPrecision(3)))).join("…");
+  return [low, high].map(brief).join("…");
 }
 
 function metrics(run, bounds) {
@@ -88,7 +92,7 @@ function metrics(run, bounds) {
       found.push(["settling", window.settling_time == null ? "never" : `${short(window.settling_time)} s`, window.settling_time == null, where]);
     }
     found.push([`peak e, ${where}`, `${short(window.peak_error)} ${y}`, false, `largest |r − y|, ${where}`]);
-    found.push([`IAE, ${where}`, `${short(window.iae)} ${y && `${y} s`}`, false, `integral of |r − y| ${where}`]);
+    found.push([`IAE, ${where}`, `${brief(window.iae)} ${y && `${y} s`}`, false, `integral of |r − y| ${where}`]);
     found.push([`TV of u, ${where}`, `${short(window.control_variation)} ${u}`, false, `sum of |Δu| ${where}`]);
   }
   return found;
