@@ -10,7 +10,7 @@ export function short(value) {
   if (!Number.isFinite(value)) return value > 0 ? "∞" : "−∞";
   const size = Math.abs(value);
   const text = size !== 0 && (size > 1e5 || size < 1e-3) ? value.toExponential(2) : String(Number(value.toPrecision(4)));
-  return text.replace("-", "−");
+  return text.replace(/\.?0+e/, "e").replace("e+", "e").replaceAll("-", "−");
 }
 
 // A plot of curves of the present design, its pins and, where there is one, a band.
