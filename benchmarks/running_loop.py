@@ -1,18 +1,22 @@
 """b0 from records of running loops: errors, and how often the stated interval holds the true b0.
 
     python benchmarks/running_loop.py [--draws N] [--seed S] [--snr DB] [--json FILE]
+    python benchmarks/running_loop.py --controller adrc       N draws with ADRC, pid or unknown
 
 Each draw has a plant of order 1 or 2 (integrating, damped or oscillating) behind a lag, a delay of
 eighths of a sample, both or neither; an ADRC whose b0 is wrong by up to a factor of 1.6, or a PID;
 a logarithmic chirp of 20 s as reference, or added to u; white noise in y, alone or with a load that
 drifts (a random walk, or one that forgets in 0.2 to 2 s) and has half of the power. The noise's
-power in y is that of y divided by the given ratio. The loop is simulated apart from the package's
-own models: by scipy at eight steps per sample.
+power in y is that of y divided by the given ratio. The unknown controller is one of them whose u is
+rounded to a fiftieth of its largest value, and limited at the 95 % quantile of its size: no linear
+model says how u depends on r and y. The loop is simulated apart from the package's own models: by
+scipy at eight steps per sample.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 import warnings
@@ -41,6 +45,23 @@ class Loop(NamedTuple):
     omega: float  # speed of the loop [rad/s]
     controller: Any
     text: str
+
+
+class Unknown(NamedTuple):
+    """A controller whose u is rounded and limited."""
+
+    controller: Any
+    step_size: float
+    most: float
+
+    def reset(self) -> None:
+        """Reset the controller."""
+        self.controller.reset()
+
+    def step(self, r: float, y: float) -> float:
+        """Return u."""
+        u = round(self.controller.step(r, y) / self.step_size) * self.step_size
+        return float(min(max(u, -self.most), self.most))
 
 
 def drawn_loop(rng: np.random.Generator) -> Loop:
@@ -101,7 +122,7 @@ def simulated(
     return u[at:], y
 
 
-def drawn_record(seed: int, snr: float) -> tuple[Loop, Vector, Vector, str]:
+def drawn_record(seed: int, snr: float, unknown: bool = False) -> tuple[Loop, Vector, Vector, str]:
     """Return a loop, u, the measured y, and what was drawn."""
     rng = np.random.default_rng(seed)
     loop = drawn_loop(rng)
@@ -110,7 +131,12 @@ def drawn_record(seed: int, snr: float) -> tuple[Loop, Vector, Vector, str]:
     chirp = signal.chirp(t, ends[0], DURATION, ends[1], method="logarithmic", phi=-90.0)
     zero, at_u = np.zeros(t.size), rng.random() < 0.3
     parts = (zero, chirp) if at_u else (chirp, zero)
-    _, clean = simulated(loop, *parts, zero, zero)
+    u, clean = simulated(loop, *parts, zero, zero)
+    if unknown:
+        own = np.abs(u - parts[1])
+        other = Unknown(loop.controller, float(np.max(own)) / 50.0, float(np.quantile(own, 0.95)))
+        loop = loop._replace(controller=other, text="other" + loop.text[4:])
+        _, clean = simulated(loop, *parts, zero, zero)
     share = float(rng.choice([0.0, 0.5]))
     target = 10.0 ** (-snr / 20.0) * float(np.std(clean))
     noise = np.sqrt(1.0 - share) * target * rng.standard_normal(t.size)
@@ -135,12 +161,19 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--seed", type=int, default=40000, help="seed of the first draw")
     parser.add_argument("--snr", type=float, default=30.0, help="signal-to-noise ratio of y [dB]")
+    parser.add_argument("--controller", choices=("adrc", "pid", "unknown"))
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", ql.DesignWarning)
     rows: list[dict[str, Any]] = []
-    for seed in range(arguments.seed, arguments.seed + arguments.draws):
-        loop, u, y, text = drawn_record(seed, arguments.snr)
+    kind = {"adrc": "ADRC", "pid": "PID", "unknown": "other", None: ""}[arguments.controller]
+    for seed in itertools.count(arguments.seed):
+        if len(rows) == arguments.draws:
+            break
+        drawn = drawn_loop(np.random.default_rng(seed)).text
+        if kind in ("ADRC", "PID") and not drawn.startswith(kind):
+            continue
+        loop, u, y, text = drawn_record(seed, arguments.snr, kind == "other")
         began = time.process_time()
         found = identify_b0(u, y, loop.dt, loop.den.size - 1)
         taken = time.process_time() - began
@@ -168,6 +201,7 @@ def main() -> None:
         ("with a load", [row for row in rows if not row["text"].endswith("noise")]),
         ("ADRC", [row for row in rows if row["text"].startswith("ADRC")]),
         ("PID", [row for row in rows if row["text"].startswith("PID")]),
+        ("unknown", [row for row in rows if row["text"].startswith("other")]),
         ("order 1", [row for row in rows if "order 1" in row["text"]]),
         ("order 2", [row for row in rows if "order 2" in row["text"]]),
     ):

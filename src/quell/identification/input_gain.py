@@ -181,12 +181,13 @@ def identify_b0(
     The plant is ``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = b0 u_l + load``, where u_l is u behind a
     lag and a delay, under a drifting load and noise in y (``quell.identification.running_loop``
     has the equations). The controller need not be known: the prediction-error method is consistent
-    in a loop of any controller, as long as u is what reached the plant. All eight forms of the
-    model, with or without lag, delay and load, are fitted; b0 is their mean with Akaike's weights,
-    and its deviation has their differences in it (Buckland, Burnham & Augustin, *Biometrics* 53,
-    1997, eqs. (2), (9))::
+    in a loop of any controller, as long as u is what reached the plant. All twelve forms of the
+    model, with or without lag and delay, under no load, one that drifts or one that forgets, are
+    fitted; b0 is their mean with Akaike's weights, and its deviation that of the mixture of their
+    distributions (Burnham & Anderson, *Model Selection and Multimodel Inference*, 2nd ed. 2002,
+    sec. 6.7)::
 
-        w_i ∝ exp(−AIC_i/2),    b0 = Σ w_i b_i,    std = Σ w_i √(var_i + (b_i − b0)²)
+        w_i ∝ exp(−AIC_i/2),    b0 = Σ w_i b_i,    std² = Σ w_i (var_i + (b_i − b0)²)
 
     Parameters
     ----------

@@ -50,10 +50,10 @@ def total_delay(one: LoopFit) -> tuple[float, float]:
 
 
 def mean(estimates: list[tuple[float, float]], weights: Vector) -> tuple[float, float]:
-    """Return the weighted mean of values with deviations, and its deviation."""
+    """Return mean and deviation of the mixture of values with deviations."""
     values, spreads = np.array(estimates).T
     mean = float(weights @ values)
-    return mean, float(weights @ np.sqrt(spreads**2 + (values - mean) ** 2))
+    return mean, math.sqrt(float(weights @ (spreads**2 + (values - mean) ** 2)))
 
 
 def visible_up_to(best: LoopFit, u: Vector, y: Vector, dt: float) -> float:

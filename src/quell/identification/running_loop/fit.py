@@ -48,7 +48,7 @@ class LoopFit(NamedTuple):
     """A model of the plant and its noise."""
 
     form: Form
-    phi: Vector  # a, l, τ, T in units of a sample
+    phi: Vector  # a, l, λ, τ, T in units of a sample
     beta: Vector  # b, initial state
     covariance: Matrix  # of phi and beta
     error: Vector  # e (N,)
@@ -76,17 +76,18 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     at, converged = _descend(form, _solved(form, phi, u, y), u, y)
     psi, size = _gradient(form, at, u, y)
     first, count = at.beta.size, at.beta.size + form.size
-    # τ and T at zero, their limit, do not vary.
-    times = first + np.arange(form.size)[form.times]
-    psi[:, times[at.phi[form.times] <= 0.0]] = 0.0
+    # λ, τ and T at zero, their limit, do not vary.
+    places = first + np.arange(form.size)[form.non_negative]
+    psi[:, places[at.phi[form.non_negative] <= 0.0]] = 0.0
     R: Matrix = np.asarray(np.linalg.qr(psi, mode="r"))
     inverse = np.linalg.pinv(R, rcond=_RANK)
     variance = at.power / max(at.error.size - count, 1)
     order = np.r_[first:count, :first]  # φ before β
-    rows = inverse[order] / size[order, None]
-    covariance = variance * rows @ rows.T
-    half = rows @ (inverse.T @ block_sums(psi, at.error, min(_BLOCKS, at.error.size)).T)
-    robust = half @ half.T
+    with np.errstate(all="ignore"):  # a fit without a stable start has no covariance
+        rows = inverse[order] / size[order, None]
+        covariance = variance * rows @ rows.T
+        half = rows @ (inverse.T @ block_sums(psi, at.error, min(_BLOCKS, at.error.size)).T)
+        robust = half @ half.T
     if robust[form.size, form.size] > covariance[form.size, form.size]:
         covariance = robust
     aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
@@ -142,10 +143,11 @@ def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool
 
 
 def _within_limits(form: Form, phi: Vector, inner: Matrix, right: Vector) -> tuple[Matrix, Vector]:
-    """Return the equations and their solution without τ or T that would leave zero downwards."""
+    """Return the equations and their solution without λ, τ or T that would leave zero downwards."""
     step: Vector = np.linalg.lstsq(inner, right, rcond=_RANK)[0].astype(np.float64)
     stuck = np.zeros(step.size, dtype=bool)
-    stuck[form.times] = (phi[form.times] <= 0.0) & (step[form.times] <= 0.0)
+    limited = form.non_negative
+    stuck[limited] = (phi[limited] <= 0.0) & (step[limited] <= 0.0)
     if np.any(stuck):
         inner = np.where(stuck, 0.0, inner)
         step = np.linalg.lstsq(inner, right, rcond=_RANK)[0].astype(np.float64)
@@ -168,7 +170,8 @@ def _damped_step(
         left = np.vstack([inner, math.sqrt(mu) * np.eye(count)])
         step = np.linalg.lstsq(left, np.append(right, np.zeros(count)), rcond=None)[0]
         phi = at.phi + step / size
-        phi[form.times] = np.clip(phi[form.times], 0.0, _LONGEST * u.size)
+        limited = form.non_negative
+        phi[limited] = np.clip(phi[limited], 0.0, _LONGEST * u.size)
         trial = _solved(form, phi, u, y)
         if trial.power < at.power:
             return trial, max(0.1 * mu, _LEAST_MU)

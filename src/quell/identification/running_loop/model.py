@@ -1,10 +1,12 @@
 """The predictor of a plant behind a lag and a delay, under a drifting load: sampled exactly.
 
-    y^(n) + a_{n−1} y^(n−1) + … + a_0 y = b u_l + d + w,     d' = w_d,     τ u_l' + u_l = u(t − T)
+    y^(n) + a_{n−1} y^(n−1) + … + a_0 y = b u_l + d + w
+    d' = −λ d + w_d,     τ u_l' + u_l = u(t − T)
 
-This is the model that ADRC has, y^(n) = f + b u, with the part of f that is linear. For white w,
-w_d and white noise in y the best prediction of y from the samples before is that of a Kalman
-filter, in the innovation form (Ljung, *System Identification*, 2nd ed. 1999, eqs. (4.91), (4.92))::
+This is the model that ADRC has, y^(n) = f + b u, with the part of f that is linear; a load d that
+forgets has λ > 0. For white w, w_d and white noise in y the best prediction of y from the samples
+before is that of a Kalman filter, in the innovation form (Ljung, *System Identification*, 2nd ed.
+1999, eqs. (4.91), (4.92))::
 
     x⁺ = Φ x + Γ u + K e,      e = y − ŷ,      ŷ = x_1
 
@@ -39,12 +41,13 @@ _LEAST_LAG = 1e-6
 
 
 class Form(NamedTuple):
-    """The parameters of a model: a, l, τ and T are *nonlinear*, b and the initial state linear."""
+    """The parameters of a model: a, l, λ, τ, T are *nonlinear*, b and the initial state linear."""
 
     order: int  #: n
     lag: bool  #: whether τ is free; else it is 0
     delay: bool  #: whether T is free; else it is 0
     drift: bool  #: whether l are free; else they are 0, and only y is noisy
+    forgets: bool = False  #: whether λ is free; else it is 0
 
     @property
     def gains(self) -> slice:
@@ -54,17 +57,26 @@ class Form(NamedTuple):
     @property
     def times(self) -> slice:
         """Places of τ and T."""
+        return slice(self.gains.stop + self.forgets, self.size)
+
+    @property
+    def non_negative(self) -> slice:
+        """Places of λ, τ and T."""
         return slice(self.gains.stop, self.size)
 
     @property
     def size(self) -> int:
         """Number of nonlinear parameters."""
-        return self.gains.stop + self.lag + self.delay
+        return self.gains.stop + self.forgets + self.lag + self.delay
 
     @property
     def states(self) -> int:
         """Number of states."""
         return self.order + 1 + self.lag
+
+    def rate_of(self, phi: Vector) -> float:
+        """Return λ [1/sample]."""
+        return float(phi[self.gains.stop]) if self.forgets else 0.0
 
     def lag_of(self, phi: Vector) -> float:
         """Return τ [samples]."""
@@ -107,13 +119,13 @@ def predicted(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Ve
 
 
 def derivatives(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Matrix:
-    """Return the derivatives (N, size) of ŷ by a, l, τ and T, by central differences."""
+    """Return the derivatives (N, size) of ŷ by a, l, λ, τ and T, by central differences."""
     found = np.empty((u.size, form.size))
     for i, step in enumerate(_steps(form, y)):
         above, below = phi.copy(), phi.copy()
         above[i] += step
-        # τ and T are not negative; at zero the difference is one-sided.
-        below[i] -= step if i < form.times.start or phi[i] >= step else 0.0
+        # λ, τ and T are not negative; at zero the difference is one-sided.
+        below[i] -= step if i < form.non_negative.start or phi[i] >= step else 0.0
         change = predicted(form, above, beta, u, y) - predicted(form, below, beta, u, y)
         found[:, i] = change / (above[i] - below[i])
     return found
@@ -125,7 +137,8 @@ def _steps(form: Form, y: Vector) -> Vector:
     slow = 2.0 * math.pi / y.size
     spread = float(np.std(y)) or 1.0
     rate = float(np.clip(np.std(y[n:] - y[:-n]) / (n * spread), 10.0 * slow, 0.3))
-    powers = np.append(n - np.arange(float(n)), np.arange(1.0, n + 2.0))[: form.times.start]
+    powers = np.append(n - np.arange(float(n)), np.arange(1.0, n + 2.0))[: form.gains.stop]
+    powers = np.append(powers, np.ones(int(form.forgets)))
     return _STEP * np.append(rate**powers, np.full(form.lag + form.delay, 1.0 / rate))
 
 
@@ -139,7 +152,7 @@ def _predictor(form: Form, phi: Vector) -> Sampled:
     n, size = form.order, form.states
     A, B = np.zeros((size, size)), np.zeros((size, 2))
     A[:n, :n] = observable(phi[:n])
-    A[n - 1, n] = 1.0
+    A[n - 1, n], A[n, n] = 1.0, -form.rate_of(phi)
     if form.drift:
         B[: n + 1, 1] = phi[form.gains]
     if form.lag:

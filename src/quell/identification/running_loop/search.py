@@ -3,7 +3,7 @@
 Each form, with or without lag, delay and drifting load, is fitted from several starts: the
 denominators of ``initial_estimate`` and that of a chain of integrators, a grid of delays or lags,
 and of a few bandwidths of the predictor. Forms with a drifting load are left out if the output
-error alone is white.
+error alone is white. Those with a load that forgets start at the ones whose load does not.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from quell.types import Vector
 # shares of a lag in the sum of lag and delay, of the starts. Chosen by hand, so that the trial of
 # benchmarks/running_loop.py finds the same minimum as a start at the true plant.
 _RATES, _GRID, _DENOMINATORS, _SHARES = (0.01, 0.05, 0.2), 6, 3, (0.2, 0.5, 0.8)
+# Rates at which loads forget, of the starts [1/sample].
+_FORGETTING = (0.001, 0.01, 0.1)
 # Lags of the test of whiteness, and its level: as in ``best_start``.
 _LAGS, _LEVEL = 50, 1e-3
 
@@ -35,7 +37,8 @@ def fits(order: int, most: float, u: Vector, y: Vector) -> list[LoopFit]:
     if not _white(min(found, key=lambda one: one.aic), y):
         a = [min(found, key=lambda one: one.aic).phi[:order], *a]
         placed_ones = [placed(one, rate) for one, rate in product(a, _RATES)]
-        found += _family(order, True, placed_ones, most, u, y)
+        drifting = _family(order, True, placed_ones, most, u, y)
+        found += drifting + [_forgetting(one, u, y) for one in drifting]
     return found
 
 
@@ -64,6 +67,13 @@ def _family(
     parts = [(one.phi[:-1], one.phi[-1], share) for one in (late, slow) for share in _SHARES]
     both = [np.append(phi, [share * T + 0.1, (1.0 - share) * T]) for phi, T, share in parts]
     return [plain, late, slow, best(True, True, both)]
+
+
+def _forgetting(one: LoopFit, u: Vector, y: Vector) -> LoopFit:
+    """Return the fit of the same form with a load that forgets."""
+    form, place = one.form._replace(forgets=True), one.form.gains.stop
+    tried = [np.insert(one.phi, place, rate) for rate in _FORGETTING]
+    return fit(form, min(tried, key=lambda phi: power(form, phi, u, y)), u, y)
 
 
 def _white(found: LoopFit, y: Vector) -> bool:
