@@ -34,6 +34,13 @@ _DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
 _OBSERVER_STARTS = (0.3, 1.0, 3.0, 10.0, 30.0)
+# With a model the law may be far faster than the plant, and the observer far slower than the law.
+_FASTER_LAW, _SLOWER_OBSERVER = (8.0, 20.0), (0.01, 0.03, 0.1)
+# Where k_i of a structure with a model is infinite: bandwidths of the law and of the observer that
+# are tried, from these multiples of the plant's phase crossover to the fastest; and the starts'
+# distances from there.
+_LAWS, _OBSERVERS, _LOWEST = 12, 240, (0.03, 0.01)
+_BESIDE = (0.03, 0.1, 0.3)
 
 
 @dataclass(frozen=True)
@@ -140,8 +147,12 @@ class AdrcStructure:
     def shapes(self) -> Matrix:
         """Return bandwidths in wide ranges; freed poles start in one place, or in two."""
         omega, rows = self.model.omega, []
+        laws: tuple[float, ...] = _LAW_STARTS
+        ratios: tuple[float, ...] = _OBSERVER_STARTS
+        if self.form.based:
+            laws, ratios = laws + _FASTER_LAW, _SLOWER_OBSERVER + ratios
         b0 = self.model.b if self.degree == self.model.degree else 1.0
-        for law, ratio in itertools.product(_LAW_STARTS, _OBSERVER_STARTS):
+        for law, ratio in itertools.product(laws, ratios):
             pair = (law * omega, law * ratio * omega)
             if max(pair) > 0.999 * self._fastest:
                 pair = (min(pair[0], 0.9 * self._fastest), 0.99 * self._fastest)
@@ -153,7 +164,34 @@ class AdrcStructure:
             found = self.rows_of(b0, *poles)
             if found is not None:
                 rows.append(found)
+        if self.form.based and not self.form.freed:
+            rows += self._beside_infinite_gain(b0)
         return np.array(rows)
+
+    def _beside_infinite_gain(self, b0: float) -> list[Vector]:
+        """Return bandwidths near which k_i is infinite, on the side where it is positive.
+
+        ``k_i b0`` depends on the bandwidths alone. It is infinite on a curve in their plane, where
+        a second pole of C_y is at z = 1. The bound of the load response keeps optima at a distance
+        from this curve, along which a narrow ridge of k_i goes: with slow and fast poles in the
+        plant, no other start may lead there.
+        """
+        rows, fastest = [], 0.99 * self._fastest
+        least = [share * self.model.omega for share in _LOWEST]
+        lowest = [min(each, 0.1 * self._fastest) for each in least]
+        observers = np.geomspace(lowest[1], fastest, _OBSERVERS)
+        for law in np.geomspace(lowest[0], fastest, _LAWS).tolist():
+            columns = [np.full(observers.size, value) for value in (b0, law)]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                inverse = 1.0 / self.integral_gain(np.column_stack([*columns, observers]))
+            for i in np.flatnonzero(np.diff(np.signbit(inverse))):
+                above = bool(inverse[i + 1] > inverse[i])
+                share = inverse[i] / (inverse[i] - inverse[i + 1])
+                place = observers[i] * (observers[i + 1] / observers[i]) ** share
+                for distance in _BESIDE:
+                    there = place * (1.0 + distance) if above else place / (1.0 + distance)
+                    rows.append(np.array([b0, law, min(there, fastest)]))
+        return rows
 
     def _designs(self, values: Matrix) -> sampled_adrc.Designs:
         key = values.tobytes()
