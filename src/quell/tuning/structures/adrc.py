@@ -184,7 +184,8 @@ class AdrcStructure:
             columns = [np.full(observers.size, value) for value in (b0, law)]
             with np.errstate(divide="ignore", invalid="ignore"):
                 inverse = 1.0 / self.integral_gain(np.column_stack([*columns, observers]))
-            for i in np.flatnonzero(np.diff(np.signbit(inverse))):
+            known = np.isfinite(inverse[1:]) & np.isfinite(inverse[:-1])
+            for i in np.flatnonzero(np.diff(np.signbit(inverse)) & known):
                 above = bool(inverse[i + 1] > inverse[i])
                 share = inverse[i] / (inverse[i] - inverse[i + 1])
                 place = observers[i] * (observers[i + 1] / observers[i]) ** share
