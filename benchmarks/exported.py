@@ -7,11 +7,13 @@ single precision, compiled without a warning by gcc, clang and as C++, and run i
 plant (``exported.c``): noise, saturation, bursts of NaN, absurd values, manual operation, retuning,
 restarts. The interpreted kernels replay what the C code was given; the columns have the number of
 samples, and how many of them differ in a bit. "compiled" is the largest difference of u to the
-compiled kernels, relative to the RMS of u. Branches are those of ``servo.c`` that the run has taken
-(gcov). All rows take 35 minutes of a core, MLP four of them: ``--results`` names a file to which
-each row is added when it is ready, and whose rows are not run again. The parts are ``bits``,
-``speed`` (the exported learner against ``reference.c``) and ``long`` (10^8 samples in single and in
-double precision).
+compiled kernels, relative to the RMS of u; "1 ulp of y" is what the compiled kernels themselves
+make of measurements that are moved by one unit of the last digit. The first comes from fused
+multiply-add alone: with ``--without-fma`` the kernels are compiled without it, and all differences
+must be zero. Branches are those of ``servo.c`` that the run has taken (gcov). All rows take 35
+minutes of a core, MLP four of them: ``--results`` names a file to which each row is added when it
+is ready, and whose rows are not run again. The parts are ``bits``, ``speed`` (the exported learner
+against ``reference.c``) and ``long`` (10^8 samples in single and in double precision).
 """
 
 from __future__ import annotations
@@ -44,7 +46,15 @@ from quell.export import TranslationError
 from quell.export.inspection import limits_path
 from quell.export.library.vectors import Action, Player
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
+# Runs this file with kernels that are compiled without fused multiply-add.
+_WITHOUT_FMA = f"""
+import runpy, sys
+from quell.kernels import linking
+sys.path.insert(0, {str(HERE)!r})
+linking.OPTIONS["fastmath"] = {{"nsz"}}
+runpy.run_path({str(HERE / "exported.py")!r}, run_name="__main__")
+"""
 STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 EXACT = ("-O2", "-ffp-contract=off")
 COMPILERS = {
@@ -166,16 +176,16 @@ def available(action: Action, names: set[str], path: str) -> Action:
     return action if needs.get(action, True) else Action.STEP
 
 
-def compiled_difference(
-    controller: Any, rows: np.ndarray, given: np.ndarray, names: set[str]
-) -> float:
-    """Return the largest difference of u to the compiled methods, relative to the RMS of u."""
+def compiled(
+    controller: Any, rows: np.ndarray, given: np.ndarray, names: set[str], y: np.ndarray
+) -> np.ndarray:
+    """Return u of the compiled methods for the measurements ``y``."""
     runner, path = copy.deepcopy(controller), limits_path(controller)
     derivatives = int(getattr(controller, "derivatives", 0)) if "set_derivatives" in names else 0
     u = np.empty(given.size)
     for k, row in enumerate(given):
         action = available(Action(int(rows[k, 0])), names, path)
-        r, y = row["r"], row["y"]
+        r = row["r"]
         more = [0.5 * r] * derivatives
         if action is Action.APPLIED:
             runner.applied(row["given"])
@@ -186,11 +196,17 @@ def compiled_difference(
         elif action is Action.RESET:
             reset_loop(runner.parameters, runner._state)  # reset() would forget what was learned
         elif action is Action.START:
-            runner.start(y, row["given"], r)
+            runner.start(row["y"], row["given"], r)
         track = action is Action.TRACK
-        u[k] = runner.track(r, y, row["given"], *more) if track else runner.step(r, y, *more)
-    size = float(np.sqrt(np.mean(np.square(given["u"])))) or 1.0
-    return float(np.max(np.abs(u - given["u"]))) / size
+        u[k] = runner.track(r, y[k], row["given"], *more) if track else runner.step(r, y[k], *more)
+    return u
+
+
+def moved(y: np.ndarray) -> np.ndarray:
+    """Return measurements that are one unit of the last digit higher or lower, by chance."""
+    up = np.random.default_rng(8).random(y.size) < 0.5
+    with np.errstate(over="ignore"):
+        return np.nextafter(y, np.where(up, np.inf, -np.inf).astype(y.dtype))
 
 
 def judged(name: str, controller: Any, precision: str, options: argparse.Namespace) -> list[str]:
@@ -219,16 +235,19 @@ def judged(name: str, controller: Any, precision: str, options: argparse.Namespa
     given = runs["gcc"]
     others = sum(not same_bits(each, given) for each in runs.values())
     count, wrong = replayed(shown, rows, given, names)
-    compiled = f"{compiled_difference(shown, rows, given, names):.0e}"
+    arguments, y = (shown, rows, given, names), given["y"]
+    u, size = compiled(*arguments, y), float(np.sqrt(np.mean(np.square(given["u"])))) or 1.0
+    difference = float(np.max(np.abs(u - given["u"]))) / size
+    rounding = float(np.max(np.abs(compiled(*arguments, moved(y)) - u))) / size
     flags = ql.Status(int(np.bitwise_or.reduce(given["status"].astype(int))))
-    cells = [name, precision, f"{count}", f"{wrong}", f"{others}", compiled, taken]
-    return [*cells, f"{int(flags)}"]
+    cells = [name, precision, f"{count}", f"{wrong}", f"{others}"]
+    return [*cells, f"{difference:.0e}", f"{rounding:.0e}", taken, f"{int(flags)}"]
 
 
 def bits(options: argparse.Namespace, console: Console) -> None:
     """Print the table of all combinations."""
-    heads = ("controller", "precision", "replayed", "differ", "compilers that differ", "compiled")
-    table = Table(*heads, "branches taken", "flags seen")
+    heads = ("controller", "precision", "replayed", "differ", "compilers that differ")
+    table = Table(*heads, "compiled", "1 ulp of y", "branches taken", "flags seen")
     known, wrong = earlier_rows(options.results), 0
     for name, controller in cases():
         if options.only not in name:
@@ -252,9 +271,9 @@ def row_of(name: str, controller: Any, precision: str, options: argparse.Namespa
     try:
         return judged(name, controller, precision, options)
     except TranslationError as error:
-        return [name, precision, "refused", str(error)[:40], "", "", "", ""]
+        return [name, precision, "refused", str(error)[:40], "", "", "", "", ""]
     except (RuntimeError, ValueError) as error:
-        return [name, precision, "FAILED", str(error)[:200], "", "", "", ""]
+        return [name, precision, "FAILED", str(error)[:200], "", "", "", "", ""]
 
 
 def earlier_rows(file: Path | None) -> dict[tuple[str, str], list[str]]:
@@ -339,7 +358,14 @@ def main() -> None:
     parser.add_argument("--part", choices=("bits", "speed", "long"), help="one part only")
     parser.add_argument("--results", type=Path, help="file of rows that are ready")
     parser.add_argument("--long", type=float, default=1e8, help="samples of the long runs")
+    parser.add_argument("--without-fma", action="store_true", help="compile kernels without FMA")
     options = parser.parse_args()
+    if options.without_fma:
+        arguments = [each for each in sys.argv[1:] if each != "--without-fma"]
+        with tempfile.TemporaryDirectory() as cache:
+            command = [sys.executable, "-c", _WITHOUT_FMA, *arguments]
+            environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
+            sys.exit(subprocess.run(command, env=environment, check=False).returncode)
     console = Console(width=max(160, int(os.environ.get("COLUMNS", "0"))))
     warnings.simplefilter("ignore")
     if options.part in (None, "bits"):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.export.library.comparison import Comparison
 from quell.export.library.templates import filled
 from quell.export.library.toolchain import stack_of
 from quell.export.library.vectors import golden_vectors
@@ -280,9 +281,15 @@ def test_single_precision_is_compared_and_refused_where_it_differs(
     assert not any(tmp_path.iterdir())
     accepted = exported(tmp_path, hasty, "single", **loop | {"accept": True})
     assert accepted.comparison.u > 0.01
-    chooses = ql.ADRC(OBSERVER, 1.5, learner=ql.learners.GaussianProcess())
-    with pytest.raises(ValueError, match="which points .* double precision or another learner"):
-        accepted.comparison.check(ql.controllers.Prefiltered(chooses, ql.baselines.ZV(3.0)))
+
+
+def test_the_refusal_names_what_would_help() -> None:
+    """For a process whose points are too close, their distance; else the rounding of y."""
+    worse = Comparison(0.2, 0.01, None, None, False)
+    for novelty, remedy in ((0.01, "novelty=0.1 of GaussianProcess"), (0.1, "lower omega_o")):
+        learner = ql.learners.GaussianProcess(5, novelty=novelty)
+        with pytest.raises(ValueError, match=f"changes u by 20 % RMS.*{remedy}.*or double"):
+            worse.check(ql.ADRC(ADRC.observer, 2.0, learner=learner))
 
 
 def test_single_precision_without_a_loop_must_be_accepted(tmp_path: Path) -> None:

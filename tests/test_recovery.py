@@ -15,6 +15,7 @@ from quell.learners.recovery import (
     LearnerWatch,
     has_escaped,
     has_lost_range,
+    is_excessive,
     is_in_proportion,
     window_samples,
 )
@@ -37,8 +38,13 @@ def verdicts(
     return [
         k
         for k in range(samples)
-        if has_lost_range(watch, WINDOW, y(k), f(k), output(k), excess(k), limited(k))
+        if has_lost_range(watch, WINDOW, y(k), f(k), output(k), beyond(excess(k)), limited(k))
     ]
+
+
+def beyond(excess: float) -> bool:
+    """Whether the law asks for too much, at so many times the u that is applied."""
+    return is_excessive(-2.0 * excess, 2.0, 1e-200)
 
 
 def wave(k: int) -> float:
@@ -126,15 +132,15 @@ def test_an_output_that_grows_without_bound_is_found_in_the_sample() -> None:
         return watch
 
     watch = watched(1.0)
-    assert has_escaped(watch, -1.2e12, 2000.0)
+    assert has_escaped(watch, -1.2e12, beyond(2000.0))
     assert (watch.most, watch.samples, watch.excessive, watch.limited) == (0.0, 0.0, 0.0, 0.0)
     assert (watch.peak, watch.most_before) == (1.0, 1.0)
-    assert not has_escaped(watched(1.0), 1e12, 2000.0)
-    assert not has_escaped(watched(1.0), 1.2e12, 1000.0)
-    assert not has_escaped(watched(0.0), 1.2e12, 2000.0)  # the first window
-    assert not has_escaped(watched(1.0), 2.0**40, 2000.0)
-    assert not has_escaped(watched(1.0), 1.2e12, 1024.0)
-    assert has_escaped(watched(0.5), 1.2e12, 1025.0)
+    assert not has_escaped(watched(1.0), 1e12, beyond(2000.0))
+    assert not has_escaped(watched(1.0), 1.2e12, beyond(1000.0))
+    assert not has_escaped(watched(0.0), 1.2e12, beyond(2000.0))  # the first window
+    assert not has_escaped(watched(1.0), 2.0**40, beyond(2000.0))
+    assert not has_escaped(watched(1.0), 1.2e12, beyond(1024.0))
+    assert has_escaped(watched(0.5), 1.2e12, beyond(1025.0))
 
 
 def test_at_the_very_limits_nothing_is_lost() -> None:

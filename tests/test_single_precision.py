@@ -19,10 +19,10 @@ from quell.kernels import dispatch, functions
 from quell.kernels.dispatch import is_finite
 from quell.kernels.functions import is_single
 from quell.kernels.single import in_single
-from quell.kernels.sums import add_small, add_to_diagonal
+from quell.kernels.sums import add_small, add_symmetrically
 from quell.learners.base import commit
 from quell.learners.kalman.search import ENTRIES, advance_search
-from quell.learners.least_squares import reduce_row
+from quell.learners.least_squares import multiply_lower, reduce_row
 from quell.learners.noise_gate import grown
 from quell.observers.base import begin, expected_measurement, observe
 from quell.observers.delta import delta_form
@@ -111,10 +111,12 @@ def test_slow_averages_reach_their_goal() -> None:
     double = np.array([1.0])
     add_small(double, 1, 0, 0.5)
     assert double.tolist() == [1.5]
-    P = np.array([[1.0, 0.0]], np.float32)
+    P = np.ones((2, 3), np.float32) * np.float32([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
     for _ in range(10_000):
-        add_to_diagonal(P, 0, np.float32(-1e-8))
-    assert float(P[0, 0]) + float(P[0, 1]) == pytest.approx(1.0 - 1e-4, abs=1e-9)
+        for i, j in ((0, 0), (1, 0), (1, 1)):
+            add_symmetrically(P, i, j, np.float32(-1e-8))
+    entries, carries = P[[0, 1, 1], [0, 0, 1]], P[[0, 0, 1], [1, 2, 2]]
+    np.testing.assert_allclose(entries.astype(float) + carries, 1.0 - 1e-4, atol=1e-9)
     weight, usual = np.float32(0.0), 0.0
     for _ in range(20_000):
         weight = np.float32(grown(weight, np.float32(1e-3)))
@@ -252,17 +254,24 @@ def test_a_search_for_frequencies_counts_its_entries_without_end() -> None:
     assert loop.entries == start + 4.0 - 4096.0 * ENTRIES
 
 
-def test_covariance_stays_symmetric() -> None:
-    """In single precision the lower triangle counts."""
-    P = np.array([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]], np.float32)
-    gain = np.array([0.5, 1.0], np.float32)
-    for i in range(2):
-        reduce_row(P, i, gain[i], gain)
-    assert P.tolist() == [[0.75, 2.5, 0.0], [2.5, 3.0, 0.0]]
-    controller = ql.ADRC(ORDER_2, 1.5, learner=ql.learners.Kalman())
-    run = ql.simulate(CHAIN, controller, SCENARIO, precision="single")
-    covariance = run.final_state.learner.covariance[:, :-1]
-    np.testing.assert_array_equal(covariance, covariance.T)
+def test_the_lower_triangle_of_a_covariance_counts() -> None:
+    """In single precision, with carries and without; what is above changes nothing but sums."""
+    gain, product = np.array([0.5, 1.0], np.float32), np.zeros(2, np.float32)
+    for above in ([7.0], [0.0, 0.0]):
+        P = np.array([[1.0, *above], [3.0, 4.0, *[0.0] * (len(above) - 1)]], np.float32)
+        multiply_lower(P, gain, product)
+        assert product.tolist() == [3.5, 5.5]
+        for i in range(2):
+            reduce_row(P, i, gain[i], gain)
+        assert P[[0, 1, 1], [0, 0, 1]].tolist() == [0.75, 2.5, 3.0]
+
+
+def test_the_covariance_has_carries_where_it_moves_slowly() -> None:
+    """At a twentieth of the sample time."""
+    for dt, width in ((1e-3, 3), (5e-5, 4)):
+        observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.1, dt=dt)
+        single = in_single_precision(ql.ADRC(observer, 1.5, learner=ql.learners.Kalman()))
+        assert single.initial_state().learner.covariance.shape == (3, width)
 
 
 @pytest.mark.compiled

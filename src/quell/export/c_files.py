@@ -27,6 +27,14 @@ _DOUBLE = [
 ]
 
 
+# C++ and Microsoft's C know the word with underscores.
+_RESTRICT = [
+    "#if defined(__cplusplus) || defined(_MSC_VER)",
+    "#define restrict __restrict",
+    "#endif",
+]
+
+
 # Stands for the lines of ``init``, which are known when all others are.
 _INITIAL = "    initial"
 
@@ -191,6 +199,8 @@ class CFiles:
             '#error "-ffast-math removes the tests for NaN and the compensated sums"',
             "#endif",
             *([] if self.single else _DOUBLE),
+            "",
+            *_RESTRICT,
             *kernels,
             "",
             f"const {name}_parameters {name}_default_parameters =",

@@ -33,16 +33,17 @@ def add_small(values: Vector, count: int, i: int, increment: float) -> None:
 
 
 @kernel
-def add_to_diagonal(matrix: Matrix, i: int, increment: float) -> None:
-    """Add to a diagonal entry: in double precision of a matrix (p, p), else of one (p, p + 1).
+def add_symmetrically(matrix: Matrix, i: int, j: int, increment: float) -> None:
+    """Add to entry (i, j), j <= i, of a symmetric matrix (p, p), or with carries of one (p, p + 1).
 
-    The last column has the carries. A covariance that shrinks by 1e-7 of itself in a sample would
-    stand still without, and its learner would go on as quickly as before.
+    With carries the lower triangle has the entries, and what is above has the carries, that of
+    (i, j) at (j, i + 1). All entries have one: if the diagonal alone went on where the rest stands
+    still, a covariance would become indefinite.
     """
-    if is_single(increment):
-        last, before = matrix.shape[1] - 1, matrix[i, i]
-        increment += matrix[i, last]
-        matrix[i, i] = before + increment
-        matrix[i, last] = increment - (matrix[i, i] - before)
+    if matrix.shape[1] > matrix.shape[0]:
+        before = matrix[i, j]
+        increment += matrix[j, i + 1]
+        matrix[i, j] = before + increment
+        matrix[j, i + 1] = increment - (matrix[i, j] - before)
     else:
-        matrix[i, i] += increment
+        matrix[i, j] += increment

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import is_single
-from quell.kernels.sums import add_to_diagonal
+from quell.kernels.sums import add_symmetrically
 from quell.types import Matrix, Vector
 
 # A larger φ·Pφ could overflow in what follows; in single precision earlier.
@@ -36,17 +36,25 @@ def reduce_row(covariance: Matrix, i: int, share: float, gain: Vector) -> None:
     """Subtract ``share · gain`` from row ``i`` of P; after all rows P is less by ``g (Pφ)ᵀ``.
 
     Rounding makes P asymmetric, and the asymmetric part does not shrink with the data. In single
-    precision it would exceed what the data leave of P, so there only the lower triangle is
-    calculated.
+    precision it would exceed what the data leave of P, so there only the lower triangle exists.
     """
     if is_single(share):
-        for j in range(i):
-            value = covariance[i, j] - share * gain[j]
-            covariance[i, j] = covariance[j, i] = value
-        add_to_diagonal(covariance, i, -share * gain[i])
+        for j in range(i + 1):
+            add_symmetrically(covariance, i, j, -share * gain[j])
     else:
         for j in range(covariance.shape[0]):
             covariance[i, j] -= share * gain[j]
+
+
+@kernel
+def multiply_lower(covariance: Matrix, features: Vector, gain: Vector) -> None:
+    """Write Pφ into ``gain`` for a P of which only the lower triangle exists."""
+    for i in range(gain.size):
+        total = 0.0
+        for j in range(i):
+            total += covariance[i, j] * features[j]
+            gain[j] += covariance[i, j] * features[i]
+        gain[i] = total + covariance[i, i] * features[i]
 
 
 @kernel

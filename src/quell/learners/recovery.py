@@ -71,12 +71,18 @@ def is_in_proportion(watch: LearnerWatch, output: float) -> bool:
 
 
 @kernel
-def has_escaped(watch: LearnerWatch, output: float, excess: float) -> bool:
+def is_excessive(unlimited: float, u: float, smallest: float) -> bool:
+    """Return whether the law asks for far more than the u that is applied, or ``smallest``."""
+    return abs(unlimited) > _TOO_LARGE * max(abs(u), smallest)
+
+
+@kernel
+def has_escaped(watch: LearnerWatch, output: float, excessive: bool) -> bool:
     """Return whether ``output`` grows without bound; the window then begins anew.
 
     The arguments are those of ``has_lost_range``.
     """
-    if not (watch.peak > 0.0 and excess > _TOO_LARGE):
+    if not (excessive and watch.peak > 0.0):
         return False
     if abs(output) * _LEAST_SHARE <= watch.peak:
         return False
@@ -93,13 +99,13 @@ def has_lost_range(
     y: float,
     f_plain: float,
     output: float,
-    excess: float,
+    excessive: bool,
     limited: bool,
 ) -> bool:
     """Return whether the learner has to start again; call it once for each good sample.
 
-    ``output`` is the learner's own, before a guard; ``excess`` is the ratio of the u that the law
-    asks for to the u that is applied; ``limited`` tells whether limits have changed it.
+    ``output`` is the learner's own, before a guard; ``excessive`` tells whether the law asks for
+    far more than the u that is applied, ``limited`` whether limits have changed it.
     """
     size = abs(f_plain)
     if watch.samples == 0.0:
@@ -108,9 +114,10 @@ def has_lost_range(
     if size > watch.most:  # false for a NaN
         watch.most = size
     watch.y_low, watch.y_high = min(watch.y_low, y), max(watch.y_high, y)
-    if excess > _TOO_LARGE and abs(output) > _TOO_LARGE * max(watch.most, watch.most_before):
+    if excessive and abs(output) > _TOO_LARGE * max(watch.most, watch.most_before):
         watch.excessive += 1.0
-    watch.limited += 1.0 if limited else 0.0
+    if limited:
+        watch.limited += 1.0
     if watch.samples < window:
         return False
     watch.peak = max(watch.peak, watch.most)

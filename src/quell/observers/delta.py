@@ -47,6 +47,7 @@ class DeltaModel(NamedTuple):
     feed: Vector  # Γ_f (N,)
     gain: Vector  # L (N,)
     predictor: Flag  # whether the controller gets z⁻ instead of z
+    chain: Flag  # whether Φ − I is zero up to its diagonal, as in a chain of integrators
 
     @property
     def states(self) -> int:
@@ -63,6 +64,7 @@ class DeltaNonlinearModel(NamedTuple):
     gain: Vector  # L (N,)
     alpha: Vector  # α (N,)
     delta: float  # δ [y-unit]
+    chain: Flag  # whether Φ − I is zero up to its diagonal
 
     @property
     def states(self) -> int:
@@ -77,6 +79,7 @@ class DeltaCascadeModel(NamedTuple):
     input: Vector  # Γ_u (N,)
     feed: Vector  # Γ_f (N,)
     gains: Matrix  # L_i (p, N)
+    chain: Flag  # whether Φ − I is zero up to its diagonal
 
     @property
     def states(self) -> int:
@@ -90,7 +93,7 @@ def predict_increments(model: Any, z: Vector, increments: Vector, u: float, f: f
     size = increments.size
     for i in range(size):
         total = z[size + i]
-        for j in range(size):
+        for j in range(i + 1 if model.chain else 0, size):
             total += model.difference[i, j] * z[j]
         increments[i] = total + model.feed[i] * f + model.input[i] * u
 
@@ -176,17 +179,17 @@ def delta_form(model: Any) -> Any:
 
 @delta_form.register
 def _of_linear(model: EsoModel) -> DeltaModel:
-    return DeltaModel(_difference(model), *model[1:])
+    return DeltaModel(*_parts(model))
 
 
 @delta_form.register
 def _of_nonlinear(model: NonlinearModel) -> DeltaNonlinearModel:
-    return DeltaNonlinearModel(_difference(model), *model[1:])
+    return DeltaNonlinearModel(*_parts(model))
 
 
 @delta_form.register
 def _of_cascade(model: CascadeModel) -> DeltaCascadeModel:
-    return DeltaCascadeModel(_difference(model), *model[1:])
+    return DeltaCascadeModel(*_parts(model))
 
 
 @delta_form.register
@@ -195,7 +198,7 @@ def _of_delayed(model: DelayedModel) -> DelayedModel:
     return DelayedModel(inner, inner.states, model.samples)
 
 
-def _difference(model: Any) -> Matrix:
-    """Return Φ − I; rounding of Φ is then that of the double run."""
+def _parts(model: Any) -> tuple[Any, ...]:
+    """Return the fields of the delta form of ``model``; rounding of Φ is that of the double run."""
     difference: Matrix = model.transition - np.eye(model.feed.size)
-    return difference
+    return difference, *model[1:], not np.any(np.tril(difference))

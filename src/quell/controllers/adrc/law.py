@@ -56,7 +56,13 @@ from quell.learners.base import (
     trouble,
 )
 from quell.learners.lag import lag_push, reset_lag
-from quell.learners.recovery import LearnerWatch, has_escaped, has_lost_range, is_in_proportion
+from quell.learners.recovery import (
+    LearnerWatch,
+    has_escaped,
+    has_lost_range,
+    is_excessive,
+    is_in_proportion,
+)
 from quell.lti.pole_pattern import pole_pattern
 from quell.observers.base import acting_control, begin, expected_measurement, observe
 from quell.types import Matrix, Status, Vector
@@ -196,10 +202,10 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     loop.constant, loop.slope = constant, slope
     loop.f_learned = constant + slope * acting_control(design.eso, state.z, u)
     if design.learns and status & _MEASUREMENT_HELD == 0:
-        excess = abs(unlimited) / max(abs(u), smallest)
+        excessive = is_excessive(unlimited, u, smallest)
         limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
-        if has_escaped(watch, output, excess) or has_lost_range(
-            watch, design.window, loop.y, f_plain, output, excess, limited
+        if has_escaped(watch, output, excessive) or has_lost_range(
+            watch, design.window, loop.y, f_plain, output, excessive, limited
         ):
             status |= _OVERFLOWED
             _start_learning_again(design, state)

@@ -14,7 +14,7 @@ from quell.features.custom import CustomDesign
 from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
 from quell.kernels.single import in_single
 from quell.learners.adapters.kernels import PythonDesign
-from quell.learners.kalman.kernels import KalmanDesign, KalmanMemory
+from quell.learners.kalman.kernels import KalmanDesign, KalmanMemory, needs_carries
 from quell.learners.lag import Lag
 from quell.learners.noise_gate import NoiseGate, NoiseGateMemory
 from quell.observers.delta import delta_form
@@ -90,6 +90,10 @@ def _with_carries(design: Any, state: Any) -> Any:
         return state._replace(controller=_with_carries(design.controller, state.controller))
     if isinstance(design, AdrcDesign):
         state = state._replace(z=np.zeros(design.eso.states))
+        learner = state.learner
+        if isinstance(design.learner, KalmanDesign) and needs_carries(design.learner):
+            wide = np.hstack([learner.covariance, np.zeros((learner.theta.size, 1))])
+            state = state._replace(learner=learner._replace(covariance=wide))
     return _with_longer(state)
 
 
@@ -101,8 +105,5 @@ def _with_longer(state: Any) -> Any:
     if isinstance(state, GuardMemory):
         return state._replace(shown=np.append(state.shown, np.zeros(CARRIES)))
     if isinstance(state, KalmanMemory | NoiseGateMemory):
-        state = state._replace(mean=np.zeros(2 * state.mean.size))
-    if isinstance(state, KalmanMemory):
-        carries = np.zeros((state.theta.size, 1))
-        return state._replace(covariance=np.hstack([state.covariance, carries]))
+        return state._replace(mean=np.zeros(2 * state.mean.size))
     return state

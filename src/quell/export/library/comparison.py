@@ -10,7 +10,7 @@ import numpy as np
 
 from quell.controllers.prefilters.prefilter import without_prefilters
 from quell.export.inspection import in_double_precision
-from quell.learners.online.gaussian_process import GaussianProcess
+from quell.learners.online.gaussian_process import SINGLE_NOVELTY, GaussianProcess
 from quell.plants.base import Plant
 from quell.simulation.scenario import Scenario
 from quell.simulation.simulate import simulate
@@ -20,17 +20,6 @@ from quell.simulation.simulate import simulate
 # (METHOD's table: at 8 % the tracking error moves by 0.0035 %). The delta form stays below 0.2 %
 # unless the rounding of y itself, times omega_o^(n+1), is too much for u.
 LIMIT = 0.01
-
-# What helps, see docs/single_precision.md, "Limits".
-_ABOUT_ROUNDING = (
-    "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with resolution=, "
-    "--resolution), or double precision would help"
-)
-_ABOUT_POINTS = (
-    "rounding changes which points the learner GaussianProcess keeps, at every omega_o; double "
-    "precision or another learner (Kalman, RLS) would help, and in most loops a budget of at most "
-    "6 points with a guard"
-)
 
 
 class Comparison(NamedTuple):
@@ -53,16 +42,29 @@ class Comparison(NamedTuple):
     diverged: bool
 
     def check(self, controller: Any) -> None:
-        """Raise a ``ValueError`` if single precision differs too much; say what would help."""
+        """Raise a ``ValueError`` if single precision differs too much for ``controller``."""
         if not self.diverged and self.u <= LIMIT:
             return
         what = "diverges" if self.diverged else f"changes u by {100 * self.u:.2g} % RMS"
-        learner = getattr(without_prefilters(controller), "learner", None)
         raise ValueError(
             f"precision = 'single': {what} in this scenario, and {100 * LIMIT:g} % is the limit; "
-            f"{_ABOUT_POINTS if isinstance(learner, GaussianProcess) else _ABOUT_ROUNDING}; "
-            "accept=True (--accept) writes it all the same"
+            f"{_remedy(controller)}, or double precision would help; accept=True (--accept) "
+            "writes it all the same"
         )
+
+
+def _remedy(controller: Any) -> str:
+    """Return what makes rounding smaller: of the learner's points, or else of y."""
+    learner = getattr(without_prefilters(in_double_precision(controller)), "learner", None)
+    if isinstance(learner, GaussianProcess) and learner.model.novelty < SINGLE_NOVELTY:
+        return (
+            f"novelty={SINGLE_NOVELTY:g} of GaussianProcess (points so close that the inverse of "
+            "their covariance loses its digits are then not stored)"
+        )
+    return (
+        "a lower omega_o, y as a difference of encoder counts (NAME_step_counts, with "
+        "resolution=, --resolution)"
+    )
 
 
 def compared(plant: Plant, controller: Any, scenario: Scenario) -> Comparison:

@@ -209,8 +209,13 @@ class Function:
             if isinstance(value.kind, Number):
                 parts.append(self.program.structs.declaration(value.kind, identifier(name)))
             else:
-                is_const = not value.mutable or name not in self.written
-                parts.append(self.program.parameter(value.kind, identifier(name), is_const))
+                # C has no conversion from arrays of numbers to arrays of constant numbers.
+                is_matrix = isinstance(value.kind, Array) and len(value.kind.shape) > 1
+                is_const = not value.mutable or not (is_matrix or name in self.written)
+                # Parameters of a controller do not change, so no store can change what was read.
+                never_stored = not value.mutable and isinstance(value.kind, Struct)
+                declared = f"{'restrict ' if never_stored else ''}{identifier(name)}"
+                parts.append(self.program.parameter(value.kind, declared, is_const))
         return f"static {self.result_type} {self.name}({', '.join(parts) or 'void'})"
 
     @property

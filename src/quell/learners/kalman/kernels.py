@@ -44,7 +44,7 @@ from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import is_single, sqrt
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Scratch, Size
-from quell.kernels.sums import add_small, add_to_diagonal
+from quell.kernels.sums import add_small, add_symmetrically
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.kalman.oscillators import (
     Oscillators,
@@ -57,7 +57,7 @@ from quell.learners.kalman.oscillators import (
 from quell.learners.kalman.search import advance_search, is_locked, start_search_again
 from quell.learners.kalman.search_verdict import LEARN_ANEW
 from quell.learners.lag import STARTUP_LAGS, lag_push, reset_lag
-from quell.learners.least_squares import reduce_row
+from quell.learners.least_squares import multiply_lower, reduce_row
 from quell.learners.noise_gate import grown, resolution
 from quell.types import Matrix, Vector
 
@@ -96,6 +96,18 @@ class KalmanDesign(NamedTuple):
     lag_time: float  # τ [s]
 
 
+# Largest share by which means follow in a sample where P has carries in single precision. Learning
+# without a walk makes P smaller by dt/t of itself in a sample: after ten averaging times by a tenth
+# of ``forget``. Rounding moves each sum by 2⁻²⁵ of it, so this is where the speed of P is wrong by
+# one per cent.
+_LEAST_WITHOUT_CARRIES = 100.0 * 10.0 * 2.0**-25
+
+
+def needs_carries(learner: KalmanDesign) -> bool:
+    """Return whether rounding would change the speed of P in single precision."""
+    return learner.forget < _LEAST_WITHOUT_CARRIES
+
+
 class KalmanAverages(Scalars):
     """Exponential sums, whose quotient with ``weight`` is a mean, and the time."""
 
@@ -109,7 +121,8 @@ class KalmanMemory(NamedTuple):
     """State of the learner, with p features and m oscillators."""
 
     theta: Vector  # θ in scaled units (p,)
-    # P (p, p), for the bias in units of R; in single precision with carries (p, p + 1).
+    # P (p, p), for the bias in units of R; in single precision only the lower triangle, and where
+    # ``needs_carries`` the carries of the sums above it (p, p + 1).
     covariance: Matrix
     chain: Matrix  # lag filters of the features (p, …)
     filtered: Vector  # φ^F (p,); from ``adapt`` to the next ``commit`` φ̃ in its place
@@ -156,12 +169,17 @@ def _adapt(
         unknown = _UNKNOWN_SINGLE if is_single(weight) else _UNKNOWN
         open_pairs(learner.oscillators, covariance, unknown / learner.lag_time)
     spread = 0.0
-    for i in range(size):
-        total = 0.0
-        for j in range(size):
-            total += covariance[i, j] * regressor[j]
-        gain[i] = total
-        spread += total * regressor[i]
+    if is_single(weight):
+        multiply_lower(covariance, regressor, gain)
+        for i in range(size):
+            spread += gain[i] * regressor[i]
+    else:
+        for i in range(size):
+            total = 0.0
+            for j in range(size):
+                total += covariance[i, j] * regressor[j]
+            gain[i] = total
+            spread += total * regressor[i]
     if spread < 0.0:  # by rounding P is no longer a covariance: do not learn
         return
     inverse = 1.0 / max(spread + 1.0 / learner.dt, spread / (learner.fastest * learner.dt))
@@ -170,7 +188,7 @@ def _adapt(
         reduce_row(covariance, i, share, gain)
         if learner.threshold[i] == 0.0:
             theta[i] += share * innovation
-            add_to_diagonal(covariance, i, learner.walk[i] * learner.dt)
+            add_symmetrically(covariance, i, i, learner.walk[i] * learner.dt)
         else:
             updated = theta[i] + share * innovation * weight
             if learner.with_u and i == size - 1:
@@ -179,9 +197,10 @@ def _adapt(
             theta[i] = updated
             if learner.bias:
                 theta[learner.states] -= change * memory.mean[i]
-            if regressor[i] != 0.0:
+            # In double precision zero is added, too: without, batches change their last bits.
+            if regressor[i] != 0.0 and not (is_single(weight) and learner.walk[i] == 0.0):
                 grown_by = learner.walk[i] * learner.dt * deviation * deviation / memory.variance[i]
-                add_to_diagonal(covariance, i, grown_by)
+                add_symmetrically(covariance, i, i, grown_by)
     step, unexplained = inverse * innovation, averages.unexplained
     for j in range(memory.omega.size):
         if not is_locked(learner.search, memory.search, j):
@@ -283,7 +302,7 @@ def _all_finite(memory: KalmanMemory) -> bool:
     for i in range(memory.theta.size):
         finite = finite and is_finite(memory.theta[i])
         finite = finite and is_finite(memory.mean[i]) and is_finite(memory.variance[i])
-        for j in range(memory.theta.size):
+        for j in range(memory.covariance.shape[1]):
             finite = finite and is_finite(memory.covariance[i, j])
     return finite
 

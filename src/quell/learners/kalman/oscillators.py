@@ -99,8 +99,11 @@ def open_pairs(oscillators: Oscillators, covariance: Matrix, variance: float) ->
     first = oscillators.first
     for i in range(first, first + 2 * oscillators.omega.size * oscillators.orders.size):
         for j in range(covariance.shape[0]):
-            covariance[i, j] = covariance[j, i] = 0.0
-        covariance[i, covariance.shape[1] - 1] = 0.0  # its carry in single precision
+            if covariance.shape[1] > covariance.shape[0]:  # the lower triangle and carries
+                low, high = min(i, j), max(i, j)
+                covariance[high, low] = covariance[low, high + 1] = 0.0
+            else:
+                covariance[i, j] = covariance[j, i] = 0.0
         covariance[i, i] = variance
 
 
