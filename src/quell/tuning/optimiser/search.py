@@ -41,9 +41,9 @@ _ITERATIONS = 20
 # parameters than a few further ones go on while all end at the same cost: of a test plant the third
 # start alone found an optimum that is a quarter better.
 _STARTS, _FIRST_ROUNDS, _FINALISTS, _ROUNDS = 5, 3, 2, 25
-# The same for structures whose k_i has ridges: of 17 plants with poles up to 3000 times apart, for
-# which five starts miss the optimum by more than 2 %, these miss it for three.
-_STARTS_ON_RIDGES, _FINALISTS_ON_RIDGES = 12, 4
+# Starts of structures with many valleys, one in each, and starts beside the best of their ends. By
+# trial on 40 stiff plants (benchmarks/model_based_starts.py).
+_VALLEYS, _BESIDE = 8, 3
 # Rounds go on while a bound is exceeded by more: a tenth of what is promised.
 _VIOLATION = 1e-4
 # What exceeding a limit by a share costs, in units of the logarithm of the objective: more than a
@@ -66,11 +66,11 @@ def best_solution(
     """
     if more is None:
         more = np.zeros((0, len(structure.parameters)))
-    count, finalists = _STARTS, _FINALISTS
-    if structure.may_swing:
-        count, finalists = _STARTS_ON_RIDGES, _FINALISTS_ON_RIDGES
     found = []
-    for start in starts(problem, structure, more, count):
+    first = starts(problem, structure, np.vstack([structure.shapes(), more]), _STARTS)
+    grid, spacing = structure.grid()
+    valleys = starts(problem, structure, grid, _VALLEYS, 1.01 * spacing)
+    for start in (*first, *valleys):
         solution = search(problem, structure, start, _FIRST_ROUNDS, roughly=True)
         if solution is not None:
             found.append(solution)
@@ -78,13 +78,18 @@ def best_solution(
     ends: list[Solution] = []
     few = len(structure.parameters) <= _FEW
     for solution in found:
-        if len(ends) >= finalists and (few or not _agree(ends)):
+        if len(ends) >= _FINALISTS and (few or not _agree(ends)):
             break
         near = (np.max(np.abs(np.log(solution.values / end.values))) < 0.02 for end in ends)
         if not any(near):
             end = search(problem, structure, solution.values, _ROUNDS, roughly=True)
             ends.append(solution if end is None else end)
     best = min(ends, key=_rank, default=None)
+    if best is not None:
+        for start in starts(problem, structure, structure.beside(best.values), _BESIDE):
+            end = search(problem, structure, start, _ROUNDS, roughly=True)
+            ends += [] if end is None else [end]
+        best = min(ends, key=_rank)
     if best is None or not _is_precise(problem, structure):
         return best
     end = search(problem, structure, best.values, _ROUNDS)

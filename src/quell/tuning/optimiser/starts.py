@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.analysis.frequency_response import Complex
 from quell.tuning.optimiser.extras import MOST_SWING, load_swing
@@ -20,37 +21,51 @@ _GAINS, _EXCESS = 80, 10.0
 _OWN = np.array([0.5, 0.7, 1.0, 1.4, 2.0])
 
 
-def starts(problem: Problem, structure: Structure, more: Matrix, count: int) -> Matrix:
-    """Return ``count`` starts (k, p) from the structure's shapes and ``more`` values.
+def starts(
+    problem: Problem, structure: Structure, shapes: Matrix, count: int, spacing: float = 0.0
+) -> Matrix:
+    """Return at most ``count`` starts (k, p) with the shapes of ``shapes`` (j, p).
 
     Each shape is tried with gains that put the crossover at frequencies all over the grid. Half of
     the starts are the best that keep to all bounds; the others may exceed them, because the
-    optimum is often near a faster shape.
+    optimum is often near a faster shape. With a ``spacing`` in the logarithms of the parameters a
+    shape is no start if one so near is better: the starts are in different valleys.
     """
-    shapes = np.vstack([structure.shapes(), more])
     shapes = np.clip(shapes, *limits(structure))
     C = structure.response(shapes, problem.plants.omega)
     C = C * shapes[:, :1] ** -structure.gain_power
     unstable = structure.unstable_poles(shapes)
-    kept: list[tuple[float, Vector]] = []
-    beyond: list[tuple[float, Vector]] = []
-    for row, response, poles in zip(shapes, C, unstable, strict=True):
+    # Of each shape the cost of the best gain that keeps to all bounds, and the merit of the best of
+    # all, with the values.
+    costs, merits = (np.full(len(shapes), np.inf) for _ in range(2))
+    kept, beyond = shapes.copy(), shapes.copy()
+    for i, (row, response, poles) in enumerate(zip(shapes, C, unstable, strict=True)):
         values, cost, ratio = _gains_of(problem, structure, row, response, poles)
         good = ratio <= 1.0
         if np.any(good):
             best = int(np.argmin(np.where(good, cost, np.inf)))
-            kept.append((float(cost[best]), values[best]))
+            costs[i], kept[i] = cost[best], values[best]
         merit = cost + _EXCESS * np.log(np.maximum(ratio, 1.0))
         if merit.size:
             best = int(np.argmin(merit))
-            beyond.append((float(merit[best]), values[best]))
-    kept.sort(key=lambda entry: entry[0])
-    beyond.sort(key=lambda entry: entry[0])
-    chosen = [row for _, row in kept[: (count + 1) // 2]]
-    for _, row in beyond:
+            merits[i], beyond[i] = merit[best], values[best]
+    chosen = list(kept[_best(costs, shapes, spacing)[: (count + 1) // 2]])
+    for row in beyond[_best(merits, shapes, spacing)]:
         if len(chosen) < count and not any(np.array_equal(row, other) for other in chosen):
             chosen.append(row)
     return np.array(chosen).reshape(-1, shapes.shape[1])
+
+
+def _best(costs: Vector, shapes: Matrix, spacing: float) -> NDArray[np.intp]:
+    """Return the shapes with a cost, the least first, but those with a better one so near."""
+    order = np.argsort(costs, kind="stable")
+    order = order[np.isfinite(costs[order])]
+    if spacing == 0.0:
+        return order
+    place = np.log(shapes[:, 1:])
+    near = np.max(np.abs(place[:, None] - place[None, :]), axis=2) <= spacing
+    least = np.min(np.where(near, costs[None, :], np.inf), axis=1)
+    return order[costs[order] <= least[order]]
 
 
 def _gains_of(

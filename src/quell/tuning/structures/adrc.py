@@ -34,13 +34,13 @@ _DAMPING = {"c": (0.6, 20.0), "o": (0.03, 20.0)}
 # in units of the law's.
 _LAW_STARTS = (0.02, 0.07, 0.2, 0.5, 1.2, 3.0)
 _OBSERVER_STARTS = (0.3, 1.0, 3.0, 10.0, 30.0)
-# With a model the law may be far faster than the plant, and the observer far slower than the law.
-_FASTER_LAW, _SLOWER_OBSERVER = (8.0, 20.0), (0.01, 0.03, 0.1)
-# Where k_i of a structure with a model is infinite: bandwidths of the law and of the observer that
-# are tried, from these multiples of the plant's phase crossover to the fastest; and the starts'
-# distances from there.
-_LAWS, _OBSERVERS, _LOWEST = 12, 240, (0.03, 0.01)
-_BESIDE = (0.03, 0.1, 0.3)
+# With a model there are many valleys, also with an observer far slower than a quick law: a grid of
+# bandwidths from this share of the crossover to this one of the fastest, with so many for each.
+_FROM, _TO, _COUNT = 0.03, 0.98, 9
+# k_i is infinite where a second pole comes to z = 1. Beside it, on the side of positive k_i, may be
+# the best optimum: the law's bandwidths in units of that of an optimum, the observer's that are
+# searched, and their distance from there, as a share.
+_LAWS, _LOWEST_OBSERVER, _OBSERVERS, _OFF = (0.5, 1.0, 2.0), 1e-3, 300, 0.1
 
 
 @dataclass(frozen=True)
@@ -147,12 +147,8 @@ class AdrcStructure:
     def shapes(self) -> Matrix:
         """Return bandwidths in wide ranges; freed poles start in one place, or in two."""
         omega, rows = self.model.omega, []
-        laws: tuple[float, ...] = _LAW_STARTS
-        ratios: tuple[float, ...] = _OBSERVER_STARTS
-        if self.form.based:
-            laws, ratios = laws + _FASTER_LAW, _SLOWER_OBSERVER + ratios
         b0 = self.model.b if self.degree == self.model.degree else 1.0
-        for law, ratio in itertools.product(laws, ratios):
+        for law, ratio in itertools.product(_LAW_STARTS, _OBSERVER_STARTS):
             pair = (law * omega, law * ratio * omega)
             if max(pair) > 0.999 * self._fastest:
                 pair = (min(pair[0], 0.9 * self._fastest), 0.99 * self._fastest)
@@ -164,35 +160,38 @@ class AdrcStructure:
             found = self.rows_of(b0, *poles)
             if found is not None:
                 rows.append(found)
-        if self.form.based and not self.form.freed:
-            rows += self._beside_infinite_gain(b0)
         return np.array(rows)
 
-    def _beside_infinite_gain(self, b0: float) -> list[Vector]:
-        """Return bandwidths near which k_i is infinite, on the side where it is positive.
+    def grid(self) -> tuple[Matrix, float]:
+        """Return pairs of bandwidths, the law's and the observer's, for structures with a model."""
+        if not self.form.based or self.form.freed:
+            return np.zeros((0, len(self.parameters))), 0.0
+        low = max(_FROM * self.model.omega, self.parameters[1].low)
+        each = np.geomspace(min(low, 0.1 * self._fastest), _TO * self._fastest, _COUNT)
+        rows = np.array([[self.model.b, *pair] for pair in itertools.product(each, each)])
+        return rows, float(np.log(each[1] / each[0]))
 
-        ``k_i b0`` depends on the bandwidths alone. It is infinite on a curve in their plane, where
-        a second pole of C_y is at z = 1. The bound of the load response keeps optima at a distance
-        from this curve, along which a narrow ridge of k_i goes: with slow and fast poles in the
-        plant, no other start may lead there.
-        """
-        rows, fastest = [], 0.99 * self._fastest
-        least = [share * self.model.omega for share in _LOWEST]
-        lowest = [min(each, 0.1 * self._fastest) for each in least]
-        observers = np.geomspace(lowest[1], fastest, _OBSERVERS)
-        for law in np.geomspace(lowest[0], fastest, _LAWS).tolist():
-            columns = [np.full(observers.size, value) for value in (b0, law)]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                inverse = 1.0 / self.integral_gain(np.column_stack([*columns, observers]))
-            known = np.isfinite(inverse[1:]) & np.isfinite(inverse[:-1])
-            for i in np.flatnonzero(np.diff(np.signbit(inverse)) & known):
-                above = bool(inverse[i + 1] > inverse[i])
+    def beside(self, values: Vector) -> Matrix:
+        """Return values beside the bandwidths of the observer at which k_i is infinite."""
+        found: list[list[float]] = []
+        if not self.form.based or self.form.freed:
+            return np.zeros((0, len(self.parameters)))
+        b0, law = values[:2].tolist()
+        observers = np.geomspace(
+            min(max(_LOWEST_OBSERVER * law, self.parameters[2].low), 0.1 * self._fastest),
+            _TO * self._fastest,
+            _OBSERVERS,
+        )
+        for omega_c in (min(factor * law, _TO * self._fastest) for factor in _LAWS):
+            tried = np.column_stack([np.broadcast_to((b0, omega_c), (_OBSERVERS, 2)), observers])
+            with np.errstate(divide="ignore"):
+                inverse = 1.0 / self.integral_gain(tried)
+            for i in np.flatnonzero(np.signbit(inverse[1:]) != np.signbit(inverse[:-1])):
                 share = inverse[i] / (inverse[i] - inverse[i + 1])
-                place = observers[i] * (observers[i + 1] / observers[i]) ** share
-                for distance in _BESIDE:
-                    there = place * (1.0 + distance) if above else place / (1.0 + distance)
-                    rows.append(np.array([b0, law, min(there, fastest)]))
-        return rows
+                infinite = observers[i] * (observers[i + 1] / observers[i]) ** share
+                beside = 1.0 + _OFF if inverse[i + 1] > 0.0 else 1.0 / (1.0 + _OFF)
+                found.append([b0, omega_c, float(infinite * beside)])
+        return np.array(found).reshape(-1, 3)
 
     def _designs(self, values: Matrix) -> sampled_adrc.Designs:
         key = values.tobytes()

@@ -53,6 +53,17 @@ class Structure(Protocol):
         """Return values (k, p) of the parameters to start from; their first one is replaced."""
         ...
 
+    def grid(self) -> tuple[Matrix, float]:
+        """Return further values (k, p) on a grid, often none, and its spacing in the logarithms.
+
+        Of values that are neighbours there only the best one is a start.
+        """
+        ...
+
+    def beside(self, values: Vector) -> Matrix:
+        """Return values (k, p) near an optimum where another one may be; often none."""
+        ...
+
     def response(self, values: Matrix, omega: Vector) -> Complex:
         """Return C_y (m, k), from −y to u, for values (m, p) at frequencies (k,) [rad/s]."""
         ...

@@ -84,6 +84,14 @@ class LqgStructure:
     def _laws(self, values: Matrix) -> list[_Law]:
         return [self._law(float(row[1]), float(row[2])) for row in values]
 
+    def grid(self) -> tuple[Matrix, float]:
+        """Return none."""
+        return np.zeros((0, len(self.parameters))), 0.0
+
+    def beside(self, values: Vector) -> Matrix:
+        """Return none."""
+        return np.zeros((0, values.size))
+
     def response(self, values: Matrix, omega: Vector) -> Complex:
         """Return C_y (m, k)."""
         rows = [law.response(omega, self.model.dt) for law in self._laws(values)]

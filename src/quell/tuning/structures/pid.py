@@ -92,6 +92,14 @@ class FilteredPID:
             f1 = values[:, 2]
         return K, K / Ti, kd, f1, f2
 
+    def grid(self) -> tuple[Matrix, float]:
+        """Return none."""
+        return np.zeros((0, len(self.parameters))), 0.0
+
+    def beside(self, values: Vector) -> Matrix:
+        """Return none."""
+        return np.zeros((0, values.size))
+
     def response(self, values: Matrix, omega: Vector) -> Complex:
         """Return C_y (m, k)."""
         kp, ki, kd, f1, f2 = (part[:, None] for part in self.parts(values))
