@@ -286,7 +286,7 @@ def small_loop() -> SmallLoop:
     """Return a loop at rest."""
     observer = OBSERVERS["model-free, order 2, current"]
     lag = lag_of(observer)
-    states = (np.zeros(observer.states), np.zeros(3), np.zeros(2), np.zeros(12), np.zeros(0))
+    states = tuple(map(np.zeros, (observer.states, 3, 2, 12, CHAIN.disturbances)))
     return SmallLoop(CHAIN.sampled(0.01), observer.model, lag, lag_memory(lag, 1), *states)
 
 
@@ -456,7 +456,7 @@ def test_a_learner_starts_again_after_measurements_beyond_its_numbers(
             started_again.append(k)
         if k >= 300:
             assert abs(law.estimate.f - (-2.0 * x[0] - 0.3 * x[1])) < 1.5
-        advance(model, x, np.zeros(12), 0.0, u, np.zeros(0))
+        advance(model, x, np.zeros(12), 0.0, u, np.zeros(CHAIN.disturbances))
     assert 70 <= started_again[-1] < 300
     for label, array in _named_arrays(law._state).items():
         assert np.all(np.abs(array) < 1e12), label

@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,7 +114,8 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     for duration in (1_000, 2_000, 50_000):
         count_duration(counts, duration)
     histogram = Histogram.of(counts)
-    step = Verification(None, plain, 1.0, 1.0, plain["y"], plain["u"])  # type: ignore[arg-type]
+    measured: Any = SimpleNamespace(trajectory=plain)
+    step = Verification(measured, plain, 1.0, 1.0, plain["y"], plain["u"])
     compared = compare.compare(LAG, {"ADRC": adrc()}, scenario)
     omegas = [4.0, 8.0]
     plots = {
