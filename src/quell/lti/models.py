@@ -83,9 +83,9 @@ def read_model(plant: Any, E: Any = None, dt: float | None = None) -> StateSpace
     raise ValueError(
         f"plant = {named}: must be a linear plant or control.StateSpace (with A, B, C), matrices "
         "(A, B, C) or (A, B, E, C), a control.TransferFunction, (numerator, denominator) or "
-        "(a, b); linearise a nonlinear plant first, quell.plants.linearised(plant, x, u); for "
-        "one without equation, as an FMU, tune from a record: quell run SETUP --save run.nc, and "
-        "quell tune run.nc"
+        "(a, b); linearise a nonlinear plant first, quell.plants.linearised(plant, x, u); one "
+        "without equation, as an FMU, is tuned for from an experiment, quell tune --device "
+        "twin:FILE.fmu, or from a record, quell run SETUP --save run.nc and quell tune run.nc"
     )
 
 
