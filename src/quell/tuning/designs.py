@@ -31,7 +31,7 @@ _NEARBY_ROUNDS = 6
 # Rounds of a search over time, from the optimum for the integral gain.
 _ROUNDS = 15
 # Factors by which contradicting limits are relaxed, and steps of the bisection between them.
-_RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0), 6
+_RELAXED, _BISECTIONS = (1.05, 1.2, 1.5, 2.0, 4.0, 10.0, 100.0, 1e3, 1e4, 1e5), 6
 # Structures whose optima stand for starts of another one. They are always tuned before it, so that
 # a result does not depend on what it is compared with.
 _GIVES_STARTS: Mapping[str, tuple[str, ...]] = {
