@@ -14,7 +14,7 @@ import quell as ql
 from quell.analysis import analyse
 from quell.quantities import Signals
 from quell.setup import load
-from quell.tuning import Constraints
+from quell.tuning import Constraints, designs
 from quell.tuning.optimiser.requirements import sizes
 from quell.tuning.plants import given_plants, model_of, plant_set
 from quell.tuning.structures.equivalent import equivalents
@@ -295,6 +295,25 @@ def test_a_model_of_slow_and_fast_poles_reaches_the_optimum_that_a_grid_shows() 
 # ---- bad input
 
 
+def test_where_no_start_keeps_to_the_limits_the_optima_of_other_limits_are_starts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """M_s of 1.6 has a controller although no start of its own leads to one."""
+    how: dict[str, Any] = {"structure": "pi-unfiltered", "compare": ()}
+    found = ql.tune(([1.0], [1.0, 3.0, 3.0, 1.0]), DT, **how)
+    original, limits = designs.best_solution, []
+
+    def misses(problem: Any, *arguments: Any) -> Any:
+        limits.append(problem.bounds[0].limit)
+        best = original(problem, *arguments)
+        return replace(best, violation=0.1) if limits[-1] == 1.6 else best
+
+    monkeypatch.setattr(designs, "best_solution", misses)
+    again = ql.tune(([1.0], [1.0, 3.0, 3.0, 1.0]), DT, **how)
+    assert again.design.k_i == pytest.approx(found.design.k_i, rel=1e-3)
+    assert limits[-1] == pytest.approx(0.85 * 1.6)
+
+
 def test_contradicting_constraints_are_named_with_their_excess() -> None:
     """An unstable plant needs more gain than M_ks allows at so small an M_t."""
     unstable = ([1.0], [1.0, -1.0])
@@ -326,6 +345,7 @@ def test_plants_that_do_not_fit_are_refused(plant: Any, message: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"M_s": 1.4}, r"M_s = 1.4: .*give constraints=quell.tuning.Constraints\(m_s=1.4\)"),
         ({"limit": 1.0}, "limit: tune has no such argument, did you mean rate_limit"),
         ({"constraint": {}}, "constraint: tune has no such argument, did you mean constraints"),
         ({"uncertain": {"a": (1.0, 2.0)}}, "plant = .*: with uncertain it must be a function"),

@@ -28,6 +28,9 @@ from quell.types import Matrix, Vector
 
 # Rounds of a search that starts at the optimum for slightly other limits.
 _NEARBY_ROUNDS = 6
+# Shares of the limits with whose optima the search goes on where it found no controller that keeps
+# to the limits: where M_ks alone counts, few starts are near those that do.
+_OTHER_LIMITS = (0.85, 1.2, 2.0)
 # Rounds of a search over time, from the optimum for the integral gain.
 _ROUNDS = 15
 # Factors by which contradicting limits are relaxed, and steps of the bisection between them.
@@ -145,11 +148,23 @@ def _best(problem: Problem, structure: Structure, known: Matrix) -> Solution | N
     """
     slow = [extra for extra in problem.extras if extra.over_time]
     if problem.objective == "load" and not slow:
-        return best_solution(problem, structure, known)
+        return _best_gain(problem, structure, known)
     quick = tuple(extra for extra in problem.extras if not extra.over_time)
     by_gain = replace(problem, objective="load", cost=load_cost, extras=quick)
-    first = best_solution(by_gain, structure, known)
+    first = _best_gain(by_gain, structure, known)
     return None if first is None else search(problem, structure, first.values, _ROUNDS)
+
+
+def _best_gain(problem: Problem, structure: Structure, known: Matrix) -> Solution | None:
+    """Return the best solution for the integral gain; if in need, from optima of other limits."""
+    best = best_solution(problem, structure, known)
+    for share in _OTHER_LIMITS:
+        if best is not None and best.feasible:
+            break
+        start = best_solution(relaxed(problem, share), structure, known)
+        found = None if start is None else search(problem, structure, start.values, _ROUNDS)
+        best = min((each for each in (best, found) if each is not None), key=_rank, default=None)
+    return best
 
 
 def _is_stable(plants: PlantSet, solution: Solution) -> bool:

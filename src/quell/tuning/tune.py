@@ -150,8 +150,11 @@ def tune(
         raise ValueError("search = {...}: is for a tuning by simulation; give a scenario, too")
     dt = checks.positive("dt", dt, "s")
     _check_names(structure, compare, objective)
-    for name in limits:
+    for name, value in limits.items():
         if name not in _LIMITS:
+            if name.lower() in Constraints.__dataclass_fields__:
+                bound = f"constraints=quell.tuning.Constraints({name.lower()}={value!r})"
+                raise ValueError(f"{name} = {value!r}: is a bound of the loop; give {bound}")
             known = [*inspect.signature(tune).parameters][:-1] + list(_LIMITS)
             raise ValueError(f"{name}: tune has no such argument, {checks.nearest(name, known)}")
     if not 0.0 < checks.finite("quantile", quantile) <= 1.0:
