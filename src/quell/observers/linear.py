@@ -41,6 +41,5 @@ def _observe(
     error = y - estimate[0]
     for i in range(z.size):
         z[i] = estimate[i] + model.gain[i] * error
-    if not model.predictor:
-        for i in range(z.size):
+        if not model.predictor:
             estimate[i] = z[i]

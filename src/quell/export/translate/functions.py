@@ -45,6 +45,8 @@ class Function:
     ----------
     name
         in C; empty if calls of it vanish.
+    is_inline
+        whether compilers should copy it into its callers.
     """
 
     def __init__(
@@ -99,6 +101,7 @@ class Function:
         )
         self.block = block
         self.name = ""
+        self.is_inline = False
 
     def _find_result(self, body: Body, block: Block, hints: tuple[str, ...]) -> None:
         """Set what the function returns, and complete its return statements."""
@@ -216,7 +219,8 @@ class Function:
                 never_stored = not value.mutable and isinstance(value.kind, Struct)
                 declared = f"{'restrict ' if never_stored else ''}{identifier(name)}"
                 parts.append(self.program.parameter(value.kind, declared, is_const))
-        return f"static {self.result_type} {self.name}({', '.join(parts) or 'void'})"
+        words = "static inline" if self.is_inline else "static"
+        return f"{words} {self.result_type} {self.name}({', '.join(parts) or 'void'})"
 
     @property
     def result_type(self) -> str:

@@ -163,8 +163,11 @@ class Program:
         """Return expressions outside of any kernel, for calls from the public functions."""
         return Expressions(self, {}, "entry point", "")
 
-    def kernel_lines(self, used_by: str) -> list[str]:
-        """Return constants, helpers and functions, as far as the code ``used_by`` needs them."""
+    def kernel_lines(self, used_by: str, step: str = "") -> list[str]:
+        """Return constants, helpers and functions, as far as the code ``used_by`` needs them.
+
+        ``step`` is the part of that code which runs in each sample.
+        """
         needed = words(used_by)
         kept: list[Function] = []
         for function in reversed(self.functions):
@@ -172,12 +175,28 @@ class Program:
                 kept.append(function)
                 needed |= function.names_used()
         self.functions = kept[::-1]
+        self._find_inline(words(step))
         self.helpers &= needed
         for name in [name for name in self._constants if name not in needed]:
             del self._constants[name]
         externals = [self.externals[name] for name in self.externals if name in needed]
         constants = [line for each in self.constant_lines() for line in wrapped(each)]
         return ["", *externals, *constants, *self.helper_lines(), *self.function_lines()]
+
+    def _find_inline(self, in_step: set[str]) -> None:
+        """Mark what one function calls in each sample, and another one elsewhere.
+
+        Compilers inline what is called once. The rare call would cost time in each sample.
+        """
+        callers: dict[str, set[str]] = {}
+        for function in reversed(self.functions):
+            for name in function.names_used():
+                callers.setdefault(name, set()).add(function.name)
+            if function.name in in_step:
+                in_step |= function.names_used()
+        for function in self.functions:
+            by = callers.get(function.name, set())
+            function.is_inline = len(by & in_step) == 1 and not by <= in_step
 
     def constant_lines(self) -> list[str]:
         """Return the definitions of named constants."""

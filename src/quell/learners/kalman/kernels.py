@@ -183,6 +183,8 @@ def _adapt(
     if spread < 0.0:  # by rounding P is no longer a covariance: do not learn
         return
     inverse = 1.0 / max(spread + 1.0 / learner.dt, spread / (learner.fastest * learner.dt))
+    # A variable, because a sum in memory waits for each store.
+    level = theta[learner.states] if learner.bias else 0.0
     for i in range(size):
         share = gain[i] * inverse
         reduce_row(covariance, i, share, gain)
@@ -196,7 +198,10 @@ def _adapt(
             change = updated - theta[i]
             theta[i] = updated
             if learner.bias:
-                theta[learner.states] -= change * memory.mean[i]
+                if learner.with_u and i > learner.states:
+                    level = theta[learner.states]
+                level -= change * memory.mean[i]
+                theta[learner.states] = level
             # In double precision zero is added, too: without, batches change their last bits.
             if regressor[i] != 0.0 and not (is_single(weight) and learner.walk[i] == 0.0):
                 grown_by = learner.walk[i] * learner.dt * deviation * deviation / memory.variance[i]
@@ -233,15 +238,23 @@ def _update_regressor(
     learner: KalmanDesign, memory: KalmanMemory, noise: float, weight: float
 ) -> None:
     """Put φ̃ in place of φ^F; ``noise`` is the mean square of y − x̂_1, ``weight`` 1/√R."""
+    for i in range(learner.states):
+        _scale_feature(learner, memory, i, noise, weight)
+    if learner.with_u:
+        _scale_feature(learner, memory, memory.filtered.size - 1, noise, weight)
+
+
+@kernel
+def _scale_feature(
+    learner: KalmanDesign, memory: KalmanMemory, i: int, noise: float, weight: float
+) -> None:
     filtered, mean, variance = memory.filtered, memory.mean, memory.variance
-    for i in range(filtered.size):
-        if learner.threshold[i] != 0.0:
-            away = filtered[i] - mean[i]
-            add_small(mean, filtered.size, i, learner.forget * away)
-            variance[i] += learner.forget * (away * away - variance[i])
-            centre = mean[i] if learner.bias else 0.0
-            moves = variance[i] > learner.threshold[i] * noise
-            filtered[i] = weight * (filtered[i] - centre) if moves else 0.0
+    away = filtered[i] - mean[i]
+    add_small(mean, filtered.size, i, learner.forget * away)
+    variance[i] += learner.forget * (away * away - variance[i])
+    centre = mean[i] if learner.bias else 0.0
+    moves = variance[i] > learner.threshold[i] * noise
+    filtered[i] = weight * (filtered[i] - centre) if moves else 0.0
 
 
 @predict.register(KalmanDesign)
