@@ -13,6 +13,7 @@ import quell as ql
 from quell.controllers.base import control
 from quell.learners.recovery import (
     LearnerWatch,
+    does_harm,
     has_escaped,
     has_lost_range,
     is_excessive,
@@ -141,6 +142,53 @@ def test_an_output_that_grows_without_bound_is_found_in_the_sample() -> None:
     assert not has_escaped(watched(1.0), 2.0**40, beyond(2000.0))
     assert not has_escaped(watched(1.0), 1.2e12, beyond(1024.0))
     assert has_escaped(watched(0.5), 1.2e12, beyond(1025.0))
+
+
+def test_an_output_that_adds_to_the_disturbance_is_found() -> None:
+    """In most samples of ten windows Δf̂ is more than four times the f that it is a part of."""
+
+    def found(ratio: float, share: int, samples: int = 450) -> list[int]:
+        watch = LearnerWatch.zeros()[0]
+        ratios = [ratio if k % 20 >= 20 - share else 0.0 for k in range(samples)]
+        return [
+            k for k in range(samples) if does_harm(watch, WINDOW, -ratios[k] * wave(k), wave(k))
+        ]
+
+    assert found(4.1, 11) == [199, 399]
+    assert found(4.1, 10) == []
+    assert found(4.0, 20) == []
+    watch = LearnerWatch.zeros()[0]
+    assert not any(does_harm(watch, WINDOW, 0.0, 0.0) for _ in range(200))
+
+
+@pytest.mark.parametrize(
+    ("learner", "guard", "forgets"),
+    [
+        (ql.learners.BatchGradient(0.0, 1), None, True),
+        (ql.learners.BatchGradient(0.0, 1), ql.Guard(), False),
+        (ql.envs.Policy(), None, False),
+    ],
+    ids=["alone", "with a guard", "from outside"],
+)
+def test_a_learner_that_adds_to_the_disturbance_starts_again(
+    learner: Any, guard: Any, forgets: bool
+) -> None:
+    """Without a jump, once, and θ is zero then; a guard sees to it, and a policy has nothing to forget."""
+    observer = ql.ESO.model_free(1, 1.0, 100.0, 0.01)
+    loop = ql.ADRC(observer, 10.0, learner=learner, guard=guard)
+    memory, y, lost, controls = loop._state.learner, 0.0, [], []
+    for k in range(25 * window_samples(observer)):
+        if k == 20:
+            memory[0][-1] = 5.0  # θ of the bias, or the output of the policy
+        controls.append(control(loop.parameters, loop._state, 1.0, y))
+        y += 0.01 * controls[-1]
+        if int(loop._state.loop[0].status) & ql.Status.OVERFLOWED:
+            lost.append(k)
+    assert len(lost) == forgets
+    assert abs(y - 1.0) < 1e-3
+    if forgets:
+        assert memory.theta.tolist() == [0.0, 0.0, 0.0]
+        assert max(abs(u) for u in controls[lost[0] - 1 :]) < 1e-3
 
 
 def test_at_the_very_limits_nothing_is_lost() -> None:

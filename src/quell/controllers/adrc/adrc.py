@@ -26,7 +26,7 @@ from quell.controllers.design_checks import check_zeros, warn_if_unwise
 from quell.controllers.limits import RateLimit, checked_limits
 from quell.controllers.stateful import StatefulController
 from quell.guard import GUARD_CHANNELS, Guard, UnguardedDesign, UnguardedMemory
-from quell.learners.base import Learner, NoLearner, checked_design
+from quell.learners.base import Learner, NoLearner, checked_design, forget
 from quell.learners.lag import NO_LAG, lag_memory, lag_of
 from quell.learners.recovery import LearnerWatch, window_samples
 from quell.observers.eso import ESO
@@ -135,6 +135,7 @@ class ADRC(StatefulController):
         gains = law_gains(observer.degree, omega_c, self.law_poles)
         gains = gains * (0.5 if self.half_gain else 1.0)
         law = np.append(gains, np.zeros(observer.order - observer.degree))
+        learner = checked_design(self.learner, observer, self._learner_omega_c)
         return AdrcDesign(
             eso=observer.model,
             law=law,
@@ -144,10 +145,12 @@ class ADRC(StatefulController):
             fade=math.exp(-omega_c * observer.dt),
             b0=observer.b0,
             limits=self._limits,
-            learner=checked_design(self.learner, observer, self._learner_omega_c),
+            learner=learner,
             lag=lag_of(observer) if learns else NO_LAG,
             guard=UnguardedDesign() if self.guard is None else self.guard.design(observer, law),
             learns=learns,
+            # A guard judges the output itself; an output set from outside is kept in any case.
+            forgets=self.guard is None and type(learner) in forget.implementations,
             window=window_samples(observer) if learns else 0,
         )
 

@@ -58,6 +58,7 @@ from quell.learners.base import (
 from quell.learners.lag import lag_push, reset_lag
 from quell.learners.recovery import (
     LearnerWatch,
+    does_harm,
     has_escaped,
     has_lost_range,
     is_excessive,
@@ -115,6 +116,7 @@ class AdrcDesign(NamedTuple):
     lag: Any  # lag filter of f_L; without taps if there is no learner
     guard: Any
     learns: Flag  # whether there is a learner
+    forgets: Flag  # whether it forgets what does harm
     window: int  # samples of the windows in which it is watched
 
 
@@ -204,9 +206,12 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
     if design.learns and status & _MEASUREMENT_HELD == 0:
         excessive = is_excessive(unlimited, u, smallest)
         limited, watch = cut != 0 and loop.manual == 0.0, state.watch[0]
-        if has_escaped(watch, output, excessive) or has_lost_range(
+        lost = has_escaped(watch, output, excessive) or has_lost_range(
             watch, design.window, loop.y, f_plain, output, excessive, limited
-        ):
+        )
+        if design.forgets and does_harm(watch, design.window, seen[seen.size - 1], f_plain):
+            lost = True
+        if lost:
             status |= _OVERFLOWED
             _start_learning_again(design, state)
     loop.status = status
