@@ -31,7 +31,7 @@ OLDER = pytest.mark.skipif(sys.version_info >= (3, 13), reason="Python suggests 
 
 
 def public() -> Iterator[tuple[str, Callable[..., Any]]]:
-    """Yield functions, classes and class methods of all rooms, with a label."""
+    """Yield functions, classes and their methods of all rooms, with a label."""
     for room in ROOMS:
         module = importlib.import_module(room)
         for name in set(module.__all__) - LEFT_OUT:
@@ -42,9 +42,18 @@ def public() -> Iterator[tuple[str, Callable[..., Any]]]:
             if isinstance(value, type) and issubclass(value, Exception):
                 continue
             yield f"{room}.{name}", value
-            for method, kept in vars(value).items() if isinstance(value, type) else ():
-                if isinstance(kept, classmethod) and not method.startswith("_"):
-                    yield f"{room}.{name}.{method}", getattr(value, method)
+            for method in dir(value) if isinstance(value, type) else ():
+                kept = getattr(value, method)
+                if not method.startswith("_") and (inspect.ismethod(kept) or has_options(kept)):
+                    yield f"{room}.{name}.{method}", kept
+
+
+def has_options(value: Any) -> bool:
+    """Whether a value is a function of quell with optional parameters."""
+    ours = inspect.isfunction(value) and (value.__module__ or "").startswith("quell")
+    return ours and any(
+        p.default is not p.empty for p in inspect.signature(value).parameters.values()
+    )
 
 
 def misspelt(function: Callable[..., Any]) -> tuple[str, str] | None:
@@ -58,7 +67,7 @@ def misspelt(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def test_every_public_name_suggests_the_nearest_parameter() -> None:
-    """Functions, classes and class methods alike."""
+    """Functions, classes, class methods and methods with optional parameters alike."""
     silent, asked = [], 0
     for label, function in public():
         if (names := misspelt(function)) is None or names[0] in inspect.signature(
