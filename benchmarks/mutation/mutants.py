@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import random
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,9 +48,15 @@ class Mutant(NamedTuple):
         return f"{self.path}, {self.function}: {self.before} -> {self.after}"
 
 
-def draw(repository: Path, paths: Iterable[str], count: int, seed: int) -> list[Mutant]:
-    """Return ``count`` different mutants of the files, each as likely as any other."""
-    found = [m for path in sorted(paths) for m in mutants(repository, path)]
+def draw(
+    repository: Path,
+    paths: Iterable[str],
+    count: int,
+    seed: int,
+    wanted: Callable[[Mutant], bool] = lambda mutant: True,
+) -> list[Mutant]:
+    """Return ``count`` different ``wanted`` mutants of the files, each as likely as any other."""
+    found = [m for path in sorted(paths) for m in mutants(repository, path) if wanted(m)]
     return random.Random(seed).sample(found, min(count, len(found)))
 
 

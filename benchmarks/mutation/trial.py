@@ -1,6 +1,7 @@
 """The mutation trial: it counts the one-line changes of the source that the tests notice.
 
     python benchmarks/mutation/trial.py [--count 300] [--seed 1] [--areas law,guard] [--json FILE]
+    python benchmarks/mutation/trial.py --since REVISION    # only lines that are newer
 
 Each mutant runs, in a copy of the repository, the tests that execute its statement, the quickest
 first, until one fails. The tests run interpreted (``interpret_all.py``), so that nothing is
@@ -13,10 +14,12 @@ from __future__ import annotations
 
 import argparse
 import concurrent.futures
+import functools
 import json
 import multiprocessing
 import os
 import queue
+import re
 import shutil
 import subprocess
 import sys
@@ -24,6 +27,7 @@ import tempfile
 import tomllib
 import xml.etree.ElementTree as ET
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,9 +59,10 @@ AREAS = {
     "law": ("controllers/adrc/law.py", "controllers/bad_samples.py"),
     "hand-over": ("controllers/adrc/handover.py", "controllers/stateful.py"),
     "guard": ("guard/*.py",),
-    "learners": ("learners/*.py", "learners/kalman/*.py", "learners/regression/*.py"),
+    "learners": tuple(f"learners/{x}*.py" for x in ("", "kalman/", "regression/", "repetitive/")),
     "gradient learners": ("learners/gradient/*.py", "learners/online/*.py"),
-    "observers": ("observers/*.py",),
+    "observers": ("observers/*.py", "lti/pole_pattern.py"),
+    "precision": ("kernels/single.py", "kernels/sums.py", "controllers/single/*.py"),
     "limits": ("controllers/limits.py",),
     "supervisor": ("realtime/loop/supervisor.py", "realtime/loop/direction.py"),
     "metrics": ("records/metrics.py",),
@@ -70,13 +75,14 @@ NEAR = {
     "guard": ("guard", "law"),
     "learners": (
         *("kalman", "kalman_equations", "learner_equations", "harmonic", "regression", "recovery"),
-        *("lag", "bad_learners", "law", "contracts/test_contracts"),
+        *("repetitive", "lag", "bad_learners", "law", "contracts/test_contracts"),
     ),
     "gradient learners": (
         *("batch_gradient", "online", "learner_equations", "recovery"),
         "contracts/test_contracts",
     ),
     "observers": ("observers", "observer_forms", "lag", "lti_canonical", "handover"),
+    "precision": ("single_precision", "contracts/test_single_precision"),
     "limits": ("limits", "law"),
     "supervisor": ("supervisor", "supervisor_rules", "safety"),
     "metrics": ("metrics",),
@@ -125,6 +131,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=300, help="mutants to draw")
     parser.add_argument("--seed", type=int, default=1, help="seed of the draw")
     parser.add_argument("--areas", default=",".join(AREAS), help="areas, separated by commas")
+    parser.add_argument("--since", help="revision after which the changed lines were written")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--json", type=Path, help="write the verdicts to this file")
     parser.add_argument("--baseline", type=Path, help="folder that keeps the unchanged run")
@@ -137,7 +144,7 @@ def main() -> None:
         baseline = options.baseline or work / "baseline"
         tests = unchanged_run(baseline, options.workers)
         area_of = {path: area for area in areas for path in _files(area)}
-        drawn = draw(REPOSITORY, area_of, options.count, options.seed)
+        drawn = draw(REPOSITORY, area_of, options.count, options.seed, _newer(options.since))
         passing: set[str] = set()
         copies: queue.Queue[Path] = queue.Queue()
         for i in range(options.workers):
@@ -163,6 +170,25 @@ def main() -> None:
                 if options.json:
                     options.json.write_text(_rows(verdicts), encoding="utf-8")
     console.print(_table(verdicts))
+
+
+def _newer(revision: str | None) -> Callable[[Mutant], bool]:
+    """Return whether a mutant's line is newer than a revision; lines that moved are not."""
+
+    @functools.cache
+    def lines(path: str) -> set[int]:
+        command = ["git", "blame", "-M", "-C", "-C", "--incremental", f"{revision}..", "--", path]
+        shown = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+        newer, these = set(), range(0)
+        for line in shown.stdout.splitlines():
+            if match := re.fullmatch(r"[0-9a-f]{40} \d+ (\d+) (\d+)", line):
+                these = range(int(match[1]), int(match[1]) + int(match[2]))
+                newer.update(these)
+            elif line == "boundary":
+                newer.difference_update(these)
+        return newer
+
+    return lambda mutant: revision is None or mutant.line in lines(mutant.path)
 
 
 def unchanged_run(folder: Path, workers: int) -> Tests:
