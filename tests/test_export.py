@@ -322,6 +322,16 @@ def test_the_command_exports_and_prints_sizes(
     assert not Path("a").exists()
 
 
+def test_the_source_leads_compilers_to_a_fast_step() -> None:
+    """What a rare operation calls, too, is inline; only long loops may become vectors."""
+    short = ql.export.c_source(ADRC).source
+    assert "static inline void observe(" in short
+    assert "static void predict_state(" in short
+    assert "no-tree-vectorize" in short
+    long = ql.export.c_source(ql.ADRC(ql.ESO.model_free(8, 1.5, 12.0, DT), 1.5)).source
+    assert "no-tree-vectorize" not in long
+
+
 @needs_gcc
 def test_sizes_are_those_of_the_structs(tmp_path: Path) -> None:
     """Half of them in single precision, but for the pointer; the deepest path of calls counts."""
