@@ -24,6 +24,8 @@ import quell as ql
 from quell.kernels import dispatch
 from quell.simulation.driver import Loop
 
+from .scheduling import FromBothEnds, compiled_first
+
 # The same examples in every run, and no stop-watch: the machines that test are shared.
 settings.register_profile("quell", deadline=None, derandomize=True)
 settings.load_profile("quell")
@@ -75,6 +77,16 @@ def _run_short(loop: Loop, *arguments: Any) -> int:
 
 
 Loop.run = _run_short  # type: ignore[method-assign]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the files with compiled tests first."""
+    compiled_first(items)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> FromBothEnds | None:
+    """Let one half of the workers compile, where workers run whole files."""
+    return FromBothEnds(config, log) if config.option.dist == "loadfile" else None
 
 
 @pytest.hookimpl(tryfirst=True)

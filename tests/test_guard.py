@@ -216,7 +216,7 @@ def test_the_bound_holds_for_the_u_of_the_sample() -> None:
     controller = law(ql.learners.Kalman(u=True), ql.Guard())
     shadow, shown, largest = np.zeros((1, 5)), 0.0, 0.0
     lag, spring, position, speed = lag_of(OBSERVER), 1.4, np.zeros(2), np.zeros(2)
-    for k in range(16_000):
+    for k in range(6_000):
         u = controller.step(math.sin(0.005 * k), position[1])
         f_learned = controller.estimate.f_learned
         correction, limit_now = abs(f_learned - shown), controller._state.guard.sample[0].limit

@@ -1,0 +1,30 @@
+"""Which worker runs which test files: files that compile run in as few processes as possible."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import pytest
+from xdist.scheduler import LoadFileScheduling
+
+
+def compiled_first(items: list[pytest.Item]) -> None:
+    """Sort the tests by the share of compiled tests in their files; the order in a file stays."""
+    tests = Counter(item.path for item in items)
+    marked = Counter(item.path for item in items if item.get_closest_marker("compiled"))
+    items.sort(key=lambda item: -marked[item.path] / tests[item.path])
+
+
+class FromBothEnds(LoadFileScheduling):
+    """Give whole files to the workers, from the first on and from the last on in turn.
+
+    A process compiles each kernel once. With ``compiled_first`` half of the workers compile most of
+    the kernels, and the others run the tests that compile none, until they meet.
+    """
+
+    def _assign_work_unit(self, node: Any) -> None:
+        """Give a worker the next file: for every second one of them, that is the last."""
+        if self.nodes.index(node) % 2:
+            self.workqueue.move_to_end(next(reversed(self.workqueue)), last=False)
+        super()._assign_work_unit(node)
