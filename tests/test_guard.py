@@ -175,6 +175,14 @@ def test_a_correction_beyond_its_bound_is_clipped(side: float, e: float) -> None
             )
 
 
+def test_where_nothing_is_permitted_the_target_is_what_is_fed_forward() -> None:
+    """So that authority which is given later begins without a jump."""
+    design, memory = trusted()
+    memory.sample[0].limit, memory.sample[0].output = 0.0, 5.0
+    record_output(design, memory, 0.7)
+    assert memory.sample[0].target == 0.7
+
+
 def test_a_change_of_the_authority_over_a_constant_does_nothing() -> None:
     """The target moves by β times the change of g, however large g is."""
     design, memory = trusted()

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.controllers.adrc.law import unlimited_control
+from quell.controllers.adrc.law import _finish_sample, unlimited_control
 from quell.controllers.base import control, reset_loop, set_reference_derivatives, write_row
 from quell.controllers.limits import Limits, apply_limits, largest_wish
 from quell.controllers.stateful import named_arrays
+from quell.guard import confine
 from quell.learners.base import commit, restart
 from quell.types import Status
 
@@ -201,6 +202,22 @@ def test_a_row_has_estimates_status_guard_and_coefficients_in_order() -> None:
     ]
     np.testing.assert_array_equal(row, expected)
     assert estimate.theta["x1"] != 0.0
+
+
+@pytest.mark.parametrize("slope", [0.3, -0.3])
+def test_the_guard_bounds_the_output_for_the_u_that_was_applied_too(slope: float) -> None:
+    """Which may differ from the u that the law gave; an output without slope was bounded before."""
+    law = ql.ADRC(OBSERVER, 3.0, learner=ql.learners.Kalman(u=True), guard=ql.Guard())
+    for k in range(30):
+        step(law, 1.0, 0.1 * math.sin(0.3 * k))
+    loop = law._state.loop[0]
+    for used, bounded in ((slope, True), (0.0, False)):
+        loop.constant, loop.slope = 2.0, used
+        expected = 2.0 + used * 1e3
+        permitted = confine(law.parameters.guard, law._state.guard, expected)
+        assert permitted != expected
+        _finish_sample(law.parameters, law._state, 1e3)
+        assert loop.f_learned == (permitted if bounded else expected)
 
 
 def test_reference_derivatives_are_forgotten_at_a_start_from_rest() -> None:

@@ -14,7 +14,12 @@ from quell.features.base import unit, write
 from quell.features.scaling import update_scale
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
 from quell.learners.lag import group_delay, lag_memory, lag_of, lag_push
-from quell.learners.noise_gate import relative_noise
+from quell.learners.noise_gate import (
+    noise_gate,
+    noise_gate_memory,
+    relative_noise,
+    update_gate,
+)
 from quell.learners.online.model import infer, learn
 
 DT, OMEGA_O, FREQUENCY, B0 = 5e-3, 21.0, 0.8, 1.5
@@ -283,6 +288,13 @@ def test_algorithm_1_on_scaled_features_follows_its_equations(rng: np.random.Gen
     for name in ("loop", "scale", "units"):
         np.testing.assert_array_equal(getattr(memory, name), getattr(learner.memory(design), name))
     assert not np.any(memory.buffers.theta)
+
+
+def test_rounding_of_a_large_measurement_counts_as_its_noise() -> None:
+    """1e-8 of y, also where the observer agrees with it exactly."""
+    gate, memory = noise_gate(OBSERVER, FREQUENCY), noise_gate_memory(2)
+    update_gate(gate, memory, np.array([5e3, 0.0, 0.0]), 5e3, 0.0)
+    assert memory.noise[0] == pytest.approx(gate.forget * 5e-5**2, rel=1e-12)
 
 
 @pytest.mark.parametrize("bias_bandwidth", [None, 0.0, 1e9])

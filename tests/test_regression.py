@@ -135,6 +135,29 @@ def test_what_has_changed_abruptly_is_learned_again_at_once(rng: np.random.Gener
     assert memory.loop[0].usual == 0.0
 
 
+def test_a_change_is_judged_by_mean_squares_over_two_times() -> None:
+    """Five lags of the observer; the usual one follows a larger one in 50 lags, else in 1000/omega_c."""
+    rule = relearning_rule(NlmsRule(1.0, 1e-2), 4.0, dt=0.1, lag_time=2.0, omega_c=50.0)
+    assert rule[1:] == pytest.approx(
+        (16.0, -math.expm1(-0.01), -math.expm1(-0.001), -math.expm1(-0.005)), rel=1e-12
+    )
+    memory, short, usual = RelearningMemory(np.zeros(0), RelearningLoop.zeros()), 0.0, 0.0
+    for error in (3.0, -4.0, 0.0, 0.0, 0.0, 0.0):
+        update_theta(rule, memory, np.zeros(1), np.ones(1), error, 1.0)
+        short += rule.short * (error * error - short)
+        usual += (rule.rise if short > usual else rule.decay) * (short - usual)
+        assert memory.loop[0].tolist() == pytest.approx((short, usual), rel=1e-12)
+    memory.loop[0].error, memory.loop[0].usual = 0.0, 1.0
+    update_theta(rule, memory, np.zeros(1), np.ones(1), 0.5, 1.0)
+    assert memory.loop[0].usual == pytest.approx(1.0 - rule.decay * (1.0 - 0.25 * rule.short))
+    inner, state = rls(1)
+    relearning = relearning_rule(inner, 4.0, dt=0.1, lag_time=2.0, omega_c=50.0)
+    memory = RelearningMemory(state, RelearningLoop.zeros())
+    for error in (0.0, 1.0):  # the first error is no change
+        update_theta(relearning, memory, np.zeros(1), np.ones(1), error, 1.0)
+    assert state.covariance[0, 0] == pytest.approx(1.0 / (1.0 / 9.0 + 1.0))
+
+
 def test_a_selection_of_all_features_is_plain_least_squares() -> None:
     """``strongest`` that is not below the number of features changes nothing."""
     assert ql.learners.RLS(strongest=3).rule(OBSERVER, 4.0, 3) == ql.learners.RLS().rule(

@@ -112,7 +112,9 @@ def test_a_start_from_rest_begins_a_cycle_and_keeps_the_table() -> None:
     design = learner.design(OBSERVER, 4.0)
     memory = learner.memory(design)
     memory.table[:] = np.arange(5.0, 25.0)
+    memory.filters[:] = 1.0
     restart(design, memory)
+    assert not memory.filters.any()
     for _ in range(7):
         commit(design, memory, np.zeros(3), 0.0, 0.0)
     assert predict(design, memory, np.zeros(3), 0.0) == (7.0, 0.0)

@@ -13,6 +13,7 @@ from quell.controllers import in_single_precision
 from quell.controllers.linear.delta import delta_law
 from quell.controllers.single import SinglePrecision
 from quell.controllers.single import single as single_module
+from quell.controllers.single.parts import single_design
 from quell.controllers.stateful import named_arrays
 from quell.features import Bias, Custom, State
 from quell.kernels import dispatch, functions
@@ -212,6 +213,14 @@ def test_averages_that_would_stand_still_are_named() -> None:
     controller = ql.ADRC(observer, 0.2, learner=ql.learners.Kalman(), guard=ql.Guard())
     with pytest.raises(ValueError, match=r"forget = .* a sample: must be at least .* raise dt"):
         in_single_precision(controller)
+    rates = dict.fromkeys(
+        ("forget", "earn", "forget_effect", "rise", "growth", "smooth"), 2.0 ** (-21)
+    )
+    fine = controller.parameters.guard._replace(**rates, decay=2.0**-23)
+    single_design(fine)
+    for name, value in (("rise", 2.0**-22), ("decay", 2.0**-24)):
+        with pytest.raises(ValueError, match=rf"{name} = {value:.3g} a sample: must be at least"):
+            single_design(fine._replace(**{name: value}))
 
 
 def test_functions_of_the_user_are_refused_by_name() -> None:
