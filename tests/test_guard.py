@@ -25,6 +25,7 @@ from quell.experiments.stress.adversaries import (
 )
 from quell.experiments.stress.random_loops import Loop
 from quell.guard import assess, confine, limit, record_output, start_again
+from quell.guard.kernels import _MOST_OWN, _update_bound
 from quell.learners.lag import lag_of, lag_push
 from quell.types import Status
 
@@ -173,6 +174,18 @@ def test_a_correction_beyond_its_bound_is_clipped(side: float, e: float) -> None
             assert confine(design, memory, beyond) == pytest.approx(
                 3.0 * e + side * authority * bound
             )
+
+
+def test_what_is_not_the_output_s_own_doing_counts_for_the_bound() -> None:
+    """The error less five times the own peak; an error that is sudden, less the own peak itself."""
+    for error, own_share in ((1.5, _MOST_OWN), (9.0, 1.0)):
+        design, memory = trusted()
+        sample = memory.sample[0]
+        sample.samples, sample.peak, sample.typical_error = 0.0, 2.0, 0.5
+        sample.own_peak, sample.outside = 0.1, 0.3
+        _update_bound(design, memory, error)
+        expected = 0.3 + design.rise * (error - 0.1 * own_share - 0.3)
+        assert sample.outside == pytest.approx(expected, rel=1e-12)
 
 
 def test_where_nothing_is_permitted_the_target_is_what_is_fed_forward() -> None:
