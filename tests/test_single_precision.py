@@ -21,7 +21,7 @@ from quell.kernels.dispatch import is_finite
 from quell.kernels.functions import is_single
 from quell.kernels.single import in_single
 from quell.kernels.sums import add_small, add_symmetrically
-from quell.learners.base import commit
+from quell.learners.base import adapt, commit
 from quell.learners.kalman.search import ENTRIES, advance_search
 from quell.learners.least_squares import multiply_lower, reduce_row
 from quell.learners.noise_gate import grown
@@ -281,6 +281,27 @@ def test_the_covariance_has_carries_where_it_moves_slowly() -> None:
         observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.1, dt=dt)
         single = in_single_precision(ql.ADRC(observer, 1.5, learner=ql.learners.Kalman()))
         assert single.initial_state().learner.covariance.shape == (3, width)
+
+
+def test_coefficients_learn_below_their_last_digit() -> None:
+    """With a P of a learner that has averaged for hours: θ changes as in double precision."""
+    moved = []
+    for precision in ("double", "single"):
+        law = ql.ADRC(ORDER_2, 1.5, learner=ql.learners.Kalman())
+        single = in_single_precision(law) if precision == "single" else law
+        design, state = single.parameters, single.initial_state().learner
+        design = getattr(design, "controller", design).learner
+        number = np.float32 if precision == "single" else float
+        state.theta[:] = [-2.0, -0.5, 0.3]
+        state.averages["time"], state.averages["weight"] = 1e6, 1.0
+        state.averages["noise"], state.variance[:] = 1e-12, 1.0
+        for _ in range(3000):
+            state.covariance[:, :3] = 1e-7 * np.eye(3)
+            state.filtered[:] = [0.7, -0.3, 1.0]
+            adapt(design, state, np.zeros(2, number), number(1e-6), number(0.0), number(-0.8))
+        moved.append(state.theta[:2].astype(float) - [-2.0, -0.5])
+    assert 1e-5 < np.max(np.abs(moved[0])) < 3000 * 2.0**-24  # all, and less than a last digit each
+    np.testing.assert_allclose(moved[1], moved[0], atol=2.0**-21)
 
 
 @pytest.mark.compiled

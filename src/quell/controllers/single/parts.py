@@ -104,6 +104,8 @@ def _with_longer(state: Any) -> Any:
     state = type(state)(*map(_with_longer, state))
     if isinstance(state, GuardMemory):
         return state._replace(shown=np.append(state.shown, np.zeros(CARRIES)))
+    if isinstance(state, KalmanMemory):
+        state = state._replace(carry=np.zeros(state.theta.size))
     if isinstance(state, KalmanMemory | NoiseGateMemory):
         return state._replace(mean=np.zeros(2 * state.mean.size))
     return state

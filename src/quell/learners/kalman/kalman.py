@@ -144,6 +144,7 @@ class Kalman:
             filtered=np.zeros(p),
             mean=np.zeros(p),
             variance=np.zeros(p),
+            carry=np.zeros(0),
             gain=np.zeros(p),
             phase=np.zeros(parameters.oscillators.omega.size),
             omega=parameters.oscillators.omega.copy(),

@@ -128,6 +128,7 @@ class KalmanMemory(NamedTuple):
     filtered: Vector  # φ^F (p,); from ``adapt`` to the next ``commit`` φ̃ in its place
     mean: Vector  # running means of φ^F (p,); in single precision with carries (2p,)
     variance: Vector  # running variances of φ^F (p,)
+    carry: Vector  # what rounding takes of θ (p,) in single precision; else (0,)
     gain: Scratch  # P φ̃ (p,)
     phase: Vector  # ψ of each oscillator [rad] (m,)
     omega: Vector  # ω̂ of each oscillator [rad/s] (m,)
@@ -192,7 +193,12 @@ def _adapt(
             theta[i] += share * innovation
             add_symmetrically(covariance, i, i, learner.walk[i] * learner.dt)
         else:
-            updated = theta[i] + share * innovation * weight
+            if memory.carry.size > 0:
+                increment = share * innovation * weight + memory.carry[i]
+                updated = theta[i] + increment
+                memory.carry[i] = increment - (updated - theta[i])
+            else:
+                updated = theta[i] + share * innovation * weight
             if learner.with_u and i == size - 1:
                 updated = min(max(updated, learner.slope_low), learner.slope_high)
             change = updated - theta[i]
@@ -315,6 +321,8 @@ def _all_finite(memory: KalmanMemory) -> bool:
     for i in range(memory.theta.size):
         finite = finite and is_finite(memory.theta[i])
         finite = finite and is_finite(memory.mean[i]) and is_finite(memory.variance[i])
+        if memory.carry.size > 0:
+            finite = finite and is_finite(memory.carry[i])
         for j in range(memory.covariance.shape[1]):
             finite = finite and is_finite(memory.covariance[i, j])
     return finite
@@ -329,6 +337,8 @@ def _forget(learner: KalmanDesign, memory: KalmanMemory) -> None:
         memory.omega[j] = learner.oscillators.omega[j]
     for i in range(memory.mean.size):
         memory.mean[i] = 0.0
+    for i in range(memory.carry.size):
+        memory.carry[i] = 0.0
     for i in range(memory.theta.size):
         memory.theta[i] = memory.variance[i] = 0.0
         memory.gain[i] = 0.0
