@@ -96,7 +96,18 @@ def test_a_measurement_beyond_any_quantity_is_held(bad: float) -> None:
     assert step(one, bad, 0.5) == step(other, math.nan, 0.5)
     assert one.estimate.status == Status.REFERENCE_HELD
     step(one, 1.0, 1e60)
-    assert one.estimate.status == Status.OK
+    assert not one.estimate.status & Status.MEASUREMENT_HELD
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_without_limits_u_stays_within_what_can_be_measured(linear: bool) -> None:
+    """A larger u would drive y to where no measurement counts; the last u holds instead."""
+    pid = ql.baselines.PID(8.0, 6.0, 3.0, tf=0.05, dt=DT)
+    law: Any = used(pid if linear else ql.ADRC(OBSERVER, 3.0), 20)
+    before = float(law._state.loop[0].u)
+    assert step(law, 1.0, 9e59) == before != 0.0
+    assert int(law._state.loop[0].status) & Status.OVERFLOWED
+    assert abs(step(law, 1.0, 0.5)) < 1e60
 
 
 def test_an_overflow_starts_everything_again_but_u() -> None:

@@ -268,15 +268,18 @@ def test_the_nonlinear_observer_with_powers_of_one_is_the_linear_one(
 
 
 def test_the_nonlinear_observer_starts_again_beyond_all_errors() -> None:
-    """From 2⁴⁰ δ on, where its powers would take for ever to return; below, it only corrects."""
+    """Beyond 2¹⁶ δ its powers would take for ever to return; those nearer to one reach further."""
     observer = ESO.nonlinear(2, 2.0, 20.0, DT, delta=0.25)
     z, seen = np.zeros(3), np.zeros(3)
-    edge = 0.25 * 2.0**40
+    edge = 0.25 * 2.0**16
     for y in (-edge, 1.01 * edge, -4e11, 1.0):
         observe(observer.model, z, seen, y, 0.0, 0.0)
         began = abs(y) != edge
         assert (seen.tolist() == [y, 0.0, 0.0]) == began, y
         np.testing.assert_array_equal(z, seen)
+    for alpha, reach in ((0.5, 2.0**24), (0.9, 2.0**40), (1.0, 2.0**40)):
+        model = ESO.nonlinear(2, 2.0, 20.0, DT, delta=0.25, alpha=[alpha] * 3).model
+        assert model.largest_error == 0.25 * reach
 
 
 def test_the_nonlinear_observer_is_hans_for_short_samples() -> None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 from quell.checks import LARGEST_SIGNAL
-from quell.controllers.limits import Limits
-from quell.kernels.dispatch import kernel
+from quell.controllers.limits import Limits, largest_magnitude
+from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import is_single
 from quell.types import Status
 
@@ -28,6 +28,18 @@ LARGEST_SINGLE_SIGNAL = 1e12
 def is_usable(value: float) -> bool:
     """Return whether ``value`` can be a reference, one of its derivatives or a measurement."""
     return abs(value) <= (LARGEST_SINGLE_SIGNAL if is_single(value) else LARGEST_SIGNAL)
+
+
+@kernel
+def is_usable_control(limits: Limits, unlimited: float) -> bool:
+    """Return whether a law's output is finite and, where no limit cuts it, not out of range.
+
+    Without limits a larger u would drive y to where measurements count as missing, and the
+    controller would never see it again.
+    """
+    if is_usable(unlimited):
+        return True
+    return is_finite(unlimited) and is_finite(largest_magnitude(limits))
 
 
 @kernel

@@ -64,6 +64,7 @@ class DeltaNonlinearModel(NamedTuple):
     gain: Vector  # L (N,)
     alpha: Vector  # α (N,)
     delta: float  # δ [y-unit]
+    largest_error: float  # beyond it the observer starts again [y-unit]
     chain: Flag  # whether Φ − I is zero up to its diagonal
 
     @property

@@ -14,7 +14,8 @@ only the correction is nonlinear::
 Within ±δ the correction is ``L_i e`` for any α: the linear observer of the bandwidth omega_o. With
 α = 1 it is linear everywhere. Beyond δ it corrects less, so it responds less to an outlier or to a
 wrong initial state, and needs longer to return from a state that is far off: the time grows with a
-power of e. Beyond 2⁴⁰ δ it starts again at y. Han's gains are ``β_i = L_i δ^(1−α_i) / dt``.
+power of e. Beyond an error from which it would hardly return, 2¹⁶ δ with the powers 1, ½ and ¼, it
+starts again at y. Han's gains are ``β_i = L_i δ^(1−α_i) / dt``.
 """
 
 from __future__ import annotations
@@ -30,9 +31,11 @@ from quell.observers.base import begin, observe, predict_state
 from quell.observers.linear import EsoModel
 from quell.types import Matrix, Vector
 
-# An error of so many δ is no error of estimation. From a smaller one an observer of order 2 with
-# Han's powers returns in 10⁴ samples (benchmarks/hostile_steps.py).
-_LARGEST_ERROR = 2.0**40
+# At an error e the weakest correction has the slope (δ/|e|)^(1−α) of its linear part, and an
+# observer with ω_o dt = 0.2 returns in about as many samples as the inverse of this slope: 2¹² from
+# |e| = 2¹⁶ δ with Han's powers of order 2 (benchmarks/hostile_steps.py). Beyond 2⁴⁰ δ no power
+# makes it an error of estimation.
+_INVERSE_SLOPE, _LARGEST = 12.0, 40.0  # powers of two
 
 
 class NonlinearModel(NamedTuple):
@@ -44,6 +47,7 @@ class NonlinearModel(NamedTuple):
     gain: Vector  # L (N,), as for the linear observer
     alpha: Vector  # α (N,), above 0 and at most 1
     delta: float  # δ [y-unit]
+    largest_error: float  # beyond it the observer starts again [y-unit]
 
     @property
     def states(self) -> int:
@@ -66,7 +70,7 @@ def fal(error: float, alpha: float, delta: float) -> float:
 @kernel
 def is_lost(model: Any, error: float) -> bool:
     """Return whether ``error`` is too large for an error of estimation."""
-    return not abs(error) <= _LARGEST_ERROR * model.delta
+    return not abs(error) <= model.largest_error
 
 
 @kernel
@@ -96,4 +100,9 @@ def nonlinear_model(linear: EsoModel, delta: float, alpha: Any) -> NonlinearMode
     powers = 0.5 ** np.arange(float(size)) if alpha is None else checks.vector("alpha", alpha, size)
     if not np.all((powers > 0.0) & (powers <= 1.0)):
         raise ValueError(f"alpha = {alpha!r}: each entry must be above 0 and at most 1")
-    return NonlinearModel(linear.transition, linear.input, linear.feed, linear.gain, powers, delta)
+    weakest = float(np.min(powers))
+    reach = _INVERSE_SLOPE / (1.0 - weakest) if weakest < 1.0 else _LARGEST
+    return NonlinearModel(
+        *(linear.transition, linear.input, linear.feed, linear.gain),
+        *(powers, delta, 2.0 ** min(reach, _LARGEST) * delta),
+    )

@@ -22,7 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell.controllers.adrc.feedback import nonlinear_part
-from quell.controllers.bad_samples import control_at_rest, hold_last_good, is_usable
+from quell.controllers.bad_samples import (
+    control_at_rest,
+    hold_last_good,
+    is_usable,
+    is_usable_control,
+)
 from quell.controllers.base import (
     bumpless_transfer,
     control,
@@ -42,7 +47,7 @@ from quell.guard import (
     start_again,
     write_channels,
 )
-from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.dispatch import kernel
 from quell.kernels.functions import is_single
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag
@@ -177,7 +182,7 @@ def _control(design: AdrcDesign, state: AdrcState, r: float, y: float) -> float:
         if permitted != f_learned:
             constant, slope = permitted, 0.0
             unlimited = unlimited_control(design, state, constant, slope)
-    if not is_finite(unlimited):
+    if not is_usable_control(design.limits, unlimited):
         status |= _OVERFLOWED
         # Else a finite θ that is out of all proportion overflows again in the next sample.
         _forget_learning(design, state)

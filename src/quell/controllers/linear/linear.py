@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.bad_samples import control_at_rest, hold_last_good
+from quell.controllers.bad_samples import control_at_rest, hold_last_good, is_usable_control
 from quell.controllers.base import control, reset_loop, set_applied_control, status_flags, write_row
 from quell.controllers.limits import (
     Limits,
@@ -21,7 +21,7 @@ from quell.controllers.limits import (
 from quell.controllers.linear.law import LinearLaw, advance_law, checked_law, rest_state
 from quell.controllers.linear.transfer import as_state_space, sampled_law
 from quell.controllers.stateful import StatefulController
-from quell.kernels.dispatch import is_finite, kernel
+from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars, clear
 from quell.types import Channels, Status, Vector
 
@@ -87,7 +87,7 @@ def _control(design: LinearDesign, state: LinearState, r: float, y: float) -> fl
         _set_rest(design, state, loop.y)
         loop.started = 1.0
     unlimited = _unlimited_control(design, state)
-    if not is_finite(unlimited):
+    if not is_usable_control(design.limits, unlimited):
         status |= _OVERFLOWED
         _set_rest(design, state, loop.y)
         unlimited = loop.u
