@@ -289,6 +289,20 @@ def test_importing_quell_imports_nothing_heavy() -> None:
     )
 
 
+def test_help_imports_neither_numpy_nor_anything_heavier() -> None:
+    """Commands import what they need when they run; so the help comes at once."""
+    code = (
+        "import sys, quell.cli\n"
+        "try:\n    quell.cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print([m for m in ('numpy', 'numba', 'scipy', 'matplotlib') if m in sys.modules])"
+    )
+    printed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    assert "quell COMMAND" in printed
+    assert printed.strip().endswith("[]")
+
+
 def test_simulating_imports_neither_plots_nor_files() -> None:
     """They cost a second that a run does not need."""
     code = (

@@ -8,8 +8,6 @@ import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from quell import checks
-
 MAX_SIZE = 256.0
 """Default limit of what a file may unpack to, as arrays of 64-bit numbers or as text [MB].
 
@@ -30,6 +28,8 @@ class TooLargeError(ValueError):
 
 def bytes_of(max_size: float) -> int:
     """Return the argument ``max_size`` [MB] in bytes."""
+    from quell import checks  # it needs NumPy, which the command line imports only to do something
+
     return round(1e6 * checks.positive("max_size", max_size, "MB"))
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from quell.reading import MAX_SIZE
 
 if TYPE_CHECKING:
@@ -44,6 +42,8 @@ def measured(
 
 def _of_run(run: Trajectory) -> Measured:
     """Return the samples of a run under control, with held measurements where one is missing."""
+    import numpy as np
+
     from quell.identification import Measured
     from quell.realtime.loop.modes import Mode
 

@@ -12,8 +12,6 @@ from rich.markup import escape
 
 from quell.cli.options import Outputs
 from quell.cli.output import Column, print_line, table
-from quell.records.measures import MEASURES
-from quell.records.metrics import SETTLING_BAND
 
 if TYPE_CHECKING:
     from quell.quantities import Signals
@@ -47,6 +45,9 @@ def windowed_metrics(run: Trajectory, setup: Setup) -> list[dict[str, Any]]:
 
 def _judged(run: Trajectory, window: dict[str, Any], end: float) -> dict[str, Any]:
     """Return the metrics of a window in a run that should go on until ``end`` [s]."""
+    from quell.records.measures import MEASURES
+    from quell.records.metrics import SETTLING_BAND
+
     start, stop = window.get("start", 0.0), window.get("stop")
     stop = end if stop is None else min(stop, end)
     band = window.get("band", SETTLING_BAND)

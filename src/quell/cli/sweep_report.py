@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
@@ -26,6 +26,8 @@ def summary(found: Sweep, worst: int) -> dict[str, Any]:
 
     The quantiles are those of runs that did not diverge.
     """
+    import numpy as np
+
     from quell.sweeping.figures import QUANTILES
     from quell.sweeping.shares import share_interval
 
@@ -70,7 +72,7 @@ def summary(found: Sweep, worst: int) -> dict[str, Any]:
 
 
 def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    return value if math.isfinite(value) else None
 
 
 def _status(status: int) -> str:
@@ -117,6 +119,8 @@ def stored_alike(
     folder: Path, number: int, name: str, run: Trajectory, measures: Mapping[str, Measure]
 ) -> bool | None:
     """Return whether a run has the measures that a folder has, bit for bit; None without them."""
+    import numpy as np
+
     from quell.sweeping import Sweep
     from quell.sweeping.measures import measure_run
     from quell.sweeping.store import MANIFEST

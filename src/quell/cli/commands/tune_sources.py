@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter
 from rich.console import Console
 
@@ -187,6 +186,8 @@ def from_rig(
 
     The samples are written to the file ``record``, if any.
     """
+    import numpy as np
+
     from quell.commissioning import experiment
     from quell.files import written_atomically
 
