@@ -12,7 +12,7 @@ import quell as ql
 from quell.features import RBF, Bias, Friction, Input, Polynomial, State
 from quell.learners.base import adapt, coefficients, commit, predict, restart
 from quell.learners.least_squares import RlsRule
-from quell.learners.regression.kernels import reset_uncertainty, update_theta
+from quell.learners.regression.kernels import keep_within, reset_uncertainty, update_theta
 from quell.learners.regression.nlms import NlmsRule
 from quell.learners.regression.relearning import (
     RelearningLoop,
@@ -50,6 +50,49 @@ def test_rls_without_forgetting_is_ridge_regression(rng: np.random.Generator) ->
         theta, np.linalg.solve(information, features.T @ targets / rule.noise), atol=1e-11
     )
     np.testing.assert_allclose(memory.covariance, np.linalg.inv(information), atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", ["rls", "selection", "relearning"])
+def test_a_coefficient_at_its_limit_is_that_of_ridge_regression_with_this_limit(
+    kind: str, rng: np.random.Generator
+) -> None:
+    """The others are then those of the regression in which it is known, of all active features."""
+    features, targets = rng.normal(size=(200, 4)), rng.normal(size=200)
+    features[:, 1] += features[:, 3]
+    inner, inner_memory = rls(4)
+    rule, memory, active = inner, inner_memory, [0, 1, 2, 3]
+    if kind == "selection":
+        rule, active = SelectionRule(inner, 0.0, 10**6), [0, 1, 3]
+        memory = selection_memory(rule, 3, 4)
+        memory.active[:] = active
+        memory.inactive[:] = 0.0, 0.0, 1.0, 0.0
+    elif kind == "relearning":
+        rule = relearning_rule(inner, 1e9, dt=0.1, lag_time=2.0, omega_c=50.0)
+        memory = RelearningMemory(inner_memory, RelearningLoop.zeros())
+    theta = taught(rule, memory, features, targets)
+    keep_within(rule, memory, theta, 3, theta[3] - 1.0, theta[3] + 1.0)
+    np.testing.assert_array_equal(theta, free := theta.copy())
+    keep_within(rule, memory, theta, 3, free[3] + 0.3, free[3] + 0.8)
+    assert theta[3] == free[3] + 0.3
+    rest = active[:-1]
+    Phi, known = features[:, rest], targets - theta[3] * features[:, 3]
+    information = np.eye(len(rest)) / inner.prior + Phi.T @ Phi / inner.noise
+    expected = np.linalg.solve(information, Phi.T @ known / inner.noise)
+    np.testing.assert_allclose(theta[rest], expected, atol=1e-11)
+    if kind == "selection":  # an inactive coefficient moves alone
+        keep_within(rule, memory, theta, 2, 5.0, 6.0)
+        assert theta[2] == 5.0
+        np.testing.assert_allclose(theta[rest], expected, atol=1e-11)
+
+
+def test_a_coefficient_without_a_covariance_is_cut_off_alone() -> None:
+    """``NLMS`` has none, and RLS can have lost it by rounding."""
+    for rule, memory in ((NlmsRule(1.0, 1e-2), np.zeros(0)), rls(2)):
+        if isinstance(memory, RlsMemory):
+            memory.covariance[:] = -np.eye(2)
+        theta = np.array([0.5, 2.0])
+        keep_within(rule, memory, theta, 1, -1.0, 1.5)
+        assert theta.tolist() == [0.5, 1.5]
 
 
 def test_rls_learns_less_from_what_is_less_sure(rng: np.random.Generator) -> None:

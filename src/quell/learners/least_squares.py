@@ -32,6 +32,18 @@ class RlsRule(NamedTuple):
 
 
 @kernel
+def excess_share(covariance: Matrix, i: int, j: int) -> float:
+    """Return how much θ_j must change with θ_i, which a limit moves by one: ``P_ij / P_ii``.
+
+    The nearest θ in the metric of P⁻¹, for which the data are as likely as they can be: Simon &
+    Chia, "Kalman filtering with state equality constraints", *IEEE Trans. Aerospace and Electronic
+    Systems* 38, 2002, eq. (13). If θ_i alone were cut off, the error that this leaves would move
+    the others in every sample.
+    """
+    return float(covariance[max(i, j), min(i, j)] / covariance[i, i])
+
+
+@kernel
 def reduce_row(covariance: Matrix, i: int, share: float, gain: Vector) -> None:
     """Subtract ``share · gain`` from row ``i`` of P; after all rows P is less by ``g (Pφ)ᵀ``.
 

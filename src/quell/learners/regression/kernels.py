@@ -5,7 +5,8 @@ The features pass through the observer's own lag filter (``lag.py``), so that
     Δf̂ + f_L^F = θ · φ^F + noise
 
 is a regression without lag bias for any features. A *rule* determines θ: a NamedTuple for whose
-type ``update_theta`` and ``reset_uncertainty`` are registered (``nlms.py``, ``rls.py``).
+type ``update_theta`` and ``reset_uncertainty`` are registered, and ``keep_within`` where it has a
+covariance (``nlms.py``, ``rls.py``).
 
 *Scaling.* States, u and f are divided by powers of two (``features/scaling.py``). When a scale
 grows, θ and the filters are converted; for features that are products of signals this is exact, and
@@ -34,7 +35,7 @@ from numpy.typing import NDArray
 
 from quell.features.scaling import reset_scale, update_scale
 from quell.features.sizes import reset_sizes, write_units
-from quell.kernels.dispatch import generic, is_finite, kernel
+from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
 from quell.kernels.scalars import Scalars, clear
 from quell.kernels.sized import Flag, Size
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart
@@ -68,6 +69,17 @@ def update_theta(
 def reset_uncertainty(rule: Any, memory: Any) -> None:
     """Set the uncertainty of θ back to the prior: the features have changed their meaning."""
     raise TypeError
+
+
+@generic_with_default
+def keep_within(
+    rule: Any, memory: Any, theta: Vector, i: int, lowest: float, highest: float
+) -> None:
+    """Move ``theta`` (p,) so that its coefficient ``i`` is between ``lowest`` and ``highest``.
+
+    The others move as far as they have been estimated together with it.
+    """
+    theta[i] = min(max(theta[i], lowest), highest)
 
 
 class LinearDesign(NamedTuple):
@@ -140,7 +152,7 @@ def _adapt(
         last = theta.size - 1
         in_plant = scale[scale.size - 1] / scale[scale.size - 2]
         low, high = learner.slope_low / in_plant, learner.slope_high / in_plant
-        theta[last] = min(max(theta[last], low), high)
+        keep_within(learner.rule, memory.rule, theta, last, low, high)
 
 
 @kernel

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars, clear
-from quell.learners.regression.kernels import reset_uncertainty, update_theta
+from quell.learners.regression.kernels import keep_within, reset_uncertainty, update_theta
 from quell.types import Vector
 
 # The short time in lags of the observer: the error of one sample is noise. Chosen by hand.
@@ -90,3 +90,15 @@ def _has_changed(rule: RelearningRule, memory: RelearningMemory, error: float) -
 def _reset_uncertainty(rule: RelearningRule, memory: RelearningMemory) -> None:
     clear(memory.loop)
     reset_uncertainty(rule.inner, memory.inner)
+
+
+@keep_within.register(RelearningRule)
+def _keep_within(
+    rule: RelearningRule,
+    memory: RelearningMemory,
+    theta: Vector,
+    i: int,
+    lowest: float,
+    highest: float,
+) -> None:
+    keep_within(rule.inner, memory.inner, theta, i, lowest, highest)

@@ -14,8 +14,8 @@ import numpy as np
 
 from quell import checks
 from quell.features import Features
-from quell.learners.least_squares import RlsRule, least_squares_gain
-from quell.learners.regression.kernels import reset_uncertainty, update_theta
+from quell.learners.least_squares import RlsRule, excess_share, least_squares_gain
+from quell.learners.regression.kernels import keep_within, reset_uncertainty, update_theta
 from quell.learners.regression.linear import Linear
 from quell.learners.regression.relearning import (
     RelearningLoop,
@@ -63,6 +63,18 @@ def _reset_uncertainty(rule: RlsRule, memory: RlsMemory) -> None:
     for i in range(memory.covariance.shape[0]):
         for j in range(memory.covariance.shape[1]):
             memory.covariance[i, j] = rule.prior if i == j else 0.0
+
+
+@keep_within.register(RlsRule)
+def _keep_within(
+    rule: RlsRule, memory: RlsMemory, theta: Vector, i: int, lowest: float, highest: float
+) -> None:
+    within = min(max(theta[i], lowest), highest)
+    excess = theta[i] - within
+    if excess != 0.0 and memory.covariance[i, i] > 0.0:
+        for j in range(theta.size):
+            theta[j] -= excess_share(memory.covariance, i, j) * excess
+    theta[i] = within
 
 
 class RLS(Linear):
