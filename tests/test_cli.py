@@ -293,7 +293,8 @@ def test_help_imports_neither_numpy_nor_anything_heavier() -> None:
     """Commands import what they need when they run; so the help comes at once."""
     code = (
         "import sys, quell.cli\n"
-        "try:\n    quell.cli.main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "sys.argv = ['quell', '--help']\n"
+        "try:\n    quell.cli.main()\nexcept SystemExit:\n    pass\n"
         "print([m for m in ('numpy', 'numba', 'scipy', 'matplotlib') if m in sys.modules])"
     )
     printed = subprocess.run(
@@ -326,5 +327,6 @@ def test_every_public_name_can_be_had() -> None:
     for name in ql.__all__:
         assert getattr(ql, name) is not None
     assert set(ql.__all__) <= set(dir(ql))
+    assert all(name in ql.__all__ or name.startswith("__") for name in dir(ql))
     with pytest.raises(AttributeError, match="has no attribute 'PID2'"):
         ql.PID2  # noqa: B018

@@ -8,9 +8,7 @@ constructors and wrapped methods, those that have optional parameters. A call th
 
 from __future__ import annotations
 
-import difflib
 import functools
-import inspect
 import sys
 from collections.abc import Callable, Iterable
 from types import FunctionType
@@ -38,7 +36,7 @@ def suggesting(value: Any, module: str) -> Any:
     """
     if not _NEEDED:
         return value
-    if inspect.isclass(value) and value.__module__.startswith("quell."):
+    if isinstance(value, type) and value.__module__.startswith("quell."):
         _wrap_constructors(value)
         for base in value.__mro__:
             if base.__module__.startswith("quell."):
@@ -101,6 +99,9 @@ def _wrapper(function: Callable[..., Any]) -> Any:
 
 def _hint(function: Callable[..., Any], given: Iterable[str]) -> str:
     """Return the suggestion of Python 3.13 for the first unknown name, "" if there is none."""
+    import difflib
+    import inspect
+
     parameters = inspect.signature(function).parameters
     unknown = [name for name in given if name not in parameters]
     near = difflib.get_close_matches(unknown[0], [*parameters], n=1) if unknown else ()

@@ -42,7 +42,7 @@ def run_rig(
     trust: Trust = False,
     outputs: RunOutputs = RUN_OUTPUTS,
 ) -> None:
-    """Run a setup in real time around a device, for instance the twin that `quell rig` is.
+    """Run a setup in real time around a device, for instance the twin that quell rig is.
 
     The exit code is 0 where the scenario was run to its end, 3 where a limit or a fault ended it,
     130 after Ctrl-C; u was ramped to zero in each case. It is 2 for an error in the arguments.
