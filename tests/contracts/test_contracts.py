@@ -17,7 +17,13 @@ import quell as ql
 from quell import plants as plant_room
 from quell.controllers.base import control
 from quell.controllers.stateful import named_arrays as _named_arrays
-from quell.kernels.dispatch import call_specialised, compiled, dispatcher_for, interpreted
+from quell.kernels.dispatch import (
+    call_specialised,
+    compiled,
+    dispatcher_for,
+    interpreted,
+    kernel,
+)
 from quell.learners.base import adapt, coefficients, commit, forget, predict, restart, trouble
 from quell.learners.lag import lag_memory, lag_of, lag_push
 from quell.observers.base import acting_control, begin, expected_measurement, observe
@@ -290,6 +296,28 @@ def small_loop() -> SmallLoop:
     return SmallLoop(CHAIN.sampled(0.01), observer.model, lag, lag_memory(lag, 1), *states)
 
 
+@kernel
+def show(loop: SmallLoop, seen: Any, k: int, y: float, f: float, u: float, f_learned: float) -> Any:
+    """Estimate what a learner sees: what is given, or the loop's; return the measurement and f_plain."""
+    if seen.shape[0] > 0:
+        for i in range(loop.seen.size):
+            loop.seen[i] = seen[k, i]
+        return y, f
+    measured = measure(loop.plant, loop.x) + y
+    shown = lag_push(loop.lag, loop.shadow, 0, f_learned)
+    observe(loop.eso, loop.z, loop.seen, measured, u, f_learned)
+    return measured, loop.seen[2] + shown
+
+
+@kernel
+def act(loop: SmallLoop, k: int, constant: float, slope: float) -> Any:
+    """Move the loop's plant by a law without limits, at the reference 0.5; return u and f_learned."""
+    force = 2.25 * (0.5 - loop.seen[0]) - 3.0 * loop.seen[1] - loop.seen[2]
+    u = (force - constant) / (1.5 + slope)
+    advance(loop.plant, loop.x, loop.scratch, 0.01 * k, u, loop.w)
+    return u, constant + slope * u
+
+
 @compiled
 def drive(
     design: Any,
@@ -304,35 +332,26 @@ def drive(
 ) -> None:
     """Show a learner what is given; if no estimates are, ``y`` is noise in a loop around it.
 
-    The loop is that of a law without limits, at the reference 0.5. What is shown estimates forgets
-    halfway, after its θ was read, and restarts after three quarters.
+    What is shown estimates forgets halfway, after its θ was read, and restarts after three
+    quarters. What does not depend on the learner's type is in ``show`` and ``act``, compiled once.
     """
+    given = seen.shape[0] > 0
     applied = f_learned = 0.0
     for k in range(y.size):
-        measured = y[k]
-        if seen.shape[0] > 0:
-            for i in range(loop.seen.size):
-                loop.seen[i] = seen[k, i]
-            f_plain, applied = f[k], u[k]
-        else:
-            measured = measure(loop.plant, loop.x) + y[k]
-            shown = lag_push(loop.lag, loop.shadow, 0, f_learned)
-            observe(loop.eso, loop.z, loop.seen, measured, applied, f_learned)
-            f_plain = loop.seen[2] + shown
+        if given:
+            applied = u[k]
+        measured, f_plain = show(loop, seen, k, y[k], f[k], applied, f_learned)
         adapt(design, memory, loop.seen, measured, applied, f_plain)
         constant, slope = predict(design, memory, loop.seen, applied)
         said[k, 0], said[k, 1], said[k, 2] = constant, slope, trouble(design, memory)
         said[k, 3] = measured
-        if seen.shape[0] == 0:
-            force = 2.25 * (0.5 - loop.seen[0]) - 3.0 * loop.seen[1] - loop.seen[2]
-            applied = (force - constant) / (1.5 + slope)
-            f_learned = constant + slope * applied
-            advance(loop.plant, loop.x, loop.scratch, 0.01 * k, applied, loop.w)
+        if not given:
+            applied, f_learned = act(loop, k, constant, slope)
         commit(design, memory, loop.seen, applied, f_learned)
-        if seen.shape[0] > 0 and 4 * k == 2 * y.size:
+        if given and 4 * k == 2 * y.size:
             coefficients(design, memory, theta)
             forget(design, memory)
-        if seen.shape[0] > 0 and 4 * k == 3 * y.size:
+        if given and 4 * k == 3 * y.size:
             restart(design, memory)
 
 
