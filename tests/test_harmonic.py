@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import quell as ql
+from quell.controllers.stateful import named_arrays
 from quell.learners.kalman.line_fit import (
     add_row,
     begin_pass,
@@ -84,6 +85,44 @@ def test_an_unknown_frequency_is_found_and_the_load_rejected(start: float, truth
     assert run.final_state.learner.omega[0] == pytest.approx(truth, rel=0.01)
     late = run.window(130.0, 140.0)
     assert np.max(np.abs(run["y"][late] - 1.0)) < 0.02 * np.max(np.abs(plain["y"][late] - 1.0))
+
+
+def bounded_run(noise: object) -> ql.Trajectory:
+    """1e5 samples in a loop with a limited u: all of the learner's state is below 1e30."""
+    controller = ql.ADRC(
+        ql.ESO.model_free(4, 1.0, 10.0, 0.01),
+        omega_c=1.0,
+        learner=ql.learners.Harmonic(),
+        u_min=-100.0,
+        u_max=100.0,
+    )
+    scenario = ql.Scenario(0.5, duration=1000.0, noise=noise)
+    run = ql.simulate(
+        ql.plants.two_mass_spring(), controller, scenario, record_every=10, limit=1e30
+    )
+    assert not run.diverged
+    for name, array in named_arrays(run.final_state.learner).items():
+        assert np.all(np.abs(array) < 1e30), name
+    return run
+
+
+def test_it_stays_bounded_without_excitation() -> None:
+    """A constant reference for 1e5 samples: nothing winds up, drifts or leaves the numbers."""
+    run = bounded_run(ql.signals.BandLimitedNoise(1e-12, 0.01))
+    assert np.max(np.abs(run["y"][run.t >= 100.0] - 0.5)) < 1e-2
+    for name, array in named_arrays(run.final_state.learner).items():
+        assert np.all(np.abs(array) < 1e6), name
+
+
+def test_it_stays_bounded_whatever_it_is_shown(rng: np.random.Generator) -> None:
+    """1e5 measurements with errors of very different size: state and output stay finite and repeatable."""
+    size = np.repeat(10.0 ** rng.uniform(-6.0, 3.0, 100), 1000)
+    size *= np.where(rng.random(size.size) < 1e-3, 1e3, 1.0)
+    wild = ql.signals.Samples(0.01 * np.arange(size.size), size * rng.normal(size=size.size))
+    first, again = bounded_run(wild), bounded_run(wild)
+    np.testing.assert_array_equal(first.log, again.log)
+    assert np.all(np.isfinite(first.log))
+    assert np.max(np.abs(first["f_learned"])) > 1.0, "it said nothing: the test says nothing"
 
 
 def test_sinusoids_closer_than_a_line_width_are_separated_by_the_search() -> None:

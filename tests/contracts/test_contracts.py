@@ -367,9 +367,10 @@ def driven(entry: Any, name: str, seen: Any, y: Any, u: Any, f: Any) -> tuple[An
 
 compiled_drive = partial(call_specialised, drive)
 
-# The code of the first two is a part of the code of those with u; the features of the others are
-# compiled in test_features, and their learners are here with other features.
-LESS = ("RLS", "Kalman", "NLMS on random features", "gradient on radial features")
+# The code of the first two is a part of the code of those with u, that of the third one of the code
+# with a search (test_harmonic has its long runs); the features of the others are compiled in
+# test_features, and their learners are here with other features.
+LESS = ("RLS", "Kalman", "Harmonic", "NLMS on random features", "gradient on radial features")
 TO_DRIVE = [name for name in LEARNERS if name not in LESS]
 # All kinds of learners, each with one set of features.
 OTHER_FEATURES = ("with u", "on the strongest", "radial features", "random features")
