@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -482,17 +483,23 @@ def _learn(model: ExplodesDesign, memory: Memory, features: Any, target: float) 
 
 SCENARIO = ql.Scenario(
     ql.signals.Sinusoid(omega=1.5),
-    duration=8.0,
+    duration=5.0,
     disturbances=(),
     noise=ql.signals.BandLimitedNoise(1e-12, 0.01),
 )
+
+
+@cache
+def plain_run() -> ql.Trajectory:
+    """The run without learner."""
+    return ql.simulate(CHAIN, law(None), SCENARIO)
 
 
 @pytest.mark.parametrize("then", [math.inf, -math.inf, math.nan, 1e300, -1e12, 1e5])
 def test_a_model_that_explodes_is_cut_off(then: float) -> None:
     """The loop is as good as without learner, and the run says why."""
     run = ql.simulate(CHAIN, law(ql.learners.Online(Explodes(then)), guard=ql.Guard()), SCENARIO)
-    plain = ql.simulate(CHAIN, law(None), SCENARIO)
+    plain = plain_run()
     late = run.t > 3.0
     assert (
         np.sqrt(np.mean((run["y"] - run["r"])[late] ** 2))
@@ -518,7 +525,7 @@ def test_a_python_model_that_breaks_in_a_guarded_loop_leaves_a_plain_one(then: A
         with pytest.warns(RuntimeWarning, match="learner Broken raised"):
             run = ql.simulate(CHAIN, guarded, SCENARIO, interpret=True)
         assert Status.LEARNER_FAILED in run.status
-    plain = ql.simulate(CHAIN, law(None), SCENARIO)
+    plain = plain_run()
     assert np.max(np.abs(run["y"] - run["r"])) <= 1.05 * np.max(np.abs(plain["y"] - plain["r"]))
     assert not run.diverged
     assert OBSERVER.dt == run.dt

@@ -36,7 +36,7 @@ def error(name: str) -> float:
     """
     s = ql.signals
     controller = ql.ADRC(
-        ql.ESO.model_free(order=2, b0=2.0, omega_o=30.0, dt=5e-3),
+        ql.ESO.model_free(order=2, b0=2.0, omega_o=30.0, dt=1e-2),
         omega_c=OMEGA_C,
         learner=LEARNERS[name],
     )

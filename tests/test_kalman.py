@@ -91,7 +91,7 @@ def test_the_kalman_learner_finds_a_wrong_gain() -> None:
     )
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.5]], [0.0, 2.0], [1.0, 0.0])
     controller = ql.ADRC(
-        ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=5e-3),
+        ESO.model_free(order=2, b0=1.0, omega_o=20.0, dt=1e-2),
         omega_c=4.0,
         learner=ql.learners.Kalman(
             u=True, bias=True, bias_bandwidth=0.05, gain_interval=(0.3, 3.0)

@@ -79,7 +79,7 @@ def test_loops_are_drawn_within_their_ranges(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("kind", stress.KINDS)
 def test_every_kind_of_adversary_runs_as_it_was_drawn(kind: str, rng: np.random.Generator) -> None:
     """Each draw is another learner, with a short run to show."""
-    loop = stress.draw_loops(1, rng)[0]
+    loop = replace(stress.draw_loops(1, rng)[0], dt=1e-2)
     one, other = (stress.draw_adversary(kind, rng) for _ in range(2))
     assert repr(one) != repr(other)
     run = ql.simulate(

@@ -14,7 +14,7 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse
-from quell.experiments.stress.general import attacks, measures, trial
+from quell.experiments.stress.general import attacks, measures, named, trial
 from quell.experiments.stress.general.cross_entropy import search
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop, loads, references
 from quell.experiments.stress.general.loops.plant import GeneralPlant
@@ -195,8 +195,9 @@ def test_exact_weights_are_those_of_f() -> None:
     assert weights["load"] == 1.0
 
 
-def test_a_perfect_learner_removes_the_load() -> None:
-    """All but a thousandth without guard; with it, more than half."""
+def test_a_perfect_learner_removes_the_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but a thousandth without guard; with it, more than half; in 200 of the trial's 300 lags."""
+    monkeypatch.setattr(named, "_PERFECT_LAGS", 200.0)
     case = perfect_case(1, "sine", ql.Guard(), 0)
     assert case.unguarded < 1e-3 * case.plain
     assert case.lost_share < 0.5

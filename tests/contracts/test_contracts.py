@@ -506,7 +506,7 @@ def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
 @pytest.mark.parametrize("form", ["current", "predictor"])
 def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
     """The loop is stable and ends where it should."""
-    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.02, form=form)
+    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.025, form=form)
     run = ql.simulate(
         CHAIN,
         ql.ADRC(observer, omega_c=1.5, learner=LEARNERS[name]),
