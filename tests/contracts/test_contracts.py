@@ -236,7 +236,8 @@ def test_a_guarded_learner_runs_the_same_again_and_interpreted() -> None:
 
     So it is without a guard and with other learners, whose functions are compared below.
     """
-    check_run(CHAIN, law_for(CHAIN, learner=LEARNERS["Kalman"], guard=ql.Guard(time=0.5)), SHORT)
+    guarded = law_for(CHAIN, learner=LEARNERS["Kalman with u"], guard=ql.Guard(time=0.5))
+    check_run(CHAIN, guarded, SHORT)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
