@@ -117,7 +117,11 @@ class Regression:
         self.theta += self.step(phi, error, share) * self.units * self.scale[3]
         if self.learner.features.has_input:
             low, high = self.learner.gain_interval
-            self.theta[-1] = np.clip(self.theta[-1], B0 * (low - 1.0), B0 * (high - 1.0))
+            within = np.clip(self.theta[-1], B0 * (low - 1.0), B0 * (high - 1.0))
+            if not isinstance(self.learner, ql.learners.NLMS):  # the nearest θ in the metric of 1/P
+                excess = (self.theta[-1] - within) / self.units[-1]
+                self.theta -= self.P[:, -1] / self.P[-1, -1] * excess * self.units
+            self.theta[-1] = within
 
     def step(self, phi: np.ndarray, error: float, share: float) -> np.ndarray:
         """Return the change of the scaled θ."""
