@@ -94,12 +94,14 @@ def test_what_a_linear_model_learns_has_no_lag_bias(library: str, form: str) -> 
             lambda m: [m.weights[0], m.weights[1]],
         )
     learner, read = make[library]()
-    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=15.0, dt=5e-3, form=form)
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=15.0, dt=1e-2, form=form)
     scenario = ql.Scenario(
         reference=ql.signals.Sinusoid(omega=1.0) + ql.signals.Sinusoid(0.3, omega=1.7),
         duration=120.0,
     )
-    run = ql.simulate(plant, ql.ADRC(observer, omega_c=4.0, learner=learner), scenario)
+    run = ql.simulate(
+        plant, ql.ADRC(observer, omega_c=4.0, learner=learner), scenario, interpret=True
+    )
     theta = np.array(read(learner.trained(run.final_state.learner))) * scale[3] / scale[:2]
     np.testing.assert_allclose(theta, [-6.0, -1.0], rtol=0.02, atol=0.05)
 
@@ -116,9 +118,8 @@ def test_the_model_is_called_once_a_period_with_all_pairs_since() -> None:
     """The first call has one pair, each other a period's."""
     for period in (1, 7):
         learner = PythonModel(Counter(), period=period, scale=np.ones(4))  # which does not grow
-        run = ql.simulate(
-            CHAIN, law(learner), ql.Scenario(reference=ql.signals.Sinusoid(), duration=3.0)
-        )
+        scenario = ql.Scenario(reference=ql.signals.Sinusoid(), duration=3.0)
+        run = ql.simulate(CHAIN, law(learner), scenario, interpret=True)
         batches = learner.trained(run.final_state.learner).batches
         assert set(batches[1:]) == {period}
         assert batches[0] == 1

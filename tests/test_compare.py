@@ -17,8 +17,6 @@ from quell.experiments.compare import FORCE, FORCE_AT, Benchmark
 
 from .commands import Shown
 
-pytestmark = pytest.mark.compiled
-
 LAG = ql.plants.LinearPlant([[-1.0]], [1.0], [1.0])
 
 
@@ -71,6 +69,7 @@ def test_a_run_that_diverges_is_shown_as_one() -> None:
     assert axes[0].get_ylim()[1] < 1e5
 
 
+@pytest.mark.compiled
 def test_the_benchmarks_controllers_are_stable_and_do_what_they_are_there_for() -> None:
     """At 5 ms. No model: MF-ESO rejects the load to a fiftieth of PID. LQG and MB-ESO alike. PID is slow."""
     result = compare.two_mass(Benchmark(dt=5e-3), [*compare.NAMES, "zv+lqg"])
@@ -119,6 +118,7 @@ def test_a_mistake_is_named(wrong: object, message: str) -> None:
         wrong()  # type: ignore[operator]
 
 
+@pytest.mark.compiled
 def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,6 +150,7 @@ def test_an_unstable_loop_is_called_one_and_its_numbers_fit(
     }
 
 
+@pytest.mark.compiled
 def test_what_is_proved_of_a_guarded_learner_is_told_for_the_real_plant(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -169,6 +170,7 @@ def test_what_is_proved_of_a_guarded_learner_is_told_for_the_real_plant(
     assert "guarded-l-eso: no certificate" in shown
 
 
+@pytest.mark.compiled
 def test_the_comparison_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -214,6 +216,7 @@ def test_the_gains_of_a_loop_are_the_largest_ones_of_its_responses() -> None:
     assert compare.sensitivities(DOUBLE_LAG, ql.baselines.PID(-1.0, dt=0.002)) is None
 
 
+@pytest.mark.compiled
 def test_a_reference_model_takes_the_overshoot_out_of_a_step() -> None:
     """It settles sooner than with half of its bandwidth; a loop without overshoot gets none."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [0.0, -0.5]], [0.0, 2.0], [1.0, 0.0])

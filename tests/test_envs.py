@@ -336,7 +336,7 @@ def test_compiled_loops_in_threads_agree_with_plain_python() -> None:
     """To rounding, as products may be fused; in two threads exactly as in one."""
     rewards = []
     for options in ({"workers": 2}, {"workers": 1}):
-        env = VectorEnv(130, two_mass_spring(), NOISY, law(Policy(most=2.0), ql.Guard()), **options)
+        env = VectorEnv(130, two_mass_spring(), NOISY, law(Policy(most=2.0)), **options)
         observations, _ = env.reset(seed=0)
         rng, total = np.random.default_rng(1), np.zeros(130)
         for _ in range(30):
@@ -345,7 +345,7 @@ def test_compiled_loops_in_threads_agree_with_plain_python() -> None:
         rewards.append(total)
         env.close()
     assert np.array_equal(*rewards)
-    slow = residual(interpret=True)
+    slow = Env(two_mass_spring(), NOISY, law(Policy(most=2.0)), interpret=True)
     slow.reset(seed=129)
     rng = np.random.default_rng(1)
     for _ in range(30):
