@@ -160,10 +160,10 @@ def tune_by_simulation(
     uncertain, count, seed = how.get("uncertain"), how.get("samples", 20), how.get("seed", 0)
     box = None if uncertain is None else Uncertain(plant, uncertain)
     parts = _linear_parts(plant, box)
-    found = linear(parts, **how, objective="load")
     plants = as_list(plant) if box is None else box.plants(box.design_set(count, seed))
     plants = [LinearPlant.of(p) if is_linear_model(p) else p for p in plants]
     problem = Problem.of_runs(plants, scenario, objective)
+    found = linear(parts, **how, objective="load")
     assert found.design.solution is not None  # ``tune`` returns no other design
     limits = found.task.u
     build = Build(found.design.solution.structure, limits)
