@@ -281,30 +281,28 @@ def test_a_command_can_be_run_twice_and_replaces_where_asked(
     assert (tmp_path / "u.csv").read_bytes() != old
 
 
+def printed_by(code: str) -> str:
+    """Return what a new Python process prints."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
 def test_importing_quell_imports_nothing_heavy() -> None:
     """Numba, scipy, xarray, matplotlib and python-control come when they are used."""
     code = "import sys, quell; print([m for m in ('numba', 'scipy', 'xarray', 'matplotlib', 'control', 'numpy') if m in sys.modules])"
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        == "[]"
-    )
+    assert printed_by(code) == "[]"
 
 
 def test_help_imports_neither_numpy_nor_anything_heavier() -> None:
     """Commands import what they need when they run; so the help comes at once."""
-    code = (
+    printed = printed_by(
         "import sys, quell.cli\n"
         "sys.argv = ['quell', '--help']\n"
         "try:\n    quell.cli.main()\nexcept SystemExit:\n    pass\n"
         "print([m for m in ('numpy', 'numba', 'scipy', 'matplotlib') if m in sys.modules])"
     )
-    printed = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout
     assert "quell COMMAND" in printed
-    assert printed.strip().endswith("[]")
+    assert printed.endswith("[]")
 
 
 def test_simulating_imports_neither_plots_nor_files() -> None:
@@ -315,12 +313,7 @@ def test_simulating_imports_neither_plots_nor_files() -> None:
         "print([m for m in ('xarray', 'matplotlib', 'control', 'rich', 'pydantic') if m in "
         "sys.modules])"
     )
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        == "[]"
-    )
+    assert printed_by(code) == "[]"
 
 
 def test_every_public_name_can_be_had() -> None:

@@ -5,7 +5,7 @@ The features pass through the observer's own lag filter (``lag.py``), so that
     Δf̂ + f_L^F = θ · φ^F + noise
 
 is a regression without lag bias for any features. A *rule* determines θ: a NamedTuple for whose
-type ``update_theta`` and ``reset_uncertainty`` are registered, and ``keep_within`` where it has a
+type ``update_theta`` and ``reset_uncertainty`` are registered, and ``share_excess`` where it has a
 covariance (``nlms.py``, ``rls.py``).
 
 *Scaling.* States, u and f are divided by powers of two (``features/scaling.py``). When a scale
@@ -72,14 +72,23 @@ def reset_uncertainty(rule: Any, memory: Any) -> None:
 
 
 @generic_with_default
+def share_excess(rule: Any, memory: Any, theta: Vector, i: int, excess: float) -> None:
+    """Move the other coefficients of ``theta`` (p,) as a limit takes ``excess`` from the one at i.
+
+    A rule without a covariance does not know how they belong together: they stay.
+    """
+
+
+@kernel
 def keep_within(
     rule: Any, memory: Any, theta: Vector, i: int, lowest: float, highest: float
 ) -> None:
-    """Move ``theta`` (p,) so that its coefficient ``i`` is between ``lowest`` and ``highest``.
-
-    The others move as far as they have been estimated together with it.
-    """
-    theta[i] = min(max(theta[i], lowest), highest)
+    """Move ``theta`` (p,) so that its coefficient ``i`` is between ``lowest`` and ``highest``."""
+    within = min(max(theta[i], lowest), highest)
+    excess = theta[i] - within
+    if excess != 0.0:
+        share_excess(rule, memory, theta, i, excess)
+    theta[i] = within
 
 
 class LinearDesign(NamedTuple):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars, clear
-from quell.learners.regression.kernels import keep_within, reset_uncertainty, update_theta
+from quell.learners.regression.kernels import reset_uncertainty, share_excess, update_theta
 from quell.types import Vector
 
 # The short time in lags of the observer: the error of one sample is noise. Chosen by hand.
@@ -92,13 +92,8 @@ def _reset_uncertainty(rule: RelearningRule, memory: RelearningMemory) -> None:
     reset_uncertainty(rule.inner, memory.inner)
 
 
-@keep_within.register(RelearningRule)
-def _keep_within(
-    rule: RelearningRule,
-    memory: RelearningMemory,
-    theta: Vector,
-    i: int,
-    lowest: float,
-    highest: float,
+@share_excess.register(RelearningRule)
+def _share_excess(
+    rule: RelearningRule, memory: RelearningMemory, theta: Vector, i: int, excess: float
 ) -> None:
-    keep_within(rule.inner, memory.inner, theta, i, lowest, highest)
+    share_excess(rule.inner, memory.inner, theta, i, excess)

@@ -15,7 +15,7 @@ import numpy as np
 from quell import checks
 from quell.features import Features
 from quell.learners.least_squares import RlsRule, excess_share, least_squares_gain
-from quell.learners.regression.kernels import keep_within, reset_uncertainty, update_theta
+from quell.learners.regression.kernels import reset_uncertainty, share_excess, update_theta
 from quell.learners.regression.linear import Linear
 from quell.learners.regression.relearning import (
     RelearningLoop,
@@ -65,16 +65,11 @@ def _reset_uncertainty(rule: RlsRule, memory: RlsMemory) -> None:
             memory.covariance[i, j] = rule.prior if i == j else 0.0
 
 
-@keep_within.register(RlsRule)
-def _keep_within(
-    rule: RlsRule, memory: RlsMemory, theta: Vector, i: int, lowest: float, highest: float
-) -> None:
-    within = min(max(theta[i], lowest), highest)
-    excess = theta[i] - within
-    if excess != 0.0 and memory.covariance[i, i] > 0.0:
+@share_excess.register(RlsRule)
+def _share_excess(rule: RlsRule, memory: RlsMemory, theta: Vector, i: int, excess: float) -> None:
+    if memory.covariance[i, i] > 0.0:
         for j in range(theta.size):
             theta[j] -= excess_share(memory.covariance, i, j) * excess
-    theta[i] = within
 
 
 class RLS(Linear):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from quell.kernels.dispatch import kernel
 from quell.kernels.scalars import Scalars
 from quell.learners.least_squares import RlsRule, excess_share, least_squares_gain
-from quell.learners.regression.kernels import keep_within, reset_uncertainty, update_theta
+from quell.learners.regression.kernels import reset_uncertainty, share_excess, update_theta
 from quell.types import Matrix, Vector
 
 # An inactive feature must be so many times stronger than the active one that it replaces: less, and
@@ -136,20 +136,12 @@ def _reset_uncertainty(rule: SelectionRule, memory: SelectionMemory) -> None:
             memory.covariance[i, j] = rule.rls.prior if i == j else 0.0
 
 
-@keep_within.register(SelectionRule)
-def _keep_within(
-    rule: SelectionRule,
-    memory: SelectionMemory,
-    theta: Vector,
-    i: int,
-    lowest: float,
-    highest: float,
+@share_excess.register(SelectionRule)
+def _share_excess(
+    rule: SelectionRule, memory: SelectionMemory, theta: Vector, i: int, excess: float
 ) -> None:
-    within = min(max(theta[i], lowest), highest)
-    excess = theta[i] - within
     for k in range(memory.active.size):
-        if excess != 0.0 and int(memory.active[k]) == i and memory.covariance[k, k] > 0.0:
+        if int(memory.active[k]) == i and memory.covariance[k, k] > 0.0:
             for j in range(memory.active.size):
                 share = excess_share(memory.covariance, k, j)
                 theta[int(memory.active[j])] -= share * excess
-    theta[i] = within
