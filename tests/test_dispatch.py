@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numba.core import event
 from numba.core.errors import NumbaError
 
 from quell.controllers.base import control
@@ -264,6 +265,32 @@ def test_a_kernel_prints_and_raises_in_what_it_is_inlined_into(
     assert capsys.readouterr().out == "it was 1.0\n"
     with pytest.raises(ValueError, match="too much"):
         prints.uncached(3.0)
+
+
+@dispatch.kernel
+def _tripled(value: float) -> float:
+    return 3.0 * value
+
+
+@dispatch.compiled
+def triple(value: float) -> float:
+    """Run without the interpreter lock."""
+    return _tripled(value)
+
+
+@dispatch.compiled_call
+def triple_in_a_short_call(value: float) -> float:
+    """Keep the interpreter lock."""
+    return _tripled(value)
+
+
+def test_all_kinds_of_entry_points_share_a_compiled_kernel() -> None:
+    """What a simulation compiled of a controller is there for its ``step``."""
+    with event.install_recorder("numba:compile") as recorder:
+        assert triple.uncached(1.0) == triple_in_a_short_call.uncached(1.0) == 3.0
+    compiled = [what.data["dispatcher"].py_func for _, what in recorder.buffer if what.is_start]
+    assert compiled.count(_tripled) == 1
+    assert len(compiled) == 3
 
 
 def test_a_packed_controller_has_the_parameters_and_the_state_of_the_interpreted_one() -> None:

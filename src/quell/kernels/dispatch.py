@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import FunctionType
-from typing import Any, ParamSpec, Protocol, TypeVar, cast
+from typing import Any, NoReturn, ParamSpec, Protocol, TypeVar, cast
 
 import numba
 import numpy as np
@@ -32,7 +32,7 @@ from numba.extending import overload, register_jitable
 import quell.kernels.compile_time  # noqa: F401  (counts from the first compilation on)
 from quell.kernels.cache import code_cache
 from quell.kernels.functions import is_single
-from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS, WithoutOverlaps
+from quell.kernels.linking import KERNEL_OPTIONS, OPTIONS, EntryCompiler, WithoutOverlaps
 from quell.kernels.overlaps import overlap
 from quell.kernels.sized import layout_of, type_of
 from quell.kernels.user_types import add_user_type, uses_user_types
@@ -82,16 +82,17 @@ def generic(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
     name = declaration.__name__
     table: dict[type | None, Callable[..., Any]] = {}
 
+    def refuse(cls: type) -> NoReturn:
+        raise TypeError(
+            f"{name}() has no implementation for {cls.__name__}; register one with "
+            f"@{name}.register({cls.__name__}) before the first run"
+        )
+
     @functools.wraps(declaration)
-    def call(head: Any, *rest: Any) -> Any:
-        implementation = table.get(type(head)) or table.get(object)
-        if implementation is None:
-            cls = type(head).__name__
-            raise TypeError(
-                f"{name}() has no implementation for {cls}; register one with "
-                f"@{name}.register({cls}) before the first run"
-            )
-        return implementation(head, *rest)
+    def call(*arguments: Any) -> Any:
+        cls = type(arguments[0])
+        implementation = table.get(cls) or table.get(object) or refuse(cls)
+        return implementation(*arguments)
 
     def resolve(head: Any, *rest: Any) -> Any:
         is_named_tuple = isinstance(head, nb_types.BaseNamedTuple)
@@ -284,7 +285,7 @@ def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _dispatcher(function: Any, **options: Any) -> Any:
     """Return a dispatcher with a disk cache if possible; its ``uncached`` is one without."""
-    options |= OPTIONS
+    options = {"pipeline_class": EntryCompiler} | OPTIONS | options
     dispatcher = numba.njit(function, **options)
     dispatcher.uncached, dispatcher.specialised = dispatcher, {}
     dispatcher.plain = _plain(function)

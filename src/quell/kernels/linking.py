@@ -15,10 +15,13 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 from llvmlite import ir
+from numba._dynfunc import make_function
+from numba.core.cgutils import normalize_ir_text
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
-from numba.core.typed_passes import AnnotateTypes
+from numba.core.targetconfig import ConfigStack
+from numba.core.typed_passes import AnnotateTypes, NativeLowering
 from numba.core.untyped_passes import IRProcessing
 
 from quell.kernels.single_literals import SingleLiterals
@@ -29,6 +32,16 @@ _ENVIRONMENT = "_ZN08NumbaEnv"
 
 class KernelLibrary(JITCodeLibrary):
     """The code of a kernel, to be linked into other code."""
+
+    uses_environment = False  # whether its own code does
+
+    def add_ir_module(self, ir_module: ir.Module) -> None:
+        """Do as Numba does; see whether more of the environment is there than its declaration."""
+        text = normalize_ir_text(str(ir_module))
+        self.uses_environment |= text.count(_ENVIRONMENT) > 1
+        ll_module = llvm.parse_assembly(text)
+        ll_module.name = ir_module.name
+        self.add_llvm_module(ll_module)
 
     def _optimize_functions(self, ll_module: Any) -> None:
         """Do as Numba does, but not for declarations: most of a module are the kernels it calls."""
@@ -42,6 +55,13 @@ class KernelLibrary(JITCodeLibrary):
         """Do nothing: the entry point is optimised as a whole."""
 
     def _finalize_final_module(self) -> None:
+        """Make no machine code; add the environment variables to the engine if they are used."""
+        self._finalize_dynamic_globals()
+        if self.uses_environment:
+            self._add_environments()
+        self._finalized = True
+
+    def _add_environments(self) -> None:
         """Add only the environment variables to the engine: Numba sets each of them once."""
         variables = self._codegen._create_empty_module(f"{self.name}.variables")
         pointer = ir.IntType(8).as_pointer()
@@ -49,16 +69,9 @@ class KernelLibrary(JITCodeLibrary):
             if variable.name.startswith(_ENVIRONMENT):
                 declared = ir.GlobalVariable(variables, pointer, variable.name)
                 declared.linkage, declared.initializer = "common", ir.Constant(pointer, None)
-        self._finalize_dynamic_globals()
         cleanup = self._codegen._add_module(llvm.parse_assembly(str(variables)))
         if cleanup:
             weakref.finalize(self, cleanup)
-        self._finalized = True
-
-    def get_pointer_to_function(self, name: str) -> int:
-        """Return zero: Python can not call a kernel."""
-        self._ensure_finalized()
-        return 0
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)
@@ -73,20 +86,60 @@ class _UseKernelLibrary(AnalysisPass):
         return False
 
 
+@register_pass(mutates_CFG=False, analysis_only=True)
+class _FinishKernel(AnalysisPass):
+    """What Numba does after the lowering of code that Python calls, for code that it does not."""
+
+    _name = "finish_kernel"
+
+    def __init__(self) -> None:
+        AnalysisPass.__init__(self)
+
+    def run_pass(self, state: Any) -> bool:
+        lowered, library, target = state.cr, state.library, state.targetctx
+        library.finalize()
+        module, name = lowered.fndesc.lookup_module(), lowered.fndesc.qualname
+        handle = make_function(module, name, "a kernel", 0, lowered.env, (library,))
+        if library.uses_environment:
+            library.codegen.set_env(target.get_env_name(lowered.fndesc), lowered.env)
+        target.insert_user_function(handle, lowered.fndesc, [library])
+        state.reload_init.extend(library._reload_init)
+        state.cr = lowered._replace(cfunc=handle)
+        return False
+
+
 class KernelCompiler(CompilerBase):
     """Numba's compiler, writing to a ``KernelLibrary``."""
 
     def define_pipelines(self) -> list[Any]:
         """Return Numba's passes, with single literals, and the library replaced."""
+        self.state.flags.no_compile = True
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.add_pass_after(SingleLiterals, IRProcessing)
         passes.add_pass_after(_UseKernelLibrary, AnnotateTypes)
+        passes.add_pass_after(_FinishKernel, NativeLowering)
         passes.finalize()
         return [passes]
 
 
-class WithoutOverlaps(CompilerBase):
-    """Numba's compiler for an entry point that writes to no memory which it reaches in two ways.
+class EntryCompiler(CompilerBase):
+    """Numba's compiler for an entry point, which shares the kernels that it calls.
+
+    In Numba's table of compiled functions, the flags of their caller are a part of the key. How
+    Python calls an entry point says nothing about what it calls: without these flags, kernels are
+    not compiled again for an entry point that keeps the interpreter lock.
+    """
+
+    def define_pipelines(self) -> list[Any]:
+        """Return Numba's passes."""
+        of_callees = ConfigStack.top_or_none()  # a copy of the flags, which callees inherit from
+        of_callees.discard("release_gil")
+        of_callees.no_cpython_wrapper = of_callees.no_cfunc_wrapper = True
+        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
+
+
+class WithoutOverlaps(EntryCompiler):
+    """The compiler for an entry point that writes to no memory which it reaches in two ways.
 
     LLVM may then keep in registers what it has read, although the code writes to other arrays.
     """
@@ -94,7 +147,7 @@ class WithoutOverlaps(CompilerBase):
     def define_pipelines(self) -> list[Any]:
         """Return Numba's passes."""
         self.state.flags.noalias = True
-        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
+        return super().define_pipelines()
 
 
 # Options for ``overload`` and ``register_jitable``. They depend on internals of Numba: with
