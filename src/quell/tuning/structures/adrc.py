@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,13 @@ class Form:
     half_law: bool = False
     based: bool = False
     knows_delay: bool = False
+
+
+class _Designed(NamedTuple):
+    """Designs for values (m, p): one for neighbouring rows that differ in b0 only."""
+
+    designs: sampled_adrc.Designs
+    of_row: NDArray[np.intp]  # number of the design of each row (m,)
 
 
 class AdrcStructure:
@@ -193,39 +200,45 @@ class AdrcStructure:
                 found.append([b0, omega_c, float(infinite * beside)])
         return np.array(found).reshape(-1, 3)
 
-    def _designs(self, values: Matrix) -> sampled_adrc.Designs:
+    def _designs(self, values: Matrix) -> _Designed:
         key = values.tobytes()
         if key != self._last[0]:  # response and integral gain are asked for in turn
             self._last = key, self._made(values)
         return self._last[1]
 
-    def _made(self, values: Matrix) -> sampled_adrc.Designs:
+    def _made(self, values: Matrix) -> _Designed:
         law, observer = self.poles(values)
         gains = sampled_adrc.coefficients(law) * (0.5 if self.form.half_law else 1.0)
-        return sampled_adrc.designs(
+        is_new = np.ones(len(values), dtype=bool)
+        is_new[1:] = np.any(values[1:, 1:] != values[:-1, 1:], axis=1)
+        found = sampled_adrc.designs(
             self._chain,
             gains,
             observer,
+            np.flatnonzero(is_new),
             reduced=self.form.reduced,
             half_gain=self.form.half_observer,
             delay=self._delay,
         )
+        return _Designed(found, np.cumsum(is_new) - 1)
 
     def response(self, values: Matrix, omega: Vector) -> Complex:
         """Return C_y (m, k)."""
-        found = self._designs(values)
-        factor = self.model.sign * found.factor / values[:, 0]
-        response: Complex = factor[:, None] * sampled_adrc.feedback(found, omega)
+        found, of_row = self._designs(values)
+        factor = self.model.sign * found.factor[of_row] / values[:, 0]
+        response: Complex = factor[:, None] * sampled_adrc.feedback(found, omega)[of_row]
         return response
 
     def integral_gain(self, values: Matrix) -> Vector:
         """Return k_i (m,)."""
-        found = self._designs(values)
-        return sampled_adrc.integral_gain(found) * found.factor / values[:, 0]
+        found, of_row = self._designs(values)
+        gain: Vector = (found.integral_gain * found.factor)[of_row] / values[:, 0]
+        return gain
 
     def unstable_poles(self, values: Matrix) -> Vector:
         """Return how many poles of C_y are unstable (m,)."""
-        return sampled_adrc.unstable_poles(self._designs(values))
+        found, of_row = self._designs(values)
+        return sampled_adrc.unstable_poles(found)[of_row]
 
     def rules(self, values: Matrix) -> Matrix:
         """Return ``1 − 2 ζ ω/R + (ω/R)²`` of each pair: negative if one real pole is beyond R.

@@ -21,7 +21,9 @@ residue is ``K v · w L / (w M'(0) v)``, from which the integral gain follows. A
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +81,8 @@ def _placing(difference: Matrix) -> Matrix:
     return np.array(found[::-1])
 
 
-class Designs(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Designs:
     """m designs in coordinates of similar size."""
 
     gain: Matrix  # L (m, N)
@@ -90,11 +93,23 @@ class Designs(NamedTuple):
     delay: int
     dt: float
 
+    @cached_property
+    def integral_gain(self) -> Vector:
+        """``k_i b0 / ω^r`` (m,)."""
+        left, _, right = np.linalg.svd(self.base + self.closing)
+        v, w = right[:, -1, :], left[:, :, -1]
+        slope = np.eye(v.shape[1]) - self.delay * self.closing
+        inner = np.einsum("mi,mij,mj->m", w, slope, v)
+        through = np.sum(self.law * v, axis=1) * np.sum(w * self.gain, axis=1)
+        gain: Vector = through / inner / self.dt
+        return gain
+
 
 def designs(
     chain: SampledChain,
     law: Matrix,
     poles: NDArray[np.complex128],
+    kept: NDArray[np.intp],
     *,
     reduced: bool = False,
     half_gain: bool = False,
@@ -102,32 +117,36 @@ def designs(
 ) -> Designs:
     """Return designs with law gains k (m, r) and observer poles (m, N), or (m, N − 1) if reduced.
 
-    ``delay`` is the known delay of u [samples].
+    ``kept`` are the numbers of those to return: not by itself, because in a product of matrices a
+    single row has other rounding. ``delay`` is the known delay of u [samples].
     """
     count, size = law.shape[0], chain.power.size
-    omega = np.exp(np.mean(np.log(np.abs(poles)), axis=1))
+    omega = np.exp(np.sum(np.log(np.abs(poles)), axis=1) / poles.shape[1])
     step = omega * chain.dt
     power = chain.power
-    difference = chain.difference * step[:, None, None] ** (power[None, :] - power[:, None])
     offsets = -np.expm1(poles * chain.dt)
     if reduced:
         offsets = np.hstack([offsets, np.ones((count, 1))])
-    gain = monic(-offsets) @ chain.placing * step[:, None] ** -power
+    gain = monic(-offsets) @ chain.placing
+    gain, law, omega, step = gain[kept], law[kept], omega[kept], step[kept]
+    gain *= step[:, None] ** -power
     if reduced:
         gain[:, 0] = 1.0
     if half_gain:
-        gain = 0.5 * gain
-    K = np.zeros((count, size))
+        gain *= 0.5
+    K = np.zeros((kept.size, size))
     K[:, : law.shape[1]] = law
     K[:, :-1] -= chain.cancel
     K[:, -1] = chain.cancel_f
     K *= omega[:, None] ** (power - chain.degree)
+    correct = np.empty((kept.size, size, size))  # I − L c
+    correct[:] = np.eye(size)
+    correct[:, :, 0] -= gain
     column = chain.input * step[:, None] ** (chain.degree - power)
-    Lc = np.zeros_like(difference)
-    Lc[:, :, 0] = gain
-    correct = np.eye(size) - Lc
     closing = (correct @ column[:, :, None]) * K[:, None, :]
-    base = Lc - correct @ difference
+    difference = chain.difference * step[:, None, None] ** (power - power[:, None])
+    base = -(correct @ difference)
+    base[:, :, 0] += gain
     return Designs(gain, K, omega**chain.degree, base, closing, delay, chain.dt)
 
 
@@ -148,37 +167,30 @@ def monic(roots: NDArray[np.complex128]) -> Matrix:
 
 def feedback(found: Designs, omega: Vector) -> Complex:
     """Return ``C_y b0 / ω^r`` (m, k) at frequencies (k,) [rad/s]."""
-    matrix, late = _matrices(found, omega)
-    right = np.broadcast_to(found.gain[:, None, :, None], (*matrix.shape[:3], 1))
-    solved = np.linalg.solve(matrix, right)[..., 0]
-    product: Complex = np.einsum("mkn,mn->mk", solved, found.law) * late
+    matrix, z = _matrices(found, omega)
+    solved = np.linalg.solve(matrix, found.gain[:, None, :, None])[..., 0]
+    product: Complex = np.einsum("mkn,mn->mk", solved, found.law) * z
     return product
 
 
 def _matrices(found: Designs, omega: Vector) -> tuple[Complex, Complex]:
     """Return M (m, k, N, N) and z (k,)."""
-    base, closing = found.base, found.closing
+    base, closing = found.base[:, None], found.closing[:, None]
     zeta = np.expm1(1j * omega * found.dt)
     z = 1.0 + zeta
-    unit = np.eye(found.gain.shape[1])
-    matrix = zeta[None, :, None, None] * unit + base[:, None]
     if found.delay:
-        matrix = matrix + z[None, :, None, None] ** -float(found.delay) * closing[:, None]
-    else:
-        matrix = matrix + closing[:, None]
+        closing = z[:, None, None] ** -float(found.delay) * closing
+    count, _, size, _ = base.shape
+    matrix = np.empty((count, omega.size, size, size), dtype=complex)
+    matrix[...] = base + closing
+    _diagonals(matrix)[...] = zeta[:, None] + _diagonals(base) + _diagonals(closing)
     return matrix, z
 
 
-def integral_gain(found: Designs) -> Vector:
-    """Return ``k_i b0 / ω^r`` (m,)."""
-    base, closing = found.base, found.closing
-    left, _, right = np.linalg.svd(base + closing)
-    v, w = right[:, -1, :], left[:, :, -1]
-    slope = np.eye(v.shape[1]) - found.delay * closing
-    inner = np.einsum("mi,mij,mj->m", w, slope, v)
-    through = np.sum(found.law * v, axis=1) * np.sum(w * found.gain, axis=1)
-    gain: Vector = through / inner / found.dt
-    return gain
+def _diagonals(matrix: NDArray[Any]) -> NDArray[Any]:
+    """Return the diagonals (m, k, N) of matrices (m, k, N, N), to read or to write."""
+    found: NDArray[Any] = np.einsum("mkii->mki", matrix)
+    return found
 
 
 def unstable_poles(found: Designs) -> Vector:
