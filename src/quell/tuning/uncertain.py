@@ -15,7 +15,7 @@ from quell.sweeping.shares import share_interval
 from quell.sweeping.values import latin_hypercube
 from quell.tuning.optimiser.loops import PlantSet
 from quell.tuning.optimiser.problem import Problem, Solution
-from quell.tuning.optimiser.requirements import all_peaks
+from quell.tuning.optimiser.requirements import all_peaks, grid_sizes
 from quell.types import Matrix, Vector
 
 # With more parameters, the corners of their box are not all in the set.
@@ -136,10 +136,11 @@ def checked(
     unstable = plants.unstable_loops(C, structure.unstable_poles(row))[0] > 0.5
     ratio = np.zeros(len(plants.plants))
     worst = {}
+    on_grid = grid_sizes(problem.bounds, plants, C[0])
+    peaks = all_peaks(problem.bounds, plants, controller, on_grid, 0.5)
     for number, (kind, limit) in enumerate(problem.bounds):
-        peaks = all_peaks(problem.bounds[number : number + 1], plants, controller, C[0], 0.5)
         own = np.zeros(ratio.size)
-        for _, peak in peaks:
+        for peak in (peak for of_bound, peak in peaks if of_bound == number):
             own[peak.plant] = max(own[peak.plant], peak.value)
         if not np.all(unstable):
             worst[kind] = float(np.max(own[~unstable])) * limit

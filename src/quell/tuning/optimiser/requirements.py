@@ -18,7 +18,6 @@ from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser.loops import Peak, PlantSet, peaks
 from quell.types import Matrix, Vector
 
-Stack = NDArray[np.float64]
 _KINDS = {"m_s": "M_s", "m_t": "M_t", "m_ks": "M_ks"}
 
 
@@ -29,12 +28,20 @@ class Bound(NamedTuple):
     limit: float
 
 
-class Points(NamedTuple):
-    """Points at which bounds are kept: for each the bound, the plant and the frequency."""
+class Part(NamedTuple):
+    """The points at which one bound is kept."""
 
-    kind: NDArray[np.intp]
-    P: NDArray[np.complex128]
-    at: NDArray[np.intp]  # index of the frequency
+    bound: Bound
+    rows: NDArray[np.intp]  # their numbers among all points (k,)
+    P: Complex  # responses of their plants (k,)
+    at: NDArray[np.intp]  # indices of their frequencies (k,)
+
+
+class Points(NamedTuple):
+    """Points at which bounds are kept, each of a bound, a plant and a frequency."""
+
+    parts: tuple[Part, ...]
+    total: int  # k, their number
     omega: Vector  # distinct frequencies
 
 
@@ -57,80 +64,106 @@ def bounds_of(constraints: Constraints) -> tuple[Bound, ...]:
 def sizes(kind: str, P: Complex, C: Complex) -> NDArray[np.float64]:
     """Return |S|, |T| or |C S| for broadcast responses of plants and controllers."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        L = P * C
-        S = 1.0 / (1.0 + L)
-        found = {"M_s": S, "M_t": L * S, "M_ks": C * S}[kind]
+        _, found = _sensitivities(kind, P, C)
         size: NDArray[np.float64] = np.abs(found)
     return size
+
+
+def _sensitivities(kind: str, P: Complex, C: Complex) -> tuple[Complex, Complex]:
+    """Return S, and S, T or C S."""
+    L = P * C
+    S = 1.0 / (1.0 + L)
+    if kind == "M_s":
+        return S, S
+    return S, (L if kind == "M_t" else C) * S
 
 
 def worst_ratio(bounds: tuple[Bound, ...], plants: PlantSet, C: Complex) -> Vector:
     """Return the largest ratio (m,) on the grid, for controllers (m, G)."""
     worst, gain = np.zeros(C.shape[0]), np.abs(C)
     for P in plants.P:
-        L = P * C
         with np.errstate(divide="ignore", invalid="ignore"):
-            S = 1.0 / np.abs(1.0 + L)
-            size = {"M_s": S, "M_t": np.abs(P) * gain * S, "M_ks": gain * S}
-        for kind, limit in bounds:
-            worst = np.maximum(worst, np.max(size[kind], axis=1) / limit)
+            S = 1.0 / np.abs(1.0 + P * C)
+            for kind, limit in bounds:
+                size = S
+                if kind != "M_s":
+                    size = (np.abs(P) * gain if kind == "M_t" else gain) * S
+                worst = np.maximum(worst, np.max(size, axis=1) / limit)
     return worst
 
 
-def slack(ratio: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``1 − log2(1 + r²)``."""
-    found: NDArray[np.float64] = 1.0 - np.log1p(ratio**2) / math.log(2.0)
+def points_of(
+    bounds: tuple[Bound, ...],
+    kind: NDArray[np.intp],
+    P: Complex,
+    at: NDArray[np.intp],
+    omega: Vector,
+) -> Points:
+    """Return points, given the number of the bound, the plant and the frequency of each (k,)."""
+    parts = []
+    for number, bound in enumerate(bounds):
+        rows = np.flatnonzero(kind == number)
+        if rows.size:
+            parts.append(Part(bound, rows, P[rows], at[rows]))
+    return Points(tuple(parts), kind.size, omega)
+
+
+def slacks(points: Points, C: Complex) -> Vector:
+    """Return the slack ``1 − log2(1 + r²)`` (k,) at points, for a controller C (ω,)."""
+    found = np.empty(points.total)
+    for (kind, limit), rows, P, at in points.parts:
+        _, X = _sensitivities(kind, P, C[at])
+        square = (X.real**2 + X.imag**2) / limit**2
+        found[rows] = 1.0 - np.log1p(square) / math.log(2.0)
     return found
 
 
-def slack_and_slope(
-    bounds: tuple[Bound, ...], points: Points, C: Complex, dC: NDArray[np.complex128]
-) -> tuple[Vector, Matrix]:
-    """Return the slack (k,) at points and its derivatives (k, p).
+def slopes_of_slacks(points: Points, C: Complex, dC: NDArray[np.complex128]) -> Matrix:
+    """Return the derivatives (k, p) of the slacks, for a controller C (ω,) and its own (p, ω).
 
-    ``C`` (ω,) and ``dC`` (p, ω) are the controller and its derivatives. With S = 1/(1 + PC):
-    ``dS = −S² P dC``, ``dT = S² P dC``, ``d(CS) = S² dC``.
+    With S = 1/(1 + PC): ``dS = −S² P dC``, ``dT = S² P dC``, ``d(CS) = S² dC``.
     """
-    values, slopes = np.empty(points.kind.size), np.empty((points.kind.size, dC.shape[0]))
-    for number, (kind, limit) in enumerate(bounds):
-        mine = points.kind == number
-        if not np.any(mine):
-            continue
-        P, at = points.P[mine], points.at[mine]
-        here, change = C[at], dC[:, at]
-        S = 1.0 / (1.0 + P * here)
-        X, slope = {
-            "M_s": (S, -(S**2) * P),
-            "M_t": (P * here * S, S**2 * P),
-            "M_ks": (here * S, S**2),
-        }[kind]
+    found = np.empty((points.total, dC.shape[0]))
+    for (kind, limit), rows, P, at in points.parts:
+        S, X = _sensitivities(kind, P, C[at])
+        slope = S**2
+        if kind != "M_ks":
+            slope = (-slope if kind == "M_s" else slope) * P
         square = (X.real**2 + X.imag**2) / limit**2
-        values[mine] = 1.0 - np.log1p(square) / math.log(2.0)
         weight = np.conj(X) * slope * (-2.0 / math.log(2.0) / limit**2) / (1.0 + square)
-        slopes[mine] = (weight.real * change.real - weight.imag * change.imag).T
-    return values, slopes
+        change = dC[:, at]
+        found[rows] = (weight.real * change.real - weight.imag * change.imag).T
+    return found
+
+
+def grid_sizes(bounds: tuple[Bound, ...], plants: PlantSet, C: Complex) -> list[Matrix]:
+    """Return |S|, |T| or |C S| (J, G) for each bound, for a controller C (G,) on the grid."""
+    return [sizes(kind, plants.P, C) for kind, _ in bounds]
 
 
 def all_peaks(
     bounds: tuple[Bound, ...],
     plants: PlantSet,
     controller: Callable[[Vector], Complex],
-    C: Complex,
+    on_grid: list[Matrix],
     least: float,
 ) -> list[tuple[int, Peak]]:
     """Return the refined maxima with a ratio above ``least``, each with the number of its bound.
 
-    ``controller`` is a function from frequencies to C_y (k,); ``C`` (G,) are its values on the
-    grid.
+    ``controller`` is a function from frequencies to C_y (k,); ``on_grid`` are its ``grid_sizes``.
     """
-    found = []
-    for number, (kind, limit) in enumerate(bounds):
+    count = len(plants.plants)
 
-        def ratio(
-            omega: Vector, members: NDArray[np.intp], kind: str = kind, limit: float = limit
-        ) -> Stack:
-            return sizes(kind, plants.responses_of(omega, members), controller(omega)) / limit
+    def ratios(omega: Vector, rows: NDArray[np.intp]) -> Vector:
+        number, plant = np.divmod(rows, count)
+        P, C = plants.responses_of(omega, plant), controller(omega)
+        found = np.empty(omega.size)
+        for i, (kind, limit) in enumerate(bounds):
+            own = number == i
+            found[own] = sizes(kind, P[own], C[own]) / limit
+        return found
 
-        values = sizes(kind, plants.P, C) / limit
-        found += [(number, peak) for peak in peaks(ratio, plants.omega, values, least)]
-    return found
+    limits = [limit for _, limit in bounds]
+    values = np.vstack([size / limit for size, limit in zip(on_grid, limits, strict=True)])
+    found = peaks(ratios, plants.omega, values, least)
+    return [(peak.plant // count, peak._replace(plant=peak.plant % count)) for peak in found]

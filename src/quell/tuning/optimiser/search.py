@@ -14,25 +14,18 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quell.tuning.optimiser.candidate import Candidate
+from quell.tuning.optimiser.finite_problem import FiniteProblem
+from quell.tuning.optimiser.loops import Peak
 from quell.tuning.optimiser.problem import Problem, Solution, limits
-from quell.tuning.optimiser.requirements import (
-    Points,
-    all_peaks,
-    sizes,
-    slack_and_slope,
-)
+from quell.tuning.optimiser.requirements import Points
 from quell.tuning.optimiser.starts import starts
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector
 
-# Step of the differences in the logarithms: between the rounding error of C_y, some 1e-12, and its
-# curvature.
-_DIFFERENCE = 1e-6
-# Points with a ratio above the first are in the problem, in later rounds those above the second;
-# peaks above the third are refined.
-_NEAR, _NEARER, _PEAK = 0.5, 0.85, 0.93
+# Points with a ratio above the first are in the problem, in later rounds those above the second.
+_NEAR, _NEARER = 0.5, 0.85
 _EARLY_ROUNDS = 2
 # Half width of the box of a round in the logarithms, and how it shrinks after an unstable result.
 _BOX, _SHRINK = 0.7, 0.3
@@ -125,90 +118,34 @@ def search(
     ``roughly`` ends when the objective settles, even if there are few parameters.
     """
     low, high = (np.log(limit) for limit in limits(structure))
-    x, box = np.clip(np.log(start), low, high), _BOX
-    best: tuple[float, float, Vector] | None = None
-    extra_points: list[tuple[int, int, float]] = []
+    now, box = Candidate(problem, structure, np.clip(np.log(start), low, high)), _BOX
+    best: Candidate | None = None
+    extra_points: list[tuple[int, Peak]] = []
     last, few = math.inf, not roughly and _is_precise(problem, structure)
     settled = _SETTLED_OF_FEW if few else _SETTLED
     allowed = _SETTLED_OF_FEW if few else _VIOLATION
     for i in range(rounds):
-        cost, violation, refined = _judged(problem, structure, x)
-        if best is None or _merit(cost, violation) < _merit(*best[:2]):
-            best = (cost, violation, x)
-        if i == rounds - 1 or (violation <= allowed and abs(last - cost) < settled):
+        merit = _merit(now.cost, now.violation)
+        if best is None or merit < _merit(best.cost, best.violation):
+            best = now
+        if i == rounds - 1 or (now.violation <= allowed and abs(last - now.cost) < settled):
             break
-        last = cost
-        extra_points = (extra_points + refined)[-400:]
-        near = _NEAR if i < _EARLY_ROUNDS else _NEARER
-        points = _points(problem, structure, x, extra_points, near)
-        bounds = list(zip(np.maximum(low, x - box), np.minimum(high, x + box), strict=True))
+        last = now.cost
+        extra_points = (extra_points + now.peaks)[-400:]
+        points = now.points(_NEAR if i < _EARLY_ROUNDS else _NEARER, extra_points)
+        bounds = list(zip(np.maximum(low, now.x - box), np.minimum(high, now.x + box), strict=True))
         tolerance = _TOLERANCE_OF_FEW if few else _TOLERANCE
-        after = _quadratic_programming(problem, structure, x, points, bounds, tolerance)
-        if after is None or not _stable(problem, structure, after):
+        x = _quadratic_programming(problem, structure, now.x, points, bounds, tolerance)
+        after = None if x is None else Candidate(problem, structure, x)
+        if after is None or not after.stable:
             box *= _SHRINK
             if box < 1e-3:
                 break
             continue
-        x = after
+        now = after
     if best is None:
         return None
-    cost, violation, x = best
-    return Solution(structure, np.exp(x), cost, violation)
-
-
-def _judged(
-    problem: Problem, structure: Structure, x: Vector
-) -> tuple[float, float, list[tuple[int, int, float]]]:
-    """Return cost, violation, and the refined peaks (bound, plant, frequency)."""
-    values = np.exp(x)[None, :]
-    C = structure.response(values, problem.plants.omega)[0]
-
-    def controller(omega: Vector) -> NDArray[np.complex128]:
-        return structure.response(values, omega)[0]
-
-    found = all_peaks(problem.bounds, problem.plants, controller, C, _PEAK)
-    ratios = [peak.value for _, peak in found]
-    ratios += [float(extra.ratio(structure, values)[0]) for extra in problem.extras]
-    ratios += (1.0 - structure.rules(values)[0]).tolist()
-    violation = max([ratio - 1.0 for ratio in ratios], default=0.0)
-    cost = float(problem.cost(structure, values)[0])
-    return cost, max(violation, 0.0), [(i, peak.plant, peak.omega) for i, peak in found]
-
-
-def _stable(problem: Problem, structure: Structure, x: Vector) -> bool:
-    values = np.exp(x)[None, :]
-    C = structure.response(values, problem.plants.omega)
-    unstable = problem.plants.unstable_loops(C, structure.unstable_poles(values))
-    return bool(np.all(unstable < 0.5))
-
-
-def _points(
-    problem: Problem,
-    structure: Structure,
-    x: Vector,
-    refined: list[tuple[int, int, float]],
-    least: float,
-) -> Points:
-    """Return the points of the grid near their bounds, and the refined peaks."""
-    plants = problem.plants
-    C = structure.response(np.exp(x)[None, :], plants.omega)[0]
-    kinds, members, places = [], [], []
-    for number, (response, limit) in enumerate(problem.bounds):
-        near = sizes(response, plants.P, C) > least * limit
-        j, i = np.nonzero(near)
-        kinds.append(np.full(j.size, number))
-        members.append(j)
-        places.append(plants.omega[i])
-    kinds.append(np.array([i for i, _, _ in refined], dtype=int))
-    members.append(np.array([j for _, j, _ in refined], dtype=int))
-    places.append(np.array([omega for _, _, omega in refined]))
-    kind, member = np.concatenate(kinds), np.concatenate(members)
-    omega, at = np.unique(np.concatenate(places), return_inverse=True)
-    if omega.size == 0:  # far from all bounds
-        omega, at = plants.omega[:1], np.zeros(1, dtype=int)
-        kind, member = np.zeros(1, dtype=int), np.zeros(1, dtype=int)
-    P = plants.responses_of(omega[at], member)
-    return Points(kind.astype(np.intp), P, at.astype(np.intp), omega)
+    return Solution(structure, np.exp(best.x), best.cost, best.violation)
 
 
 def _quadratic_programming(
@@ -221,46 +158,20 @@ def _quadratic_programming(
 ) -> Vector | None:
     from scipy.optimize import minimize
 
-    size = x.size
-    steps = np.vstack([np.zeros(size), _DIFFERENCE * np.eye(size)])
-    memo: dict[bytes, Any] = {}
-
-    def at(x: Vector) -> Any:
-        key = x.tobytes()
-        if key not in memo:
-            memo.clear()
-            values = np.exp(x + steps)
-            C = structure.response(values, points.omega)
-            g, slope = slack_and_slope(problem.bounds, points, C[0], (C[1:] - C[0]) / _DIFFERENCE)
-            parts, slopes = [g], [slope]
-            for extra in problem.extras:
-                ratio = 1.0 - extra.ratio(structure, values)
-                parts.append(ratio[:1])
-                slopes.append(((ratio[1:] - ratio[0]) / _DIFFERENCE)[None, :])
-            rules = structure.rules(values)
-            parts.append(rules[0])
-            slopes.append((rules[1:] - rules[0]).T / _DIFFERENCE)
-            cost = problem.cost(structure, values)
-            memo[key] = (
-                cost[0],
-                (cost[1:] - cost[0]) / _DIFFERENCE,
-                np.concatenate(parts),
-                np.vstack(slopes),
-            )
-        return memo[key]
-
     try:
+        near = FiniteProblem(problem, structure, points, x)
         found = minimize(
-            lambda x: at(x)[0],
+            near.cost,
             x,
-            jac=lambda x: at(x)[1],
+            jac=near.slope_of_cost,
             bounds=bounds,
-            constraints={"type": "ineq", "fun": lambda x: at(x)[2], "jac": lambda x: at(x)[3]},
-            method="SLSQP",
-            options={
-                "maxiter": _ITERATIONS,
-                "ftol": tolerance,
+            constraints={
+                "type": "ineq",
+                "fun": near.constraints,
+                "jac": near.slopes_of_constraints,
             },
+            method="SLSQP",
+            options={"maxiter": _ITERATIONS, "ftol": tolerance},
         )
     except (np.linalg.LinAlgError, ValueError):
         return None

@@ -108,7 +108,7 @@ def measured(
     for kind in _KINDS:
         grid = sizes(kind, plants.P, C[0])
         largest = float(np.max(grid))
-        found = all_peaks((Bound(kind, 1.0),), plants, controller, C[0], 0.9 * largest)
+        found = all_peaks((Bound(kind, 1.0),), plants, controller, [grid], 0.9 * largest)
         at = max(found, key=lambda entry: entry[1].value)[1]
         measures[kind] = at.value
         if kind in bounds and at.value >= (1.0 - _ACTIVE) * bounds[kind]:
