@@ -306,6 +306,26 @@ def test_a_controller_is_stepped_compiled_though_the_device_is_python(name: str)
 
 
 @pytest.mark.compiled
+def test_plain_python_does_what_compiled_code_does() -> None:
+    """Missed samples, a stall, an unsent command and a trip: same modes, same numbers."""
+    scripts: dict[str, Any] = {
+        "y": {60: math.nan, 61: math.nan, 200: 1.0},
+        "stall": {100: round(3e9 * DT)},
+        "refused": {80: 1},
+    }
+    compiled, plain = (
+        run(ScriptedDevice(PLANT, **scripts), interpret=interpret, most_error=1.1)
+        for interpret in (False, True)
+    )
+    changes, same = (
+        mode_changes(outcome.loop.controller.supervisor, DT) for outcome in (compiled, plain)
+    )
+    assert changes == same
+    assert len(changes) == 5
+    np.testing.assert_allclose(plain.rows, compiled.rows, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.compiled
 def test_a_loop_compiles_before_it_begins_and_leaves_its_controller_alone() -> None:
     """No cycle runs, a second loop compiles nothing, the controller's own state is unchanged."""
     controller = adrc()

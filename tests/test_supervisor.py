@@ -72,23 +72,6 @@ def test_nothing_happens_where_nothing_goes_wrong() -> None:
     assert not outcome["EVENTS"][outcome["EVENTS"] != Event.CHANGED].any()
 
 
-@pytest.mark.compiled
-def test_plain_python_does_what_compiled_code_does() -> None:
-    """Missed samples, a stall, an unsent command and a trip: same modes, same numbers."""
-    scripts: dict[str, Any] = {
-        "y": {60: MISS, 61: MISS, 200: 1.0},
-        "stall": {100: 3 * SAMPLE},
-        "refused": {80: 1},
-    }
-    compiled, plain = (
-        run(ScriptedDevice(PLANT, **scripts), interpret=interpret, most_error=1.1)
-        for interpret in (False, True)
-    )
-    assert modes(compiled) == modes(plain)
-    assert len(modes(compiled)) == 5
-    np.testing.assert_allclose(plain.rows, compiled.rows, rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("value", [MISS, math.inf, -math.inf])
 @pytest.mark.parametrize("missed", [1, HOLD])
 def test_a_few_missed_samples_hold_u(value: float, missed: int) -> None:
