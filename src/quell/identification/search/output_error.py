@@ -206,13 +206,6 @@ def _triangle(columns: Matrix) -> Matrix:
     count = columns.shape[1]
     blocks = columns.shape[0] // max(_ROWS, 4 * count)
     if blocks > 1:
-        # As many rows in each, but one more in the first ones.
-        rows, longer = divmod(columns.shape[0], blocks)
-        split = longer * (rows + 1)
-        parts = (
-            columns[:split].reshape(-1, rows + 1, count),
-            columns[split:].reshape(-1, rows, count),
-        )
-        columns = np.concatenate([np.linalg.qr(part, mode="r") for part in parts])
-        columns = columns.reshape(-1, count)
+        parts = [np.linalg.qr(part, mode="r") for part in np.array_split(columns, blocks)]
+        columns = np.vstack(parts)
     return np.asarray(np.linalg.qr(columns, mode="r"), dtype=np.float64)

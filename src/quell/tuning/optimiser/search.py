@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from quell.tuning.optimiser.candidate import Candidate
 from quell.tuning.optimiser.finite_problem import FiniteProblem
+from quell.tuning.optimiser.iterate import Iterate
 from quell.tuning.optimiser.loops import Peak
 from quell.tuning.optimiser.problem import Problem, Solution, limits
 from quell.tuning.optimiser.requirements import Points
@@ -118,8 +118,8 @@ def search(
     ``roughly`` ends when the objective settles, even if there are few parameters.
     """
     low, high = (np.log(limit) for limit in limits(structure))
-    now, box = Candidate(problem, structure, np.clip(np.log(start), low, high)), _BOX
-    best: Candidate | None = None
+    now, box = Iterate(problem, structure, np.clip(np.log(start), low, high)), _BOX
+    best: Iterate | None = None
     extra_points: list[tuple[int, Peak]] = []
     last, few = math.inf, not roughly and _is_precise(problem, structure)
     settled = _SETTLED_OF_FEW if few else _SETTLED
@@ -136,7 +136,7 @@ def search(
         bounds = list(zip(np.maximum(low, now.x - box), np.minimum(high, now.x + box), strict=True))
         tolerance = _TOLERANCE_OF_FEW if few else _TOLERANCE
         x = _quadratic_programming(problem, structure, now.x, points, bounds, tolerance)
-        after = None if x is None else Candidate(problem, structure, x)
+        after = None if x is None else Iterate(problem, structure, x)
         if after is None or not after.stable:
             box *= _SHRINK
             if box < 1e-3:

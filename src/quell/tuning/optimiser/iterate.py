@@ -20,7 +20,7 @@ from quell.types import Matrix, Vector
 _PEAK = 0.93
 
 
-class Candidate:
+class Iterate:
     """The parameters with the logarithms x (p,)."""
 
     def __init__(self, problem: Problem, structure: Structure, x: Vector) -> None:
