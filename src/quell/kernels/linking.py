@@ -21,7 +21,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.targetconfig import ConfigStack
-from numba.core.typed_passes import AnnotateTypes, NativeLowering
+from numba.core.typed_passes import NativeLowering
 from numba.core.untyped_passes import IRProcessing
 
 from quell.kernels.single_literals import SingleLiterals
@@ -41,6 +41,7 @@ class KernelLibrary(JITCodeLibrary):
         self.uses_environment |= text.count(_ENVIRONMENT) > 1
         ll_module = llvm.parse_assembly(text)
         ll_module.name = ir_module.name
+        ll_module.verify()
         self.add_llvm_module(ll_module)
 
     def _optimize_functions(self, ll_module: Any) -> None:
@@ -75,20 +76,8 @@ class KernelLibrary(JITCodeLibrary):
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)
-class _UseKernelLibrary(AnalysisPass):
-    _name = "use_kernel_library"
-
-    def __init__(self) -> None:
-        AnalysisPass.__init__(self)
-
-    def run_pass(self, state: Any) -> bool:
-        state.library = KernelLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
-        return False
-
-
-@register_pass(mutates_CFG=False, analysis_only=True)
 class _FinishKernel(AnalysisPass):
-    """What Numba does after the lowering of code that Python calls, for code that it does not."""
+    """Finish a kernel as Numba finishes code that Python calls, but without machine code."""
 
     _name = "finish_kernel"
 
@@ -112,11 +101,12 @@ class KernelCompiler(CompilerBase):
     """Numba's compiler, writing to a ``KernelLibrary``."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return Numba's passes, with single literals, and the library replaced."""
-        self.state.flags.no_compile = True
-        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        """Return Numba's passes, with single literals, and the end of the lowering replaced."""
+        state = self.state
+        state.library = KernelLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.flags.no_compile = True
+        passes = DefaultPassBuilder.define_nopython_pipeline(state)
         passes.add_pass_after(SingleLiterals, IRProcessing)
-        passes.add_pass_after(_UseKernelLibrary, AnnotateTypes)
         passes.add_pass_after(_FinishKernel, NativeLowering)
         passes.finalize()
         return [passes]

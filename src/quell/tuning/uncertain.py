@@ -140,8 +140,9 @@ def checked(
     peaks = all_peaks(problem.bounds, plants, controller, on_grid, 0.5)
     for number, (kind, limit) in enumerate(problem.bounds):
         own = np.zeros(ratio.size)
-        for peak in (peak for of_bound, peak in peaks if of_bound == number):
-            own[peak.plant] = max(own[peak.plant], peak.value)
+        for of_bound, peak in peaks:
+            if of_bound == number:
+                own[peak.plant] = max(own[peak.plant], peak.value)
         if not np.all(unstable):
             worst[kind] = float(np.max(own[~unstable])) * limit
         ratio = np.maximum(ratio, own)

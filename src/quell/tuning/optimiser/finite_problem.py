@@ -24,7 +24,7 @@ _DIFFERENCE = 1e-6
 
 
 class _Values(NamedTuple):
-    """What m controllers have."""
+    """Values of m controllers."""
 
     C: Complex  # at the points' frequencies (m, ω)
     extras: Matrix  # slack of the constraints that are no bounds over frequency (m, e)
@@ -33,12 +33,7 @@ class _Values(NamedTuple):
 
     def with_more(self, others: _Values) -> _Values:
         """Return the values of these controllers and of others."""
-        return _Values(
-            np.concatenate([self.C, others.C]),
-            np.concatenate([self.extras, others.extras]),
-            np.concatenate([self.rules, others.rules]),
-            np.concatenate([self.cost, others.cost]),
-        )
+        return _Values._make(map(np.concatenate, zip(self, others, strict=True)))
 
 
 class FiniteProblem:
@@ -90,9 +85,10 @@ class FiniteProblem:
 
     def _values_at(self, x: Matrix) -> _Values:
         values, structure = np.exp(x), self._structure
+        ratios = [extra.ratio(structure, values) for extra in self._problem.extras]
         return _Values(
             structure.response(values, self._points.omega),
-            1.0 - np.array([each.ratio(structure, values) for each in self._problem.extras]).T,
+            1.0 - np.reshape(ratios, (len(ratios), len(values))).T,
             structure.rules(values),
             self._problem.cost(structure, values),
         )

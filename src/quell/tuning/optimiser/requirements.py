@@ -41,8 +41,12 @@ class Points(NamedTuple):
     """Points at which bounds are kept, each of a bound, a plant and a frequency."""
 
     parts: tuple[Part, ...]
-    total: int  # k, their number
     omega: Vector  # distinct frequencies
+
+    @property
+    def total(self) -> int:
+        """Their number k."""
+        return sum(part.rows.size for part in self.parts)
 
 
 class Active(NamedTuple):
@@ -105,7 +109,7 @@ def points_of(
         rows = np.flatnonzero(kind == number)
         if rows.size:
             parts.append(Part(bound, rows, P[rows], at[rows]))
-    return Points(tuple(parts), kind.size, omega)
+    return Points(tuple(parts), omega)
 
 
 def slacks(points: Points, C: Complex) -> Vector:
