@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import FunctionType
-from typing import Any, NoReturn, ParamSpec, Protocol, TypeVar, cast
+from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import numba
 import numpy as np
@@ -82,17 +82,16 @@ def generic(declaration: Callable[P, R_co]) -> Generic[P, R_co]:
     name = declaration.__name__
     table: dict[type | None, Callable[..., Any]] = {}
 
-    def refuse(cls: type) -> NoReturn:
-        raise TypeError(
-            f"{name}() has no implementation for {cls.__name__}; register one with "
-            f"@{name}.register({cls.__name__}) before the first run"
-        )
-
     @functools.wraps(declaration)
-    def call(*arguments: Any) -> Any:
-        cls = type(arguments[0])
-        implementation = table.get(cls) or table.get(object) or refuse(cls)
-        return implementation(*arguments)
+    def call(head: Any, *rest: Any) -> Any:
+        implementation = table.get(type(head)) or table.get(object)
+        if implementation is None:
+            cls = type(head).__name__
+            raise TypeError(
+                f"{name}() has no implementation for {cls}; register one with "
+                f"@{name}.register({cls}) before the first run"
+            )
+        return implementation(head, *rest)
 
     def resolve(head: Any, *rest: Any) -> Any:
         is_named_tuple = isinstance(head, nb_types.BaseNamedTuple)
