@@ -188,6 +188,31 @@ def test_what_is_not_the_output_s_own_doing_counts_for_the_bound() -> None:
         assert sample.outside == pytest.approx(expected, rel=1e-12)
 
 
+def test_credit_from_small_errors_does_not_suffice_for_large_ones() -> None:
+    """A learner that earns nothing loses all authority until e has grown by a factor of e⁵."""
+    design, memory = trusted()
+    sample = memory.sample[0]
+    sample.authority = 1.0
+    while sample.credit > 0.0:
+        _update_bound(design, memory, 1e6)
+    assert sample.typical_error == pytest.approx(math.exp(5.0), rel=0.05)
+    sample.credit = sample.authority = 0.0
+    for _ in range(1000):
+        _update_bound(design, memory, 1e6)
+    assert sample.credit == 0.0, "without authority the growth is free"
+    assert sample.typical_error == pytest.approx(1e6, rel=1e-3)
+
+
+def test_a_bound_that_does_not_grow_costs_nothing() -> None:
+    """What e would grow by, and does not because it is limited by 2.5 o, is not paid for."""
+    design, memory = trusted()
+    sample = memory.sample[0]
+    sample.authority, sample.own_peak, sample.outside = 1.0, 10.0, 0.4
+    for _ in range(10):
+        _update_bound(design, memory, 5.0)
+    assert (sample.credit, sample.typical_error) == (1.0, 1.0)
+
+
 def test_where_nothing_is_permitted_the_target_is_what_is_fed_forward() -> None:
     """So that authority which is given later begins without a jump."""
     design, memory = trusted()
@@ -315,11 +340,13 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         peak += rise * (large - peak) if large > peak else -decay * peak
         more = rise * (large - 0.2 * own - e)
         spared += large > e > large - 0.2 * own
+        acts, before = memory.sample[0].authority > 0.0, e
         if more > 0.0:
-            e += min(more, growth * e) if memory.sample[0].authority > 0.0 else more
+            e += min(more, growth * e) if acts else more
         more = rise * (large - most_own - outside)
         outside = min(outside + max(more, 0.0), peak)
         e = min(e, peak, 2.5 * outside)
+        credit -= 0.2 * (e / before - 1.0) if acts and e > before else 0.0
         m += forget * (q * q - m)
         s += forget * min(1.0, (q * q + p * p) / (0.4 * peak) ** 2) * (p * p / (q * q + p * p) - s)
         bounded = np.clip(p, -1.2 * e, 1.2 * e)

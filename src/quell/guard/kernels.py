@@ -12,13 +12,17 @@ of the observer later it is known what the plain ESO has missed, and what g woul
 
 **The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. The learner's own
 share of q is at most Γ times its largest recent correction, so e counts only what exceeds γ times
-that; and while the learner acts, e grows by a factor of 2.7 in five lags at most (METHOD 8):
+that; and while the learner acts, e grows by a factor of 2.7 in five lags at most (METHOD 8), which
+costs a fifth of a unit of credit:
 
     c_L ← max(|e_L|, λ c_L),        e → |q| − γ c_L  where that is larger,        e ≤ min(P, 2.5 o)
+    C ← C − 0.2 Δe/e
 
 o ≤ P, the error that is certainly not the learner's, rises to |q| − 5 c_L as P rises to |q|, and to
 |q| − c_L while |q| rises so quickly that it is 1.15 P: what learner and loop build up together
 grows more slowly. So a learner that causes what it then explains does not raise e again and again.
+And credit that was earned with small errors does not suffice for large ones: a learner that
+explains them as well earns more than the growth of e costs.
 
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
@@ -84,6 +88,9 @@ _WORST_SAMPLE = 3.0
 _MEAN_SQUARES = 4.0
 # Samples below this share of P count less for S, because q at rest is noise.
 _NOISE = 0.4
+# Credit that e costs when it grows by a factor of 2.7 while the learner acts. In the five lags that
+# this takes at least, a learner that explains a sinusoidal load earns a quarter.
+_GROWTH_COST = 0.2
 # An outlier counts for so many times P.
 _OUTLIER = 5.0
 # e is at most so many times o; c_L counts so many times for o, and once while |q| is so many times
@@ -283,13 +290,15 @@ def _update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None
     more = guard.rise * (error - peak) if error > peak else -guard.decay * peak
     peak = _sum(guard, memory, _PEAK, peak, more)
     sample.peak = max(peak, _tiny(guard))
-    larger = guard.rise * (error - guard.own * own - size)
-    if larger > 0.0:
-        size += min(larger, guard.growth * size) if sample.authority > 0.0 else larger
+    learner_acts = sample.authority > 0.0
+    more = max(guard.rise * (error - guard.own * own - size), 0.0)
+    grown = size + (min(more, guard.growth * size) if learner_acts else more)
     more = guard.rise * (error - most_own - sample.outside)
     sample.outside = min(sample.outside + max(more, 0.0), sample.peak)
-    size = min(size, sample.peak, _OWN_GROWTH * sample.outside)
-    sample.typical_error = max(size, _tiny(guard))
+    grown = min(grown, sample.peak, _OWN_GROWTH * sample.outside)
+    if learner_acts and grown > size:
+        sample.credit -= _GROWTH_COST * (grown - size) / size
+    sample.typical_error = max(grown, _tiny(guard))
 
 
 @limit.register(GuardDesign)
