@@ -1,15 +1,38 @@
 """Setup files: TOML tables that describe plant, controller, scenario and device (docs/setup).
 
 May import every folder below; only ``cli`` imports this one.
+Names are imported when they are first used: whoever needs a plant only, as ``quell rig``, does not
+wait for the tables of controllers and tuning.
 """
 
-from quell.setup.description import Description
-from quell.setup.errors import SetupError
-from quell.setup.load import EXAMPLES, Setup, load, made
-from quell.setup.plants import plant_given, plant_of
-from quell.setup.toml_file import read
-from quell.setup.vary import controllers_of, varied
-from quell.suggestions import suggest_names
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from quell.suggestions import suggesting
+
+if TYPE_CHECKING:
+    from quell.setup.description import Description
+    from quell.setup.errors import SetupError
+    from quell.setup.loading import EXAMPLES, Setup, load, made
+    from quell.setup.plants import plant_given, plant_of
+    from quell.setup.toml_file import read
+    from quell.setup.vary import controllers_of, varied
+
+_HOME = {
+    "EXAMPLES": "loading",
+    "Description": "description",
+    "Setup": "loading",
+    "SetupError": "errors",
+    "controllers_of": "vary",
+    "load": "loading",
+    "made": "loading",
+    "plant_given": "plants",
+    "plant_of": "plants",
+    "read": "toml_file",
+    "varied": "vary",
+}
 
 __all__ = [
     "EXAMPLES",
@@ -25,4 +48,11 @@ __all__ = [
     "varied",
 ]
 
-suggest_names(__name__, __all__)
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'quell.setup' has no attribute {name!r}")
+    home = importlib.import_module(f"quell.setup.{_HOME[name]}")
+    value = suggesting(getattr(home, name), __name__)
+    globals()[name] = value
+    return value

@@ -14,7 +14,7 @@ from quell import checks
 from quell.files import nonfinite_to_none
 from quell.setup.description import Description, describe
 from quell.setup.errors import SetupError
-from quell.setup.load import Setup, assembled
+from quell.setup.loading import Setup, assembled
 from quell.setup.plants import contents_of
 from quell.setup.sweep_table import CASE
 from quell.setup.toml_file import immutable

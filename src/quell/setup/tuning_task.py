@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from quell.plants.linear_part import linear_model
 from quell.setup.errors import SetupError
-from quell.setup.load import Setup, made
+from quell.setup.loading import Setup, made
 from quell.setup.toml_file import read
 from quell.setup.vary import changed
 

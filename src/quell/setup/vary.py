@@ -9,7 +9,7 @@ from typing import Any
 
 from quell.controllers.base import Controller
 from quell.setup.errors import SetupError
-from quell.setup.load import Setup, made
+from quell.setup.loading import Setup, made
 
 # A path is written as in the messages: plant.m1, scenario.disturbances[1].height.
 _STEP = re.compile(r"\.?([^.\[\]]+)|\[(\d+)\]")

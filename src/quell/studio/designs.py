@@ -10,7 +10,7 @@ import numpy as np
 
 from quell import checks
 from quell.experiments.compare import tuned as tuned_references
-from quell.setup.load import Setup
+from quell.setup.loading import Setup
 from quell.simulation import simulate
 from quell.studio.frames import Columns, frame
 from quell.studio.messages import columns, number

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from quell import checks
-from quell.setup.load import Setup
+from quell.setup.loading import Setup
 
 C_NAME = "controller"
 """Begins the names of the files and functions, as by default on the command line."""

@@ -18,7 +18,7 @@ from quell.plants.linear_part import linear_model, linear_part
 from quell.records.channels import describe
 from quell.records.trajectory import Trajectory
 from quell.setup.description import describe as tables_of
-from quell.setup.load import Known, Setup, assembled
+from quell.setup.loading import Known, Setup, assembled
 from quell.simulation import simulate
 from quell.studio.frames import Columns, frame
 from quell.types import Vector

@@ -12,7 +12,7 @@ from quell.controllers import Controller
 from quell.experiments.compare.study import Comparison, compare
 from quell.experiments.compare.tuned import STRUCTURES, Entry, of_loop, tuned
 from quell.plants.linear_part import linear_model, linear_part
-from quell.setup.load import Setup
+from quell.setup.loading import Setup
 from quell.simulation import Scenario
 from quell.tuning import Constraints
 from quell.types import Progress
