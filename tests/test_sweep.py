@@ -468,13 +468,15 @@ def test_the_command_does_a_sweep_and_repeats_a_run(
     assert "sweep: missing; give a table [sweep]" in quell("sweep", "plain.toml").err
 
 
-@pytest.mark.compiled
-def test_a_cluster_that_loses_a_worker_finds_what_this_machine_finds(tmp_path: Path) -> None:
+def test_a_cluster_that_loses_a_worker_finds_what_this_machine_finds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Bit for bit, for controllers of two types, with one of two worker processes killed."""
     distributed = pytest.importorskip("distributed")
-    arguments = sweep_of(made(*read(setup_of(tmp_path, SETUP.replace("draws = 4", "draws = 30")))))
+    arguments = sweep_of(made(*read(setup_of(tmp_path, SETUP.replace("draws = 4", "draws = 10")))))
     local = sweep(**arguments, folder=tmp_path / "local")
     killed: list[int] = []
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")  # the workers run plain Python, as this process
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, local_directory=str(tmp_path)
     ) as cluster:
@@ -486,7 +488,7 @@ def test_a_cluster_that_loses_a_worker_finds_what_this_machine_finds(tmp_path: P
 
         address = cluster.scheduler_address
         where: dict[str, Any] = {"folder": tmp_path / "cluster", "executor": address}
-        remote = sweep(**arguments, **where, runs_per_file=4, progress=kill)
+        remote = sweep(**arguments, **where, runs_per_file=2, progress=kill)
     assert killed
     assert remote.missing == 0
     assert values_of(remote) == values_of(local)
