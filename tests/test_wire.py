@@ -7,12 +7,14 @@ import os
 import socket
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import quell as ql
+from quell.kernels.dispatch import call_specialised, compiled
 from quell.realtime.devices.base import (
     read_measurement,
 )
@@ -21,7 +23,15 @@ from quell.realtime.devices.twin import TwinDevice
 from quell.realtime.system.clock import system_clock
 from quell.realtime.wire import frames
 from quell.realtime.wire.shared_memory import SIZE
-from quell.realtime.wire.udp import UdpDevice
+from quell.realtime.wire.transport import (
+    connect_to_sender,
+    is_from_other_side,
+    receive,
+    reply,
+    send,
+    wait_for_frame,
+)
+from quell.realtime.wire.udp import UdpDevice, UdpTransport
 
 from .benchmark_module import benchmark
 from .rig_bench import DT, PLANT, WIRES, Bench, connect, law, packed, url_of
@@ -155,6 +165,37 @@ def test_a_port_that_is_taken_is_refused(bench: Callable[..., Bench]) -> None:
     for wire in ("udp", "shm"):
         with pytest.raises(ValueError, match=r"can't listen there|another rig has this name"):
             listen(bench(wire).url)
+
+
+@compiled
+def _taken_on(transport: UdpTransport, frame: frames.Buffer) -> tuple[int, bool, int, bool]:
+    size = receive(transport, frame)
+    stranger = not is_from_other_side(transport)
+    failed = reply(transport, frame)
+    connect_to_sender(transport)
+    return size, stranger, failed + send(transport, frame), is_from_other_side(transport)
+
+
+@pytest.mark.compiled
+def test_compiled_code_answers_whoever_sent_and_knows_him_again() -> None:
+    """What a rig does at its port with a hello; a rig itself is compiled for one wire only."""
+    host = "127.0.0.1"
+    with (
+        closing(listen(f"udp://{host}:0")) as here,
+        socket.socket(type=socket.SOCK_DGRAM) as there,
+        socket.socket(type=socket.SOCK_DGRAM) as stranger,
+    ):
+        there.settimeout(5.0)
+        hello, port = packed(frames.HELLO, 0, 0, DT), here.socket.getsockname()[1]
+        there.sendto(hello, (host, port))
+        frame = frames.buffer()
+        wait_for_frame(here.transport, 10**9)
+        done = call_specialised(_taken_on, here.transport, frame)
+        assert done == (len(hello), True, 0, True)
+        assert [there.recv(100), there.recv(100)] == [hello, hello]
+        stranger.sendto(hello, (host, port))
+        wait_for_frame(here.transport, 10**9)
+        assert call_specialised(_taken_on, here.transport, frame)[:2] == (len(hello), True)
 
 
 def test_an_address_that_cannot_be_reached_is_named() -> None:
