@@ -48,7 +48,10 @@ def test_no_module_can_unpickle_data() -> None:
     """None imports what could, and numpy's and torch's loaders are not used."""
     found = []
     for file in ROOT.rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        text = file.read_text(encoding="utf-8")
+        if not any(word in text for word in (*UNPICKLERS, "allow_pickle", "load")):
+            continue
+        for node in ast.walk(ast.parse(text)):
             names: list[str] = []
             if isinstance(node, ast.Import):
                 names = [alias.name.partition(".")[0] for alias in node.names]
