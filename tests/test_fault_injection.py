@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from quell.realtime.rig.fault_injection import KINDS, Fault, FaultInjector, Relay, random_faults
+from quell.realtime.wire import device as wire_device
 from quell.realtime.wire import frames
 
 from .rig_bench import DT, Bench, packed
@@ -67,7 +68,7 @@ def test_random_plans_have_all_kinds_and_are_the_same_again() -> None:
 
 
 def test_through_a_relay_every_fault_is_counted_and_no_wrong_number_gets_through(
-    bench: Callable[..., Bench],
+    bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both ways: lost frames are missed, corrupted ones refused; the rig applies commands only."""
     here = bench("udp", watchdog=30)
@@ -82,6 +83,7 @@ def test_through_a_relay_every_fault_is_counted_and_no_wrong_number_gets_through
     ]
     with Relay("udp://127.0.0.1:0", here.url, plan) as relay:
         device = here.open(relay.url)
+        monkeypatch.setattr(wire_device, "_MOST_AGE", 10)  # how long it waits for a lost frame
         sent, applied = {0.0}, set()
         for k in range(100):
             here.rig.tick()

@@ -52,7 +52,7 @@ class Rig:
         self.closed += 1
 
 
-def short(device: Any, duration: float = 0.3, **options: Any) -> Any:
+def short(device: Any, duration: float = 0.1, **options: Any) -> Any:
     """Run a short scenario."""
     return run_rig(
         device,
@@ -68,7 +68,7 @@ def test_a_run_from_end_to_end(tmp_path: Path) -> None:
     """Trajectory, record, files and counters agree; the device is closed."""
     device, reported = Rig(), list[ModeChange]()
     paths = [tmp_path / "run.csv", tmp_path / "run.mcap"]
-    run = short(device, telemetry=paths, on_change=reported.append)
+    run = short(device, 0.3, telemetry=paths, on_change=reported.append)
     assert run.completed
     assert [change.mode for change in run.changes] == [Mode.RUN, Mode.RAMP, Mode.STOPPED]
     assert tuple(reported) == run.changes

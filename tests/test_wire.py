@@ -21,6 +21,7 @@ from quell.realtime.devices.base import (
 from quell.realtime.devices.registry import listen
 from quell.realtime.devices.twin import TwinDevice
 from quell.realtime.system.clock import system_clock
+from quell.realtime.wire import device as wire_device
 from quell.realtime.wire import frames
 from quell.realtime.wire.shared_memory import SIZE
 from quell.realtime.wire.transport import (
@@ -138,12 +139,15 @@ def test_a_hello_that_is_heard_when_its_loop_has_gone_begins_nothing(
 
 
 @pytest.mark.parametrize("wire", ["udp", "shm"])  # a serial line hangs up with it
-def test_the_rigs_end_is_told(wire: str, bench: Callable[..., Bench]) -> None:
+def test_the_rigs_end_is_told(
+    wire: str, bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its goodbye, where it can say one."""
     here = bench(wire)
     device = here.open()
     here.cycle(device, law, 2)
     here.rig.close()
+    monkeypatch.setattr(wire_device, "_MOST_AGE", 10)  # how long it waits for a measurement
     assert np.isnan(device.read())
     assert device.lost
     with pytest.raises(ConnectionError):
