@@ -7,15 +7,30 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cyclopts
 import matplotlib.pyplot as plt
 import pytest
+from matplotlib.figure import Figure
 
 from quell.identification import Identified
 from quell.kernels.compile_time import compile_time
 
 from .commands import Shown, in_its_own_process
+
+
+@pytest.fixture
+def bare_pngs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the axes out of PNG files: the same figure is written whole as SVG."""
+    savefig = Figure.savefig
+
+    def save(figure: Figure, path: Path, **options: Any) -> None:
+        for axes in figure.axes:
+            axes.set_visible(path.suffix == ".svg")
+        savefig(figure, path, **options)
+
+    monkeypatch.setattr(Figure, "savefig", save)
 
 
 def test_help_and_version_answer(quell: Callable[..., Shown], tmp_path: Path) -> None:
@@ -28,6 +43,7 @@ def test_help_and_version_answer(quell: Callable[..., Shown], tmp_path: Path) ->
 
 
 @pytest.mark.compiled
+@pytest.mark.usefixtures("bare_pngs")
 def test_the_study_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -61,6 +77,7 @@ def test_the_study_is_printed_written_and_drawn(
 
 
 @pytest.mark.compiled
+@pytest.mark.usefixtures("bare_pngs")
 def test_the_torsional_experiment_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,6 +133,7 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(
 
 
 @pytest.mark.compiled
+@pytest.mark.usefixtures("bare_pngs")
 def test_the_guards_trial_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
