@@ -17,6 +17,7 @@ import pytest
 
 from quell.cli.commands.rig import rig as run_rig
 from quell.realtime.devices.registry import listen, open_device
+from quell.realtime.wire import device as wire_device
 
 from .commands import Shown
 from .rig_bench import connect
@@ -84,13 +85,14 @@ def test_a_rig_runs_until_it_is_told_to_end_and_says_how_it_went(tmp_path: Path)
     assert np.nanmax(rows["command"]) == 1.0
 
 
-def test_a_rig_that_is_killed_is_noticed_and_replaced() -> None:
+def test_a_rig_that_is_killed_is_noticed_and_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     """In shared memory nothing stays in the way of the next one; the loop gets no more numbers."""
     url = f"shm://test-{uuid.uuid4().hex}"
     with rig("--device", url, "--watchdog", "200") as (process, _), open_device(url, DT) as device:
         exchanged(device, 3)
         process.kill()
         process.wait()
+        monkeypatch.setattr(wire_device, "_MOST_AGE", 10)  # how long it waits for a measurement
         device.read()
         assert np.isnan(device.read())
     with pytest.raises(ConnectionError, match="start one with: quell rig"):

@@ -291,7 +291,7 @@ def test_a_full_disk_is_told_once_and_ends_neither_run_nor_exit_code(
     monkeypatch.setattr(CsvSink, "write", full)
     (tmp_path / "rig.toml").write_text(RIG)
     places = ("--csv", "run.csv", "--mcap", "run.mcap", "--no-figures", "--json", "out.json")
-    shown = quell("run-rig", "rig.toml", "--seconds", "0.3", *places)
+    shown = quell("run-rig", "rig.toml", "--seconds", "0.1", *places)
     assert shown.code == 0, shown.err
     assert (shown.out + shown.err + caplog.text).count("No space left on device") == 1
     cycles = json.loads((tmp_path / "out.json").read_text())["tally"]["cycles"]

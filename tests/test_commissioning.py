@@ -86,7 +86,7 @@ def test_an_experiment_at_a_rig_over_udp_shows_the_plant() -> None:
         ticking = threading.Thread(target=rig.run, kwargs={"priority": 0})
         ticking.start()
         try:
-            limits = Limits(-2.0, 2.0, -1.0, 1.0, 1.5)
+            limits = Limits(-2.0, 2.0, -1.0, 1.0, 0.8)
             how: dict[str, Any] = {"safety": PATIENT, "priority": 0}
             done = experiment(lambda: open_device(listener.url, DT), DT, limits, **how)
         finally:
