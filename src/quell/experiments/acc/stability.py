@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from quell.analysis.linearise import linear_law
 from quell.analysis.subsystems import closed_loop_matrix
 from quell.controllers import Controller
+from quell.controllers.linear.law import LinearLaw
 from quell.parallel import one_blas_thread
 from quell.plants import CubicSpringPlant, LinearPlant
 
@@ -18,11 +19,17 @@ def unstable(
     plants: Sequence[LinearPlant | CubicSpringPlant], controller: Controller
 ) -> NDArray[np.bool_]:
     """Return for each plant whether its loop is unstable at rest, with nothing learned."""
-    law = linear_law(controller)
+    return unstable_under(plants, linear_law(controller), controller.dt)
+
+
+def unstable_under(
+    plants: Sequence[LinearPlant | CubicSpringPlant], law: LinearLaw, dt: float
+) -> NDArray[np.bool_]:
+    """Return for each plant whether its loop with a linear law at a sample time is unstable."""
     inner = law.A + np.outer(law.B_u, law.C)
     linear = [p.linear if isinstance(p, CubicSpringPlant) else p for p in plants]
     with one_blas_thread():
-        sampled = [plant.sampled(controller.dt) for plant in linear]
+        sampled = [plant.sampled(dt) for plant in linear]
         loops = np.array(
             [closed_loop_matrix(s.transition, s.input, s.output, law, inner) for s in sampled]
         )
