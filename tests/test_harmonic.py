@@ -131,20 +131,20 @@ def test_sinusoids_closer_than_a_line_width_are_separated_by_the_search() -> Non
     As Python: to compile the search takes longer, and the contracts compare it compiled.
     """
     controller = ql.ADRC(
-        ql.ESO.model_free(4, 1.0, 6.0, 0.04),
+        ql.ESO.model_free(4, 1.0, 6.0, 0.0625),
         omega_c=1.0,
         learner=ql.learners.Harmonic(count=2, search=True),
     )
     load = ql.signals.Sinusoid(omega=0.5, start=10.0) + ql.signals.Sinusoid(omega=0.6, start=10.0)
     scenario = ql.Scenario(
-        disturbances=(0.0, load), noise=ql.signals.BandLimitedNoise(1e-12, 0.04), duration=110.0
+        disturbances=(0.0, load), noise=ql.signals.BandLimitedNoise(1e-12, 0.0625), duration=100.0
     )
     run, without = (
         ql.simulate(ql.plants.two_mass_spring(), law, scenario, interpret=True)
         for law in (controller, ql.ADRC(controller.observer, omega_c=1.0))
     )
     np.testing.assert_allclose(np.sort(run.final_state.learner.omega), (0.5, 0.6), rtol=2e-3)
-    late = run.window(73.0, 110.0)
+    late = run.window(73.0, 100.0)
     assert np.max(np.abs(run["y"][late])) < 0.02 * np.max(np.abs(without["y"][late]))
 
 

@@ -297,7 +297,7 @@ def test_nlms_learns_at_its_rate_whatever_the_sample_time() -> None:
 
 
 def loop(
-    learner: Any, duration: float = 40.0, unit: float = 1.0
+    learner: Any, duration: float = 15.0, unit: float = 1.0
 ) -> tuple[ql.Trajectory, dict[str, float]]:
     """A run with a mass on a spring that stiffens, with friction and a weight: f = −2 y − 0.5 y³ − tanh(y'/0.3) + 0.7, b = 1.5."""
 
@@ -352,18 +352,18 @@ def test_the_effective_gain_stays_in_its_interval(make: Any, rng: np.random.Gene
 def test_a_wrong_gain_is_found() -> None:
     """With u among the features and enough excitation, b0 + θ_u is the plant's gain."""
     s = ql.signals
-    excitation = s.Chirp(omega_start=0.2, omega_end=3.0, duration=60.0) + 0.5 * s.Sinusoid(
+    excitation = s.Chirp(omega_start=0.2, omega_end=3.0, duration=30.0) + 0.5 * s.Sinusoid(
         omega=1.7
     )
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-3.0, -0.5]], [0.0, 2.0], [1.0, 0.0])
     learner = ql.learners.RLS(State() + Bias() + Input(), gain_interval=(0.3, 3.0))
     controller = ql.ADRC(
-        ql.ESO.model_free(order=2, b0=1.2, omega_o=20.0, dt=5e-3), omega_c=4.0, learner=learner
+        ql.ESO.model_free(order=2, b0=1.2, omega_o=20.0, dt=1e-2), omega_c=4.0, learner=learner
     )
     run = ql.simulate(
         plant,
         controller,
-        ql.Scenario(excitation, 60.0, noise=s.BandLimitedNoise(1e-12, 0.01)),
+        ql.Scenario(excitation, 30.0, noise=s.BandLimitedNoise(1e-12, 0.01)),
         interpret=True,  # compiled, a learner with u among its features runs in the contracts
     )
     assert 1.2 + controller.read(run.final_state).theta["u"] == pytest.approx(2.0, rel=0.05)
