@@ -26,7 +26,7 @@ from .commands import Shown
 
 pytestmark = pytest.mark.compiled
 
-DT = 1e-3
+DT = 2e-3
 TESTBED = ([4.6e4], [1.0, 1.901, 1683.0, 1812.0, 0.1032])
 QUANTUM = 2.0 * np.pi / 16_000
 
@@ -45,7 +45,7 @@ def answer(plant: Any, u: np.ndarray, dt: float, quantum: float = 0.0) -> np.nda
 def twin_record(
     band: tuple[float, float], amplitude: float, offset: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return u and y of the twin with all its friction and quantisation, driven open loop by a PRBS for 60 s at 1 kHz."""
+    """Return u and y of the twin with all its friction and quantisation, driven open loop by a PRBS for 60 s at 500 Hz."""
     record = excited(
         ql.plants.torsional(),
         excitation("prbs", band, 60.0, DT, offset - amplitude, offset + amplitude),
@@ -169,16 +169,16 @@ def test_friction_of_a_single_inertia_is_found() -> None:
 
 @pytest.mark.parametrize("friction", [False, True])
 def test_the_delay_is_found(friction: bool) -> None:
-    """Of up to 20 samples, by itself."""
+    """Of up to ten samples, by itself."""
     u, y = (
-        (part[:20_000] for part in twin_record((0.2, 20.0), 2.0))
+        (part[:10_000] for part in twin_record((0.2, 20.0), 2.0))
         if friction
         else (excitation("prbs", (0.2, 60.0), 30.0, DT).u, np.zeros(0))
     )
     y = y if friction else answer(TESTBED, u, DT, QUANTUM)
     late = np.concatenate([np.zeros(7), y[:-7]])
-    found = ql.identify(u, late, DT, delay=(0.0, 0.02), friction=friction, held_out=0.2)
-    assert found.delay == pytest.approx(0.007)
+    found = ql.identify(u, late, DT, delay=(0.0, 10 * DT), friction=friction, held_out=0.2)
+    assert found.delay == pytest.approx(7 * DT)
 
 
 def test_the_deviations_of_poles_are_those_of_many_records() -> None:
@@ -217,7 +217,7 @@ def test_a_reference_frees_a_closed_loop_of_bias() -> None:
     """A slow strong force in the loop: output error is far off, instrumental variables from the reference are not."""
     dt, plant = 0.02, ql.plants.LinearPlant.of(([3.0], [1.0, 0.6, 4.0]))
     controller = ql.ADRC(ql.ESO.model_free(order=2, b0=3.0, omega_o=15.0, dt=dt), omega_c=5.0)
-    plain, freed = [], []
+    freed = []
     for seed in range(2):
         scenario = ql.Scenario(
             reference=excitation("prbs", (0.2, 10.0), 150.0, dt, seed=seed).signal,
@@ -228,9 +228,8 @@ def test_a_reference_frees_a_closed_loop_of_bias() -> None:
         )
         run = ql.simulate(plant, controller, scenario)
         record = run["u"], run["y_measured"], dt
-        plain.append(ql.identify(*record, order=2, held_out=0.0).den[1])
         freed.append(ql.identify(*record, order=2, held_out=0.0, reference=run["r"]).den[1])
-    assert np.min(np.abs(np.array(plain) - 0.6)) > 0.3
+    assert abs(ql.identify(*record, order=2, held_out=0.0).den[1] - 0.6) > 0.3
     assert np.mean(freed) == pytest.approx(0.6, abs=0.15)
 
 
