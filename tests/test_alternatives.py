@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ def by_name(found: Identified) -> dict[str, Any]:
     return {one.name: one for one in alternatives(found)}
 
 
+@cache
 def mass(seed: int, friction: float) -> tuple[Any, Any]:
     """Return u and y of a mass with viscous and Coulomb friction, which sticks, in small steps."""
     fine, rng = 20, np.random.default_rng(seed)
@@ -36,7 +38,7 @@ def mass(seed: int, friction: float) -> tuple[Any, Any]:
         y[k] = position
         for _ in range(fine):
             after = speed + h * (5.0 * force - 0.8 * speed)
-            speed = after - np.clip(after, -h * friction, h * friction)
+            speed = after - min(max(after, -h * friction), h * friction)
             position += h * speed
     return u, y + 1e-3 * rng.standard_normal(u.size)
 

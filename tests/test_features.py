@@ -50,7 +50,7 @@ BLOCKS: dict[str, Any] = {
     "rbf around centres": RBF(centers=[[0.0], [0.5]], states=(2,)),
     "custom": Custom(halves, ("half", "product")),
     "periodic": Periodic(period=0.7, orders=(1, 2, 5), state=2),
-    "joined": State() + Polynomial() + Periodic(highest=3) + RBF(9) + Bias() + Input(),
+    "joined": State() + Periodic(highest=3) + RBF(9) + Input(),
 }
 
 

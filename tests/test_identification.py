@@ -481,6 +481,7 @@ def test_the_command_prints_writes_and_draws(quell: Callable[..., Shown], tmp_pa
         "data.csv",
         "--order",
         "2",
+        "--no-alternatives",
         "--json",
         "out.json",
         "--figures",

@@ -271,7 +271,7 @@ def test_a_first_motion_out_of_friction_does_not_settle_what_is_learned(scale: f
     plain, learned = (
         ql.simulate(
             plant,
-            ql.ADRC(ESO.model_free(2, 8.0, 40.0, 2e-3), omega_c=10.0, learner=learner),
+            ql.ADRC(ESO.model_free(2, 8.0, 40.0, 4e-3), omega_c=10.0, learner=learner),
             scenario,
             interpret=True,
         ).metrics()
