@@ -129,11 +129,11 @@ def ticks(device: TickingDevice, duration: float, late: Any = (0,), **safety: An
 def test_the_grid_follows_a_devices_clock(drift: float) -> None:
     """For slower and faster clocks each cycle gets the next tick, and none is old."""
     device = TickingDevice(SAMPLE * (1.0 + drift))
-    found, loop = ticks(device, 40.0)
+    found, loop = ticks(device, 20.0)
     assert device.handle.seen[1] <= SAMPLE // 5_000
     y = found[:, LOOP_WIDTH - 2]
     np.testing.assert_array_equal(np.diff(y), 1.0)
-    assert len(y) > 3_900
+    assert len(y) > 1_950
     assert loop.controller.supervisor.counters[0].overruns == 0
 
 
@@ -143,7 +143,7 @@ def test_the_grid_follows_a_devices_clock(drift: float) -> None:
 def test_a_delay_of_the_device_costs_no_measurement(hiccup: int, k: int) -> None:
     """Its late ticks come at once; the loop takes a step for each, with its own measurement."""
     late = {k + i: max(hiccup - i * SAMPLE, 0) for i in range(4)}
-    found, loop = ticks(TickingDevice(SAMPLE, late), 10.0)
+    found, loop = ticks(TickingDevice(SAMPLE, late), 5.0)
     ahead = found[:, LOOP_WIDTH - 2] - found[:, 0]
     np.testing.assert_array_equal(np.diff(found[:, 0]), 1.0)
     np.testing.assert_array_equal(ahead, ahead[0])
@@ -158,7 +158,7 @@ def test_a_delay_of_the_loop_costs_no_measurement(hiccup: int, k: int) -> None:
     """The loop wakes late: it makes up for the ticks meanwhile, and sends u for the newest."""
     late = np.zeros(20_000, dtype=np.int64)
     late[k] = hiccup
-    found, loop = ticks(TickingDevice(SAMPLE), 10.0, late)
+    found, loop = ticks(TickingDevice(SAMPLE), 5.0, late)
     ahead = found[:, LOOP_WIDTH - 2] - found[:, 0]
     np.testing.assert_array_equal(np.diff(found[:, 0]), 1.0)
     np.testing.assert_array_equal(ahead, ahead[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import control
@@ -206,14 +207,16 @@ def test_a_cascade_finds_a_ramp_of_f_without_lag() -> None:
 
 
 PLANT = ql.plants.LinearPlant([[0.0, 1.0], [-2.0, -0.3]], [0.0, 1.5], [1.0, 0.0])
+PLAIN = ESO.model_free(2, 1.5, 30.0, 2e-3)
 
 
+@cache
 def rejection_and_noise(observer: ESO) -> tuple[float, float]:
     """Return the largest y after a step of the load, and the standard deviation of u from noise."""
 
     def run(noise: Any) -> ql.Trajectory:
         scenario = ql.Scenario(
-            disturbances=(5.0 * ql.signals.Step(at=2.0),), noise=noise, duration=8.0, seed=3
+            disturbances=(5.0 * ql.signals.Step(at=2.0),), noise=noise, duration=5.0, seed=3
         )
         return ql.simulate(PLANT, ql.ADRC(observer, omega_c=3.0), scenario)
 
@@ -225,19 +228,17 @@ def rejection_and_noise(observer: ESO) -> tuple[float, float]:
 
 def test_a_cascade_rejects_the_same_load_with_half_the_noise_in_u() -> None:
     """The claim of Łakomy & Madonski: ratio 3 against the plain ESO of the same bandwidth."""
-    plain, cascade = ESO.model_free(2, 1.5, 30.0, 2e-3), ESO.cascade(2, 1.5, 30.0, 2e-3, ratio=3.0)
-    (peak, noise), (cascade_peak, cascade_noise) = (
-        rejection_and_noise(plain),
-        rejection_and_noise(cascade),
-    )
+    cascade = ESO.cascade(2, 1.5, 30.0, 2e-3, ratio=3.0)
+    peak, noise = rejection_and_noise(PLAIN)
+    cascade_peak, cascade_noise = rejection_and_noise(cascade)
     assert cascade_peak < peak
     assert cascade_noise < 0.6 * noise
 
 
 def test_half_gain_in_observer_rejects_the_same_load_with_less_noise_in_u() -> None:
     """The claim of Herbst et al., measured: the load's effect within 2 %, noise three quarters."""
-    full, half = (ESO.model_free(2, 1.5, 30.0, 2e-3, half_gain=half) for half in (False, True))
-    (peak, noise), (half_peak, half_noise) = rejection_and_noise(full), rejection_and_noise(half)
+    half = ESO.model_free(2, 1.5, 30.0, 2e-3, half_gain=True)
+    (peak, noise), (half_peak, half_noise) = rejection_and_noise(PLAIN), rejection_and_noise(half)
     assert half_peak == pytest.approx(peak, rel=0.02)
     assert half_noise < 0.78 * noise
 
@@ -388,7 +389,7 @@ def test_a_learner_finds_the_gain_of_a_delayed_plant() -> None:
     run = ql.simulate(
         plant,
         controller,
-        ql.Scenario(ql.signals.Sinusoid(omega=1.0) + ql.signals.Sinusoid(omega=2.7), duration=80.0),
+        ql.Scenario(ql.signals.Sinusoid(omega=1.0) + ql.signals.Sinusoid(omega=2.7), duration=20.0),
         interpret=True,
     )
     theta = dict(zip(controller.features, run["theta"][-1], strict=True))
@@ -412,14 +413,15 @@ FORMS = {
 
 @pytest.mark.parametrize("name", FORMS)
 def test_noise_gains_are_what_noise_does(name: str, rng: np.random.Generator) -> None:
-    """Forty thousand samples of white noise in y, to 20 % in variance."""
+    """White noise in y of a hundred observers, for a thousand samples from their steady state on, to 10 % in variance."""
     observer = FORMS[name]
     found = response(observer.model, 3)
-    noise, state, total = rng.normal(size=40_000), np.zeros(observer.states), np.zeros(3)
-    for value in noise:
-        total += (found.output @ state + found.feedthrough[:, 0] * value) ** 2
-        state = found.transition @ state + found.input[:, 0] * value
-    np.testing.assert_allclose(total / noise.size, noise_gains(observer), rtol=0.2)
+    seen, state = [], np.zeros((observer.states, 100))
+    for y in rng.normal(size=(1200, 100)):
+        seen.append(found.output @ state + found.feedthrough[:, :1] * y)
+        state = found.transition @ state + found.input[:, :1] * y
+    variance = np.mean(np.square(seen[200:]), axis=(0, 2))
+    np.testing.assert_allclose(variance, noise_gains(observer), rtol=0.1)
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -523,7 +525,7 @@ def test_a_guarded_learner_serves_other_forms(name: str) -> None:
     run = ql.simulate(
         PLANT,
         controller,
-        ql.Scenario(ql.signals.Sinusoid(omega=1.5).until(14.0, then=1.0), duration=20.0),
+        ql.Scenario(ql.signals.Sinusoid(omega=1.5).until(7.0, then=1.0), duration=12.0),
     )
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
     assert dict(zip(controller.features, run["theta"][-1], strict=True))["x1"] == pytest.approx(
