@@ -280,7 +280,6 @@ def test_a_shaper_leaves_no_vibration_of_its_mode(
     assert np.max(np.abs(run["y"][run.t > made.times[-1] + 2e-3] - 1.0)) < 1e-5
 
 
-@pytest.mark.compiled
 def test_how_much_a_wrong_frequency_leaves_is_as_published() -> None:
     """Undamped, at 10 % off: |cos(π/2 · 1.1)| = 15.6 % for ZV, its square, 2.4 %, for ZVD; measured in a driven mode."""
     omega, off = 2.0, 1.1
@@ -290,9 +289,9 @@ def test_how_much_a_wrong_frequency_leaves_is_as_published() -> None:
         [[0.0, 1.0], [-((off * omega) ** 2), 0.0]], [0.0, (off * omega) ** 2], [1.0, 0.0]
     )
     for made in (ZV(omega), ZVD(omega)):
-        follow = Prefiltered(PID(0.0, setpoint=[0.0, 1.0, 0.0], dt=1e-3), made)
-        run = ql.simulate(mode, follow, ql.Scenario(reference=1.0, duration=10.0))
-        left = np.max(np.abs(run["y"][run.t > made.times[-1] + 2e-3] - 1.0))
+        follow = Prefiltered(PID(0.0, setpoint=[0.0, 1.0, 0.0], dt=2e-3), made)
+        run = ql.simulate(mode, follow, ql.Scenario(reference=1.0, duration=5.0))
+        left = np.max(np.abs(run["y"][run.t > made.times[-1] + 4e-3] - 1.0))
         assert left == pytest.approx(made.residual(off * omega), rel=1e-3)
 
 

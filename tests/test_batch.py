@@ -90,7 +90,11 @@ def test_a_run_that_diverges_ends_alone() -> None:
     """The others go on; it is NaN from its end, which is where exp(rate t) passes the limit."""
     rates = np.array([0.0, 5.0, 0.1, 20.0])
     runs = ql.simulate(
-        batch(growth, rate=rates), as_it_is(), ql.Scenario(duration=4.0, x0=[1.0]), limit=100.0
+        batch(growth, rate=rates),
+        as_it_is(),
+        ql.Scenario(duration=4.0, x0=[1.0]),
+        limit=100.0,
+        interpret=True,
     )
     np.testing.assert_array_equal(runs.diverged, [False, True, False, True])
     np.testing.assert_array_equal(runs.status & ql.Status.DIVERGED != 0, runs.diverged)
@@ -164,10 +168,13 @@ def test_a_controller_that_feeds_derivatives_forward_may_be_one_of_a_batch() -> 
     """Each run is given the derivatives that its controller wants, of the one reference."""
     laws = [controller(feedforward=on) for on in (True, False, True)]
     moving = ql.Scenario(ql.signals.Sinusoid(omega=0.5), duration=5.0)
-    runs = ql.simulate(PLANTS, laws, moving)
-    for i, law in enumerate(laws):
-        np.testing.assert_array_equal(runs["u"][i], ql.simulate(PLANTS[i], law, moving)["u"])
-    assert np.any(runs["u"][0] != ql.simulate(PLANTS[0], laws[1], moving)["u"])
+    runs = ql.simulate(PLANTS, laws, moving, interpret=True)
+    alone = [
+        ql.simulate(plant, law, moving, interpret=True)["u"]
+        for plant, law in zip(PLANTS, laws, strict=True)
+    ]
+    np.testing.assert_array_equal(runs["u"], alone)
+    assert np.any(runs["u"][0] != ql.simulate(PLANTS[0], laws[1], moving, interpret=True)["u"])
 
 
 def test_scenarios_of_a_batch_may_rest_at_different_times() -> None:
@@ -277,7 +284,12 @@ def test_a_saved_batch_is_loaded_back_whole(tmp_path: Path) -> None:
 
     plants = batch(lag, r=np.array([0.1, 9.0]), k=1e-9)
     runs = ql.simulate(
-        plants, as_it_is(), ql.Scenario(duration=1.0, x0=[1.0]), limit=100.0, record=("y", "x")
+        plants,
+        as_it_is(),
+        ql.Scenario(duration=1.0, x0=[1.0]),
+        limit=100.0,
+        record=("y", "x"),
+        interpret=True,
     )
     assert list(runs.diverged) == [False, True]
     data = runs.to_xarray()
@@ -312,6 +324,7 @@ def test_parameters_may_be_called_as_channels_and_coordinates_are(tmp_path: Path
         batch(lambda limit, time, run: growth(limit), limit=[0.1, 0.2], time=1.0, run=3),
         as_it_is(),
         SHORT,
+        interpret=True,
     )
     runs.save(tmp_path / "runs.nc")
     again = ql.BatchTrajectory.load(tmp_path / "runs.nc")

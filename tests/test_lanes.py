@@ -72,10 +72,15 @@ def masses(runs: int) -> Any:
     return batch(two_mass_spring, m1=np.linspace(0.8, 1.25, runs), k=1.1)
 
 
-def compare(plants: Any, law: Any, scenario: Any, **options: Any) -> ql.BatchTrajectory:
-    """Run both ways, with everything recorded; return the runs over lanes."""
+def compare(
+    plants: Any, law: Any, scenario: Any, *, interpret: bool = False, **options: Any
+) -> ql.BatchTrajectory:
+    """Run both ways, with everything recorded; return the runs over lanes.
+
+    ``interpret`` is for the exact loop: a few short runs take less time than its compilation.
+    """
     options = {"record": "all"} | options
-    exact = ql.simulate(plants, law, scenario, **options)
+    exact = ql.simulate(plants, law, scenario, interpret=interpret, **options)
     lanes = ql.simulate(plants, law, scenario, exact=False, **options)
     assert exact.final_states
     assert not lanes.final_states
@@ -142,11 +147,12 @@ def test_limits_act_over_lanes_as_in_the_exact_loop() -> None:
 def test_controllers_of_different_kinds_and_sizes_share_a_batch() -> None:
     """Each size is a group of its own; derivatives of the reference are fed forward where wanted."""
     moving = ql.Scenario(ql.signals.Sinusoid(omega=0.5), duration=5.0)
-    compare(masses(3), [controller(feedforward=on) for on in (True, False, True)], moving)
+    laws = [controller(feedforward=on) for on in (True, False, True)]
+    compare(masses(3), laws, moving, interpret=True)
     pid = baselines.PID(4.0, 2.0, 1.0, tf=0.05, b=0.7, dt=DT, u_min=-2.0, u_max=3.0)
     lqg = baselines.LQG(chain(1.0), 3.0, 12.0, DT, rate_limit=60.0)
     plants = [chain(mass) for mass in (0.5, 1.0, 2.0)]
-    compare(plants, [pid, lqg, pid], replace(NOISY, disturbances=(0.4,)))
+    compare(plants, [pid, lqg, pid], replace(NOISY, disturbances=(0.4,)), interpret=True)
 
 
 def test_each_run_may_have_its_own_scenario() -> None:
@@ -165,7 +171,7 @@ def test_delays_of_plant_and_observer() -> None:
     scenario = replace(
         NOISY, disturbances=(0.4,), x0=[0.1, 0.0, 0.5, -0.5, 1.0], rest_at=(3.0,), duration=5.0
     )
-    compare(late, ql.ADRC(observer, omega_c=1.5), scenario)
+    compare(late, ql.ADRC(observer, omega_c=1.5), scenario, interpret=True)
 
 
 def test_a_run_does_not_depend_on_its_place_neighbours_or_threads() -> None:

@@ -24,7 +24,7 @@ def stepped(
     plant: object, dt: float, samples: int, x0: object, u: float = 0.0, w: object = ()
 ) -> np.ndarray:
     """Advance a plant by hand, interpreted."""
-    model = plant.sampled(dt)
+    model = plant.sampled(dt, interpret=True)
     x, scratch = np.array(x0, dtype=float), np.zeros(6 * len(x0))
     for k in range(samples):
         advance(model, x, scratch, k * dt, u, np.array(w, dtype=float))
@@ -113,7 +113,7 @@ def test_a_nonlinear_plant_with_a_linear_equation_is_the_linear_plant() -> None:
     scenario = ql.Scenario(
         reference=1.0, duration=20.0, disturbances=(0.0, ql.signals.Step(at=10.0))
     )
-    one, other = (ql.simulate(p, controller, scenario) for p in (linear, plant))
+    one, other = (ql.simulate(p, controller, scenario, interpret=True) for p in (linear, plant))
     np.testing.assert_allclose(one["y"], other["y"], atol=1e-8)
 
 
