@@ -15,7 +15,7 @@ LEARNED = np.array([-2.5, -0.3, 0.1, 0.05])
 TRAINING = ql.Scenario(
     reference=ql.signals.Sinusoid(omega=1.0),
     noise=ql.signals.BandLimitedNoise(power=1e-12, sample_time=0.01),
-    duration=20.0,
+    duration=10.0,
 )
 
 

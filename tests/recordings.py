@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 import quell as ql
@@ -20,8 +22,9 @@ def controller(**options: object) -> ql.ADRC:
     return ql.ADRC(OBSERVER, omega_c=3.0, **(learns | options))  # type: ignore[arg-type]
 
 
-def simulated(duration: float = 10.0, **options: object) -> ql.Trajectory:
-    """Return a simulated run of this controller under noise."""
+@cache
+def simulated(duration: float = 5.0, **options: object) -> ql.Trajectory:
+    """Return a simulated run of this controller under noise; the same one for all that ask."""
     noise = ql.signals.BandLimitedNoise(power=1e-9, sample_time=DT)
     scenario = ql.Scenario(reference=ql.signals.Sinusoid(omega=2.0), duration=duration, noise=noise)
     return ql.simulate(PLANT, controller(**options), scenario)

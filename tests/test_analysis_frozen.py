@@ -55,7 +55,7 @@ def test_what_the_record_says_of_a_learner_is_what_its_state_says(learner: Any) 
     """For learners that are linear in state and u, θ is the gain, whatever they call the bias or add as a feedforward."""
     controller = adrc(2, learner=learner)
     run = ql.simulate(chain(2), controller, TRAINING)
-    recorded, final = analysis.frozen(controller, run, 20.0), analysis.frozen(controller, run)
+    recorded, final = analysis.frozen(controller, run, 10.0), analysis.frozen(controller, run)
     np.testing.assert_allclose(recorded.gain, final.gain, atol=1e-8 * np.max(np.abs(final.gain)))
     assert recorded.slope == pytest.approx(final.slope, rel=1e-9)
     assert recorded.gain[0] == pytest.approx(-1.0, abs=0.6)
@@ -66,7 +66,7 @@ def test_a_guard_s_authority_scales_what_is_fed_back() -> None:
     controller = ql.ADRC(
         adrc(2).observer, omega_c=2.0, learner=ql.learners.Kalman(), guard=ql.Guard(time=10.0)
     )
-    run = ql.simulate(chain(2), controller, TRAINING)
+    run = ql.simulate(chain(2), controller, replace(TRAINING, duration=20.0))
     authority = run["authority"]
     half = int(np.flatnonzero((authority > 0.1) & (authority < 0.9))[0])
     np.testing.assert_allclose(
@@ -94,7 +94,7 @@ def test_a_network_is_what_it_is_for_small_motions() -> None:
     assert np.any(gain != 0.0)
     for array, old in zip(memory.model, before, strict=True):
         np.testing.assert_array_equal(array, old)
-    (loop,) = analysis.loops_over_time(chain(2), controller, TRAINING, [20.0])
+    (loop,) = analysis.loops_over_time(chain(2), controller, TRAINING, [10.0])
     np.testing.assert_allclose(loop.poles, analysis.analyse(chain(2), controller, at=run).poles)
 
 
@@ -112,7 +112,7 @@ def test_margins_over_time_are_those_of_each_instant() -> None:
     """From the record; the same from the scenario, simulated up to there."""
     controller = adrc(2, learner=ql.learners.Kalman())
     run = ql.simulate(chain(2), controller, TRAINING, record_every=10)
-    times = [1.0, 7.0, 20.0]
+    times = [1.0, 4.0, 10.0]
     recorded, again = (
         analysis.loops_over_time(chain(2), controller, source, times) for source in (run, TRAINING)
     )

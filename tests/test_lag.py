@@ -43,7 +43,7 @@ LINEAR = {
 def test_the_lag_filter_is_the_observers_own_shadow(
     order: int, dt: float, form: str, model: bool, seed: int
 ) -> None:
-    """Against the definition: the full observer, fed y = 0 and the input through Γ_f, for a thousand samples."""
+    """Against the definition: the full observer, fed y = 0 and the input through Γ_f, for five hundred samples."""
     rng = np.random.default_rng(seed)
     observer = (
         ESO.model_based((rng.normal(size=order), 1.0), omega_o=10.0, dt=dt, form=form)
@@ -51,10 +51,10 @@ def test_the_lag_filter_is_the_observers_own_shadow(
         else ESO.model_free(order=order, b0=1.0, omega_o=10.0, dt=dt, form=form)
     )
     lag, size = lag_of(observer), order + 1
-    inputs = rng.normal(size=1000)
+    inputs = rng.normal(size=500)
     z, seen, chain = np.zeros(size), np.zeros(size), np.zeros((1, size))
-    shadow, quick = np.zeros(1000), np.zeros(1000)
-    for k in range(1, 1000):
+    shadow, quick = np.zeros(500), np.zeros(500)
+    for k in range(1, 500):
         observe(observer.model, z, seen, 0.0, 0.0, inputs[k - 1])
         shadow[k] = -seen[-1]
         quick[k] = lag_push(lag, chain, 0, inputs[k - 1])
@@ -76,7 +76,7 @@ def test_what_a_plain_eso_would_have_estimated_is_known_exactly(
     observer = LINEAR[name]
     lag = lag_of(observer)
     chain = lag_memory(lag, 1)
-    y, u, f_learned = (np.cumsum(rng.normal(size=2000)) * 1e-2 for _ in range(3))
+    y, u, f_learned = (np.cumsum(rng.normal(size=1000)) * 1e-2 for _ in range(3))
     z, plain = np.zeros(observer.states), np.zeros(observer.states)
     seen, plainly = np.zeros(4), np.zeros(4)
     begin(observer.model, z, seen, y[0])

@@ -55,10 +55,10 @@ def test_each_derivative_is_the_slope_of_the_one_before() -> None:
 def test_a_loop_that_feeds_forward_answers_as_its_reference_model() -> None:
     """Whatever omega_c is: two degrees of freedom. Without derivatives the loop's own lag is added."""
     plant = ql.plants.LinearPlant([[0.0, 1.0], [-1.0, -0.6]], [0.0, 2.0], [1.0, 0.0])
-    observer = ql.ESO.model_based(plant, omega_o=40.0, dt=1e-3)
+    observer = ql.ESO.model_based(plant, omega_o=40.0, dt=2e-3)
     model, scenario = (
         ql.controllers.ReferenceModel(3.0, 2),
-        ql.Scenario(reference=1.0, duration=4.0),
+        ql.Scenario(reference=1.0, duration=3.0),
     )
     wanted, errors = None, {}
     for omega_c in (2.0, 8.0):

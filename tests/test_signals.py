@@ -207,11 +207,11 @@ def test_noise_has_the_variance_power_over_sample_time_and_is_held() -> None:
 
 
 @given(
-    cuts=st.lists(st.integers(1, 99_999), max_size=6), dt=st.sampled_from([1e-3, 7e-4, 1e-2, 0.033])
+    cuts=st.lists(st.integers(1, 49_999), max_size=6), dt=st.sampled_from([1e-3, 7e-4, 1e-2, 0.033])
 )
 def test_noise_does_not_depend_on_how_time_is_cut(cuts: list[int], dt: float) -> None:
     """The same bits come out in pieces of any size, in any order."""
-    t = np.arange(100_000) * dt
+    t = np.arange(50_000) * dt
     noise = s.BandLimitedNoise(power=1.0, sample_time=0.01, seed=3)
     edges = sorted({0, *cuts, t.size})
     pieces = [noise(t[a:b]) for a, b in pairwise(edges)]

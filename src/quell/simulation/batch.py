@@ -66,7 +66,7 @@ def simulate_batch(
     loops: dict[int, Loop] = {}
     first: dict[Any, Loop] = {}
     for i, model in zip(left, models, strict=True):
-        compiled = plants[i].compiled and not interpret
+        compiled = not interpret and plants[i].compiled
         structure = (id(controllers[i]), layout_of(model)) if compiled else i
         like = first.get(structure)
         loops[i] = Loop(plants[i], model, controllers[i], sampled[i], interpret, like)
