@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from collections import ChainMap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,7 +105,9 @@ def _learn(model: OwnDesign, memory: OwnMemory, features: Any, target: float) ->
 
 PYTHON_LEARNERS = python_learners()
 _NEED_A_MODEL = ("JaxModel", "Online", "PythonModel", "RiverModel", "SklearnModel", "TorchModel")
-LEARNERS: dict[str, Any] = (
+# Their order is that of the second part, and then of the first.
+LEARNERS: ChainMap[str, Any] = ChainMap(
+    PYTHON_LEARNERS,
     {
         name: getattr(learner_room, name)()
         for name in learner_room.__all__
@@ -124,8 +127,7 @@ LEARNERS: dict[str, Any] = (
         "gradient on radial features": ql.learners.BatchGradient(
             features=RBF(16, states=(1,)) + Bias()
         ),
-    }
-    | PYTHON_LEARNERS
+    },
 )
 
 OBSERVERS: dict[str, ESO] = {

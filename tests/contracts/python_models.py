@@ -6,6 +6,7 @@ import functools
 import importlib.util
 import os
 import time
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -107,41 +108,81 @@ def jax_mlp(hidden: int = 16) -> Any:
     return equinox.nn.MLP(2, "scalar", hidden, 1, activation=jax.numpy.tanh, key=jax.random.key(0))
 
 
-def python_learners() -> dict[str, Any]:
+class OnDemand(Mapping[str, Any]):
+    """Examples by name, each made when it is first asked for: to collect tests imports no library."""
+
+    def __init__(self, makers: dict[str, Callable[[], Any]]) -> None:
+        self._makers = makers
+        self._made: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._made:
+            self._made[name] = self._makers[name]()
+        return self._made[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._makers
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._makers)
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+
+def _sgd_regressor() -> Any:
+    from sklearn.linear_model import SGDRegressor
+
+    return ql.learners.SklearnModel(SGDRegressor(learning_rate="constant", eta0=0.05))
+
+
+def _mlp_regressor() -> Any:
+    from sklearn.neural_network import MLPRegressor
+
+    mlp = MLPRegressor(
+        hidden_layer_sizes=(16,),
+        activation="tanh",
+        solver="sgd",
+        learning_rate_init=0.05,
+        momentum=0.0,
+    )
+    return ql.learners.SklearnModel(mlp)
+
+
+def _river_pipeline() -> Any:
+    from river import linear_model, optim, preprocessing
+
+    pipeline = preprocessing.StandardScaler() | linear_model.LinearRegression(
+        optimizer=optim.SGD(0.05)
+    )
+    return ql.learners.RiverModel(pipeline)
+
+
+def _torch_mlp() -> Any:
+    import torch
+
+    return ql.learners.TorchModel(torch_mlp(), functools.partial(torch.optim.SGD, lr=0.1))
+
+
+def _equinox_mlp() -> Any:
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    return ql.learners.JaxModel(jax_mlp())
+
+
+def python_learners() -> OnDemand:
     """Return a learner for each library that is installed."""
-    found: dict[str, Any] = {"PythonModel": ql.learners.PythonModel(LeastMeanSquares())}
+    found: dict[str, Callable[[], Any]] = {
+        "PythonModel": lambda: ql.learners.PythonModel(LeastMeanSquares())
+    }
     if has("sklearn"):
-        from sklearn.linear_model import SGDRegressor
-        from sklearn.neural_network import MLPRegressor
-
-        found["SGDRegressor"] = ql.learners.SklearnModel(
-            SGDRegressor(learning_rate="constant", eta0=0.05)
-        )
-        mlp = MLPRegressor(
-            hidden_layer_sizes=(16,),
-            activation="tanh",
-            solver="sgd",
-            learning_rate_init=0.05,
-            momentum=0.0,
-        )
-        found["MLPRegressor"] = ql.learners.SklearnModel(mlp)
+        found |= {"SGDRegressor": _sgd_regressor, "MLPRegressor": _mlp_regressor}
     if has("river"):
-        from river import linear_model, optim, preprocessing
-
-        pipeline = preprocessing.StandardScaler() | linear_model.LinearRegression(
-            optimizer=optim.SGD(0.05)
-        )
-        found["river pipeline"] = ql.learners.RiverModel(pipeline)
+        found["river pipeline"] = _river_pipeline
     if has("torch"):
-        import torch
-
-        found["torch MLP"] = ql.learners.TorchModel(
-            torch_mlp(), functools.partial(torch.optim.SGD, lr=0.1)
-        )
+        found["torch MLP"] = _torch_mlp
     if has("jax", "equinox", "optax"):
-        os.environ.setdefault("JAX_PLATFORMS", "cpu")
-        found["Equinox MLP"] = ql.learners.JaxModel(jax_mlp())
-    return found
+        found["Equinox MLP"] = _equinox_mlp
+    return OnDemand(found)
 
 
 def law(learner: Any, **options: Any) -> ql.ADRC:

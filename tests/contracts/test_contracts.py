@@ -15,6 +15,7 @@ import pytest
 
 import quell as ql
 from quell import plants as plant_room
+from quell.controllers import in_single_precision
 from quell.controllers.base import control
 from quell.controllers.stateful import named_arrays as _named_arrays
 from quell.features import Bias, Input, Polynomial, State
@@ -520,6 +521,15 @@ def test_a_learner_serves_either_form_of_observer(name: str, form: str) -> None:
         ql.Scenario(reference=1.0, duration=10.0),
     )
     assert run["y"][-1] == pytest.approx(1.0, abs=1e-2)
+
+
+@pytest.mark.parametrize("name", PYTHON_LEARNERS)
+def test_a_model_in_python_is_refused_by_name_in_single_precision(name: str) -> None:
+    """Its functions take double arrays by address."""
+    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)
+    controller = ql.ADRC(observer, 1.5, learner=PYTHON_LEARNERS[name])
+    with pytest.raises(ValueError, match="learner is a model in Python"):
+        in_single_precision(controller)
 
 
 def test_the_interpreted_driver_is_the_same_function() -> None:

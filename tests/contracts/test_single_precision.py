@@ -59,12 +59,3 @@ def test_a_learner_in_single_precision_learns_what_it_does_in_double(name: str) 
     """
     observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.1, dt=0.01)
     check_single(CHAIN, ql.ADRC(observer, 1.5, learner=LEARNERS[name]), 1e-4)
-
-
-@pytest.mark.parametrize("name", PYTHON_LEARNERS)
-def test_a_model_in_python_is_refused_by_name(name: str) -> None:
-    """Its functions take double arrays by address."""
-    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.0, dt=0.01)
-    controller = ql.ADRC(observer, 1.5, learner=PYTHON_LEARNERS[name])
-    with pytest.raises(ValueError, match="learner is a model in Python"):
-        in_single_precision(controller)
