@@ -185,11 +185,12 @@ def estimate(
             found[k, 3 + i] = sample.seen[i]
 
 
-# Each form for one order and for four, and the largest order; the other observers have order two.
+# Each form for one order, one of them for the largest order and the others for four; the other
+# observers have order two.
 TO_COMPILE = [
     name
     for name in OBSERVERS
-    if "order 2" not in name and ("order 8" not in name or "current" in name)
+    if "order 2" not in name and ("order 4" if "current" in name else "order 8") not in name
 ]
 
 
@@ -492,7 +493,7 @@ def test_a_learner_starts_again_after_measurements_beyond_its_numbers(
 
 @pytest.mark.parametrize("name", [name for name in LEARNERS if name != "NoLearner"])
 def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
-    """Saved and restored by named arrays, copied or pickled: the same bits follow, interpreted."""
+    """Saved and restored by named arrays, copied or pickled: the same bits of u and of all states follow, interpreted."""
 
     def step(law: ql.ADRC, y: float) -> float:
         return control(law.parameters, law._state, 0.5, y)
@@ -500,14 +501,21 @@ def test_a_guarded_learner_goes_on_without_a_trace(name: str) -> None:
     one, other = (
         law_for(CHAIN, learner=LEARNERS[name], guard=ql.Guard(time=0.5)) for _ in range(2)
     )
-    ys = (np.sin(0.02 * np.arange(500)) + 0.1 * np.sin(0.31 * np.arange(500))).tolist()
-    for y in ys[:400]:
+    ys = (np.sin(0.02 * np.arange(280)) + 0.1 * np.sin(0.31 * np.arange(280))).tolist()
+    for y in ys[:250]:
         step(one, y)
     other.state = one.state
     others = (other, copy.deepcopy(one), pickle.loads(pickle.dumps(one)))
-    expected = [step(one, y) for y in ys[400:]]
+    expected = [step(one, y) for y in ys[250:]]
+    state = _named_arrays(one._state)
+    if name in PYTHON_LEARNERS:
+        del state["learner.model"]  # the number of the Python object, which is a copy, too
     for copied in others:
-        assert [step(copied, y) for y in ys[400:]] == expected
+        assert [step(copied, y) for y in ys[250:]] == expected
+        # The guard may not have let the learner act on u yet: what it holds is compared, too.
+        arrays = _named_arrays(copied._state)
+        for label, array in state.items():
+            np.testing.assert_array_equal(arrays[label], array, err_msg=label)
 
 
 @pytest.mark.parametrize("name", IN_LOOPS)
