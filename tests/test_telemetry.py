@@ -309,7 +309,7 @@ def test_a_full_disk_ends_a_recording_and_nothing_else(
     telemetry = TelemetryWriter(header, [sink, kept])
     telemetry.start()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (110_000, before[1]))
     try:
         offer(telemetry, np.concatenate([rows, rows]))
         telemetry.stop()
