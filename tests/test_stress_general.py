@@ -161,6 +161,7 @@ def watched(weights: np.ndarray, rules: tuple[float, ...], load: np.ndarray) -> 
     return Watched(observer, 1.0, learner=program, guard=ql.Guard())
 
 
+@pytest.mark.compiled
 def test_a_program_earns_trust_with_the_load_itself_and_then_spends_it() -> None:
     """It sees the guard's own memory, and changes its mode by the authority there."""
     t = DT * np.arange(1500)
