@@ -28,8 +28,8 @@ SETTINGS = {"dt": DT, "watchdog": 20, "u_max": 1.0, "rest": True}
 
 
 @contextmanager
-def rig(*arguments: str, compiled: bool = False) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start a rig, compiled or as plain Python; yield it and what it says when it is ready."""
+def rig(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start a rig that runs as plain Python; yield it and what it says when it is ready."""
     command = [
         sys.executable,
         "-m",
@@ -43,9 +43,12 @@ def rig(*arguments: str, compiled: bool = False) -> Iterator[tuple[subprocess.Po
         "0",
         *arguments,
     ]
-    env = os.environ | {"NUMBA_DISABLE_JIT": str(int(not compiled))}
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
     ) as process:
         try:
             yield process, str(process.stdout and process.stdout.readline())
@@ -62,31 +65,14 @@ def exchanged(device: Any, count: int) -> list[float]:
     return measured
 
 
-def test_a_rig_runs_until_it_is_told_to_end_and_says_how_it_went(tmp_path: Path) -> None:
-    """One line when it is ready, its counts at the end, exit code 0; and each tick in the log."""
-    log = tmp_path / "wire.csv"
-    settings = ("--log", str(log), "--u-max", "0.5", "--watchdog", "200")
-    url = f"shm://test-{uuid.uuid4().hex}"  # other tests compile a rig in shared memory, too
-    with rig("--device", url, *settings, compiled=True) as (process, ready):
-        assert ready.startswith(f"two-mass at {url}: a tick every 0.01 s")
-        with open_device(url, DT) as device:
-            assert np.isfinite(exchanged(device, 20)).all()
-        process.send_signal(signal.SIGTERM)
-        said, errors = process.communicate(timeout=60)
-        assert process.returncode == 0
-    assert [line for line in errors.splitlines() if "compiled code for" not in line] == []
-    assert "sessions: 1" in said
-    assert "largest |u| 1, cut to the limit: 1" in said
-    assert "frames that were not accepted:" in said
-    rows = np.genfromtxt(log, delimiter=",", names=True)
-    assert np.array_equal(rows["tick"], np.arange(rows.size))
-    assert f"ticks: {rows.size}" in said
-    assert np.nanmax(rows["u"]) == 0.5
-    assert np.nanmax(rows["command"]) == 1.0
+def test_a_rig_that_is_killed_is_noticed_and_its_successor_runs_until_it_is_told_to_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop gets no more numbers, and in shared memory nothing stays in the way of the next rig.
 
-
-def test_a_rig_that_is_killed_is_noticed_and_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In shared memory nothing stays in the way of the next one; the loop gets no more numbers."""
+    That one prints a line when it is ready and its counts at the end, with exit code 0; each tick is
+    in the log.
+    """
     url = f"shm://test-{uuid.uuid4().hex}"
     with rig("--device", url, "--watchdog", "200") as (process, _), open_device(url, DT) as device:
         exchanged(device, 3)
@@ -97,13 +83,25 @@ def test_a_rig_that_is_killed_is_noticed_and_replaced(monkeypatch: pytest.Monkey
         assert np.isnan(device.read())
     with pytest.raises(ConnectionError, match="start one with: quell rig"):
         connect(url, timeout=0.3)
-    with rig("--device", url) as (process, ready):
-        assert ready
+    log = tmp_path / "wire.csv"
+    settings = ("--log", str(log), "--u-max", "0.5", "--watchdog", "200")
+    with rig("--device", url, *settings) as (process, ready):
+        assert ready.startswith(f"two-mass at {url}: a tick every 0.01 s")
         with open_device(url, DT) as device:
-            exchanged(device, 3)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+            assert np.isfinite(exchanged(device, 20)).all()
+        process.send_signal(signal.SIGTERM)
+        said, errors = process.communicate(timeout=60)
+        assert process.returncode == 0
+    assert errors == ""
     assert not list(Path("/dev/shm").glob(f"quell-{url.removeprefix('shm://')}*"))
+    assert "sessions: 1" in said
+    assert "largest |u| 1, cut to the limit: 1" in said
+    assert "frames that were not accepted:" in said
+    rows = np.genfromtxt(log, delimiter=",", names=True)
+    assert np.array_equal(rows["tick"], np.arange(rows.size))
+    assert f"ticks: {rows.size}" in said
+    assert np.nanmax(rows["u"]) == 0.5
+    assert np.nanmax(rows["command"]) == 1.0
 
 
 def test_a_loop_that_is_killed_leaves_u_at_zero(tmp_path: Path) -> None:
@@ -131,6 +129,7 @@ os.kill(os.getpid(), signal.SIGKILL)
             exchanged(device, 3)
         process.send_signal(signal.SIGINT)
         assert "ended by the watchdog: 1" in process.communicate(timeout=60)[0]
+        assert process.returncode == 0
     rows = np.genfromtxt(log, delimiter=",", names=True)
     last = np.flatnonzero(
         np.isfinite(rows["command"]) & (rows["session"] == rows["session"][rows["session"] > 0][0])
