@@ -77,14 +77,25 @@ class PRBS(Signal):
 
 @lru_cache(maxsize=4)
 def _sequence(bits: int) -> Vector:
-    """Return a period of the sequence, ±1."""
-    register, taps = [1] * bits, [tap - 1 for tap in _TAPS[bits]]
-    values = np.empty(2**bits - 1)
-    for k in range(values.size):
-        values[k] = 2.0 * register[-1] - 1.0
-        register = [sum(register[tap] for tap in taps) % 2, *register[:-1]]
-    values.flags.writeable = False
-    return values
+    """Return a period of the sequence, ±1.
+
+    A value is the sum of those ``tap`` places before it, and then, as polynomials over two elements
+    are squared term by term, also the sum of those ``2 tap``, ``4 tap``, … places before it. So the
+    values are made in blocks that double.
+    """
+    taps, stride, done = _TAPS[bits], 1, bits
+    values = np.ones(2**bits - 1, dtype=np.uint8)
+    while done < values.size:
+        if done >= 2 * bits * stride:
+            stride *= 2
+        end = min(done + min(taps) * stride, values.size)
+        values[done:end] = 0
+        for tap in taps:
+            values[done:end] ^= values[done - tap * stride : end - tap * stride]
+        done = end
+    sequence: Vector = 2.0 * values - 1.0
+    sequence.flags.writeable = False
+    return sequence
 
 
 @dataclass(frozen=True, eq=False)
