@@ -7,43 +7,32 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cyclopts
 import matplotlib.pyplot as plt
 import pytest
-from matplotlib.figure import Figure
 
+from quell.experiments.common.figures import save_figure
 from quell.identification import Identified
 from quell.kernels.compile_time import compile_time
 
-from .commands import Shown, in_its_own_process
+from .commands import Shown
 
 
-@pytest.fixture
-def bare_pngs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the axes out of PNG files: the same figure is written whole as SVG."""
-    savefig = Figure.savefig
-
-    def save(figure: Figure, path: Path, **options: Any) -> None:
-        for axes in figure.axes:
-            axes.set_visible(path.suffix == ".svg")
-        savefig(figure, path, **options)
-
-    monkeypatch.setattr(Figure, "savefig", save)
-
-
-def test_help_and_version_answer(quell: Callable[..., Shown], tmp_path: Path) -> None:
-    """The commands are listed."""
-    shown = in_its_own_process("--help", cwd=tmp_path)
-    assert shown.code == 0
-    assert "reproduce" in shown.out
+def test_help_and_version_answer(quell: Callable[..., Shown]) -> None:
+    """The commands are listed; the help comes at once, as commands import what they need when they run."""
+    command = [sys.executable, "-X", "importtime", "-m", "quell", "--help"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "quell COMMAND" in ended.stdout
+    assert "reproduce" in ended.stdout
+    imported = {line.rpartition("|")[2].strip() for line in ended.stderr.splitlines()}
+    assert "quell.cli.app" in imported
+    assert not imported & {"numpy", "numba", "scipy", "matplotlib"}
     assert "two-mass" in quell("reproduce", "--help").out
     assert quell("--version").out.strip() == __import__("quell").__version__
 
 
 @pytest.mark.compiled
-@pytest.mark.usefixtures("bare_pngs")
 def test_the_study_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -77,7 +66,6 @@ def test_the_study_is_printed_written_and_drawn(
 
 
 @pytest.mark.compiled
-@pytest.mark.usefixtures("bare_pngs")
 def test_the_torsional_experiment_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,7 +121,6 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(
 
 
 @pytest.mark.compiled
-@pytest.mark.usefixtures("bare_pngs")
 def test_the_guards_trial_is_printed_written_and_drawn(
     quell: Callable[..., Shown], tmp_path: Path
 ) -> None:
@@ -272,6 +259,16 @@ def test_two_outputs_have_two_files(quell: Callable[..., Shown], tmp_path: Path)
     assert "out': must be a file for one output, is for two" in shown.err
 
 
+def test_a_figure_is_written_as_png_and_svg(tmp_path: Path) -> None:
+    """With all that is in it; commands in these tests write theirs without the axes."""
+    figure = plt.figure()
+    figure.subplots().plot([0.0, 1.0], [0.0, 1.0], gid="the-line")
+    png, svg = save_figure(figure, tmp_path / "pictures", "step")
+    assert (png.name, svg.name) == ("step.png", "step.svg")
+    assert plt.imread(png).min() == 0.0
+    assert "the-line" in svg.read_text(encoding="utf-8")
+
+
 @pytest.mark.compiled
 def test_a_command_can_be_run_twice_and_replaces_where_asked(
     quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -299,39 +296,18 @@ def test_a_command_can_be_run_twice_and_replaces_where_asked(
     assert (tmp_path / "u.csv").read_bytes() != old
 
 
-def printed_by(code: str) -> str:
-    """Return what a new Python process prints."""
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-
-def test_importing_quell_imports_nothing_heavy() -> None:
-    """Numba, scipy, xarray, matplotlib and python-control come when they are used."""
-    code = "import sys, quell; print([m for m in ('numba', 'scipy', 'xarray', 'matplotlib', 'control', 'numpy') if m in sys.modules])"
-    assert printed_by(code) == "[]"
-
-
-def test_help_imports_neither_numpy_nor_anything_heavier() -> None:
-    """Commands import what they need when they run; so the help comes at once."""
-    printed = printed_by(
-        "import sys, quell.cli\n"
-        "sys.argv = ['quell', '--help']\n"
-        "try:\n    quell.cli.main()\nexcept SystemExit:\n    pass\n"
-        "print([m for m in ('numpy', 'numba', 'scipy', 'matplotlib') if m in sys.modules])"
-    )
-    assert "quell COMMAND" in printed
-    assert printed.endswith("[]")
-
-
-def test_simulating_imports_neither_plots_nor_files() -> None:
-    """They cost a second that a run does not need."""
+def test_neither_importing_quell_nor_simulating_imports_what_it_does_not_need() -> None:
+    """Numba, scipy, xarray, matplotlib and python-control come when they are used; plots and files cost a second."""
     code = (
-        "import sys, quell as ql; ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0); "
-        "ql.Trajectory; ql.simulate;"
-        "print([m for m in ('xarray', 'matplotlib', 'control', 'rich', 'pydantic') if m in "
-        "sys.modules])"
+        "import sys, quell as ql\n"
+        "heavy = {'numba', 'scipy', 'xarray', 'matplotlib', 'control', 'numpy'}\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
+        "ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.01), 1.0); ql.Trajectory; ql.simulate\n"
+        "unused = {'xarray', 'matplotlib', 'control', 'rich', 'pydantic'}\n"
+        "print(sorted(unused & set(sys.modules)), 'numba' in sys.modules)\n"
     )
-    assert printed_by(code) == "[]"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.splitlines() == ["[]", "[] True"]
 
 
 def test_every_public_name_can_be_had() -> None:
