@@ -31,7 +31,7 @@ def by_name(found: Identified) -> dict[str, Any]:
 @cache
 def mass(seed: int, friction: float) -> tuple[Any, Any]:
     """Return u and y of a mass with viscous and Coulomb friction, which sticks, in small steps."""
-    fine, rng = 20, np.random.default_rng(seed)
+    fine, rng = 8, np.random.default_rng(seed)
     u = excitation("prbs", (0.5, 10.0), 30.0, DT, -1.0, 1.0, seed=seed).u
     y, position, speed, h = np.empty(u.size), 0.0, 0.0, DT / fine
     for k, force in enumerate(u.tolist()):
@@ -127,8 +127,8 @@ def test_the_command_validates_and_suggests(quell: Callable[..., Shown], tmp_pat
 
 @pytest.mark.skipif(not RECORDS.is_dir(), reason="the public records are not on this machine")
 def test_a_positioning_system_with_friction_gets_the_published_parameters() -> None:
-    """EMPS in means of 10 ms: friction is suggested; pole, gain and friction are near to those of Janot, Gautier & Brunot 2019."""
-    record, every = read_record(RECORDS / "emps.csv"), 10
+    """EMPS in means of 20 ms: friction is suggested; pole, gain and friction are near to those of Janot, Gautier & Brunot 2019."""
+    record, every = read_record(RECORDS / "emps.csv"), 20
     size = record.u.size // every * every
     u, y = record.u[:size].reshape(-1, every).mean(axis=1), record.y[:size:every]
     found = ql.identify(u, y, every * record.dt, order=2)

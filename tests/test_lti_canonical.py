@@ -198,7 +198,7 @@ def test_a_record_is_mapped_like_a_sample() -> None:
 )
 def test_the_loop_of_a_plant_with_zeros_steps_as_if_it_had_none(num: Any, den: Any) -> None:
     """Y follows ``(omega_c/(s + omega_c))^r``, r the relative degree, and rejects a load."""
-    plant, omega_c, dt = hidden(num, den), 2.0, 3e-3
+    plant, omega_c, dt = hidden(num, den), 2.0, 2.5e-3
     controller = ql.ADRC(ESO.model_based(plant, omega_o=20.0, dt=dt), omega_c=omega_c)
     run = ql.simulate(plant, controller, ql.Scenario(1.0, 16.0, (ql.signals.Step(at=8.0),)))
     y, t = run["y"].ravel(), run.t

@@ -275,7 +275,7 @@ faults = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(scripts=faults)
 def test_under_any_faults_u_is_within_limits_and_ends_at_zero(
     scripts: dict[str, dict[int, Any]],

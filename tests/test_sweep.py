@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -471,19 +472,28 @@ def test_the_command_does_a_sweep_and_repeats_a_run(
 def test_a_cluster_that_loses_a_worker_finds_what_this_machine_finds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bit for bit, for controllers of two types, with one of two worker processes killed."""
+    """Bit for bit, for controllers of two types, with one of two workers killed.
+
+    The killed one is a process and is not started again; the other is a thread of this process.
+    """
     distributed = pytest.importorskip("distributed")
     arguments = sweep_of(made(*read(setup_of(tmp_path, SETUP.replace("draws = 4", "draws = 10")))))
     local = sweep(**arguments, folder=tmp_path / "local")
     killed: list[int] = []
-    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")  # the workers run plain Python, as this process
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, local_directory=str(tmp_path)
-    ) as cluster:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")  # the process runs plain Python, as this one
+    options = {"nthreads": 1, "local_directory": str(tmp_path)}
+    workers = {
+        "process": {"cls": distributed.Nanny, "options": options},
+        "thread": {"cls": distributed.Worker, "options": options},
+    }
+    scheduler = {"cls": distributed.Scheduler, "options": {"port": 0, "dashboard": False}}
+    with distributed.SpecCluster(workers, scheduler, silence_logs=logging.ERROR) as cluster:
 
         def kill(share: float) -> None:
             if 0.2 < share < 0.8 and not killed:
-                killed.append(next(iter(cluster.workers.values())).pid)
+                process = cluster.workers["process"]
+                process.auto_restart = False
+                killed.append(process.pid)
                 os.kill(killed[0], signal.SIGKILL)
 
         address = cluster.scheduler_address
