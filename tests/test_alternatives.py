@@ -32,7 +32,7 @@ def by_name(found: Identified) -> dict[str, Any]:
 def mass(seed: int, friction: float) -> tuple[Any, Any]:
     """Return u and y of a mass with viscous and Coulomb friction, which sticks, in small steps."""
     fine, rng = 8, np.random.default_rng(seed)
-    u = excitation("prbs", (0.5, 10.0), 30.0, DT, -1.0, 1.0, seed=seed).u
+    u = excitation("prbs", (0.5, 10.0), 20.0, DT, -1.0, 1.0, seed=seed).u
     y, position, speed, h = np.empty(u.size), 0.0, 0.0, DT / fine
     for k, force in enumerate(u.tolist()):
         y[k] = position

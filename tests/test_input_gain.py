@@ -180,11 +180,12 @@ def test_the_command_reads_a_saved_run_and_the_setup_of_its_loop(
     setup = tmp_path / "loop.toml"
     setup.write_text(
         f"dt = {DT}\ncontroller = {{omega_c = 5.0}}\n"
-        "observer = {kind = 'model-free', order = 2, b0 = 25.0, omega_o = 20.0}\n"
+        "observer = {kind = 'model-free', order = 1, b0 = 25.0, omega_o = 20.0}\n"
     )
-    plant = ql.plants.LinearPlant.of(([40.0], [1.0, 2.0, 0.0]))
+    plant = ql.plants.LinearPlant.of(([40.0], [1.0, 2.0]))
     reference = ql.identification.excitation("chirp", (0.5, 8.0), 6.0, DT, -1.0, 1.0).signal
-    run = ql.simulate(plant, adrc(), ql.Scenario(reference=reference, duration=6.0), interpret=True)
+    scenario = ql.Scenario(reference=reference, duration=6.0)
+    run = ql.simulate(plant, adrc(order=1), scenario, interpret=True)
     run.save(tmp_path / "run.nc")
     shown = quell("b0", "run.nc", "--loop", "loop.toml", "--json", "out.json")
     assert shown.code == 0, shown.err

@@ -97,10 +97,13 @@ def fmu(
         raise ValueError(f"name = {name!r}: is the name of a file that each FMU has; give another")
     check_writable(target, checks.flag("overwrite", overwrite))
     plant, controller = _parts(part)
+    own = _own_sources(sources)
     model, files = _model(plant, controller, name, dt, x0)
+    for each in own.keys() & files.keys():
+        raise _two_files(each)
     if checks.flag("binary", binary):
         place(name)
-    content = _content(model, files | _own_sources(sources, files), name, binary)
+    content = _content(model, files | own, name, binary)
     with (
         written_atomically(target, overwrite) as file,
         zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
@@ -126,9 +129,7 @@ def _parts(part: Any) -> tuple[Any, Any]:
     return plant, controller
 
 
-def _own_sources(
-    sources: Sequence[str | os.PathLike[str]], generated: Mapping[str, str]
-) -> dict[str, str]:
+def _own_sources(sources: Sequence[str | os.PathLike[str]]) -> dict[str, str]:
     """Return the texts of the user's C files by name."""
     if not checks.is_sequence(sources):
         raise ValueError(f"sources = {sources!r}: must be a sequence of files")
@@ -136,11 +137,15 @@ def _own_sources(
     for path in map(Path, sources):
         if path.suffix not in (".c", ".h") or path.stem in _OWN_NAMES:
             raise ValueError(f"sources: {path.name}: must be a file *.c or *.h, of another name")
-        if path.name in generated or path.name in found:
-            raise ValueError(f"sources: {path.name}: there are two files of this name")
+        if path.name in found:
+            raise _two_files(path.name)
         check_regular(path, f"sources: {path}")
         found[path.name] = whole_text(path)
     return found
+
+
+def _two_files(name: str) -> ValueError:
+    return ValueError(f"sources: {name}: there are two files of this name")
 
 
 def _model(
