@@ -6,7 +6,7 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -181,8 +181,14 @@ def test_the_deviations_of_a_model_are_plants_around_it() -> None:
         identified_plants(quiet)
 
 
-def test_a_record_is_identified_and_tuned(quell: Callable[..., Shown], tmp_path: Path) -> None:
-    """``quell tune record.csv``: model, tuned controller, and a setup that ``quell run`` accepts."""
+def test_a_record_is_identified_and_tuned(
+    quell: Callable[..., Shown], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``quell tune record.csv``: model, tuned controller, and a setup that ``quell run`` accepts.
+
+    Without the structures that it is compared with, which take ten times as long.
+    """
+    monkeypatch.setattr(ql.tuning, "tune", partial(ql.tune, compare=()))
     rng = np.random.default_rng(0)
     u = excitation("prbs", (0.5, 20.0), 10.0, 0.02).u
     y = answer(([5.0], [1.0, 3.0]), u, 0.02) + 0.01 * rng.standard_normal(u.size)

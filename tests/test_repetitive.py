@@ -156,7 +156,7 @@ def test_twenty_five_repeats_of_a_move_leave_a_twentieth_of_the_error() -> None:
             20.0 * (u - 0.1 * x[1] - 2.0 * math.sin(x[0]) - 0.5 * math.tanh(x[1] / 0.02)) + w[0],
         ),
         order=2,
-        substeps=4,
+        substeps=2,
     )
     period, dt, repeats = 2.8, 1e-2, 25
     moves = ql.signals.Trapezoid(1.5, 1.0, start=0.2) - ql.signals.Trapezoid(1.5, 1.0, start=1.6)

@@ -39,7 +39,7 @@ def loop_of(plant: Any, dt: float, delay: float = 0.0) -> Any:
 @pytest.fixture(scope="module")
 def tuned() -> ql.Tuned:
     """Three lags under the usual constraints."""
-    return ql.tune(LAGS, DT, compare=("pi", "pid", "bandwidths"))
+    return ql.tune(LAGS, DT, order=2, compare=("pi", "pid", "bandwidths"))
 
 
 # ---- structures
