@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import random
@@ -9,8 +10,10 @@ import shutil
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -25,7 +28,7 @@ from quell.realtime.telemetry.channels import LOOP_CHANNELS, row_channels
 from quell.realtime.telemetry.header import Header
 from quell.realtime.telemetry.load import load
 from quell.realtime.telemetry.ros_message import MARK, SCHEMA, TOPIC
-from quell.records import netcdf
+from quell.records import netcdf, netcdf_reader
 from quell.setup import load as load_setup
 from tests.mutations import mutated, write_seeds
 
@@ -163,6 +166,25 @@ def test_a_header_is_refused_in_a_line_if_it_is_none(tmp_path: Path) -> None:
         load(path)
 
 
+@pytest.fixture
+def read_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read NetCDF files in this process, without limits: another one takes 0.15 s to start."""
+
+    @contextmanager
+    def reader(arguments: Sequence[str], most: int) -> Iterator[io.BytesIO]:
+        answer = io.BytesIO()
+        lists = ([*filter(None, text.split(","))] for text in arguments[2:])
+        with monkeypatch.context() as patch:
+            patch.setattr(netcdf_reader, "_limit_resources", lambda most: None)
+            patch.setattr(sys, "stdout", SimpleNamespace(buffer=answer))
+            netcdf_reader.main(arguments[0], most, *lists)
+        answer.seek(0)
+        yield answer
+
+    monkeypatch.setattr(netcdf, "_reader", reader)
+
+
+@pytest.mark.usefixtures("read_here")
 def test_shapes_and_attributes_of_a_netcdf_file_are_checked_before_its_data(
     saved: Path, tmp_path: Path
 ) -> None:

@@ -63,7 +63,6 @@ def short(device: Any, duration: float = 0.1, **options: Any) -> Any:
     )
 
 
-@pytest.mark.compiled
 def test_a_run_from_end_to_end(tmp_path: Path) -> None:
     """Trajectory, record, files and counters agree; the device is closed."""
     device, reported = Rig(), list[ModeChange]()
