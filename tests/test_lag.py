@@ -32,7 +32,7 @@ LINEAR = {
 }
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     order=st.integers(1, 8),
     dt=st.sampled_from([1e-3, 1e-2]),

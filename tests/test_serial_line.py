@@ -106,7 +106,7 @@ FAULTS = st.tuples(
 
 
 @given(st.lists(FAULTS, min_size=1, max_size=4))
-@settings(max_examples=200)
+@settings(max_examples=100)
 def test_no_fault_of_bytes_makes_a_wrong_frame(wire, faults):
     """A frame with bytes lost, inserted or changed is counted; the next but one comes through."""
     broken = bytearray(packet_of(2))

@@ -399,10 +399,10 @@ def test_tune_goes_on_by_simulation_within_the_bounds_of_the_linear_loop() -> No
         constraints=BOUNDS,
         uncertain={"gain": (0.8, 1.2)},
         samples=4,
-        check_samples=30,
+        check_samples=20,
         scenario=ql.Scenario(reference=1.0, duration=3.0),
         objective=Objective(effort, Worst()),
-        search={"trials": 24, "factor": 4.0},
+        search={"trials": 16, "factor": 4.0},
         u_min=-1.0,
         u_max=1.0,
     )
@@ -416,9 +416,9 @@ def test_tune_goes_on_by_simulation_within_the_bounds_of_the_linear_loop() -> No
     assert tuned.controller.parameters.limits.high == 1.0
     assert tuned.simulated_check is not None
     check = tuned.simulated_check["effort"]
-    assert check.samples == 30
+    assert check.samples == 20
     assert check.value == pytest.approx(best.values["effort"], rel=0.05)
-    assert "effort on 30 fresh samples" in tuned.summary()
+    assert "effort on 20 fresh samples" in tuned.summary()
     assert "against the optimal PI controller" in tuned.summary()
     assert tuned.to_json()["search"]["front"] == [best.number]
     assert "u_max = 1.0" in tuned.toml()
