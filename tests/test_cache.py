@@ -1,12 +1,13 @@
-"""The disk cache of compiled code: what it keeps, what it removes, and faults of its files."""
+"""The disk cache of compiled code: what it keeps, what it removes, and faults of its files.
+
+That a second process loads the code of the first is in tests/test_sized.py.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -21,23 +22,6 @@ from quell.kernels import cache, dispatch
 pytestmark = pytest.mark.compiled
 
 PACKAGE = Path(quell.__file__).parent
-# One step of a controller; prints u, and whether Numba compiled anything for it.
-STEP = """
-from numba.core.event import install_recorder
-import quell as ql
-with install_recorder("numba:compile") as recorder:
-    u = ql.baselines.PID(1.0, dt=0.01).step(1.0, 0.0)
-print(u, "compiled" if recorder.buffer else "loaded")
-"""
-
-
-def step(cache_directory: Path) -> str:
-    """Return what ``STEP`` prints in a process of its own."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache_directory)}
-    command = [sys.executable, "-c", STEP]
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    return run.stdout.strip()
 
 
 def double(x: Any) -> Any:
@@ -58,11 +42,6 @@ def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(cache, "cache_path", lambda: tmp_path)
     assert [compilations(), compilations()] == [1, 0]
     return tmp_path
-
-
-def test_a_second_process_loads_the_code_of_the_first(tmp_path: Path) -> None:
-    """A user sees it as a first step that works at once; nothing at all is compiled."""
-    assert [step(tmp_path), step(tmp_path)] == ["1.0 compiled", "1.0 loaded"]
 
 
 def test_without_a_place_for_the_cache_the_code_is_compiled_by_each_dispatcher(

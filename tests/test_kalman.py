@@ -167,56 +167,42 @@ def test_what_was_learned_is_kept_through_hours_of_rest() -> None:
     assert run.metrics(10_000.0, target=2.0)["overshoot"] < 1e-3
 
 
-@pytest.mark.parametrize(("order", "power"), [(4, 1e-12), (6, 1e-14)])
-def test_at_rest_a_learner_is_as_quiet_as_no_learner(order: int, power: float) -> None:
-    """Its gain does not follow the noise, which would fold the noise's high frequencies down to where the loop is sensitive.
-
-    A learner that says nothing is in the place of none, whose loop of order 6 nobody else compiles.
-    """
-    plant = chain(order, -0.5)
-    observer = ESO.model_free(order=order, b0=1.0, omega_o=30.0, dt=2e-3)
-    scenario = ql.Scenario(1.0, duration=300.0, noise=ql.signals.BandLimitedNoise(power, 0.01))
-    silent, learned = (
+def test_at_rest_a_learner_is_as_quiet_as_no_learner() -> None:
+    """Its gain does not follow the noise, which would fold the noise's high frequencies down to where the loop is sensitive."""
+    plant = chain(4, -0.5)
+    observer = ESO.model_free(order=4, b0=1.0, omega_o=30.0, dt=2e-3)
+    scenario = ql.Scenario(1.0, duration=300.0, noise=ql.signals.BandLimitedNoise(1e-12, 0.01))
+    plain, learned = (
         ql.simulate(
-            plant,
-            ql.ADRC(observer, omega_c=1.0, learner=learner),
-            scenario,
-            record_every=5,
+            plant, ql.ADRC(observer, omega_c=1.0, learner=learner), scenario, record_every=5
         )
-        for learner in (
-            ql.learners.Kalman(prior=1e-100, bias_bandwidth=0.0),
-            ql.learners.Kalman(),
-        )
+        for learner in (None, ql.learners.Kalman())
     )
-    assert np.max(np.abs(silent["theta"])) < 1e-99
-    if order == 4:
-        plain = ql.simulate(plant, ql.ADRC(observer, omega_c=1.0), scenario, record_every=5)
-        np.testing.assert_allclose(silent["y"], plain["y"], rtol=1e-12)
-    late = silent.window(200.0, 300.0)
-    assert np.std(learned["y"][late]) < 3.0 * np.std(silent["y"][late])
+    late = plain.window(200.0, 300.0)
+    assert np.std(learned["y"][late]) < 3.0 * np.std(plain["y"][late])
 
 
 @pytest.mark.parametrize(("order", "u"), [(2, True), (4, False), (6, False)])
 def test_where_nothing_is_left_to_learn_nothing_is_learned(order: int, u: bool) -> None:
     """A chain of integrators without noise: what is left is rounding, P stays positive, the loop goes on.
 
-    With u among the features as Python, in fewer samples: compiled, nobody else runs that loop.
+    Of order 2 and 6 as Python, in fewer samples: compiled, nobody else runs that loop.
     """
-    plant = chain(order, 0.0)
-    s = ql.signals
+    plant, python = chain(order, 0.0), order != 4
+    s, half = ql.signals, 30.0 if python else 60.0
     scenario = ql.Scenario(
-        s.Sinusoid().until(60.0, then=s.Sinusoid(omega=0.5)).until(120.0, then=2.0),
-        160.0,
-        (s.Step(at=140.0),),
+        s.Sinusoid().until(half, then=s.Sinusoid(omega=0.5)).until(2.0 * half, then=2.0),
+        2.0 * half + 40.0,
+        (s.Step(at=2.0 * half + 20.0),),
     )
     controller = ql.ADRC(
-        ESO.model_free(order, 1.0, 10.0, 2e-2 if u else 5e-3),
+        ESO.model_free(order, 1.0, 10.0, 2e-2 if python else 5e-3),
         omega_c=1.0,
         learner=ql.learners.Kalman(u=u),
     )
-    run = ql.simulate(plant, controller, scenario, interpret=u)
+    run = ql.simulate(plant, controller, scenario, interpret=python)
     assert not run.diverged
-    assert np.max(np.abs(run["theta"][run.t < 140.0])) < 0.1
+    assert np.max(np.abs(run["theta"][run.t < 2.0 * half + 20.0])) < 0.1
     covariance = run.final_state.learner.covariance
     assert np.min(np.linalg.eigvalsh(0.5 * (covariance + covariance.T))) > -1e-9 * np.max(
         np.abs(covariance)

@@ -132,23 +132,26 @@ def test_overlaps_are_found_where_something_is_written() -> None:
 def test_new_parameters_of_a_loop_are_not_compiled_for() -> None:
     """Neither by a simulation nor by a step; a loop of another order is."""
 
-    def run(order: int, omega: float) -> tuple[int, Any]:
-        controller = ql.ADRC(ql.ESO.model_free(order, 1.0, 4.0 * omega, 1e-2), omega)
-        plant = ql.plants.LinearPlant.of(([omega], [1.0, *np.zeros(order)]))
+    def run(k: float, omega: float) -> tuple[int, Any]:
+        controller = ql.ADRC(ql.ESO.model_free(4, k, 4.0 * omega, 1e-2), omega)
+        plant = ql.plants.two_mass_spring(k=k)  # a loop that other tests compile
         ql.simulate(plant, controller, ql.Scenario(1.0, duration=0.05))
         controller.step(1.0, 0.0)
         return len(run_block.signatures), controller._step
 
-    first, step = run(1, 2.0)
-    assert run(1, 3.0) == (first, step)
-    assert run(2, 2.0)[1] != step
+    first, step = run(1.0, 2.0)
+    assert run(0.5, 3.0) == (first, step)
+    smaller = ql.ADRC(ql.ESO.model_free(2, 1.0, 8.0, 1e-2), 2.0)
+    smaller.step(1.0, 0.0)
+    assert smaller._step != step
 
 
 def test_loops_are_compiled_once_for_all_that_share_code(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A second process takes some of several; the second study finds all in the disk cache."""
+    """A second process takes some of several; the second study finds all in the disk cache, and so does its first step."""
     script = """
+from numba.core.event import install_recorder
 import quell as ql
 from quell.kernels.dispatch import compilations
 from quell.simulation.driver import run_block
@@ -159,7 +162,10 @@ if __name__ == "__main__":
     pids = [ql.baselines.PID(gain, dt=0.01) for gain in (1.0, 2.0)]
     loops = [(plant, pid) for pid in pids]
     loops.append((plant, ql.baselines.PID(1.0, 1.0, 0.1, tf=0.05, dt=0.01)))
-    print(precompile(loops), len(run_block.signatures), compilations(run_block) <= 2)
+    print(precompile(loops), len(run_block.signatures), compilations(run_block) <= 2, end=" ")
+    with install_recorder("numba:compile") as recorder:
+        u = pids[0].step(1.0, 0.0)
+    print(u, "compiled" if recorder.buffer else "loaded")
 """
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     file = tmp_path / "study.py"
@@ -169,4 +175,4 @@ if __name__ == "__main__":
         command = [sys.executable, str(file)]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-    assert [study(), study()] == ["2 2 True", "0 2 True"]
+    assert [study(), study()] == ["2 2 True 1.0 compiled", "0 2 True 1.0 loaded"]

@@ -69,50 +69,58 @@ def test_every_controller_has_an_example() -> None:
     assert found == {type(example).__name__ for example in CONTROLLERS.values()}
 
 
+def test_a_loop_runs_the_same_again_and_interpreted() -> None:
+    """Same seed, same output; no second compilation; interpreted = compiled.
+
+    Of all controllers the next test compiles ``step``: the same functions without the loop.
+    """
+    check_run(CHAIN, CONTROLLERS["ADRC"], SCENARIO)
+
+
 # An ADRC behind a prefilter is among them twice without this one, and its filter behind a PID.
 IN_LOOPS = [name for name in CONTROLLERS if name != "Prefiltered ADRC"]
 
 
 @pytest.mark.parametrize("name", IN_LOOPS)
-def test_a_controller_runs_the_same_again_and_interpreted(name: str) -> None:
-    """Same seed, same output; no second compilation; interpreted = compiled."""
-    check_run(PLANTS.get(name, CHAIN), CONTROLLERS[name], SCENARIO)
+def test_a_step_at_a_time_is_the_simulated_run_and_interpreted(name: str) -> None:
+    """Compiled ``step`` with what was measured gives the u of an interpreted run but for rounding, and its state; again, the same bits."""
+    run = ql.simulate(
+        PLANTS.get(name, CHAIN),
+        CONTROLLERS[name],
+        ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise),
+        interpret=True,
+    )
+    one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
+    shown = list(zip(run["r"], run["y_measured"], strict=True))
+    u = [one.step(r, y) for r, y in shown]
+    assert [other.step(r, y) for r, y in shown] == u
+    # Fused multiply-add rounds otherwise.
+    np.testing.assert_allclose(u, run["u"], rtol=1e-9, atol=1e-9)
+    for label, array in named_arrays(run.final_state).items():
+        np.testing.assert_allclose(one.state[label], array, rtol=1e-9, atol=1e-9, err_msg=label)
 
 
-# Those that are no linear law with limits: batches over lanes leave them to the exact loop.
+# Those that are no linear law with limits: batches over lanes leave them to the exact loop (test_lanes).
 NOT_LINEAR = {name for name in CONTROLLERS if name.startswith("Prefiltered") or "Han" in name}
 
 
-@pytest.mark.parametrize("name", IN_LOOPS)
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_says_whether_it_is_linear(name: str) -> None:
+    """A linear law with limits has its linear form, all others have none."""
+    assert (linear_form(CONTROLLERS[name].parameters) is None) == (name in NOT_LINEAR)
+
+
+@pytest.mark.parametrize("name", [name for name in CONTROLLERS if name not in NOT_LINEAR])
 def test_a_batch_over_lanes_is_the_exact_one(name: str) -> None:
-    """To 1e-9 of each channel's range if the controller has a linear form, else bit for bit."""
+    """To 1e-9 of each channel's range; the exact loop runs as Python."""
     plant, controller = PLANTS.get(name, CHAIN), CONTROLLERS[name]
-    assert (linear_form(controller.parameters) is None) == (name in NOT_LINEAR)
-    exact = ql.simulate(plant, controller, SCENARIO)
+    exact = ql.simulate(plant, controller, SCENARIO, interpret=True)
     lanes = ql.simulate([plant] * 2, controller, SCENARIO, record="all", exact=False)
-    tolerance = 0.0 if name in NOT_LINEAR else 1e-9
     for channel in exact.names:
-        size = tolerance * np.max(np.abs(exact[channel]))
+        size = 1e-9 * np.max(np.abs(exact[channel]))
         for run in lanes[channel]:
             np.testing.assert_allclose(run, exact[channel], rtol=0.0, atol=size)
     assert np.all(lanes.status == exact.status)
-
-
-@pytest.mark.parametrize("name", IN_LOOPS)
-def test_a_step_at_a_time_is_the_simulated_run(name: str) -> None:
-    """``step`` with what was measured gives the u of ``simulate``, bit for bit, and the same state."""
-    controller = copy.deepcopy(CONTROLLERS[name])
-    run = ql.simulate(
-        PLANTS.get(name, CHAIN),
-        CONTROLLERS[name],  # a copy's arrays can be written to: another type, compiled once more
-        ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise),
-    )
-    u = [controller.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]
-    np.testing.assert_allclose(u, run["u"], rtol=0.0, atol=1e-12)
-    for label, array in named_arrays(run.final_state).items():
-        np.testing.assert_allclose(
-            controller.state[label], array, rtol=1e-9, atol=1e-12, err_msg=label
-        )
 
 
 def awaited(controller: Any, y: float) -> float:

@@ -180,13 +180,18 @@ def test_it_is_a_device_and_opened_by_its_url(example: Any) -> None:
 @pytest.mark.compiled
 @every
 def test_it_measures_the_plant_that_u_moves(example: Any) -> None:
-    """Bit for bit as a twin, delayed by a sample over a wire; to the quanta of the card."""
+    """Bit for bit as a twin, delayed by a sample over a wire; to the quanta of the card.
+
+    UDP as Python: tests/test_wire.py compiles what is of UDP.
+    """
     device = example.open()
+    as_device = as_python if example.url.startswith("udp:") else nullcontext
     plant = ql.plants.delayed(PLANT, example.delay, DT) if example.delay else PLANT
     twin = TwinDevice(plant, DT)
     for k in range(300):
         u = 1.5 * math.sin(0.02 * k)
-        y = example.sample(device, u)
+        with as_device():
+            y = example.sample(device, u)
         with as_python() if getattr(example, "plain", False) else nullcontext():
             assert abs(y - twin.read()) <= example.tolerance
             twin.write(u)

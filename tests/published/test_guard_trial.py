@@ -1,12 +1,11 @@
 """Figures of learners and guard on the benchmark.
 
 The trial of hostile and of honest learners, with its bars, is a command, ``quell stress``, of which ``.ci/run``
-runs a part.
+runs a part; loads of two sinusoids and a step are rejected there, too.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 
 import numpy as np
@@ -19,7 +18,6 @@ from quell.parallel import in_parallel
 pytestmark = pytest.mark.compiled
 
 SETTINGS = study.Settings()
-SINE = ql.signals.Sinusoid
 
 
 def late_peaks(learners: list[object], guard: ql.Guard | None, scenario: ql.Scenario) -> np.ndarray:
@@ -46,19 +44,6 @@ def test_a_load_of_unknown_frequency_is_rejected_to_a_five_hundredth(
         ql.learners.Harmonic(omegas=(start,)) for start in (0.1, 0.17, 0.3, 0.55, 1.0, 1.7, 3.0)
     ]
     assert np.max(late_peaks(learners, guard, study.scenario(SETTINGS))) <= 1.0 / 500.0
-
-
-@pytest.mark.parametrize(
-    ("slow", "fast", "size"), [(0.1 * np.pi, 0.8, 0.5), (0.3, 1.3, 1.0), (0.27, 0.69, 0.9)]
-)
-def test_two_sinusoids_and_a_step_are_rejected_to_a_fiftieth(
-    slow: float, fast: float, size: float
-) -> None:
-    """Frequencies a factor of two and more apart; docs/theory has what closer ones do."""
-    at = study.FORCE_AT
-    load = SINE(omega=slow, start=at) + SINE(size, fast, start=at) + 0.5 * ql.signals.Step(at=at)
-    scenario = dataclasses.replace(study.scenario(SETTINGS), disturbances=(0.0, load))
-    assert late_peaks([ql.learners.Harmonic(count=2)], None, scenario)[0] <= 1.0 / 50.0
 
 
 def test_algorithm_1_is_harmless_at_any_rate_behind_the_guard() -> None:

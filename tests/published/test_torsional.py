@@ -1,4 +1,8 @@
-"""The torsional experiment: the reference figures of docs/torsional, and the bars that were set. Seeds 0 to 2, five starts each."""
+"""The torsional experiment: the reference figures of docs/torsional, and the bars that were set, on the linear plant.
+
+Seeds 0 and 1, three starts each. ``.ci/run`` has the bars on the plant with friction, too, and the guarded learner there (on the
+linear plant it overshoots by 0.41 % and does not settle from all starts: most of what the guard sees there is encoder noise, docs/theory).
+"""
 
 from __future__ import annotations
 
@@ -18,14 +22,14 @@ SLOW = (20.0, 90.0)
 
 @cache
 def median(
-    name: str, kind: str, seed: int, case: tuple[float, float] = SLOW, starts: int = 3
+    name: str, seed: int, case: tuple[float, float] = SLOW, starts: int = 3
 ) -> dict[str, float]:
-    """Run a controller from some starts; return the medians of its scores."""
+    """Run a controller from some starts on the linear plant; return the medians of its scores."""
     settings = study.Settings(seed=seed)
-    controller, plant = study.controllers(settings, *case)[name], study.plant(kind)
+    controller, plant = study.controllers(settings, *case)[name], study.plant(study.LINEAR)
     found = [
         study.score(simulate(plant, controller, course))
-        for course in study.scenarios(settings, kind)[:starts]
+        for course in study.scenarios(settings, study.LINEAR)[:starts]
     ]
     return {
         key: statistics.median(score[key] for score in found)
@@ -42,54 +46,28 @@ def test_the_reference_figures_of_the_linear_plant_are_met(
 ) -> None:
     """Within a count and a half of the encoder, and 20 ms."""
     for seed in SEEDS:
-        found = median(name, study.LINEAR, seed)
+        found = median(name, seed)
         assert found["overshoot"] == pytest.approx(overshoot, abs=1.5 * 2.0 / study.COUNTS)
         assert found["settling_time"] == pytest.approx(settling, abs=0.02)
 
 
-@pytest.mark.parametrize("kind", study.PLANTS)
-def test_l_eso_beats_both_mf_eso_and_a_model_that_is_ten_percent_off(kind: str) -> None:
+def test_l_eso_beats_both_mf_eso_and_a_model_that_is_ten_percent_off() -> None:
     """Overshoot at most 0.1 %, settling at most 2.4 s, both no more than the others', control variation no larger than MF-ESO's."""
     for seed in SEEDS:
-        found = median(study.L, kind, seed)
+        found = median(study.L, seed)
         assert found["overshoot"] <= 0.001 * (1.0 + 1e-9)
         assert found["settling_time"] <= 2.4
         for other in (study.MF, study.MB_OFF):
-            rival = median(other, kind, seed)
+            rival = median(other, seed)
             assert found["overshoot"] <= rival["overshoot"]
             assert found["settling_time"] <= rival["settling_time"]
-        assert found["control_variation"] <= 0.9 * median(study.MF, kind, seed)["control_variation"]
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [
-        kind
-        if kind != "linear"
-        else pytest.param(
-            kind,
-            marks=pytest.mark.xfail(
-                strict=True,
-                raises=TypeError,
-                reason="the guarded learner overshoots by 0.41 % and does not settle from all "
-                "starts: most of what the guard sees there is encoder noise (docs/theory)",
-            ),
-        )
-        for kind in study.PLANTS
-    ],
-)
-def test_the_guard_keeps_most_of_it(kind: str) -> None:
-    """Overshoot and settling of the guarded learner lie nearer to L-ESO's than to MF-ESO's."""
-    free, guarded, plain = (median(name, kind, 0) for name in (study.L, study.LG, study.MF))
-    for key in ("overshoot", "settling_time"):
-        assert guarded[key] - free[key] < 0.5 * (plain[key] - free[key])
+        assert found["control_variation"] <= 0.9 * median(study.MF, seed)["control_variation"]
 
 
 @pytest.mark.parametrize("case", [(90.0, 40.0), (40.0, 90.0)])
 def test_the_papers_bandwidths_are_stable_either_way_round(case: tuple[float, float]) -> None:
-    """L-ESO arrives within 10 ms of what the design asks for, on the linear plant and with friction."""
+    """L-ESO arrives within 10 ms of what the design asks for."""
     asked = {90.0: 1.995, 40.0: 2.073}[case[0]]
-    for kind in study.PLANTS:
-        found = median(study.L, kind, 0, case, starts=1)
-        assert found["settling_time"] == pytest.approx(asked, abs=0.01)
-        assert found["overshoot"] <= 0.0015
+    found = median(study.L, 0, case, starts=1)
+    assert found["settling_time"] == pytest.approx(asked, abs=0.01)
+    assert found["overshoot"] <= 0.0015
