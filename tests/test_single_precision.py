@@ -213,9 +213,8 @@ def test_averages_that_would_stand_still_are_named() -> None:
     controller = ql.ADRC(observer, 0.2, learner=ql.learners.Kalman(), guard=ql.Guard())
     with pytest.raises(ValueError, match=r"forget = .* a sample: must be at least .* raise dt"):
         in_single_precision(controller)
-    rates = dict.fromkeys(
-        ("forget", "earn", "forget_effect", "rise", "growth", "smooth"), 2.0 ** (-21)
-    )
+    names = ("forget", "earn", "forget_effect", "forget_account", "rise", "growth", "smooth")
+    rates = dict.fromkeys(names, 2.0**-21)
     fine = controller.parameters.guard._replace(**rates, decay=2.0**-23)
     single_design(fine)
     for name, value in (("rise", 2.0**-22), ("decay", 2.0**-24)):

@@ -37,11 +37,13 @@ _OWN_SHARE, _OWN_LAGS = 0.2, 10.0
 # β̄ follows β over this time.
 _SMOOTHING_LAGS = 30.0
 # The target returns to f_L over this time, where the bound keeps them apart.
-_LEAK_LAGS = 20.0
+_LEAK_LAGS = 7.0
 # The target approaches β̄g over this time, by at most e in it: a slow drift has almost no effect.
 _HOME_LAGS = 1000.0
 # What a learner does to y is judged over T and so many times n/ω_c, in which y responds.
 EFFECT_TIME = 5.0
+# Memory of the account.
+_ACCOUNT_LAGS = 300.0
 # After the filters were emptied in mid-run, q is wrong for this time.
 _SETTLING_LAGS = 3.0
 
@@ -106,16 +108,17 @@ class Guard:
             return -math.expm1(-dt / (lags * lag_time))
 
         # The law's gains are those of its poles; without a law y is taken to be as slow as f̂.
-        stages = observer.order if law is None else len(law)
-        omega_c = 1.0 / lag_time if law is None else float(law[0]) ** (1.0 / stages)
+        order = observer.order if law is None else len(law)
+        omega_c = 1.0 / lag_time if law is None else float(law[0]) ** (1.0 / order)
         lag, invertible = lag_of(observer), is_invertible(observer)
         return GuardDesign(
             lag=lag,
             forget=-math.expm1(-dt / time),
             earn=dt / (_CREDIT_TIME * time),
-            stages=stages,
+            stages=max(order - 2, 1),
             respond=-math.expm1(-omega_c * dt),
-            forget_effect=dt / (time + EFFECT_TIME * stages / omega_c),
+            forget_effect=dt / (time + EFFECT_TIME * order / omega_c),
+            forget_account=dt / (_ACCOUNT_LAGS * lag_time),
             rise=share(_RISE_LAGS),
             decay=share(_DECAY_LAGS),
             growth=share(_GROWTH_LAGS),
@@ -136,7 +139,7 @@ class Guard:
         """Return the state before the first sample, without authority."""
         fed = lag_memory(parameters.fed_lag, 0 if parameters.invertible else 1)
         filters = lag_memory(parameters.lag, 3), fed, np.zeros(4)
-        effects = np.zeros((2, parameters.stages))
+        effects = np.zeros((3, parameters.stages))
         memory = GuardMemory(*filters, effects, GuardAverages.zeros(), GuardSample.zeros())
         withdraw_authority(memory)
         return memory

@@ -29,18 +29,32 @@ each in which it would have increased it costs credit; M is the mean of q² over
 raise slowly:
 
     p̄ = clip(p, ±κe),        C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
-    β = min( clip(2 C, 0, 1),  clip(1 + 2 C_y, 0, 1),  1.2 (1 − S)/S )
+    β = min( clip(2 C, 0, 1),  clip(1 + 2 C_y, 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
 
 C starts at −1. S, the mean share of p² in p² + q² over T, scales down an output that is larger than
 what it explains. C_y is a veto: y is q through n integrations, so a learner that explains quick
-changes of f and adds to slow ones earns credit C and harms y. C_y follows the rule of C with what q
-and p̄ do to y, ``(ω_c/(s + ω_c))^n q`` and ``(ω_c/(s + ω_c))^n p̄``, over ``T + 5 n/ω_c``, from 0 on.
+changes of f and adds to slow ones earns credit C and harms y. C_y follows the rule of C with ℓ q
+and ℓ p̄ in place of q and p̄, over ``T + 5 n/ω_c``, from 0 on. With m = max(n − 2, 1) stages,
+``ℓ = (ω_c/(s + ω_c))^m`` shows slow changes as y does, and earlier than y.
+
+**Account.** Credit is soon forgotten: a learner can earn it in twenty lags and spend it in ten,
+again and again. So an account over 300 lags compares what its corrections did with what was missed:
+
+    J ← J + ((ℓ q)² − J) dt/300 lags,
+    A ← max( A + (2 ℓq ℓe_L − 1.5 (ℓe_L)² − A) dt/300 lags,  −0.02 J )
+
+Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
+removed; the factor is for plants on which a correction acts more strongly than on the observer's
+model. While R < −0.01 the credit is −1: whoever has added one percent to the squared error begins
+anew. The bound is κe for a learner with R ≥ 0.3, and less for one that has removed less:
+
+    κ_R = κ (ρ + (1 − ρ) clip(R/0.3, 0, 1)),        ρ = 0.7
 
 **Output.** The target changes by ``β̄ Δg``, so that a change of β over a constant g does nothing,
 and what the bound took is made up for while the target is still near:
 
-    target ← target + β̄ (g − g_before),        e_L = clip( target − f_L^F, ±β κ e ),
-    f_L = f_L^F + e_L,        target ← target + dt/(20 lags) (f_L − target)
+    target ← target + β̄ (g − g_before),        e_L = clip( target − f_L^F, ±β κ_R e ),
+    f_L = f_L^F + e_L,        target ← target + dt/(7 lags) (f_L − target)
 
 β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
 what is constant in e_L.
@@ -91,6 +105,13 @@ _NOISE = 0.4
 # Credit that e costs when it grows by a factor of 2.7 while the learner acts. In the five lags that
 # this takes at least, a learner that explains a sinusoidal load earns a quarter.
 _GROWTH_COST = 0.2
+# Factor of (ℓ e_L)² in the account: the plant's gain may be so many times b0.
+_OWN_SQUARES = 1.5
+# Share by which a learner may make the squared error larger, and least R, as a multiple of it: R
+# comes back from there within 200 lags.
+_LOAN, _LARGEST_DEBT = 0.01, 2.0
+# R from which the bound is κe, and share of it that a learner with R ≤ 0 has: ρ.
+_PROVEN, _UNPROVEN_BOUND = 0.3, 0.7
 # An outlier counts for so many times P.
 _OUTLIER = 5.0
 # e is at most so many times o; c_L counts so many times for o, and once while |q| is so many times
@@ -113,9 +134,10 @@ class GuardDesign(NamedTuple):
     lag: Any  # lag filter of the observer
     forget: float  # dt/T
     earn: float  # dt/T_C
-    stages: Size  # n: order of the response of y
+    stages: Size  # m: order of ℓ
     respond: float  # share by which each of its stages follows in a sample
     forget_effect: float  # dt/(T + 5 n/ω_c)
+    forget_account: float  # dt/(300 lags)
     rise: float  # share by which P and e follow a larger |q| in a sample
     decay: float  # share by which P decays in a sample
     growth: float  # largest share by which e grows in a sample while the learner acts
@@ -137,7 +159,9 @@ class GuardAverages(Scalars):
 
     loudness: float  # S
     square: float  # M, mean of q² that grows by a factor of 2.7 in 0.7 lags at most
-    effect_square: float  # the same of what q does to y
+    effect_square: float  # the same of ℓ q, over T + 5 n/ω_c
+    missed: float  # J
+    gained: float  # A
     error_plain: float  # mean square of q [(y-unit/s^n)²]
     error_learned: float  # mean square of q − p [(y-unit/s^n)²]
 
@@ -156,8 +180,7 @@ class GuardSample(Scalars):
     output: float  # g [y-unit/s^n]
     begun: float  # 1 if there is an output of a sample before, else 0
     target: float  # target of f_L [y-unit/s^n]
-    shown: float  # f_L^F [y-unit/s^n]
-    limit: float  # β κ e: bound of |e_L| [y-unit/s^n]
+    limit: float  # β κ_R e: bound of |e_L| [y-unit/s^n]
     reason: float  # a Reason
     samples: float  # number of samples so far
     unsettled: float  # samples until q is right again
@@ -170,13 +193,15 @@ class GuardMemory(NamedTuple):
     fed: Matrix  # lag filter of f_L (1, …), if it is not that of the observer, else (0, …)
     # Their outputs f_plain^F, g^F, p and f_L^F (4,); in single precision carries, too (7,).
     shown: Vector
-    effects: Matrix  # what q and p̄ do to y, stage by stage (2, n) [y-unit/s^n]
+    effects: Matrix  # ℓ q, ℓ p̄ and ℓ e_L, stage by stage (3, m) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
 
 
 # Rows of GuardMemory.chain and, with the last, entries of GuardMemory.shown.
 _F_PLAIN, _G, _V, _F_L = range(4)
+# Rows of GuardMemory.effects.
+_MISSED, _BOUNDED, _CORRECTED = range(3)
 # Carries of sums in single precision, the last entries of GuardMemory.shown there.
 _TARGET, _SHARE, _PEAK = 4, 5, 6
 CARRIES = 3
@@ -250,16 +275,31 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
 def _judge_effect(
     guard: GuardDesign, memory: GuardMemory, q: float, bounded: float, is_new: bool
 ) -> None:
-    """Update C_y with what the learner, bounded, would have done to y."""
-    effects, averages, sample = memory.effects, memory.averages[0], memory.sample[0]
-    for i in range(guard.stages):
-        effects[0, i] += guard.respond * (q - effects[0, i])
-        effects[1, i] += guard.respond * (bounded - effects[1, i])
-        q, bounded = effects[0, i], effects[1, i]
-    rate = guard.forget_effect
-    averages.effect_square = _mean_square(guard, averages.effect_square, q * q, rate, is_new)
+    """Update C_y with what the learner, bounded, would have done to y, and the account."""
+    averages, sample = memory.averages[0], memory.sample[0]
+    q = _respond(guard, memory, _MISSED, q)
+    bounded = _respond(guard, memory, _BOUNDED, bounded)
+    rate, square = guard.forget_effect, q * q
+    averages.effect_square = _mean_square(guard, averages.effect_square, square, rate, is_new)
     earned = _earned(q, bounded, averages.effect_square, _tiny(guard))
     sample.effect_credit = min(max(sample.effect_credit + rate * earned, -1.0), 1.0)
+    own, rate = memory.effects[_CORRECTED, guard.stages - 1], guard.forget_account
+    averages.missed = _mean_square(guard, averages.missed, square, rate, is_new)
+    gain = (2.0 * q - _OWN_SQUARES * own) * own
+    allowed = _LOAN * averages.missed
+    averages.gained += rate * (gain - averages.gained)
+    averages.gained = max(averages.gained, -_LARGEST_DEBT * allowed)
+    if averages.gained < -allowed:
+        sample.credit = -1.0
+
+
+@kernel
+def _respond(guard: GuardDesign, memory: GuardMemory, row: int, value: float) -> float:
+    """Return ``ℓ value``, which is as slow as y."""
+    for i in range(guard.stages):
+        memory.effects[row, i] += guard.respond * (value - memory.effects[row, i])
+        value = memory.effects[row, i]
+    return value
 
 
 @kernel
@@ -314,9 +354,9 @@ def _limit(
     sample = memory.sample[0]
     output = constant + slope * u_before
     most = _CUT_OFF * max(abs(f_plain), sample.peak)
-    if not guard.invertible:
-        f_shown = memory.shown[_F_L]
-    sample.shown = f_shown
+    if guard.invertible:
+        memory.shown[_F_L] = f_shown
+    f_shown = memory.shown[_F_L]
     if not (abs(output) <= most and is_finite(slope)):
         finite = is_finite(output) and is_finite(slope)
         sample.output = min(max(output, -most), most) if finite else 0.0
@@ -328,9 +368,12 @@ def _limit(
         return f_shown, 0.0, not finite
     before = sample.output if sample.begun != 0.0 else output
     sample.output, sample.begun = output, 1.0
-    authority, sample.reason = _authority(guard, memory)
+    removed = memory.averages[0].gained / max(memory.averages[0].missed, _tiny(guard))
+    authority, sample.reason = _authority(guard, memory, removed)
     sample.authority = authority
-    sample.limit = authority * guard.bound * sample.typical_error
+    proven = min(max(removed / _PROVEN, 0.0), 1.0)
+    proven = _UNPROVEN_BOUND + (1.0 - _UNPROVEN_BOUND) * proven
+    sample.limit = authority * proven * guard.bound * sample.typical_error
     more = guard.smooth * (authority - sample.share)
     sample.share = _sum(guard, memory, _SHARE, sample.share, more)
     if is_single(guard.forget):
@@ -349,15 +392,16 @@ def _limit(
 
 @confine.register(GuardDesign)
 def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float:
-    sample = memory.sample[0]
-    return min(max(f_learned, sample.shown - sample.limit), sample.shown + sample.limit)
+    shown, most = memory.shown[_F_L], memory.sample[0].limit
+    return min(max(f_learned, shown - most), shown + most)
 
 
 @kernel
-def _authority(guard: GuardDesign, memory: GuardMemory) -> tuple[float, int]:
-    """Return β and the reason for it."""
+def _authority(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[float, int]:
+    """Return β and the reason for it; ``removed`` is R."""
     loudness, sample = memory.averages[0].loudness, memory.sample[0]
     earned = min(sample.credit, _FULL_CREDIT + sample.effect_credit) / _FULL_CREDIT
+    earned = min(earned, 1.0 + removed / _LOAN)
     if earned <= 0.0:
         return 0.0, _UNPROVEN
     scaled = _LOUDEST * (1.0 - loudness) / max(loudness, _tiny(guard))
@@ -379,9 +423,11 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
     v = sample.output - shown[_G]
     shown[_G] = lag_push(guard.lag, memory.chain, _G, sample.output)
     shown[_V] = lag_push(guard.lag, memory.chain, _V, v)
+    correction = f_learned - shown[_F_L]
     if not guard.invertible:
         shown[_F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
-    sample.own_peak = max(abs(f_learned - sample.shown), guard.own_decay * sample.own_peak)
+    _respond(guard, memory, _CORRECTED, correction)
+    sample.own_peak = max(abs(correction), guard.own_decay * sample.own_peak)
     if sample.limit > 0.0:
         more = guard.leak * (f_learned - sample.target)
         sample.target = _sum(guard, memory, _TARGET, sample.target, more)
@@ -411,7 +457,7 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     reset_lag(memory.effects)
     for i in range(memory.shown.size):
         memory.shown[i] = 0.0
-    sample.output = sample.begun = sample.target = sample.shown = 0.0
+    sample.output = sample.begun = sample.target = 0.0
     sample.limit = sample.own_peak = sample.unsettled = 0.0
 
 

@@ -45,13 +45,13 @@ _OTHER = 1.25  # times omega_c: another value, for which the closed form is chec
 class GuardTimes(NamedTuple):
     """The numbers of a guard that depend on omega_c."""
 
-    stages: int  # n
+    order: int  # n
     fixed: float  # A [s]
     by_bandwidth: float  # B
 
     def changed(self, guard: GuardDesign, first_gain: float, dt: float) -> GuardDesign:
         """Return the parameters of a guard for another gain k_1."""
-        omega = first_gain ** (1.0 / self.stages)
+        omega = first_gain ** (1.0 / self.order)
         forget = dt / (self.fixed + self.by_bandwidth / omega)
         return guard._replace(respond=-math.expm1(-omega * dt), forget_effect=forget)
 
@@ -95,11 +95,11 @@ def _guard_times(controller: ADRC) -> GuardTimes | None:
     design = controller.parameters
     if not isinstance(design.guard, GuardDesign):
         return None
-    stages = design.guard.stages
-    by_bandwidth = EFFECT_TIME * stages
-    omega = float(design.law[0]) ** (1.0 / stages)
+    order = design.law.size
+    by_bandwidth = EFFECT_TIME * order
+    omega = float(design.law[0]) ** (1.0 / order)
     fixed = controller.dt / design.guard.forget_effect - by_bandwidth / omega
-    return GuardTimes(stages, fixed, by_bandwidth)
+    return GuardTimes(order, fixed, by_bandwidth)
 
 
 def _weights(controller: ADRC, guard: GuardTimes | None) -> Vector | None:

@@ -56,7 +56,7 @@ def _omega_c_lines(known: Bandwidths, weights: Vector, cast: str) -> list[str]:
     count, dt = weights.size, known.dt
     guard = []
     if known.guard is not None:
-        power = repr(1.0 / known.guard.stages)
+        power = repr(1.0 / known.guard.order)
         times = f"({known.guard.fixed!r} + {known.guard.by_bandwidth!r} / omega_g)"
         guard = [
             f"    const double omega_g = pow(weights[0] * pow(omega_c, {count}), {power});",
