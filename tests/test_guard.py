@@ -429,7 +429,7 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         more = account * (q * q - missed)
         missed += more if (k + 1) * forget < 1.0 else min(more, rise * missed)
         gained += account * (2.0 * q * stages[2, 1] - 1.5 * stages[2, 1] ** 2 - gained)
-        gained = max(gained, -0.02 * missed)
+        gained = min(max(gained, -0.02 * missed), missed)
         credit = -1.0 if gained < -0.01 * missed else credit
         begun_anew += gained < -0.01 * missed
         if k % 100 == 99:

@@ -41,7 +41,7 @@ and ℓ p̄ in place of q and p̄, over ``T + 5 n/ω_c``, from 0 on. With m = ma
 again and again. So an account over 300 lags compares what its corrections did with what was missed:
 
     J ← J + ((ℓ q)² − J) dt/300 lags,
-    A ← max( A + (2 ℓq ℓe_L − 1.5 (ℓe_L)² − A) dt/300 lags,  −0.02 J )
+    A ← clip( A + (2 ℓq ℓe_L − 1.5 (ℓe_L)² − A) dt/300 lags,  −0.02 J, J )
 
 Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
 removed; the factor is for plants on which a correction acts more strongly than on the observer's
@@ -287,8 +287,8 @@ def _judge_effect(
     averages.missed = _mean_square(guard, averages.missed, square, rate, is_new)
     gain = (2.0 * q - _OWN_SQUARES * own) * own
     allowed = _LOAN * averages.missed
-    averages.gained += rate * (gain - averages.gained)
-    averages.gained = max(averages.gained, -_LARGEST_DEBT * allowed)
+    gain = averages.gained + rate * (gain - averages.gained)
+    averages.gained = min(max(gain, -_LARGEST_DEBT * allowed), averages.missed)
     if averages.gained < -allowed:
         sample.credit = -1.0
 
