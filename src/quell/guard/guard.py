@@ -60,6 +60,7 @@ class Guard:
         largest correction of the plain observer's estimate, in units of that estimate's error e: κ.
         With κ = 1 a perfect learner is clipped at its peaks, because e is a little less than those
         of what the plain observer misses.
+        A learner has 0.7 of it until it has removed a good part of the error (``kernels.py``).
     time
         time T [s] over which a learner is judged; by default 15 lags ``(n + 1)/omega_o`` of the
         observer.
