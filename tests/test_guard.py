@@ -369,7 +369,7 @@ def test_who_has_added_a_hundredth_to_the_squared_error_begins_anew_and_may_with
     design, memory = trusted()
     design = design._replace(forget_account=10.0 * design.forget_account)  # 30 lags
     lag, account = round(0.5 / 5e-3), memory.averages[0]
-    account.missed, account.gained = 0.4**2, 0.0
+    account.missed, account.effect_square, account.gained = 0.4**2, 0.4**2, 0.0
     settle(design, memory, 0.4, -0.4, 10 * lag)
     assert account.gained == pytest.approx(-0.02 * account.missed)
     assert memory.sample[0].credit == -1.0
@@ -426,9 +426,11 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         effect += more if (k + 1) * forget < 1.0 else min(more, rise * effect)
         earned = (2.0 * q * bounded - bounded**2) / max(q * q, 4.0 * effect)
         veto = np.clip(veto + slowly * max(earned, -3.0), -1.0, 1.0)
-        more = account * (q * q - missed)
-        missed += more if (k + 1) * forget < 1.0 else min(more, rise * missed)
-        gained += account * (2.0 * q * stages[2, 1] - 1.5 * stages[2, 1] ** 2 - gained)
+        more, is_new = account * (q * q - missed), (k + 1) * forget < 1.0
+        if is_new or more <= rise * missed:
+            gained += account * (2.0 * q * stages[2, 1] - 1.5 * stages[2, 1] ** 2 - gained)
+        missed += more if is_new else min(more, rise * missed)
+        missed = min(missed, 1e4 * effect)
         gained = min(max(gained, -0.02 * missed), missed)
         credit = -1.0 if gained < -0.01 * missed else credit
         begun_anew += gained < -0.01 * missed

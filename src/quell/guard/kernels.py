@@ -43,6 +43,9 @@ again and again. So an account over 300 lags compares what its corrections did w
     J ← J + ((ℓ q)² − J) dt/300 lags,
     A ← clip( A + (2 ℓq ℓe_L − 1.5 (ℓe_L)² − A) dt/300 lags,  −0.02 J, J )
 
+J follows a burst no more quickly than M does, and A does not follow it; J is at most 10⁴ times the
+mean of (ℓ q)² over ``T + 5 n/ω_c``, so that an absurd measurement is forgotten.
+
 Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
 removed; the factor is for plants on which a correction acts more strongly than on the observer's
 model. While R < −0.01 the credit is −1: whoever has added one percent to the squared error begins
@@ -110,6 +113,8 @@ _OWN_SQUARES = 1.5
 # Share by which a learner may make the squared error larger, and least R, as a multiple of it: R
 # comes back from there within 200 lags.
 _LOAN, _LARGEST_DEBT = 0.01, 2.0
+# Largest J in units of the mean of (ℓ q)² over T + 5 n/ω_c: an absurd past counts for little.
+_MOST_PAST = 1e4
 # R from which the bound is κe, and share of it that a learner with R ≤ 0 has: ρ.
 _PROVEN, _UNPROVEN_BOUND = 0.3, 0.7
 # An outlier counts for so many times P.
@@ -284,10 +289,13 @@ def _judge_effect(
     earned = _earned(q, bounded, averages.effect_square, _tiny(guard))
     sample.effect_credit = min(max(sample.effect_credit + rate * earned, -1.0), 1.0)
     own, rate = memory.effects[_CORRECTED, guard.stages - 1], guard.forget_account
+    is_burst = not is_new and rate * (square - averages.missed) > guard.rise * averages.missed
     averages.missed = _mean_square(guard, averages.missed, square, rate, is_new)
+    averages.missed = min(averages.missed, _MOST_PAST * averages.effect_square)
     gain = (2.0 * q - _OWN_SQUARES * own) * own
     allowed = _LOAN * averages.missed
-    gain = averages.gained + rate * (gain - averages.gained)
+    # What a learner did in a burst says nothing, as J does not follow it.
+    gain = averages.gained + (0.0 if is_burst else rate * (gain - averages.gained))
     averages.gained = min(max(gain, -_LARGEST_DEBT * allowed), averages.missed)
     if averages.gained < -allowed:
         sample.credit = -1.0
