@@ -25,7 +25,7 @@ from quell.experiments.stress.adversaries import (
 )
 from quell.experiments.stress.random_loops import Loop
 from quell.guard import assess, confine, limit, record_output, start_again
-from quell.guard.kernels import _MOST_OWN, _update_bound
+from quell.guard.bound import _MOST_OWN, update_bound
 from quell.learners.lag import lag_of, lag_push
 from quell.types import Status
 
@@ -184,7 +184,7 @@ def test_what_is_not_the_output_s_own_doing_counts_for_the_bound() -> None:
         sample = memory.sample[0]
         sample.samples, sample.peak, sample.typical_error = 0.0, 2.0, 0.5
         sample.own_peak, sample.outside = 0.1, 0.3
-        _update_bound(design, memory, error)
+        update_bound(design, memory, error)
         expected = 0.3 + design.rise * (error - 0.1 * own_share - 0.3)
         assert sample.outside == pytest.approx(expected, rel=1e-12)
 
@@ -195,11 +195,11 @@ def test_credit_from_small_errors_does_not_suffice_for_large_ones() -> None:
     sample = memory.sample[0]
     sample.authority = 1.0
     while sample.credit > 0.0 and sample.typical_error < 1e5:
-        _update_bound(design, memory, 1e6)
+        update_bound(design, memory, 1e6)
     assert sample.typical_error == pytest.approx(math.exp(5.0), rel=0.05)
     sample.credit = sample.authority = 0.0
     for _ in range(1000):
-        _update_bound(design, memory, 1e6)
+        update_bound(design, memory, 1e6)
     assert sample.credit == 0.0, "without authority the growth is free"
     assert sample.typical_error == pytest.approx(1e6, rel=1e-3)
 
@@ -210,7 +210,7 @@ def test_a_bound_that_does_not_grow_costs_nothing() -> None:
     sample = memory.sample[0]
     sample.authority, sample.own_peak, sample.outside = 1.0, 10.0, 0.4
     for _ in range(10):
-        _update_bound(design, memory, 5.0)
+        update_bound(design, memory, 5.0)
     assert (sample.credit, sample.typical_error) == (1.0, 1.0)
 
 

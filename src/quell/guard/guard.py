@@ -8,16 +8,12 @@ from typing import Any
 
 import numpy as np
 
+import quell.guard.kernels  # noqa: F401  (registers the functions for ``GuardDesign``)
 from quell import checks
 from quell.guard.certified import certified_bound
 from quell.guard.correction import is_invertible
-from quell.guard.kernels import (
-    GuardAverages,
-    GuardDesign,
-    GuardMemory,
-    GuardSample,
-    withdraw_authority,
-)
+from quell.guard.credit import withdraw_authority
+from quell.guard.state import GuardAverages, GuardDesign, GuardMemory, GuardSample
 from quell.learners.lag import lag_memory, lag_of
 from quell.observers.eso import ESO
 from quell.types import Vector

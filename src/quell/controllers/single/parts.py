@@ -11,7 +11,7 @@ from quell.controllers.linear.delta import delta_law
 from quell.controllers.linear.law import LinearLaw
 from quell.controllers.prefilters.prefilter import PrefilteredDesign
 from quell.features.custom import CustomDesign
-from quell.guard.kernels import CARRIES, GuardDesign, GuardMemory
+from quell.guard.state import CARRIES, GuardDesign, GuardMemory
 from quell.kernels.single import in_single
 from quell.learners.adapters.kernels import PythonDesign
 from quell.learners.kalman.kernels import KalmanDesign, KalmanMemory, needs_carries

@@ -30,7 +30,7 @@ from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.law import law_gains
 from quell.controllers.prefilters.prefilter import Prefiltered
 from quell.guard.guard import EFFECT_TIME
-from quell.guard.kernels import GuardDesign
+from quell.guard.state import GuardDesign
 from quell.learners import NoLearner
 from quell.observers.eso import ESO
 from quell.observers.linear import EsoModel
