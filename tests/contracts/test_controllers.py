@@ -69,12 +69,26 @@ def test_every_controller_has_an_example() -> None:
     assert found == {type(example).__name__ for example in CONTROLLERS.values()}
 
 
+# A controller that is stepped is not told of a start from rest.
+WITHOUT_REST = ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise)
+
+
 def test_a_loop_runs_the_same_again_and_interpreted() -> None:
-    """Same seed, same output; no second compilation; interpreted = compiled.
+    """Same seed, same output; no second compilation; interpreted = compiled; ``step`` gives the same u and state.
 
     Of all controllers the next test compiles ``step``: the same functions without the loop.
     """
     check_run(CHAIN, CONTROLLERS["ADRC"], SCENARIO)
+    run, controller = (
+        ql.simulate(CHAIN, CONTROLLERS["ADRC"], WITHOUT_REST),
+        copy.deepcopy(CONTROLLERS["ADRC"]),
+    )
+    u = [controller.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]
+    np.testing.assert_allclose(u, run["u"], rtol=0.0, atol=1e-12)
+    for label, array in named_arrays(run.final_state).items():
+        np.testing.assert_allclose(
+            controller.state[label], array, rtol=1e-9, atol=1e-12, err_msg=label
+        )
 
 
 # An ADRC behind a prefilter is among them twice without this one, and its filter behind a PID.
@@ -87,7 +101,7 @@ def test_a_step_at_a_time_is_the_simulated_run_and_interpreted(name: str) -> Non
     run = ql.simulate(
         PLANTS.get(name, CHAIN),
         CONTROLLERS[name],
-        ql.Scenario(SCENARIO.reference, 2.0, noise=SCENARIO.noise),
+        WITHOUT_REST,
         interpret=True,
     )
     one, other = (copy.deepcopy(CONTROLLERS[name]) for _ in range(2))
