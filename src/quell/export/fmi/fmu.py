@@ -131,7 +131,9 @@ def _parts(part: Any) -> tuple[Any, Any]:
 
 def _own_sources(sources: Sequence[str | os.PathLike[str]]) -> dict[str, str]:
     """Return the texts of the user's C files by name."""
-    if not checks.is_sequence(sources):
+    if not checks.is_sequence(sources) or not all(
+        isinstance(each, str | os.PathLike) for each in sources
+    ):
         raise ValueError(f"sources = {sources!r}: must be a sequence of files")
     found: dict[str, str] = {}
     for path in map(Path, sources):
