@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 from quell.experiments.common.figures import save_figure
+from quell.experiments.torsional.setup import LINEAR, plant
 from quell.identification import Identified
 from quell.kernels.compile_time import compile_time
 
@@ -71,9 +72,14 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(
 ) -> None:
     """Tables, JSON in the study's form with one entry a pair of bandwidths, figures; without a terminal.
 
-    From one start, where the experiment has five.
+    From one start, where the experiment has five, and with the linear plant as both of its plants;
+    ``.ci/run`` judges what the whole command finds.
     """
     monkeypatch.setattr("quell.experiments.torsional.setup.STARTS", 1)
+    for module in ("setup", "study"):
+        monkeypatch.setattr(
+            f"quell.experiments.torsional.{module}.plant", lambda kind: plant(LINEAR)
+        )
     shown = quell(
         "reproduce",
         "torsional",
