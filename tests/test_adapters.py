@@ -46,7 +46,7 @@ def driven(plant: Any, learner: Any, end: float, *, interpret: bool = False) -> 
     return ql.simulate(plant, law(learner), scenario, interpret=interpret)
 
 
-ideal = cache(lambda end: driven(CHAIN, None, end)["y"])
+ideal = cache(lambda end: driven(CHAIN, None, end, interpret=True)["y"])
 
 
 def deviation(run: ql.Trajectory, start: float, end: float) -> float:
@@ -61,11 +61,11 @@ def plain_deviation() -> float:
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_python_model_learns_a_hard_spring_in_the_compiled_loop(name: str) -> None:
+def test_a_python_model_learns_a_hard_spring(name: str) -> None:
     """It takes two thirds of what the plain ESO leaves of a spring and drag it was told nothing of."""
-    run = driven(HARD_SPRING, LEARNERS[name], 45.0)
+    run = driven(HARD_SPRING, LEARNERS[name], 30.0, interpret=True)
     assert Status.LEARNER_FAILED not in run.status
-    assert deviation(run, 30.0, 45.0) < plain_deviation() / 3.0
+    assert deviation(run, 20.0, 30.0) < plain_deviation() / 3.0
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_the_model_is_called_once_a_period_with_all_pairs_since() -> None:
 def test_the_loop_of_ones_own_is_the_simulated_loop(name: str) -> None:
     """``controller.step`` gives what ``simulate`` gives."""
     run = ql.simulate(
-        HARD_SPRING, law(LEARNERS[name]), ql.Scenario(reference=ql.signals.Sinusoid(), duration=2.0)
+        CHAIN, law(LEARNERS[name]), ql.Scenario(reference=ql.signals.Sinusoid(), duration=2.0)
     )
     controller = law(LEARNERS[name])
     u = [controller.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]
@@ -148,8 +148,8 @@ def test_the_loop_of_ones_own_is_the_simulated_loop(name: str) -> None:
 
 def test_a_model_within_its_budget_does_as_without() -> None:
     """The same numbers, when the loop waits long enough."""
-    waited = ql.simulate(HARD_SPRING, law(PythonModel(LeastMeanSquares(), budget=30.0)), SHORT)
-    called = ql.simulate(HARD_SPRING, law(PythonModel(LeastMeanSquares())), SHORT)
+    waited = ql.simulate(CHAIN, law(PythonModel(LeastMeanSquares(), budget=30.0)), SHORT)
+    called = ql.simulate(CHAIN, law(PythonModel(LeastMeanSquares())), SHORT)
     assert Status.LEARNER_LATE not in waited.status
     np.testing.assert_array_equal(waited.log, called.log)
 
@@ -165,7 +165,7 @@ def test_an_optimiser_of_torch_is_copied_with_its_module(kind: str) -> None:
     learner = ql.learners.TorchModel(
         module, getattr(torch.optim, kind)(module.parameters(), lr=0.01), steps=2
     )
-    run = ql.simulate(HARD_SPRING, law(learner), SHORT)
+    run = ql.simulate(CHAIN, law(learner), SHORT)
     after = learner.trained(run.final_state.learner).state_dict()
     assert all(torch.equal(before[key], value) for key, value in module.state_dict().items())
     assert any(not torch.equal(before[key], value) for key, value in after.items())
@@ -175,9 +175,9 @@ def test_an_optimiser_of_torch_is_copied_with_its_module(kind: str) -> None:
 def test_same_seed_same_bits(name: str) -> None:
     """Also in two threads at once, and after another run of the same controller."""
     controller = law(LEARNERS[name])
-    first = ql.simulate(HARD_SPRING, controller, SHORT)
+    first = ql.simulate(CHAIN, controller, SHORT)
     with ThreadPoolExecutor(2) as pool:
-        both = list(pool.map(lambda _: ql.simulate(HARD_SPRING, controller, SHORT), range(2)))
+        both = list(pool.map(lambda _: ql.simulate(CHAIN, controller, SHORT), range(2)))
     for run in both:
         np.testing.assert_array_equal(run.log, first.log)
 
@@ -226,11 +226,11 @@ def test_the_model_passed_in_is_not_changed() -> None:
     """Nor does changing it later change the learner."""
     model = Counter()
     learner = PythonModel(model)
-    first = ql.simulate(HARD_SPRING, law(learner), SHORT)
+    first = ql.simulate(CHAIN, law(learner), SHORT)
     assert model.theta.size == 0
     assert model.batches == []
     model.rate = 1e9
-    np.testing.assert_array_equal(ql.simulate(HARD_SPRING, law(learner), SHORT).log, first.log)
+    np.testing.assert_array_equal(ql.simulate(CHAIN, law(learner), SHORT).log, first.log)
 
 
 @pytest.mark.parametrize("budget", [None, 30.0])
@@ -239,7 +239,7 @@ def test_nothing_is_left_behind(budget: float | None) -> None:
     gc.collect()
     before, threads = set(INSTANCES), threading.active_count()
     controller = law(PythonModel(LeastMeanSquares(), budget=budget))
-    run = ql.simulate(HARD_SPRING, controller, SHORT)
+    run = ql.simulate(CHAIN, controller, SHORT)
     for k in range(300):
         controller.step(0.5, 0.01 * k)
     assert len(set(INSTANCES) - before) == 2
