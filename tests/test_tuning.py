@@ -283,15 +283,6 @@ def test_the_bode_diagram_has_the_phase_of_the_margin(tuned: ql.Tuned) -> None:
     assert degrees[0] == pytest.approx(-90.0, abs=0.1)
 
 
-def test_a_model_of_slow_and_fast_poles_reaches_the_optimum_that_a_grid_shows() -> None:
-    """Poles at 1, 11 and 2400 s; k_i is that of the best of 50 searches from a grid of bandwidths."""
-    den = np.polymul([1.0, 1.0], np.polymul([11.23, 1.0], [2390.0, 1.0]))
-    bounds = Constraints(m_s=1.6, m_t=None)
-    how: dict[str, Any] = {"structure": "model-based", "constraints": bounds, "compare": ()}
-    found = ql.tune(([1.0], den.tolist()), 0.067, **how)
-    assert found.design.k_i == pytest.approx(39.64, rel=0.02)
-
-
 # ---- bad input
 
 
