@@ -16,7 +16,7 @@ from quell.types import Vector
 
 TABLES = {
     "title": "A loop",
-    "dt": 0.001,
+    "dt": 0.005,
     "plant": {"kind": "linear", "num": [50.0], "den": [1.0, 4.0, 0.0]},
     "observer": {"kind": "model-free", "order": 2, "b0": 50.0, "omega_o": 40.0},
     "controller": {"kind": "adrc", "omega_c": 8.0, "u_min": -10.0, "u_max": 10.0},

@@ -69,7 +69,7 @@ def test_a_full_ring_drops_the_newest_rows_and_counts_them(attempt: Any) -> None
 
 def test_no_row_is_torn_lost_or_repeated_between_two_threads() -> None:
     """A compiled producer at full speed on a small ring."""
-    count, shared, pushed = 50_000, ring(61, WIDTH), []
+    count, shared, pushed = 20_000, ring(61, WIDTH), []
     producer = Thread(target=lambda: pushed.append(_produce(shared, np.empty(WIDTH), count)))
     parts = []
     producer.start()
