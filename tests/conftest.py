@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-# Two workers share two cores, and in small matrices the threads of BLAS mostly wait for each other.
+# The workers share the cores, and in small matrices the threads of BLAS mostly wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Tests read the standard error: no announcements of long compilations.
 os.environ["QUELL_QUIET"] = "1"
