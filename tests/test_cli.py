@@ -7,13 +7,15 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cyclopts
 import matplotlib.pyplot as plt
 import pytest
 
+from quell.controllers import ADRC
 from quell.experiments.common.figures import save_figure
-from quell.experiments.torsional.setup import LINEAR, plant
+from quell.experiments.torsional import setup, study
 from quell.identification import Identified
 from quell.kernels.compile_time import compile_time
 
@@ -72,14 +74,19 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(
 ) -> None:
     """Tables, JSON in the study's form with one entry a pair of bandwidths, figures; without a terminal.
 
-    From one start, where the experiment has five, and with the linear plant as both of its plants;
+    Here both plants are the linear one, the guard is left out, and there is one start, not five;
     ``.ci/run`` judges what the whole command finds.
     """
-    monkeypatch.setattr("quell.experiments.torsional.setup.STARTS", 1)
-    for module in ("setup", "study"):
-        monkeypatch.setattr(
-            f"quell.experiments.torsional.{module}.plant", lambda kind: plant(LINEAR)
-        )
+
+    def unguarded(*arguments: Any) -> dict[str, ADRC]:
+        found = original(*arguments)
+        return found | {setup.LG: found[setup.L]}
+
+    original, linear = setup.controllers, setup.plant(setup.LINEAR)
+    monkeypatch.setattr(setup, "STARTS", 1)
+    for module in (setup, study):
+        monkeypatch.setattr(module, "plant", lambda kind: linear)
+        monkeypatch.setattr(module, "controllers", unguarded)
     shown = quell(
         "reproduce",
         "torsional",
