@@ -85,7 +85,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> FromBothEnds | None:
-    """Let one half of the workers compile, where workers run whole files."""
+    """Let some of the workers compile, where workers run whole files."""
     return FromBothEnds(config, log) if config.option.dist == "loadfile" else None
 
 

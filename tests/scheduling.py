@@ -19,8 +19,8 @@ def compiled_first(items: list[pytest.Item]) -> None:
 class FromBothEnds(LoadFileScheduling):
     """Give whole files to the workers, from the first on and from the last on in turn.
 
-    A process compiles each kernel once. With ``compiled_first`` half of the workers compile most of
-    the kernels, and the others run the tests that compile none, until they meet.
+    A process compiles each kernel once. With ``compiled_first`` the workers that begin at the front
+    compile most of the kernels, and the others run the tests that compile none, until they meet.
     """
 
     def _assign_work_unit(self, node: Any) -> None:
