@@ -39,14 +39,14 @@ PythonModel = ql.learners.PythonModel
 LEARNERS = python_learners()
 
 
-def driven(plant: Any, learner: Any, end: float, *, interpret: bool = False) -> ql.Trajectory:
-    """Run a loop with a sinusoid as reference."""
+def driven(plant: Any, learner: Any, end: float) -> ql.Trajectory:
+    """Run a loop with a sinusoid as reference, as Python."""
     noise = ql.signals.BandLimitedNoise(1e-10, 0.01)
     scenario = ql.Scenario(ql.signals.Sinusoid(omega=1.5), duration=end, noise=noise)
-    return ql.simulate(plant, law(learner), scenario, interpret=interpret)
+    return ql.simulate(plant, law(learner), scenario, interpret=True)
 
 
-ideal = cache(lambda end: driven(CHAIN, None, end, interpret=True)["y"])
+ideal = cache(lambda end: driven(CHAIN, None, end)["y"])
 
 
 def deviation(run: ql.Trajectory, start: float, end: float) -> float:
@@ -57,13 +57,13 @@ def deviation(run: ql.Trajectory, start: float, end: float) -> float:
 @cache
 def plain_deviation() -> float:
     """That of the plain ESO, which repeats itself from the first periods on."""
-    return deviation(driven(HARD_SPRING, None, 20.0, interpret=True), 10.0, 20.0)
+    return deviation(driven(HARD_SPRING, None, 20.0), 10.0, 20.0)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_python_model_learns_a_hard_spring(name: str) -> None:
     """It takes two thirds of what the plain ESO leaves of a spring and drag it was told nothing of."""
-    run = driven(HARD_SPRING, LEARNERS[name], 30.0, interpret=True)
+    run = driven(HARD_SPRING, LEARNERS[name], 30.0)
     assert Status.LEARNER_FAILED not in run.status
     assert deviation(run, 20.0, 30.0) < plain_deviation() / 3.0
 

@@ -77,12 +77,12 @@ def test_the_torsional_experiment_is_printed_written_and_drawn(
     Here both plants are the linear one, the guard is left out, and there is one start, not five;
     ``.ci/run`` judges what the whole command finds.
     """
+    original, linear = setup.controllers, setup.plant(setup.LINEAR)
 
     def unguarded(*arguments: Any) -> dict[str, ADRC]:
         found = original(*arguments)
         return found | {setup.LG: found[setup.L]}
 
-    original, linear = setup.controllers, setup.plant(setup.LINEAR)
     monkeypatch.setattr(setup, "STARTS", 1)
     for module in (setup, study):
         monkeypatch.setattr(module, "plant", lambda kind: linear)

@@ -79,10 +79,8 @@ def test_a_loop_runs_the_same_again_and_interpreted() -> None:
     Of all controllers the next test compiles ``step``: the same functions without the loop.
     """
     check_run(CHAIN, CONTROLLERS["ADRC"], SCENARIO)
-    run, controller = (
-        ql.simulate(CHAIN, CONTROLLERS["ADRC"], WITHOUT_REST),
-        copy.deepcopy(CONTROLLERS["ADRC"]),
-    )
+    run = ql.simulate(CHAIN, CONTROLLERS["ADRC"], WITHOUT_REST)
+    controller = copy.deepcopy(CONTROLLERS["ADRC"])
     u = [controller.step(r, y) for r, y in zip(run["r"], run["y_measured"], strict=True)]
     np.testing.assert_allclose(u, run["u"], rtol=0.0, atol=1e-12)
     for label, array in named_arrays(run.final_state).items():
