@@ -11,6 +11,7 @@ import uuid
 import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
+from contextvars import copy_context
 from typing import Any
 
 import numpy as np
@@ -141,7 +142,8 @@ class Bench:
         self, work: Callable[[], Any], meanwhile: Callable[[], Any] = lambda: None
     ) -> None:
         """Tick while ``work`` runs on a thread."""
-        thread = threading.Thread(target=work)
+        # Threads begin with an empty context: ``as_python`` holds in this one, too.
+        thread = threading.Thread(target=copy_context().run, args=(work,))
         thread.start()
         while thread.is_alive():
             self.rig.tick()

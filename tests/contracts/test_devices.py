@@ -184,8 +184,9 @@ def test_it_measures_the_plant_that_u_moves(example: Any) -> None:
 
     UDP as Python: tests/test_wire.py compiles what is of UDP.
     """
-    device = example.open()
     as_device = as_python if example.url.startswith("udp:") else nullcontext
+    with as_device():
+        device = example.open()
     plant = ql.plants.delayed(PLANT, example.delay, DT) if example.delay else PLANT
     twin = TwinDevice(plant, DT)
     for k in range(300):

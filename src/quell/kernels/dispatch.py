@@ -60,6 +60,7 @@ _LARGEST, _LARGEST_SINGLE = sys.float_info.max, float(np.finfo(np.float32).max)
 interpret_all = bool(numba.config.DISABLE_JIT)
 """Whether entry points run as plain Python wherever they are called by ``specialised``: for tests
 that are not about compiled code, and with ``NUMBA_DISABLE_JIT=1``."""
+_as_python: ContextVar[bool] = ContextVar("as_python", default=False)
 
 
 def kernel(function: F) -> F:
@@ -170,7 +171,7 @@ def specialised(entry: Any, *arguments: Any) -> Any:
     See ``kernels/sized.py``. It does not check the types of its arguments: call it with arguments
     of the same types, shapes and constants only.
     """
-    if interpret_all:
+    if interpret_all or _as_python.get():
         return entry.plain
     dispatcher, layouts = _dispatcher_and_layouts(entry, arguments)
     found = dispatcher.specialised.get(layouts)
@@ -232,12 +233,9 @@ def _dispatcher_and_layouts(entry: Any, arguments: tuple[Any, ...]) -> tuple[Any
     return dispatcher_for(entry, *arguments), layouts
 
 
-_as_python: ContextVar[bool] = ContextVar("as_python", default=False)
-
-
 @contextmanager
 def as_python() -> Iterator[None]:
-    """Make ``call_specialised`` run plain Python inside the ``with`` block."""
+    """Make ``specialised`` return plain Python inside the ``with`` block."""
     token = _as_python.set(True)
     try:
         yield
@@ -247,8 +245,6 @@ def as_python() -> Iterator[None]:
 
 def call_specialised(entry: Any, *arguments: Any) -> Any:
     """Call an entry point, ``specialised`` for its arguments."""
-    if _as_python.get():
-        return entry.plain(*arguments)
     return specialised(entry, *arguments)(*arguments)
 
 
