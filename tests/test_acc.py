@@ -21,18 +21,14 @@ from quell.cli.commands.acc import _print_cases
 from quell.experiments import acc
 from quell.experiments.acc import (
     DT,
-    PUBLISHED,
     CaseResult,
     box,
-    controllers,
     designs,
     interval,
     judge,
-    judge_published,
-    study_cases,
     unstable,
 )
-from quell.experiments.acc.controllers import MB, MF, L, freed
+from quell.experiments.acc.controllers import MB, MF, freed
 from quell.experiments.acc.samples import BOX, boxed, generated
 from quell.plants import lagged_two_mass_spring, two_mass_spring
 from quell.plants.base import advance
@@ -228,42 +224,6 @@ def test_every_controller_of_the_benchmark_has_margins() -> None:
         assert 0.1 < low < 1.0 < high
 
 
-@pytest.mark.compiled
-def test_ours_fail_less_than_the_published_on_drawn_plants_without_and_with_the_cubic_spring() -> (
-    None
-):
-    """On 60 plants three times as uncertain: the published 40 % and more, ours less than half of the best of them."""
-    samples = acc.generated(60, 3.0, seed=5)
-    for cubic in (False, True):
-        published = min(
-            np.mean(judge_published(design, samples, cubic).fails) for design in PUBLISHED.values()
-        )
-        assert published > 0.4
-        for name in (MF, MB, L):
-            assert (
-                np.mean(acc.judge_sampled(designs()[name], samples, cubic).fails) < 0.5 * published
-            )
-
-
-@pytest.fixture(scope="module")
-def cases() -> dict[str, CaseResult]:
-    """The design cases of the original problem; they take seconds."""
-    return study_cases()
-
-
-@pytest.mark.compiled
-def test_the_original_design_cases_are_met(cases: dict[str, CaseResult]) -> None:
-    """Stable for all 0.5 < k < 2 (MB-ESO from 0.59 only), settled by 15 s at k = 1; the sinusoid fades under the learner."""
-    for name in (MF, MB, L):
-        case = cases[name]
-        assert case.stable_from < (0.6 if name == MB else 0.5)
-        assert case.stable_to > 2.0
-        assert case.settled_at < 15.0
-        assert case.margins.modulus > 0.4
-    assert cases[L].load_peak < 0.11 < 0.4 < cases[MF].load_peak
-    assert cases[L].load_remains < 0.005 < 0.4 < cases[MF].load_remains
-
-
 def test_a_case_that_is_lost_is_called_unstable_and_one_that_does_not_settle_never() -> None:
     """In the printed table: a size in metres is no time that never comes."""
     margins = analyse(two_mass_spring(), designs()[MB]).margins
@@ -278,34 +238,30 @@ def test_a_case_that_is_lost_is_called_unstable_and_one_that_does_not_settle_nev
     assert "3never" not in told
 
 
-@pytest.mark.compiled
 def test_the_command_writes_what_programs_read(
-    cases: dict[str, CaseResult],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The keys are fixed, rates lie in their intervals; without the baselines, whose loops would be compiled for this alone."""
-    monkeypatch.setattr(controllers, "BASELINES", {})
-    monkeypatch.setattr("quell.experiments.acc.study.study_cases", lambda: cases)
-    (tmp_path / "few.csv").write_text(HEADER + "1,1,1,0.1,1,0.01\n0.9,1.1,0.95,-0.1,0.9,0.02\n")
+    """The keys are fixed, rates lie in their intervals; with one controller of ours and one plant, as Python."""
+    loop = analyse(two_mass_spring(), designs()[MF])
+    case = CaseResult(loop.margins, 9.0, 9.5, 0.4, 2.1, 0.1, 0.5, np.inf)
+    for name, found in {
+        "designs": lambda dt: {MF: designs(dt)[MF]},
+        "study_cases": lambda: {MF: case},
+    }.items():
+        monkeypatch.setattr(f"quell.experiments.acc.study.{name}", found)
+    (tmp_path / "few.csv").write_text(HEADER + "0.9,1.1,0.95,-0.1,0.9,0.02\n")
     where = ["--json", str(tmp_path / "out.json"), "--no-figures"]
     with pytest.raises(SystemExit, match="0"):
         app(["reproduce", "acc", "--samples", str(tmp_path / "few.csv"), *where])
     found = json.loads((tmp_path / "out.json").read_text())
-    names = {
-        "published nominal",
-        "published SP1(0.05)",
-        "published SP2",
-        "MF-ESO",
-        "MB-ESO",
-        "L-ESO",
-    }
+    names = {"published nominal", "published SP1(0.05)", "published SP2", "MF-ESO"}
     for spring in ("linear", "cubic"):
-        assert set(found[spring]) >= names
+        assert set(found[spring]) == names
         for row in found[spring].values():
             low, high = row["ci95"]
             assert 0.0 <= low <= row["failure_rate"] <= high <= 1.0
+    assert found["cases"][MF]["settled_at"] == 9.0
+    assert found["cases"][MF]["load_remains"] is None
     assert found["runs_per_second"] > 0.0
     assert "published SP2" in capsys.readouterr().out
     with pytest.raises(ValueError, match="must exist"):
@@ -370,20 +326,17 @@ def test_the_search_for_the_box_begins_at_mf_eso_and_may_reach_its_result() -> N
     assert np.max(np.abs(poles)) < 0.5
 
 
-@pytest.mark.compiled
 def test_the_score_of_the_search_counts_failures_and_ranks_by_late_motion() -> None:
-    """A plant that fails scores about 1, another about 0; the tuned design fails on fewer of 60 plants."""
-    samples = boxed(60, 9)
-    rates = []
-    for controller in (designs()[MF], freed()):
-        judged = acc.judge_sampled(controller, samples, cubic=True)
-        (scores,) = box.scores(controller, list(samples))
-        assert np.array_equal(np.round(scores), judged.fails)
-        settled = ~judged.fails
-        order = np.argsort(judged.late_peak[settled])
-        assert np.all(np.diff(scores[settled][order]) >= -1e-12)
-        rates.append(np.mean(judged.fails))
-    assert rates[1] < 0.7 * rates[0]
+    """A plant that fails scores about 1, another about 0: the more the more it moves late."""
+    samples = boxed(6, 9)[1::2]
+    judged = acc.judge_sampled(designs()[MF], samples, cubic=True, workers=1)
+    (scores,) = box.scores(designs()[MF], list(samples))
+    assert np.array_equal(np.round(scores), judged.fails)
+    assert set(judged.fails) == {False, True}
+    settled = ~judged.fails
+    order = np.argsort(judged.late_peak[settled])
+    assert np.all(np.diff(scores[settled][order]) >= 0.0)
+    assert scores[settled].max() > scores[settled].min()
 
 
 def test_a_box_has_its_own_ranges() -> None:

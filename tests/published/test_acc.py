@@ -1,7 +1,7 @@
 """Failure rates on the 1000 published samples of small uncertainty (Rocchetta, Crespo & Kenny, DSCC 2019).
 
 The samples are not part of this repository; they are looked for beside it, in
-``shared/benchmarks/acc``.
+``shared/benchmarks/acc``. ``.ci/run`` has the failure rates of our controllers.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from quell.experiments import acc
-from quell.experiments.acc import PUBLISHED, designs, judge_published
+from quell.experiments.acc import PUBLISHED, judge_published
 
 SAMPLES = Path(__file__).resolve().parents[3] / "shared" / "benchmarks" / "acc" / "theta_small.csv"
 pytestmark = [
@@ -29,16 +29,3 @@ def test_the_published_designs_fail_as_often_as_listed(name: str, rate: float) -
     """To the last of 1000 plants, strictly read, with a horizon of 25 s."""
     found = judge_published(PUBLISHED[name], acc.read(SAMPLES), cubic=False, duration=25.0)
     assert np.mean(found.fails) == rate
-
-
-@pytest.mark.parametrize(
-    ("name", "spring", "bar"),
-    [("MF-ESO", "linear", 0.005), ("MB-ESO", "linear", 0.005), ("L-ESO", "cubic", 0.01)],
-)
-def test_each_of_ours_stays_below_the_bar(name: str, spring: str, bar: float) -> None:
-    """0.5 % without, 1 % with the cubic spring, in every fourth plant; measured: none at all.
-
-    ``.ci/run`` has each of them with either spring, on drawn plants.
-    """
-    found = acc.judge_sampled(designs()[name], acc.read(SAMPLES)[::4], acc.SPRINGS[spring])
-    assert np.mean(found.fails) <= bar
