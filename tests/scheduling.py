@@ -8,6 +8,19 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadFileScheduling
 
+# Files that compile the same loops run in one process.
+_GROUPS = {
+    "two masses": (
+        "published/test_two_mass_study",
+        "test_batch",
+        "test_guard",
+        "test_harmonic",
+        "test_sized",
+    ),
+    "Python models": ("contracts/test_contracts", "test_adapters"),
+}
+_GROUP_OF = {f"tests/{file}.py": name for name, files in _GROUPS.items() for file in files}
+
 
 def compiled_first(items: list[pytest.Item]) -> None:
     """Sort the tests by the share of compiled tests in their files; the order in a file stays."""
@@ -22,6 +35,11 @@ class FromBothEnds(LoadFileScheduling):
     A process compiles each kernel once. With ``compiled_first`` the workers that begin at the front
     compile most of the kernels, and the others run the tests that compile none, until they meet.
     """
+
+    def _split_scope(self, nodeid: str) -> str:
+        """Return the name of what a test is handed out with: its file, or a group of files."""
+        file = super()._split_scope(nodeid)
+        return _GROUP_OF.get(file, file)
 
     def _assign_work_unit(self, node: Any) -> None:
         """Give a worker the next file: for every second one of them, that is the last."""
