@@ -1,9 +1,11 @@
-"""The guard's trial as an instrument: it can fail, it repeats, it says what it did."""
+"""The guard's trial as an instrument: it can fail, it repeats, it says what it did.
+
+``.ci/run`` has that most kinds wreck some loop without guard.
+"""
 
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,20 +17,8 @@ from quell.experiments.stress.adversaries import FEATURES
 from quell.kernels.sized import layout_of
 
 
-@pytest.mark.compiled
-def test_without_a_guard_the_trial_is_lost() -> None:
-    """What does harm is in it: most kinds wreck some loop.
-
-    Of the ten kinds before those in the next test.
-    """
-    found = [one for seed in range(3) for one in stress.run(10, 0, seed=seed, guard=None).outcomes]
-    assert {one.kind for one in found} == set(stress.KINDS[:10])
-    assert stress.summary(found)["unstable_where_plain_is_stable"] >= 8
-    assert all(math.isnan(outcome.ratio) == outcome.unstable for outcome in found)
-
-
 @pytest.mark.parametrize("kind", stress.KINDS[10:])
-def test_without_a_guard_the_other_kinds_wreck_a_loop_too(kind: str) -> None:
+def test_without_a_guard_the_latest_kinds_wreck_a_loop_too(kind: str) -> None:
     """A turncoat, once it has turned, and random features; as Python: the loop does not last."""
     hostile = {
         "turncoat": stress.Turncoat(ql.learners.Kalman(), 20.0, 10.0),
