@@ -13,7 +13,7 @@ _GROUPS = {
     "two masses": (
         "published/test_two_mass_study",
         "test_batch",
-        "test_guard",
+        "test_guarded_loops",
         "test_harmonic",
         "test_sized",
     ),

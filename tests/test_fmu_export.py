@@ -431,6 +431,8 @@ def test_functions_in_c_come_along(tmp_path: Path, made: Maker) -> None:
     for wrong in (tmp_path / "product.o", tmp_path / "model.c", tmp_path / "none.c"):
         with pytest.raises((ValueError, FileNotFoundError), match=wrong.name):
             fmu(law, tmp_path / "other.fmu", sources=[wrong])
+    with pytest.raises(ValueError, match=r"sources: '': must be a file \*.c or \*.h"):
+        fmu(law, tmp_path / "other.fmu", sources=[""])
     with pytest.raises(ValueError, match=r"sources = \[3\]: must be a sequence of files"):
         fmu(law, tmp_path / "other.fmu", sources=[3])  # type: ignore[list-item]
 
