@@ -293,6 +293,15 @@ def test_all_kinds_of_entry_points_share_a_compiled_kernel() -> None:
     assert len(compiled) == 3
 
 
+def test_in_a_block_as_python_nothing_is_compiled() -> None:
+    """Neither called at once nor kept for later calls; after the block it is."""
+    with dispatch.as_python():
+        assert dispatch.is_available(triple, 1.0)
+        assert dispatch.specialised(triple, 1.0) is triple.plain
+        assert dispatch.call_specialised(triple, 2.0) == 6.0
+    assert dispatch.specialised(triple, 1.0) is not triple.plain
+
+
 def test_a_packed_controller_has_the_parameters_and_the_state_of_the_interpreted_one() -> None:
     """Nested, negative, true and strided ones; new parameters of the same types need no other code."""
     table = np.arange(24.0).reshape(4, 6)

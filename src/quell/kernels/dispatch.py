@@ -210,7 +210,7 @@ def _without_garbage_collection() -> Iterator[None]:
 
 def is_available(entry: Any, *arguments: Any) -> bool:
     """Return whether ``specialised`` has no need to compile: its code is here, or on the disk."""
-    if interpret_all:
+    if interpret_all or _as_python.get():
         return True
     dispatcher, _ = _dispatcher_and_layouts(entry, arguments)
     types = tuple(map(type_of, arguments))
