@@ -136,11 +136,11 @@ def _own_sources(sources: Sequence[str | os.PathLike[str]]) -> dict[str, str]:
     ):
         raise ValueError(f"sources = {sources!r}: must be a sequence of files")
     found: dict[str, str] = {}
-    for given, path in zip(sources, map(Path, sources), strict=True):
+    for given in sources:
+        path = Path(given)
         if path.suffix not in (".c", ".h") or path.stem in _OWN_NAMES:
-            raise ValueError(
-                f"sources: {os.fspath(given)!r}: must be a file *.c or *.h, of another name"
-            )
+            shown = os.fspath(given)  # Path("") would show "."
+            raise ValueError(f"sources: {shown!r}: must be a file *.c or *.h, of another name")
         if path.name in found:
             raise _two_files(path.name)
         check_regular(path, f"sources: {path}")
