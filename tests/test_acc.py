@@ -26,6 +26,7 @@ from quell.experiments.acc import (
     designs,
     interval,
     judge,
+    study,
     unstable,
 )
 from quell.experiments.acc.controllers import MB, MF, freed
@@ -244,11 +245,8 @@ def test_the_command_writes_what_programs_read(
     """The keys are fixed, rates lie in their intervals; with one controller of ours and one plant, as Python."""
     loop = analyse(two_mass_spring(), designs()[MF])
     case = CaseResult(loop.margins, 9.0, 9.5, 0.4, 2.1, 0.1, 0.5, np.inf)
-    for name, found in {
-        "designs": lambda dt: {MF: designs(dt)[MF]},
-        "study_cases": lambda: {MF: case},
-    }.items():
-        monkeypatch.setattr(f"quell.experiments.acc.study.{name}", found)
+    monkeypatch.setattr(study, "designs", lambda dt: {MF: designs(dt)[MF]})
+    monkeypatch.setattr(study, "study_cases", lambda: {MF: case})
     (tmp_path / "few.csv").write_text(HEADER + "0.9,1.1,0.95,-0.1,0.9,0.02\n")
     where = ["--json", str(tmp_path / "out.json"), "--no-figures"]
     with pytest.raises(SystemExit, match="0"):
@@ -327,7 +325,7 @@ def test_the_search_for_the_box_begins_at_mf_eso_and_may_reach_its_result() -> N
 
 
 def test_the_score_of_the_search_counts_failures_and_ranks_by_late_motion() -> None:
-    """A plant that fails scores about 1, another about 0: the more the more it moves late."""
+    """A plant that fails scores about 1, another about 0, and more where it moves more late; ``.ci/run`` has 60 plants."""
     samples = boxed(6, 9)[1::2]
     judged = acc.judge_sampled(designs()[MF], samples, cubic=True, workers=1)
     (scores,) = box.scores(designs()[MF], list(samples))
