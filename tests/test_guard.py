@@ -244,7 +244,7 @@ def settle(design: object, memory: object, q: float, correction: float, samples:
 
 def test_the_account_is_the_share_of_the_squared_error_that_was_removed() -> None:
     """With a correction of x times what is missed it tends to ``2 x − 1.5 x²``, and to −0.02 at least."""
-    for share in (0.5, 1.0, 1.34, -0.5):
+    for share in (0.0, 0.5, 2.0 / 3.0, 1.0, 1.34, 3.0, -0.5):
         design, memory = trusted()
         design = design._replace(forget_account=100.0 * design.forget_account)  # 3 lags
         memory.averages[0].missed = memory.averages[0].gained = 0.0

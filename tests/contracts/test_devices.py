@@ -184,19 +184,17 @@ def test_it_measures_the_plant_that_u_moves(example: Any) -> None:
 
     UDP as Python: tests/test_wire.py compiles what is of UDP.
     """
-    as_device = as_python if example.url.startswith("udp:") else nullcontext
-    with as_device():
+    with as_python() if example.url.startswith("udp:") else nullcontext():
         device = example.open()
-    plant = ql.plants.delayed(PLANT, example.delay, DT) if example.delay else PLANT
-    twin = TwinDevice(plant, DT)
-    for k in range(300):
-        u = 1.5 * math.sin(0.02 * k)
-        with as_device():
+        plant = ql.plants.delayed(PLANT, example.delay, DT) if example.delay else PLANT
+        twin = TwinDevice(plant, DT)
+        for k in range(300):
+            u = 1.5 * math.sin(0.02 * k)
             y = example.sample(device, u)
-        with as_python() if getattr(example, "plain", False) else nullcontext():
-            assert abs(y - twin.read()) <= example.tolerance
-            twin.write(u)
-    assert abs(y) > 0.1
+            with as_python() if getattr(example, "plain", False) else nullcontext():
+                assert abs(y - twin.read()) <= example.tolerance
+                twin.write(u)
+        assert abs(y) > 0.1
 
 
 @every
