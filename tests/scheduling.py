@@ -9,7 +9,7 @@ import pytest
 from xdist.scheduler import LoadFileScheduling
 
 # Files that compile the same loops run in one process.
-_GROUPS = {
+GROUPS = {
     "two masses": (
         "published/test_two_mass_study",
         "test_batch",
@@ -19,7 +19,7 @@ _GROUPS = {
     ),
     "Python models": ("contracts/test_contracts", "test_adapters"),
 }
-_GROUP_OF = {f"tests/{file}.py": name for name, files in _GROUPS.items() for file in files}
+_GROUP_OF = {f"tests/{file}.py": name for name, files in GROUPS.items() for file in files}
 
 
 def compiled_first(items: list[pytest.Item]) -> None:
