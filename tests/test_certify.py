@@ -211,7 +211,7 @@ def test_the_bounds_are_those_of_the_theorem_and_of_the_worst_plant() -> None:
     """1/(1 − κΓ) and Γ_y κ/(1 − κΓ); infinite where κΓ is not below 1."""
     plants = {f"b = {b}": ([b], [1.0, 0.0, 0.0]) for b in (0.7, 1.0, 1.6)}
     found = certify(plants, controller(guard=ql.Guard(bound=1.2)))
-    alone = [certify(plant, controller()) for plant in plants.values()]
+    alone = [certify(plant, controller(guard=ql.Guard(bound=1.2))) for plant in plants.values()]
     assert found.worst == "b = 1.6"
     assert found.gain == max(one.gain for one in alone)
     assert found.output_factor == max(one.output_factor for one in alone)
@@ -227,13 +227,13 @@ def test_the_bounds_are_those_of_the_theorem_and_of_the_worst_plant() -> None:
 
 
 def test_a_certified_guard_takes_its_bound_from_the_plants() -> None:
-    """κ is 0.9/Γ where 1.2 is too much, and 1.2 elsewhere; a new omega_c gives a new one."""
+    """κ is 0.9/Γ where 3 is too much, and 3 elsewhere; a new omega_c gives a new one."""
     weak, strong = ([0.7], [1.0, *4 * [0.0]]), ([1.1], [1.0, *4 * [0.0]])
     both = controller(4, guard=ql.Guard(certified_for=[weak, strong]))
     found = certify([weak, strong], both)
     assert found.kappa == pytest.approx(0.9 / found.gain)
     assert found.certified
-    assert certify(strong, controller(4, guard=ql.Guard(certified_for=strong))).kappa == 1.2
+    assert certify(strong, controller(4, guard=ql.Guard(certified_for=strong))).kappa == 3.0
     both.retune(omega_c=0.7)
     slower = certify([weak, strong], both)
     assert slower.kappa * slower.gain == pytest.approx(0.9)
@@ -262,8 +262,10 @@ def test_an_analysis_has_a_certificate_where_a_guarded_learner_is() -> None:
     plant, learner = ([1.3], [1.0, 0.0, 0.0]), ql.learners.Kalman()
     assert analyse(plant, controller()).certificate is None
     assert analyse(plant, controller(learner=learner)).certificate is None
-    guarded = controller(learner=learner, guard=ql.Guard())
-    assert "certified: κΓ = 1.2 · 0" in analyse(plant, guarded).summary()
+    free = controller(learner=learner, guard=ql.Guard())
+    assert "not certified: κΓ = 3 · 0.374" in analyse(plant, free).summary()
+    guarded = controller(learner=learner, guard=ql.Guard(certified_for=plant))
+    assert "\ncertified: κΓ = 2.41 · 0.374 = 0.9" in analyse(plant, guarded).summary()
     curved = controller(
         learner=learner,
         guard=ql.Guard(),

@@ -166,7 +166,7 @@ def test_what_is_proved_of_a_guarded_learner_is_told_for_the_real_plant(
     assert proof["gain"] == pytest.approx(0.713, abs=0.001)
     assert told[1]["certificate"].startswith("no certificate: plant: the loop without learner is")
     shown = capsys.readouterr().out
-    assert "guarded-l-eso: certified: κΓ = 1.2 · 0.713 = 0.855" in shown
+    assert "guarded-l-eso: not certified: κΓ = 3 · 0.713 = 2.14 must be below 1" in shown
     assert "guarded-l-eso: no certificate" in shown
 
 

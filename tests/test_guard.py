@@ -9,7 +9,8 @@ import pytest
 
 import quell as ql
 from quell.guard import assess, confine, limit, record_output, start_again
-from quell.guard.bound import _MOST_OWN, update_bound
+from quell.guard.bound import _MOST_OWN, _SUDDEN_OWN, update_bound
+from quell.guard.state import CORRECTED
 from quell.learners.lag import lag_of, lag_push
 
 OBSERVER = ql.ESO.model_free(order=4, b0=1.0, omega_o=10.0, dt=5e-3)
@@ -44,7 +45,7 @@ def test_the_correction_lies_within_its_bound(rng: np.random.Generator) -> None:
 
 
 def trusted(e: float = 1.0, b0: float = 1.0) -> tuple[object, object]:
-    """A guard that trusts its learner, which has removed half of the squared error: κ = 1.2, the error e, no output before."""
+    """A guard that trusts its learner, which has removed half of the squared error: κ_0 = 1.2, the error e, no output before."""
     observer = ql.ESO.model_free(order=4, b0=b0, omega_o=10.0, dt=5e-3)
     design = ql.Guard().design(observer)
     memory = ql.Guard().memory(design)
@@ -91,8 +92,8 @@ def test_a_correction_beyond_its_bound_is_clipped(side: float, e: float) -> None
 
 
 def test_what_is_not_the_output_s_own_doing_counts_for_the_bound() -> None:
-    """The error less five times the own peak; an error that is sudden, less the own peak itself."""
-    for error, own_share in ((1.5, _MOST_OWN), (9.0, 1.0)):
+    """The error less five times the own peak; an error that is sudden, less 1.5 times it."""
+    for error, own_share in ((1.5, _MOST_OWN), (9.0, _SUDDEN_OWN)):
         design, memory = trusted()
         sample = memory.sample[0]
         sample.samples, sample.peak, sample.typical_error = 0.0, 2.0, 0.5
@@ -130,7 +131,8 @@ def test_a_bound_that_does_not_grow_costs_nothing() -> None:
 def test_where_nothing_is_permitted_the_target_is_what_is_fed_forward() -> None:
     """So that authority which is given later begins without a jump."""
     design, memory = trusted()
-    memory.sample[0].limit, memory.sample[0].output = 0.0, 5.0
+    memory.sample[0].lower = memory.sample[0].upper = 0.0
+    memory.sample[0].output = 5.0
     record_output(design, memory, 0.7)
     assert memory.sample[0].target == 0.7
 
@@ -226,11 +228,78 @@ def test_the_authority_is_what_a_learner_has_earned(
 def test_a_learner_that_has_removed_nothing_yet_has_a_smaller_bound(
     removed: float, share: float
 ) -> None:
-    """From 0.7 κe at R = 0 to κe at R = 0.3, scaled by the authority, which falls with a negative R."""
+    """From 0.7 κ_0 e at R = 0 to κ_0 e at R = 0.3, scaled by the authority, which falls with a negative R."""
     design, memory = trusted()
     memory.averages[0].missed, memory.averages[0].gained = 2.0, 2.0 * removed
     limit(design, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
-    assert memory.sample[0].limit == pytest.approx(1.2 * share)
+    assert memory.sample[0].upper == memory.sample[0].lower == pytest.approx(1.2 * share)
+
+
+@pytest.mark.parametrize(
+    ("removed", "left", "shown", "outside", "widest"),
+    [
+        (0.5, 0.0, 2.0, 1.0, 2.4),  # 1.2 V
+        (0.5, 0.0, 9.0, 1.0, 3.0),  # κe
+        (0.5, 0.0, 9.0, 0.5, 2.0),  # 4 o
+        (0.5, 0.6, 2.0, 1.0, 1.2 + 0.5 * (2.4 - 1.2)),
+        (0.5, 0.8, 2.0, 1.0, 1.2),
+        (0.15, 0.0, 2.0, 1.0, 1.2 * 0.85),
+        (0.5, 0.0, 0.1, 1.0, 1.2),  # a wider bound is never narrower
+    ],
+)
+def test_a_learner_that_explains_nearly_everything_has_a_wider_bound(
+    removed: float, left: float, shown: float, outside: float, widest: float
+) -> None:
+    """Up to κe, 1.2 V and 4 o, the more the less of q was left in 1.5 lags, from R = 0.15 on."""
+    design, memory = trusted()
+    memory.averages[0].missed, memory.averages[0].gained = 2.0, 2.0 * removed
+    memory.averages[0].newest_error, memory.averages[0].newest_left = 3.0, 3.0 * left
+    memory.sample[0].largest_output, memory.sample[0].outside = shown, outside
+    limit(design, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
+    assert memory.sample[0].upper == memory.sample[0].lower == pytest.approx(widest)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize(("left", "share"), [(1.0, 1.0), (2.0, 1.0), (3.0, 0.5), (4.0, 0.3)])
+def test_a_learner_that_is_wrong_has_less_where_it_pushes_and_may_take_it_back(
+    left: float, share: float, side: float
+) -> None:
+    """Less of the bound on the side of ℓe_L, from twice the squared error in 1.5 lags on, 0.3 at least."""
+    design, memory = trusted()
+    memory.averages[0].newest_error, memory.averages[0].newest_left = 3.0, 3.0 * left
+    memory.effects[CORRECTED, -1] = 0.1 * side
+    limit(design, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
+    bounds = memory.sample[0].lower, memory.sample[0].upper
+    assert bounds[:: 1 if side > 0.0 else -1] == pytest.approx((1.2, 1.2 * share))
+
+
+def test_a_learner_that_turns_is_seen_within_five_lags() -> None:
+    """With g = f nothing of q is left; with g = −f from then on, more than twice q."""
+    design, memory = trusted()
+    lag = 100  # samples, 5/omega_o
+    f = np.sin(2.0 * np.pi * np.arange(15 * lag) / (4 * lag))
+    turned = np.where(np.arange(f.size) < 10 * lag, f, -f)
+    feed(design, memory, f[: 10 * lag], f[: 10 * lag])
+    averages = memory.averages[0]
+    assert averages.newest_left < 0.02 * averages.newest_error
+    design, memory = trusted()
+    feed(design, memory, f, turned)
+    averages = memory.averages[0]
+    assert averages.newest_left > 2.0 * averages.newest_error
+
+
+def test_a_guard_with_kappa_of_the_usual_bound_has_no_wider_one() -> None:
+    """``Guard(bound=1.2)`` limits every learner to 1.2 e, and a smaller κ holds for all as well."""
+    observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=5e-3)
+    assert ql.Guard(bound=1.2).design(observer).usual_bound == 1.2
+    assert ql.Guard(bound=0.5).design(observer).usual_bound == 0.5
+    assert ql.Guard(bound=5.0).design(observer).usual_bound == 1.2
+    design, memory = trusted()
+    memory.sample[0].largest_output = 9.0
+    for bound, expected in ((1.2, 1.2), (0.5, 0.5), (2.0, 2.0)):
+        narrower = design._replace(bound=bound, usual_bound=min(bound, 1.2))
+        limit(narrower, memory, 1.0, 0.0, 0.0, 0.0, 0.0)
+        assert memory.sample[0].upper == pytest.approx(expected)
 
 
 def settle(design: object, memory: object, q: float, correction: float, samples: int) -> None:

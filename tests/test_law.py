@@ -135,7 +135,7 @@ def test_a_start_from_rest_resets_all_filters() -> None:
     state.loop[0].offset = 1.0
     guard = state.guard.sample[0]
     assert guard.output != 0.0
-    guard.target = guard.limit = guard.own_peak = 0.5
+    guard.target = guard.lower = guard.upper = guard.own_peak = 0.5
     theta, authority = state.learner.theta.copy(), guard.authority
     reset_loop(design, state)
     assert not np.any(state.loop.view(float))
@@ -143,7 +143,7 @@ def test_a_start_from_rest_resets_all_filters() -> None:
     for each in (state.shadow, *filters):
         assert not np.any(each)
     assert (guard.output, guard.begun, guard.target) == (0.0, 0.0, 0.0)
-    assert (guard.limit, guard.own_peak) == (0.0, 0.0)
+    assert (guard.lower, guard.upper, guard.own_peak) == (0.0, 0.0, 0.0)
     assert guard.authority == authority
     np.testing.assert_array_equal(state.learner.theta, theta)
     assert np.any(theta)

@@ -328,9 +328,9 @@ def test_a_guard_is_certified_for_plants_of_the_file() -> None:
         setup(learner + "[guard]\n" + line).controller.parameters.guard.bound
         for line in ("", "certified_for = 'two-mass'", two)
     ]
-    assert bounds[0] == 1.2
+    assert bounds[0] == 3.0
     assert bounds[1] >= bounds[2] > 0.0
-    assert bounds[2] < 1.2
+    assert bounds[2] < 3.0
 
 
 def test_none_stands_for_no_value() -> None:

@@ -156,8 +156,9 @@ def certify(
     --------
     >>> import quell as ql
     >>> observer = ql.ESO.model_free(order=2, b0=1.0, omega_o=10.0, dt=0.005)
-    >>> controller = ql.ADRC(observer, omega_c=1.0, learner=ql.learners.Kalman(), guard=ql.Guard())
     >>> plants = {f"b = {b}": ([b], [1.0, 0.0, 0.0]) for b in (0.7, 1.0, 1.3)}
+    >>> learner, guard = ql.learners.Kalman(), ql.Guard(certified_for=plants)
+    >>> controller = ql.ADRC(observer, omega_c=1.0, learner=learner, guard=guard)
     >>> found = certify(plants, controller)
     >>> found.certified, found.worst, round(found.gain, 2)
     (True, 'b = 0.7', 0.52)

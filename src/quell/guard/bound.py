@@ -1,8 +1,8 @@
-"""The bound e of a correction; ``kernels.py`` has its equations."""
+"""The error e, and the bound of a correction in units of it; ``kernels.py`` has the equations."""
 
 from __future__ import annotations
 
-from quell.guard.state import PEAK, GuardDesign, GuardMemory, carried_sum, tiny
+from quell.guard.state import CORRECTED, PEAK, GuardDesign, GuardMemory, carried_sum, tiny
 from quell.kernels.dispatch import kernel
 
 # These values and those in ``guard.py`` were chosen by hand on tuning seeds of `quell stress`; it
@@ -12,10 +12,20 @@ from quell.kernels.dispatch import kernel
 _GROWTH_COST = 0.2
 # An outlier counts for so many times P.
 _OUTLIER = 5.0
-# e is at most so many times o; c_L counts so many times for o, and once while |q| is so many times
-# P. With 1.2 instead of 1.15 the two worst runs are better still, but honest learners lose much
-# where a load begins slowly; with 1.1 and below the worst runs are as bad as without o.
-_OWN_GROWTH, _MOST_OWN, _SUDDEN = 2.5, 5.0, 1.15
+# e is at most so many times o.
+_OWN_GROWTH = 2.5
+# c_L counts so many times for o; the second holds while |q| is more than so many times P. With 1.1
+# and below, motion that learner and loop make together raises o as if there were no limit.
+_MOST_OWN, _SUDDEN_OWN, _SUDDEN = 5.0, 1.5, 1.25
+# R from which the bound is κ_0 e, and share of it that a learner with R ≤ 0 has: ρ.
+_PROVEN, _UNPROVEN_BOUND = 0.3, 0.7
+# The bound becomes wider from this R on, wholly at 0.3, and where ε is below this, wholly at half.
+_WIDER_FROM, _CLOSE = 0.15, 0.8
+# Widest bound in units of V, and of o. With 3 o, repeated moves leave half as much again; without,
+# learners that keep a loop with friction moving do more harm.
+_SHOWN, _MOST_OUTSIDE = 1.2, 4.0
+# The bound becomes narrower from this ε on, down to this share.
+_WRONG, _NARROWEST = 2.0, 0.3
 
 
 @kernel
@@ -26,7 +36,7 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
     # After T an outlier counts for 5 P at most: one bad measurement must not open all bounds.
     if sample.samples * guard.forget >= 1.0:
         error = min(error, _OUTLIER * peak)
-    most_own = own if error > _SUDDEN * peak else _MOST_OWN * own
+    most_own = (_SUDDEN_OWN if error > _SUDDEN * peak else _MOST_OWN) * own
     more = guard.rise * (error - peak) if error > peak else -guard.decay * peak
     peak = carried_sum(guard, memory, PEAK, peak, more)
     sample.peak = max(peak, tiny(guard))
@@ -39,3 +49,23 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
     if learner_acts and grown > size:
         sample.credit -= _GROWTH_COST * (grown - size) / size
     sample.typical_error = max(grown, tiny(guard))
+
+
+@kernel
+def set_bound(guard: GuardDesign, memory: GuardMemory, authority: float, removed: float) -> None:
+    """Set the bounds of e_L; ``removed`` is R."""
+    averages, sample = memory.averages[0], memory.sample[0]
+    left = averages.newest_left / max(averages.newest_error, tiny(guard))
+    proven = min(max(removed / _PROVEN, 0.0), 1.0)
+    share = _UNPROVEN_BOUND + (1.0 - _UNPROVEN_BOUND) * proven
+    most = share * guard.usual_bound * sample.typical_error
+    wider = min(max((removed - _WIDER_FROM) / (_PROVEN - _WIDER_FROM), 0.0), 1.0)
+    wider *= min(max(2.0 * (_CLOSE - left) / _CLOSE, 0.0), 1.0)
+    widest = min(_SHOWN * sample.largest_output, _MOST_OUTSIDE * sample.outside)
+    widest = min(widest, guard.bound * sample.typical_error)
+    most = authority * (most + wider * max(widest - most, 0.0))
+    narrow = most * min(max(2.0 - left / _WRONG, _NARROWEST), 1.0)
+    # What has been pushed too far upwards may be taken back at once, and the other way round.
+    upwards = memory.effects[CORRECTED, guard.stages - 1] > 0.0
+    sample.upper = narrow if upwards else most
+    sample.lower = most if upwards else narrow

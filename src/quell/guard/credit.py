@@ -25,8 +25,6 @@ _OWN_SQUARES = 1.5
 _LOAN, _LARGEST_DEBT = 0.01, 2.0
 # Largest J in units of the mean of (ℓ q)² over T + 5 n/ω_c: an absurd past counts for little.
 _MOST_PAST = 1e4
-# R from which the bound is κe, and share of it that a learner with R ≤ 0 has: ρ.
-_PROVEN, _UNPROVEN_BOUND = 0.3, 0.7
 
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
 
@@ -41,14 +39,17 @@ def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
         return
     is_new = sample.samples * guard.forget < 1.0
     averages.square = _mean_square(guard, averages.square, qq, guard.forget, is_new)
+    left, rate = (q - p) * (q - p), guard.forget_match
     averages.error_plain += guard.forget * (qq - averages.error_plain)
-    averages.error_learned += guard.forget * ((q - p) * (q - p) - averages.error_learned)
+    averages.error_learned += guard.forget * (left - averages.error_learned)
     averages.loudness += (
         guard.forget
         * min(energy / (_NOISE * sample.peak) ** 2, 1.0)
         * (pp / energy - averages.loudness)
     )
-    most = guard.bound * sample.typical_error
+    averages.newest_error += rate * (qq - averages.newest_error)
+    averages.newest_left += rate * (left - averages.newest_left)
+    most = guard.usual_bound * sample.typical_error
     bounded = min(max(p, -most), most)
     earned = _earned(q, bounded, averages.square, tiny(guard))
     sample.credit = min(max(sample.credit + guard.earn * earned, -1.0), 1.0)
@@ -117,13 +118,6 @@ def removed_share(guard: GuardDesign, memory: GuardMemory) -> float:
     """Return R."""
     averages = memory.averages[0]
     return averages.gained / max(averages.missed, tiny(guard))
-
-
-@kernel
-def bound_share(removed: float) -> float:
-    """Return κ_R/κ; ``removed`` is R."""
-    proven = min(max(removed / _PROVEN, 0.0), 1.0)
-    return _UNPROVEN_BOUND + (1.0 - _UNPROVEN_BOUND) * proven
 
 
 @kernel

@@ -40,6 +40,11 @@ _HOME_LAGS = 1000.0
 EFFECT_TIME = 5.0
 # Memory of the account.
 _ACCOUNT_LAGS = 300.0
+# Time over which ε compares p with q, over T: a learner that turns is seen within five lags.
+_MATCH_TIME = 0.1
+# κ_0, for learners that leave a good part of the error. With 1 a perfect one is clipped at its
+# peaks, because e is a little less than those of what the plain observer misses.
+_USUAL_BOUND = 1.2
 # After the filters were emptied in mid-run, q is wrong for this time.
 _SETTLING_LAGS = 3.0
 
@@ -54,9 +59,9 @@ class Guard:
     ----------
     bound
         largest correction of the plain observer's estimate, in units of that estimate's error e: κ.
-        With κ = 1 a perfect learner is clipped at its peaks, because e is a little less than those
-        of what the plain observer misses.
-        A learner has 0.7 of it until it has removed a good part of the error (``kernels.py``).
+        Only a learner that explains nearly all of the error has it. The others have 1.2, or κ if
+        that is less, and 0.84 until they have removed a good part of the error (``kernels.py``).
+        After a jump of the disturbance a perfect learner needs more than 2.
     time
         time T [s] over which a learner is judged; by default 15 lags ``(n + 1)/omega_o`` of the
         observer.
@@ -71,7 +76,7 @@ class Guard:
         for a parameter that is not positive.
     """
 
-    bound: float = 1.2
+    bound: float = 3.0
     time: float | None = None
     certified_for: Any = None
 
@@ -116,10 +121,12 @@ class Guard:
             respond=-math.expm1(-omega_c * dt),
             forget_effect=dt / (time + EFFECT_TIME * order / omega_c),
             forget_account=dt / (_ACCOUNT_LAGS * lag_time),
+            forget_match=-math.expm1(-dt / (_MATCH_TIME * time)),
             rise=share(_RISE_LAGS),
             decay=share(_DECAY_LAGS),
             growth=share(_GROWTH_LAGS),
             bound=bound,
+            usual_bound=min(bound, _USUAL_BOUND),
             own=_OWN_SHARE,
             own_decay=1.0 - share(_OWN_LAGS),
             smooth=share(_SMOOTHING_LAGS),

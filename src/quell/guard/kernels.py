@@ -19,7 +19,7 @@ costs a fifth of a unit of credit:
     C ← C − 0.2 Δe/e
 
 o ≤ P, the error that is certainly not the learner's, rises to |q| − 5 c_L as P rises to |q|, and to
-|q| − c_L while |q| rises so quickly that it is 1.15 P: what learner and loop build up together
+|q| − 1.5 c_L while |q| rises so quickly that it is 1.25 P: what learner and loop build up together
 grows more slowly. So a learner that causes what it then explains does not raise e again and again.
 And credit that was earned with small errors does not suffice for large ones: a learner that
 explains them as well earns more than the growth of e costs.
@@ -28,7 +28,7 @@ explains them as well earns more than the growth of e costs.
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
 raise slowly:
 
-    p̄ = clip(p, ±κe),        C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
+    p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
     β = min( clip(2 C, 0, 1),  clip(1 + 2 C_y, 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
 
 C starts at −1. S, the mean share of p² in p² + q² over T, scales down an output that is larger than
@@ -49,14 +49,28 @@ mean of (ℓ q)² over ``T + 5 n/ω_c``, so that an absurd measurement is forgot
 Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
 removed; the factor is for plants on which a correction acts more strongly than on the observer's
 model. While R < −0.01 the credit is −1: whoever has added one percent to the squared error begins
-anew. The bound is κe for a learner with R ≥ 0.3, and less for one that has removed less:
+anew.
 
-    κ_R = κ (ρ + (1 − ρ) clip(R/0.3, 0, 1)),        ρ = 0.7
+**Width.** The bound b is κ_0 e for a learner with R ≥ 0.3, and less for one that has removed less;
+κ_0 = 1.2, or κ if that is less. After a jump of f, (1 − F) f is twice what q shows of it, and b
+clips what would be right. So b is wider, up to κe, for a learner with R > 0.15 whose p is close to
+q, but not wider than what it has shown before (V, the peak of |v|, which decays as P), nor than a
+multiple of the error that is not its own:
+
+    b_0 = κ_0 e (ρ + (1 − ρ) clip(R/0.3, 0, 1)),        ρ = 0.7
+    ε = mean (q − p)² / mean q²  over T/10, 1.5 lags
+    w = clip(R/0.15 − 1, 0, 1) clip(2 − 2.5 ε, 0, 1)
+    b = b_0 + w max(min(κe, 1.2 V, 4 o) − b_0, 0)
+
+A learner with ε > 1 adds to the error. From ε = 2 on it has less of b on the side to which its
+corrections have moved y, the sign of ℓe_L; on the other side it has b, to take them back:
+
+    b_ε = b clip(2 − ε/2, 0.3, 1)
 
 **Output.** The target changes by ``β̄ Δg``, so that a change of β over a constant g does nothing,
 and what the bound took is made up for while the target is still near:
 
-    target ← target + β̄ (g − g_before),        e_L = clip( target − f_L^F, ±β κ_R e ),
+    target ← target + β̄ (g − g_before),        e_L = clip( target − f_L^F, ±β b )  or b_ε
     f_L = f_L^F + e_L,        target ← target + dt/(7 lags) (f_L − target)
 
 β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
@@ -81,10 +95,9 @@ from quell.guard.base import (
     start_again,
     write_channels,
 )
-from quell.guard.bound import update_bound
+from quell.guard.bound import set_bound, update_bound
 from quell.guard.credit import (
     authority_of,
-    bound_share,
     judge,
     removed_share,
     respond,
@@ -156,7 +169,7 @@ def _limit(
         finite = is_finite(output) and is_finite(slope)
         sample.output = min(max(output, -most), most) if finite else 0.0
         sample.reason = _EXPLODED if finite else _NOT_FINITE
-        sample.authority = sample.limit = sample.begun = 0.0
+        sample.authority = sample.lower = sample.upper = sample.begun = 0.0
         sample.target = f_shown
         clear_carry(memory, TARGET)
         withdraw_authority(memory)
@@ -166,7 +179,7 @@ def _limit(
     removed = removed_share(guard, memory)
     authority, sample.reason = authority_of(guard, memory, removed)
     sample.authority = authority
-    sample.limit = authority * bound_share(removed) * guard.bound * sample.typical_error
+    set_bound(guard, memory, authority, removed)
     more = guard.smooth * (authority - sample.share)
     sample.share = carried_sum(guard, memory, SHARE, sample.share, more)
     if is_single(guard.forget):
@@ -176,7 +189,7 @@ def _limit(
     else:
         base = sample.target - sample.share * before
         sample.target = base + sample.share * output
-    if abs(sample.target - f_shown) > sample.limit:
+    if not -sample.lower <= sample.target - f_shown <= sample.upper:
         sample.reason = _OUT_OF_BOUNDS if authority > 0.0 else sample.reason
     elif guard.least_slope <= sample.share * slope <= guard.largest_slope:
         return base + sample.share * constant, sample.share * slope, False
@@ -185,14 +198,15 @@ def _limit(
 
 @confine.register(GuardDesign)
 def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float:
-    shown, most = memory.shown[F_L], memory.sample[0].limit
-    return min(max(f_learned, shown - most), shown + most)
+    shown, sample = memory.shown[F_L], memory.sample[0]
+    return min(max(f_learned, shown - sample.lower), shown + sample.upper)
 
 
 @record_output.register(GuardDesign)
 def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> None:
     shown, sample = memory.shown, memory.sample[0]
     v = sample.output - shown[G]
+    sample.largest_output = max(abs(v), (1.0 - guard.decay) * sample.largest_output)
     shown[G] = lag_push(guard.lag, memory.chain, G, sample.output)
     shown[V] = lag_push(guard.lag, memory.chain, V, v)
     correction = f_learned - shown[F_L]
@@ -200,7 +214,7 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
         shown[F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
     respond(guard, memory, CORRECTED, correction)
     sample.own_peak = max(abs(correction), guard.own_decay * sample.own_peak)
-    if sample.limit > 0.0:
+    if sample.upper > 0.0:
         more = guard.leak * (f_learned - sample.target)
         sample.target = carried_sum(guard, memory, TARGET, sample.target, more)
         step = guard.home * sample.typical_error
@@ -230,7 +244,7 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     for i in range(memory.shown.size):
         memory.shown[i] = 0.0
     sample.output = sample.begun = sample.target = 0.0
-    sample.limit = sample.own_peak = sample.unsettled = 0.0
+    sample.lower = sample.upper = sample.own_peak = sample.unsettled = 0.0
 
 
 @start_again.register(GuardDesign)

@@ -26,10 +26,12 @@ class GuardDesign(NamedTuple):
     respond: float  # share by which each of its stages follows in a sample
     forget_effect: float  # dt/(T + 5 n/ω_c)
     forget_account: float  # dt/(300 lags)
+    forget_match: float  # dt/(1.5 lags)
     rise: float  # share by which P and e follow a larger |q| in a sample
     decay: float  # share by which P decays in a sample
     growth: float  # largest share by which e grows in a sample while the learner acts
     bound: float  # κ
+    usual_bound: float  # κ_0: κ of a learner that leaves a good part of the error
     own: float  # γ
     own_decay: float  # λ
     smooth: float  # share by which β̄ follows β in a sample
@@ -50,6 +52,8 @@ class GuardAverages(Scalars):
     effect_square: float  # the same of ℓ q, over T + 5 n/ω_c
     missed: float  # J
     gained: float  # A
+    newest_error: float  # mean of q² over 1.5 lags [(y-unit/s^n)²]
+    newest_left: float  # the same of (q − p)²
     error_plain: float  # mean square of q [(y-unit/s^n)²]
     error_learned: float  # mean square of q − p [(y-unit/s^n)²]
 
@@ -65,10 +69,12 @@ class GuardSample(Scalars):
     typical_error: float  # e [y-unit/s^n]
     outside: float  # o [y-unit/s^n]
     own_peak: float  # c_L [y-unit/s^n]
+    largest_output: float  # V: peak of |g − g^F| [y-unit/s^n]
     output: float  # g [y-unit/s^n]
     begun: float  # 1 if there is an output of a sample before, else 0
     target: float  # target of f_L [y-unit/s^n]
-    limit: float  # β κ_R e: bound of |e_L| [y-unit/s^n]
+    lower: float  # largest correction downwards: bound of −e_L [y-unit/s^n]
+    upper: float  # bound of e_L [y-unit/s^n]
     reason: float  # a Reason
     samples: float  # number of samples so far
     unsettled: float  # samples until q is right again

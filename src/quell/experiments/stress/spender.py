@@ -85,7 +85,7 @@ def draw_push(rng: np.random.Generator, pulse: Vector, samples: int, lag: float)
     """
     push = np.full(samples, np.nan)
     at, length = round(rng.uniform(20.0, 60.0) * lag), round(rng.uniform(0.3, 12.0) * lag)
-    # A guard with the bound κ = 1.2 clips what is larger, or does not listen to what is far larger.
+    # A guard clips what is larger than 1.2 e, or does not listen to what is far larger.
     size, turn = (
         rng.choice([0.5, 1.0, 1.2, 2.0, 2.9]) * rng.choice([-1.0, 1.0]),
         rng.choice([-1, 1]),
