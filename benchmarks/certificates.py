@@ -208,7 +208,7 @@ def honest(count: int) -> None:
         runs = in_parallel([partial(errors, loop, Harmonic(), guard) for loop, guard in pairs])
         ratios = np.array([[np.nan] * 3 if run is None else run for run in runs]) / plain
         kappas = [
-            np.inf if guard is None else loop.controller(None, guard).parameters.guard.bound
+            np.inf if guard is None else loop.controller(Harmonic(), guard).parameters.guard.bound
             for loop, guard in pairs
         ]
         run, load, late = ratios.T

@@ -48,7 +48,7 @@ class Case:
     def __init__(self, plant: Any, scenario: Any, model: Any, make: Any) -> None:
         self.plant, self.scenario, self.make = plant, scenario, make
         self.guard = Guard(certified_for=model)
-        self.proof: Certificate = certify(model, make(None, self.guard))
+        self.proof: Certificate = certify(model, make(ql.learners.Harmonic(), self.guard))
         self.alone = simulate(plant, make(None, None), scenario)
         q_0 = float(np.max(np.abs(observer_error(make(None, None), self.alone))))
         self.bounds = self.proof.error_bound(q_0), self.proof.output_bound(q_0)

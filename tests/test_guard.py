@@ -70,7 +70,7 @@ def feed(design: object, memory: object, f: np.ndarray, g: np.ndarray) -> None:
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("e", [1.0, 1e-3])
 def test_a_correction_beyond_its_bound_is_clipped(side: float, e: float) -> None:
-    """f_L follows g up to κe from f_L^F, scaled by the authority; beyond it the slope is zero."""
+    """f_L follows g up to κ_0 e from f_L^F, scaled by the authority; beyond it the slope is zero."""
     for credit in (1.0, 0.25):
         authority, bound = min(2.0 * credit, 1.0), 1.2 * e
         for share, inside in ((0.99, True), (1.01, False), (20.0, False)):

@@ -26,7 +26,7 @@ class GuardDesign(NamedTuple):
     respond: float  # share by which each of its stages follows in a sample
     forget_effect: float  # dt/(T + 5 n/ω_c)
     forget_account: float  # dt/(300 lags)
-    forget_match: float  # dt/(1.5 lags)
+    forget_match: float  # 10 dt/T
     rise: float  # share by which P and e follow a larger |q| in a sample
     decay: float  # share by which P decays in a sample
     growth: float  # largest share by which e grows in a sample while the learner acts
@@ -52,7 +52,7 @@ class GuardAverages(Scalars):
     effect_square: float  # the same of ℓ q, over T + 5 n/ω_c
     missed: float  # J
     gained: float  # A
-    newest_error: float  # mean of q² over 1.5 lags [(y-unit/s^n)²]
+    newest_error: float  # mean of q² over T/10 [(y-unit/s^n)²]
     newest_left: float  # the same of (q − p)²
     error_plain: float  # mean square of q [(y-unit/s^n)²]
     error_learned: float  # mean square of q − p [(y-unit/s^n)²]
