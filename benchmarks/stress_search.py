@@ -23,7 +23,7 @@ from rich.table import Table
 from quell.experiments.stress.general.attacks import FOUND
 from quell.experiments.stress.general.cross_entropy import judge, search
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop
-from quell.experiments.stress.general.trial import HEALTHY
+from quell.experiments.stress.general.trial import HEALTHY, error_of, is_fragile
 from quell.guard import Guard
 
 ORDERS = (1, 2, 3, 4)
@@ -35,7 +35,8 @@ def healthy_loops(order: int, count: int, *seed: int) -> list[GeneralLoop]:
     rng, found = np.random.default_rng([*seed, order]), []
     while len(found) < count:
         loop = draw_loop(rng, order=order)
-        if loop.margin >= HEALTHY:
+        plain = error_of(loop, None, None) if loop.margin >= HEALTHY else None
+        if plain is not None and not is_fragile(loop, plain):
             found.append(loop)
     return found
 

@@ -24,6 +24,8 @@ from quell.experiments.stress.adversaries import (
     Turncoat,
 )
 from quell.experiments.stress.random_loops import Loop
+from quell.guard.bound import bounds_of
+from quell.guard.credit import removed_share
 from quell.learners.lag import lag_of, lag_push
 from quell.types import Status
 
@@ -108,12 +110,16 @@ def test_the_bound_holds_for_the_u_of_the_sample() -> None:
     )
     shadow, shown, largest = np.zeros((1, 5)), 0.0, 0.0
     lag, spring, position, speed = lag_of(observer), 1.4, np.zeros(2), np.zeros(2)
+    design = controller.parameters.guard
     for k in range(3_000):
         u = controller.step(math.sin(0.01 * k), position[1])
         f_learned = controller.estimate.f_learned
-        correction, bounds = f_learned - shown, controller._state.guard.sample[0]
+        correction = f_learned - shown
+        # The guard records this correction in the next sample, when the applied u is known.
+        guard = controller._state.guard
+        least, most = bounds_of(design, guard, removed_share(design, guard))
         rounding = 1e-9 * (1.0 + abs(f_learned))
-        assert -bounds.lower - rounding <= correction <= bounds.upper + rounding, k
+        assert least - rounding <= correction <= most + rounding, k
         largest = max(largest, abs(correction))
         shown = lag_push(lag, shadow, 0, f_learned)
         force = spring * (position[0] - position[1])

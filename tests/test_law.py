@@ -135,7 +135,7 @@ def test_a_start_from_rest_resets_all_filters() -> None:
     state.loop[0].offset = 1.0
     guard = state.guard.sample[0]
     assert guard.output != 0.0
-    guard.target = guard.lower = guard.upper = guard.own_peak = 0.5
+    guard.target = guard.own_peak = 0.5
     theta, authority = state.learner.theta.copy(), guard.authority
     reset_loop(design, state)
     assert not np.any(state.loop.view(float))
@@ -143,7 +143,7 @@ def test_a_start_from_rest_resets_all_filters() -> None:
     for each in (state.shadow, *filters):
         assert not np.any(each)
     assert (guard.output, guard.begun, guard.target) == (0.0, 0.0, 0.0)
-    assert (guard.lower, guard.upper, guard.own_peak) == (0.0, 0.0, 0.0)
+    assert guard.own_peak == 0.0
     assert guard.authority == authority
     np.testing.assert_array_equal(state.learner.theta, theta)
     assert np.any(theta)
@@ -207,8 +207,8 @@ def test_a_row_has_estimates_status_guard_and_coefficients_in_order() -> None:
     expected = [
         *(*estimate.x, estimate.f_residual, estimate.f_learned, int(estimate.status)),
         guard.sample[0].authority,
-        math.sqrt(guard.averages[0].error_plain),
-        math.sqrt(guard.averages[0].error_learned),
+        math.sqrt(guard.averages[0].square),
+        math.sqrt(guard.averages[0].square_left),
         guard.sample[0].reason,
         *estimate.theta.values(),
     ]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from quell.guard.credit import newest_share
 from quell.guard.state import CORRECTED, PEAK, GuardDesign, GuardMemory, carried_sum, tiny
 from quell.kernels.dispatch import kernel
 
 # These values and those in ``guard.py`` were chosen by hand on tuning seeds of `quell stress`; it
 # judges them as a set on other seeds (docs/theory).
 # Credit that e costs when it grows by a factor of 2.7 while the learner acts. In the five lags that
-# this takes at least, a learner that explains a sinusoidal load earns a quarter.
-_GROWTH_COST = 0.2
+# this takes at least, a learner that explains a sinusoidal load earns a quarter, and up to two if
+# it explains all of it.
+_GROWTH_COST = 0.35
 # An outlier counts for so many times P.
 _OUTLIER = 5.0
 # e is at most so many times o.
@@ -19,13 +21,14 @@ _OWN_GROWTH = 2.5
 _MOST_OWN, _SUDDEN_OWN, _SUDDEN = 5.0, 1.5, 1.25
 # R from which the bound is κ_0 e, and share of it that a learner with R ≤ 0 has: ρ.
 _PROVEN, _UNPROVEN_BOUND = 0.3, 0.7
-# The bound becomes wider from this R on, wholly at 0.3, and where ε is below this, wholly at half.
-_WIDER_FROM, _CLOSE = 0.15, 0.8
+# The bound becomes wider from the first R on, wholly at the second, and where ε is below the third,
+# wholly at half of it.
+_WIDER_FROM, _WIDE, _CLOSE = 0.05, 0.15, 0.8
 # Widest bound in units of V, and of o. With 3 o, repeated moves leave half as much again; without,
 # learners that keep a loop with friction moving do more harm.
 _SHOWN, _MOST_OUTSIDE = 1.2, 4.0
 # The bound becomes narrower from this ε on, down to this share.
-_WRONG, _NARROWEST = 2.0, 0.3
+_WRONG, _NARROWEST = 1.5, 0.3
 
 
 @kernel
@@ -52,20 +55,35 @@ def update_bound(guard: GuardDesign, memory: GuardMemory, error: float) -> None:
 
 
 @kernel
-def set_bound(guard: GuardDesign, memory: GuardMemory, authority: float, removed: float) -> None:
-    """Set the bounds of e_L; ``removed`` is R."""
-    averages, sample = memory.averages[0], memory.sample[0]
-    left = averages.newest_left / max(averages.newest_error, tiny(guard))
+def bounds_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[float, float]:
+    """Return the least and the largest e_L; ``removed`` is R."""
+    sample = memory.sample[0]
+    if sample.authority == 0.0:
+        closing = _closing(guard, memory)
+        return closing, closing
+    left = newest_share(guard, memory)
     proven = min(max(removed / _PROVEN, 0.0), 1.0)
     share = _UNPROVEN_BOUND + (1.0 - _UNPROVEN_BOUND) * proven
     most = share * guard.usual_bound * sample.typical_error
-    wider = min(max((removed - _WIDER_FROM) / (_PROVEN - _WIDER_FROM), 0.0), 1.0)
+    wider = min(max((removed - _WIDER_FROM) / (_WIDE - _WIDER_FROM), 0.0), 1.0)
     wider *= min(max(2.0 * (_CLOSE - left) / _CLOSE, 0.0), 1.0)
     widest = min(_SHOWN * sample.largest_output, _MOST_OUTSIDE * sample.outside)
     widest = min(widest, guard.bound * sample.typical_error)
-    most = authority * (most + wider * max(widest - most, 0.0))
+    most = sample.authority * (most + wider * max(widest - most, 0.0))
     narrow = most * min(max(2.0 - left / _WRONG, _NARROWEST), 1.0)
     # What has been pushed too far upwards may be taken back at once, and the other way round.
-    upwards = memory.effects[CORRECTED, guard.stages - 1] > 0.0
-    sample.upper = narrow if upwards else most
-    sample.lower = most if upwards else narrow
+    if memory.effects[CORRECTED, guard.stages - 1] > 0.0:
+        return -most, narrow
+    return -narrow, most
+
+
+@kernel
+def _closing(guard: GuardDesign, memory: GuardMemory) -> float:
+    """Return the e_L that brings ℓ e_L to zero after a learner has lost its authority."""
+    weight, closing, stages = 1.0, 0.0, guard.stages
+    faster = max(guard.closing / guard.respond - 1.0, 0.0)
+    for i in range(stages):
+        weight *= faster * (stages - i) / (i + 1)
+        closing -= weight * memory.effects[CORRECTED, i]
+    most = guard.usual_bound * memory.sample[0].typical_error
+    return min(max(closing, -most), most)

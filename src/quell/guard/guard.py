@@ -34,7 +34,7 @@ _OWN_SHARE, _OWN_LAGS = 0.2, 10.0
 _SMOOTHING_LAGS = 30.0
 # The target returns to f_L over this time, where the bound keeps them apart.
 _LEAK_LAGS = 7.0
-# The target approaches β̄g over this time, by at most e in it: a slow drift has almost no effect.
+# A target that is far from β̄g approaches it by e in this time, which has almost no effect.
 _HOME_LAGS = 1000.0
 # What a learner does to y is judged over T and so many times n/ω_c, in which y responds.
 EFFECT_TIME = 5.0
@@ -45,6 +45,8 @@ _MATCH_TIME = 0.1
 # κ_0, for learners that leave a good part of the error. With 1 a perfect one is clipped at its
 # peaks, because e is a little less than those of what the plain observer misses.
 _USUAL_BOUND = 1.2
+# After a learner has lost its authority, what it has done to y is taken back in this time.
+_CLOSING_LAGS = 2.0 / 3.0
 # After the filters were emptied in mid-run, q is wrong for this time.
 _SETTLING_LAGS = 3.0
 
@@ -119,6 +121,7 @@ class Guard:
             earn=dt / (_CREDIT_TIME * time),
             stages=max(order - 2, 1),
             respond=-math.expm1(-omega_c * dt),
+            closing=share(_CLOSING_LAGS),
             forget_effect=dt / (time + EFFECT_TIME * order / omega_c),
             forget_account=dt / (_ACCOUNT_LAGS * lag_time),
             forget_match=-math.expm1(-dt / (_MATCH_TIME * time)),

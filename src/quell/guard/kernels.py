@@ -13,10 +13,10 @@ of the observer later it is known what the plain ESO has missed, and what g woul
 **The bound e.** P, the peak of |q|, rises within 0.7 lags and decays over 200. The learner's own
 share of q is at most Γ times its largest recent correction, so e counts only what exceeds γ times
 that; and while the learner acts, e grows by a factor of 2.7 in five lags at most (METHOD 8), which
-costs a fifth of a unit of credit:
+costs credit:
 
     c_L ← max(|e_L|, λ c_L),        e → |q| − γ c_L  where that is larger,        e ≤ min(P, 2.5 o)
-    C ← C − 0.2 Δe/e
+    C ← C − 0.35 Δe/e
 
 o ≤ P, the error that is certainly not the learner's, rises to |q| − 5 c_L as P rises to |q|, and to
 |q| − 1.5 c_L while |q| rises so quickly that it is 1.25 P: what learner and loop build up together
@@ -31,11 +31,14 @@ raise slowly:
     p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
     β = min( clip(2 C, 0, 1),  clip(1 + 2 C_y, 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
 
-C starts at −1. S, the mean share of p² in p² + q² over T, scales down an output that is larger than
-what it explains. C_y is a veto: y is q through n integrations, so a learner that explains quick
-changes of f and adds to slow ones earns credit C and harms y. C_y follows the rule of C with ℓ q
-and ℓ p̄ in place of q and p̄, over ``T + 5 n/ω_c``, from 0 on. With m = max(n − 2, 1) stages,
-``ℓ = (ω_c/(s + ω_c))^m`` shows slow changes as y does, and earlier than y.
+C starts at −1. A learner that explains q nearly completely earns up to eight times as much: 1 + 7
+clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below); a jump of f
+is seen in q for two lags only. S, the mean share of p² in p² + q² over T, scales down an output
+that is larger than what it explains. C_y is a veto: y is q through n integrations, so a learner
+that explains quick changes of f and adds to slow ones earns credit C and harms y. C_y follows the
+rule of C, without that factor, with ℓ q and ℓ p̄ in place of q and p̄, over ``T + 5 n/ω_c``, from 0
+on. With m = max(n − 2, 1) stages, ``ℓ = (ω_c/(s + ω_c))^m`` shows slow changes as y does, and
+earlier than y.
 
 **Account.** Credit is soon forgotten: a learner can earn it in twenty lags and spend it in ten,
 again and again. So an account over 300 lags compares what its corrections did with what was missed:
@@ -53,19 +56,19 @@ anew.
 
 **Width.** The bound b is κ_0 e for a learner with R ≥ 0.3, and less for one that has removed less;
 κ_0 = 1.2, or κ if that is less. After a jump of f, (1 − F) f is twice what q shows of it, and b
-clips what would be right. So b is wider, up to κe, for a learner with R > 0.15 whose p is close to
+clips what would be right. So b is wider, up to κe, for a learner with R > 0.05 whose p is close to
 q, but not wider than what it has shown before (V, the peak of |v|, which decays as P), nor than a
 multiple of the error that is not its own:
 
     b_0 = κ_0 e (ρ + (1 − ρ) clip(R/0.3, 0, 1)),        ρ = 0.7
     ε = mean (q − p)² / mean q²  over T/10, 1.5 lags
-    w = clip(R/0.15 − 1, 0, 1) clip(2 − 2.5 ε, 0, 1)
+    w = clip((R − 0.05)/0.1, 0, 1) clip(2 − 2.5 ε, 0, 1)
     b = b_0 + w max(min(κe, 1.2 V, 4 o) − b_0, 0)
 
-A learner with ε > 1 adds to the error. From ε = 2 on it has less of b on the side to which its
+A learner with ε > 1 adds to the error. From ε = 1.5 on it has less of b on the side to which its
 corrections have moved y, the sign of ℓe_L; on the other side it has b, to take them back:
 
-    b_ε = b clip(2 − ε/2, 0.3, 1)
+    b_ε = b clip(2 − ε/1.5, 0.3, 1)
 
 **Output.** The target changes by ``β̄ Δg``, so that a change of β over a constant g does nothing,
 and what the bound took is made up for while the target is still near:
@@ -74,7 +77,17 @@ and what the bound took is made up for while the target is still near:
     f_L = f_L^F + e_L,        target ← target + dt/(7 lags) (f_L − target)
 
 β̄ is β, smoothed over 30 lags: a β that moves with g would rectify it, and the plant integrates
-what is constant in e_L.
+what is constant in e_L. At β = 1 it comes nearer by 0.05/30 lags at least, so that it reaches 1.
+The constant part of f_L is free. A target that is more than 1000 e from β̄g approaches it by e in
+1000 lags, so that rounding errors stay small.
+
+**Without authority** what earlier corrections have done to y is taken back. With the stages x_i of
+ℓ e_L, x_1 the first,
+
+    e_L = clip( −Σ_i C(m, i) (r − 1)^i x_i, ±κ_0 e ),        r ω_c = 1.5/lag
+
+places the m poles of ℓ e_L, which are at −ω_c, at −r ω_c, so that it decays within some lags. A
+learner that never had authority has e_L = 0.
 
 For observers with which that recursion is unstable (``correction.is_invertible``), F is here the
 filter of a chain of integrators with the same omega_o; for them nothing is certified.
@@ -95,7 +108,7 @@ from quell.guard.base import (
     start_again,
     write_channels,
 )
-from quell.guard.bound import set_bound, update_bound
+from quell.guard.bound import bounds_of, update_bound
 from quell.guard.credit import (
     authority_of,
     judge,
@@ -116,15 +129,21 @@ from quell.guard.state import (
     V,
     carried_sum,
     clear_carry,
+    tiny,
 )
 from quell.kernels.dispatch import is_finite
-from quell.kernels.functions import is_single, sqrt
+from quell.kernels.functions import copysign, is_single, sqrt
 from quell.kernels.scalars import clear
 from quell.learners.lag import lag_push, reset_lag
 from quell.types import Vector
 
 # An output that is so many times larger than f is cut off.
 _CUT_OFF = 100.0
+# With full authority β̄ comes nearer to 1 as if at least so much were missing, and so reaches it.
+_LAST_SHARE = 0.05
+# The target approaches β̄g only from a distance of so many e on: where it is does not matter, but
+# rounding must not.
+_FAR = 1000.0
 
 _OUT_OF_BOUNDS, _EXPLODED = int(Reason.OUT_OF_BOUNDS), int(Reason.EXPLODED)
 _NOT_FINITE = int(Reason.NOT_FINITE)
@@ -141,6 +160,10 @@ def _assess(guard: GuardDesign, memory: GuardMemory, f_plain: float) -> None:
         sample.target, sample.unsettled = target, guard.settling
         return
     shown[F_PLAIN] = lag_push(guard.lag, memory.chain, F_PLAIN, f_plain)
+    if q * q + p * p < tiny(guard):
+        # At rest nothing is judged: averages that began with zeros would take all that follows for
+        # a burst.
+        return
     sample.samples += 1.0
     if sample.unsettled > 0.0:
         sample.unsettled -= 1.0
@@ -169,18 +192,20 @@ def _limit(
         finite = is_finite(output) and is_finite(slope)
         sample.output = min(max(output, -most), most) if finite else 0.0
         sample.reason = _EXPLODED if finite else _NOT_FINITE
-        sample.authority = sample.lower = sample.upper = sample.begun = 0.0
+        sample.authority = sample.begun = 0.0
         sample.target = f_shown
         clear_carry(memory, TARGET)
         withdraw_authority(memory)
-        return f_shown, 0.0, not finite
+        return confine(guard, memory, f_shown), 0.0, not finite
     before = sample.output if sample.begun != 0.0 else output
     sample.output, sample.begun = output, 1.0
     removed = removed_share(guard, memory)
     authority, sample.reason = authority_of(guard, memory, removed)
     sample.authority = authority
-    set_bound(guard, memory, authority, removed)
-    more = guard.smooth * (authority - sample.share)
+    missing = authority - sample.share
+    more = guard.smooth * missing
+    if authority >= 1.0:
+        more = min(max(more, guard.smooth * _LAST_SHARE), missing)
     sample.share = carried_sum(guard, memory, SHARE, sample.share, more)
     if is_single(guard.forget):
         step = sample.share * (output - before)
@@ -189,7 +214,8 @@ def _limit(
     else:
         base = sample.target - sample.share * before
         sample.target = base + sample.share * output
-    if not -sample.lower <= sample.target - f_shown <= sample.upper:
+    least, largest = bounds_of(guard, memory, removed)
+    if not least <= sample.target - f_shown <= largest:
         sample.reason = _OUT_OF_BOUNDS if authority > 0.0 else sample.reason
     elif guard.least_slope <= sample.share * slope <= guard.largest_slope:
         return base + sample.share * constant, sample.share * slope, False
@@ -198,8 +224,9 @@ def _limit(
 
 @confine.register(GuardDesign)
 def _confine(guard: GuardDesign, memory: GuardMemory, f_learned: float) -> float:
-    shown, sample = memory.shown[F_L], memory.sample[0]
-    return min(max(f_learned, shown - sample.lower), shown + sample.upper)
+    least, largest = bounds_of(guard, memory, removed_share(guard, memory))
+    shown = memory.shown[F_L]
+    return min(max(f_learned, shown + least), shown + largest)
 
 
 @record_output.register(GuardDesign)
@@ -214,13 +241,13 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
         shown[F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
     respond(guard, memory, CORRECTED, correction)
     sample.own_peak = max(abs(correction), guard.own_decay * sample.own_peak)
-    if sample.upper > 0.0:
+    if sample.authority > 0.0:
         more = guard.leak * (f_learned - sample.target)
         sample.target = carried_sum(guard, memory, TARGET, sample.target, more)
-        step = guard.home * sample.typical_error
         distance = sample.share * sample.output - sample.target
-        more = min(max(guard.home * distance, -step), step)
-        sample.target = carried_sum(guard, memory, TARGET, sample.target, more)
+        if abs(distance) > _FAR * sample.typical_error:
+            step = copysign(guard.home * sample.typical_error, distance)
+            sample.target = carried_sum(guard, memory, TARGET, sample.target, step)
     else:
         sample.target = f_learned
         clear_carry(memory, TARGET)
@@ -229,8 +256,8 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
 @write_channels.register(GuardDesign)
 def _write_channels(guard: GuardDesign, memory: GuardMemory, row: Vector) -> int:
     row[0] = memory.sample[0].authority
-    row[1] = sqrt(memory.averages[0].error_plain)
-    row[2] = sqrt(memory.averages[0].error_learned)
+    row[1] = sqrt(memory.averages[0].square)
+    row[2] = sqrt(memory.averages[0].square_left)
     row[3] = memory.sample[0].reason
     return 4
 
@@ -244,7 +271,7 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     for i in range(memory.shown.size):
         memory.shown[i] = 0.0
     sample.output = sample.begun = sample.target = 0.0
-    sample.lower = sample.upper = sample.own_peak = sample.unsettled = 0.0
+    sample.own_peak = sample.unsettled = 0.0
 
 
 @start_again.register(GuardDesign)

@@ -24,6 +24,7 @@ class GuardDesign(NamedTuple):
     earn: float  # dt/T_C
     stages: Size  # m: order of ℓ
     respond: float  # share by which each of its stages follows in a sample
+    closing: float  # the same of ℓ e_L, stage by stage, without authority
     forget_effect: float  # dt/(T + 5 n/ω_c)
     forget_account: float  # dt/(300 lags)
     forget_match: float  # 10 dt/T
@@ -36,7 +37,7 @@ class GuardDesign(NamedTuple):
     own_decay: float  # λ
     smooth: float  # share by which β̄ follows β in a sample
     leak: float  # share of its distance to f_L that the target loses in a sample
-    home: float  # share of its distance to β̄g that the target loses in a sample, at most that of e
+    home: float  # share of e by which a target that is far from β̄g approaches it in a sample
     settling: float  # samples in which q is wrong after the filters were emptied
     invertible: Flag  # whether f_L = f_L^F + e_L is stable with the filter of the observer
     fed_lag: Any  # lag filter of f_L where it is not
@@ -49,13 +50,12 @@ class GuardAverages(Scalars):
 
     loudness: float  # S
     square: float  # M, mean of q² that grows by a factor of 2.7 in 0.7 lags at most
+    square_left: float  # the same of (q − p)²
     effect_square: float  # the same of ℓ q, over T + 5 n/ω_c
     missed: float  # J
     gained: float  # A
     newest_error: float  # mean of q² over T/10 [(y-unit/s^n)²]
     newest_left: float  # the same of (q − p)²
-    error_plain: float  # mean square of q [(y-unit/s^n)²]
-    error_learned: float  # mean square of q − p [(y-unit/s^n)²]
 
 
 class GuardSample(Scalars):
@@ -73,8 +73,6 @@ class GuardSample(Scalars):
     output: float  # g [y-unit/s^n]
     begun: float  # 1 if there is an output of a sample before, else 0
     target: float  # target of f_L [y-unit/s^n]
-    lower: float  # largest correction downwards: bound of −e_L [y-unit/s^n]
-    upper: float  # bound of e_L [y-unit/s^n]
     reason: float  # a Reason
     samples: float  # number of samples so far
     unsettled: float  # samples until q is right again
