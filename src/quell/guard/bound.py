@@ -80,10 +80,15 @@ def bounds_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[
 @kernel
 def _closing(guard: GuardDesign, memory: GuardMemory) -> float:
     """Return the e_L that brings ℓ e_L to zero after a learner has lost its authority."""
-    weight, closing, stages = 1.0, 0.0, guard.stages
+    weight, closing, place, above = 1.0, 0.0, 0.0, 0.0
     faster = max(guard.closing / guard.respond - 1.0, 0.0)
-    for i in range(stages):
-        weight *= faster * (stages - i) / (i + 1)
+    # Numbers of stages as floats: a quotient of integers would be in double precision.
+    for _ in range(guard.stages):
+        above += 1.0
+    for i in range(guard.stages):
+        place += 1.0
+        weight *= faster * above / place
+        above -= 1.0
         closing -= weight * memory.effects[CORRECTED, i]
     most = guard.usual_bound * memory.sample[0].typical_error
     return min(max(closing, -most), most)
