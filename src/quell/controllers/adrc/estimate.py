@@ -21,7 +21,7 @@ class Estimate(NamedTuple):
     f: float
     """Total disturbance ``f_learned + f_residual`` [y-unit/s^n; y-unit/s^f_degree with zeros]."""
     f_learned: float
-    """The learner's share, f_L."""
+    """The learner's share, f_L; with a guard its constant part is free, and ``f`` is right."""
     f_residual: float
     """The observer's share, Δf̂."""
     theta: dict[str, float]
