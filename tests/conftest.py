@@ -31,8 +31,8 @@ settings.register_profile("quell", deadline=None, derandomize=True)
 settings.load_profile("quell")
 
 # Numba makes millions of objects that live long: look for garbage among them less often, and never
-# again among those of a compilation. A tenth of the tests' time is in these numbers.
-gc.set_threshold(200_000, 20, 50)
+# again among those of a compilation.
+gc.set_threshold(50_000, 20, 20)
 
 
 class _FrozenCode(event.Listener):
