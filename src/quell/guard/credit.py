@@ -34,7 +34,7 @@ _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(
 
 @kernel
 def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
-    """Update averages, credit, veto and account with q and p."""
+    """Update averages, credit, veto and account with q and p, of which one is not zero."""
     averages, sample = memory.averages[0], memory.sample[0]
     qq, pp = q * q, p * p
     energy = qq + pp
