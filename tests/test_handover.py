@@ -502,7 +502,7 @@ def test_a_guard_starts_with_no_correction(said: float) -> None:
     controller = ql.ADRC(OBSERVER, omega_c=3.0, learner=learner, guard=guard)
     state = controller._state
     state.learner.theta[0] = said
-    state.guard.sample[0].credit = 1.0
+    state.guard.sample[0].credit = state.guard.sample[0].share = 1.0
     state.guard.sample[0].typical_error = state.guard.sample[0].peak = 1.0
     controller.start_at([0.5, 0.0], 2.0)
     assert state.loop[0].f_learned == 0.0

@@ -213,7 +213,7 @@ def test_averages_that_would_stand_still_are_named() -> None:
     controller = ql.ADRC(observer, 0.2, learner=ql.learners.Kalman(), guard=ql.Guard())
     with pytest.raises(ValueError, match=r"forget = .* a sample: must be at least .* raise dt"):
         in_single_precision(controller)
-    names = ("forget", "earn", "forget_effect", "forget_account", "rise", "growth", "smooth")
+    names = ("forget", "earn", "forget_account", "rise", "growth", "smooth")
     rates = dict.fromkeys(names, 2.0**-21)
     fine = controller.parameters.guard._replace(**rates, decay=2.0**-23)
     single_design(fine)

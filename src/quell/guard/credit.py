@@ -1,9 +1,9 @@
-"""What a learner has earned: credit, veto and account; ``kernels.py`` has their equations."""
+"""What a learner has earned: credit and account; ``kernels.py`` has their equations."""
 
 from __future__ import annotations
 
 from quell.guard.reason import Reason
-from quell.guard.state import BOUNDED, CORRECTED, MISSED, GuardDesign, GuardMemory, tiny
+from quell.guard.state import MISSED, GuardDesign, GuardMemory, tiny
 from quell.kernels.dispatch import kernel
 
 # These values and those in ``guard.py`` were chosen by hand on tuning seeds of `quell stress`; it
@@ -26,15 +26,22 @@ _OWN_SQUARES = 1.5
 # Share by which a learner may make the squared error larger, and least R, as a multiple of it: R
 # comes back from there within 200 lags.
 _LOAN, _LARGEST_DEBT = 0.01, 2.0
-# Largest J in units of the mean of (ℓ q)² over T + 5 n/ω_c: an absurd past counts for little.
+# Largest J in units of M: an absurd past counts for little.
 _MOST_PAST = 1e4
 
+# RMS of q in units of o from which it may be the learner's own doing, and until which authority is
+# withheld; the share of the square of the first that such a learner leaves at least.
+_OWN_DOING, _GONE, _LEFT = 2.0, 1.3, 0.05
+# Of higher order, withholding authority moves y more than what it ends.
+_HIGHEST_ORDER = 3
+
 _TRUSTED, _UNPROVEN, _TOO_LOUD = int(Reason.TRUSTED), int(Reason.UNPROVEN), int(Reason.TOO_LOUD)
+_WITHHELD = int(Reason.WITHHELD)
 
 
 @kernel
 def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
-    """Update averages, credit, veto and account with q and p, of which one is not zero."""
+    """Update averages, credit and account with q and p, of which one is not zero."""
     averages, sample = memory.averages[0], memory.sample[0]
     qq, pp = q * q, p * p
     energy = qq + pp
@@ -56,33 +63,18 @@ def judge(guard: GuardDesign, memory: GuardMemory, q: float, p: float) -> None:
         matching = max(1.0 - newest_share(guard, memory) / _MATCHING, 0.0)
         earned *= 1.0 + (_QUICK - 1.0) * matching
     sample.credit = min(max(sample.credit + guard.earn * earned, -1.0), 1.0)
-    _judge_effect(guard, memory, q, bounded, is_new)
+    _keep_account(guard, memory, respond(guard, memory, MISSED, q), is_new)
 
 
 @kernel
-def _judge_effect(
-    guard: GuardDesign, memory: GuardMemory, q: float, bounded: float, is_new: bool
-) -> None:
-    """Update C_y with what the learner, bounded, would have done to y; then the account."""
-    averages, sample = memory.averages[0], memory.sample[0]
-    q = respond(guard, memory, MISSED, q)
-    bounded = respond(guard, memory, BOUNDED, bounded)
-    rate, square = guard.forget_effect, q * q
-    averages.effect_square = _mean_square(guard, averages.effect_square, square, rate, is_new)
-    earned = _earned(q, bounded, averages.effect_square, tiny(guard))
-    sample.effect_credit = min(max(sample.effect_credit + rate * earned, -1.0), 1.0)
-    _keep_account(guard, memory, q, is_new)
-
-
-@kernel
-def _keep_account(guard: GuardDesign, memory: GuardMemory, q: float, is_new: bool) -> None:
+def _keep_account(guard: GuardDesign, memory: GuardMemory, missed: float, is_new: bool) -> None:
     """Update J and A with ℓ q and with what the learner's corrections did."""
-    averages, square = memory.averages[0], q * q
-    own, rate = memory.effects[CORRECTED, guard.stages - 1], guard.forget_account
+    averages, square = memory.averages[0], missed * missed
+    own, rate = memory.sample[0].late_effect, guard.forget_account
     is_burst = not is_new and rate * (square - averages.missed) > guard.rise * averages.missed
     averages.missed = _mean_square(guard, averages.missed, square, rate, is_new)
-    averages.missed = min(averages.missed, _MOST_PAST * averages.effect_square)
-    gain = (2.0 * q - _OWN_SQUARES * own) * own
+    averages.missed = min(averages.missed, _MOST_PAST * averages.square)
+    gain = (2.0 * missed - _OWN_SQUARES * own) * own
     allowed = _LOAN * averages.missed
     # What a learner did in a burst says nothing, as J does not follow it.
     gain = averages.gained + (0.0 if is_burst else rate * (gain - averages.gained))
@@ -93,7 +85,7 @@ def _keep_account(guard: GuardDesign, memory: GuardMemory, q: float, is_new: boo
 
 @kernel
 def respond(guard: GuardDesign, memory: GuardMemory, row: int, value: float) -> float:
-    """Return ``ℓ value``, which is as slow as y."""
+    """Return ``ℓ value``, which responds as y does."""
     for i in range(guard.stages):
         memory.effects[row, i] += guard.respond * (value - memory.effects[row, i])
         value = memory.effects[row, i]
@@ -131,13 +123,26 @@ def removed_share(guard: GuardDesign, memory: GuardMemory) -> float:
 
 
 @kernel
+def _is_own_doing(guard: GuardDesign, memory: GuardMemory) -> bool:
+    """Return whether q is so large beside o that learner and loop may keep it up together."""
+    averages, sample = memory.averages[0], memory.sample[0]
+    if guard.stages > _HIGHEST_ORDER:
+        return False
+    if sample.authority > 0.0:
+        own_doing = (_OWN_DOING * sample.outside) ** 2
+        return averages.square > own_doing and averages.square_left > _LEFT * own_doing
+    return averages.square > (_GONE * sample.outside) ** 2
+
+
+@kernel
 def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[float, int]:
     """Return β and the reason for it; ``removed`` is R."""
     loudness, sample = memory.averages[0].loudness, memory.sample[0]
-    earned = min(sample.credit, _FULL_CREDIT + sample.effect_credit) / _FULL_CREDIT
-    earned = min(earned, 1.0 + removed / _LOAN)
+    earned = min(sample.credit / _FULL_CREDIT, 1.0 + removed / _LOAN)
     if earned <= 0.0:
         return 0.0, _UNPROVEN
+    if _is_own_doing(guard, memory):
+        return 0.0, _WITHHELD
     scaled = _LOUDEST * (1.0 - loudness) / max(loudness, tiny(guard))
     if scaled < min(earned, 1.0):
         return scaled, _TOO_LOUD
@@ -147,5 +152,5 @@ def authority_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tup
 @kernel
 def withdraw_authority(memory: GuardMemory) -> None:
     """Set the credit of a learner that has yet to prove itself, and the loudness of one like f."""
-    memory.sample[0].credit, memory.sample[0].effect_credit = -1.0, 0.0
+    memory.sample[0].credit = -1.0
     memory.averages[0].loudness = 0.5

@@ -36,8 +36,6 @@ _SMOOTHING_LAGS = 30.0
 _LEAK_LAGS = 7.0
 # A target that is far from β̄g approaches it by e in this time, which has almost no effect.
 _HOME_LAGS = 1000.0
-# What a learner does to y is judged over T and so many times n/ω_c, in which y responds.
-EFFECT_TIME = 5.0
 # Memory of the account.
 _ACCOUNT_LAGS = 300.0
 # Time over which ε compares p with q, over T: a learner that turns is seen within five lags.
@@ -119,10 +117,9 @@ class Guard:
             lag=lag,
             forget=-math.expm1(-dt / time),
             earn=dt / (_CREDIT_TIME * time),
-            stages=max(order - 2, 1),
+            stages=order,
             respond=-math.expm1(-omega_c * dt),
             closing=share(_CLOSING_LAGS),
-            forget_effect=dt / (time + EFFECT_TIME * order / omega_c),
             forget_account=dt / (_ACCOUNT_LAGS * lag_time),
             forget_match=-math.expm1(-dt / (_MATCH_TIME * time)),
             rise=share(_RISE_LAGS),
@@ -132,6 +129,7 @@ class Guard:
             usual_bound=min(bound, _USUAL_BOUND),
             own=_OWN_SHARE,
             own_decay=1.0 - share(_OWN_LAGS),
+            within_lag=share(1.0),
             smooth=share(_SMOOTHING_LAGS),
             leak=share(_LEAK_LAGS),
             home=share(_HOME_LAGS),
@@ -146,7 +144,7 @@ class Guard:
         """Return the state before the first sample, without authority."""
         fed = lag_memory(parameters.fed_lag, 0 if parameters.invertible else 1)
         filters = lag_memory(parameters.lag, 3), fed, np.zeros(4)
-        effects = np.zeros((3, parameters.stages))
+        effects = np.zeros((2, parameters.stages))
         memory = GuardMemory(*filters, effects, GuardAverages.zeros(), GuardSample.zeros())
         withdraw_authority(memory)
         return memory

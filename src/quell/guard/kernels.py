@@ -24,30 +24,41 @@ grows more slowly. So a learner that causes what it then explains does not raise
 And credit that was earned with small errors does not suffice for large ones: a learner that
 explains them as well earns more than the growth of e costs.
 
+**Own doing.** Friction lets learner and loop keep each other moving: the learner explains much of a
+motion that would not be there without it. Then q is large beside o. Authority is withheld to see
+whether the motion goes on: with M, the mean of q² (below), and M_left, that of (q − p)²,
+
+    β = 0  from  M > (2 o)² and M_left > 0.05 (2 o)²  on, until  M < (1.3 o)²
+
+Without authority λ is that of one lag, so o soon follows |q| if the error was not the learner's; if
+it was, M decays. Only for n ≤ 3: of higher order, what a gap in e_L does to y is worse.
+
 **Credit.** Each sample in which the learner, bounded, would have reduced the error earns credit,
 each in which it would have increased it costs credit; M is the mean of q² over T, which bursts
 raise slowly:
 
     p̄ = clip(p, ±κ_0 e),      C ← clip( C + dt/T_C (2 q p̄ − p̄²) / max(q², 4 M), −1, 1 )
-    β = min( clip(2 C, 0, 1),  clip(1 + 2 C_y, 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
+    β = min( clip(2 C, 0, 1),  clip(1 + 100 R, 0, 1),  1.2 (1 − S)/S )
 
 C starts at −1. A learner that explains q nearly completely earns up to eight times as much: 1 + 7
 clip(1 − ε/0.35, 0, 1) times, where ε is what it left of q in the last 1.5 lags (below); a jump of f
 is seen in q for two lags only. S, the mean share of p² in p² + q² over T, scales down an output
-that is larger than what it explains. C_y is a veto: y is q through n integrations, so a learner
-that explains quick changes of f and adds to slow ones earns credit C and harms y. C_y follows the
-rule of C, without that factor, with ℓ q and ℓ p̄ in place of q and p̄, over ``T + 5 n/ω_c``, from 0
-on. With m = max(n − 2, 1) stages, ``ℓ = (ω_c/(s + ω_c))^m`` shows slow changes as y does, and
-earlier than y.
+that is larger than what it explains.
 
 **Account.** Credit is soon forgotten: a learner can earn it in twenty lags and spend it in ten,
-again and again. So an account over 300 lags compares what its corrections did with what was missed:
+again and again. And y is q through n integrations: a learner that explains quick changes of f and
+adds to slow ones earns credit and harms y. So an account over 300 lags compares what its
+corrections did to y with what was missed there, with ``ℓ = (ω_c/(s + ω_c))^n``, as y responds to f:
 
     J ← J + ((ℓ q)² − J) dt/300 lags,
-    A ← clip( A + (2 ℓq ℓe_L − 1.5 (ℓe_L)² − A) dt/300 lags,  −0.02 J, J )
+    A ← clip( A + (2 ℓq d − 1.5 d² − A) dt/300 lags,  −0.02 J, J )
 
-J follows a burst no more quickly than M does, and A does not follow it; J is at most 10⁴ times the
-mean of (ℓ q)² over ``T + 5 n/ω_c``, so that an absurd measurement is forgotten.
+q is a lag of the observer late, so d is ``ℓ e_L`` through a first-order lag of that time: with
+``ℓ e_L`` of now, right corrections of disturbances with a period below some nine lags would count
+as harm.
+
+J follows a burst no more quickly than M does, and A does not follow it; J is at most 10⁴ M, so that
+an absurd measurement is forgotten.
 
 Without the factor 1.5, R = A/J would be the share of the squared error that the learner has
 removed; the factor is for plants on which a correction acts more strongly than on the observer's
@@ -84,9 +95,9 @@ The constant part of f_L is free. A target that is more than 1000 e from β̄g a
 **Without authority** what earlier corrections have done to y is taken back. With the stages x_i of
 ℓ e_L, x_1 the first,
 
-    e_L = clip( −Σ_i C(m, i) (r − 1)^i x_i, ±κ_0 e ),        r ω_c = 1.5/lag
+    e_L = clip( −Σ_i C(n, i) (r − 1)^i x_i, ±κ_0 e ),        r ω_c = 1.5/lag
 
-places the m poles of ℓ e_L, which are at −ω_c, at −r ω_c, so that it decays within some lags. A
+places the n poles of ℓ e_L, which are at −ω_c, at −r ω_c, so that it decays within some lags. A
 learner that never had authority has e_L = 0.
 
 For observers with which that recursion is unstable (``correction.is_invertible``), F is here the
@@ -192,13 +203,14 @@ def _limit(
         finite = is_finite(output) and is_finite(slope)
         sample.output = min(max(output, -most), most) if finite else 0.0
         sample.reason = _EXPLODED if finite else _NOT_FINITE
-        sample.authority = sample.begun = 0.0
+        sample.authority = 0.0
         sample.target = f_shown
         clear_carry(memory, TARGET)
         withdraw_authority(memory)
         return confine(guard, memory, f_shown), 0.0, not finite
-    before = sample.output if sample.begun != 0.0 else output
-    sample.output, sample.begun = output, 1.0
+    before, sample.output = sample.output, output
+    if sample.share < 0.0:
+        before, sample.share = output, -sample.share
     removed = removed_share(guard, memory)
     authority, sample.reason = authority_of(guard, memory, removed)
     sample.authority = authority
@@ -239,8 +251,10 @@ def _record_output(guard: GuardDesign, memory: GuardMemory, f_learned: float) ->
     correction = f_learned - shown[F_L]
     if not guard.invertible:
         shown[F_L] = lag_push(guard.fed_lag, memory.fed, 0, f_learned)
-    respond(guard, memory, CORRECTED, correction)
-    sample.own_peak = max(abs(correction), guard.own_decay * sample.own_peak)
+    effect = respond(guard, memory, CORRECTED, correction)
+    sample.late_effect += guard.within_lag * (effect - sample.late_effect)
+    decay = guard.own_decay if sample.authority > 0.0 else 1.0 - guard.within_lag
+    sample.own_peak = max(abs(correction), decay * sample.own_peak)
     if sample.authority > 0.0:
         more = guard.leak * (f_learned - sample.target)
         sample.target = carried_sum(guard, memory, TARGET, sample.target, more)
@@ -270,8 +284,10 @@ def _reset_filters(guard: GuardDesign, memory: GuardMemory) -> None:
     reset_lag(memory.effects)
     for i in range(memory.shown.size):
         memory.shown[i] = 0.0
-    sample.output = sample.begun = sample.target = 0.0
-    sample.own_peak = sample.unsettled = 0.0
+    sample.output = sample.target = sample.unsettled = 0.0
+    sample.own_peak = sample.late_effect = 0.0
+    # The next output has none before it: it is a constant.
+    sample.share = -abs(sample.share)
 
 
 @start_again.register(GuardDesign)

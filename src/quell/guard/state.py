@@ -22,10 +22,9 @@ class GuardDesign(NamedTuple):
     lag: Any  # lag filter of the observer
     forget: float  # dt/T
     earn: float  # dt/T_C
-    stages: Size  # m: order of ℓ
+    stages: Size  # n: order of ℓ
     respond: float  # share by which each of its stages follows in a sample
     closing: float  # the same of ℓ e_L, stage by stage, without authority
-    forget_effect: float  # dt/(T + 5 n/ω_c)
     forget_account: float  # dt/(300 lags)
     forget_match: float  # 10 dt/T
     rise: float  # share by which P and e follow a larger |q| in a sample
@@ -35,6 +34,7 @@ class GuardDesign(NamedTuple):
     usual_bound: float  # κ_0: κ of a learner that leaves a good part of the error
     own: float  # γ
     own_decay: float  # λ
+    within_lag: float  # share by which d follows ℓ e_L in a sample, with one lag as time constant
     smooth: float  # share by which β̄ follows β in a sample
     leak: float  # share of its distance to f_L that the target loses in a sample
     home: float  # share of e by which a target that is far from β̄g approaches it in a sample
@@ -51,7 +51,6 @@ class GuardAverages(Scalars):
     loudness: float  # S
     square: float  # M, mean of q² that grows by a factor of 2.7 in 0.7 lags at most
     square_left: float  # the same of (q − p)²
-    effect_square: float  # the same of ℓ q, over T + 5 n/ω_c
     missed: float  # J
     gained: float  # A
     newest_error: float  # mean of q² over T/10 [(y-unit/s^n)²]
@@ -62,16 +61,15 @@ class GuardSample(Scalars):
     """Values of the newest sample."""
 
     credit: float  # C
-    effect_credit: float  # C_y
     authority: float  # β
-    share: float  # β̄: β, smoothed
+    share: float  # β̄: β, smoothed; negative if there is no output of a sample before
     peak: float  # P [y-unit/s^n]
     typical_error: float  # e [y-unit/s^n]
     outside: float  # o [y-unit/s^n]
     own_peak: float  # c_L [y-unit/s^n]
+    late_effect: float  # d: ℓ e_L, as late as q [y-unit/s^n]
     largest_output: float  # V: peak of |g − g^F| [y-unit/s^n]
     output: float  # g [y-unit/s^n]
-    begun: float  # 1 if there is an output of a sample before, else 0
     target: float  # target of f_L [y-unit/s^n]
     reason: float  # a Reason
     samples: float  # number of samples so far
@@ -85,7 +83,7 @@ class GuardMemory(NamedTuple):
     fed: Matrix  # lag filter of f_L (1, …), if it is not that of the observer, else (0, …)
     # Their outputs f_plain^F, g^F, p and f_L^F (4,); in single precision carries, too (7,).
     shown: Vector
-    effects: Matrix  # ℓ q, ℓ p̄ and ℓ e_L, stage by stage (3, m) [y-unit/s^n]
+    effects: Matrix  # ℓ q and ℓ e_L, stage by stage (2, n) [y-unit/s^n]
     averages: NDArray[GuardAverages]  # (1,)
     sample: NDArray[GuardSample]  # (1,)
 
@@ -93,7 +91,7 @@ class GuardMemory(NamedTuple):
 # Rows of GuardMemory.chain and, with the last, entries of GuardMemory.shown.
 F_PLAIN, G, V, F_L = range(4)
 # Rows of GuardMemory.effects.
-MISSED, BOUNDED, CORRECTED = range(3)
+MISSED, CORRECTED = range(2)
 # Carries of sums in single precision, the last entries of GuardMemory.shown there.
 TARGET, SHARE, PEAK = 4, 5, 6
 CARRIES = 3

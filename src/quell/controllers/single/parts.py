@@ -24,7 +24,7 @@ _OTHERS = "take a learner of quell.learners with its own kernels, or one of the 
 # half a unit of the last digit where the average is within a tenth of its goal.
 _RATES: dict[type, tuple[str, ...]] = {
     GuardDesign: (
-        *("forget", "earn", "forget_effect", "forget_account"),
+        *("forget", "earn", "forget_account"),
         *("rise", "decay", "growth", "smooth"),
     ),
     KalmanDesign: ("forget",),

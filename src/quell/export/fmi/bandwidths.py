@@ -2,11 +2,8 @@
 
 *omega_c*: ``k_i = w_i omega_c^(m−i+1)`` with the binomial coefficients, or those of a pattern of
 poles, as w (``controllers/adrc/law.py``), and the factor ``exp(−omega_c dt)`` of the offset after a
-bumpless transfer. A guard takes the gains for poles at ``ω_g = k_1^(1/n)``::
-
-    respond = 1 − exp(−ω_g dt),        forget_effect = dt/(A + B/ω_g)
-
-(``guard/guard.py``).
+bumpless transfer. A guard takes the gains for poles at ``ω_g = k_1^(1/n)``, and has the parameter
+``respond = 1 − exp(−ω_g dt)`` (``guard/guard.py``).
 
 *omega_o*: Ackermann's formula (``observers/placement.py``) with N equal poles ``1 − ω``,
 ``ω = 1 − exp(−omega_o dt)``, is a polynomial, because its last factor does not depend on ω::
@@ -29,7 +26,6 @@ import numpy as np
 from quell.controllers.adrc.adrc import ADRC
 from quell.controllers.adrc.law import law_gains
 from quell.controllers.prefilters.prefilter import Prefiltered
-from quell.guard.guard import EFFECT_TIME
 from quell.guard.state import GuardDesign
 from quell.learners import NoLearner
 from quell.observers.eso import ESO
@@ -42,20 +38,6 @@ _LARGEST_ERROR = 1e-9
 _OTHER = 1.25  # times omega_c: another value, for which the closed form is checked
 
 
-class GuardTimes(NamedTuple):
-    """The numbers of a guard that depend on omega_c."""
-
-    order: int  # n
-    fixed: float  # A [s]
-    by_bandwidth: float  # B
-
-    def changed(self, guard: GuardDesign, first_gain: float, dt: float) -> GuardDesign:
-        """Return the parameters of a guard for another gain k_1."""
-        omega = first_gain ** (1.0 / self.order)
-        forget = dt / (self.fixed + self.by_bandwidth / omega)
-        return guard._replace(respond=-math.expm1(-omega * dt), forget_effect=forget)
-
-
 class Bandwidths(NamedTuple):
     """Data that C needs for the bandwidths of an ADRC; None for a bandwidth that is fixed."""
 
@@ -63,7 +45,7 @@ class Bandwidths(NamedTuple):
     dt: float
     omega_c: float
     weights: Vector | None  # w (m,)
-    guard: GuardTimes | None
+    guard: int | None  # n of its ω_g
     omega_o: float
     coefficients: Matrix | None  # of ω^k in L (N, N + 1)
 
@@ -75,7 +57,7 @@ def bandwidths(controller: Any) -> Bandwidths | None:
         path, controller = f"{path}controller.", controller.controller
     if type(controller) is not ADRC:
         return None
-    observer, guard = controller.observer, _guard_times(controller)
+    observer, guard = controller.observer, _guard_order(controller)
     return Bandwidths(
         path,
         observer.dt,
@@ -91,18 +73,12 @@ def _learns(controller: ADRC) -> bool:
     return not isinstance(controller.learner, NoLearner)
 
 
-def _guard_times(controller: ADRC) -> GuardTimes | None:
+def _guard_order(controller: ADRC) -> int | None:
     design = controller.parameters
-    if not isinstance(design.guard, GuardDesign):
-        return None
-    order = design.law.size
-    by_bandwidth = EFFECT_TIME * order
-    omega = float(design.law[0]) ** (1.0 / order)
-    fixed = controller.dt / design.guard.forget_effect - by_bandwidth / omega
-    return GuardTimes(order, fixed, by_bandwidth)
+    return int(design.law.size) if isinstance(design.guard, GuardDesign) else None
 
 
-def _weights(controller: ADRC, guard: GuardTimes | None) -> Vector | None:
+def _weights(controller: ADRC, guard: int | None) -> Vector | None:
     """Return the gains for omega_c = 1, if the closed forms give all that omega_c changes."""
     observer, dt = controller.observer, controller.dt
     weights = law_gains(observer.degree, 1.0, controller.law_poles)
@@ -114,7 +90,9 @@ def _weights(controller: ADRC, guard: GuardTimes | None) -> Vector | None:
             fade=math.exp(-omega_c * dt),
         )
         if guard is not None:
-            closed = closed._replace(guard=guard.changed(closed.guard, float(gains[0]), dt))
+            omega = float(gains[0]) ** (1.0 / guard)
+            respond = -math.expm1(-omega * dt)
+            closed = closed._replace(guard=closed.guard._replace(respond=respond))
         design = controller._design(observer, omega_c)
         if not all(_equal(*pair) for pair in zip(_leaves(design), _leaves(closed), strict=True)):
             return None

@@ -56,12 +56,10 @@ def _omega_c_lines(known: Bandwidths, weights: Vector, cast: str) -> list[str]:
     count, dt = weights.size, known.dt
     guard = []
     if known.guard is not None:
-        power = repr(1.0 / known.guard.order)
-        times = f"({known.guard.fixed!r} + {known.guard.by_bandwidth!r} / omega_g)"
+        power = repr(1.0 / known.guard)
         guard = [
             f"    const double omega_g = pow(weights[0] * pow(omega_c, {count}), {power});",
             f"    next->{known.path}guard.respond = {cast}-expm1(-omega_g * {dt!r});",
-            f"    next->{known.path}guard.forget_effect = {cast}({dt!r} / {times});",
         ]
     return [
         f"if (m->real[AT_OMEGA_C] != {known.omega_c!r}) {{ /* else the numbers of the export */",
