@@ -443,11 +443,8 @@ def test_who_has_added_a_hundredth_to_the_squared_error_begins_anew_and_may_with
     assert memory.sample[0].credit == -1.0
     waited = 0
     while memory.sample[0].credit == -1.0:
-        memory.effects[CORRECTED], memory.sample[0].late_effect, memory.sample[0].credit = (
-            0.0,
-            0.0,
-            1.0,
-        )
+        memory.effects[CORRECTED] = memory.sample[0].late_effect = 0.0
+        memory.sample[0].credit = 1.0
         settle(design, memory, 0.4, 0.0, 1)
         waited += 1
     # The account halves in 30 log 2 = 21 lags.

@@ -1,4 +1,4 @@
-"""What a learner has earned: credit and account; ``kernels.py`` has their equations."""
+"""Credit and account of a learner, and its authority; ``kernels.py`` has their equations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ _OWN_SQUARES = 1.5
 _LOAN, _LARGEST_DEBT = 0.01, 2.0
 # Largest J in units of M: an absurd past counts for little.
 _MOST_PAST = 1e4
-
 # RMS of q in units of o from which it may be the learner's own doing, and until which authority is
 # withheld; the share of the square of the first that such a learner leaves at least.
 _OWN_DOING, _GONE, _LEFT = 2.0, 1.3, 0.05

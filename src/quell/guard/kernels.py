@@ -24,7 +24,7 @@ grows more slowly. So a learner that causes what it then explains does not raise
 And credit that was earned with small errors does not suffice for large ones: a learner that
 explains them as well earns more than the growth of e costs.
 
-**Own doing.** Friction lets learner and loop keep each other moving: the learner explains much of a
+**Withheld.** Friction lets learner and loop keep each other moving: the learner explains much of a
 motion that would not be there without it. Then q is large beside o. Authority is withheld to see
 whether the motion goes on: with M, the mean of q² (below), and M_left, that of (q − p)²,
 

@@ -23,10 +23,7 @@ _OTHERS = "take a learner of quell.learners with its own kernels, or one of the 
 # Shares by which averages follow in a sample. What is left of a smaller one in the sum is below
 # half a unit of the last digit where the average is within a tenth of its goal.
 _RATES: dict[type, tuple[str, ...]] = {
-    GuardDesign: (
-        *("forget", "earn", "forget_account"),
-        *("rise", "decay", "growth", "smooth"),
-    ),
+    GuardDesign: ("forget", "earn", "forget_account", "rise", "decay", "growth", "smooth"),
     KalmanDesign: ("forget",),
     NoiseGate: ("forget",),
 }
