@@ -80,11 +80,9 @@ def run(settings: Settings, progress: Progress | None = None) -> Result:
     """Run the study."""
     progress = progress or (lambda part, share: None)
     plant, paper = two_mass_spring(), scenario(settings)
-    runs = {}
-    for i, (name, candidate) in enumerate(controllers(settings).items()):
-        progress("simulating", i / len(NAMES))
-        runs[name] = simulate(plant, candidate, paper)
-    progress("simulating", 1.0)
+    jobs = [partial(simulate, plant, each, paper) for each in controllers(settings).values()]
+    done = in_parallel(jobs, partial(progress, "simulating"))
+    runs = dict(zip(NAMES, done, strict=True))
     scores = {name: score(run) for name, run in runs.items()}
     needed = {name: _bandwidth_for(settings, name == MB, scores, progress) for name in (MF, MB)}
     variations = _batch_variations(settings)
