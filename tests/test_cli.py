@@ -12,6 +12,7 @@ import cyclopts
 import matplotlib.pyplot as plt
 import pytest
 
+from quell import experiments
 from quell.experiments.common.figures import save_figure
 from quell.identification import Identified
 from quell.kernels.compile_time import compile_time
@@ -263,6 +264,63 @@ def test_neither_importing_quell_nor_simulating_imports_what_it_does_not_need() 
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout.splitlines() == ["[]", "[] True"]
+
+
+def test_an_experiment_does_not_wait_for_the_others() -> None:
+    """Neither theirs nor what they import is loaded; each is found as an attribute."""
+    code = (
+        "import sys, quell as ql, quell.experiments.two_mass_spring\n"
+        "others = ('quell.experiments.acc', 'quell.experiments.stress', 'quell.setup', 'quell.tuning')\n"
+        "print([name for name in sys.modules if name.startswith(others)], end=' ')\n"
+        "print(*(getattr(ql.experiments, name).__name__ for name in ql.experiments.__all__))\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    names = ("acc", "compare", "stress", "torsional", "two_mass_spring")
+    assert ended.stdout.split() == ["[]", *(f"quell.experiments.{name}" for name in names)]
+    with pytest.raises(AttributeError, match="has no attribute 'three_masses'"):
+        experiments.three_masses  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("ending", "code"),
+    [("pass", 0), ("sys.exit(4)", 4), ("sys.exit(None)", 0), ("1 / 0", 1)],
+)
+def test_the_process_ends_when_all_is_written_and_closed(ending: str, code: int) -> None:
+    """Exit code, output and handlers are those of Python; only the memory is not cleared first."""
+    script = f"""
+import atexit, sys
+import quell.cli
+from quell.__main__ import run
+
+class Memory:
+    def __del__(self): print("cleared", flush=True)
+
+def main():
+    sys.memory = Memory()
+    atexit.register(print, "closed")
+    print("result")
+    {ending}
+
+quell.cli.main = main
+run()
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert ended.returncode == code
+    assert ended.stdout.split() == ["result", "closed"]
+    assert ("ZeroDivisionError" in ended.stderr) == (code == 1)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a full disk")
+def test_output_that_can_not_be_written_is_an_error_at_the_end_too() -> None:
+    """What is in the buffer when a command has done its work is not lost without a word."""
+    script = (
+        "import quell.cli as cli; cli.main = lambda: print(1); import quell.__main__ as m; m.run()"
+    )
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-c", script]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert ended.returncode != 0
+    assert "No space left" in ended.stderr
 
 
 def test_every_public_name_can_be_had() -> None:

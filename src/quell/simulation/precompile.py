@@ -29,11 +29,12 @@ def precompile(loops: Sequence[Parts]) -> int:
     """Compile loops, or load them from the disk cache; return how many were compiled.
 
     If there are several to compile, a second process takes some of them, and this one loads their
-    code from the disk cache then. As always with ``multiprocessing``, that process imports the main
-    module: a script needs ``if __name__ == "__main__"``.
+    code from the disk cache then. This one begins at once and takes what takes longest; the second
+    one imports quell first and takes what takes least. As always with ``multiprocessing``, that
+    process imports the main module: a script needs ``if __name__ == "__main__"``.
     """
     missing = [parts for parts in _distinct(loops) if not _is_compiled(parts)]
-    todo = deque(missing)
+    todo = deque(sorted(missing, key=_size, reverse=True))
     with ExitStack() as stack:
         if len(missing) > 1 and cache_path() is not None and (os.cpu_count() or 1) > 1:
             stack.enter_context(_SecondProcess(todo))
@@ -68,6 +69,18 @@ def _distinct(loops: Sequence[Parts]) -> list[Parts]:
         model, state = plant.sampled(controller.dt), controller.initial_state()
         found.setdefault(layout_of((model, controller.parameters, state)), (plant, controller))
     return list(found.values())
+
+
+def _size(parts: Parts) -> int:
+    """Return the number of values in a loop's parameters and state, with which its code grows."""
+    plant, controller = parts
+    return _values(
+        (plant.sampled(controller.dt), controller.parameters, controller.initial_state())
+    )
+
+
+def _values(part: object) -> int:
+    return sum(map(_values, part)) if isinstance(part, tuple) else 1
 
 
 def _is_compiled(parts: Parts) -> bool:
@@ -119,3 +132,4 @@ def _serve(connection: Connection) -> None:
             with suppress(Exception):  # the first process meets it, too
                 _compile(parts)
             connection.send(None)
+    os._exit(0)  # all code is in the cache; Python would take half a second to clear its memory
