@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -308,6 +309,17 @@ run()
     assert ended.returncode == code
     assert ended.stdout.split() == ["result", "closed"]
     assert ("ZeroDivisionError" in ended.stderr) == (code == 1)
+
+
+def test_a_command_whose_reader_has_ended_does_its_work(tmp_path: Path) -> None:
+    """As after ``| head``: the file is written, nothing is printed as an error, and the code is 0."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "quell", "excite", "u.csv"]
+    ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert (tmp_path / "u.csv").stat().st_size > 1000
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a full disk")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from rich.console import Console
-
-from quell.cli.output import print_line
+from quell.cli.output import Console, print_line
 
 
 def confirm(console: Console, question: str, yes: bool) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
+import rich.console
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -28,6 +30,17 @@ T = TypeVar("T", bound=Outputs)
 
 COMPILING = "simulating (the first run compiles for some seconds)"
 """Label of a progress bar until the first samples are done."""
+
+
+class Console(rich.console.Console):
+    """The standard output; when its reader ends, as ``| head`` does, the work goes on silently."""
+
+    def on_broken_pipe(self) -> None:
+        """Print nothing any more: without this, rich ends the process."""
+        self.quiet = True
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 class Column(NamedTuple):

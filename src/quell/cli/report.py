@@ -7,11 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.markup import escape
 
 from quell.cli.options import Outputs
-from quell.cli.output import Column, print_line, table
+from quell.cli.output import Column, Console, print_line, table
 
 if TYPE_CHECKING:
     from quell.quantities import Signals

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.markup import escape
 
-from quell.cli.output import print_line, table
+from quell.cli.output import Console, print_line, table
 
 if TYPE_CHECKING:
     from quell.records.trajectory import Trajectory

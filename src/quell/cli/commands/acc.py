@@ -8,11 +8,17 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.markup import escape
 
 from quell.cli.options import OUTPUTS, MaxSize, Outputs, Switch, WholeOrNone
-from quell.cli.output import check_outputs, compile_loops, progress_bar, table, write_results
+from quell.cli.output import (
+    Console,
+    check_outputs,
+    compile_loops,
+    progress_bar,
+    table,
+    write_results,
+)
 from quell.reading import MAX_SIZE
 
 if TYPE_CHECKING:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from quell.cli.options import MaxSize, Overwrite, Trust, WholeOrNone
-from quell.cli.output import print_line
+from quell.cli.output import Console, print_line
 from quell.cli.records import measured
 from quell.reading import MAX_SIZE
 

@@ -7,8 +7,6 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from quell.cli.commands.compare_report import (
     as_json,
     print_gains,
@@ -17,7 +15,7 @@ from quell.cli.commands.compare_report import (
 )
 from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import OUTPUTS, Outputs, Trust, Whole
-from quell.cli.output import COMPILING, check_outputs, progress_bar, write_results
+from quell.cli.output import COMPILING, Console, check_outputs, progress_bar, write_results
 
 if TYPE_CHECKING:
     from quell.analysis import Certificate

@@ -7,9 +7,7 @@ from dataclasses import asdict
 from math import inf
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
-from quell.cli.output import table
+from quell.cli.output import Console, table
 
 if TYPE_CHECKING:
     from quell.experiments.compare import Benchmark, Comparison, Entry

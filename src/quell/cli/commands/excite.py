@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-
 from quell.cli.options import Overwrite, Whole
-from quell.cli.output import print_line
+from quell.cli.output import Console, print_line
 
 
 def excite(

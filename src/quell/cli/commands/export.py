@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich.console import Console
-
 from quell.cli.options import Overwrite, Switch, Trust
-from quell.cli.output import print_line
+from quell.cli.output import Console, print_line
 
 if TYPE_CHECKING:
     from quell.export import Comparison, Exported

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from quell.cli.options import OUTPUTS, MaxSize, Outputs, Whole, WholeOrNone
-from quell.cli.output import check_outputs, print_line, table, write_results
+from quell.cli.output import Console, check_outputs, print_line, table, write_results
 from quell.reading import MAX_SIZE
 
 if TYPE_CHECKING:

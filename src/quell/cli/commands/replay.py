@@ -5,10 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from rich.console import Console
-
 from quell.cli.options import RUN_OUTPUTS, MaxSize, RunOutputs, Trust
-from quell.cli.output import check_outputs, number, print_line, table, write_record, write_results
+from quell.cli.output import (
+    Console,
+    check_outputs,
+    number,
+    print_line,
+    table,
+    write_record,
+    write_results,
+)
 from quell.cli.report import print_outcome, save_run_figure
 from quell.reading import MAX_SIZE
 

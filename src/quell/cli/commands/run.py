@@ -5,11 +5,16 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-
 from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, Trust
-from quell.cli.output import COMPILING, check_outputs, progress_bar, write_record, write_results
+from quell.cli.output import (
+    COMPILING,
+    Console,
+    check_outputs,
+    progress_bar,
+    write_record,
+    write_results,
+)
 from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
 
 

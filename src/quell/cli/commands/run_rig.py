@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
-from rich.console import Console
 
 from quell.cli.exit_codes import ExitCode
 from quell.cli.interrupt import exit_on_signal
 from quell.cli.options import RUN_OUTPUTS, RunOutputs, Switch, Trust, WholeOrNone
-from quell.cli.output import check_outputs, print_line, table, write_record, write_results
+from quell.cli.output import Console, check_outputs, print_line, table, write_record, write_results
 from quell.cli.report import print_metrics, print_outcome, save_run_figure, windowed_metrics
 from quell.realtime.devices.registry import examples
 

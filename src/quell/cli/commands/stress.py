@@ -5,11 +5,18 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
-from rich.console import Console
 from rich.markup import escape
 
 from quell.cli.options import OUTPUTS, Outputs, Whole
-from quell.cli.output import check_outputs, number, progress_bar, table, write_results, yes_or_no
+from quell.cli.output import (
+    Console,
+    check_outputs,
+    number,
+    progress_bar,
+    table,
+    write_results,
+    yes_or_no,
+)
 
 if TYPE_CHECKING:
     from quell.experiments.stress.general.result import GeneralResult

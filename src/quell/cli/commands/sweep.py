@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
-from rich.console import Console
 
 from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import RUN_OUTPUTS, RunOutputs, Trust, Whole, WholeOrNone
 from quell.cli.output import (
     COMPILING,
+    Console,
     check_outputs,
     print_line,
     progress_bar,

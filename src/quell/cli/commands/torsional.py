@@ -5,13 +5,13 @@ from __future__ import annotations
 from itertools import product
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.markup import escape
 
 from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import OUTPUTS, Outputs, Whole
 from quell.cli.output import (
     Column,
+    Console,
     check_outputs,
     compile_loops,
     print_diverged,

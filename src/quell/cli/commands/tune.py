@@ -8,8 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from quell.cli.commands.run_rig import exit_code
 from quell.cli.commands.tune_sources import (
     RECORD_OPTIONS,
@@ -26,7 +24,7 @@ from quell.cli.commands.tune_sources import (
 )
 from quell.cli.exit_codes import ExitCode
 from quell.cli.options import OUTPUTS, Outputs, Trust, WholeOrNone
-from quell.cli.output import check_outputs, print_line, progress_bar, table, write_results
+from quell.cli.output import Console, check_outputs, print_line, progress_bar, table, write_results
 
 if TYPE_CHECKING:
     from quell.commissioning import Verification

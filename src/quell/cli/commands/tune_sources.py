@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
-from rich.console import Console
 
 from quell.cli.confirm import confirm
 from quell.cli.options import Switch, Whole
-from quell.cli.output import print_line
+from quell.cli.output import Console, print_line
 from quell.cli.records import measured
 
 if TYPE_CHECKING:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from quell.cli.exit_codes import exit_if_diverged
 from quell.cli.options import OUTPUTS, Outputs, Whole
 from quell.cli.output import (
     Column,
+    Console,
     check_outputs,
     compile_loops,
     print_diverged,
