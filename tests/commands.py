@@ -1,7 +1,9 @@
-"""Running the command line in tests."""
+"""Running the command line, and programs in an interpreter of their own, in tests."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any, NamedTuple
 
 import pytest
@@ -42,3 +44,9 @@ def in_this_process(
     except SystemExit as ended:
         code = int(ended.code or 0)
     return Shown(code, *capsys.readouterr())
+
+
+def run_python(code: str, check: bool = True, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a program in a fresh interpreter; what it prints is in the result."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, check=check, capture_output=True, text=True, **options)

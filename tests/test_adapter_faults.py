@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 import threading
 import time
@@ -16,6 +15,7 @@ import pytest
 import quell as ql
 from quell.types import Status
 
+from .commands import run_python
 from .contracts.python_models import (
     CHAIN,
     SHORT,
@@ -139,9 +139,7 @@ try:
 except KeyboardInterrupt:
     print("interrupted")
 """
-    shown = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120
-    )
+    shown = run_python(script, timeout=120)
     assert shown.stdout.strip() == "interrupted"
 
 

@@ -18,7 +18,7 @@ from quell.experiments.common.figures import save_figure
 from quell.identification import Identified
 from quell.kernels.compile_time import compile_time
 
-from .commands import Shown
+from .commands import Shown, run_python
 
 
 def test_help_and_version_answer(quell: Callable[..., Shown]) -> None:
@@ -263,7 +263,7 @@ def test_neither_importing_quell_nor_simulating_imports_what_it_does_not_need() 
         "unused = {'xarray', 'matplotlib', 'control', 'rich', 'pydantic'}\n"
         "print(sorted(unused & set(sys.modules)), 'numba' in sys.modules)\n"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ended = run_python(code)
     assert ended.stdout.splitlines() == ["[]", "[] True"]
 
 
@@ -275,7 +275,7 @@ def test_an_experiment_does_not_wait_for_the_others() -> None:
         "print([name for name in sys.modules if name.startswith(others)], end=' ')\n"
         "print(*(getattr(ql.experiments, name).__name__ for name in ql.experiments.__all__))\n"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ended = run_python(code)
     names = ("acc", "compare", "stress", "torsional", "two_mass_spring")
     assert ended.stdout.split() == ["[]", *(f"quell.experiments.{name}" for name in names)]
     with pytest.raises(AttributeError, match="has no attribute 'three_masses'"):
@@ -305,7 +305,7 @@ def main():
 quell.cli.main = main
 run()
 """
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    ended = run_python(script, check=False)
     assert ended.returncode == code
     assert ended.stdout.split() == ["result", "closed"]
     assert ("ZeroDivisionError" in ended.stderr) == (code == 1)

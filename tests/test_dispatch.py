@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +16,8 @@ from quell.controllers.base import control
 from quell.controllers.compiled_step import PackedController, entry_point, step_packed
 from quell.kernels import dispatch
 from quell.kernels.compile_time import compile_time
+
+from .commands import run_python
 
 pytestmark = pytest.mark.compiled
 
@@ -206,12 +206,7 @@ print(abs(runs[0]["y"] - runs[1]["y"]).max() < 1e-9, runs[0]["y"][-1])
     for rate in ("1.0", "30.0"):
         (tmp_path / "mine.py").write_text(module.replace("RATE", rate))
         environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
-        command = [sys.executable, "-c", script]
-        shown.append(
-            subprocess.run(
-                command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
-            ).stdout.split()
-        )
+        shown.append(run_python(script, cwd=tmp_path, env=environment).stdout.split())
     assert [agree for agree, _ in shown] == ["True", "True"]
     assert shown[0][1] != shown[1][1]
 
@@ -232,14 +227,8 @@ found = float(run["y"][-1]), controller.step(1.0, 0.25)
     with monkeypatch.context() as patch:
         patch.setattr(dispatch, "interpret_all", True)
         exec(script, given)
-    shown = subprocess.run(
-        [sys.executable, "-c", script + "print(*found)"],
-        cwd=tmp_path,
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    shown = run_python(script + "print(*found)", cwd=tmp_path, env=environment).stdout
     assert tuple(map(float, shown.split())) == given["found"]
 
 

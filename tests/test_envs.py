@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import subprocess
-import sys
 import warnings
 from dataclasses import replace
 from typing import Any
@@ -24,6 +22,8 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from quell.envs import Env, Policy, VectorEnv  # noqa: E402
 from quell.envs.registration import NAMES  # noqa: E402
+
+from .commands import run_python  # noqa: E402
 
 DT, U_MAX = 0.01, 4.0
 NOISY = ql.Scenario(
@@ -362,7 +362,7 @@ def test_without_gymnasium_the_error_names_the_extra() -> None:
         "try: quell.envs.Env\n"
         "except ImportError as error: print(error)\n"
     )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    shown = run_python(code)
     assert "pip install 'quell[envs]'" in shown.stdout
 
 
@@ -374,6 +374,6 @@ def test_gymnasium_finds_the_environments_by_their_module() -> None:
         "many = gymnasium.make_vec('quell/two-mass-v0', num_envs=2)\n"
         "print(env.unwrapped.action_space.shape, many.action_space.shape)\n"
     )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    shown = run_python(code)
     assert shown.stdout == "(1,) (2, 1)\n"
     assert not shown.stderr

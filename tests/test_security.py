@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import ast
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import quell
+
+from .commands import run_python
 
 ROOT = Path(quell.__file__).parent
 # Modules that run code which data holds.
@@ -36,9 +36,7 @@ print(json.dumps([during, sorted(set(seen))]))
 
 def test_importing_every_module_touches_no_network_and_starts_or_unpickles_nothing() -> None:
     """In a fresh interpreter, as Python itself reports it; the same hook sees each of these."""
-    done = subprocess.run(
-        [sys.executable, "-c", AUDIT], capture_output=True, text=True, check=True, timeout=120
-    )
+    done = run_python(AUDIT, timeout=120)
     during, control = json.loads(done.stdout)
     assert during == []
     assert {"pickle.find_class", "socket.__new__", "subprocess.Popen"} <= set(control)
