@@ -13,7 +13,7 @@ def run() -> None:
     Python would clear its memory first. With compiled code in it that takes up to a second, in
     which a user waits for nothing; the operating system takes the memory back at once.
     """
-    code: int = 1  # of an error with a traceback
+    code = 1  # of an error with a traceback
 
     def end() -> None:
         try:

@@ -34,7 +34,7 @@ def precompile(loops: Sequence[Parts]) -> int:
     process imports the main module: a script needs ``if __name__ == "__main__"``.
     """
     missing = [parts for parts in _distinct(loops) if not _is_compiled(parts)]
-    todo = deque(sorted(missing, key=_size, reverse=True))
+    todo = deque(sorted(missing, key=lambda parts: _size(_arguments(parts)), reverse=True))
     with ExitStack() as stack:
         if len(missing) > 1 and cache_path() is not None and (os.cpu_count() or 1) > 1:
             stack.enter_context(_SecondProcess(todo))
@@ -65,22 +65,20 @@ def _short(controller: Controller) -> Scenario:
 def _distinct(loops: Sequence[Parts]) -> list[Parts]:
     """Return the loops without those whose code is that of an earlier one."""
     found: dict[object, Parts] = {}
-    for plant, controller in loops:
-        model, state = plant.sampled(controller.dt), controller.initial_state()
-        found.setdefault(layout_of((model, controller.parameters, state)), (plant, controller))
+    for parts in loops:
+        found.setdefault(layout_of(_arguments(parts)), parts)
     return list(found.values())
 
 
-def _size(parts: Parts) -> int:
-    """Return the number of values in a loop's parameters and state, with which its code grows."""
+def _arguments(parts: Parts) -> tuple[object, ...]:
+    """Return the parameters and the state of a loop, for whose types it is compiled."""
     plant, controller = parts
-    return _values(
-        (plant.sampled(controller.dt), controller.parameters, controller.initial_state())
-    )
+    return plant.sampled(controller.dt), controller.parameters, controller.initial_state()
 
 
-def _values(part: object) -> int:
-    return sum(map(_values, part)) if isinstance(part, tuple) else 1
+def _size(part: object) -> int:
+    """Return the number of values in parameters and state of a loop, with which its code grows."""
+    return sum(map(_size, part)) if isinstance(part, tuple) else 1
 
 
 def _is_compiled(parts: Parts) -> bool:
