@@ -19,20 +19,15 @@ from .test_controllers import CONTROLLERS, PLANTS
 SHORT = dataclasses.replace(SCENARIO, duration=2.0, rest_at=(1.5,))
 
 
-def single_run(plant: Any, controller: Any, scenario: ql.Scenario = SHORT) -> ql.Trajectory:
-    """Return a run in single precision; its state and u are single throughout, and finite."""
-    run = ql.simulate(plant, in_single_precision(controller), scenario)
+def check_single(plant: Any, controller: Any, tolerance: float) -> None:
+    """Its state and u are single throughout; u is that of double precision within ``tolerance``."""
+    single = in_single_precision(controller)
+    double = ql.simulate(plant, controller, SHORT)
+    run = ql.simulate(plant, single, SHORT)
     for name, array in named_arrays(run.final_state).items():
         assert array.dtype != np.float64, f"{name} is double"
     assert np.all(np.isfinite(run.log))
     assert np.array_equal(run["u"], run["u"].astype(np.float32)), "u is double"
-    return run
-
-
-def check_single(plant: Any, controller: Any, tolerance: float) -> None:
-    """Its state and u are single throughout; u is that of double precision within ``tolerance``."""
-    double = ql.simulate(plant, controller, SHORT)
-    run = single_run(plant, controller)
     assert run.status == double.status
     deviation = run["u"] - double["u"]
     assert np.any(deviation != 0.0), "single precision has the bits of double precision"
@@ -65,15 +60,3 @@ def test_a_learner_in_single_precision_learns_what_it_does_in_double(name: str) 
     """
     observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.1, dt=0.01)
     check_single(CHAIN, ql.ADRC(observer, 1.5, learner=LEARNERS[name]), 1e-4)
-
-
-@pytest.mark.compiled
-def test_a_compiled_guarded_loop_stays_in_single_precision() -> None:
-    """A quotient of integers is a double only where it is compiled; on a target it takes dozens of instructions.
-
-    What a guard allows is not compared: a difference in the last digit may decide between two.
-    """
-    observer = ql.ESO.model_free(order=2, b0=1.5, omega_o=12.1, dt=0.01)
-    controller = ql.ADRC(observer, 1.5, learner=ql.learners.Kalman(), guard=ql.Guard())
-    run = single_run(CHAIN, controller, dataclasses.replace(SCENARIO, duration=20.0))
-    assert run["authority"].max() == 1.0
