@@ -20,6 +20,7 @@ from quell.experiments.stress.general.cross_entropy import search
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop, loads, references
 from quell.experiments.stress.general.loops.plant import GeneralPlant
 from quell.experiments.stress.general.loops.random_plants import FAMILIES
+from quell.experiments.stress.general.measures import Measures
 from quell.experiments.stress.general.named import Case, perfect_case
 from quell.experiments.stress.general.program import INPUTS, Program, Watched
 from quell.experiments.stress.general.result import GeneralResult
@@ -265,6 +266,26 @@ def test_a_loop_is_fragile_if_u_hardly_suffices_for_the_load() -> None:
         assert trial.is_fragile(limited, plain) == fragile
 
 
+def test_another_draw_changes_the_noise_only() -> None:
+    """Reference and load are the same; the noise has the same size."""
+    loop = one("friction", 2, seed=8)
+    (r, w, noise), (r_other, w_other, other) = loop.tables, replace(loop, draw=1).tables
+    assert np.array_equal(r, r_other)
+    assert np.array_equal(w, w_other)
+    assert abs(np.corrcoef(noise, other)[0, 1]) < 0.1
+    assert np.std(other) == pytest.approx(np.std(noise), rel=0.1)
+
+
+@pytest.mark.usefixtures("short_runs")
+def test_other_noise_moves_the_ratios_of_mf_eso_a_little() -> None:
+    """In a loop without friction; a loop that is lost with it counts as lost."""
+    found = trial.run_one(8, 1, "Kalman", None, honest=True)
+    again = found.of_other_noise
+    assert again.kind == trial.OTHER_NOISE
+    assert 0.0 < abs(again.rms - 1.0) < 0.05
+    assert outcome(other_noise=Measures(*[math.nan] * 4)).of_other_noise.lost
+
+
 def outcome(**fields: Any) -> GeneralOutcome:
     """Return an outcome with all ratios one, but for the given fields."""
     usual: dict[str, Any] = {
@@ -272,6 +293,7 @@ def outcome(**fields: Any) -> GeneralOutcome:
         **{"family": "stable", "order": 2, "load": "sine", "reference": "steps", "level": 0.0},
         **{"margin": 0.5, "plain_lost": False, "fragile": False, "lost": False},
         **{"rms": 1.0, "peak": 1.0, "window": 1.0, "late": 1.0},
+        "other_noise": Measures(1.0, 1.0, 1.0, 1.0),
     }
     return GeneralOutcome(**(usual | fields))
 
@@ -295,6 +317,7 @@ def test_bars_count_healthy_loops_only() -> None:
     assert json.loads(json.dumps(found)) == found
     assert found["hostile"]["runs"] == 2
     assert found["left_out"] == {"low_margin": 1, "plain_lost": 1, "fragile": 1, "lost": 1}
+    assert {bar.other_noise for bar in result.bars()} == {0.0, 1.0, None}
     lost = outcome(lost=True, rms=math.nan, peak=math.nan, window=math.nan, late=math.nan)
     assert not GeneralResult({}, [lost], []).bars()[0].met
 

@@ -132,15 +132,16 @@ def _print_general(console: Console, result: GeneralResult, guarded: bool) -> No
         worse = number(found["worse"], ".3f")
         rows.add_row(escape(label), str(found["runs"]), lost, *cells, worse)
     console.print(rows)
-    bars = table("Bars", "over", "measure", "figure", "bar", "met", left=2)
+    bars = table("Bars", "over", "measure", "figure", "bar", "met", "other\nnoise", left=2)
     for bar in result.bars():
-        figure = number(bar.figure, ".4g")
-        bars.add_row(
-            escape(bar.over), escape(bar.measure), figure, f"{bar.bar:g}", yes_or_no(bar.met)
-        )
+        figure, other = (number(x, ".4g") for x in (bar.figure, bar.other_noise))
+        met = yes_or_no(bar.met)
+        bars.add_row(escape(bar.over), escape(bar.measure), figure, f"{bar.bar:g}", met, other)
     console.print(bars)
     why = result.left_out
     console.print(
+        "Other noise: MF-ESO itself, with another draw of the same noise, over MF-ESO: what chance "
+        "alone does to a figure.\n"
         f"Not counted: {why['low_margin']} runs with a lower margin, {why['plain_lost']} in which "
         f"MF-ESO is lost, {why['fragile']} in which it hardly holds within the limits of u; "
         f"{why['lost']} of these are lost.\n"

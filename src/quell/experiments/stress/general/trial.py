@@ -7,6 +7,9 @@ of u the margin of the linear part says little: a loop in which MF-ESO itself ha
 *fragile*, and does not count: with limits that are 20 % lower it is lost, or has measures 1.5 times
 as large.
 
+How much of a ratio is chance is what MF-ESO itself shows with another draw of the same noise: where
+friction holds a plant or lets it slip, or limits of u hardly suffice, this decides which happens.
+
 Seeds below 10 000 are for tuning; seeds from 1 000 000 on are for judging, and are looked at once.
 """
 
@@ -30,6 +33,7 @@ from quell.simulation.simulate import simulate
 
 HEALTHY = 0.35
 """Least modulus margin of the loops for which the bars hold."""
+OTHER_NOISE = "MF-ESO, other noise"
 HONEST: dict[str, Learner] = {"Harmonic": Harmonic(), "Kalman": Kalman()}
 # What tells fragile loops: share of the limits, and ratio to the measures with the full limits.
 # Chosen by hand; with the first guard all saturated loops with ratios above 8 were fragile.
@@ -62,11 +66,19 @@ class GeneralOutcome:
     peak: float
     window: float
     late: float
+    other_noise: Measures  #: MF-ESO with another draw of the noise, over MF-ESO; NaN if it is lost
 
     @property
     def healthy(self) -> bool:
         """Whether the bars hold for its loop."""
         return self.margin >= HEALTHY and not (self.plain_lost or self.fragile)
+
+    @property
+    def of_other_noise(self) -> GeneralOutcome:
+        """The outcome of MF-ESO with another draw of the noise, in place of the learner's."""
+        measured = self.other_noise
+        lost = math.isnan(measured.rms) and not self.plain_lost
+        return replace(self, kind=OTHER_NOISE, learner="", lost=lost, **measured._asdict())
 
 
 def error_of(loop: GeneralLoop, learner: Learner | None, guard: Guard | None) -> Measures | None:
@@ -98,9 +110,7 @@ def run_one(
     learner = HONEST[kind] if honest else draw_attack(kind, rng, loop, guard)
     plain = error_of(loop, None, None)
     learned = None if plain is None else error_of(loop, learner, guard)
-    ratios = Measures(*[np.nan] * 4)
-    if plain is not None and learned is not None:
-        ratios = learned.over(plain)
+    again = None if plain is None else error_of(replace(loop, draw=1), None, None)
     return GeneralOutcome(
         kind=kind,
         honest=honest,
@@ -116,11 +126,16 @@ def run_one(
         plain_lost=plain is None,
         fragile=plain is not None and is_fragile(loop, plain),
         lost=learned is None and plain is not None,
-        rms=ratios.rms,
-        peak=ratios.peak,
-        window=ratios.window,
-        late=ratios.late,
+        **_over(learned, plain)._asdict(),
+        other_noise=_over(again, plain),
     )
+
+
+def _over(measured: Measures | None, plain: Measures | None) -> Measures:
+    """Return the ratios to those of MF-ESO; NaN if one of the two is lost."""
+    if measured is None or plain is None:
+        return Measures(*[math.nan] * 4)
+    return measured.over(plain)
 
 
 def run_all(

@@ -64,6 +64,7 @@ class GeneralLoop:
     amplitude: float  #: varying part of the load
     omega: float  #: frequency of the load
     seed: int
+    draw: int = 0  #: which draw of the measurement noise; all else is the same
 
     @property
     def lag(self) -> float:
@@ -92,7 +93,7 @@ class GeneralLoop:
             start=start,
             lag=self.lag,
         )
-        return r, w, self.noise * rng.standard_normal(t.size)
+        return r, w, self.noise * rng.standard_normal((self.draw + 1, t.size))[-1]
 
     @property
     def scenario(self) -> Scenario:
