@@ -250,6 +250,7 @@ def test_a_search_for_frequencies_counts_its_entries_without_end() -> None:
     harmonic = ql.learners.Harmonic(search=True)
     single = in_single_precision(ql.ADRC(ORDER_2, 1.5, learner=harmonic))
     design, memory = single.parameters.controller.learner.search, single.initial_state().learner
+    design = design._replace(follow=np.float32(1.0))
     loop = memory.search.loop[0]
     start = 8192.0 * ENTRIES - 2.0
     loop.stage, loop.entries, loop.newest, loop.window = 1.0, start, start - 8.0, 32.0

@@ -63,11 +63,12 @@ from quell.types import Matrix, Vector
 
 # Least share of f that counts as unexplained by a linear model; chosen by hand, not tuned further.
 _UNEXPLAINED_SHARE = 0.1
-# Variance of amplitudes that are to be learned anew, in units of R: they may be 10⁴ times what is
-# unexplained. Chosen by hand: a hundred times less delays the result, more changes nothing. In
-# single precision P then shrinks to less than what rounding leaves of the difference, and θ is
-# lost; with 10⁴ it was not in three loops.
-_UNKNOWN, _UNKNOWN_SINGLE = 1e8, 1e4
+# Variance of amplitudes that are to be learned anew, in units of R: they may be 10³ times what is
+# unexplained. Chosen by hand on `benchmarks/close_frequencies.py`: with 10⁴ the result is late;
+# with 10⁸ two near sinusoids are learned so quickly that their difference explains anything, and a
+# loop was at 15 times MF-ESO's error for ten seconds. In single precision P shrinks to less than
+# what rounding leaves of the difference, and θ is lost; with 10⁴ it was not in three loops.
+_UNKNOWN, _UNKNOWN_SINGLE = 1e6, 1e4
 
 
 class KalmanDesign(NamedTuple):

@@ -6,7 +6,9 @@ because each oscillator follows all of them. A least-squares fit over a window s
 a fraction of the beat. Its input is f_plain, the estimate of an ESO without learner, whose
 frequencies are those of the load whatever the learner feeds forward.
 
-* f_plain is averaged over entries of ``2/omega_o``, of which the last 512 are kept.
+* f_plain passes a first-order lag of ``1/omega_c``, because f shows the loop's quick motion more
+  than y does: without the lag, transients of learner and loop cover a slow load. It is averaged
+  over entries of ``2/omega_o``, of which the last 512 are kept.
 * A search begins with the shortest window and no sinusoid. It looks for the strongest line in what
   is left (*scan*), adds it, fits all frequencies (*fit*, ``line_fit.py``), and so on: relaxation
   after Li & Stoica, *Efficient mixed-spectrum estimation with applications to target feature
@@ -68,7 +70,7 @@ _GOOD, _CERTAIN, _GOOD_ORDERS = 0.02, 0.005, 0.1
 _LEAST_LEFT = 1e-3
 # Shortest window whose frequencies are used, in units of 1/omega_c: transients of the loop, also
 # those that a learner causes, last some ten.
-_LOOP_TIMES = 20.0
+_LOOP_TIMES = 16.0
 # Numbers of entries are counted up to this, and then are less by a multiple of the ring's length:
 # in single precision a count ends at 2²⁴.
 _WRAP = 4096.0 * ENTRIES
@@ -94,6 +96,7 @@ def frequency_search(observer: ESO, omega_c: float, oscillators: Oscillators) ->
         lines=lines,
         spacing=float(spacing),
         step=step,
+        follow=-math.expm1(-omega_c * observer.dt),
         rows=math.ceil(ENTRIES / spacing),
         good=_GOOD_ORDERS if several else _GOOD,
         certain=_GOOD_ORDERS if several else _CERTAIN,
@@ -172,7 +175,10 @@ def _advance(search: FrequencySearch, memory: SearchMemory, f_plain: float, omeg
     if not abs(f_plain) < (_ABSURD_SINGLE if is_single(search.step) else _ABSURD):
         start_search_again(search, memory)
         return NOTHING
-    loop.total += f_plain
+    if loop.entries == 0.0 and loop.samples == 0.0:
+        loop.late = f_plain
+    loop.late += search.follow * (f_plain - loop.late)
+    loop.total += loop.late
     loop.samples += 1.0
     if loop.samples >= search.spacing:
         memory.past[int(loop.entries) % ENTRIES] = loop.total / loop.samples
