@@ -1,6 +1,6 @@
 """Loads that are periodic but not sinusoidal: square, triangle and sawtooth waves.
 
-    python benchmarks/periodic_loads.py [--loops 8] [--seed 1]
+    python benchmarks/periodic_loads.py [--loops 32] [--seed 1]
 
 The plant is ``y'' = u − y'/2 + w``; the loop has dt = 5 ms, a model-free ESO of 20 rad/s with b0
 wrong by a factor in [0.7, 1.4], omega_c = 4 rad/s, and noise of 1e-12 held for 10 ms. The load of
@@ -71,7 +71,7 @@ def late_error(load: Signal, b0: float, seed: int, learner: Learner | None, guar
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--loops", type=int, default=8)
+    parser.add_argument("--loops", type=int, default=32)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     table = Table("load", "learner", "median", "largest", "guarded: median", "largest")

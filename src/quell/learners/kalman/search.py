@@ -7,8 +7,9 @@ a fraction of the beat. Its input is f_plain, the estimate of an ESO without lea
 frequencies are those of the load whatever the learner feeds forward.
 
 * f_plain passes a first-order lag of ``1/omega_c``, because f shows the loop's quick motion more
-  than y does: without the lag, transients of learner and loop cover a slow load. It is averaged
-  over entries of ``2/omega_o``, of which the last 512 are kept.
+  than y does: without the lag, transients of learner and loop cover a slow load. A search for
+  several orders has no lag: the higher ones tell the frequency best. The result is averaged over
+  entries of ``2/omega_o``, of which the last 512 are kept.
 * A search begins with the shortest window and no sinusoid. It looks for the strongest line in what
   is left (*scan*), adds it, fits all frequencies (*fit*, ``line_fit.py``), and so on: relaxation
   after Li & Stoica, *Efficient mixed-spectrum estimation with applications to target feature
@@ -96,7 +97,7 @@ def frequency_search(observer: ESO, omega_c: float, oscillators: Oscillators) ->
         lines=lines,
         spacing=float(spacing),
         step=step,
-        follow=-math.expm1(-omega_c * observer.dt),
+        follow=1.0 if several else -math.expm1(-omega_c * observer.dt),
         rows=math.ceil(ENTRIES / spacing),
         good=_GOOD_ORDERS if several else _GOOD,
         certain=_GOOD_ORDERS if several else _CERTAIN,

@@ -27,7 +27,7 @@ class FrequencySearch(NamedTuple):
     lines: Buffer  # frequencies of a scan [rad/entry] (K,)
     spacing: float  # samples of an entry
     step: float  # duration of an entry [s]
-    follow: float  # share by which a lag of 1/omega_c follows in a sample
+    follow: float  # share by which the lag of 1/omega_c follows in a sample, 1 without
     rows: int  # entries of a pass in each sample
     good: float  # share of the variance that a fit may leave which is continued
     certain: float  # the same for a fit whose frequencies are used
@@ -39,7 +39,7 @@ class FrequencySearch(NamedTuple):
 class SearchLoop(Scalars):
     """Scalars of the search."""
 
-    late: float  # f_plain through a lag of 1/omega_c
+    late: float  # f_plain through that lag
     total: float  # sum of that over the samples of the entry that is not complete
     samples: float  # their number
     entries: float  # number of complete entries
