@@ -315,7 +315,8 @@ def test_bars_count_healthy_loops_only() -> None:
     }
     found = result.to_json()
     assert json.loads(json.dumps(found)) == found
-    assert found["hostile"]["runs"] == 2
+    assert found["hostile"]["runs"] == found["hostile_other_noise"]["runs"] == 2
+    assert found["worst"][0]["other_noise"]["peak"] == 1.0
     assert found["left_out"] == {"low_margin": 1, "plain_lost": 1, "fragile": 1, "lost": 1}
     assert {bar.other_noise for bar in result.bars()} == {0.0, 1.0, None}
     lost = outcome(lost=True, rms=math.nan, peak=math.nan, window=math.nan, late=math.nan)

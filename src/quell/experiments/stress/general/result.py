@@ -126,15 +126,24 @@ class GeneralResult:
             "bars": [{**bar._asdict(), "met": bar.met} for bar in self.bars()],
             **{name: summary(group) for name, group in groups.items()},
             **{
+                f"{name}_other_noise": summary([o.of_other_noise for o in group])
+                for name, group in groups.items()
+            },
+            **{
                 f"{name}_by_{by}": {
                     key: summary(some) for key, some in self.grouped(group, by).items()
                 }
                 for name, group in groups.items()
                 for by in ("kind", "family", "load", "reference", "order")
             },
-            "worst": [nonfinite_to_none(asdict(outcome)) for outcome in worst[:_WORST_LISTED]],
+            "worst": [_to_json(outcome) for outcome in worst[:_WORST_LISTED]],
             "cases": [nonfinite_to_none(asdict(case)) for case in self.cases],
         }
+
+
+def _to_json(outcome: GeneralOutcome) -> Any:
+    """Return a dictionary for ``json.dump``."""
+    return nonfinite_to_none({**asdict(outcome), "other_noise": outcome.other_noise._asdict()})
 
 
 def _look_up(found: Mapping[str, Any], key: str) -> float | None:
