@@ -9,7 +9,7 @@ import quell as ql
 from quell.learners.kalman import search as room
 from quell.learners.kalman.oscillators import Oscillators
 from quell.learners.kalman.search import advance_search, is_locked, start_search_again
-from quell.learners.kalman.search_state import ENTRIES, FIT, SCAN, SearchMemory
+from quell.learners.kalman.search_state import ENTRIES, FIT, SCAN, FrequencySearch, SearchMemory
 from quell.learners.kalman.search_verdict import (
     ADOPT,
     LEARN_ANEW,
@@ -22,7 +22,10 @@ from quell.types import Vector
 DT, STEP = 0.01, 0.1
 TRUTH = np.array([6.0, 9.0])
 OSCILLATORS = Oscillators(0, np.array([1.0, 3.0]), 0.5, 20.0, np.ones(1))
-SEARCH = room.frequency_search(ql.ESO.model_free(1, 1.0, 20.0, DT), 4.0, OSCILLATORS)
+ONE = Oscillators(0, np.array([1.0]), 0.5, 20.0, np.ones(1))
+OBSERVER = ql.ESO.model_free(1, 1.0, 20.0, DT)
+LAGGED = room.frequency_search(OBSERVER, 4.0, OSCILLATORS)
+SEARCH = LAGGED._replace(follow=1.0)  # f_plain itself, without the lag of 1/omega_c
 
 
 def load(k: int, omega: Vector = TRUTH) -> float:
@@ -53,13 +56,38 @@ def test_an_entry_is_a_mean_and_lasts_two_lags_of_a_pole() -> None:
     assert (SEARCH.spacing, SEARCH.step, SEARCH.rows) == (10.0, pytest.approx(STEP), 52)
     assert SEARCH.lines[[0, -1]] == pytest.approx([0.05, 2.0])
     np.testing.assert_allclose(SEARCH.lines[1:] / SEARCH.lines[:-1], 40.0 ** (1.0 / 63.0))
-    assert SEARCH.shortest == pytest.approx(20.0 / (4.0 * STEP))
+    assert SEARCH.shortest == pytest.approx(16.0 / (4.0 * STEP))
     memory, omega = started()
     searched(memory, omega, range(57))
     assert memory.past[:5] == pytest.approx(
         [np.mean([load(k) for k in range(10 * i, 10 * i + 10)]) for i in range(5)]
     )
     assert memory.loop[0].total == pytest.approx(sum(load(k) for k in range(50, 57)))
+
+
+def test_a_search_for_one_order_sees_f_plain_through_a_lag_of_the_loop() -> None:
+    """A first-order lag of 1/omega_c that begins at the first sample; with several orders there is none."""
+    memory, omega = started()
+    late, seen = load(0), []
+    for k in range(20):
+        advance_search(LAGGED, memory, load(k), omega)
+        late += -np.expm1(-4.0 * DT) * (load(k) - late)
+        seen.append(late)
+    assert memory.past[:2] == pytest.approx([np.mean(seen[:10]), np.mean(seen[10:])])
+    several = OSCILLATORS._replace(orders=np.array([1.0, 3.0]))
+    assert room.frequency_search(OBSERVER, 4.0, several).follow == 1.0
+
+
+@pytest.mark.parametrize(("search", "found"), [(LAGGED, True), (SEARCH, False)])
+def test_the_lag_shows_a_slow_load_under_quick_motion(search: FrequencySearch, found: bool) -> None:
+    """A fifth of the load's amplitude, at ten times its frequency."""
+    memory = room.search_memory(search, ONE)
+    omega = ONE.omega.copy()
+    for k in range(1200):
+        f_plain = np.sin(1.6 * DT * k) + 0.2 * np.sin(16.0 * DT * k)
+        advance_search(search, memory, f_plain, omega)
+    assert is_locked(search, memory, 0) == found
+    assert (abs(omega[0] - 1.6) < 0.016) == found
 
 
 def test_a_scan_correlates_what_is_left_with_all_lines() -> None:
@@ -88,9 +116,9 @@ def test_frequencies_are_adopted_from_a_window_that_resolves_them_and_it_grows()
     """Exactly, without noise; the deviation is that of the least squares, for 1/1000 of the variance."""
     memory, omega = started()
     results = searched(memory, omega, range(700))
-    assert results[0] == (LEARN_ANEW, 506, 50.0, 50.0)
-    # Two passes of a fit and a check; each takes a sample for its 51 rows, and one to conclude.
-    assert [each[:2] for each in results[1:3]] == [(ADOPT, 512), (ADOPT, 518)]
+    assert results[0] == (LEARN_ANEW, 410, 40.0, 41.0)
+    # Two passes of a fit and a check; each takes a sample for its 41 rows, and one to conclude.
+    assert [each[:2] for each in results[1:3]] == [(ADOPT, 416), (ADOPT, 422)]
     np.testing.assert_allclose(omega, TRUTH, rtol=1e-9)
     assert all(window in (entries, entries - 1.0) for _, _, window, entries in results)
     assert is_locked(SEARCH, memory, 0)
@@ -100,10 +128,10 @@ def test_frequencies_are_adopted_from_a_window_that_resolves_them_and_it_grows()
     while not is_locked(SEARCH, memory, 0):
         searched(memory, omega, range(k, k + 1))
         k += 1
-    times = -np.arange(50.0)
-    values = memory.past[49::-1]
+    times = -np.arange(40.0)
+    values = memory.past[39::-1]
     phase = [np.outer(times, TRUTH[i : i + 1] * STEP)[:, 0] for i in range(2)]
-    columns = [np.ones(50)] + [f(p) for p in phase for f in (np.sin, np.cos)]
+    columns = [np.ones(40)] + [f(p) for p in phase for f in (np.sin, np.cos)]
     (_, *pairs), *_ = np.linalg.lstsq(np.column_stack(columns), values, rcond=None)
     for i, p in enumerate(phase):
         columns.append(times * (pairs[2 * i] * np.cos(p) - pairs[2 * i + 1] * np.sin(p)))
@@ -199,7 +227,7 @@ def test_a_frequency_is_resolved_by_a_window_that_is_long_enough() -> None:
 def test_the_strongest_line_that_the_window_contains_is_added_without_amplitudes() -> None:
     """A whole period of it; the line is that of the lowest order, and others keep their amplitudes."""
     oscillators = OSCILLATORS._replace(orders=np.array([2.0, 5.0]))
-    search = room.frequency_search(ql.ESO.model_free(1, 1.0, 20.0, DT), 4.0, oscillators)
+    search = room.frequency_search(OBSERVER, 4.0, oscillators)
     memory = room.search_memory(search, oscillators)
     memory.loop[0].found, memory.loop[0].window = 1.0, 40.0
     memory.fit.amplitude[:] = 1.0

@@ -18,7 +18,6 @@ from quell.learners.kalman.line_fit import (
     write_deviations,
 )
 from quell.learners.kalman.oscillators import Oscillators, retune, turn_phases
-from quell.learners.kalman.search import advance_search
 
 pytestmark = pytest.mark.compiled
 
@@ -147,20 +146,6 @@ def test_sinusoids_closer_than_a_line_width_are_separated_by_the_search() -> Non
     np.testing.assert_allclose(np.sort(run.final_state.learner.omega), (0.5, 0.6), rtol=2e-3)
     late = run.window(73.0, 100.0)
     assert np.max(np.abs(run["y"][late])) < 0.02 * np.max(np.abs(without["y"][late]))
-
-
-@pytest.mark.parametrize("lagged", [True, False])
-def test_the_search_finds_a_slow_load_under_quick_motion(lagged: bool) -> None:
-    """A fifth of its amplitude at ten times its frequency: f_plain through a lag of 1/omega_c shows the load."""
-    harmonic = ql.learners.Harmonic(search=True)
-    controller = ql.ADRC(ql.ESO.model_free(2, 1.0, 10.0, 0.02), omega_c=1.0, learner=harmonic)
-    design = controller.parameters.learner.search
-    design = design if lagged else design._replace(follow=1.0)
-    memory = controller.initial_state().learner
-    for t in 0.02 * np.arange(2000):
-        f_plain = math.sin(0.4 * t) + 0.2 * math.sin(4.0 * t)
-        advance_search(design, memory.search, f_plain, memory.omega)
-    assert (abs(memory.omega[0] - 0.4) < 4e-3) == lagged
 
 
 def test_a_fit_finds_frequencies_amplitudes_and_their_deviations() -> None:
