@@ -15,6 +15,7 @@ import pytest
 
 import quell as ql
 from quell.analysis import analyse
+from quell.cli.commands.stress import _figure
 from quell.experiments.stress.general import attacks, measures, named, trial
 from quell.experiments.stress.general.cross_entropy import search
 from quell.experiments.stress.general.loops import GeneralLoop, draw_loop, loads, references
@@ -23,7 +24,7 @@ from quell.experiments.stress.general.loops.random_plants import FAMILIES
 from quell.experiments.stress.general.measures import Measures
 from quell.experiments.stress.general.named import Case, perfect_case
 from quell.experiments.stress.general.program import INPUTS, Program, Watched
-from quell.experiments.stress.general.result import GeneralResult
+from quell.experiments.stress.general.result import Bar, GeneralResult
 from quell.experiments.stress.general.trial import GeneralOutcome
 from quell.kernels.dispatch import call_specialised, compiled, interpreted
 from quell.learners.base import adapt, commit, predict
@@ -321,6 +322,12 @@ def test_bars_count_healthy_loops_only() -> None:
     assert {bar.other_noise for bar in result.bars()} == {0.0, 1.0, None}
     lost = outcome(lost=True, rms=math.nan, peak=math.nan, window=math.nan, late=math.nan)
     assert not GeneralResult({}, [lost], []).bars()[0].met
+
+
+def test_a_figure_beyond_its_bar_is_not_printed_as_equal_to_it() -> None:
+    """With four digits; with eight where these would hide it."""
+    shown = [_figure(Bar("", "", figure, 1.0)) for figure in (1.0000015, 1.0, 1.23456, None)]
+    assert shown == ["1.0000015", "1", "1.235", "–"]
 
 
 @pytest.mark.usefixtures("short_runs")

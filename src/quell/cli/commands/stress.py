@@ -19,7 +19,7 @@ from quell.cli.output import (
 )
 
 if TYPE_CHECKING:
-    from quell.experiments.stress.general.result import GeneralResult
+    from quell.experiments.stress.general.result import Bar, GeneralResult
     from quell.experiments.stress.study import Result
 
 _HEADINGS = (
@@ -112,6 +112,12 @@ def _print(console: Console, result: Result, guarded: bool) -> None:
     )
 
 
+def _figure(bar: Bar) -> str:
+    """Return a figure with four digits; with eight, if four hide that it exceeds the bar."""
+    exceeds = bar.figure is not None and bar.figure > bar.bar >= float(f"{bar.figure:.4g}")
+    return number(bar.figure, ".8g" if exceeds else ".4g")
+
+
 def _print_general(console: Console, result: GeneralResult, guarded: bool) -> None:
     from quell.experiments.stress.general.result import summary
     from quell.experiments.stress.general.trial import HEALTHY
@@ -134,9 +140,8 @@ def _print_general(console: Console, result: GeneralResult, guarded: bool) -> No
     console.print(rows)
     bars = table("Bars", "over", "measure", "figure", "bar", "met", "other\nnoise", left=2)
     for bar in result.bars():
-        figure, other = (number(x, ".4g") for x in (bar.figure, bar.other_noise))
-        met = yes_or_no(bar.met)
-        bars.add_row(escape(bar.over), escape(bar.measure), figure, f"{bar.bar:g}", met, other)
+        cells = [_figure(bar), f"{bar.bar:g}", yes_or_no(bar.met), number(bar.other_noise, ".4g")]
+        bars.add_row(escape(bar.over), escape(bar.measure), *cells)
     console.print(bars)
     why = result.left_out
     console.print(
