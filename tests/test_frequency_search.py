@@ -22,7 +22,7 @@ from quell.types import Vector
 DT, STEP = 0.01, 0.1
 TRUTH = np.array([6.0, 9.0])
 OSCILLATORS = Oscillators(0, np.array([1.0, 3.0]), 0.5, 20.0, np.ones(1))
-ONE = Oscillators(0, np.array([1.0]), 0.5, 20.0, np.ones(1))
+ONE = OSCILLATORS._replace(omega=np.array([1.0]))
 OBSERVER = ql.ESO.model_free(1, 1.0, 20.0, DT)
 LAGGED = room.frequency_search(OBSERVER, 4.0, OSCILLATORS)
 SEARCH = LAGGED._replace(follow=1.0)  # f_plain itself, without the lag of 1/omega_c

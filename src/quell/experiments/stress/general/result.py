@@ -93,7 +93,7 @@ class GeneralResult:
         """Return the figures that have a bar; those of cases that were not run are left out."""
         groups = {"all": self.healthy, "hostile": self.hostile, "honest": self.honest}
         figures = {name: summary(group) for name, group in groups.items()}
-        others = {name: summary([o.of_other_noise for o in groups[name]]) for name in groups}
+        others = {name: _with_other_noise(group) for name, group in groups.items()}
         found = [
             Bar(over, measure, _look_up(figures[over], key), bar, _look_up(others[over], key))
             for over, measure, key, bar in _BARS
@@ -125,10 +125,7 @@ class GeneralResult:
             "left_out": self.left_out,
             "bars": [{**bar._asdict(), "met": bar.met} for bar in self.bars()],
             **{name: summary(group) for name, group in groups.items()},
-            **{
-                f"{name}_other_noise": summary([o.of_other_noise for o in group])
-                for name, group in groups.items()
-            },
+            **{f"{name}_other_noise": _with_other_noise(group) for name, group in groups.items()},
             **{
                 f"{name}_by_{by}": {
                     key: summary(some) for key, some in self.grouped(group, by).items()
@@ -150,6 +147,11 @@ def _look_up(found: Mapping[str, Any], key: str) -> float | None:
     """Return a figure of a ``summary``."""
     name, *part = key.split()
     return found[name][part[0]] if part else found[name]
+
+
+def _with_other_noise(outcomes: Sequence[GeneralOutcome]) -> dict[str, Any]:
+    """Return the ``summary`` of MF-ESO itself, with another draw of the noise in the same loops."""
+    return summary([outcome.of_other_noise for outcome in outcomes])
 
 
 def summary(outcomes: Sequence[GeneralOutcome]) -> dict[str, Any]:
