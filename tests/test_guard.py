@@ -12,6 +12,7 @@ from scipy.linalg import expm
 import quell as ql
 from quell.guard import assess, confine, limit, record_output, start_again
 from quell.guard.bound import _MOST_OWN, _SUDDEN_OWN, update_bound
+from quell.guard.credit import respond
 from quell.guard.state import CORRECTED
 from quell.learners.lag import lag_of, lag_push
 from tests.guarded_samples import OBSERVER, bounds, trusted
@@ -242,6 +243,21 @@ def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order
     assert abs(moved[-1]) < 0.03 or order == 1
     memory.effects[CORRECTED], memory.sample[0].typical_error = 1.0, 0.01
     assert bounds(design, memory) == pytest.approx((-0.012, -0.012))
+
+
+def test_what_was_done_is_taken_back_without_swinging_where_the_bound_is_small() -> None:
+    """A chain of four lags comes to rest although the pole placement asks for a hundred times κ_0 e."""
+    observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=20.0, dt=5e-3)
+    design = ql.Guard().design(observer, np.array([1.0, 4.0, 6.0, 4.0]))  # omega_c = 1
+    memory = ql.Guard().memory(design)
+    memory.sample[0].typical_error = 0.5
+    memory.effects[CORRECTED] = start = 0.15
+    moved = []
+    for _ in range(6000):
+        correction, _ = bounds(design, memory)
+        assert abs(correction) <= 0.6
+        moved.append(abs(respond(design, memory, CORRECTED, correction)))
+    assert max(moved[4000:]) < 1e-3 * start
 
 
 def test_a_guard_with_kappa_of_the_usual_bound_has_no_wider_one() -> None:

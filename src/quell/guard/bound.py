@@ -29,6 +29,9 @@ _WIDER_FROM, _WIDE, _CLOSE = 0.05, 0.15, 0.8
 _SHOWN, _MOST_OUTSIDE = 1.2, 4.0
 # The bound becomes narrower from this ε on, down to this share.
 _WRONG, _NARROWEST = 1.5, 0.3
+# What was done to y is taken back with poles that ask for so many times the bound at most, and that
+# are slower by this factor, several times, where they would ask for more.
+_MOST_ASKED, _SLOWER, _TRIES = 4.0, 0.7, 8
 
 
 @kernel
@@ -80,8 +83,20 @@ def bounds_of(guard: GuardDesign, memory: GuardMemory, removed: float) -> tuple[
 @kernel
 def _closing(guard: GuardDesign, memory: GuardMemory) -> float:
     """Return the e_L that brings ℓ e_L to zero after a learner has lost its authority."""
-    weight, closing, place, above = 1.0, 0.0, 0.0, 0.0
     faster = max(guard.closing / guard.respond - 1.0, 0.0)
+    most = guard.usual_bound * memory.sample[0].typical_error
+    closing = _placing(guard, memory, faster)
+    for _ in range(_TRIES):
+        if abs(closing) > _MOST_ASKED * most:
+            faster *= _SLOWER
+            closing = _placing(guard, memory, faster)
+    return min(max(closing, -most), most)
+
+
+@kernel
+def _placing(guard: GuardDesign, memory: GuardMemory, faster: float) -> float:
+    """Return the e_L with which the poles of ℓ e_L are ``1 + faster`` times as fast."""
+    weight, placing, place, above = 1.0, 0.0, 0.0, 0.0
     # Numbers of stages as floats: a quotient of integers would be in double precision.
     for _ in range(guard.stages):
         above += 1.0
@@ -89,6 +104,5 @@ def _closing(guard: GuardDesign, memory: GuardMemory) -> float:
         place += 1.0
         weight *= faster * above / place
         above -= 1.0
-        closing -= weight * memory.effects[CORRECTED, i]
-    most = guard.usual_bound * memory.sample[0].typical_error
-    return min(max(closing, -most), most)
+        placing -= weight * memory.effects[CORRECTED, i]
+    return placing

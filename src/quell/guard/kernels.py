@@ -97,8 +97,9 @@ The constant part of f_L is free. A target that is more than 1000 e from β̄g a
 
     e_L = clip( −Σ_i C(n, i) (r − 1)^i x_i, ±κ_0 e ),        r ω_c = 1.5/lag
 
-places the n poles of ℓ e_L, which are at −ω_c, at −r ω_c, so that it decays within some lags. A
-learner that never had authority has e_L = 0.
+places the n poles of ℓ e_L, which are at −ω_c, at −r ω_c, so that it decays within some lags. Where
+that asks for more than 4 κ_0 e, r is smaller: a chain of four lags that is pushed to and fro with
+all of κ_0 e swings for a hundred lags. A learner that never had authority has e_L = 0.
 
 For observers with which that recursion is unstable (``correction.is_invertible``), F is here the
 filter of a chain of integrators with the same omega_o; for them nothing is certified.
