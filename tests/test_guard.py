@@ -246,7 +246,7 @@ def test_what_a_learner_has_done_is_taken_back_when_it_loses_its_authority(order
 
 
 def test_what_was_done_is_taken_back_without_swinging_where_the_bound_is_small() -> None:
-    """A chain of four lags comes to rest although the pole placement asks for a hundred times κ_0 e."""
+    """A chain of four lags comes to rest although the pole placement asks for 300 times κ_0 e."""
     observer = ql.ESO.model_free(order=4, b0=1.0, omega_o=20.0, dt=5e-3)
     design = ql.Guard().design(observer, np.array([1.0, 4.0, 6.0, 4.0]))  # omega_c = 1
     memory = ql.Guard().memory(design)
