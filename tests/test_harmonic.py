@@ -158,14 +158,14 @@ def test_a_fit_finds_frequencies_amplitudes_and_their_deviations() -> None:
             np.repeat(truth, 2), (1, 3, 1, 3), (2.0, 0.5, 1.0, 0.7), range(4), strict=True
         )
     )
-    fit = line_fit(2, 2)
+    fit = line_fit(2, 2, 0)
     fit.omega[:] = (0.2, 0.26)
     for _ in range(8):
-        begin_pass(orders, fit, fit.omega, 1.0, 2)
+        begin_pass(orders, fit, 2)
         for i in range(size):
             add_row(orders, fit, 2, -float(i), float(z[i]))
             next_row(fit, 8)
-        total, left = solve(fit, 9, 11)
+        total, left = solve(fit, 9, 11, 0.0)
         fit.amplitude[:] = fit.solution[1:9]
         fit.omega[:] += np.clip(fit.solution[9:], -0.03, 0.03)
     np.testing.assert_allclose(fit.omega, truth, rtol=1e-7)
@@ -174,17 +174,42 @@ def test_a_fit_finds_frequencies_amplitudes_and_their_deviations() -> None:
     )
     assert fit.solution[0] == pytest.approx(1.5)
     assert left < 1e-9 * total
-    one, many, amplitude = line_fit(1, 1), 400, 3.0
+    one, many, amplitude = line_fit(1, 1, 0), 400, 3.0
     one.omega[0], one.amplitude[0] = 0.7, amplitude
-    begin_pass(np.ones(1), one, one.omega, 1.0, 1)
+    begin_pass(np.ones(1), one, 1)
     for i in range(many):
         add_row(np.ones(1), one, 1, -float(i), 0.0)
         next_row(one, 2)
-    solve(one, 3, 4)
+    solve(one, 3, 4, 0.0)
     write_deviations(one, 3, 4, 0.04)
     assert one.deviation[0] == pytest.approx(
         math.sqrt(24.0 * 0.04 / amplitude**2 / many**3), rel=0.01
     )
+
+
+def test_given_signals_are_fitted_with_a_ridge(rng: np.random.Generator) -> None:
+    """The solution, and what the signals leave without and with sinusoids, are those of NumPy."""
+    size, ridge, omega = 50, 0.3, 0.4
+    times, signals = -np.arange(size), rng.normal(1.0, 2.0, (size, 2))
+    z = signals @ [0.5, -1.0] + np.sin(omega * times) + rng.normal(0.0, 0.1, size)
+    fit = line_fit(1, 1, 2)
+    fit.omega[0] = omega
+    begin_pass(np.ones(1), fit, 1)
+    for i in range(size):
+        fit.signal[:] = signals[i]
+        add_row(np.ones(1), fit, 1, float(times[i]), float(z[i]))
+        next_row(fit, 2)
+    for _ in range(2):  # sums are kept, so another ridge can follow
+        without, left = solve(fit, 5, 5, ridge)
+    waves = np.column_stack([np.sin(omega * times), np.cos(omega * times)])
+    penalty = np.diag(np.sqrt(ridge * size) * np.std(signals, axis=0))
+    for columns, minimum in ((2, without), (4, left)):
+        rows = np.column_stack([np.ones(size), signals, waves])[:, : 1 + columns]
+        extra = np.pad(penalty, ((0, 0), (1, columns - 2)))
+        matrix, right = np.vstack([rows, extra]), np.append(z, np.zeros(2))
+        solution, squares, *_ = np.linalg.lstsq(matrix, right, rcond=None)
+        assert minimum == pytest.approx(float(squares[0]))
+    np.testing.assert_allclose(fit.solution[:5], solution, rtol=1e-9)
 
 
 def test_frequencies_start_apart_and_stay_within_their_limits() -> None:

@@ -251,14 +251,17 @@ def test_a_search_for_frequencies_counts_its_entries_without_end() -> None:
     single = in_single_precision(ql.ADRC(ORDER_2, 1.5, learner=harmonic))
     design, memory = single.parameters.controller.learner.search, single.initial_state().learner
     design = design._replace(follow=np.float32(1.0))
-    loop = memory.search.loop[0]
+    loop, state = memory.search.loop[0], np.zeros(2, np.float32)
     start = 8192.0 * ENTRIES - 2.0
     loop.stage, loop.entries, loop.newest, loop.window = 1.0, start, start - 8.0, 32.0
     written = []
     for k in range(4):
         for _ in range(int(design.spacing)):
-            advance_search(design, memory.search, np.float32(1.0 + k), memory.omega)
-        written.append(float(memory.search.past[(int(start) + k) % ENTRIES]))
+            advance_search(
+                design, memory.search, np.float32(1.0 + k), state, np.float32(0.0), memory.omega
+            )
+        width = memory.search.late.size
+        written.append(float(memory.search.past[(int(start) + k) % ENTRIES * width]))
     assert written == [1.0, 2.0, 3.0, 4.0]
     assert loop.entries == start + 4.0 - 4096.0 * ENTRIES
 

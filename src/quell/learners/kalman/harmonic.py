@@ -128,7 +128,9 @@ class Harmonic(Kalman):
 
     def frequency_search(self, observer: ESO, omega_c: float, oscillators: Oscillators) -> Any:
         """Return the parameters of the search for frequencies, if there is one."""
-        return frequency_search(observer, omega_c, oscillators) if self.search else NoSearch()
+        if not self.search:
+            return NoSearch()
+        return frequency_search(observer, omega_c, oscillators, observer.order * self.state)
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return ``("x1", …, "bias", "sin1", "cos1", …, "u")``, as far as they are features.

@@ -55,7 +55,7 @@ from quell.learners.kalman.oscillators import (
     turn_phases,
 )
 from quell.learners.kalman.search import advance_search, is_locked, start_search_again
-from quell.learners.kalman.search_verdict import LEARN_ANEW
+from quell.learners.kalman.search_verdict import LEARN_ANEW, NOTHING
 from quell.learners.lag import STARTUP_LAGS, lag_push, reset_lag
 from quell.learners.least_squares import multiply_lower, reduce_row
 from quell.learners.noise_gate import grown, resolution
@@ -161,11 +161,16 @@ def _adapt(
     if deviation == 0.0:
         return
     weight = 1.0 / deviation
-    _update_regressor(learner, memory, noise, weight)
     time = averages.time * learner.dt if is_single(learner.dt) else averages.time
-    if time <= STARTUP_LAGS * learner.lag_time:
+    is_started = time > STARTUP_LAGS * learner.lag_time
+    result = NOTHING
+    if is_started:
+        result = advance_search(
+            learner.search, memory.search, f_plain, memory.filtered, u_before, memory.omega
+        )
+    _update_regressor(learner, memory, noise, weight)
+    if not is_started:
         return
-    result = advance_search(learner.search, memory.search, f_plain, memory.omega)
     # Many orders that are learned anew at once upset the loop: they explain almost anything.
     if result == LEARN_ANEW and learner.oscillators.orders.size == 1:
         unknown = _UNKNOWN_SINGLE if is_single(weight) else _UNKNOWN

@@ -2,16 +2,23 @@
 
 In a *pass* over the samples z at the times t = 0, −1, … of a window, the model
 
-    z = c + Σ_j Σ_k a_jk sin(k ω_j t) + b_jk cos(k ω_j t)
+    z = c + Σ_i w_i r_i + Σ_j Σ_k a_jk sin(k ω_j t) + b_jk cos(k ω_j t)
 
-with m frequencies ω and p orders k each is linearised in ω, and its normal equations are added up:
+with q given signals r, m frequencies ω and p orders k each is linearised in ω, and its normal
+equations are added up:
 
-    z = c + Σ (a s + b c)_jk + Σ_j δω_j t Σ_k k (a_jk c_jk − b_jk s_jk),    s_jk = sin(k ω_j t), …
+    z = c + Σ w_i r_i + Σ (a s + b c)_jk + Σ_j δω_j t Σ_k k (a_jk c_jk − b_jk s_jk)
 
-At the end of the pass a, b, c and δω are solved for: a step of Gauss and Newton for the least
-squares over all parameters, which for white noise is the most likely answer (Rife & Boorstyn,
-*Multiple tone parameter estimation from discrete-time observations*, Bell System Technical Journal
-55 (1976)). In passes of few samples the work for a sample of the loop is small and constant.
+with s_jk = sin(k ω_j t) and c_jk = cos(k ω_j t). At the end of the pass c, w, a, b and δω are
+solved for: a step of Gauss and Newton for the least squares over all parameters, which for white
+noise is the most likely answer (Rife & Boorstyn, *Multiple tone parameter estimation from
+discrete-time observations*, Bell System Technical Journal 55 (1976)). The given signals have a
+ridge μ: what is minimised is
+
+    Σ (z − model)² + μ Σ_i w_i² Σ (r_i − mean of r_i)²
+
+so that where signals and sinusoids explain z equally well, the sinusoids do. In passes of few
+samples the work for a sample of the loop is small and constant.
 """
 
 from __future__ import annotations
@@ -32,30 +39,36 @@ _UNKNOWN = 10.0
 
 
 class LineFit(NamedTuple):
-    """State of a fit of up to m frequencies with p orders; C = 1 + 2mp + m."""
+    """State of a fit of q signals and up to m frequencies with p orders; C = 1 + q + 2mp + m."""
 
     omega: Vector  # frequencies ω [rad/sample] (m,)
     amplitude: Vector  # a, b of each pair (2mp,)
     wave: Vector  # sin and cos of each pair at this row (2mp,)
     turn: Vector  # sin and cos of the angle from one row to the next (2mp,)
+    signal: Vector  # given signals r at this row (q,)
     column: Vector  # the row of the regression (C,)
-    gram: Matrix  # sums of its squares, then their Cholesky factor (C, C)
-    moment: Vector  # sums of its products with z (C,)
-    solution: Vector  # c, a, b, δω (C,)
+    squares: Matrix  # sums of its squares and products, the lower triangle (C, C)
+    products: Vector  # sums of its products with z (C,)
+    gram: Matrix  # Cholesky factor of the normal equations (C, C)
+    moment: Vector  # their right side, times the inverse of the factor (C,)
+    solution: Vector  # c, w, a, b, δω (C,)
     deviation: Vector  # standard deviation of each frequency [rad/sample] (m,)
     square: Vector  # sum of z² (1,)
 
 
-def line_fit(count: int, orders: int) -> LineFit:
+def line_fit(count: int, orders: int, signals: int) -> LineFit:
     """Return the state of a fit of up to ``count`` frequencies with ``orders`` orders each."""
     pairs = 2 * count * orders
-    size = 1 + pairs + count
+    size = 1 + signals + pairs + count
     return LineFit(
         omega=np.zeros(count),
         amplitude=np.zeros(pairs),
         wave=np.zeros(pairs),
         turn=np.zeros(pairs),
+        signal=np.zeros(signals),
         column=np.zeros(size),
+        squares=np.zeros((size, size)),
+        products=np.zeros(size),
         gram=np.zeros((size, size)),
         moment=np.zeros(size),
         solution=np.zeros(size),
@@ -65,19 +78,19 @@ def line_fit(count: int, orders: int) -> LineFit:
 
 
 @kernel
-def begin_pass(orders: Vector, fit: LineFit, omega: Vector, scale: float, found: int) -> None:
-    """Begin a pass with the first ``found`` frequencies of ``scale · omega``."""
+def begin_pass(orders: Vector, fit: LineFit, found: int) -> None:
+    """Begin a pass with the first ``found`` frequencies."""
     for j in range(found):
         for k in range(orders.size):
             at = 2 * (j * orders.size + k)
-            angle = -orders[k] * scale * omega[j]
+            angle = -orders[k] * fit.omega[j]
             fit.turn[at], fit.turn[at + 1] = sin(angle), cos(angle)
             fit.wave[at], fit.wave[at + 1] = 0.0, 1.0
     fit.square[0] = 0.0
-    for i in range(fit.moment.size):
-        fit.moment[i] = 0.0
-        for j in range(fit.moment.size):
-            fit.gram[i, j] = 0.0
+    for i in range(fit.products.size):
+        fit.products[i] = 0.0
+        for j in range(i + 1):
+            fit.squares[i, j] = 0.0
 
 
 @kernel
@@ -114,11 +127,13 @@ def next_row(fit: LineFit, pairs: int) -> None:
 @kernel
 def add_row(orders: Vector, fit: LineFit, found: int, time: float, value: float) -> None:
     """Add ``value``, the sample at ``time``, to the normal equations."""
-    column, pairs = fit.column, 2 * orders.size * found
-    size = 1 + pairs + found
+    column, first, pairs = fit.column, 1 + fit.signal.size, 2 * orders.size * found
+    size = first + pairs + found
     column[0] = 1.0
+    for i in range(fit.signal.size):
+        column[1 + i] = fit.signal[i]
     for i in range(pairs):
-        column[1 + i] = fit.wave[i]
+        column[first + i] = fit.wave[i]
     for j in range(found):
         slope = 0.0
         for k in range(orders.size):
@@ -126,23 +141,29 @@ def add_row(orders: Vector, fit: LineFit, found: int, time: float, value: float)
             slope += orders[k] * (
                 fit.amplitude[at] * fit.wave[at + 1] - fit.amplitude[at + 1] * fit.wave[at]
             )
-        column[1 + pairs + j] = time * slope
+        column[first + pairs + j] = time * slope
     fit.square[0] += value * value
     for i in range(size):
-        fit.moment[i] += column[i] * value
+        fit.products[i] += column[i] * value
         for j in range(i + 1):
-            fit.gram[i, j] += column[i] * column[j]
+            fit.squares[i, j] += column[i] * column[j]
 
 
 @kernel
-def solve(fit: LineFit, linear: int, size: int) -> tuple[float, float]:
-    """Solve the first ``size`` normal equations; the first ``linear`` are those of c, a, b.
+def solve(fit: LineFit, linear: int, size: int, ridge: float) -> tuple[float, float]:
+    """Solve the first ``size`` normal equations; the first ``linear`` are those of c, w, a, b.
 
-    Return the sums of squares about the mean, and of what c, a and b do not explain.
+    Return what is minimised, the squares with the ridge's, for c and w alone and for c, w, a, b.
     """
     gram, moment, solution = fit.gram, fit.moment, fit.solution
-    left = about_mean = unexplained = fit.square[0]
+    left = without_lines = unexplained = fit.square[0]
     dependent = _DEPENDENT_SINGLE if is_single(left) else _DEPENDENT
+    for i in range(size):
+        moment[i] = fit.products[i]
+        for j in range(i + 1):
+            gram[i, j] = fit.squares[i, j]
+    for i in range(1, 1 + fit.signal.size):
+        gram[i, i] += ridge * (gram[i, i] - gram[i, 0] * gram[i, 0] / gram[0, 0])
     for i in range(size):
         whole = gram[i, i]
         for j in range(i + 1):
@@ -158,8 +179,8 @@ def solve(fit: LineFit, linear: int, size: int) -> tuple[float, float]:
             total -= gram[i, k] * moment[k]
         moment[i] = total / gram[i, i] if gram[i, i] > 0.0 else 0.0
         left -= moment[i] * moment[i]
-        if i == 0:
-            about_mean = left
+        if i == fit.signal.size:
+            without_lines = left
         if i == linear - 1:
             unexplained = left
     for back in range(size):
@@ -168,7 +189,7 @@ def solve(fit: LineFit, linear: int, size: int) -> tuple[float, float]:
         for k in range(i + 1, size):
             total -= gram[k, i] * solution[k]
         solution[i] = total / gram[i, i] if gram[i, i] > 0.0 else 0.0
-    return max(about_mean, 0.0), max(unexplained, 0.0)
+    return max(without_lines, 0.0), max(unexplained, 0.0)
 
 
 @kernel

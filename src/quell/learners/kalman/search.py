@@ -3,23 +3,33 @@
 The rotation of a pair (``oscillators.py``) finds a frequency from a start that is near, and one at
 a time: it needs many periods of the beat to separate sinusoids that are close to each other,
 because each oscillator follows all of them. A least-squares fit over a window separates them within
-a fraction of the beat. Its input is f_plain, the estimate of an ESO without learner, whose
-frequencies are those of the load whatever the learner feeds forward.
+a fraction of the beat. What is fitted is f_plain, the estimate of an ESO without learner, which is
+the same whatever the learner feeds forward. For a plant that is linear in its state,
 
-* f_plain passes a first-order lag of ``1/omega_c``, because f shows the loop's quick motion more
-  than y does: without the lag, transients of learner and loop cover a slow load. A search for
-  several orders has no lag: the higher ones tell the frequency best. The result is averaged over
-  entries of ``2/omega_o``, of which the last 512 are kept.
+    f_plain = c + W x^F + (b/b0 − 1) b0 u^F + load^F,
+
+with the lag F of the observer. While the loop or the learner is not yet steady, the terms of state
+and u are no sinusoids of the load, so they are fitted, too, with x̂^F and u^F as given signals.
+
+* **The ridge.** In the steady state x and u consist of the load's frequencies, so W and u would
+  explain all of f_plain without a sinusoid. A ridge μ (``line_fit.py``) makes sinusoids explain
+  what both can. Lines are looked for with μ = 1, and refined with 1e-5.
+* All signals pass a first-order lag of ``1/(3 omega_c)``, because f_plain is y differentiated n
+  times, and noise covers a small load in it. A search for several orders has no lag: the higher
+  ones tell the frequency best. The results are averaged over entries of ``2/omega_o``, of which the
+  last 512 are kept.
 * A search begins with the shortest window and no sinusoid. It looks for the strongest line in what
-  is left (*scan*), adds it, fits all frequencies (*fit*, ``line_fit.py``), and so on: relaxation
-  after Li & Stoica, *Efficient mixed-spectrum estimation with applications to target feature
-  extraction*, IEEE Trans. Signal Processing 44 (1996). If the result is not good, the next search
-  has a window of twice the length, and after the longest the shortest again.
-* A result is good if it leaves a small share of the variance. The oscillators take over those of
-  its frequencies that the window resolves. If they had left four times as much (*check*), their
-  amplitudes are learned anew. The window grows and the fit is continued as long as it is good, so
-  its frequencies become ever more exact; a window that contains a change of the load does not fit,
-  and shrinks (``search_verdict.py``).
+  is left (*scan*), adds it, fits all frequencies (*fit*), and so on: relaxation after Li & Stoica,
+  *Efficient mixed-spectrum estimation with applications to target feature extraction*, IEEE Trans.
+  Signal Processing 44 (1996). Then it *refines* all of them with the small ridge.
+* A fit is good if it leaves a small share of what state and u leave without sinusoids: either with
+  μ = 0.1, which shows it in the steady state, or with 1e-5, which shows it where the loop
+  moves more than the load makes it. The window grows and the fit is continued as long as it is
+  good, so its frequencies become ever more exact; a window that contains a change of the load does
+  not fit. If nothing fits, the next search begins anew with a longer window, and after the longest
+  with the shortest (``search_verdict.py``).
+* The oscillators take over those frequencies of a good fit that the window resolves. If one differs
+  much from the oscillator's, its amplitude is learned anew.
 """
 
 from __future__ import annotations
@@ -42,35 +52,39 @@ from quell.learners.kalman.line_fit import (
 )
 from quell.learners.kalman.oscillators import Oscillators
 from quell.learners.kalman.search_state import (
-    CHECK,
     ENTRIES,
+    REFINE,
     SCAN,
     SHORTEST,
     FrequencySearch,
     SearchLoop,
     SearchMemory,
-    begin_check,
     begin_fit,
+    begin_refinement,
+    begin_rows,
     begin_scan,
     search_from_nothing,
 )
 from quell.learners.kalman.search_verdict import COMPLETE, NOTHING, judge
+from quell.learners.lag import lag_memory, lag_of, lag_push, reset_lag
 from quell.observers.eso import ESO
 from quell.types import Vector
 
+# Bandwidth of the signals' lag as a multiple of omega_c.
+_BANDWIDTH = 3.0
 # Lines of a scan between the limits: 9 % apart for the default limits, a third of the width of a
 # line in the window in which it is found.
 _LINES = 64
 # Gauss-Newton steps of a fit at most; a step of the phase over the window that ends it [rad]; and
 # the largest step, a third of the distance of two lines [rad].
-_MOST_PASSES, _CONVERGED, _LARGEST_STEP = 8, 0.02, 2.0
-# Share of the variance that a fit may leave: if it is continued, and if its frequencies are used.
-# Of a sawtooth with eight orders the higher ones are 7 %.
-_GOOD, _CERTAIN, _GOOD_ORDERS = 0.02, 0.005, 0.1
-# Least share that counts as noise: what the loop's transients leave is not white.
-_LEAST_LEFT = 1e-3
-# Shortest window whose frequencies are used, in units of 1/omega_c: transients of the loop, also
-# those that a learner causes, last some ten.
+_MOST_PASSES, _CONVERGED, _LARGEST_STEP = 12, 0.02, 2.0
+# Ridges with which lines are looked for; with which they are refined, also in single precision,
+# where sums are less exact; and with which a fit is judged besides: with the small ridge, state and
+# u leave little more than noise in the steady state.
+_LOOKING, _REFINING, _REFINING_SINGLE, _JUDGING = 1.0, 1e-5, 1e-4, 0.1
+# Least share of what state and u leave that counts as noise: rounding.
+_ROUNDING, _ROUNDING_SINGLE = 1e-9, 1e-5
+# Shortest window, in units of 1/omega_c: transients of the loop last some ten.
 _LOOP_TIMES = 16.0
 # Numbers of entries are counted up to this, and then are less by a multiple of the ring's length:
 # in single precision a count ends at 2²⁴.
@@ -84,8 +98,10 @@ class NoSearch(NamedTuple):
     """Parameters and state of a learner that does not search."""
 
 
-def frequency_search(observer: ESO, omega_c: float, oscillators: Oscillators) -> FrequencySearch:
-    """Return a search for the frequencies of oscillators."""
+def frequency_search(
+    observer: ESO, omega_c: float, oscillators: Oscillators, states: int
+) -> FrequencySearch:
+    """Return a search for the frequencies of oscillators, with n ``states`` as given signals."""
     # In units of the observer's bandwidth, whatever its tuning: N over its lag.
     spacing = max(round(2.0 * observer.lag_time / ((observer.order + 1) * observer.dt)), 1)
     step = spacing * observer.dt
@@ -93,15 +109,15 @@ def frequency_search(observer: ESO, omega_c: float, oscillators: Oscillators) ->
     lines = np.geomspace(low, high, _LINES) * oscillators.orders[0]
     several = oscillators.orders.size > 1
     return FrequencySearch(
+        lag=lag_of(observer),
+        states=states,
         orders=oscillators.orders,
         lines=lines,
         spacing=float(spacing),
         step=step,
-        follow=1.0 if several else -math.expm1(-omega_c * observer.dt),
+        follow=1.0 if several else -math.expm1(-_BANDWIDTH * omega_c * observer.dt),
         rows=math.ceil(ENTRIES / spacing),
-        good=_GOOD_ORDERS if several else _GOOD,
-        certain=_GOOD_ORDERS if several else _CERTAIN,
-        shortest=_LOOP_TIMES / (omega_c * step),
+        shortest=max(float(SHORTEST), math.floor(_LOOP_TIMES / (omega_c * step))),
         low=low,
         high=high,
     )
@@ -111,22 +127,31 @@ def search_memory(search: Any, oscillators: Oscillators) -> Any:
     """Return the state before the first sample."""
     if isinstance(search, NoSearch):
         return search
+    count, signals = oscillators.omega.size, 2 + search.states
     return SearchMemory(
-        past=np.zeros(ENTRIES),
+        past=np.zeros(ENTRIES * signals),
+        chain=lag_memory(search.lag, 1),
+        late=np.zeros(signals),
+        total=np.zeros(signals),
         wave=np.zeros(2 * _LINES),
         turn=np.zeros(2 * _LINES),
         score=np.zeros(2 * _LINES),
-        fit=line_fit(oscillators.omega.size, oscillators.orders.size),
-        adopted=np.zeros(oscillators.omega.size),
+        fit=line_fit(count, oscillators.orders.size, signals - 1),
+        good=np.zeros(count),
+        adopted=np.zeros(count),
+        taken=np.zeros(count),
         loop=SearchLoop.zeros(),
     )
 
 
 @generic
-def advance_search(search: Any, memory: Any, f_plain: float, omega: Vector) -> int:
+def advance_search(
+    search: Any, memory: Any, f_plain: float, filtered: Vector, u: float, omega: Vector
+) -> int:
     """Continue the search with a sample.
 
-    Write frequencies into ``omega`` (m,) [rad/s] when there is a good fit, and return whether.
+    ``filtered`` begins with the lag-filtered state, and ``u`` acted before the sample. Write
+    frequencies into ``omega`` (m,) [rad/s] when there is a good fit, and return what is new.
     """
     raise TypeError
 
@@ -144,7 +169,9 @@ def start_search_again(search: Any, memory: Any) -> None:
 
 
 @advance_search.register(NoSearch)
-def _advance_nothing(search: NoSearch, memory: NoSearch, f_plain: float, omega: Vector) -> int:
+def _advance_nothing(
+    search: NoSearch, memory: NoSearch, f_plain: float, filtered: Vector, u: float, omega: Vector
+) -> int:
     return NOTHING
 
 
@@ -166,32 +193,36 @@ def _is_locked(search: FrequencySearch, memory: SearchMemory, j: int) -> bool:
 @start_search_again.register(FrequencySearch)
 def _start_again(search: FrequencySearch, memory: SearchMemory) -> None:
     clear(memory.loop)
+    reset_lag(memory.chain)
+    for i in range(memory.total.size):
+        memory.total[i] = 0.0
     for j in range(memory.adopted.size):
         memory.adopted[j] = 0.0
 
 
 @advance_search.register(FrequencySearch)
-def _advance(search: FrequencySearch, memory: SearchMemory, f_plain: float, omega: Vector) -> int:
+def _advance(
+    search: FrequencySearch,
+    memory: SearchMemory,
+    f_plain: float,
+    filtered: Vector,
+    u: float,
+    omega: Vector,
+) -> int:
     loop = memory.loop[0]
-    if not abs(f_plain) < (_ABSURD_SINGLE if is_single(search.step) else _ABSURD):
+    absurd = _ABSURD_SINGLE if is_single(search.step) else _ABSURD
+    if not (abs(f_plain) < absurd and abs(u) < absurd):
         start_search_again(search, memory)
         return NOTHING
-    if loop.entries == 0.0 and loop.samples == 0.0:
-        loop.late = f_plain
-    loop.late += search.follow * (f_plain - loop.late)
-    loop.total += loop.late
-    loop.samples += 1.0
-    if loop.samples >= search.spacing:
-        memory.past[int(loop.entries) % ENTRIES] = loop.total / loop.samples
-        loop.entries += 1.0
-        loop.total = loop.samples = 0.0
-        if loop.entries >= _MOST_ENTRIES:
-            loop.entries -= _WRAP
-            loop.newest -= _WRAP
+    _add_sample(search, memory, f_plain, filtered, u)
+    if loop.entries >= _MOST_ENTRIES:
+        loop.entries -= _WRAP
+        loop.newest -= _WRAP
+        loop.start -= _WRAP
     if loop.stage == 0.0:
-        if loop.entries < SHORTEST:
+        if loop.entries < search.shortest:
             return NOTHING
-        search_from_nothing(search, memory, float(SHORTEST))
+        search_from_nothing(search, memory, search.shortest)
     if loop.row >= loop.window:
         return _finish_pass(search, memory, omega)
     for _ in range(search.rows):
@@ -201,16 +232,48 @@ def _advance(search: FrequencySearch, memory: SearchMemory, f_plain: float, omeg
 
 
 @kernel
+def _add_sample(
+    search: FrequencySearch, memory: SearchMemory, f_plain: float, filtered: Vector, u: float
+) -> None:
+    """Add f_plain, the state and u to the entry that is not complete."""
+    loop, late, total = memory.loop[0], memory.late, memory.total
+    is_first = loop.entries == 0.0 and loop.samples == 0.0
+    u_filtered = lag_push(search.lag, memory.chain, 0, u)
+    for i in range(late.size):
+        value = f_plain if i == 0 else u_filtered
+        if 0 < i <= search.states:
+            value = filtered[i - 1]
+        if is_first:
+            late[i] = value
+        late[i] += search.follow * (value - late[i])
+        total[i] += late[i]
+    loop.samples += 1.0
+    if loop.samples >= search.spacing:
+        at = int(loop.entries) % ENTRIES * late.size
+        for i in range(late.size):
+            memory.past[at + i] = total[i] / loop.samples
+            total[i] = 0.0
+        loop.entries += 1.0
+        loop.samples = 0.0
+
+
+@kernel
 def _take_row(search: FrequencySearch, memory: SearchMemory) -> None:
-    loop, fit = memory.loop[0], memory.fit
-    value = memory.past[(int(loop.newest) - 1 - int(loop.row)) % ENTRIES]
-    found = fit.omega.size if loop.stage == CHECK else int(loop.found)
-    pairs = 2 * search.orders.size * found
+    loop, fit, past = memory.loop[0], memory.fit, memory.past
+    width, newest = memory.late.size, int(loop.newest) - 1
+    at, last = (newest - int(loop.row)) % ENTRIES * width, newest % ENTRIES * width
+    value = past[at]
+    # Less the newest values, so that a set-point far from zero costs no digits.
+    for i in range(fit.signal.size):
+        fit.signal[i] = past[at + 1 + i] - past[last + 1 + i]
+    pairs = 2 * search.orders.size * int(loop.found)
     if loop.stage == SCAN:
         rest = value - fit.solution[0] - fitted(fit, pairs)
+        for i in range(fit.signal.size):
+            rest -= fit.solution[1 + i] * fit.signal[i]
         _add_to_scores(memory, rest * sin(math.pi * (loop.row + 0.5) / loop.window) ** 2)
     else:
-        add_row(search.orders, fit, found, -loop.row, value)
+        add_row(search.orders, fit, int(loop.found), -loop.row, value)
     next_row(fit, pairs)
     loop.row += 1.0
 
@@ -229,23 +292,20 @@ def _add_to_scores(memory: SearchMemory, value: float) -> None:
 
 @kernel
 def _finish_pass(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> int:
-    loop, fit = memory.loop[0], memory.fit
-    orders, count = search.orders, fit.omega.size
+    loop = memory.loop[0]
     if loop.stage == SCAN:
         _add_strongest_line(search, memory)
-        begin_fit(search, memory, 0.0)
+        begin_fit(search, memory)
         return NOTHING
-    if loop.stage == CHECK:
-        pairs = 2 * orders.size * count
-        _, left = solve(fit, 1 + pairs, 1 + pairs)
-        return judge(search, memory, left, omega)
-    is_done = _finish_fit(search, memory)
-    if not is_done:
-        begin_fit(search, memory, loop.passes)
-    elif loop.found < count and loop.left > COMPLETE * loop.variance:
+    is_refined = loop.stage == REFINE
+    if not _finish_fit(search, memory):
+        begin_rows(search, memory)
+    elif is_refined:
+        return judge(search, memory, omega)
+    elif loop.found < memory.fit.omega.size and loop.share > COMPLETE:
         begin_scan(search, memory)
     else:
-        begin_check(search, memory, omega)
+        begin_refinement(search, memory)
     return NOTHING
 
 
@@ -253,12 +313,22 @@ def _finish_pass(search: FrequencySearch, memory: SearchMemory, omega: Vector) -
 def _finish_fit(search: FrequencySearch, memory: SearchMemory) -> bool:
     """Take a step of Gauss and Newton; return whether it was the last."""
     loop, fit, found = memory.loop[0], memory.fit, int(memory.loop[0].found)
-    linear = 1 + 2 * search.orders.size * found
-    loop.variance, loop.left = solve(fit, linear, linear + found)
-    noise = max(loop.left, _LEAST_LEFT * loop.variance) / loop.window
-    write_deviations(fit, linear, linear + found, noise)
-    for i in range(linear - 1):
-        fit.amplitude[i] = fit.solution[1 + i]
+    first = 1 + fit.signal.size
+    linear = first + 2 * search.orders.size * found
+    rounding = _ROUNDING_SINGLE if is_single(search.step) else _ROUNDING
+    ridge, judging = _LOOKING, _LOOKING
+    if loop.stage == REFINE:
+        ridge = _REFINING_SINGLE if is_single(search.step) else _REFINING
+        judging = _JUDGING
+    loop.without, left = solve(fit, linear, linear + found, judging)
+    without, loop.rest = solve(fit, linear, linear + found, ridge)
+    loop.share = 1.0
+    if loop.without > 0.0 and without > 0.0:
+        loop.share = min(left / loop.without, loop.rest / without)
+    variance = max(loop.rest, rounding * loop.without) / loop.window
+    write_deviations(fit, linear, linear + found, variance)
+    for i in range(linear - first):
+        fit.amplitude[i] = fit.solution[first + i]
     largest, most = 0.0, _LARGEST_STEP / loop.window
     for j in range(found):
         step = min(max(fit.solution[linear + j], -most), most)

@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from quell.kernels.dispatch import kernel
 from quell.kernels.functions import cos, sin
 from quell.kernels.scalars import Scalars
-from quell.kernels.sized import Buffer
+from quell.kernels.sized import Buffer, Scratch, Size
 from quell.learners.kalman.line_fit import LineFit, begin_pass, shift_amplitudes
-from quell.types import Vector
+from quell.types import Matrix, Vector
 
 # Entries that are kept: 100 s at omega_o = 10 rad/s, a beat period of 0.3 and 0.36 rad/s; and those
 # of the shortest window. The margin is not used, because a pass lasts up to an entry.
 ENTRIES, SHORTEST, MARGIN = 520, 32, 8
 
-SCAN, FIT, CHECK = 1.0, 2.0, 3.0
+SCAN, FIT, REFINE = 1.0, 2.0, 3.0
 
 
 class FrequencySearch(NamedTuple):
     """Parameters."""
 
+    lag: Any  # lag filter of u
+    states: Size  # number n of state features
     orders: Vector  # multiples of each frequency (p,)
     lines: Buffer  # frequencies of a scan [rad/entry] (K,)
     spacing: float  # samples of an entry
     step: float  # duration of an entry [s]
-    follow: float  # share by which the lag of 1/omega_c follows in a sample, 1 without
+    follow: float  # share by which the lag of the signals follows in a sample, 1 without
     rows: int  # entries of a pass in each sample
-    good: float  # share of the variance that a fit may leave which is continued
-    certain: float  # the same for a fit whose frequencies are used
-    shortest: float  # entries of the shortest window whose frequencies are used
+    shortest: float  # entries of the shortest window
     low: float  # least frequency [rad/entry]
     high: float  # largest frequency [rad/entry]
 
@@ -39,32 +39,39 @@ class FrequencySearch(NamedTuple):
 class SearchLoop(Scalars):
     """Scalars of the search."""
 
-    late: float  # f_plain through that lag
-    total: float  # sum of that over the samples of the entry that is not complete
-    samples: float  # their number
+    samples: float  # samples of the entry that is not complete
     entries: float  # number of complete entries
-    stage: float  # scan, fit or check; 0 before the first
+    stage: float  # scan, fit or refine; 0 before the first
     newest: float  # number of entries at the beginning of the pass
     row: float  # row of the pass
     window: float  # rows of a pass
     found: float  # number of frequencies in the fit
     passes: float  # since a frequency was added
-    level: float  # mean square that the last good fit left
-    continues: float  # 1 if the fit of the last window was good
-    variance: float  # sum of squares about the mean in the window
-    left: float  # sum of squares that the fit leaves
+    without: float  # sum of squares that state and u leave without sinusoids
+    share: float  # share of it that the fit leaves
+    rest: float  # sum of squares that the fit leaves with the ridge of its stage
+    continues: float  # 1 if the last fit was good
+    level: float  # ``rest`` of the last good fit for each entry
+    start: float  # number of entries before its window
+    good_found: float  # number of its frequencies
 
 
 class SearchMemory(NamedTuple):
     """State of a search for m frequencies."""
 
-    past: Buffer  # the last entries, as a ring (L,)
+    # f_plain, state and u of the last entries, as a ring (L (2 + n),)
+    past: Buffer
+    chain: Matrix  # lag filter of u (1, …)
+    late: Vector  # the signals through their lag (2 + n,)
+    total: Vector  # sums of that over the samples of the entry that is not complete (2 + n,)
     wave: Buffer  # sin and cos of each line at this row (2K,)
     turn: Buffer  # sin and cos of the angle from one row to the next (2K,)
     score: Buffer  # correlation of the rest with each line (2K,)
     fit: LineFit
+    good: Vector  # frequencies of the last good fit [rad/entry] (m,)
     # Standard deviation [rad/entry] of the frequency that an oscillator has from a fit, else 0 (m,)
     adopted: Vector
+    taken: Scratch  # 1 for an oscillator that has a frequency of this fit (m,)
     loop: NDArray[SearchLoop]  # (1,)
 
 
@@ -73,26 +80,28 @@ def search_from_nothing(search: FrequencySearch, memory: SearchMemory, window: f
     """Begin with no sinusoid, in the newest ``window`` entries."""
     loop = memory.loop[0]
     loop.window, loop.found, loop.continues = window, 0.0, 0.0
-    begin_fit(search, memory, 0.0)
+    begin_fit(search, memory)
 
 
 @kernel
-def begin_fit(search: FrequencySearch, memory: SearchMemory, passes: float) -> None:
-    """Begin a pass of the fit; ``passes`` were made since a frequency was added."""
-    loop, fit = memory.loop[0], memory.fit
-    shift_amplitudes(search.orders, fit, int(loop.found), loop.entries - loop.newest)
-    _begin(loop, FIT)
-    loop.passes = passes
-    begin_pass(search.orders, fit, fit.omega, 1.0, int(loop.found))
+def begin_fit(search: FrequencySearch, memory: SearchMemory) -> None:
+    """Begin to fit the frequencies found so far."""
+    memory.loop[0].stage, memory.loop[0].passes = FIT, 0.0
+    begin_rows(search, memory)
+
+
+@kernel
+def begin_refinement(search: FrequencySearch, memory: SearchMemory) -> None:
+    """Begin to refine the frequencies found, with a small ridge."""
+    memory.loop[0].stage, memory.loop[0].passes = REFINE, 0.0
+    begin_rows(search, memory)
 
 
 @kernel
 def begin_scan(search: FrequencySearch, memory: SearchMemory) -> None:
     """Begin the pass that looks for the strongest line in what the fit leaves."""
-    loop, fit = memory.loop[0], memory.fit
-    shift_amplitudes(search.orders, fit, int(loop.found), loop.entries - loop.newest)
-    _begin(loop, SCAN)
-    begin_pass(search.orders, fit, fit.omega, 1.0, int(loop.found))
+    memory.loop[0].stage = SCAN
+    begin_rows(search, memory)
     for i in range(search.lines.size):
         angle = -search.lines[i]
         memory.turn[2 * i], memory.turn[2 * i + 1] = sin(angle), cos(angle)
@@ -101,12 +110,9 @@ def begin_scan(search: FrequencySearch, memory: SearchMemory) -> None:
 
 
 @kernel
-def begin_check(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> None:
-    """Begin a pass with the frequencies ``omega`` of the oscillators (m,) [rad/s]."""
-    _begin(memory.loop[0], CHECK)
-    begin_pass(search.orders, memory.fit, omega, search.step, omega.size)
-
-
-@kernel
-def _begin(loop: SearchLoop, stage: float) -> None:
-    loop.stage, loop.row, loop.newest = stage, 0.0, loop.entries
+def begin_rows(search: FrequencySearch, memory: SearchMemory) -> None:
+    """Begin a pass over the window with its newest row."""
+    loop, fit = memory.loop[0], memory.fit
+    shift_amplitudes(search.orders, fit, int(loop.found), loop.entries - loop.newest)
+    loop.row, loop.newest = 0.0, loop.entries
+    begin_pass(search.orders, fit, int(loop.found))
