@@ -91,6 +91,12 @@ def test_an_entry_is_a_mean_and_lasts_two_lags_of_a_pole() -> None:
     assert memory.total[0] == pytest.approx(sum(load(k) for k in range(50, 57)))
 
 
+@pytest.mark.parametrize(("omega_c", "expected"), [(0.01, 512.0), (0.5, 320.0), (19.0, 32.0)])
+def test_the_shortest_window_fits_into_the_ring(omega_c: float, expected: float) -> None:
+    """16/omega_c where that is possible."""
+    assert room.frequency_search(OBSERVER, omega_c, OSCILLATORS, 0).shortest == expected
+
+
 def test_state_and_u_are_in_the_ring_beside_f_plain() -> None:
     """The state as it is given, lag-filtered; u through the lag of an estimate of f."""
     search = room.frequency_search(OBSERVER, 4.0, OSCILLATORS, 2)._replace(follow=1.0)

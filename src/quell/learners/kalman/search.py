@@ -53,6 +53,7 @@ from quell.learners.kalman.line_fit import (
 from quell.learners.kalman.oscillators import Oscillators
 from quell.learners.kalman.search_state import (
     ENTRIES,
+    MARGIN,
     REFINE,
     SCAN,
     SHORTEST,
@@ -108,6 +109,7 @@ def frequency_search(
     low, high = oscillators.low * step, oscillators.high * step
     lines = np.geomspace(low, high, _LINES) * oscillators.orders[0]
     several = oscillators.orders.size > 1
+    shortest = max(float(SHORTEST), math.floor(_LOOP_TIMES / (omega_c * step)))
     return FrequencySearch(
         lag=lag_of(observer),
         states=states,
@@ -117,7 +119,7 @@ def frequency_search(
         step=step,
         follow=1.0 if several else -math.expm1(-_BANDWIDTH * omega_c * observer.dt),
         rows=math.ceil(ENTRIES / spacing),
-        shortest=max(float(SHORTEST), math.floor(_LOOP_TIMES / (omega_c * step))),
+        shortest=float(min(shortest, ENTRIES - MARGIN)),
         low=low,
         high=high,
     )
