@@ -6,7 +6,7 @@ because each oscillator follows all of them. A least-squares fit over a window s
 a fraction of the beat. What is fitted is f_plain, the estimate of an ESO without learner, which is
 the same whatever the learner feeds forward. For a plant that is linear in its state,
 
-    f_plain = c + W x^F + (b/b0 − 1) b0 u^F + load^F,
+    f_plain = c + W x^F + (b − b0) u^F + load^F,
 
 with the lag F of the observer. While the loop or the learner is not yet steady, the terms of state
 and u are no sinusoids of the load, so they are fitted, too, with x̂^F and u^F as given signals.
