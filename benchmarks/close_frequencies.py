@@ -1,12 +1,12 @@
 """Two sinusoidal loads whose frequencies are close to each other, in random loops.
 
-    python benchmarks/close_frequencies.py [--loops 50] [--seed 6] [--other-loads]
+    python benchmarks/close_frequencies.py [--loops 50] [--seed 7] [--other-loads]
 
 The plants and designs are those of ``quell.experiments.stress.random_loops``. From 90 s on two
 sinusoids act on m2: the slower one of 0.15 to 0.8 rad/s, the other faster by the factor in the
 table, with amplitudes of 0.2 to 2 N and random phases. The figures are the largest errors over 40
 s, from one minute or one beat period after the start of the load on, whichever is later, over those
-of MF-ESO. Seeds 0 and 2 to 5 were for tuning; seed 1 was looked at before the last changes.
+of MF-ESO. Seeds 0 and 2 to 5 were for tuning; seeds 1 and 6 were looked at before the last changes.
 
 With ``--other-loads`` the loads are not two constant sinusoids, so a search can go wrong: coloured
 noise, square waves, a chirp, one sinusoid of changing amplitude, slow steps, and a sinusoid that
@@ -130,7 +130,7 @@ def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--loops", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=6)
+    parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--other-loads", action="store_true")
     options = parser.parse_args()
     if options.other_loads:
