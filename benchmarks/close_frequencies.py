@@ -37,18 +37,22 @@ OTHER_LOADS = ("coloured", "square", "chirp", "amplitude", "steps", "jump")
 OTHER_END, OTHER_STEP = 200.0, 0.05
 
 
+def simulated(
+    loop: Loop, load: Signal, learner: Learner | None, guard: bool, end: float
+) -> ql.Trajectory:
+    """Return the run of a loop under a load on m2."""
+    scenario = replace(loop.scenario, disturbances=(0.0, load), duration=end)
+    controller = loop.controller(learner, ql.Guard() if guard else None)
+    return ql.simulate(loop.plant, controller, scenario, record_every=5)
+
+
 def late_peak(
     loop: Loop, load: tuple[Sinusoid, Sinusoid], learner: Learner | None, guard: bool
 ) -> float:
     """Return the largest error after a minute or beat period of load; infinity if lost."""
     start = LOAD_AT + max(60.0, 2.0 * math.pi / abs(load[1].omega - load[0].omega))
-    scenario = replace(
-        loop.scenario,
-        disturbances=(0.0, load[0] + load[1]),
-        duration=math.ceil((start + JUDGED) / 0.01) * 0.01,
-    )
-    controller = loop.controller(learner, ql.Guard() if guard else None)
-    run = ql.simulate(loop.plant, controller, scenario, record_every=5)
+    end = math.ceil((start + JUDGED) / 0.01) * 0.01
+    run = simulated(loop, load[0] + load[1], learner, guard, end)
     late = run.window(start, start + JUDGED)
     return math.inf if run.diverged else float(np.max(np.abs(run["y"][late] - 1.0)))
 
@@ -97,9 +101,7 @@ def other_errors(
     loop: Loop, load: Signal, learner: Learner | None, guard: bool
 ) -> tuple[float, float]:
     """Return RMS and largest error under a load of ``other_load``; infinity if lost."""
-    scenario = replace(loop.scenario, disturbances=(0.0, load), duration=OTHER_END)
-    controller = loop.controller(learner, ql.Guard() if guard else None)
-    run = ql.simulate(loop.plant, controller, scenario, record_every=5)
+    run = simulated(loop, load, learner, guard, OTHER_END)
     if run.diverged:
         return math.inf, math.inf
     error = np.abs(run["y"] - 1.0)[run.window(LOAD_AT, OTHER_END)]

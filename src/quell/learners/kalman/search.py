@@ -53,6 +53,7 @@ from quell.learners.kalman.line_fit import (
 from quell.learners.kalman.oscillators import Oscillators
 from quell.learners.kalman.search_state import (
     ENTRIES,
+    FIT,
     MARGIN,
     REFINE,
     SCAN,
@@ -61,7 +62,6 @@ from quell.learners.kalman.search_state import (
     SearchLoop,
     SearchMemory,
     begin_fit,
-    begin_refinement,
     begin_rows,
     begin_scan,
     search_from_nothing,
@@ -238,25 +238,29 @@ def _add_sample(
     search: FrequencySearch, memory: SearchMemory, f_plain: float, filtered: Vector, u: float
 ) -> None:
     """Add f_plain, the state and u to the entry that is not complete."""
-    loop, late, total = memory.loop[0], memory.late, memory.total
-    is_first = loop.entries == 0.0 and loop.samples == 0.0
-    u_filtered = lag_push(search.lag, memory.chain, 0, u)
-    for i in range(late.size):
-        value = f_plain if i == 0 else u_filtered
-        if 0 < i <= search.states:
-            value = filtered[i - 1]
-        if is_first:
-            late[i] = value
-        late[i] += search.follow * (value - late[i])
-        total[i] += late[i]
+    loop, total = memory.loop[0], memory.total
+    _add_signal(search, memory, 0, f_plain)
+    for i in range(search.states):
+        _add_signal(search, memory, 1 + i, filtered[i])
+    _add_signal(search, memory, total.size - 1, lag_push(search.lag, memory.chain, 0, u))
     loop.samples += 1.0
     if loop.samples >= search.spacing:
-        at = int(loop.entries) % ENTRIES * late.size
-        for i in range(late.size):
+        at = int(loop.entries) % ENTRIES * total.size
+        for i in range(total.size):
             memory.past[at + i] = total[i] / loop.samples
             total[i] = 0.0
         loop.entries += 1.0
         loop.samples = 0.0
+
+
+@kernel
+def _add_signal(search: FrequencySearch, memory: SearchMemory, i: int, value: float) -> None:
+    """Add ``value`` through the lag, which begins at the first one, to the sum of signal ``i``."""
+    late = memory.late
+    if memory.loop[0].entries == 0.0 and memory.loop[0].samples == 0.0:
+        late[i] = value
+    late[i] += search.follow * (value - late[i])
+    memory.total[i] += late[i]
 
 
 @kernel
@@ -297,17 +301,15 @@ def _finish_pass(search: FrequencySearch, memory: SearchMemory, omega: Vector) -
     loop = memory.loop[0]
     if loop.stage == SCAN:
         _add_strongest_line(search, memory)
-        begin_fit(search, memory)
-        return NOTHING
-    is_refined = loop.stage == REFINE
-    if not _finish_fit(search, memory):
+        begin_fit(search, memory, FIT)
+    elif not _finish_fit(search, memory):
         begin_rows(search, memory)
-    elif is_refined:
+    elif loop.stage == REFINE:
         return judge(search, memory, omega)
     elif loop.found < memory.fit.omega.size and loop.share > COMPLETE:
         begin_scan(search, memory)
     else:
-        begin_refinement(search, memory)
+        begin_fit(search, memory, REFINE)
     return NOTHING
 
 
@@ -317,18 +319,18 @@ def _finish_fit(search: FrequencySearch, memory: SearchMemory) -> bool:
     loop, fit, found = memory.loop[0], memory.fit, int(memory.loop[0].found)
     first = 1 + fit.signal.size
     linear = first + 2 * search.orders.size * found
-    rounding = _ROUNDING_SINGLE if is_single(search.step) else _ROUNDING
-    ridge, judging = _LOOKING, _LOOKING
+    size = linear + found
+    loop.without, left = solve(fit, linear, size, _JUDGING if loop.stage == REFINE else _LOOKING)
+    without, loop.rest = loop.without, left
     if loop.stage == REFINE:
-        ridge = _REFINING_SINGLE if is_single(search.step) else _REFINING
-        judging = _JUDGING
-    loop.without, left = solve(fit, linear, linear + found, judging)
-    without, loop.rest = solve(fit, linear, linear + found, ridge)
+        refining = _REFINING_SINGLE if is_single(search.step) else _REFINING
+        rounding = _ROUNDING_SINGLE if is_single(search.step) else _ROUNDING
+        without, loop.rest = solve(fit, linear, size, refining)
+        variance = max(loop.rest, rounding * loop.without) / loop.window
+        write_deviations(fit, linear, size, variance)
     loop.share = 1.0
     if loop.without > 0.0 and without > 0.0:
         loop.share = min(left / loop.without, loop.rest / without)
-    variance = max(loop.rest, rounding * loop.without) / loop.window
-    write_deviations(fit, linear, linear + found, variance)
     for i in range(linear - first):
         fit.amplitude[i] = fit.solution[first + i]
     largest, most = 0.0, _LARGEST_STEP / loop.window

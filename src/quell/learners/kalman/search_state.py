@@ -46,7 +46,7 @@ class SearchLoop(Scalars):
     row: float  # row of the pass
     window: float  # rows of a pass
     found: float  # number of frequencies in the fit
-    passes: float  # since a frequency was added
+    passes: float  # of a fit or refinement
     without: float  # sum of squares that state and u leave without sinusoids
     share: float  # share of it that the fit leaves
     rest: float  # sum of squares that the fit leaves with the ridge of its stage
@@ -80,20 +80,13 @@ def search_from_nothing(search: FrequencySearch, memory: SearchMemory, window: f
     """Begin with no sinusoid, in the newest ``window`` entries."""
     loop = memory.loop[0]
     loop.window, loop.found, loop.continues = window, 0.0, 0.0
-    begin_fit(search, memory)
+    begin_fit(search, memory, FIT)
 
 
 @kernel
-def begin_fit(search: FrequencySearch, memory: SearchMemory) -> None:
-    """Begin to fit the frequencies found so far."""
-    memory.loop[0].stage, memory.loop[0].passes = FIT, 0.0
-    begin_rows(search, memory)
-
-
-@kernel
-def begin_refinement(search: FrequencySearch, memory: SearchMemory) -> None:
-    """Begin to refine the frequencies found, with a small ridge."""
-    memory.loop[0].stage, memory.loop[0].passes = REFINE, 0.0
+def begin_fit(search: FrequencySearch, memory: SearchMemory, stage: float) -> None:
+    """Begin to fit the frequencies found so far, or to refine them, as ``stage`` says."""
+    memory.loop[0].stage, memory.loop[0].passes = stage, 0.0
     begin_rows(search, memory)
 
 

@@ -8,12 +8,13 @@ from quell.kernels.dispatch import kernel
 from quell.learners.kalman.line_fit import LineFit
 from quell.learners.kalman.search_state import (
     ENTRIES,
+    FIT,
     MARGIN,
+    REFINE,
     FrequencySearch,
     SearchLoop,
     SearchMemory,
     begin_fit,
-    begin_refinement,
     search_from_nothing,
 )
 from quell.types import Vector
@@ -78,10 +79,8 @@ def judge(search: FrequencySearch, memory: SearchMemory, omega: Vector) -> int:
 @kernel
 def _fit_again(search: FrequencySearch, memory: SearchMemory) -> None:
     """Continue with the frequencies that there are; look for more if some are missing."""
-    if memory.loop[0].found < memory.fit.omega.size:
-        begin_fit(search, memory)
-    else:
-        begin_refinement(search, memory)
+    some_missing = memory.loop[0].found < memory.fit.omega.size
+    begin_fit(search, memory, FIT if some_missing else REFINE)
 
 
 @kernel
