@@ -135,6 +135,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--other-loads", action="store_true")
     options = parser.parse_args()
+    if options.loops < 1:
+        parser.error(f"--loops {options.loops}: must be 1 or more")
+    if options.seed < 0:
+        parser.error(f"--seed {options.seed}: must be 0 or more")
     if options.other_loads:
         print_other_loads(options.loops, options.seed)
         return
