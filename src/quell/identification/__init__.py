@@ -7,7 +7,7 @@ search for its parameters, ``running_loop`` the same for the gain in records of 
 files here put them together.
 """
 
-from quell.identification.alternatives import Alternative, alternatives, decided
+from quell.identification.alternatives import Alternative, alternatives, decided, not_told_apart
 from quell.identification.experiment.excitation import Excitation, excitation
 from quell.identification.experiment.frequency_response import FrequencyResponse, frequency_response
 from quell.identification.experiment.measured import Measured, excited
@@ -36,6 +36,7 @@ __all__ = [
     "frequency_response",
     "identify",
     "identify_b0",
+    "not_told_apart",
     "read_record",
     "simulated_plant",
 ]

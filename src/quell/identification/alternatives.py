@@ -1,6 +1,18 @@
 """Other structures for the same record, and whether the record decides between them.
 
-Two models are compared by their errors e and e' of simulation, over blocks of the record::
+Where the larger of two models explains the response to u (``Identified.explained``), the ratio of
+likelihoods decides. With both errors whitened by the noise model of the larger one's error,
+
+    L = N (log Σ w² − log Σ w'²)
+
+is χ² with as many degrees of freedom as it has more parameters, p, if the smaller one is true
+(Ljung, *System Identification*, 2nd ed. 1999, sec. 16.4). This holds also where all information is
+in a few samples, as in the record of one step. A needless pole is put where it explains most of the
+noise: of about N/2 frequencies that is χ² of 2 log N and more. So L has to exceed Schwarz's
+``p log N`` (*Annals of Statistics* 6, 1978) and log N besides, too.
+
+Where neither model is true, as with most machines, a needless pole always explains something. Then
+two models are compared by their errors e and e' of simulation, over blocks of the record::
 
     D_i = log(Σ e²) − log(Σ e'²) in block i,     z = mean(D) √B / std(D),     i = 1 … B
 
@@ -14,13 +26,15 @@ little where a larger model is just better, and much where it is not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from quell.identification.identify import identify
 from quell.identification.result import Identified
+from quell.identification.search.output_error import noise_model
 
 # Blocks: each should be longer than the correlation of the errors, and there should be enough of
 # them for their variance. Chosen by hand.
@@ -40,6 +54,12 @@ _RIGID = "order 2 with friction"
 _LEAST_ORDER, _MOST_ORDER, _LEAST_WITH_FRICTION = 1, 8, 2
 
 
+OF_MODEL: Literal["of model"] = "of model"
+"""Stands for the delay of the model at hand."""
+
+Delay = tuple[float, float] | float | None | Literal["of model"]
+
+
 @dataclass(frozen=True, eq=False)
 class Alternative:
     """Another structure for a record, compared with the model at hand."""
@@ -47,65 +67,86 @@ class Alternative:
     name: str  #: what is different, for example ``"order 3"`` or ``"Coulomb friction"``
     smaller: bool  #: whether it has fewer parameters
     gain: float  #: mean of D: how much smaller the logarithm of its squared error is
-    z: float  #: above zero where it is better; see ``quell.identification.alternatives``
+    #: above zero where it is better: L with that sign where the larger model explains the response,
+    #: else z; see ``quell.identification.alternatives``
+    z: float
     limit: float  #: |z| from which on the record decides, at 99 %
+    by_likelihood: bool  #: whether L decides
     model: Identified  #: its fit
     options: str  #: what to give to ``quell identify`` for it
 
     @property
     def verdict(self) -> str:
         """``"better"``, ``"worse"``, or ``"undecided"`` if the record does not decide."""
-        if abs(self.z) < self.limit or abs(self.gain) < _EQUAL:
+        too_small = abs(self.gain) < _EQUAL and not self.by_likelihood
+        if abs(self.z) < self.limit or too_small:
             return "undecided"
         return "better" if self.z > 0.0 else "worse"
 
     @property
     def may_be_as_good(self) -> bool:
         """Whether there is no hint that it is worse."""
+        if self.by_likelihood:
+            return self.z > -self.limit
         return self.z > -_HINT * self.limit or self.gain > -_EQUAL
+
+    @property
+    def _measure(self) -> str:
+        """The measure that decides, and its limit."""
+        name = "likelihood ratio" if self.by_likelihood else "z"
+        return f"{name} {abs(self.z) if self.by_likelihood else self.z:.1f}, limit {self.limit:.1f}"
 
     def describe(self, than: Identified) -> str:
         """Return a line of text that compares it with ``than``, empty if it is of no use."""
-        key = "held out" if "held out" in than.fits else "estimation"
+        key = "held out" if {"held out"} <= than.fits.keys() & self.model.fits.keys() else "estimation"
         fits = f"{self.model.fits[key]:.2f} instead of {than.fits[key]:.2f} % ({key})"
         known = "no friction" if than.friction is None else "friction"
         here = f"order {than.den.size - 1}" if self.name.startswith("order") else known
         if self.name == _RIGID:
             here = f"{here} without friction"
         if self.verdict == "better":
-            return f"SUGGESTION: {self.name} ({self.options}) fits better: {fits}, z = {self.z:.1f}"
+            return (
+                f"NOT the best model: {self.name} ({self.options}) fits better: {fits}, "
+                f"{self._measure}"
+            )
         hinted = "friction" in self.name and self.z > _HINT * self.limit
         if self.verdict == "worse" or not (self.smaller or hinted):
             return ""
         taken = f"{self.name} ({self.options})" if self.smaller else here
         return (
-            f"the record cannot decide between {here} and {self.name}: {fits}, z = {self.z:.1f}, "
-            f"limit {self.limit:.1f}; take {taken}, which has fewer parameters, or record more"
+            f"the record cannot decide between {here} and {self.name}: {fits}, {self._measure}; take {taken}, which has fewer parameters, or record more"
         )
 
     def to_json(self) -> dict[str, Any]:
         """Return name, verdict and fits for JSON."""
-        names = ("name", "options", "smaller", "gain", "z", "limit", "verdict")
+        names = ("name", "options", "smaller", "gain", "z", "limit", "by_likelihood", "verdict")
         return {name: getattr(self, name) for name in names} | {"fits": self.model.fits}
 
 
 def alternatives(
-    found: Identified, delay: tuple[float, float] | None = None
+    found: Identified,
+    delay: Delay = OF_MODEL,
+    *,
+    integrators: int | None = None,
+    friction: bool | None = None,
 ) -> tuple[Alternative, ...]:
     """Fit other structures to the record of a model, and compare them with it.
 
     They are: one pole less, and one zero less; if the error is not white, also the opposite of the
     given assumption on Coulomb friction, and for a larger model without friction that of a mass
-    with friction, unless friction would drive the plant; and one pole more, if the error depends on
-    past u and the model has no ``shortcomings``. A structure that cannot be fitted is left out.
+    with friction, unless friction would drive the plant; and one pole more, if the model does not
+    explain the response to u and has no ``faults``. A structure that cannot be fitted is left out.
 
     Parameters
     ----------
     found
         result of ``identify``.
     delay
-        least and largest delay to search [s]; that of the model by default. With fewer poles
-        another delay may be the best.
+        least and largest delay to search [s], or None to search all; that of the model by default.
+        With fewer poles another delay may be the best.
+    integrators, friction
+        what all alternatives have: number of poles at s = 0, and whether there is friction; by
+        default both are open.
     """
     order, zeros, rubs = found.den.size - 1, found.num.size - 1, found.friction is not None
     direct = zeros == order
@@ -114,47 +155,73 @@ def alternatives(
         fewer = {"order": order - 1, "zeros": min(zeros, order - 1) - (not direct and zeros > 0)}
         tried.append((f"order {order - 1}", True, fewer))
     if not found.residuals.white:
-        if order >= _LEAST_WITH_FRICTION and not direct and found.reference is None:
+        open_to_friction = friction is None and found.reference is None
+        if order >= _LEAST_WITH_FRICTION and not direct and open_to_friction:
             name = "no friction" if rubs else "Coulomb friction"
             tried.append((name, rubs, {"friction": not rubs}))
             if order > _LEAST_WITH_FRICTION and not rubs:
                 tried.append((_RIGID, True, {"order": 2, "zeros": 0, "friction": True}))
-        if order < _MOST_ORDER and not found.residuals.independent and not found.shortcomings:
-            more = {"order": order + 1, "zeros": zeros + direct}
-            tried.append((f"order {order + 1}", False, more))
+    if order < _MOST_ORDER and not found.explained and not found.faults:
+        tried.append((f"order {order + 1}", False, {"order": order + 1, "zeros": zeros + direct}))
     options: dict[str, Any] = {"order": order, "zeros": zeros, "friction": rubs}
     options |= {
-        "delay": found.delay if delay is None else delay,
-        "held_out": 1.0 - found.held_from / found.y.size,
+        "delay": found.delay if delay is OF_MODEL else delay,
+        "integrators": integrators,
     }
+    if not found.samples:
+        options["held_out"] = 1.0 - found.held_from / found.y.size
     options |= {"reference": found.reference, "horizon": found.horizon, "signals": found.signals}
     models = []
     for name, smaller, change in tried:
+        # A smaller model is compared under the same assumption on the start.
+        rest = found.rest if smaller or found.rest_given else None
         try:
-            model = identify(found.u, found.y, found.dt, **(options | change))
+            model = identify(*found.records, found.dt, **(options | change | {"rest": rest}))
         except ValueError:  # too short a record for it, or no such model
             continue
+        model = replace(model, rest_given=found.rest_given)
         if model.friction is not None and model.friction <= 0.0:  # it would drive the plant
             continue
         flags = _options(change)
-        models.append(Alternative(name, smaller, *_compared(found, model), model, flags))
+        nested = name != _RIGID
+        measures = _compared(found, model, smaller) if nested else _by_blocks(found, model)
+        models.append(Alternative(name, smaller, *measures, model, flags))
     return tuple(models)
 
 
-def decided(found: Identified, delay: tuple[float, float] | None = None) -> Identified:
+def decided(found: Identified, delay: Delay = OF_MODEL, **given: Any) -> Identified:
     """Return the model that the record supports: with friction if it fits better, of least order.
 
-    First a better alternative is taken, then, one after the other, smaller ones without a hint that
-    they are worse. ``delay`` is that of ``alternatives``.
+    First a better alternative is taken, then, one after the other, smaller ones that may be as
+    good. ``delay`` and ``given`` are arguments of ``alternatives``.
     """
-    for _ in range(_MOST_ORDER):
-        others = alternatives(found, delay)
+    return not_told_apart(found, delay, **given)[0]
+
+
+def not_told_apart(
+    found: Identified,
+    delay: Delay = OF_MODEL,
+    *,
+    progress: Callable[[float], None] | None = None,
+    **given: Any,
+) -> tuple[Identified, ...]:
+    """Return the model that ``decided`` returns, and those that the record does not tell from it.
+
+    These are the larger models from which a smaller one was taken because it may be as good, if
+    they have no ``faults``. ``progress`` gets the share of the work that is done, about.
+    """
+    kept: list[Identified] = []
+    for step in range(_MOST_ORDER):
+        if progress is not None:
+            progress(step / (step + 2.0))
+        others = alternatives(found, delay, **given)
         better = [one for one in others if one.verdict == "better" and one.model.converged]
         smaller = [one for one in others if one.smaller and one.may_be_as_good]
         if not better and not smaller:
             break
+        kept = [] if better else [*kept, found]
         found = max(better or smaller, key=lambda one: one.z).model
-    return found
+    return (found, *(one for one in kept if not one.faults))
 
 
 def _options(change: dict[str, Any]) -> str:
@@ -166,7 +233,28 @@ def _options(change: dict[str, Any]) -> str:
     return " ".join([*numbers, *friction])
 
 
-def _compared(first: Identified, second: Identified) -> tuple[float, float, float]:
+def _compared(
+    found: Identified, model: Identified, smaller: bool
+) -> tuple[float, float, float, bool]:
+    """Return the mean of D, L or z, above zero if ``model`` is better, its limit, and if it is L."""
+    from scipy.signal import lfilter
+    from scipy.stats import chi2
+
+    gain, z, limit, _ = _by_blocks(found, model)
+    larger, less = (found, model) if smaller else (model, found)
+    if not larger.explained:
+        return gain, z, limit, False
+    errors = [(one.y - one.simulated)[: one.held_from] for one in (less, larger)]
+    c, _ = noise_model(errors[1])
+    least = _EXACT * float(np.sum((found.y - np.mean(found.y)) ** 2))
+    powers = [float(np.sum(lfilter(c, [1.0], error) ** 2)) + least for error in errors]
+    ratio = errors[0].size * float(np.log(powers[0] / powers[1]))
+    more = max(larger.parameters - less.parameters, 1)
+    limit = max(float(chi2.isf(_LEVEL, more)), (more + 1) * float(np.log(errors[0].size)))
+    return gain, -ratio if smaller else ratio, limit, True
+
+
+def _by_blocks(first: Identified, second: Identified) -> tuple[float, float, float, bool]:
     """Return the mean of D, z, above zero if the second model is better, and the limit of z."""
     from scipy.stats import t
 
@@ -180,4 +268,4 @@ def _compared(first: Identified, second: Identified) -> tuple[float, float, floa
     spread = float(np.std(gain, ddof=1)) / np.sqrt(_BLOCKS)
     limit = float(t.isf(0.5 * _LEVEL, _BLOCKS - 1))
     mean = float(np.mean(gain))
-    return mean, (mean / spread if spread > 0.0 else 0.0), limit
+    return mean, (mean / spread if spread > 0.0 else 0.0), limit, False

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
 from quell.types import Vector
+
+
+# Share of a record that is held out, and longest delay at first [samples], by default: by hand.
+_HELD_OUT, _MOST_DELAY = 0.3, 20
+# Relative error of a range of delays by the rounding of the sample time.
+_ROUNDED = 1e-9
 
 
 def other_record(u: Any, y: Any, least: int) -> tuple[Vector, Vector]:
@@ -36,29 +43,72 @@ def resolution_of(y: Vector) -> float:
     return step if rounded else 0.0
 
 
-def delay_range(delay: Any, dt: float) -> tuple[int, int]:
-    """Return the least and the largest delay [samples]."""
+class Records(NamedTuple):
+    """One record, or several one after the other."""
+
+    u: Vector
+    y: Vector
+    samples: tuple[int, ...]  # number of samples of each record, if there are several
+
+
+def given_records(u: Any, y: Any) -> Records:
+    """Return the checked record, or the records of two lists."""
+    if not _is_list_of_records(u) and not _is_list_of_records(y):
+        u, y = checks.vector("u", u), checks.vector("y", y)
+        checks.vector("y", y, u.size)
+        return Records(u, y, ())
+    if not (_is_list_of_records(u) and _is_list_of_records(y)) or len(u) != len(y):
+        raise ValueError(
+            "u, y: must both be arrays, or lists of as many arrays, one for each record"
+        )
+    parts = []
+    for i, (one, other) in enumerate(zip(u, y, strict=True)):
+        first = checks.vector(f"u[{i}]", one)
+        parts.append((first, checks.vector(f"y[{i}]", other, first.size)))
+    samples = tuple(part.size for part, _ in parts)
+    joined = [np.concatenate(signals) for signals in zip(*parts, strict=True)]
+    return Records(joined[0], joined[1], samples if len(samples) > 1 else ())
+
+
+def _is_list_of_records(value: Any) -> bool:
+    return isinstance(value, list | tuple) and bool(value) and np.ndim(value[0]) == 1
+
+
+def delay_range(delay: Any, dt: float, size: int) -> tuple[int, int]:
+    """Return the least and the largest delay [samples]; None is the default for ``size`` samples.
+
+    An end of a range that is no whole number of samples is the next one inside the range.
+    """
+    if delay is None:
+        return 0, max(min(_MOST_DELAY, size // 4), 0)
     if np.ndim(delay) == 0:
         samples = checks.samples("delay", delay, dt)
         return samples, samples
-    ends = checks.vector("delay", delay, 2).tolist()
-    low, high = (checks.samples("delay", value, dt) for value in ends)
-    if low > high:
-        raise ValueError(f"delay = {delay!r}: the smallest comes first")
-    return low, high
+    low, high = checks.vector("delay", delay, 2).tolist()
+    if not 0.0 <= low <= high:
+        raise ValueError(f"delay = {delay!r}: must be from 0 on, and the smallest comes first")
+    first = math.ceil(low / dt * (1.0 - _ROUNDED))
+    return first, max(math.floor(high / dt * (1.0 + _ROUNDED)), first)
 
 
 def first_held_out(
-    u: Vector, y: Vector, order: int, held_out: float, least: int, least_held: int
+    records: Records, order: int, held_out: float | None, least: int, least_held: int
 ) -> int:
     """Return the index of the first held-out sample, with at least ``least`` samples before it."""
-    share = checks.non_negative("held_out", held_out)
+    u, y = records.u, records.y
+    share = _HELD_OUT if held_out is None else checks.non_negative("held_out", held_out)
     if share > 0.9:
         raise ValueError(
             f"held_out = {held_out!r}: must be from 0 to 0.9, "
             "the share of the record that is not used for the fit"
         )
-    held = int(share * u.size)
+    if records.samples and held_out:
+        raise ValueError(
+            f"held_out = {held_out!r}: goes with one record; of several give one as validation"
+        )
+    held = 0 if records.samples else int(share * u.size)
+    if held_out is None and held and _rests_at_end(u, held):
+        held = 0
     held_from = u.size - held
     if held_from < least:
         raise ValueError(
@@ -80,3 +130,8 @@ def first_held_out(
                 "move; hold fewer out, or none, or cut the record where it rests"
             )
     return held_from
+
+
+def _rests_at_end(u: Vector, held: int) -> bool:
+    """Return whether u moves in one of fit and held-out samples alone."""
+    return bool(np.ptp(u[-held:]) == 0.0 or np.ptp(u[:-held]) == 0.0)

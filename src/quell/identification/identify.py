@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -11,17 +12,19 @@ from quell import checks
 from quell.identification.given_record import (
     delay_range,
     first_held_out,
+    given_records,
     other_record,
     resolution_of,
 )
-from quell.identification.model.roots import poles_of, zeros_of
+from quell.identification.model.roots import gain_interval, poles_of, zeros_of
 from quell.identification.model.structure import Structure, free_run
 from quell.identification.result import Identified
 from quell.identification.search.closed_loop import instrumental_variables
-from quell.identification.search.search import Fit, fit
+from quell.identification.search.search import Fit, Wanted, fit
 from quell.identification.validation import (
     fit_predictor,
     nrmse,
+    one_more_pole,
     prediction_fit,
     residuals,
     simulate_fit,
@@ -48,10 +51,11 @@ def identify(
     zeros: int = 0,
     *,
     integrators: int | None = None,
-    delay: float | tuple[float, float] = 0.0,
+    delay: float | tuple[float, float] | None = 0.0,
     bias: bool = True,
     friction: bool = False,
-    held_out: float = 0.3,
+    rest: bool | None = None,
+    held_out: float | None = None,
     horizon: int = 10,
     reference: Any = None,
     validation: tuple[Any, Any] | None = None,
@@ -71,10 +75,10 @@ def identify(
     Parameters
     ----------
     u
-        input of the plant (N,) [u-unit]; held between samples.
+        input of the plant (N,) [u-unit]; held between samples. Or a list of such arrays, one for
+        each of several records: they have one model, each its own initial state and constant force.
     y
-        measured output (N,) [y-unit], each at the time when its u began to act; noise and an
-        encoder's steps are taken as white.
+        measured output (N,) [y-unit], each at the time when its u began to act; or a list.
     dt
         sample time [s].
     order, zeros
@@ -87,14 +91,22 @@ def identify(
         and two poles, if this holds for both at once.
     delay
         delay of u [s], a whole number of samples; or the least and the largest, to find the best
-        between them.
+        between them; or None, to find it from 0 to 20 samples, and beyond that as long as the
+        longest one is the best.
     bias
         whether a constant force acts besides u, as an offset of u does.
     friction
         whether Coulomb friction acts. The sign of the model's own speed is then a second input,
-        with a numerator of its own of degree n − 2.
+        with a numerator of its own of degree n − 2. In order 1 y is the speed.
+    rest
+        whether the plant was at rest under the first u before the record began. By default this is
+        assumed where the record alone does not tell the gain within ±10 % and where it is more
+        likely than not (``quell.identification.search.at_rest``), never with friction; ``rest_probability`` and
+        ``shortcomings`` of the result say how much the record supports it.
     held_out
         share of the record, its end, that is not used for the fit but for its validation; 0 to 0.9.
+        By default 0.3, or none of several records, and none if u does not move there, as in the
+        record of a step.
     horizon
         number of samples that predictions look ahead.
     reference
@@ -131,14 +143,16 @@ def identify(
     >>> found.num.round(6).tolist(), found.den.round(6).tolist()
     ([3.0], [1.0, 2.0])
     """
-    u, y = checks.vector("u", u), checks.vector("y", y)
-    checks.vector("y", y, u.size)
+    records = given_records(u, y)
+    u, y = records.u, records.y
     if reference is not None:
         reference = checks.vector("reference", reference, u.size)
         if np.ptp(reference) == 0.0:
             raise ValueError(
                 f"reference is {reference[0]:g} all through: must move; without one leave it out"
             )
+        if records.samples:
+            raise ValueError("reference: goes with one record, not with several")
     dt = checks.positive("dt", dt, "s")
     order = checks.whole("order", order, 1, 8)
     zeros = checks.whole("zeros", zeros, 0, order)
@@ -150,26 +164,35 @@ def identify(
     if integrators is not None:
         integrators = checks.whole("integrators", integrators, 0, order)
     bias, friction = checks.flag("bias", bias), checks.flag("friction", friction)
-    delays = delay_range(delay, dt)
-    horizon = checks.whole("horizon", horizon, 1)
-    least = max(
-        _SAMPLES_PER_PARAMETER * (3 * order + zeros + 2), 3 * horizon * (order + 1), 4 * delays[1]
-    )
-    least_held = 3 * horizon * (order + 1)
-    held_from = first_held_out(u, y, order, held_out, least, least_held)
-    other = None if validation is None else other_record(*validation, least_held)
-    with one_blas_thread():
-        fitted = fit(
-            u[:held_from], y[:held_from], order, zeros, integrators, delays, bias, friction
+    if rest is not None and checks.flag("rest", rest) and not bias:
+        raise ValueError("rest = True: goes with bias = True: y at rest is not known")
+    if rest and friction:
+        raise ValueError(
+            "rest = True: goes without friction, which may hold a plant anywhere at standstill"
         )
+    horizon = checks.whole("horizon", horizon, 1)
+    least_held = 3 * horizon * (order + 1)
+    least = max(_SAMPLES_PER_PARAMETER * (3 * order + zeros + 2), least_held)
+    shortest = min(records.samples or (u.size,))
+    delays = delay_range(delay, dt, shortest)
+    least = max(least, 4 * delays[1])
+    held_from = first_held_out(records, order, held_out, least, least_held)
+    other = None if validation is None else other_record(*validation, least_held)
+    wanted = Wanted(order, zeros, integrators, delays, delay is None, bias, friction, rest)
+    # An unstable trial of the search may overflow; its cost is then infinite.
+    with one_blas_thread(), np.errstate(all="ignore"):
+        fitted = fit(u[:held_from], y[:held_from], records.samples, wanted)
         if reference is not None:
-            structure, theta = fitted.structure, fitted.estimate.theta
-            v = free_run(structure, theta, fitted.inputs(u[:held_from]), own_friction=True)[1]
-            y_fit, r_fit = y[:held_from], reference[:held_from]
-            estimate = instrumental_variables(structure, theta, v, y_fit, r_fit)
-            fitted = fitted._replace(estimate=estimate)
+            fitted = _with_instruments(fitted, u[:held_from], y[:held_from], reference[:held_from])
         found = _validated(fitted, u, y, reference, dt, held_from, horizon, other)
     return replace(found, signals=Signals(signals.y, signals.u))
+
+
+def _with_instruments(fitted: Fit, u: Vector, y: Vector, r: Vector) -> Fit:
+    """Return the fit with the parameters by instrumental variables from the reference."""
+    structure, theta = fitted.structure, fitted.estimate.theta
+    v = free_run(structure, theta, fitted.inputs(u), own_friction=True)[1]
+    return fitted._replace(estimate=instrumental_variables(structure, theta, v, y, r))
 
 
 def _validated(
@@ -215,7 +238,10 @@ def _validated(
     b, covariance = _numerator(structure, theta, covariance)
     of_b = slice(free, free + b.size)
     gain = b[0] if b[0] != 0.0 else np.nan
-    rubbing = numerators[numerators.shape[0] - len(structure.friction) :, 0]
+    of_a = covariance[: free + 1, : free + 1]
+    friction, friction_std = _friction(structure, theta, fitted.estimate.covariance, seconds, gain)
+    statistic, limit = one_more_pole(fitted, u[first], y[first])
+    low, high = gain_interval(a[structure.integrators :], float(b[0]), of_a)
     return Identified(
         num=b[::-1].copy(),
         den=np.append(1.0, a[::-1]),
@@ -225,10 +251,20 @@ def _validated(
         integrators=structure.integrators,
         delay=fitted.delay * dt,
         bias=float(numerators[1, 0] / gain) if fitted.bias else 0.0,
-        friction=float(np.sum(rubbing) / gain) if structure.friction else None,
+        friction=friction,
+        friction_std=friction_std,
+        gain_interval=(low, high),
+        delay_interval=_delay_interval(fitted, dt),
+        delay_is_at_end=fitted.searched[0] < fitted.delay == fitted.searched[1],
+        rest=fitted.rest.assumed,
+        rest_given=fitted.rest.given,
+        rest_probability=fitted.rest.probability,
+        samples=structure.samples,
         dt=dt,
         horizon=horizon,
         fits=fits,
+        one_more_pole=statistic,
+        one_more_pole_limit=limit,
         residuals=residuals(error, tested_u, min(_LAGS, error.size // 4)),
         resolution=resolution_of(y),
         held_from=held_from,
@@ -241,6 +277,37 @@ def _validated(
     )
 
 
+def _delay_interval(fitted: Fit, dt: float) -> tuple[float, float]:
+    """Return the 95 % interval of the delay [s]: half a sample more than the whole samples."""
+    if fitted.searched[0] == fitted.searched[1]:
+        return fitted.delay * dt, fitted.delay * dt
+    low, high = fitted.delays
+    return max(low - 0.5, 0.0) * dt, (high + 0.5) * dt
+
+
+def _friction(
+    structure: Structure, theta: Vector, covariance: Matrix, seconds: Vector, gain: float
+) -> tuple[float | None, float]:
+    """Return Coulomb friction [u-unit], positive if it acts against motion, and its deviation.
+
+    ``theta`` is in seconds, ``covariance`` in samples, ``seconds`` the factors between them. The
+    force on y^(n) is F, so F/|b| acts like u whichever sign b has.
+    """
+    if not structure.friction:
+        return None, math.nan
+    slope, at = np.zeros(theta.size), structure.free
+    places = []
+    for degree in structure.degrees:
+        places.append(at)
+        at += degree + 1
+    rubbing = places[len(places) - len(structure.friction) :]
+    force = float(np.sum(theta[rubbing]))
+    slope[rubbing] = 1.0 / abs(gain)
+    slope[places[0]] = -force / (gain * abs(gain))
+    slope *= seconds
+    return force / abs(gain), math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+
+
 def _numerator(structure: Structure, theta: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
     """Return b in ascending powers, and the covariance of a and b."""
     free, a = structure.free, structure.denominator(theta)
@@ -249,7 +316,7 @@ def _numerator(structure: Structure, theta: Vector, covariance: Matrix) -> tuple
     if not structure.direct:
         return b, covariance[:size, :size]
     # B + D_u A, with the derivatives by a, B and D_u
-    at, direct = structure.size - structure.order - 1, structure.feedthrough(theta)
+    at, direct = structure.common - 1, structure.feedthrough(theta)
     slope = np.zeros((size + 1, structure.size))
     slope[:size, :size] = np.eye(size)
     slope[free + structure.integrators : size, :free] = direct * np.eye(free)

@@ -25,6 +25,11 @@ from quell.types import Matrix, Vector
 _FRICTION_WIDTH = 0.02
 # A pole and a zero within three standard deviations may be equal (99.7 %).
 _DEVIATIONS = 3.0
+# A gain whose 95 % interval is wider than this share of it is not decided: then it may be half or
+# twice of what it is, beyond what a design allows for. A probability from here on is certain.
+_WIDE, _SURE = 1.0, 0.95
+# From here down a start at rest that was given is contradicted: three standard deviations.
+_CONTRADICTED = 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +48,23 @@ class Identified:
     delay: float  #: delay of u [s]
     bias: float  #: constant force on the plant [u-unit]; NaN if a constant u has no effect on it
     friction: float | None  #: Coulomb friction, the |u| for slow motion [u-unit]; None: not fitted
+    friction_std: float  #: its standard deviation [u-unit]; NaN: not fitted
+    #: 95 % interval of ``gain``; infinite at an end that the record does not tell
+    gain_interval: tuple[float, float]
+    delay_interval: tuple[float, float]  #: 95 % interval of the delay [s], if it was searched
+    delay_is_at_end: bool  #: whether the best delay is the longest one that was searched
+    rest: bool  #: whether the model starts at rest
+    rest_given: bool  #: whether the start at rest was given, not assumed
+    rest_probability: float  #: of a start at rest, from the record alone; NaN if not assumed
+    samples: tuple[int, ...]  #: number of samples of each record, if there are several
     dt: float  #: sample time of the record [s]
     horizon: int  #: number of samples that the predictions in ``fits`` look ahead
     #: NRMSE in %: ``"estimation"``, ``"held out"`` and ``"validation"``, as far as there are such
     #: samples, also with ``", predicted"``
     fits: dict[str, float]
     residuals: Residuals  #: tests of the error, on the last of the samples in ``fits``
+    one_more_pole: float  #: χ² of a further response to u in the error of the fit; see ``validation``
+    one_more_pole_limit: float  #: limit that it exceeds by chance in one of a thousand records
     resolution: float  #: step that y is rounded to, 0.0 if it is not rounded [y-unit]
     held_from: int  #: index of the first held-out sample; N if none was held out
     u: Vector
@@ -58,6 +74,57 @@ class Identified:
     converged: bool  #: whether the search ended at a minimum that a second start or tests confirm
     method: str
     signals: Signals = UNKNOWN  #: names and units of u and y
+
+    @property
+    def gain(self) -> float:
+        """Gain ``lim s^q G(s)`` at s = 0, with q integrators [y-unit/u-unit/s^q]."""
+        constant = self.den[self.den.size - 1 - self.integrators]
+        return float(self.num[-1] / constant) if constant else math.inf
+
+    @property
+    def records(self) -> tuple[Any, Any]:
+        """u and y as ``identify`` got them: arrays, or lists of arrays of several records."""
+        if not self.samples:
+            return self.u, self.y
+        edges = np.cumsum(self.samples)[:-1]
+        return np.split(self.u, edges), np.split(self.y, edges)
+
+    @property
+    def parameters(self) -> int:
+        """Number of fitted parameters, those of the start of each record and the delay included."""
+        order, records = self.den.size - 1, max(len(self.samples), 1)
+        rubbing = 0 if self.friction is None else max(order - 1, 1)
+        searched = self.delay_interval[0] < self.delay_interval[1]
+        start = 1 if self.rest else order + 1
+        return order - self.integrators + self.num.size + rubbing + searched + start * records
+
+    @property
+    def explained(self) -> bool:
+        """True if the error has no further response to u, by the test for one more pole."""
+        return self.one_more_pole <= self.one_more_pole_limit
+
+    @property
+    def undecided(self) -> tuple[str, ...]:
+        """What the record does not decide, and what to do; empty if it decides all."""
+        found, (low, high) = [], self.gain_interval
+        remedy = "record more rest before the first step, more steps, or a longer time"
+        value = f"it is {self.gain:.4g}, 95 %: {low:.4g} to {high:.4g}; {remedy}"
+        if low <= 0.0 <= high and low < high:
+            found.append(f"the record does not decide the sign of the gain: {value}")
+        elif not high - low <= _WIDE * abs(self.gain):
+            found.append(f"the record does not decide the size of the gain: {value}")
+        if self.rest and not self.rest_given and self.rest_probability < _SURE:
+            found.append(
+                "the record does not decide whether the plant was at rest before it, on which the gain "
+                f"depends (probability {self.rest_probability:.2g}): if it was, give rest=True (--rest); "
+                "if not, record more rest before the first step"
+            )
+        if self.delay_is_at_end:
+            found.append(
+                f"the record does not decide the delay: {self.delay:.4g} s is the longest one that was "
+                "searched; search longer ones (delay, --max-delay), or record longer"
+            )
+        return tuple(found)
 
     @cached_property
     def plant(self) -> LinearPlant:
@@ -79,6 +146,28 @@ class Identified:
 
     @property
     def shortcomings(self) -> tuple[str, ...]:
+        """Reasons not to rely on the model, each with what to do; empty for a good one.
+
+        They are the ``faults``, what is ``undecided``, a response to u that it does not explain, and
+        a start that is not at rest although ``rest`` says so.
+        """
+        found = [*self.faults, *self.undecided]
+        if not self.explained:
+            found.append(
+                "the response to u is not of this form "
+                f"(one more pole: {self.one_more_pole:.3g}, limit {self.one_more_pole_limit:.3g}), so "
+                "gain and poles may be farther from the plant's than their deviations say; use a "
+                "higher order, zeros, friction, or another delay"
+            )
+        if self.rest and self.rest_probability < _CONTRADICTED:
+            found.append(
+                "the first samples contradict the start at rest "
+                f"(probability {self.rest_probability:.2g}); leave rest=True (--rest) out"
+            )
+        return tuple(found)
+
+    @property
+    def faults(self) -> tuple[str, ...]:
         """Faults that the fit does not show: poles that are unstable, too fast, or cancelled."""
         fastest = math.pi / self.dt
         poles, zeros = (
@@ -160,9 +249,19 @@ class Identified:
         ]
         if self.zeros:
             lines += ["zero [rad/s]", *(_row(root) for root in self.zeros)]
-        lines += ["", f"constant force {self.bias:.4g} (in units of u)"]
+        low, high = self.gain_interval
+        lines += ["", f"gain {self.gain:.5g}, 95 %: {low:.5g} to {high:.5g}{_of(self.integrators)}"]
+        low, high = self.delay_interval
+        if low < high:
+            lines += [f"delay {self.delay:.4g} s, 95 %: {low:.4g} to {high:.4g} s"]
+        if self.rest:
+            how = "given" if self.rest_given else "assumed"
+            lines += [f"start at rest: {how} (probability {self.rest_probability:.3g})"]
+        lines += [f"constant force {self.bias:.4g} (in units of u)"]
         if self.friction is not None:
-            lines += [f"Coulomb friction {self.friction:.4g} (in units of u)"]
+            lines += [
+                f"Coulomb friction {self.friction:.4g} ± {self.friction_std:.2g} (in units of u)"
+            ]
         lines += [f"fit, {name}: {percent(value)} %" for name, value in self.fits.items()]
         tests, rounding = self.residuals, ""
         if self.resolution:
@@ -210,8 +309,17 @@ class Identified:
             "zeros": [_root_json(root) for root in self.zeros],
             "integrators": self.integrators,
             "delay": self.delay,
+            "gain": self.gain,
+            "gain_interval": list(self.gain_interval),
+            "delay_interval": list(self.delay_interval),
+            "rest": self.rest,
+            "rest_given": self.rest_given,
+            "rest_probability": self.rest_probability,
+            "one_more_pole": self.one_more_pole,
+            "one_more_pole_limit": self.one_more_pole_limit,
             "bias": self.bias,
             "friction": self.friction,
+            "friction_std": self.friction_std,
             "friction_width": self.friction_width,
             "dt": self.dt,
             "samples": self.y.size,
@@ -234,6 +342,11 @@ class Identified:
             "method": self.method,
         }
         return dict(nonfinite_to_none(value))
+
+
+def _of(integrators: int) -> str:
+    """Return what a gain with integrators is the gain of."""
+    return f" (of s^{integrators} G)" if integrators > 1 else (" (of s G)" if integrators else "")
 
 
 def _largest_correlation(tests: Residuals) -> float:

@@ -13,6 +13,14 @@ of them are within a limit with the probability 1 − α if each exceeds it with
 ``α/(M + 1)`` at most (Bonferroni), however they depend on each other. The first
 tests a model of the noise, which an output-error model does not have; the second tests the model of
 the plant.
+
+*One more pole*: a pole λ in the model changes its output by ``−p/(p + λ) ŷ_u``, ŷ_u being the
+response to u. For some λ, slower and faster than the poles of the model, these changes are regressed
+on ε together with the derivatives ψ of the output by θ, all of them whitened by the model of the
+noise of ``output_error``. The reduction of ``Σ w²/σ_w²`` that they bring is χ² with as many degrees
+of freedom if ε has nothing of u (Lagrange-multiplier test; Breusch & Pagan, *Review of Economic
+Studies* 47, 1980). It also shows an order that is too low in the record of one step, where the
+correlation with u does not.
 """
 
 from __future__ import annotations
@@ -23,12 +31,15 @@ import numpy as np
 
 from quell.identification.model.correlation import correlation
 from quell.identification.model.sampling import chains
-from quell.identification.model.structure import free_run, nonzero_lengths
+from quell.identification.model.structure import free_run, gradient, nonzero_lengths
+from quell.identification.search.output_error import noise_model
 from quell.identification.search.search import Fit
 from quell.types import Matrix, Vector
 
 # Rounds that adapt the start and the signs of friction to each other: chosen by hand, not tuned.
 _ROUNDS = 6
+# Poles of the test for one more pole, and the probability that it fails by chance: by hand.
+_EXTRA_POLES, _SELDOM = 4, 1e-3
 # Relative singular value that counts as zero.
 _RANK = 1e-12
 
@@ -72,7 +83,8 @@ def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
     structure, theta = fit.structure, fit.estimate.theta
     if y is None:
         return _finite(free_run(structure, theta, v, own_friction=True)[0])
-    theta = theta.copy()
+    structure = structure.single()
+    theta = theta[: structure.size].copy()
     theta[-structure.order :] = 0.0
     free = chains(structure.denominator(theta), np.zeros((y.size, 0)))[:, :, 0]
     size = nonzero_lengths(_finite(free))
@@ -83,6 +95,44 @@ def simulate_fit(fit: Fit, v: Matrix, y: Vector | None = None) -> Vector:
         theta[-structure.order :] += change / size
         predicted = _finite(free_run(structure, theta, v, own_friction=True)[0])
     return predicted
+
+
+def one_more_pole(fit: Fit, u: Vector, y: Vector) -> tuple[float, float]:
+    """Return the statistic of the test for one more pole, and its limit at 99.9 %."""
+    from scipy.signal import lfilter
+    from scipy.stats import chi2
+
+    structure, theta = fit.structure, fit.estimate.theta
+    v = free_run(structure, theta, fit.inputs(u), own_friction=True)[1]
+    predicted, psi = gradient(structure, theta, v)
+    alone = np.zeros_like(v)
+    alone[:, 0] = v[:, 0] - v[0, 0]
+    a = structure.denominator(theta)
+    poles = np.abs(np.roots(np.append(1.0, a[::-1])))
+    slow, fast = np.clip([np.min(poles), np.max(poles)], 3.0 / y.size, 1.0)
+    b = structure.numerators(theta)[0]
+    columns = []
+    for rate in np.geomspace(slow / 3.0, min(3.0 * fast, 2.0), _EXTRA_POLES).tolist():
+        wider = np.convolve(np.append(a, 1.0), [rate, 1.0])[:-1]
+        parts = []
+        for place in structure.records(y.size):
+            bank = chains(wider, alone[place, :1])[:, :, 0]
+            parts.append(bank[:, 1 : b.size + 1] @ b)
+        columns.append(np.concatenate(parts))
+    c, variance = noise_model(y - predicted)
+    known = psi / nonzero_lengths(psi)
+    extra = np.column_stack(columns)
+    extra /= nonzero_lengths(extra)
+    whitened = lfilter(c, [1.0], np.column_stack([known, extra, y - predicted]), axis=0)
+    if not np.all(np.isfinite(whitened)) or not variance > 0.0:
+        return 0.0, float(chi2.isf(_SELDOM, _EXTRA_POLES))
+    error = whitened[:, -1]
+    left = [
+        float(np.sum((error - part @ np.linalg.lstsq(part, error, rcond=1e-9)[0]) ** 2))
+        for part in (whitened[:, : known.shape[1]], whitened[:, :-1])
+    ]
+    statistic = (left[0] - left[1]) / (left[1] / max(y.size - whitened.shape[1] + 1, 1))
+    return statistic, float(chi2.isf(_SELDOM, _EXTRA_POLES))
 
 
 def _finite(predicted: Matrix) -> Matrix:

@@ -57,7 +57,7 @@ def given_plants(
     b_range: Sequence[float] = (1.0, 1.0),
     operating_point: Any = None,
 ) -> Given:
-    """Return the plants, checked: the same relative degree and sign of the gain.
+    """Return the plants, checked: the same sign of the gain.
 
     Raises ``ValueError`` for a plant with a zero at s = 0, on which integral action has no effect.
     """
@@ -74,11 +74,6 @@ def given_plants(
             raise ValueError(
                 f"plant[{i}] has a zero at s = 0: integral action has no effect on its output; "
                 "measure another output"
-            )
-        if form.degree != forms[0].degree:
-            raise ValueError(
-                f"plant[{i}] has relative degree {form.degree}, plant[0] {forms[0].degree}: must "
-                "be the same in a set; tune for each of them"
             )
     signs = [_sign(form.b, form.zeros) for form in forms]
     for i, sign in enumerate(signs):

@@ -126,7 +126,7 @@ def tune(
     Raises
     ------
     ValueError
-        for arguments out of range, plants with different relative degrees or signs of the gain, a
+        for arguments out of range, plants with different signs of the gain, a
         plant that no controller of the structure stabilises, constraints that contradict each
         other (which, and by how much).
 

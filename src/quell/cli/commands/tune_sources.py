@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from quell.cli.confirm import confirm
-from quell.cli.options import Switch, Whole
-from quell.cli.output import Console, print_line
+from quell.cli.options import Switch, Whole, WholeOrNone
+from quell.cli.output import Console, print_line, progress_bar
 from quell.cli.records import measured
 
 if TYPE_CHECKING:
@@ -23,9 +24,8 @@ if TYPE_CHECKING:
 RECORDS = (".csv", ".mcap", ".nc")
 """Suffixes of files that are records, not setups."""
 
-# Longest delay that is searched by default [samples], and the verifying step's length in units of
-# 1/(frequency of the phase margin). Chosen by hand.
-_MOST_DELAY, _STEP_LENGTH = 20, 60.0
+# The verifying step's length in units of 1/(frequency of the phase margin), chosen by hand.
+_STEP_LENGTH = 60.0
 # Safe actions for twins in this process: nothing is lost if a deadline is, as no plant moves.
 _TWIN = {"hold": 10_000, "most_overruns": 10_000}
 
@@ -44,13 +44,27 @@ class RecordOptions:
     model_order
         Poles of the model at first; fewer, or friction, where the record shows it.
     max_delay
-        Longest delay to search [s]; 20 samples by default.
+        Longest delay to search [s]; by default 20 samples, and more where the longest is the best.
+    integrators
+        Poles of the model at s = 0; by default as many as the record shows.
+    friction
+        Whether the model has Coulomb friction; by default where the record shows it.
+    rest
+        Whether the plant was at rest before the record; by default this is assumed where the gain
+        is not known without it and the first samples support it.
+    held_out
+        Share of the record, at its end, on which the model is judged; 0.3 by default, none where u
+        does not move there.
     """
 
     columns: str = ""
     time_unit: str | None = None
     model_order: Whole = 4
     max_delay: float | None = None
+    integrators: WholeOrNone = None
+    friction: bool | None = None
+    rest: bool | None = None
+    held_out: float | None = None
 
 
 @Parameter(name="*")
@@ -94,28 +108,47 @@ class RigOptions:
 RECORD_OPTIONS, RIG_OPTIONS = RecordOptions(), RigOptions()
 
 
-def identified(console: Console, record: Measured, options: RecordOptions) -> tuple[Any, float]:
-    """Identify a record; print and return the model, and half a sample if the delay was searched.
+def identified(
+    console: Console, record: Measured, options: RecordOptions
+) -> tuple[Identified, list[Any], list[float]]:
+    """Identify a record; print the model, return it and the plants for tuning with their delays.
 
-    Raises ``ValueError`` for a model with faults that no controller should be tuned for.
+    Raises ``ValueError`` for a model with faults that no controller should be tuned for, and for
+    what the record does not decide.
     """
-    from quell.identification import decided, identify
+    from quell.identification import identify, not_told_apart
+    from quell.tuning.identified import identified_plants
 
     dt = record.dt
-    most = _MOST_DELAY * dt if options.max_delay is None else options.max_delay
-    delays = (0.0, round(most / dt) * dt)
-    with console.status("Identifying, with other orders and friction where the record shows it."):
+    delay = None if options.max_delay is None else (0.0, options.max_delay)
+    given = {"integrators": options.integrators, "friction": options.friction}
+    with progress_bar(console, "identifying") as report:
+        report("identifying: first model", 0.0)
         first = identify(
-            record.u, record.y, dt, options.model_order, delay=delays, signals=record.signals
+            record.u,
+            record.y,
+            dt,
+            options.model_order,
+            delay=delay,
+            integrators=options.integrators,
+            friction=bool(options.friction),
+            rest=options.rest,
+            held_out=options.held_out,
+            signals=record.signals,
         )
-        model: Identified = decided(first, delays)
+        progress = partial(report, "identifying: other orders, and friction")
+        model, *others = not_told_apart(first, delay, progress=progress, **given)
     print_line(console, model.describe())
-    if model.shortcomings:
+    if model.held_from == model.y.size and options.held_out is None:
+        print_line(console, "nothing is held out: u does not move at the end of the record")
+    for other in others:
+        print_line(console, f"the record does not tell it from {other!r}, which is tuned for, too")
+    reasons = [*model.faults, *model.undecided]
+    if reasons:
         raise ValueError(
-            f"record: no plant to tune for: {'; '.join(model.shortcomings)}; give --model-order, "
-            "or record more"
+            f"record: no plant to tune for: {'; '.join(reasons)}; or give --model-order"
         )
-    return model, 0.5 * dt if delays[1] > 0.0 else 0.0
+    return model, *identified_plants(model, others)
 
 
 def from_record(
@@ -127,15 +160,8 @@ def from_record(
     """Return the plants that a record shows, its sample time, options of ``tune``, the model."""
     record = measured(path, options.columns, dt, options.time_unit)
     print_line(console, f"{path.name}: {record.y.size} samples, dt = {record.dt:g} s")
-    model, late = identified(console, record, options)
-    return (*_plants(model, late, record.dt), model)
-
-
-def _plants(model: Identified, late: float, dt: float) -> tuple[list[Any], float, dict[str, Any]]:
-    from quell.tuning.identified import identified_plants
-
-    plants, delays = identified_plants(model, late)
-    return plants, dt, {"delay": delays}
+    model, plants, delays = identified(console, record, options)
+    return plants, record.dt, {"delay": delays}, model
 
 
 @dataclass(frozen=True)
@@ -203,10 +229,10 @@ def from_rig(
         with written_atomically(record, overwrite) as part:
             np.savetxt(part, table, delimiter=",", header="t,u,y", comments="", fmt="%.10g")
         print_line(console, f"Record: {record}")
-    model, late = identified(console, done.measured, options)
+    model, plants, delays = identified(console, done.measured, options)
     last = float(done.runs[-1].record["y"][-1])
     y_now = last if model.integrators else done.y_rest
-    return (*_plants(model, late, dt), model, y_now)
+    return plants, dt, {"delay": delays}, model, y_now
 
 
 def verified(

@@ -116,16 +116,19 @@ def _gradient(
 
 @compiled
 def _states_with_friction(
-    phi: Matrix, gamma: Matrix, v: Matrix, speeds: Matrix, x: Vector, out: Matrix
+    phi: Matrix, gamma: Matrix, v: Matrix, speeds: Matrix, offset: float, x: Vector, out: Matrix
 ) -> None:
-    """Write the states and the last inputs: minus the signs of ``speeds`` times the state."""
+    """Write the states and the last inputs: minus the signs of ``speeds`` times the state.
+
+    ``offset`` is added to the speeds.
+    """
     n, m = gamma.shape
     first = m - speeds.shape[0]
     for k in range(v.shape[0]):
         for i in range(n):
             out[k, i] = x[i]
         for j in range(first, m):
-            rate = 0.0
+            rate = offset
             for i in range(n):
                 rate += speeds[j - first, i] * x[i]
             v[k, j] = -1.0 if rate > 0.0 else (1.0 if rate < 0.0 else 0.0)
@@ -178,12 +181,15 @@ def states(system: Sampled, v: Matrix, x0: Vector | None = None) -> Matrix:
 
 
 def states_with_friction(
-    system: Sampled, v: Matrix, speeds: Matrix, x0: Vector
+    system: Sampled, v: Matrix, speeds: Matrix, x0: Vector, offset: float = 0.0
 ) -> tuple[Matrix, Matrix]:
-    """Return states and inputs; the last are minus the signs of ``speeds`` times the state."""
+    """Return states and inputs; the last are minus the signs of ``speeds`` times the state.
+
+    ``offset`` is added to the speeds.
+    """
     out, inputs = np.empty((v.shape[0], x0.size)), np.array(v, order="C")
     speeds, x = np.ascontiguousarray(speeds), np.array(x0, dtype=np.float64)
-    _states_with_friction(system.phi, system.gamma, inputs, speeds, x, out)
+    _states_with_friction(system.phi, system.gamma, inputs, speeds, offset, x, out)
     return out, inputs
 
 

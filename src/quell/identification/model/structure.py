@@ -30,11 +30,23 @@ order 4 on there may be a spring between them. For inertias J₁ (driven) and J�
 
 ω_a, the frequency at which the driven side stands still while the other oscillates, is not a zero
 of y and has to be searched for: it is below the resonance ``ω_r² = ω_a² (1 + J₂/J₁)``.
+
+In order 1 y is itself the speed, ``y' + a y = b u − F sign(y)``: the record of a drive's speed.
+
+**Start at rest.** A plant that has been at rest at u_0 and y_0 before the record obeys::
+
+    y = y_0 + B/A (u − u_0) + F₁/A v₁ + …        from zero initial states
+
+with one unknown y_0 in place of the n of D and the constant force.
+
+**Several records** have the same A, B and F, but each has its own D, or its own y_0.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +63,7 @@ from quell.types import Matrix, Vector
 
 
 class Structure(NamedTuple):
-    """The parameters θ, in this order: a_q … a_{n−1}; the numerator of each input; D_u; D."""
+    """The parameters θ: a_q … a_{n−1}; the numerator of each input; D_u; D or y_0 of each record."""
 
     order: int  #: n
     integrators: int  #: q, the number of poles that are set to s = 0
@@ -60,6 +72,10 @@ class Structure(NamedTuple):
     """1/ω_a² [samples²] of each friction input, the last ones; 0.0 on the measured side."""
     direct: bool = False
     """Whether u also acts on y at once: ``y = … + D_u u``; then B has the degree n − 1."""
+    at_rest: bool = False
+    """Whether the records start at rest; then the first input is u − u_0."""
+    samples: tuple[int, ...] = ()
+    """Number of samples of each record, if there are several."""
 
     @property
     def free(self) -> int:
@@ -67,9 +83,19 @@ class Structure(NamedTuple):
         return self.order - self.integrators
 
     @property
+    def common(self) -> int:
+        """Number of parameters that all records have in common."""
+        return self.free + sum(self.degrees) + len(self.degrees) + self.direct
+
+    @property
+    def of_start(self) -> int:
+        """Number of parameters of the start of each record."""
+        return 1 if self.at_rest else self.order
+
+    @property
     def size(self) -> int:
         """Number of parameters."""
-        return self.free + sum(self.degrees) + len(self.degrees) + self.direct + self.order
+        return self.common + self.of_start * max(len(self.samples), 1)
 
     def denominator(self, theta: Vector) -> Vector:
         """Return a (n,), in ascending powers."""
@@ -86,12 +112,16 @@ class Structure(NamedTuple):
         return found
 
     def initial(self, theta: Vector) -> Vector:
-        """Return D (n,), in ascending powers."""
-        return theta[self.size - self.order :]
+        """Return D (n,) of a single record, in ascending powers; zero for a start at rest."""
+        return np.zeros(self.order) if self.at_rest else theta[self.common :]
+
+    def level(self, theta: Vector) -> float:
+        """Return y_0 of a single record that starts at rest, else zero."""
+        return float(theta[-1]) if self.at_rest else 0.0
 
     def feedthrough(self, theta: Vector) -> float:
         """Return D_u, zero without direct feedthrough."""
-        return float(theta[self.size - self.order - 1]) if self.direct else 0.0
+        return float(theta[self.common - 1]) if self.direct else 0.0
 
     def powers(self, unit: float) -> Vector:
         """Return the factor of each parameter for a unit of time that is ``unit`` times as long."""
@@ -99,14 +129,41 @@ class Structure(NamedTuple):
         a = unit ** (n - np.arange(float(self.integrators), n))
         numerators = [unit ** (n - np.arange(degree + 1.0)) for degree in self.degrees]
         direct = np.ones(int(self.direct))
-        return np.concatenate([a, *numerators, direct, unit ** (n - 1.0 - np.arange(n))])
+        start = np.ones(1) if self.at_rest else unit ** (n - 1.0 - np.arange(n))
+        return np.concatenate(
+            [a, *numerators, direct, np.tile(start, max(len(self.samples), 1))]
+        )
+
+    def records(self, count: int) -> list[slice]:
+        """Return the places of each record in ``count`` samples."""
+        edges = accumulate(self.samples or (count,), initial=0)
+        return [slice(*pair) for pair in pairwise(edges)]
+
+    def single(self) -> Structure:
+        """Return the structure for one of the records."""
+        return self._replace(samples=())
+
+
+def _each(structure: Structure, theta: Vector, count: int) -> Iterator[tuple[slice, Vector, slice]]:
+    """Yield the samples of each record, its own θ, and the places of its start in θ."""
+    for i, place in enumerate(structure.records(count)):
+        at = structure.common + i * structure.of_start
+        start = slice(at, at + structure.of_start)
+        yield place, np.append(theta[: structure.common], theta[start]), start
 
 
 def linear_columns(structure: Structure, a: Vector, v: Matrix) -> Matrix:
     """Return the derivatives of y by all parameters except those of A (N, size − free)."""
-    bank = chains(a, v)
-    parts = [bank[:, : degree + 1, j] for j, degree in enumerate(structure.degrees)]
-    return np.hstack([*parts, v[:, : int(structure.direct)], bank[:, :, -1]])
+    found = np.zeros((v.shape[0], structure.size - structure.free))
+    common = structure.common - structure.free
+    for i, place in enumerate(structure.records(v.shape[0])):
+        bank = chains(a, v[place])
+        parts = [bank[:, : degree + 1, j] for j, degree in enumerate(structure.degrees)]
+        found[place, :common] = np.hstack([*parts, v[place, : int(structure.direct)]])
+        at = common + i * structure.of_start
+        start = 1.0 if structure.at_rest else bank[:, :, -1]
+        found[place, at : at + structure.of_start] = start
+    return found
 
 
 def output(structure: Structure, theta: Vector, v: Matrix) -> Vector:
@@ -118,17 +175,25 @@ def free_run(
     structure: Structure, theta: Vector, v: Matrix, own_friction: bool = False
 ) -> tuple[Vector, Matrix]:
     """Return y (N,) and the inputs, with ``own_friction`` those of the model's own speeds."""
+    if structure.samples:
+        single, parts = structure.single(), _each(structure, theta, v.shape[0])
+        runs = [free_run(single, own, v[place], own_friction) for place, own, _ in parts]
+        return np.concatenate([y for y, _ in runs]), np.vstack([inputs for _, inputs in runs])
     A = observable(structure.denominator(theta))
     B = np.ascontiguousarray(structure.numerators(theta)[:, ::-1].T)
     system, initial = sampled(A, B), structure.initial(theta)[::-1]
-    direct = structure.feedthrough(theta) * v[:, 0]
+    direct = structure.feedthrough(theta) * v[:, 0] + structure.level(theta)
     if not (own_friction and structure.friction):
         return states(system, v, initial)[:, 0] + direct, v
-    # y' and y‴ without the direct effect of the inputs; y = x_1
-    first = A[0]
-    third = first @ A @ A
-    speeds = np.array([first + weight * third for weight in structure.friction])
-    x, inputs = states_with_friction(system, v, speeds, initial)
+    if structure.order == 1:
+        # y, and with it the sign of the speed, has a level of its own.
+        speeds, offset = np.ones((1, 1)), structure.level(theta)
+    else:
+        # y' and y‴ without the direct effect of the inputs; y = x_1
+        first, offset = A[0], 0.0
+        third = first @ A @ A
+        speeds = np.array([first + weight * third for weight in structure.friction])
+    x, inputs = states_with_friction(system, v, speeds, initial, offset)
     return x[:, 0] + direct, inputs
 
 
@@ -143,19 +208,30 @@ def cost(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> float:
 
 def gradient(structure: Structure, theta: Vector, v: Matrix) -> tuple[Vector, Matrix]:
     """Return y (N,) and its derivatives by θ (N, size)."""
-    n, degrees = structure.order, (*structure.degrees, structure.order - 1)
-    columns, at = np.full((n, len(degrees)), -1), structure.free
+    if structure.samples:
+        y, psi = np.empty(v.shape[0]), np.zeros((v.shape[0], structure.size))
+        single, common = structure.single(), structure.common
+        for place, own, start in _each(structure, theta, v.shape[0]):
+            y[place], part = gradient(single, own, v[place])
+            psi[place, :common], psi[place, start] = part[:, :common], part[:, common:]
+        return y, psi
+    n, degrees = structure.order, structure.degrees
+    columns, at = np.full((n, len(degrees) + 1), -1), structure.free
     for j, degree in enumerate(degrees):
-        at += structure.direct * (j == len(structure.degrees))
         columns[: degree + 1, j] = np.arange(at, at + degree + 1)
         at += degree + 1
+    if not structure.at_rest:
+        columns[:, -1] = np.arange(structure.common, structure.size)
     a, B = structure.denominator(theta), structure.numerators(theta)[:, ::-1].T
     initial = structure.initial(theta)[::-1]
     y, psi = sampling.gradient(a, B, initial, columns, structure.integrators, v, structure.size)
+    # The derivatives by a are those of the part of y that has passed through 1/A.
     if structure.direct:
-        # The derivatives by a are those of the part of y that has passed through 1/A.
-        psi[:, structure.size - n - 1] = v[:, 0]
+        psi[:, structure.common - 1] = v[:, 0]
         y += structure.feedthrough(theta) * v[:, 0]
+    if structure.at_rest:
+        psi[:, -1] = 1.0
+        y += structure.level(theta)
     return y, psi
 
 

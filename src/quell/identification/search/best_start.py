@@ -9,6 +9,9 @@ smaller model with a pole, or a pole and an equal zero, added (``nested``): the 
 fits worse than it. If the first two starts lead to the same model and it leaves nearly nothing
 unexplained, the rest is left out; the smaller models, if only white noise is left.
 
+For records that start at rest, and for several records, the poles of the best model of each record
+from any start are the starts.
+
 A minimum is *confirmed* if a second start leads to it, or if its error is white: then no model can
 be better by much.
 """
@@ -52,6 +55,8 @@ class Start(NamedTuple):
 
 def best_start(structure: Structure, v: Matrix, y: Vector) -> Start:
     """Return the model of least output error from many starts, for inputs ``v``, output ``y``."""
+    if structure.at_rest or structure.samples:
+        return _from_parts(structure, v, y)
     filtered = filtered_estimates(structure, v, y)
     found = [
         descend(structure, refined(structure, theta, v, y)[1], v, y, _STEPS)
@@ -65,14 +70,57 @@ def best_start(structure: Structure, v: Matrix, y: Vector) -> Start:
     near.sort(key=lambda one: one.cost)
     found += near[_FINISHED:]
     found += [descend(structure, one.theta, v, y, _STEPS) for one in near[:_FINISHED]]
-    white = _white(structure, _best(found), v, y)
+    found += _from_smaller(structure, found, v, y)
+    return Start(_best(found), _white(structure, _best(found), v, y) or _agree(found, y))
+
+
+def _from_parts(structure: Structure, v: Matrix, y: Vector) -> Start:
+    """Return the best model from the poles of each record's model from any start."""
+    found, confirmed = [], []
+    for place in structure.records(y.size):
+        single, inputs = from_any_start(structure, v[place])
+        start = best_start(single, inputs, y[place])
+        found.append(descend(structure, with_poles(structure, start.estimate), v, y, _STEPS))
+        confirmed.append(start.confirmed)
+    found += _from_smaller(structure, found, v, y)
+    best = _best(found)
+    white = _white(structure, best, v, y)
+    return Start(best, white or any(confirmed) or (len(found) > 1 and _agree(found, y)))
+
+
+def from_any_start(structure: Structure, v: Matrix) -> tuple[Structure, Matrix]:
+    """Return the structure of one record that starts anywhere, and its inputs, from those at rest.
+
+    Of several records with a constant force each, ``v`` are the inputs of one.
+    """
+    rubbing = len(structure.friction)
+    has_force = structure.at_rest or len(structure.degrees) > 1 + rubbing
+    first, last = v[:, :1], v[:, v.shape[1] - rubbing :]
+    force = np.ones((v.shape[0], int(has_force)))
+    of_friction = structure.degrees[len(structure.degrees) - rubbing :]
+    degrees = (structure.degrees[0], *[0] * has_force, *of_friction)
+    single = structure._replace(degrees=degrees, at_rest=False, samples=())
+    return single, np.hstack([first, force, last])
+
+
+def with_poles(structure: Structure, estimate: ParameterEstimate) -> Vector:
+    """Return θ of ``structure`` with the poles of an estimate; its linear parameters are zero."""
+    theta = np.zeros(structure.size)
+    theta[: structure.free] = estimate.theta[: structure.free]
+    return theta
+
+
+def _from_smaller(
+    structure: Structure, found: list[ParameterEstimate], v: Matrix, y: Vector
+) -> list[ParameterEstimate]:
+    """Return models from the smaller one; none if the best one leaves white noise."""
     lower = smaller(structure)
-    if not white and lower is not None:
-        theta = best_start(lower, v, y).estimate.theta
-        for more in extended(structure, lower, theta):
-            found.append(descend(structure, more, v, y, _STEPS))
-        white = _white(structure, _best(found), v, y)
-    return Start(_best(found), white or _agree(found, y))
+    if lower is None or _white(structure, _best(found), v, y):
+        return []
+    theta = best_start(lower, v, y).estimate.theta
+    return [
+        descend(structure, more, v, y, _STEPS) for more in extended(structure, lower, theta)
+    ]
 
 
 def _best(found: list[ParameterEstimate]) -> ParameterEstimate:
@@ -91,7 +139,8 @@ def _white(structure: Structure, estimate: ParameterEstimate, v: Matrix, y: Vect
 
     if not math.isfinite(estimate.cost):
         return False
-    error = y - output(structure, estimate.theta, v)
+    with np.errstate(all="ignore"):
+        error = y - output(structure, estimate.theta, v)
     lags = min(_LAGS, y.size // 4)
     correlation = autocorrelation(error, lags)
     return float(y.size * np.sum(correlation[1:] ** 2)) <= float(chi2.isf(_LEVEL, lags))

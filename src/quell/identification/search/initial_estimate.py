@@ -74,7 +74,8 @@ def stable(structure: Structure, theta: Vector) -> Vector:
     free = theta[: structure.free]
     if structure.free == 0 or not np.all(np.isfinite(free)):
         return theta
-    roots = np.roots(np.append(1.0, free[::-1]))
+    with np.errstate(all="ignore"):
+        roots = np.roots(np.append(1.0, free[::-1]))
     if np.all(roots.real <= 0.0):
         return theta
     found = theta.copy()

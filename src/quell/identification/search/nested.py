@@ -43,8 +43,10 @@ def extended(structure: Structure, lower: Structure, theta: Vector) -> Iterator[
         a = _times(np.append(lower.denominator(theta), 1.0), rate)
         rows = zip(lower.numerators(theta), structure.degrees, strict=True)
         numerators = [_times(row, rate)[: degree + 1] for row, degree in rows]
-        initial = _times(lower.initial(theta), rate)
-        yield np.concatenate([a[structure.integrators : -1], *numerators, direct, initial])
+        start = theta[lower.common :]
+        if not structure.at_rest:
+            start = np.concatenate([_times(one, rate) for one in start.reshape(-1, lower.order)])
+        yield np.concatenate([a[structure.integrators : -1], *numerators, direct, start])
 
 
 def _times(polynomial: Vector, rate: float) -> Vector:

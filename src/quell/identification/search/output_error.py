@@ -14,11 +14,21 @@ decomposition of ``[Φ ψ e]``, by blocks of rows (Demmel et al., *SIAM J. Scien
 predicts a relative gain below a limit: a small gain of a damped step shows nothing.
 
 For white and normal e the result is the maximum-likelihood estimate. For coloured e it is still
-consistent if u is open loop (Ljung 1999, th. 8.3), but the usual covariance is wrong. So the
-covariance is computed from sums of ψ e over blocks that are longer than the correlation of e (the
-sandwich of Huber and White; Liang & Zeger, *Biometrika* 73, 1986), here with ψ for all parameters::
+consistent if u is open loop (Ljung 1999, th. 8.3), but the usual covariance is wrong. Here e is
+taken as an autoregressive process ``e = w/C(q)`` of the order that Schwarz's criterion chooses, and
+with ψ for all parameters (Ljung 1999, eq. (9.42))::
 
-    cov θ = H⁻¹ (Σ_blocks s sᵀ) H⁻¹,     H = Σ ψ ψᵀ,  s = Σ_{k in block} ψ_k e_k
+    cov θ = H⁻¹ M H⁻¹,     H = Σ ψ ψᵀ,     M = Σ_k Σ_l ψ_k R_e(k − l) ψ_lᵀ = σ_w² Σ φ φᵀ
+
+where φ is ψ filtered by 1/C backwards in time. This holds when all information is in a few samples,
+as in the record of one step. Where e is larger at some times than at others, sums of ψ e over
+blocks that are longer than its correlation show it (the sandwich of Huber and White; Liang & Zeger,
+*Biometrika* 73, 1986)::
+
+    M' = Σ_blocks s sᵀ,     s = Σ_{k in block} ψ_k e_k
+
+These say nothing where one block has all information. So the deviations are those of M, increased
+to those of M' for the parameters for which these are larger; correlations are those of M.
 """
 
 from __future__ import annotations
@@ -29,6 +39,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quell.identification.model.correlation import correlation
 from quell.identification.model.structure import (
     Structure,
     gradient,
@@ -50,6 +61,8 @@ _ROUNDING = 1e-24
 # Least number of blocks for the covariance: longer ones hold more correlation, fewer make the
 # covariance uncertain; chosen by hand.
 _BLOCKS = 60
+# Most coefficients of the model of the noise, and least number of samples for each: chosen by hand.
+_MOST_COLOUR, _PER_COLOUR = 20, 20
 # Rows of a block of the QR decomposition: it stays in the processor's cache; by measurement.
 _ROWS = 700
 
@@ -123,9 +136,55 @@ def covariance(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> Mat
     if found is None:
         return np.full((theta.size, theta.size), np.inf)
     error, psi, size = found
+    inverse = np.linalg.pinv(psi.T @ psi, rcond=_RANK, hermitian=True)
+    filtered, variance = _coloured(structure, psi, error)
+    cov = variance * inverse @ (filtered.T @ filtered) @ inverse
     scores = block_sums(psi, error, min(max(4 * theta.size, _BLOCKS), y.size))
-    half = np.linalg.pinv(psi.T @ psi, rcond=_RANK, hermitian=True) @ scores.T
-    return half @ half.T / np.outer(size, size)
+    by_blocks = np.sum((inverse @ scores.T) ** 2, axis=1)
+    own = np.diag(cov)
+    wider = np.sqrt(np.maximum(by_blocks / np.where(own > 0.0, own, 1.0), 1.0))
+    return cov * np.outer(wider, wider) / np.outer(size, size)
+
+
+def _coloured(structure: Structure, psi: Matrix, error: Vector) -> tuple[Matrix, float]:
+    """Return φ (N, size), and the variance of w, of a model of the noise ``e = w/C(q)``."""
+    from scipy.signal import lfilter
+
+    c, variance = noise_model(error)
+    variance *= error.size / max(error.size - structure.size, 1)
+    if c.size == 1:
+        return psi, variance
+    parts = [
+        lfilter([1.0], c, psi[place][::-1], axis=0)[::-1]
+        for place in structure.records(error.size)
+    ]
+    return np.concatenate(parts), variance
+
+
+def noise_model(error: Vector) -> tuple[Vector, float]:
+    """Return ``C = (1, c_1, …)`` of ``e = w/C(q)``, and the variance of w.
+
+    The coefficients solve the Yule-Walker equations by Levinson's recursion (Stoica & Moses,
+    *Spectral Analysis of Signals*, 2005, sec. 3.5.1), so that 1/C is stable; the order has the least
+    ``N log σ_w² + p log N`` (Schwarz, *Annals of Statistics* 6, 1978).
+    """
+    most = min(_MOST_COLOUR, error.size // _PER_COLOUR)
+    power = float(np.mean(error**2))
+    if most < 1 or not power > 0.0:
+        return np.ones(1), power
+    r = correlation(error, error, most)[most:]
+    c, variance = np.ones(1), power
+    best, chosen = error.size * math.log(power), (c, variance)
+    for order in range(1, most + 1):
+        reflection = -float(c @ r[order:0:-1]) / variance
+        c = np.append(c, 0.0) + reflection * np.append(c, 0.0)[::-1]
+        variance *= 1.0 - reflection**2
+        if not variance > _RANK * power:
+            break
+        criterion = error.size * math.log(variance) + order * math.log(error.size)
+        if criterion < best:
+            best, chosen = criterion, (c, variance)
+    return chosen
 
 
 def gauss_newton(structure: Structure, theta: Vector, v: Matrix, y: Vector) -> tuple[float, Vector]:

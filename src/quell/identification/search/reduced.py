@@ -98,5 +98,6 @@ def _with_poles(structure: Structure, poles: NDArray[np.complex128]) -> Vector:
     theta = np.zeros(structure.size)
     slow_first = poles[np.argsort(np.abs(poles))]
     kept = slow_first[structure.integrators : structure.order]
-    theta[: structure.free] = np.poly(kept).real[:0:-1]
+    if kept.size:
+        theta[: structure.free] = np.poly(kept).real[:0:-1]
     return theta

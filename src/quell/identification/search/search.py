@@ -6,10 +6,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.model.roots import squared_distance_from_zero
-from quell.identification.model.structure import Structure, free_run
-from quell.identification.search.delay import delayed, nearest_delay, start_with_delay, with_delay
-from quell.identification.search.output_error import ParameterEstimate, gauss_newton, refine
+from quell.identification.model.roots import gain_interval, squared_distance_from_zero
+from quell.identification.given_record import resolution_of
+from quell.identification.model.structure import Structure, free_run, output
+from quell.identification.search.at_rest import (
+    AtRest,
+    from_rest,
+    general,
+    probability,
+    structure_at_rest,
+)
+from quell.identification.search.delay import nearest_delay, start_with_delay, with_delay
+from quell.identification.search.output_error import (
+    ParameterEstimate,
+    covariance,
+    descend,
+    gauss_newton,
+    noise_model,
+    refine,
+)
 from quell.types import Matrix, Vector
 
 # Half width of the mean slope that stands for the measured speed until there is a model [samples]:
@@ -35,6 +50,15 @@ _SLOWER = 10.0
 # are not settled decide the fit, and only the factors hold. Chosen by hand.
 _MOST_COST, _FIT_SHARE = {1: 30.0, 2: 1.05}, 0.005
 _ROUNDING = 1e-18
+# A gain whose interval is within ±2 % needs no assumption on the start, one within ±10 % only
+# if it is sure: chosen by hand. A start at rest is sure, and likely, from these probabilities on.
+_CERTAIN, _USEFUL, _SURE, _LIKELY = 0.02, 0.1, 0.95, 0.5
+# Probability with which a start at rest is refused by chance.
+_SELDOM = 1e-3
+# Delays on each side of the best that are looked at, steps of the refinement at each, and χ² of one
+# degree of freedom at 95 %.
+_MOST_DELAYS, _DELAY_STEPS, _WITHIN_95 = 10, 12, 3.84
+_NONE = ParameterEstimate(np.zeros(0), np.zeros((0, 0)), np.inf, False)
 
 
 class Fit(NamedTuple):
@@ -43,64 +67,197 @@ class Fit(NamedTuple):
     structure: Structure
     estimate: ParameterEstimate
     delay: int  # delay of u [samples]
+    delays: tuple[int, int]  # delays that the record does not tell apart, at 95 % [samples]
+    searched: tuple[int, int]  # range of delays in which it was searched [samples]
     bias: bool
+    rest: AtRest
 
     def inputs(self, u: Vector) -> Matrix:
-        """Return the inputs (N, inputs) for ``u``; ``free_run`` fills in friction inputs."""
-        zero = np.zeros(u.size)
-        return _columns(u, self.delay, self.bias, [zero] * len(self.structure.friction))
+        """Return the inputs (N, inputs) for ``u``; ``free_run`` fills in friction inputs.
+
+        Another number of samples than that of the fit is one record, with the first one's force.
+        """
+        structure = self.structure
+        if structure.samples and sum(structure.samples) != u.size:
+            structure = structure.single()
+        v = np.zeros((u.size, len(self.structure.degrees)))
+        v[:, 0] = with_delay(structure, v, u, self.delay)[:, 0]
+        if self.bias:
+            for i, place in enumerate(structure.records(u.size)):
+                v[place, 1 + i] = 1.0
+        return v
 
 
-def _columns(u: Vector, delay: int, bias: bool, friction: list[Vector]) -> Matrix:
-    return np.column_stack([delayed(u, delay), *([np.ones(u.size)] if bias else []), *friction])
+class Wanted(NamedTuple):
+    """What a model is to have."""
+
+    order: int
+    zeros: int
+    integrators: int | None  # None: as many as the record shows
+    delays: tuple[int, int]  # [samples]
+    grows: bool  # whether the range of delays is extended
+    bias: bool
+    friction: bool
+    rest: bool | None  # None: if the record needs it, and does not contradict
 
 
-def fit(
-    u: Vector,
-    y: Vector,
-    order: int,
-    zeros: int,
-    integrators: int | None,
-    delays: tuple[int, int],
-    bias: bool,
-    friction: bool,
-) -> Fit:
-    """Return the model of least output error; ``delays`` is their range to search [samples]."""
-    direct = zeros == order
-    degrees = (zeros - direct, *([0] if bias else []), *([max(order - 2, 0)] if friction else []))
-    structure = Structure(order, integrators or 0, degrees, (0.0,) if friction else (), direct)
-    v = _columns(u, delays[0], bias, [measured_sign(y, _HALF_WIDTH)] if friction else [])
-    delay, start = start_with_delay(structure, u, v, y, delays)
+def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
+    """Return the model of least output error; ``samples`` are those of each record, if several."""
+    forces = max(len(samples), 1) if wanted.bias else 0
+    direct = wanted.zeros == wanted.order
+    rubbing = [max(wanted.order - 2, 0)] if wanted.friction else []
+    degrees = (wanted.zeros - direct, *[0] * forces, *rubbing)
+    signs = (0.0,) if wanted.friction else ()
+    q = wanted.integrators or 0
+    structure = Structure(wanted.order, q, degrees, signs, direct, samples=samples)
+    if wanted.rest and wanted.bias:
+        return _fit_at_rest(structure, u, y, wanted)
+    found = _fitted(structure, u, y, wanted)
+    needless = not wanted.bias or wanted.friction or _relative_width(found) <= _CERTAIN
+    if wanted.rest is False or needless:
+        return found
+    at_rest = _fit_at_rest(structure, u, y, wanted)
+    # Without need, only what is certain is assumed.
+    least = _SURE if _relative_width(found) <= _USEFUL else _LIKELY
+    refused = at_rest.rest.probability < least or _contradicts(found, at_rest, u, y)
+    return found if refused else at_rest
+
+
+def _contradicts(found: Fit, at_rest: Fit, u: Vector, y: Vector) -> bool:
+    """Return whether the model at rest fits worse than chance explains, by the likelihood ratio."""
+    from scipy.signal import lfilter
+    from scipy.stats import chi2
+
+    errors = [
+        y - output(one.structure, one.estimate.theta, one.inputs(u)) for one in (found, at_rest)
+    ]
+    c, _ = noise_model(errors[0])
+    powers = [float(np.sum(lfilter(c, [1.0], error) ** 2)) for error in errors]
+    least = _ROUNDING * float(y @ y)
+    ratio = y.size * np.log((powers[1] + least) / (powers[0] + least))
+    return bool(not ratio <= chi2.isf(_SELDOM, found.structure.order))
+
+
+def _fit_at_rest(structure: Structure, u: Vector, y: Vector, wanted: Wanted) -> Fit:
+    """Return the model of a start at rest, in the general form."""
+    resting = structure_at_rest(structure)
+    found = _fitted(resting, from_rest(structure, u), y, wanted)
+    v = found.inputs(from_rest(structure, u))
+    chance = probability(found.structure, found.estimate, v, y, resolution_of(y))
+    free, estimate = general(found.structure, found.estimate, u)
+    rest = AtRest(True, bool(wanted.rest), chance)
+    return found._replace(structure=free, estimate=estimate, bias=True, rest=rest)
+
+
+def _relative_width(found: Fit) -> float:
+    """Return half the width of the gain's 95 % interval, relative to its middle."""
+    free, theta = found.structure.free, found.estimate.theta
+    part = found.estimate.covariance[: free + 1, : free + 1]
+    low, high = gain_interval(theta[:free], float(theta[free]), part)
+    return abs((high - low) / (high + low)) if np.isfinite(high - low) and high + low else np.inf
+
+
+def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted) -> Fit:
+    """Return the model of one structure; at rest, ``u`` is without its first value."""
+    friction, delays, bias = wanted.friction, wanted.delays, wanted.bias and not structure.at_rest
+    first = Fit(structure, _NONE, delays[0], delays, delays, bias, AtRest(False, False, np.nan))
+    v = first.inputs(u)
+    if friction:
+        v[:, -1] = measured_sign(structure, y, _HALF_WIDTH)
+    searched, delay, start = start_with_delay(structure, u, v, y, delays, wanted.grows)
+    searched = delays[0], searched[1]
     if not np.isfinite(start.estimate.cost):
         none = "no model was found whose output is finite; lower the order, or scale u and y"
-        raise ValueError(f"order = {order}, zeros = {zeros}: {none}")
-    v = with_delay(v, u, delay)
+        raise ValueError(f"order = {wanted.order}, zeros = {wanted.zeros}: {none}")
+    v = with_delay(structure, v, u, delay)
     estimate = refine(structure, start.estimate.theta, v, y, _STEPS)
-    if integrators is None:
+    if wanted.integrators is None:
         structure, estimate = _set_integrators(structure, estimate, v, y)
-    if friction and order > 3:
+    if friction and wanted.order > 3:
         structure, estimate, v = _add_driven_friction(structure, estimate, v, y)
-        if integrators is None:
+        if wanted.integrators is None:
             structure, estimate = _set_integrators(structure, estimate, v, y)
     estimate, v = _settle_signs(structure, estimate, v, y)
-    if friction and delays[0] < delays[1]:
+    if friction and searched[0] < searched[1]:
         # With wrong signs of the speed another delay may have been the best.
         again, start = nearest_delay(
-            structure, start._replace(estimate=estimate), u, v, y, delays, delay
+            structure, start._replace(estimate=estimate), u, v, y, searched, delay
         )
         if again != delay:
-            delay, v = again, with_delay(v, u, again)
+            delay, v = again, with_delay(structure, v, u, again)
             estimate, v = _settle_signs(structure, start.estimate, v, y)
-    converged = estimate.converged and start.confirmed
-    estimate = estimate._replace(converged=converged)
-    return Fit(structure, estimate, delay, bias)
+    estimate = estimate._replace(converged=estimate.converged and start.confirmed)
+    certain = delay, delay
+    if searched[0] < searched[1]:
+        estimate, certain = _over_delays(structure, estimate, u, v, y, delay, searched)
+    return first._replace(
+        structure=structure, estimate=estimate, delay=delay, delays=certain, searched=searched
+    )
 
 
-def measured_sign(y: Vector, half_width: int) -> Vector:
-    """Return minus the sign of the mean slope of ``y``, over ``half_width`` samples each way."""
-    index = np.arange(y.size)
-    ahead, behind = np.minimum(index + half_width, y.size - 1), np.maximum(index - half_width, 0)
-    return -np.sign(y[ahead] - y[behind])
+def _over_delays(
+    structure: Structure,
+    estimate: ParameterEstimate,
+    u: Vector,
+    v: Matrix,
+    y: Vector,
+    delay: int,
+    searched: tuple[int, int],
+) -> tuple[ParameterEstimate, tuple[int, int]]:
+    """Return the estimate with a covariance that has the delays in it, and their 95 % range.
+
+    With the errors whitened by one model of the noise, ``ΔL = N log(Σ e²/Σ e_0²)`` is χ² with one
+    degree of freedom; the models have the weights ``exp(−ΔL/2)`` of a mixture.
+    """
+    from scipy.signal import lfilter
+
+    error = y - output(structure, estimate.theta, v)
+    c, power = noise_model(error)
+    least = max(power, _ROUNDING * float(np.mean(y**2))) * y.size
+    low = high = delay
+    found = [(1.0, estimate)]
+    for step in (-1, 1):
+        near, other = estimate, delay + step
+        for _ in range(_MOST_DELAYS):
+            if not searched[0] <= other <= searched[1]:
+                break
+            inputs = with_delay(structure, v, u, other)
+            near = descend(structure, near.theta, inputs, y, _DELAY_STEPS)
+            if not np.isfinite(near.cost):
+                break
+            white = lfilter(c, [1.0], y - output(structure, near.theta, inputs))
+            change = y.size * float(np.log(max(white @ white, least) / least))
+            if change > _WITHIN_95:
+                break
+            low, high = min(low, other), max(high, other)
+            near = near._replace(covariance=covariance(structure, near.theta, inputs, y))
+            found.append((float(np.exp(-0.5 * max(change, 0.0))), near))
+            other += step
+    if len(found) > 1:
+        total = sum(weight for weight, _ in found)
+        parts = [
+            weight / total * (one.covariance + np.outer(*[one.theta - estimate.theta] * 2))
+            for weight, one in found
+        ]
+        estimate = estimate._replace(covariance=np.sum(parts, axis=0))
+    return estimate, (low, high)
+
+
+def measured_sign(structure: Structure, y: Vector, half_width: int) -> Vector:
+    """Return minus the sign of the speed: the mean slope of y over ``half_width`` samples each way.
+
+    In order 1 the speed is y itself.
+    """
+    if structure.order == 1:
+        return -np.sign(y)
+    found = []
+    for place in structure.records(y.size):
+        part = y[place]
+        index = np.arange(part.size)
+        ahead, behind = index + half_width, index - half_width
+        after, before = np.minimum(ahead, part.size - 1), np.maximum(behind, 0)
+        found.append(-np.sign(part[after] - part[before]))
+    return np.concatenate(found)
 
 
 def _settle_signs(

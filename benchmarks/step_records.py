@@ -1,0 +1,163 @@
+"""Step records: how often the stated intervals hold, and whether the set for tuning has the plant.
+
+    python benchmarks/step_records.py [--draws N] [--seed S] [--json FILE] [--set] [--verbose]
+
+Each draw is the record of one step from rest: a plant of order 1, 2 or 3 (lags, at order 3 also an
+oscillating pair), with or without a dead time of up to 40 samples, of either sign of the gain, 1, 5
+or 50 samples of rest before the step, and noise of 0.1, 0.5 or 2 % of the motion, rounded to steps
+of the same size in half of the draws. The record lasts for 3 to 8 times the sum of the lags and the
+dead time. It is identified with the order that the plant has and a delay that is searched; a record
+is *right* if the true gain is within the stated 95 % interval, *not decided* if a line begins with
+NOT, and *wrong* otherwise. With ``--set`` the model is chosen as ``quell tune`` does, and the set of
+plants for tuning is asked whether the true plant is inside: whether in gain and in the frequency
+response at the frequencies of the controller the true one lies within the range of the set.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import signal
+
+import quell as ql
+from quell.types import Vector
+
+RESTS, NOISES = (1, 5, 50), (0.001, 0.005, 0.02)
+
+
+class Step(NamedTuple):
+    """A record and its plant."""
+
+    u: Vector
+    y: Vector
+    dt: float
+    num: Vector
+    den: Vector
+    delay: float
+    text: str
+
+    @property
+    def gain(self) -> float:
+        """The plant's gain."""
+        return float(self.num[-1] / self.den[-1])
+
+
+def drawn(seed: int, rest: int, noise: float, order: int, late: bool) -> Step:
+    """Return a record of one step."""
+    rng = np.random.default_rng([seed, rest, order, int(late), round(1e4 * noise)])
+    dt = float(np.exp(rng.uniform(np.log(1e-3), np.log(5.0))))
+    count = int(rng.integers(300, 1200))
+    gain = float(np.exp(rng.uniform(-3.0, 3.0)) * rng.choice([-1.0, 1.0]))
+    shares = np.sort(rng.dirichlet(np.full(order, 1.5)))[::-1]
+    dead = int(rng.integers(2, 41)) if late else 0
+    lengths = float(rng.uniform(3.0, 8.0))
+    total = max((count - rest) / lengths - dead, 20.0) * dt
+    lags = np.maximum(shares * total, 2.0 * dt)
+    den = np.ones(1)
+    if order == 3 and rng.random() < 0.3:
+        zeta = float(rng.uniform(0.2, 0.7))
+        den = np.polymul([lags[1] * lags[2], 2.0 * zeta * np.sqrt(lags[1] * lags[2]), 1.0],
+                         [lags[0], 1.0])
+    else:
+        for lag in lags:
+            den = np.polymul(den, [lag, 1.0])
+    num = np.array([gain]) / den[0]
+    den = den / den[0]
+    amount = float(rng.choice([0.5, 5.0, 50.0]))
+    u = np.where(np.arange(count) >= rest, amount, 0.0) + float(rng.choice([0.0, 2.0]))
+    A, B, C, _, _ = signal.cont2discrete(signal.tf2ss(num, den), dt)
+    moved = np.concatenate([np.zeros(dead), u - u[0]])[:count]
+    y = signal.dlsim((A, B, C, np.zeros((1, 1)), dt), moved)[1][:, 0]
+    size = noise * abs(gain) * amount
+    y = y + size * rng.standard_normal(count) + float(rng.uniform(-2.0, 2.0)) * abs(gain) * amount
+    rounded = rng.random() < 0.5
+    if rounded:
+        y = np.round(y / size) * size
+    text = f"order {order} rest {rest:2} noise {100 * noise:.1f} % dead {dead:2}"
+    text += " rounded" if rounded else ""
+    return Step(u, y, dt, num, den, dead * dt, text)
+
+
+def judged(step: Step, order: int) -> dict[str, Any]:
+    """Return how identification does on a record."""
+    begin = time.perf_counter()
+    found = ql.identify(step.u, step.y, step.dt, order, delay=None)
+    low, high = found.gain_interval
+    report = str(found)
+    return {
+        "text": step.text,
+        "said_not": "NOT" in report,
+        "covered": bool(low <= step.gain <= high),
+        "wrong_sign": bool(found.gain * step.gain < 0.0),
+        "gain": found.gain / step.gain,
+        "width": (high - low) / abs(found.gain) if np.isfinite(high - low) else None,
+        "delay_covered": bool(
+            found.delay_interval[0] - 1e-9 <= step.delay <= found.delay_interval[1] + 1e-9
+        ),
+        "delay": (found.delay - step.delay) / step.dt,
+        "seconds": time.perf_counter() - begin,
+        "z": _z(found, step),
+        "undecided": found.undecided,
+        "rest": (found.rest, found.rest_probability),
+        "white": found.residuals.white,
+    }
+
+
+def _z(found: Any, step: Step) -> float:
+    """Return the error of the slowest pole in its standard deviations."""
+    true = np.roots(step.den)
+    true = true[np.argmin(np.abs(true))]
+    pole = min(found.poles, key=lambda one: abs(one.value))
+    return float(abs(pole.value - true) / max(pole.deviation, 1e-300))
+
+
+def main() -> None:
+    """Print shares of right, undecided and wrong results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--verbose", action="store_true")
+    args = parser.parse_args()
+    cases = list(itertools.product((1, 2, 3), (False, True), RESTS, NOISES))
+    each = max(args.draws // len(cases), 1)
+    results = []
+    for order, late, rest, noise in cases:
+        for i in range(each):
+            step = drawn(1000 * args.seed + i, rest, noise, order, late)
+            result = judged(step, order) | {"order": order, "rest_samples": rest, "late": late}
+            results.append(result | {"noise": noise, "seed": 1000 * args.seed + i})
+            bad = not result["covered"] and not result["said_not"]
+            if args.verbose and bad:
+                print(results[-1])
+    _summary(results)
+    if args.json is not None:
+        args.json.write_text(json.dumps(results))
+
+
+def _summary(results: list[dict[str, Any]]) -> None:
+    for name in ("all", "order", "late", "rest_samples", "noise"):
+        for value in sorted({one.get(name) for one in results}, key=str):
+            part = [one for one in results if one.get(name) == value]
+            told = [one for one in part if not one["said_not"]]
+            covered = np.mean([one["covered"] for one in told]) if told else np.nan
+            widths = [one["width"] for one in told if one["width"] is not None]
+            print(
+                f"{name} {value}: {len(part)} records, NOT {1 - len(told) / len(part):.0%}, "
+                f"gain covered {covered:.1%} of the others, "
+                f"sign wrong without NOT {sum(one['wrong_sign'] for one in told)}, "
+                f"median width {np.median(widths) if widths else np.nan:.3f}, "
+                f"delay covered {np.mean([one['delay_covered'] for one in told]):.1%}, "
+                f"slow pole within 2 {np.mean([one['z'] < 2.0 for one in told]):.1%}, "
+                f"{np.mean([one['seconds'] for one in part]):.2f} s"
+            )
+
+
+if __name__ == "__main__":
+    main()
