@@ -77,6 +77,8 @@ _KINDS = (
     (b"GIF8", Kind("an image (GIF)", "give the numbers that it shows")),
     (b"%PDF", Kind("a PDF document", "give the numbers that it shows")),
     (b"\x7fELF", Kind("a program", "give a record")),
+    (b'{"', Kind("a JSON file", _EXPORT)),
+    (b"{\n", Kind("a JSON file", _EXPORT)),
     (b"<?xml", Kind("an XML file", _EXPORT)),
     (b"<!DOCTYPE", Kind("a page (HTML)", "give the table of its numbers as text (CSV)")),
     (b"<html", Kind("a page (HTML)", "give the table of its numbers as text (CSV)")),

@@ -24,6 +24,7 @@ from quell.identification.experiment.record_columns import (
 from quell.identification.experiment.record_layout import (
     Layout,
     has_decimal_comma,
+    has_thousands,
     hint_of_commas,
     is_comment,
     is_missing,
@@ -122,8 +123,11 @@ def read_record(
     rows = _rows(where, chain(head[layout.before :], lines), layout)
     first = list(islice(rows, _HEAD_LINES))
     if len(first) < _FEWEST:
+        remedy = "record more, or give a table with a line for each sample"
+        if sum(bool(line.strip()) for line in head[layout.before :]) > len(first) + _FEWEST:
+            remedy = "is there a quotation mark without a second one? Mend it"
         raise ValueError(
-            f"{where}: has {len(first)} samples; must have at least {_FEWEST}: record more"
+            f"{where}: has {len(first)} samples; must have at least {_FEWEST}: {remedy}"
         )
     table = _Table(where, layout, places, columns, first, timed)
     numbers, values = table.values(chain(first, rows), most)
@@ -322,7 +326,7 @@ class _Table:
         return values
 
     def _value(self, where: str, text: str, name: str, first: bool) -> float:
-        shown = text if len(text) <= 40 else f"{text[:37]}..."
+        shown = text if len(repr(text)) <= 42 else f"{text[: 37 if text.isprintable() else 9]}..."
         if first and self.stamps is not None:
             try:
                 return self.stamps.seconds(text)
@@ -364,7 +368,11 @@ class _Table:
         if is_stamp(text):
             if time:
                 return "most others are no dates; mend it, or give the sample time (--dt)"
-            return "a date or a time is read as t only; say which columns are u and y (--columns)"
+            return (
+                "dates and times are read as t only; say which columns are t, u and y (--columns)"
+            )
+        if has_thousands(text):
+            return "write nothing between thousands, and decimal points"
         if time:
             return (
                 "a time is a number, a date or hours:minutes:seconds; mend it, or give the sample "

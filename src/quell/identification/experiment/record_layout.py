@@ -30,6 +30,7 @@ MISSING = {
     *_SHEET_ERRORS,
 }
 """Texts in lower case that stand for a number that is not there."""
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:,\d{3})+(?:\.\d*)?|(?:\.\d{3})+(?:,\d*)?)")
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _SETUP = re.compile(r"\s*(?:\[{1,2}[\w.\"' -]+\]{1,2}\s*(?:#.*)?|[\w.-]+\s*=\s*\S.*)\s*")
 
@@ -74,7 +75,10 @@ def layout_of(where: str, head: Sequence[str], columns: Sequence[str], timed: bo
     first = next((i for i, line in enumerate(plain) if _fits(cells[line.index], width, numeric)), 0)
     start = plain[first].index
     above = [line for line in lines if line.index < start][::-1]
-    named = _named(above[:_MOST_TEXT], width, separator, asked)
+    _check_decimal_commas(f"{where}, line {start + 1}", separator, [*cells.values()][first:])
+    # A column that is empty in all lines may have a name, too.
+    padded = len(cells_of(plain[first].text, separator))
+    named = _named(above[:_MOST_TEXT], {width, padded}, separator, asked)
     if named is None:
         _check_count(where, above, width, separator, asked, cells[start])
         for line in plain[:first][::-1]:  # a line of numbers that lacks some
@@ -84,15 +88,16 @@ def layout_of(where: str, head: Sequence[str], columns: Sequence[str], timed: bo
             start = line.index
         return Layout(separator, None, 0, [""] * width, width, start)
     at, names = named
+    width = len(names)
     units = [""] * width
     for line in plain:
         if at < line.index <= start:
             row = cells[line.index]
-            if line.index == start or not _is_text(row, numeric):
+            if line.index == start or not _is_text(row, numeric, width):
                 start = line.index
                 break
-            if len(row) == width and not any(units):
-                units = row
+            if not any(units) and any(c.isalpha() for c in "".join(row)):
+                units = [*row, ""][:width]
     return Layout(separator, names, at + 1, units, width, start)
 
 
@@ -126,6 +131,11 @@ def is_number(text: str) -> bool:
 def has_decimal_comma(text: str) -> bool:
     """Return whether a text is a number with a decimal comma."""
     return "," in text and _WITH_COMMA.fullmatch(text) is not None
+
+
+def has_thousands(text: str) -> bool:
+    """Return whether a text seems to be a number with marks between thousands."""
+    return _THOUSANDS.fullmatch(text) is not None
 
 
 def is_missing(text: str) -> bool:
@@ -201,21 +211,24 @@ def _fits(row: list[str], width: int, numeric: list[int]) -> bool:
     )
 
 
-def _is_text(row: list[str], numeric: list[int]) -> bool:
-    """Return whether a row has texts where the table has numbers."""
+def _is_text(row: list[str], numeric: list[int], width: int) -> bool:
+    """Return whether a row below the names has units or such, or is a line of dashes."""
+    if not any(c.isalnum() for cell in row for c in cell):
+        return True
     told = [row[i] for i in numeric if i < len(row)]
-    return not any(map(is_value, told)) and not all(map(is_missing, told))
+    full = width - 1 <= len(row) <= width
+    return full and not any(map(is_value, told)) and not all(map(is_missing, told))
 
 
 def _named(
-    above: list[_Line], width: int, separator: str | None, asked: Sequence[tuple[str, str]]
+    above: list[_Line], widths: set[int], separator: str | None, asked: Sequence[tuple[str, str]]
 ) -> tuple[int, list[str]] | None:
     """Return index and cells of the line of names among those above the numbers, nearest first."""
     full: list[tuple[_Line, list[str]]] = []
     for line in above:
         for each in (separator, *(other for other in _SEPARATORS if other != separator)):
             row = without_empty_end(_header(line.text, each))
-            if len(row) == width and not all(map(is_value, row)):
+            if len(row) in widths and not all(map(is_value, row)):
                 full.append((line, row))
                 break
     hits = [sum(_has(row, *pair) for pair in asked) for _, row in full]
@@ -261,6 +274,21 @@ def _check_count(
         raise ValueError(
             f"{where}: {fault}{line_} names {listed(row)}, but the numbers below it have {width} "
             f"cells in a line{hint}"
+        )
+
+
+def _check_decimal_commas(where: str, separator: str | None, rows: list[list[str]]) -> None:
+    """Check that no number is cut in two at a decimal comma: that leaves digits such as 05."""
+    count = Counter(map(len, rows)).most_common(1)[0][0]
+    rows = [row for row in rows if len(row) == count]
+    if separator != "," or count % 2 or any("." in cell for row in rows for cell in row):
+        return
+    behind = [cell for row in rows for cell in row[1::2]]
+    if all(map(str.isdecimal, behind)) and any(c[0] == "0" and len(c) > 1 for c in behind):
+        raise ValueError(
+            f"{where}: has {count} cells, and no decimal points, but digits such as "
+            f"{next(c for c in behind if c[0] == '0' and len(c) > 1)}, as behind decimal commas"
+            f"{hint_of_commas(separator, rows[0])}"
         )
 
 

@@ -25,13 +25,15 @@ from quell.types import Matrix, Vector
 from quell.warn import warn
 
 # A step that differs from the sample time by this share is none: a sample is missing or repeated.
-# Jitter of a third of a sample still passes. Chosen by hand between that and 1.
-_ODD = 0.75
+# Jitter of a fifth of a sample has up to 0.4, a missing sample with it no less than 0.6. Chosen by
+# hand between them.
+_ODD = 0.65
 # Times may be off the grid by half a sample, as nearest ones are, and by this factor of rounding.
 _OFF = 0.5 * 1.02
 # Fewer odd steps than that are faults, even if an even grid of another rate could explain them by
-# rounding: one missing sample in the middle always can be so. Chosen by hand.
-_FAULTS = 3
+# rounding: one missing sample in the middle always can be so, three at random in 3 of 100 records.
+# Chosen by hand.
+_FAULTS = 6
 # Limits of repair: missing samples in a row; share of odd steps, and number that is permitted in
 # short records. Chosen by hand: the plant moves on in a gap, and what is put there is no datum.
 _LONGEST_GAP, _MOST_ODD, _FEW = 5, 0.05, 2
@@ -43,8 +45,22 @@ _MOST_ODD_JITTER = 0.1
 _DRIFT = 5e-3
 # Samples over which the drift is averaged. Chosen by hand: jitter averages out.
 _DRIFT_OVER = 100
-# Resolution in samples beyond which there is a warning. Chosen by hand: a lost sample is not seen.
+# Missing or repeated samples are there if the logarithm of the likelihood, of normal distances from
+# the grid, rises by this times log n for each: twice the criterion of Bayes, chosen by hand.
+_EVIDENCE = 4.0
+# RMS distance from the grid in samples beyond which times do not fit it; those that have nothing to
+# do with it have 0.29. Chosen by hand: rounding to 0.75 samples has 0.22.
+_SPREAD = 0.22
+# Share by which the grid follows the distance of a time from it. Chosen by hand.
+_FOLLOW = 0.05
+# Single times may be off the grid by that many samples if there are as many samples as the time
+# permits. Chosen by hand: normal jitter of a quarter of a sample has it once in 10 000 samples.
+_LATE = 1.02
+# Samples at one time, on average, beyond which the times have a coarse resolution: a lost sample is
+# not seen then, which is warned of. Chosen by hand.
 _COARSE = 1.5
+# Least number of changes of coarse times: two give the sample time, the third one tests it.
+_CHANGES = 3
 # Sample times that differ by this share from those of the file are warned of; chosen by hand.
 _ANOTHER = 0.2
 # As seconds since 1970 a time beyond it [s] is after the year 2286; in ms it is in 1970.
@@ -61,9 +77,8 @@ _DAYS = ((30_000.0, 60_000.0), (730_000.0, 750_000.0))
 
 
 class _Grid(NamedTuple):
-    """Times in units of the mean step, and how they lie on an even grid."""
+    """An even grid for times in units of the mean step."""
 
-    x: Vector  # times
     unit: float  # sample time
     off: float  # largest distance from the grid, in samples
     spread: float  # RMS of the distances, in samples
@@ -85,19 +100,21 @@ def on_even_grid(where: str, t: Vector, lines: Vector, values: Matrix) -> tuple[
         raise ValueError(f"{where}: t is beyond all numbers; {_dt_instead(None)}")
     _check_rising(where, t, lines, step)
     x = x / step
+    if (grid := _coarse(x)) is not None:
+        dt = _rounded(grid.unit * step, grid.spread, n)
+        warn(
+            f"{where}: the times have a resolution of {float(np.min(x[x > 0.0])) * step:.4g} s "
+            f"only, and are read as evenly spaced, {dt:.6g} s apart by the mean; a sample that is "
+            "missing would not be seen. Give dt (--dt) if you know it better.",
+            UserWarning,
+        )
+        return dt, values
     grid = _fitted(x, np.arange(n, dtype=np.float64))
     d = np.diff(x) / grid.unit
     odd = int(np.count_nonzero(np.abs(d - 1.0) > _ODD))
-    resolution = float(np.min(d[d > 0.0]))
     dt = _rounded(grid.unit * step, grid.spread, n)
+    resolution = float(np.min(d[d > 0.0]))
     if (odd == 0 or odd >= _FAULTS) and grid.off <= _OFF * max(1.0, resolution):
-        if resolution > _COARSE:
-            warn(
-                f"{where}: the times have a resolution of {resolution * dt:.4g} s only, and are "
-                f"read as evenly spaced by the mean sample time of {dt:.6g} s; a sample that is "
-                "missing would not be seen. Give dt (--dt) if you know it better.",
-                UserWarning,
-            )
         return dt, values
     if odd == 0 and (drift := _drift(d)) <= _DRIFT:
         warn(
@@ -155,7 +172,8 @@ def warn_of_another_unit(where: str, t: Vector, named: bool) -> None:
         mean = float(t[-1] - t[0]) / (t.size - 1)
     if not (step > 0.0 and mean > 0.0 and np.isfinite(step) and np.isfinite(mean)):
         return
-    hint = "if they are milliseconds, give time_unit = 'ms' (--time-unit ms), 's' if seconds"
+    hint = "if they are milliseconds, give time_unit = 'ms' (--time-unit ms), or us, ns, min, h, "
+    hint += "and 's' if they are seconds"
     begin = float(t[0])
     if abs(begin) > _LATEST:
         reason = f"begin at {begin:.6g}, which as seconds since 1970 is after the year 2286"
@@ -217,11 +235,24 @@ def _fitted(x: Vector, k: Vector) -> _Grid:
     centred = k - np.mean(k)
     unit = float(np.dot(centred, x) / np.dot(centred, centred))
     if not unit > 0.0:  # times that all but stand still
-        return _Grid(x, 1.0, np.inf, np.inf)
-    residual = (x - unit * k) / unit
+        return _Grid(1.0, np.inf, np.inf)
+    residual = x - unit * k
     middle = 0.5 * (float(np.max(residual)) + float(np.min(residual)))
-    off = float(np.max(np.abs(residual - middle)))
-    return _Grid(x, unit, off, float(np.std(residual)))
+    off = float(np.max(np.abs(residual - middle))) / unit
+    return _Grid(unit, off, float(np.std(residual)) / unit)
+
+
+def _coarse(x: Vector) -> _Grid | None:
+    """Return the grid of times that have a resolution of more than a sample, else None.
+
+    The first of several samples at one time tells when they were taken, to a sample; the others
+    tell nothing.
+    """
+    first = np.flatnonzero(np.diff(x) > 0.0) + 1
+    if x.size < _COARSE * first.size or first.size < _CHANGES:
+        return None
+    grid = _fitted(x[first], first.astype(np.float64))
+    return grid if grid.off <= _LATE else None
 
 
 def _drift(d: Vector) -> float:
@@ -260,45 +291,69 @@ def _repaired(
     """Put samples on an even grid, within the limits, and warn of it."""
     n, d = t.size, np.diff(x)
     unit = _typical(d)
-    dt = _rounded(unit * step, 0.0, n)
     d = d / unit
-    _check_faults(where, t, lines, d, dt)
-    steps = _without_late_ones(np.rint(d).astype(np.int64))
-    index = np.concatenate(([0], np.cumsum(steps)))
-    grid = _fitted(x, index.astype(np.float64))
-    snapped = grid.off <= _OFF
-    if snapped:
-        dt = _rounded(grid.unit * step, grid.spread, n)
-        place, count = index.astype(np.float64), int(index[-1]) + 1
-    else:
-        count = round(float(x[-1]) / unit) + 1
-        place = x * ((count - 1) / float(x[-1]))
-        dt = float(x[-1]) * step / (count - 1)
+    _check_faults(where, t, lines, d, unit * step)
+    counted = _steps(x, unit)
+    steps = _without_late_ones(counted.copy())
+    index = np.concatenate(([0], np.cumsum(steps))).astype(np.float64)
+    whole, found = _fitted(x, np.arange(n, dtype=np.float64)), _fitted(x, index)
+    gain = n * np.log((whole.spread**2 + 1e-20) / (found.spread**2 + 1e-20))
+    fits = found.off <= _OFF and found.spread < _SPREAD
+    snapped = fits and gain > _EVIDENCE * np.count_nonzero(steps != 1) * np.log(n)
+    single = 0 < np.count_nonzero(counted != 1) <= _permitted(n) and np.all(steps == 1)
+    levels = d / float(np.median(d[d > 0.0]))
+    clean = _few_levels(levels)  # neither jitter nor a slow change of the rate
+    if clean and not (snapped or single):
+        _check_faults(where, t, lines, levels, float(np.median(d)) * unit * step)
+    late = single or (not (snapped or clean) and _is_jitter(x, whole.unit))
+    grid = found if snapped else whole
+    dt = _rounded(grid.unit * step, grid.spread, n)
     faults = np.flatnonzero(np.abs(d - 1.0) > _ODD)
     first = int(faults[0]) if faults.size else int(np.argmax(np.abs(d - 1.0)))
     at = f"{where}, line {lines[first + 1]:.0f}"
     begin = f"{at}: t rises by {t[first + 1] - t[first]:.6g} s where samples are {dt:.6g} s apart"
-    if faults.size > 1:
-        begin += f", and {faults.size - 1} more steps of t are odd"
-    if snapped and np.all(steps == 1):
+    begin += f", one of {faults.size} odd steps" if faults.size > 1 else ""
+    if late and whole.off <= _LATE:
         warn(
-            f"{begin}; as many samples as the time permits are there, so that they are read as "
-            "evenly spaced",
+            f"{begin}; the samples are read as evenly spaced by the mean, as many of them as the "
+            "time permits are there; if some are missing, interpolate the record on even times",
             UserWarning,
         )
         return dt, values
     if snapped:
         missing, repeated = int(np.sum(steps[steps > 1] - 1)), int(np.sum(steps == 0))
         which = [f"{missing} missing"] * (missing > 0) + [f"{repeated} repeated"] * (repeated > 0)
-        what = f"{' and '.join(which)} of {count} samples"
+        what = f"{' and '.join(which)} of {int(index[-1]) + 1} samples"
     else:
         what = "uneven steps"
+        # The grid may have any step, as the times are believed.
+        dt = float(f"{dt:.3g}")
+        index = x * (step / dt)
     warn(
-        f"{begin} ({what}): resampled on an even grid; u keeps its value until the next sample, y "
-        f"is interpolated linearly; {_dt_instead(dt)}",
+        f"{begin} ({what}): resampled {dt:.6g} s apart; u keeps its value until the next sample, y "
+        f"is interpolated linearly; {_dt_instead(_rounded(whole.unit * step, whole.spread, n))}",
         UserWarning,
     )
-    return dt, _resampled(place, values, count)
+    return dt, _resampled(index, values, int(index[-1] + 1e-9) + 1)
+
+
+def _steps(x: Vector, unit: float) -> Vector:
+    """Return the number of samples from each time to the next, with a grid that follows jitter."""
+    phase, last, index = 0.0, 0, []
+    for k, time in enumerate(x.tolist()):
+        at = (time - phase) / unit
+        last = max(round(at), last)
+        # The first times are averaged, later ones followed.
+        phase += max(1.0 / (k + 1.0), _FOLLOW) * (at - last) * unit
+        index.append(last)
+    return np.diff(index)
+
+
+def _is_jitter(x: Vector, unit: float) -> bool:
+    """Return whether times scatter around an even grid; a rate that changes is no jitter."""
+    residual = x - unit * np.arange(x.size)
+    residual -= np.mean(residual)
+    return float(np.mean(np.diff(residual) ** 2)) > float(np.mean(residual**2))
 
 
 def _check_faults(where: str, t: Vector, lines: Vector, d: Vector, dt: float) -> None:
@@ -308,7 +363,7 @@ def _check_faults(where: str, t: Vector, lines: Vector, d: Vector, dt: float) ->
     odd = int(np.count_nonzero(np.abs(d - 1.0) > _ODD))
     at = f"{where}, line {lines[jump + 1]:.0f}"
     rise = f"t rises by {t[jump + 1] - t[jump]:.6g} s where samples are {dt:.6g} s apart"
-    permitted = max(_FEW, _MOST_ODD * n)
+    permitted = _permitted(n)
     if same > permitted:
         raise ValueError(
             f"{where}: t does not rise, or hardly, at {same} of {n} lines, the first is line "
@@ -328,12 +383,17 @@ def _check_faults(where: str, t: Vector, lines: Vector, d: Vector, dt: float) ->
         )
 
 
+def _permitted(n: int) -> float:
+    """Return the number of odd steps that is permitted in a record of n samples."""
+    return max(_FEW, _MOST_ODD * n)
+
+
 def _few_levels(d: Vector) -> bool:
     """Return whether steps are near multiples of a sample: samples are missing, not late."""
     return bool(np.mean(np.abs(d - np.rint(d))) < 0.1)
 
 
-def _without_late_ones(steps: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Vector:
+def _without_late_ones(steps: Vector) -> Vector:
     """Return steps of 1, 1 in place of 0, 2 and 2, 0: one time is wrong, no sample is missing."""
     for k in np.flatnonzero((steps[:-1] != 1) & (steps[:-1] + steps[1:] == 2)):
         if steps[k] + steps[k + 1] == 2:  # not changed at k - 1
