@@ -335,6 +335,9 @@ FILES: dict[str, Read | Refused] = {
     "decimal commas in quotation marks": Read(
         "t,u,y\n" + rows(lambda k: f'"{T[k]:.2f}","{U[k]}","{Y[k]}"'.replace(".", ","))
     ),
+    "numbers and names in quotation marks behind spaces": Read(
+        't, "u", "y"\n' + rows(lambda k: f'{T[k]:.2f}, "{U[k]}", "{Y[k]}"')
+    ),
     "decimal commas between commas": Refused(
         table(decimal=",", digits=".2f"), "names t, u, y, but .* 6 cells|has 6 cells", "semicolons"
     ),
@@ -364,7 +367,9 @@ FILES: dict[str, Read | Refused] = {
     "a line with a cell too many": Refused(
         swapped(table(), "0.05,", "0.05,7,"), "line 7: has 4 cells, and other lines have 3", "cells"
     ),
-    "text at the end": Refused(table() + "End of file\n", "line 66: t = 'End of file'", "mend it"),
+    "text at the end": Refused(
+        table() + "End of file\n", "line 66: t = 'End of file'", "cut the record there"
+    ),
     "zeros at the end": Refused(table().encode() + bytes(40), "line 66: t =", "cut the record"),
     "names that are there again": Refused(
         table() + table(), "line 66: t = 't': .* names are there again", "cut it there"

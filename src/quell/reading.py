@@ -273,7 +273,7 @@ def csv_rows(
             if cells := words_of(line):
                 yield number, cells
         return
-    reader = csv.reader(lines, delimiter=delimiter)
+    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
     last = 0
     try:
         for row in reader:

@@ -375,7 +375,7 @@ class _Table:
             return "write nothing between thousands, and decimal points"
         if time:
             return (
-                "a time is a number, a date or hours:minutes:seconds; mend it, or give the sample "
-                "time in place of the times (--dt)"
+                "a time is a number, a date or hours:minutes:seconds; mend it, cut the record "
+                "there, or give the sample time in place of the times (--dt)"
             )
         return "mend the record, cut it there, or take another column (--columns)"

@@ -47,7 +47,7 @@ class Layout(NamedTuple):
 
 
 class _Line(NamedTuple):
-    index: int  # among the lines of the file
+    at: int  # index among the lines of the file
     comment: bool
     text: str  # without mark of a comment
 
@@ -71,10 +71,10 @@ def layout_of(where: str, head: Sequence[str], columns: Sequence[str], timed: bo
     roles = ROLES[0 if timed else 1 :]
     asked = [*zip(columns, roles, strict=False)]
     plain = [line for line in lines if not line.comment]
-    cells = {line.index: without_empty_end(cells_of(line.text, separator)) for line in plain}
-    first = next((i for i, line in enumerate(plain) if _fits(cells[line.index], width, numeric)), 0)
-    start = plain[first].index
-    above = [line for line in lines if line.index < start][::-1]
+    cells = {line.at: without_empty_end(cells_of(line.text, separator)) for line in plain}
+    first = next((i for i, line in enumerate(plain) if _fits(cells[line.at], width, numeric)), 0)
+    start = plain[first].at
+    above = [line for line in lines if line.at < start][::-1]
     _check_decimal_commas(f"{where}, line {start + 1}", separator, [*cells.values()][first:])
     # A column that is empty in all lines may have a name, too.
     padded = len(cells_of(plain[first].text, separator))
@@ -82,19 +82,19 @@ def layout_of(where: str, head: Sequence[str], columns: Sequence[str], timed: bo
     if named is None:
         _check_count(where, above, width, separator, asked, cells[start])
         for line in plain[:first][::-1]:  # a line of numbers that lacks some
-            row = cells[line.index]
+            row = cells[line.at]
             if sum(map(is_value, row)) < 2 or not all(is_value(c) or is_missing(c) for c in row):
                 break
-            start = line.index
+            start = line.at
         return Layout(separator, None, 0, [""] * width, width, start)
     at, names = named
     width = len(names)
     units = [""] * width
     for line in plain:
-        if at < line.index <= start:
-            row = cells[line.index]
-            if line.index == start or not _is_text(row, numeric, width):
-                start = line.index
+        if at < line.at <= start:
+            row = cells[line.at]
+            if line.at == start or not _is_text(row, numeric, width):
+                start = line.at
                 break
             if not any(units) and any(c.isalpha() for c in "".join(row)):
                 units = [*row, ""][:width]
@@ -234,14 +234,14 @@ def _named(
     hits = [sum(_has(row, *pair) for pair in asked) for _, row in full]
     for (line, row), count in zip(full, hits, strict=True):
         if count == len(asked):
-            return line.index, row
+            return line.at, row
     for line, row in full:
         distinct = len({*row}) == len(row) or len(row) > 8
         if not line.comment and not all(map(is_unit, row)) and distinct:
-            return line.index, row
+            return line.at, row
     for (line, row), count in zip(full, hits, strict=True):
         if count > 0 or not line.comment:  # a comment without any of them is no line of names
-            return line.index, row
+            return line.at, row
     return None
 
 
@@ -269,7 +269,7 @@ def _check_count(
         if len(lacks) == len(asked):
             continue
         hint = hint_of_commas(separator, first)
-        line_ = "the first line" if line.index == 0 else f"line {line.index + 1}"
+        line_ = "the first line" if line.at == 0 else f"line {line.at + 1}"
         fault = f"column {lacks[0]} is missing; " if lacks else ""
         raise ValueError(
             f"{where}: {fault}{line_} names {listed(row)}, but the numbers below it have {width} "
