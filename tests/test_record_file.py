@@ -92,8 +92,8 @@ def test_a_sample_time_that_contradicts_the_times_in_the_file_gives_a_warning(
         assert record_of(tmp_path / "data.csv", dated, columns=columns, dt=0.1).u.size == 12
     with pytest.raises(ValueError, match="time_unit = 'ms': there are no times, as dt is given"):
         record_of(tmp_path / "data.csv", lines, columns=columns, dt=0.1, time_unit="ms")
-    with pytest.raises(ValueError, match="time_unit = 'min': must be one of s, ms, us, ns"):
-        record_of(tmp_path / "data.csv", lines, time_unit="min")
+    with pytest.raises(ValueError, match="time_unit = 'week': must be one of s, ms, us, ns, min"):
+        record_of(tmp_path / "data.csv", lines, time_unit="week")
 
 
 def test_a_text_of_names_is_no_list_of_them(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from quell.reading import whole_text
+from quell.reading import begin_of, encoding_of, kind_of, whole_text
 from quell.setup.errors import SetupError
 
 # Tables and lists within each other: setups have up to six; signals that follow each other may have
@@ -26,18 +26,38 @@ def read(path: str | os.PathLike[str]) -> tuple[str, dict[str, Any]]:
     Raises
     ------
     SetupError
-        for a file that cannot be read, or is not TOML.
+        for a file that cannot be read, or is not TOML; for a record it names the commands that take
+        one.
     """
     name = Path(path).name
     try:
-        text = whole_text(path)
+        return name, parsed(name, whole_text(path))
     except OSError as error:
         raise SetupError([f"{path}: can't be read ({error.strerror})"]) from None
     except UnicodeDecodeError as error:
-        raise SetupError([f"{name}: not TOML: byte {error.start} is not UTF-8"]) from None
+        fault = SetupError([f"{name}: not TOML: byte {error.start} is not UTF-8"])
+    except SetupError as error:
+        fault = error
     except ValueError as error:  # too long
-        raise SetupError([f"{name}: not a setup: {error}"]) from None
-    return name, parsed(name, text)
+        fault = SetupError([f"{name}: not a setup: {error}"])
+    raise _of_another_kind(path, name) or fault
+
+
+def _of_another_kind(path: str | os.PathLike[str], name: str) -> SetupError | None:
+    """Return an error that says what a file is that is no setup, None if that is not known."""
+    # It takes longer to import than a setup to read.
+    from quell.identification.experiment.record_layout import seems_record
+
+    begin = begin_of(path)
+    kind = kind_of(begin)
+    text = begin.decode(encoding_of(begin), errors="replace")
+    if Path(path).suffix.lower() in (".mcap", ".nc") or seems_record(text.splitlines()[:-1]):
+        rule = f"quell identify {name} finds a model in it, quell tune {name} a controller, and "
+        rule += f"quell b0 {name} the gain of the input"
+        return SetupError([f"{name}: is a record, not a setup: {rule}"])
+    if kind is not None:
+        return SetupError([f"{name}: is {kind.what}, not a setup; give a file in TOML"])
+    return None
 
 
 def parsed(name: str, text: str) -> dict[str, Any]:
