@@ -32,9 +32,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quell.identification.identify import identify
+from quell.identification.given_record import given_records
+from quell.identification.identify import Options, identified
 from quell.identification.result import Identified
 from quell.identification.search.output_error import noise_model
+from quell.identification.search.search import Known
 
 # Blocks: each should be longer than the correlation of the errors, and there should be enough of
 # them for their variance. Chosen by hand.
@@ -163,20 +165,34 @@ def alternatives(
                 tried.append((_RIGID, True, {"order": 2, "zeros": 0, "friction": True}))
     if order < _MOST_ORDER and not found.explained and not found.faults:
         tried.append((f"order {order + 1}", False, {"order": order + 1, "zeros": zeros + direct}))
-    options: dict[str, Any] = {"order": order, "zeros": zeros, "friction": rubs}
-    options |= {
-        "delay": found.delay if delay is OF_MODEL else delay,
-        "integrators": integrators,
-    }
-    if not found.samples:
-        options["held_out"] = 1.0 - found.held_from / found.y.size
-    options |= {"reference": found.reference, "horizon": found.horizon, "signals": found.signals}
+    held_out = None if found.samples else 1.0 - found.held_from / found.y.size
+    same = Options(
+        order,
+        zeros,
+        integrators,
+        found.delay if delay is OF_MODEL else delay,
+        True,
+        rubs,
+        None,
+        held_out,
+        found.horizon,
+    )
     models = []
     for name, smaller, change in tried:
-        # A smaller model is compared under the same assumption on the start.
+        # A smaller model is compared under the same assumption on the start, and found from this.
         rest = found.rest if smaller or found.rest_given else None
+        options = same._replace(**change, rest=rest and not change.get("friction", rubs))
+        known = _known(found) if options.order == order - 1 and not options.friction else None
         try:
-            model = identify(*found.records, found.dt, **(options | change | {"rest": rest}))
+            model = identified(
+                given_records(*found.records),
+                found.dt,
+                options,
+                found.reference,
+                None,
+                found.signals,
+                known,
+            )
         except ValueError:  # too short a record for it, or no such model
             continue
         model = replace(model, rest_given=found.rest_given)
@@ -187,6 +203,13 @@ def alternatives(
         measures = _compared(found, model, smaller) if nested else _by_blocks(found, model)
         models.append(Alternative(name, smaller, *measures, model, flags))
     return tuple(models)
+
+
+def _known(found: Identified) -> Known:
+    """Return where the search for a smaller model begins."""
+    powers = found.dt ** np.arange(found.den.size - 1.0, 0.0, -1.0)
+    low, high = (round(end / found.dt) for end in found.delays_searched)
+    return Known(found.den[:0:-1] * powers, (low, high))
 
 
 def decided(found: Identified, delay: Delay = OF_MODEL, **given: Any) -> Identified:

@@ -10,7 +10,6 @@ import numpy as np
 from quell import checks
 from quell.types import Vector
 
-
 # Share of a record that is held out, and longest delay at first [samples], by default: by hand.
 _HELD_OUT, _MOST_DELAY = 0.3, 20
 # Relative error of a range of delays by the rounding of the sample time.

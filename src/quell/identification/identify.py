@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from quell import checks
 from quell.identification.given_record import (
+    Records,
     delay_range,
     first_held_out,
     given_records,
@@ -20,7 +21,7 @@ from quell.identification.model.roots import gain_interval, poles_of, zeros_of
 from quell.identification.model.structure import Structure, free_run
 from quell.identification.result import Identified
 from quell.identification.search.closed_loop import instrumental_variables
-from quell.identification.search.search import Fit, Wanted, fit
+from quell.identification.search.search import Fit, Known, Wanted, fit
 from quell.identification.validation import (
     fit_predictor,
     nrmse,
@@ -143,8 +144,36 @@ def identify(
     >>> found.num.round(6).tolist(), found.den.round(6).tolist()
     ([3.0], [1.0, 2.0])
     """
-    records = given_records(u, y)
+    options = Options(order, zeros, integrators, delay, bias, friction, rest, held_out, horizon)
+    return identified(given_records(u, y), dt, options, reference, validation, signals)
+
+
+class Options(NamedTuple):
+    """Arguments of ``identify``."""
+
+    order: int
+    zeros: int
+    integrators: int | None
+    delay: Any
+    bias: bool
+    friction: bool
+    rest: bool | None
+    held_out: float | None
+    horizon: int
+
+
+def identified(
+    records: Records,
+    dt: float,
+    options: Options,
+    reference: Any,
+    validation: tuple[Any, Any] | None,
+    signals: Signals,
+    known: Known | None = None,
+) -> Identified:
+    """Return the result of ``identify``; the search begins at a model that is ``known``, if any."""
     u, y = records.u, records.y
+    order, zeros, integrators, delay, bias, friction, rest, held_out, horizon = options
     if reference is not None:
         reference = checks.vector("reference", reference, u.size)
         if np.ptp(reference) == 0.0:
@@ -178,7 +207,7 @@ def identify(
     least = max(least, 4 * delays[1])
     held_from = first_held_out(records, order, held_out, least, least_held)
     other = None if validation is None else other_record(*validation, least_held)
-    wanted = Wanted(order, zeros, integrators, delays, delay is None, bias, friction, rest)
+    wanted = Wanted(order, zeros, integrators, delays, delay is None, bias, friction, rest, known)
     # An unstable trial of the search may overflow; its cost is then infinite.
     with one_blas_thread(), np.errstate(all="ignore"):
         fitted = fit(u[:held_from], y[:held_from], records.samples, wanted)
@@ -255,7 +284,7 @@ def _validated(
         friction_std=friction_std,
         gain_interval=(low, high),
         delay_interval=_delay_interval(fitted, dt),
-        delay_is_at_end=fitted.searched[0] < fitted.delay == fitted.searched[1],
+        delays_searched=(fitted.searched[0] * dt, fitted.searched[1] * dt),
         rest=fitted.rest.assumed,
         rest_given=fitted.rest.given,
         rest_probability=fitted.rest.probability,

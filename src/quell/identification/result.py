@@ -52,7 +52,7 @@ class Identified:
     #: 95 % interval of ``gain``; infinite at an end that the record does not tell
     gain_interval: tuple[float, float]
     delay_interval: tuple[float, float]  #: 95 % interval of the delay [s], if it was searched
-    delay_is_at_end: bool  #: whether the best delay is the longest one that was searched
+    delays_searched: tuple[float, float]  #: range in which the delay was searched [s]
     rest: bool  #: whether the model starts at rest
     rest_given: bool  #: whether the start at rest was given, not assumed
     rest_probability: float  #: of a start at rest, from the record alone; NaN if not assumed
@@ -83,7 +83,7 @@ class Identified:
 
     @property
     def records(self) -> tuple[Any, Any]:
-        """u and y as ``identify`` got them: arrays, or lists of arrays of several records."""
+        """U and y as ``identify`` got them: arrays, or lists of arrays of several records."""
         if not self.samples:
             return self.u, self.y
         edges = np.cumsum(self.samples)[:-1]
@@ -94,7 +94,7 @@ class Identified:
         """Number of fitted parameters, those of the start of each record and the delay included."""
         order, records = self.den.size - 1, max(len(self.samples), 1)
         rubbing = 0 if self.friction is None else max(order - 1, 1)
-        searched = self.delay_interval[0] < self.delay_interval[1]
+        searched = self.delays_searched[0] < self.delays_searched[1]
         start = 1 if self.rest else order + 1
         return order - self.integrators + self.num.size + rubbing + searched + start * records
 
@@ -119,7 +119,8 @@ class Identified:
                 f"depends (probability {self.rest_probability:.2g}): if it was, give rest=True (--rest); "
                 "if not, record more rest before the first step"
             )
-        if self.delay_is_at_end:
+        shortest, longest = self.delays_searched
+        if shortest < longest <= self.delay + 0.5 * self.dt:
             found.append(
                 f"the record does not decide the delay: {self.delay:.4g} s is the longest one that was "
                 "searched; search longer ones (delay, --max-delay), or record longer"

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from quell.types import Matrix, Vector
 
-
 # Deviations within which a normal number lies with 95 %.
 WITHIN_95 = 1.96
 

@@ -80,7 +80,8 @@ def _from_parts(structure: Structure, v: Matrix, y: Vector) -> Start:
     for place in structure.records(y.size):
         single, inputs = from_any_start(structure, v[place])
         start = best_start(single, inputs, y[place])
-        found.append(descend(structure, with_poles(structure, start.estimate), v, y, _STEPS))
+        a = single.denominator(start.estimate.theta)
+        found.append(descend(structure, with_poles(structure, a), v, y, _STEPS))
         confirmed.append(start.confirmed)
     found += _from_smaller(structure, found, v, y)
     best = _best(found)
@@ -103,10 +104,10 @@ def from_any_start(structure: Structure, v: Matrix) -> tuple[Structure, Matrix]:
     return single, np.hstack([first, force, last])
 
 
-def with_poles(structure: Structure, estimate: ParameterEstimate) -> Vector:
-    """Return θ of ``structure`` with the poles of an estimate; its linear parameters are zero."""
+def with_poles(structure: Structure, a: Vector) -> Vector:
+    """Return θ of ``structure`` with the denominator ``a`` (n,); its linear parameters are zero."""
     theta = np.zeros(structure.size)
-    theta[: structure.free] = estimate.theta[: structure.free]
+    theta[: structure.free] = a[structure.integrators :]
     return theta
 
 

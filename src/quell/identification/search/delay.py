@@ -3,29 +3,31 @@
 A model with a wrong delay has other poles, so the error of one model at several delays says little,
 and it has a local minimum for each period of a resonance. Therefore a model is estimated at every
 delay of the range (at evenly spread ones of a long range, then at all between the best of them)
-from the part of the record in which u moves most. At each delay it is the better of two: an
-estimate of its own, and the model of the delay before, refined by a few steps. The best delays and
-the shortest one are searched in full, and from the best of these, small steps lead to the nearest
-minimum.
+from the part of the record in which u moves most. The best delays and the shortest one, in which
+such an estimate may fail, are searched in full, and small steps lead to the nearest minimum of each.
 
-Where the best delay is the longest one of a range that may grow, the range is doubled, until the
-delay is inside it or the record is too short.
+Where the best delay is among the longest ones of a range that may grow, the range is doubled, until
+it is not, or the record is too short.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from quell.identification.model.structure import Structure
-from quell.identification.search.best_start import Start, best_start, from_any_start
+from quell.identification.search.best_start import Start, best_start, from_any_start, with_poles
 from quell.identification.search.initial_estimate import filtered_estimates, refined
-from quell.identification.search.output_error import descend
+from quell.identification.search.output_error import ParameterEstimate, descend
 from quell.types import Matrix, Vector
 
 # Most delays that are estimated, number of samples for it, and number of delays that are searched
 # in full besides the shortest. Chosen by hand: the first two limit the time, and a second minimum
 # is sometimes better.
 _SCANNED, _SAMPLES, _SEARCHED = 25, 4000, 2
+# Mean square errors of estimates up to this factor of the least may become the least: by hand.
+_NEARLY = 1.5
 # Steps of the refinement at the neighbours, where a good start is known, and of a model that goes
 # on to the next delay: chosen by hand.
 _STEPS, _FEW_STEPS = 12, 3
@@ -53,43 +55,82 @@ def start_with_delay(
     """
     if delays[0] == delays[1]:
         return delays, delays[0], best_start(structure, with_delay(structure, v, u, delays[0]), y)
-    most = int(MOST_SHARE * min(place.stop - place.start for place in structure.records(y.size)))
-    while True:
-        delay, start = _in_range(structure, u, v, y, delays)
-        if not grows or delay < delays[1] or delays[1] >= most:
-            return delays, delay, start
-        delays = max(delay - 1, delays[0]), min(2 * delays[1], most)
-
-
-def _in_range(
-    structure: Structure, u: Vector, v: Matrix, y: Vector, delays: tuple[int, int]
-) -> tuple[int, Start]:
-    """Return the delay of least output error in a range, and the model at it."""
     part = _moving_part(structure, u)
     single, of_part = from_any_start(structure, v[part])
+
+    def costs(delays: range) -> dict[int, float]:
+        return _costs(single, u[part], of_part, y[part], delays)
+
+    low, (high, stride, found) = delays[0], _scanned(costs, delays, longest(structure, y, grows))
+    near = []
+    for delay in dict.fromkeys([*_minima(found, stride), low]):
+        start = best_start(structure, with_delay(structure, v, u, delay), y)
+        found_near = nearest_delay(structure, start.estimate, u, v, y, (low, high), delay, stride)
+        near.append((found_near[0], start._replace(estimate=found_near[1])))
+    return (low, high), *min(near, key=lambda one: one[1].estimate.cost)
+
+
+def from_poles(
+    structure: Structure,
+    poles: Sequence[Vector],
+    u: Vector,
+    v: Matrix,
+    y: Vector,
+    delays: tuple[int, int],
+) -> tuple[int, ParameterEstimate]:
+    """Return the delay of least output error in a range, and the model at it, from given poles.
+
+    ``poles`` are the coefficients a (n,) of polynomials.
+    """
     stride = -(-(delays[1] - delays[0] + 1) // _SCANNED)
-    costs = _costs(single, u[part], of_part, y[part], range(delays[0], delays[1] + 1, stride))
+    starts = [with_poles(structure, a) for a in poles]
+    costs: dict[int, float] = {}
+    known: dict[int, ParameterEstimate] = {}
+    before: list[Vector] = []
+    for delay in range(delays[0], delays[1] + 1, stride):
+        inputs = with_delay(structure, v, u, delay)
+        tried = [descend(structure, one, inputs, y, _FEW_STEPS) for one in (*starts, *before)]
+        known[delay] = min(tried, key=lambda one: one.cost)
+        costs[delay], before = known[delay].cost, [known[delay].theta]
+    near = [
+        nearest_delay(structure, known[delay], u, v, y, delays, delay, stride)
+        for delay in _minima(costs, stride)
+    ]
+    return min(near, key=lambda one: one[1].cost)
+
+
+def longest(structure: Structure, y: Vector, grows: bool) -> int:
+    """Return the longest delay to which a range may grow; 0 if it may not."""
+    shortest = min(place.stop - place.start for place in structure.records(y.size))
+    return int(MOST_SHARE * shortest) if grows else 0
+
+
+def _scanned(
+    costs: Callable[[range], dict[int, float]], delays: tuple[int, int], most: int
+) -> tuple[int, int, dict[int, float]]:
+    """Return the longest delay, the step, and the errors over a range that may grow up to ``most``.
+
+    It is doubled as long as the least error is in its last fifth.
+    """
+    low, high = delays
+    stride = -(-(high - low + 1) // _SCANNED)
+    found = costs(range(low, high + 1, stride))
+    while min(found, key=lambda one: found[one]) > high - 0.2 * (high - low) and high < most:
+        first, high = max(found) + stride, min(2 * high, most)
+        found |= costs(range(first, high + 1, stride))
+    return high, stride, found
+
+
+def _minima(costs: dict[int, float], stride: int) -> list[int]:
+    """Return the delays of the best local minima, the least error first."""
+    least = min(costs.values())
     minima = [
         delay
         for delay in costs
         if costs[delay] <= min(costs.get(delay - stride, np.inf), costs.get(delay + stride, np.inf))
+        and costs[delay] <= _NEARLY * least
     ]
-    searched = dict.fromkeys(sorted(minima, key=lambda one: costs[one])[:_SEARCHED])
-    searched |= dict.fromkeys(delays[:1])
-    near = {
-        delay: nearest_delay(
-            structure,
-            best_start(structure, with_delay(structure, v, u, delay), y),
-            u,
-            v,
-            y,
-            delays,
-            delay,
-            stride,
-        )
-        for delay in searched
-    }
-    return min(near.values(), key=lambda one: one[1].estimate.cost)
+    return sorted(minima, key=lambda one: costs[one])[:_SEARCHED] or [min(costs)]
 
 
 def _moving_part(structure: Structure, u: Vector) -> slice:
@@ -114,30 +155,25 @@ def _costs(
 ) -> dict[int, float]:
     """Return the mean square error of an estimated model at each of the delays."""
     costs: dict[int, float] = {}
-    before: Vector | None = None
     for delay in delays:
         inputs = with_delay(structure, v, u, delay)
-        cost, theta = refined(structure, filtered_estimates(structure, inputs, y)[0], inputs, y)
-        if before is not None:
-            near = descend(structure, before, inputs, y, _FEW_STEPS)
-            if near.cost < cost:
-                cost, theta = near.cost, near.theta
-        costs[delay], before = cost, theta
+        theta = filtered_estimates(structure, inputs, y)[0]
+        costs[delay] = refined(structure, theta, inputs, y)[0]
     return costs
 
 
 def nearest_delay(
     structure: Structure,
-    start: Start,
+    estimate: ParameterEstimate,
     u: Vector,
     v: Matrix,
     y: Vector,
     delays: tuple[int, int],
     delay: int,
     step: int = 1,
-) -> tuple[int, Start]:
+) -> tuple[int, ParameterEstimate]:
     """Return the delay of least output error near ``delay``, and the model at it."""
-    known = {delay: start.estimate}
+    known = {delay: estimate}
     while step:
         for other in (delay + step, delay - step):
             if delays[0] <= other <= delays[1] and other not in known:
@@ -145,4 +181,4 @@ def nearest_delay(
                 known[other] = descend(structure, known[delay].theta, inputs, y, _STEPS)
         best = min(known, key=lambda one: known[one].cost)
         delay, step = (best, step) if best != delay else (delay, step // 2)
-    return delay, start._replace(estimate=known[delay])
+    return delay, known[delay]

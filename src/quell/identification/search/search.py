@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from quell.identification.model.roots import gain_interval, squared_distance_from_zero
 from quell.identification.given_record import resolution_of
+from quell.identification.model.roots import gain_interval, squared_distance_from_zero
 from quell.identification.model.structure import Structure, free_run, output
 from quell.identification.search.at_rest import (
     AtRest,
@@ -16,7 +17,13 @@ from quell.identification.search.at_rest import (
     probability,
     structure_at_rest,
 )
-from quell.identification.search.delay import nearest_delay, start_with_delay, with_delay
+from quell.identification.search.best_start import Start, best_start
+from quell.identification.search.delay import (
+    from_poles,
+    nearest_delay,
+    start_with_delay,
+    with_delay,
+)
 from quell.identification.search.output_error import (
     ParameterEstimate,
     covariance,
@@ -88,6 +95,13 @@ class Fit(NamedTuple):
         return v
 
 
+class Known(NamedTuple):
+    """A model from which a search begins."""
+
+    a: Vector  # coefficients of its denominator (n,), per sample
+    searched: tuple[int, int]  # range of delays in which it was searched [samples]
+
+
 class Wanted(NamedTuple):
     """What a model is to have."""
 
@@ -99,6 +113,7 @@ class Wanted(NamedTuple):
     bias: bool
     friction: bool
     rest: bool | None  # None: if the record needs it, and does not contradict
+    known: Known | None = None  # a larger model, from which the search begins
 
 
 def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
@@ -112,11 +127,11 @@ def fit(u: Vector, y: Vector, samples: tuple[int, ...], wanted: Wanted) -> Fit:
     structure = Structure(wanted.order, q, degrees, signs, direct, samples=samples)
     if wanted.rest and wanted.bias:
         return _fit_at_rest(structure, u, y, wanted)
-    found = _fitted(structure, u, y, wanted)
+    found = _fitted(structure, u, y, wanted, wanted.known)
     needless = not wanted.bias or wanted.friction or _relative_width(found) <= _CERTAIN
     if wanted.rest is False or needless:
         return found
-    at_rest = _fit_at_rest(structure, u, y, wanted)
+    at_rest = _fit_at_rest(structure, u, y, wanted, found)
     # Without need, only what is certain is assumed.
     least = _SURE if _relative_width(found) <= _USEFUL else _LIKELY
     refused = at_rest.rest.probability < least or _contradicts(found, at_rest, u, y)
@@ -138,10 +153,19 @@ def _contradicts(found: Fit, at_rest: Fit, u: Vector, y: Vector) -> bool:
     return bool(not ratio <= chi2.isf(_SELDOM, found.structure.order))
 
 
-def _fit_at_rest(structure: Structure, u: Vector, y: Vector, wanted: Wanted) -> Fit:
-    """Return the model of a start at rest, in the general form."""
+def _fit_at_rest(
+    structure: Structure, u: Vector, y: Vector, wanted: Wanted, from_any: Fit | None = None
+) -> Fit:
+    """Return the model of a start at rest, in the general form.
+
+    The search begins at the poles of ``from_any``, a model from any start, if there is one.
+    """
+    known = wanted.known
+    if from_any is not None:
+        a = from_any.structure.denominator(from_any.estimate.theta)
+        known = Known(a, from_any.searched)
     resting = structure_at_rest(structure)
-    found = _fitted(resting, from_rest(structure, u), y, wanted)
+    found = _fitted(resting, from_rest(structure, u), y, wanted, known)
     v = found.inputs(from_rest(structure, u))
     chance = probability(found.structure, found.estimate, v, y, resolution_of(y))
     free, estimate = general(found.structure, found.estimate, u)
@@ -157,15 +181,19 @@ def _relative_width(found: Fit) -> float:
     return abs((high - low) / (high + low)) if np.isfinite(high - low) and high + low else np.inf
 
 
-def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted) -> Fit:
+def _fitted(
+    structure: Structure, u: Vector, y: Vector, wanted: Wanted, known: Known | None
+) -> Fit:
     """Return the model of one structure; at rest, ``u`` is without its first value."""
     friction, delays, bias = wanted.friction, wanted.delays, wanted.bias and not structure.at_rest
     first = Fit(structure, _NONE, delays[0], delays, delays, bias, AtRest(False, False, np.nan))
     v = first.inputs(u)
     if friction:
         v[:, -1] = measured_sign(structure, y, _HALF_WIDTH)
-    searched, delay, start = start_with_delay(structure, u, v, y, delays, wanted.grows)
-    searched = delays[0], searched[1]
+    if known is None:
+        searched, delay, start = start_with_delay(structure, u, v, y, delays, wanted.grows)
+    else:
+        searched, delay, start = _from_known(structure, known, u, v, y, wanted)
     if not np.isfinite(start.estimate.cost):
         none = "no model was found whose output is finite; lower the order, or scale u and y"
         raise ValueError(f"order = {wanted.order}, zeros = {wanted.zeros}: {none}")
@@ -180,12 +208,10 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted) -> Fit:
     estimate, v = _settle_signs(structure, estimate, v, y)
     if friction and searched[0] < searched[1]:
         # With wrong signs of the speed another delay may have been the best.
-        again, start = nearest_delay(
-            structure, start._replace(estimate=estimate), u, v, y, searched, delay
-        )
+        again, near = nearest_delay(structure, estimate, u, v, y, searched, delay)
         if again != delay:
             delay, v = again, with_delay(structure, v, u, again)
-            estimate, v = _settle_signs(structure, start.estimate, v, y)
+            estimate, v = _settle_signs(structure, near, v, y)
     estimate = estimate._replace(converged=estimate.converged and start.confirmed)
     certain = delay, delay
     if searched[0] < searched[1]:
@@ -193,6 +219,43 @@ def _fitted(structure: Structure, u: Vector, y: Vector, wanted: Wanted) -> Fit:
     return first._replace(
         structure=structure, estimate=estimate, delay=delay, delays=certain, searched=searched
     )
+
+
+def _from_known(
+    structure: Structure, known: Known, u: Vector, v: Matrix, y: Vector, wanted: Wanted
+) -> tuple[tuple[int, int], int, Start]:
+    """Return the range of delays, the best delay and the model at it, from a known model.
+
+    Its poles, or those without each one of them, are the starts at all delays of its range; at the
+    best delay all starts are tried.
+    """
+    searched = known.searched
+    if not wanted.grows:
+        searched = wanted.delays
+    poles = [known.a] if known.a.size == structure.order else _without_one(known.a)
+    delay, estimate = from_poles(structure, poles, u, v, y, searched)
+    if known.a.size == structure.order:
+        return searched, delay, Start(estimate, math.isfinite(estimate.cost))
+    start = best_start(structure, with_delay(structure, v, u, delay), y)
+    again = nearest_delay(structure, start.estimate, u, v, y, searched, delay)
+    delay, estimate = min((delay, estimate), again, key=lambda one: one[1].cost)
+    return searched, delay, start._replace(estimate=estimate)
+
+
+def _without_one(a: Vector) -> list[Vector]:
+    """Return the coefficients without each real pole, or with a real one in place of each pair."""
+    poles = np.roots(np.append(1.0, a[::-1]))
+    found = []
+    for i, pole in enumerate(poles):
+        if pole.imag > 0.0:
+            pair = (poles == pole) | (poles == pole.conjugate())
+            rest = np.append(poles[~pair], -abs(pole))
+        elif pole.imag == 0.0:
+            rest = np.delete(poles, i)
+        else:
+            continue
+        found.append(np.poly(rest).real[:0:-1])
+    return found
 
 
 def _over_delays(
