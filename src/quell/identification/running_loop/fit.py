@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.identification.model.structure import nonzero_lengths
-from quell.identification.running_loop.model import Form, derivatives, is_stable, linear_columns
+from quell.identification.running_loop.model import Form, derivatives, growth, is_stable, linear_columns
 from quell.identification.search.output_error import block_sums
 from quell.types import Matrix, Vector
 
@@ -74,7 +74,11 @@ def power(form: Form, phi: Vector, u: Vector, y: Vector) -> float:
 def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     """Return the model of least prediction error near ``phi``."""
     at, converged = _descend(form, _solved(form, phi, u, y), u, y)
+    if not math.isfinite(at.power):
+        return _without_model(form, at)
     psi, size = _gradient(form, at, u, y)
+    if not np.all(np.isfinite(psi)):
+        return _without_model(form, at)
     first, count = at.beta.size, at.beta.size + form.size
     # λ, τ and T at zero, their limit, do not vary.
     places = first + np.arange(form.size)[form.non_negative]
@@ -83,25 +87,34 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     inverse = np.linalg.pinv(R, rcond=_RANK)
     variance = at.power / max(at.error.size - count, 1)
     order = np.r_[first:count, :first]  # φ before β
-    with np.errstate(all="ignore"):  # a fit without a stable start has no covariance
-        rows = inverse[order] / size[order, None]
-        covariance = variance * rows @ rows.T
-        half = rows @ (inverse.T @ block_sums(psi, at.error, min(_BLOCKS, at.error.size)).T)
-        robust = half @ half.T
+    rows = inverse[order] / size[order, None]
+    covariance = variance * rows @ rows.T
+    half = rows @ (inverse.T @ block_sums(psi, at.error, min(_BLOCKS, at.error.size)).T)
+    robust = half @ half.T
     if robust[form.size, form.size] > covariance[form.size, form.size]:
         covariance = robust
     aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
+    aic += 2.0 * growth(form, at.phi, u.size)
     return LoopFit(form, at.phi, at.beta, covariance, at.error, aic, converged)
+
+
+def _without_model(form: Form, at: _Point) -> LoopFit:
+    """Return what counts as no fit: no start has a prediction."""
+    count = at.beta.size + form.size
+    covariance = np.full((count, count), np.nan)
+    return LoopFit(form, at.phi, at.beta, covariance, at.error, math.inf, False)
 
 
 def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:
     """Return the model with the best β for φ; its power is infinite if it has none."""
+    nothing = _Point(phi, np.zeros(1 + form.states), y, np.empty((0, 0)), math.inf)
+    if not is_stable(form, phi, u.size):
+        return nothing
     with np.errstate(all="ignore"):
         columns, of_y = linear_columns(form, phi, u, y)
         size, target = nonzero_lengths(columns), y - of_y
-        stable = is_stable(form, phi)
-        if not (stable and np.all(np.isfinite(size)) and np.all(np.isfinite(target))):
-            return _Point(phi, np.zeros(size.size), y, columns, math.inf)
+        if not (np.all(np.isfinite(size)) and math.isfinite(float(target @ target))):
+            return nothing
         scaled = columns / size
         R: Matrix = np.asarray(np.linalg.qr(np.column_stack([scaled, target]), mode="r"))
         beta = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=_RANK)[0]
@@ -111,9 +124,10 @@ def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:
 
 def _gradient(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
     """Return the columns ψ of β and φ (N, all), scaled to length 1, and their lengths."""
-    psi = np.hstack([at.columns, derivatives(form, at.phi, at.beta, u, y)])
-    size = nonzero_lengths(psi)
-    psi /= size
+    with np.errstate(all="ignore"):  # the caller sees numbers that are not finite
+        psi = np.hstack([at.columns, derivatives(form, at.phi, at.beta, u, y)])
+        size = nonzero_lengths(psi)
+        psi /= np.where(np.isfinite(size), size, np.nan)
     return psi, size
 
 

@@ -14,6 +14,14 @@ with ``x = (x_1 … x_n, d, u_l)`` and free gains K, so that the noises' intensi
 known. K is Φ's integral over the sample times ``(l_1 … l_{n+1})``. The predictor's matrix ``Φ − K
 C`` has to be stable; the plant's need not be.
 
+Without loads only y is noisy, and K follows from the plant. It is zero for a stable plant, whose
+state is simulated. The state of an unstable plant cannot be: its best predictor has the unstable
+poles mirrored at the unit circle, and the others where the plant has them (Anderson & Moore,
+*Optimal Filtering*, 1979, sec. 4.4, for a noise of the state that goes to zero). With λ_j the
+unstable poles, ``z_j = exp(λ_j)``, and v_j the eigenvectors of the plant with ``C v_j = 1``::
+
+    K = Σ_j v_j Π_i (z_j − 1/z_i*) / Π_{i≠j} (z_j − z_i)
+
 A sample is a unit of time, as in ``sampling``. u is held between samples, and T need not be a whole
 number of them: in a sample the u before acts for the part ``T − ⌊T⌋``, then the next one for the
 rest. For given a, l, τ and T, ŷ is linear in b and the initial state.
@@ -25,6 +33,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quell.identification.model.sampling import Sampled, observable, states
 from quell.identification.search.delay import delayed
@@ -38,6 +47,14 @@ _STEP = 1e-4
 _LIMIT = 1.0 + 1e-6
 # Least time constant of the lag [samples], so that 1/τ is finite.
 _LEAST_LAG = 1e-6
+# Growth of an unstable pole's motion over the record, from which on it is not simulated but
+# predicted [log]: a factor of 1000 leaves 13 digits. Below, the predictor would have to settle for
+# a large part of the record.
+_LARGEST_GROWTH = math.log(1e3)
+# Largest coefficient of the model [1/sample^n] that is sampled; 1/τ is the largest that has a use.
+_LARGEST = 1e7
+
+Complex = NDArray[np.complex128]
 
 
 class Form(NamedTuple):
@@ -46,7 +63,7 @@ class Form(NamedTuple):
     order: int  #: n
     lag: bool  #: whether τ is free; else it is 0
     delay: bool  #: whether T is free; else it is 0
-    drift: bool  #: whether l are free; else they are 0, and only y is noisy
+    drift: bool  #: whether l are free; else K follows from the plant, and only y is noisy
     forgets: bool = False  #: whether λ is free; else it is 0
 
     @property
@@ -93,17 +110,32 @@ def placed(a: Vector, omega: float) -> Vector:
     return np.concatenate([a, target - np.append(a[::-1], 0.0)])
 
 
-def is_stable(form: Form, phi: Vector) -> bool:
-    """Return whether the predictor is stable, or at its limit; one without gains always counts."""
-    if not form.drift:
-        return True
-    closed = _predictor(form, phi).phi
-    return bool(np.all(np.isfinite(closed)) and np.max(np.abs(np.linalg.eigvals(closed))) <= _LIMIT)
+def is_stable(form: Form, phi: Vector, samples: int) -> bool:
+    """Return whether the predictor is stable, or at its limit; one without loads always is."""
+    closed = _predictor(form, phi, samples).phi
+    if not np.all(np.isfinite(closed)):
+        return False
+    return not form.drift or bool(np.max(np.abs(np.linalg.eigvals(closed))) <= _LIMIT)
+
+
+def is_unstable(form: Form, phi: Vector, samples: int) -> bool:
+    """Return whether the plant has a pole whose motion grows too far to be simulated."""
+    return bool(samples * np.max(_poles(phi[: form.order]).real) > _LARGEST_GROWTH)
+
+
+def growth(form: Form, phi: Vector, samples: int) -> float:
+    """Return by how much unstable poles that are simulated grow over the record, as a logarithm.
+
+    By twice as much the logarithm of the determinant of the initial state's information grows: the
+    likelihood of the output counts it, its sum of squares does not.
+    """
+    rates = samples * _poles(phi[: form.order]).real
+    return 0.0 if form.drift else float(np.sum(rates[(rates > 0.0) & (rates <= _LARGEST_GROWTH)]))
 
 
 def linear_columns(form: Form, phi: Vector, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
     """Return ŷ by b and by each initial state (N, 1 + states), and its part from y (N,)."""
-    system, v = _predictor(form, phi), _inputs(form, phi, u, y)
+    system, v = _predictor(form, phi, u.size), _inputs(form, phi, u, y)
     nothing = np.zeros((u.size, 1))
     of_u, of_y, of_none = (_with(system, part) for part in (slice(0, 2), slice(2, 3), slice(2, 3)))
     parts = [states(of_u, v[:, :2])[:, 0]]
@@ -113,7 +145,7 @@ def linear_columns(form: Form, phi: Vector, u: Vector, y: Vector) -> tuple[Matri
 
 def predicted(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Vector:
     """Return ŷ (N,) for the linear parameters ``beta``: b, and the initial state."""
-    system = _predictor(form, phi)
+    system = _predictor(form, phi, u.size)
     system = system._replace(gamma=system.gamma * np.array([beta[0], beta[0], 1.0]))
     return states(system, _inputs(form, phi, u, y), beta[1:])[:, 0]
 
@@ -147,8 +179,11 @@ def _with(system: Sampled, inputs: slice) -> Sampled:
     return system._replace(gamma=gamma, slope=np.zeros_like(gamma))
 
 
-def _predictor(form: Form, phi: Vector) -> Sampled:
-    """Return the predictor, for the inputs u before, u after the delay's change, y."""
+def _predictor(form: Form, phi: Vector, samples: int) -> Sampled:
+    """Return the predictor, for the inputs u before, u after the delay's change, y.
+
+    Its matrices are NaN for parameters that are too large for numbers.
+    """
     n, size = form.order, form.states
     A, B = np.zeros((size, size)), np.zeros((size, 2))
     A[:n, :n] = observable(phi[:n])
@@ -160,14 +195,37 @@ def _predictor(form: Form, phi: Vector) -> Sampled:
         A[n - 1, n + 1], A[n + 1, n + 1], B[n + 1, 0] = 1.0, -1.0 / tau, 1.0 / tau
     else:
         B[n - 1, 0] = 1.0
+    if not (np.max(np.abs(A)) <= _LARGEST and np.all(np.isfinite(B))):
+        return Sampled(*(np.full((size, width), np.nan) for width in (size, 3, 3)))
     late = math.modf(form.delay_of(phi))[0]
     with np.errstate(all="ignore"):
         whole, (gamma,) = zero_order_hold(A, [B], 1.0)
         _, (rest,) = zero_order_hold(A, [B[:, :1]], 1.0 - late)
-    K = gamma[:, 1]
-    whole[:, 0] -= K
+        K = gamma[:, 1] if form.drift else _mirroring(phi[:n], size, samples)
+        whole[:, 0] -= K
     gammas = np.column_stack([gamma[:, 0] - rest[:, 0], rest[:, 0], K])
     return Sampled(whole, gammas, np.zeros_like(gammas))
+
+
+def _poles(a: Vector) -> Complex:
+    """Return the poles of the plant [1/sample]."""
+    return np.asarray(np.linalg.eigvals(observable(a)), dtype=np.complex128)
+
+
+def _mirroring(a: Vector, states: int, samples: int) -> Vector:
+    """Return the K (states,) that mirrors the unstable poles, those that grow over the record."""
+    K = np.zeros(states, dtype=np.complex128)
+    poles = _poles(a)
+    poles = poles[samples * poles.real > _LARGEST_GROWTH]
+    z = np.exp(poles)
+    for j, pole in enumerate(poles):
+        others = np.arange(z.size) != j
+        weight = np.prod(z[j] - 1.0 / z.conj()) / np.prod(z[j] - z[others])
+        vector = np.ones(1, dtype=np.complex128)
+        for coefficient in a[:0:-1]:  # v_1 = 1, v_(i+1) = λ v_i + a_(n−i)
+            vector = np.append(vector, pole * vector[-1] + coefficient)
+        K[: a.size] += weight * vector
+    return K.real.copy()
 
 
 def _inputs(form: Form, phi: Vector, u: Vector, y: Vector) -> Matrix:

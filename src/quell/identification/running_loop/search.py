@@ -13,11 +13,11 @@ from itertools import product
 import numpy as np
 
 from quell.identification.model.correlation import autocorrelation
-from quell.identification.model.structure import Structure
+from quell.identification.model.structure import Structure, linear_columns, nonzero_lengths
 from quell.identification.running_loop.fit import LoopFit, fit, power
-from quell.identification.running_loop.model import Form, placed
+from quell.identification.running_loop.model import Form, is_unstable, placed
 from quell.identification.search.delay import delayed
-from quell.identification.search.initial_estimate import filtered_estimates
+from quell.identification.search.initial_estimate import equation, filtered_estimates
 from quell.types import Vector
 
 # Bandwidths of the predictor [1/sample], number of delays and lags, number of denominators, and the
@@ -26,6 +26,9 @@ from quell.types import Vector
 _RATES, _GRID, _DENOMINATORS, _SHARES = (0.01, 0.05, 0.2), 6, 3, (0.2, 0.5, 0.8)
 # Rates at which loads forget, of the starts [1/sample].
 _FORGETTING = (0.001, 0.01, 0.1)
+# Poles of the filters that give unstable denominators [1/sample] and their number, and the number
+# of these denominators that are tried.
+_FILTERS, _UNSTABLE = (0.003, 0.5, 6), 2
 # Lags of the test of whiteness, and its level: as in ``best_start``.
 _LAGS, _LEVEL = 50, 1e-3
 
@@ -47,7 +50,30 @@ def _denominators(order: int, most: float, u: Vector, y: Vector) -> list[Vector]
     v = np.column_stack([delayed(u, round(0.25 * most)), np.ones(u.size)])
     estimates = filtered_estimates(structure, v, y)[:_DENOMINATORS]
     found = [structure.denominator(theta) for theta in estimates if np.all(np.isfinite(theta))]
-    return [np.zeros(order), *found]
+    return [np.zeros(order), *found, *_unstable(structure, most, u, y)]
+
+
+def _unstable(structure: Structure, most: float, u: Vector, y: Vector) -> list[Vector]:
+    """Return the best unstable denominators by least squares on filtered signals.
+
+    ``filtered_estimates`` mirrors unstable poles into the left half plane: in an open loop the
+    noise is their reason. In a loop the plant may have them.
+    """
+    form, n = Form(structure.order, False, True, False), structure.order
+    found = []
+    for rate in np.geomspace(*_FILTERS):
+        prefilter = np.poly(np.full(n, -rate)).real[:0:-1]
+        for delay in (0, round(0.25 * most)):
+            v = np.column_stack([delayed(u, delay), np.ones(u.size)])
+            target, regressors = equation(
+                structure, prefilter, linear_columns(structure, prefilter, v), y
+            )
+            size = nonzero_lengths(regressors)
+            theta = np.linalg.lstsq(regressors / size, target, rcond=1e-14)[0] / size
+            phi = np.append(structure.denominator(theta), float(delay))
+            if is_unstable(form, phi, y.size):
+                found.append((power(form, phi, u, y), phi[:-1]))
+    return [a for _, a in sorted(found, key=lambda one: one[0])[:_UNSTABLE]]
 
 
 def _family(
