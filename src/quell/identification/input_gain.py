@@ -242,14 +242,16 @@ def identify_b0(
                 f"max_delay = {max_delay!r} s: must be at most a quarter of the record"
             )
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
+    # The u before the record is not known: the first samples of y, which it reaches, are left out.
+    before = math.ceil(min(most, _MOST_SHARE * u.size)) + 1
     with one_blas_thread():
-        found = fits(order, most, u / scale_u, y / scale_y)
+        found = fits(order, most, u / scale_u, y[before:] / scale_y)
     usable = [one for one in found if _is_usable(one)]
     if not usable:
         raise ValueError(
             f"order = {order}: no model was found; check the order, and that u belongs to y"
         )
-    return _result(usable, u, y, dt, scale_u, scale_y)
+    return _result(usable, u, y[before:], dt, scale_u, scale_y)
 
 
 def _is_usable(one: LoopFit) -> bool:
@@ -276,7 +278,7 @@ def _result(
     spreads = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     lags = min(50, y.size // 4)
     # In a loop u depends on the error of its own sample: only u before it counts.
-    tests = residuals(best.error[1:], u[:-1], lags)
+    tests = residuals(best.error[1:], u[u.size - y.size : -1], lags)
     return InputGain(
         order=n,
         b0=unit * b0,
@@ -289,9 +291,9 @@ def _result(
         total_delay=total * dt,
         total_delay_std=total_std * dt,
         dt=dt,
-        samples=y.size,
+        samples=u.size,
         noise=scale_y * float(np.sqrt(np.mean(best.error**2))),
-        omega_max=visible_up_to(best, u / scale_u, y / scale_y, dt),
+        omega_max=visible_up_to(best, u / scale_u, dt),
         white=tests.white,
         independent=tests.independent,
         converged=best.converged,

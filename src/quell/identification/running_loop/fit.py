@@ -94,7 +94,7 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     if robust[form.size, form.size] > covariance[form.size, form.size]:
         covariance = robust
     aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
-    aic += 2.0 * growth(form, at.phi, u.size)
+    aic += 2.0 * growth(form, at.phi, y.size)
     return LoopFit(form, at.phi, at.beta, covariance, at.error, aic, converged)
 
 
@@ -108,7 +108,7 @@ def _without_model(form: Form, at: _Point) -> LoopFit:
 def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:
     """Return the model with the best β for φ; its power is infinite if it has none."""
     nothing = _Point(phi, np.zeros(1 + form.states), y, np.empty((0, 0)), math.inf)
-    if not is_stable(form, phi, u.size):
+    if not is_stable(form, phi, y.size):
         return nothing
     with np.errstate(all="ignore"):
         columns, of_y = linear_columns(form, phi, u, y)
@@ -185,7 +185,7 @@ def _damped_step(
         step = np.linalg.lstsq(left, np.append(right, np.zeros(count)), rcond=None)[0]
         phi = at.phi + step / size
         limited = form.non_negative
-        phi[limited] = np.clip(phi[limited], 0.0, _LONGEST * u.size)
+        phi[limited] = np.clip(phi[limited], 0.0, _LONGEST * y.size)
         trial = _solved(form, phi, u, y)
         if trial.power < at.power:
             return trial, max(0.1 * mu, _LEAST_MU)

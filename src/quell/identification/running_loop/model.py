@@ -25,6 +25,9 @@ unstable poles, ``z_j = exp(λ_j)``, and v_j the eigenvectors of the plant with 
 A sample is a unit of time, as in ``sampling``. u is held between samples, and T need not be a whole
 number of them: in a sample the u before acts for the part ``T − ⌊T⌋``, then the next one for the
 rest. For given a, l, τ and T, ŷ is linear in b and the initial state.
+
+u may begin before y: its last N samples belong to those of y. So a delay needs no u that is not
+known; before its own first sample u is taken to have had that value.
 """
 
 from __future__ import annotations
@@ -135,8 +138,8 @@ def growth(form: Form, phi: Vector, samples: int) -> float:
 
 def linear_columns(form: Form, phi: Vector, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
     """Return ŷ by b and by each initial state (N, 1 + states), and its part from y (N,)."""
-    system, v = _predictor(form, phi, u.size), _inputs(form, phi, u, y)
-    nothing = np.zeros((u.size, 1))
+    system, v = _predictor(form, phi, y.size), _inputs(form, phi, u, y)
+    nothing = np.zeros((y.size, 1))
     of_u, of_y, of_none = (_with(system, part) for part in (slice(0, 2), slice(2, 3), slice(2, 3)))
     parts = [states(of_u, v[:, :2])[:, 0]]
     parts += [states(of_none, nothing, start)[:, 0] for start in np.eye(form.states)]
@@ -145,14 +148,14 @@ def linear_columns(form: Form, phi: Vector, u: Vector, y: Vector) -> tuple[Matri
 
 def predicted(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Vector:
     """Return ŷ (N,) for the linear parameters ``beta``: b, and the initial state."""
-    system = _predictor(form, phi, u.size)
+    system = _predictor(form, phi, y.size)
     system = system._replace(gamma=system.gamma * np.array([beta[0], beta[0], 1.0]))
     return states(system, _inputs(form, phi, u, y), beta[1:])[:, 0]
 
 
 def derivatives(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Matrix:
     """Return the derivatives (N, size) of ŷ by a, l, λ, τ and T, by central differences."""
-    found = np.empty((u.size, form.size))
+    found = np.empty((y.size, form.size))
     for i, step in enumerate(_steps(form, y)):
         above, below = phi.copy(), phi.copy()
         above[i] += step
@@ -161,6 +164,22 @@ def derivatives(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> 
         change = predicted(form, above, beta, u, y) - predicted(form, below, beta, u, y)
         found[:, i] = change / (above[i] - below[i])
     return found
+
+
+def responses(form: Form, phi: Vector, samples: int, omega: Vector) -> tuple[Vector, Vector]:
+    """Return the absolute frequency responses from u and from e to y, with b = 1, at ``omega``.
+
+    ``omega`` is in 1/sample and not zero. The response to e is ``det(z I − Φ + K C)/det(z I − Φ)``.
+    """
+    system = _predictor(form, phi, samples)
+    plant = system.phi.copy()
+    plant[:, 0] += system.gamma[:, 2]
+    z, s = np.exp(1j * omega)[:, None], 1j * omega
+    with np.errstate(all="ignore"):  # a pole at a frequency
+        ratio = (z - np.linalg.eigvals(system.phi)) / (z - np.linalg.eigvals(plant))
+        of_u = 1.0 / np.polyval(np.append(1.0, phi[: form.order][::-1]), s)
+        of_u = of_u / (1.0 + form.lag_of(phi) * s)
+    return np.abs(of_u), np.abs(np.prod(ratio, axis=1))
 
 
 def _steps(form: Form, y: Vector) -> Vector:
@@ -230,5 +249,5 @@ def _mirroring(a: Vector, states: int, samples: int) -> Vector:
 
 def _inputs(form: Form, phi: Vector, u: Vector, y: Vector) -> Matrix:
     """Return u before and after the delay's change in each sample, and y (N, 3)."""
-    whole = math.floor(form.delay_of(phi))
-    return np.column_stack([delayed(u, whole + 1), delayed(u, whole), y])
+    whole, first = math.floor(form.delay_of(phi)), u.size - y.size
+    return np.column_stack([delayed(u, whole + 1)[first:], delayed(u, whole)[first:], y])

@@ -34,7 +34,10 @@ _LAGS, _LEVEL = 50, 1e-3
 
 
 def fits(order: int, most: float, u: Vector, y: Vector) -> list[LoopFit]:
-    """Return the fits of all forms, for delays and lags of up to ``most`` samples at the start."""
+    """Return the fits of all forms, for delays and lags of up to ``most`` samples at the start.
+
+    u may begin before y; see ``model``.
+    """
     a = _denominators(order, most, u, y)
     found = _family(order, False, [*a], most, u, y)
     if not _white(min(found, key=lambda one: one.aic), y):
@@ -47,7 +50,8 @@ def fits(order: int, most: float, u: Vector, y: Vector) -> list[LoopFit]:
 
 def _denominators(order: int, most: float, u: Vector, y: Vector) -> list[Vector]:
     structure = Structure(order, 0, (0, 0))
-    v = np.column_stack([delayed(u, round(0.25 * most)), np.ones(u.size)])
+    late = delayed(u, round(0.25 * most))[u.size - y.size :]
+    v = np.column_stack([late, np.ones(y.size)])
     estimates = filtered_estimates(structure, v, y)[:_DENOMINATORS]
     found = [structure.denominator(theta) for theta in estimates if np.all(np.isfinite(theta))]
     return [np.zeros(order), *found, *_unstable(structure, most, u, y)]
@@ -64,7 +68,8 @@ def _unstable(structure: Structure, most: float, u: Vector, y: Vector) -> list[V
     for rate in np.geomspace(*_FILTERS):
         prefilter = np.poly(np.full(n, -rate)).real[:0:-1]
         for delay in (0, round(0.25 * most)):
-            v = np.column_stack([delayed(u, delay), np.ones(u.size)])
+            late = delayed(u, delay)[u.size - y.size :]
+            v = np.column_stack([late, np.ones(y.size)])
             target, regressors = equation(
                 structure, prefilter, linear_columns(structure, prefilter, v), y
             )
