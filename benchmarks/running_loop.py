@@ -17,7 +17,8 @@ With ``--plants`` the plant is of one kind, under an ADRC: unstable (s − p and
 further stable pole), integrating (one or two integrators), resonant (damping 0.01 to 0.1), or any
 of these with a negative gain. Orders are 1 and 2; or as given by ``--orders``, with further stable
 poles. The record has 1500 to 12000 samples; r or u is moved by a chirp, random steps or sines; the
-noise, with or without a load as above, is 1e-4 to 1e-2 of y.
+noise, with or without a load as above, is 1e-4 to 1e-2 of y; the load acts in front of the lag, as
+above, or behind it.
 """
 
 from __future__ import annotations
@@ -157,19 +158,28 @@ def motion(rng: np.random.Generator, t: Vector, omega: float) -> tuple[Vector, s
 
 
 def simulated(
-    loop: Loop, r: Vector, added: Vector, noise: Vector, load: Vector
+    loop: Loop, r: Vector, added: Vector, noise: Vector, load: Vector, inside: bool = False
 ) -> tuple[Vector, Vector]:
-    """Return u and y without its noise; the controller measures both together."""
+    """Return u and y without its noise; the controller measures both together.
+
+    The load acts on the plant with ``inside``, else in front of the lag.
+    """
     den = np.polymul(loop.den, [loop.lag, 1.0]) if loop.lag else loop.den
-    system = signal.cont2discrete(signal.tf2ss([loop.b], den), loop.dt / STEPS)
+    A, B, C, _ = signal.tf2ss([loop.b], den)
+    if inside:  # the lag's inverse in front of it: C (s I − A)⁻¹ A B = s C (s I − A)⁻¹ B
+        B = np.hstack([B, B + loop.lag * A @ B])
+    system = signal.cont2discrete((A, B, C, np.zeros((1, B.shape[1]))), loop.dt / STEPS)
     A, B, C = system[0], system[1][:, 0], system[2][0]
+    loads = [system[1][:, -1]]
     whole, part = divmod(round(loop.delay / loop.dt * STEPS), STEPS)
     powers, sums = [np.eye(B.size)], [np.zeros(B.size)]
     for _ in range(STEPS):
         sums.append(A @ sums[-1] + B)
         powers.append(A @ powers[-1])
+        loads.append(A @ loads[-1])
     old, new = powers[STEPS - part] @ sums[part], sums[STEPS - part]
     x, u, y = np.zeros(B.size), np.zeros(r.size + whole + 1), np.zeros(r.size)
+    of_load = np.sum(loads[:-1], axis=0)
     at = whole + 1  # u has zeros before the record
     loop.controller.reset()
     step = loop.controller.step
@@ -177,7 +187,7 @@ def simulated(
         y[k] = C @ x
         u[k + at] = step(r[k], y[k] + noise[k]) + added[k]
         x = powers[STEPS] @ x + new * u[k + at - whole] + old * u[k + at - whole - 1]
-        x = x + sums[STEPS] * load[k]
+        x = x + of_load * load[k]
     return u[at:], y
 
 
@@ -213,7 +223,7 @@ def drawn_special_record(
     parts = (zero, moved) if at_u else (moved, zero)
     _, clean = simulated(loop, *parts, zero, zero)
     ratio = float(np.exp(rng.uniform(np.log(1e-4), np.log(1e-2))))
-    u, y, text = disturbed(rng, loop, parts, clean, ratio)
+    u, y, text = disturbed(rng, loop, parts, clean, ratio, inside=bool(rng.random() < 0.5))
     where = f"{t.size} of {1e3 * loop.dt:.0f} ms, {how} in {'u' if at_u else 'r'}"
     return loop, u, y, f"{loop.text} {where}, {ratio:.1e} {text}"
 
@@ -224,6 +234,7 @@ def disturbed(
     parts: tuple[Vector, Vector],
     clean: Vector,
     ratio: float,
+    inside: bool = False,
 ) -> tuple[Vector, Vector, str]:
     """Return u and the measured y with noise of ``ratio`` of y, or half of it from a load."""
     zero = np.zeros(clean.size)
@@ -235,10 +246,10 @@ def disturbed(
         memory = float(rng.choice([np.inf, rng.uniform(0.2, 2.0)]))
         pole = np.exp(-loop.dt / memory)
         load = signal.lfilter([1.0], [1.0, -pole], rng.standard_normal(clean.size))
-        _, moved = simulated(loop, zero, zero, zero, load)
+        _, moved = simulated(loop, zero, zero, zero, load, inside)
         load *= np.sqrt(share) * target / np.std(moved)
-        text = f"load {memory:4.2f} s"
-    u, y = simulated(loop, *parts, noise, load)
+        text = f"load {memory:4.2f} s{' inside' * inside}"
+    u, y = simulated(loop, *parts, noise, load, inside)
     return u, y + noise, text
 
 

@@ -266,10 +266,12 @@ def _result(
     # A fit that did not converge has no valid deviation; it counts if no other comes near to it.
     settled = [one for one in found if one.converged and one.aic <= best.aic + _MOST_DIFFERENCE]
     settled = settled or found
-    best = min(settled, key=lambda one: one.aic)
+    # What there is besides b0 is that of a model with free times.
+    best = min((one for one in settled if one.form.share is None), key=lambda one: one.aic)
     form, n = best.form, best.form.order
     near = [one for one in settled if one.aic - best.aic <= _MOST_DIFFERENCE]
-    weights = np.exp(-0.5 * np.array([one.aic - best.aic for one in near]))
+    scores = np.array([one.aic - 2.0 * one.form.of_times for one in near])
+    weights = np.exp(-0.5 * (scores - np.min(scores)))
     weights /= np.sum(weights)
     unit = scale_y / scale_u / dt**n
     b0, b0_std = mean([gain(one) for one in near], weights)

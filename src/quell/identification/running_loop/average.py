@@ -43,6 +43,9 @@ def gain(one: LoopFit) -> tuple[float, float]:
 
 def total_delay(one: LoopFit) -> tuple[float, float]:
     """Return τ + T and its deviation [samples]."""
+    if one.form.share is not None:
+        place = one.form.times.start
+        return float(one.phi[place]), math.sqrt(max(float(one.covariance[place, place]), 0.0))
     places = [place for place in _places(one)[-2:] if place >= 0]
     variance = float(np.sum(one.covariance[np.ix_(places, places)]))
     total = one.form.lag_of(one.phi) + one.form.delay_of(one.phi)

@@ -34,6 +34,9 @@ from quell.types import Matrix, Vector
 # First, least and last μ, and the relative gain that a step without damping must predict: as in
 # ``output_error``, chosen by hand. Steps are few, because a start is near.
 _MU, _LEAST_MU, _MOST_MU, _CONVERGED, _STEPS = 1e-3, 1e-8, 1e8, 1e-7, 60
+# Gain in AIC that ends the search, and with which it may end where rounding stops it: a parameter is
+# then off by the root of it, 0.05 and 0.3 of its deviation.
+_SETTLED, _STALLED = 0.0025, 0.1
 # Longest lag and delay, as a share of the record: chosen by hand.
 _LONGEST = 0.25
 # Blocks of the record for the covariance, as in ``output_error``.
@@ -80,12 +83,12 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     if not np.all(np.isfinite(psi)):
         return _without_model(form, at)
     first, count = at.beta.size, at.beta.size + form.size
-    # λ, τ and T at zero, their limit, do not vary.
-    places = first + np.arange(form.size)[form.non_negative]
-    psi[:, places[at.phi[form.non_negative] <= 0.0]] = 0.0
-    R: Matrix = np.asarray(np.linalg.qr(psi, mode="r"))
-    inverse = np.linalg.pinv(R, rcond=_RANK)
     variance = at.power / max(at.error.size - count, 1)
+    known = _known_by_limits(form, at.phi) * math.sqrt(variance)
+    psi[:, first:][:, np.isinf(known)] = 0.0
+    rows = np.diag(np.concatenate([np.zeros(first), np.where(np.isinf(known), 0.0, known)]) / size)
+    R: Matrix = np.asarray(np.linalg.qr(np.vstack([psi, rows]), mode="r"))
+    inverse = np.linalg.pinv(R, rcond=_RANK)
     order = np.r_[first:count, :first]  # φ before β
     rows = inverse[order] / size[order, None]
     covariance = variance * rows @ rows.T
@@ -96,6 +99,22 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
     aic += 2.0 * growth(form, at.phi, y.size)
     return LoopFit(form, at.phi, at.beta, covariance, at.error, aic, converged)
+
+
+def _known_by_limits(form: Form, phi: Vector) -> Vector:
+    """Return the inverse deviations (size,) that parameters at their limit, zero, have by it.
+
+    λ does not vary. τ or T varies by as much as the other one has: what is known is their sum, and
+    how it is divided counts in the deviation of b.
+    """
+    found = np.zeros(form.size)
+    at_limit = np.arange(form.size)[form.non_negative]
+    at_limit = at_limit[phi[at_limit] <= 0.0]
+    total = form.lag_of(phi) + form.delay_of(phi)
+    found[at_limit] = np.inf
+    if total > 0.0:
+        found[at_limit[at_limit >= form.times.start]] = 1.0 / total
+    return found
 
 
 def _without_model(form: Form, at: _Point) -> LoopFit:
@@ -147,11 +166,12 @@ def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool
         inner, right = R[first:-1, first:-1], R[first:-1, -1]
         inner, step = _within_limits(form, at.phi, inner, right)
         gain = float(right @ right - np.sum((right - inner @ step) ** 2))
-        if gain <= _CONVERGED * at.power:
+        least = at.power / at.error.size  # that much changes AIC by one
+        if gain <= max(_CONVERGED * at.power, _SETTLED * least):
             return at, True
         moved, mu = _damped_step(form, at, inner, right, size[first:], mu, u, y)
         if moved is None:
-            return at, False
+            return at, gain <= _STALLED * least
         at = moved
     return at, False
 

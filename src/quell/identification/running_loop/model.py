@@ -11,7 +11,8 @@ before is that of a Kalman filter, in the innovation form (Ljung, *System Identi
     x⁺ = Φ x + Γ u + K e,      e = y − ŷ,      ŷ = x_1
 
 with ``x = (x_1 … x_n, d, u_l)`` and free gains K, so that the noises' intensities need not be
-known. K is Φ's integral over the sample times ``(l_1 … l_{n+1})``. The predictor's matrix ``Φ − K
+known. K is Φ's integral over the sample times ``(l_1 … l_{n+2})``, the last one, of u_l, for a load
+in front of the lag. The predictor's matrix ``Φ − K
 C`` has to be stable; the plant's need not be.
 
 Without loads only y is noisy, and K follows from the plant. It is zero for a stable plant, whose
@@ -68,11 +69,13 @@ class Form(NamedTuple):
     delay: bool  #: whether T is free; else it is 0
     drift: bool  #: whether l are free; else K follows from the plant, and only y is noisy
     forgets: bool = False  #: whether λ is free; else it is 0
+    share: float | None = None
+    """The given share of τ in τ + T, which is then the only time that is free; None if both are."""
 
     @property
     def gains(self) -> slice:
         """Places of l."""
-        return slice(self.order, self.order + self.drift * (self.order + 1))
+        return slice(self.order, self.order + self.drift * (self.order + 1 + self.lag))
 
     @property
     def times(self) -> slice:
@@ -87,7 +90,13 @@ class Form(NamedTuple):
     @property
     def size(self) -> int:
         """Number of nonlinear parameters."""
-        return self.gains.stop + self.forgets + self.lag + self.delay
+        times = self.lag + self.delay if self.share is None else 1
+        return self.gains.stop + self.forgets + times
+
+    @property
+    def of_times(self) -> int:
+        """Number of parameters that a form without lag and delay does not have."""
+        return self.lag + self.delay + (self.lag and self.drift)
 
     @property
     def states(self) -> int:
@@ -100,11 +109,13 @@ class Form(NamedTuple):
 
     def lag_of(self, phi: Vector) -> float:
         """Return τ [samples]."""
-        return float(phi[self.times][0]) if self.lag else 0.0
+        share = 1.0 if self.share is None else self.share
+        return share * float(phi[self.times][0]) if self.lag else 0.0
 
     def delay_of(self, phi: Vector) -> float:
         """Return T [samples]."""
-        return float(phi[-1]) if self.delay else 0.0
+        share = 0.0 if self.share is None else self.share
+        return (1.0 - share) * float(phi[-1]) if self.delay else 0.0
 
 
 def placed(a: Vector, omega: float) -> Vector:
@@ -188,9 +199,11 @@ def _steps(form: Form, y: Vector) -> Vector:
     slow = 2.0 * math.pi / y.size
     spread = float(np.std(y)) or 1.0
     rate = float(np.clip(np.std(y[n:] - y[:-n]) / (n * spread), 10.0 * slow, 0.3))
-    powers = np.append(n - np.arange(float(n)), np.arange(1.0, n + 2.0))[: form.gains.stop]
+    gains = np.minimum(np.arange(1.0, n + 3.0), n + 1.0)
+    powers = np.append(n - np.arange(float(n)), gains)[: form.gains.stop]
     powers = np.append(powers, np.ones(int(form.forgets)))
-    return _STEP * np.append(rate**powers, np.full(form.lag + form.delay, 1.0 / rate))
+    times = np.full(form.size - form.times.start, 1.0 / rate)
+    return _STEP * np.append(rate**powers, times)
 
 
 def _with(system: Sampled, inputs: slice) -> Sampled:
@@ -208,7 +221,7 @@ def _predictor(form: Form, phi: Vector, samples: int) -> Sampled:
     A[:n, :n] = observable(phi[:n])
     A[n - 1, n], A[n, n] = 1.0, -form.rate_of(phi)
     if form.drift:
-        B[: n + 1, 1] = phi[form.gains]
+        B[:, 1] = phi[form.gains]
     if form.lag:
         tau = max(form.lag_of(phi), _LEAST_LAG)
         A[n - 1, n + 1], A[n + 1, n + 1], B[n + 1, 0] = 1.0, -1.0 / tau, 1.0 / tau

@@ -24,6 +24,9 @@ from quell.types import Vector
 # shares of a lag in the sum of lag and delay, of the starts. Chosen by hand, so that the trial of
 # benchmarks/running_loop.py finds the same minimum as a start at the true plant.
 _RATES, _GRID, _DENOMINATORS, _SHARES = (0.01, 0.05, 0.2), 6, 3, (0.2, 0.5, 0.8)
+# Difference in AIC up to which a division of lag and delay is open, as in the mean of models, and the
+# shares of the lag that then count.
+_OPEN, _DIVISIONS = 20.0, (0.15, 0.3, 0.5, 0.7, 0.85)
 # Rates at which loads forget, of the starts [1/sample].
 _FORGETTING = (0.001, 0.01, 0.1)
 # Poles of the filters that give unstable denominators [1/sample] and their number, and the number
@@ -45,7 +48,39 @@ def fits(order: int, most: float, u: Vector, y: Vector) -> list[LoopFit]:
         placed_ones = [placed(one, rate) for one, rate in product(a, _RATES)]
         drifting = _family(order, True, placed_ones, most, u, y)
         found += drifting + [_forgetting(one, u, y) for one in drifting]
-    return found
+    return found + _divided(found, u, y)
+
+
+def _divided(found: list[LoopFit], u: Vector, y: Vector) -> list[LoopFit]:
+    """Return fits with given shares of the lag in the sum of lag and delay, if data leave it open.
+
+    How the sum is divided moves b. Where a lag alone or a delay alone fits nearly as well, neither
+    its own deviation nor that of the fit of both, to first order, holds b's: the mean over shares
+    that are spread evenly does.
+    """
+    form = min(found, key=lambda one: one.aic).form
+    alike = [one for one in found if one.form[3:5] == form[3:5]]
+    both = next(one for one in alike if one.form.lag and one.form.delay)
+    ends = [one for one in alike if one.form.lag != one.form.delay]
+    if min(one.aic for one in ends) > both.aic + _OPEN:
+        return []
+    # A gain of u_l of one fit may have no stable predictor with the lag of another.
+    of_lag = both.form.gains.stop - 1
+    tried = []
+    for one in (both, *ends):
+        total = float(np.sum(one.phi[one.form.times]))
+        phi = np.append(one.phi[: one.form.times.start], total)
+        if both.form.drift and not one.form.lag:
+            phi = np.insert(phi, of_lag, 0.0)
+        tried.append(phi)
+        if both.form.drift and one.form.lag:
+            tried.append(np.where(np.arange(phi.size) == of_lag, 0.0, phi))
+
+    def at(share: float) -> LoopFit:
+        form = both.form._replace(share=share)
+        return fit(form, min(tried, key=lambda phi: power(form, phi, u, y)), u, y)
+
+    return [at(share) for share in _DIVISIONS]
 
 
 def _denominators(order: int, most: float, u: Vector, y: Vector) -> list[Vector]:
@@ -93,9 +128,12 @@ def _family(
     times = np.geomspace(0.5, max(most, 1.0), _GRID)
     late = best(False, True, [np.append(phi, T) for phi in starts for T in (0.0, *times)])
     shared = late.phi[:-1]
-    slow = best(True, False, [np.append(shared, tau) for tau in (*times, max(late.phi[-1], 0.1))])
+    # A lag has a gain of its own where loads drift.
+    behind = np.append(shared, np.zeros(int(drift)))
+    slow = best(True, False, [np.append(behind, tau) for tau in (*times, max(late.phi[-1], 0.1))])
     plain = best(False, False, [shared, *starts])
-    parts = [(one.phi[:-1], one.phi[-1], share) for one in (late, slow) for share in _SHARES]
+    found = ((behind, late.phi[-1]), (slow.phi[:-1], slow.phi[-1]))
+    parts = [(*one, share) for one in found for share in _SHARES]
     both = [np.append(phi, [share * T + 0.1, (1.0 - share) * T]) for phi, T, share in parts]
     return [plain, late, slow, best(True, True, both)]
 
