@@ -262,14 +262,10 @@ def _result(
     found: list[LoopFit], u: Vector, y: Vector, dt: float, scale_u: float, scale_y: float
 ) -> InputGain:
     """Return the mean of the models, and what the best of them has besides b0."""
-    best = min(found, key=lambda one: one.aic)
-    # A fit that did not converge has no valid deviation; it counts if no other comes near to it.
-    settled = [one for one in found if one.converged and one.aic <= best.aic + _MOST_DIFFERENCE]
-    settled = settled or found
     # What there is besides b0 is that of a model with free times.
-    best = min((one for one in settled if one.form.share is None), key=lambda one: one.aic)
+    best = min((one for one in found if one.form.share is None), key=lambda one: one.aic)
     form, n = best.form, best.form.order
-    near = [one for one in settled if one.aic - best.aic <= _MOST_DIFFERENCE]
+    near = [one for one in found if one.aic - best.aic <= _MOST_DIFFERENCE]
     scores = np.array([one.aic - 2.0 * one.form.of_times for one in near])
     weights = np.exp(-0.5 * (scores - np.min(scores)))
     weights /= np.sum(weights)

@@ -27,7 +27,15 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.identification.model.structure import nonzero_lengths
-from quell.identification.running_loop.model import Form, derivatives, growth, is_stable, linear_columns
+from quell.identification.running_loop.model import (
+    Form,
+    derivatives,
+    growth,
+    is_stable,
+    limit_slopes,
+    linear_columns,
+    stabilised,
+)
 from quell.identification.search.output_error import block_sums
 from quell.types import Matrix, Vector
 
@@ -165,6 +173,7 @@ def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool
         first = at.beta.size
         inner, right = R[first:-1, first:-1], R[first:-1, -1]
         inner, step = _within_limits(form, at.phi, inner, right)
+        inner, step = _along_limit(form, at.phi, inner, right, step, size[first:], y)
         gain = float(right @ right - np.sum((right - inner @ step) ** 2))
         least = at.power / at.error.size  # that much changes AIC by one
         if gain <= max(_CONVERGED * at.power, _SETTLED * least):
@@ -188,6 +197,25 @@ def _within_limits(form: Form, phi: Vector, inner: Matrix, right: Vector) -> tup
     return inner, step
 
 
+def _along_limit(
+    form: Form, phi: Vector, inner: Matrix, right: Vector, step: Vector, size: Vector, y: Vector
+) -> tuple[Matrix, Vector]:
+    """Return the equations and their solution without a predictor's pole that would leave |z| < 1.
+
+    Loads that hardly move have such poles, and steps that lead out of the limit would all be
+    refused.
+    """
+    slopes = limit_slopes(form, phi, y) / size
+    slopes[:, ~np.any(inner, axis=0)] = 0.0  # those at their own limit
+    slopes = slopes[np.all(np.isfinite(slopes), axis=1)]
+    slopes = slopes[slopes @ step > 0.0]
+    if slopes.size:
+        away = np.linalg.qr(slopes.T)[0]
+        inner = inner - (inner @ away) @ away.T
+        step = np.linalg.lstsq(inner, right, rcond=_RANK)[0].astype(np.float64)
+    return inner, step
+
+
 def _damped_step(
     form: Form,
     at: _Point,
@@ -206,7 +234,7 @@ def _damped_step(
         phi = at.phi + step / size
         limited = form.non_negative
         phi[limited] = np.clip(phi[limited], 0.0, _LONGEST * y.size)
-        trial = _solved(form, phi, u, y)
+        trial = _solved(form, stabilised(form, phi, y.size), u, y)
         if trial.power < at.power:
             return trial, max(0.1 * mu, _LEAST_MU)
         mu = max(10.0 * mu, 1e-6)

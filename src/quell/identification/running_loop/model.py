@@ -49,6 +49,8 @@ from quell.types import Matrix, Vector
 _STEP = 1e-4
 # Largest |z| of a stable predictor: one, and rounding of multiple eigenvalues at z = 1.
 _LIMIT = 1.0 + 1e-6
+# Growth over the record by which a pole may be below the limit and count as at it: no effect on ŷ.
+_AT_LIMIT = 0.1
 # Least time constant of the lag [samples], so that 1/τ is finite.
 _LEAST_LAG = 1e-6
 # Growth of an unstable pole's motion over the record, from which on it is not simulated but
@@ -137,6 +139,47 @@ def is_unstable(form: Form, phi: Vector, samples: int) -> bool:
     return bool(samples * np.max(_poles(phi[: form.order]).real) > _LARGEST_GROWTH)
 
 
+def stabilised(form: Form, phi: Vector, samples: int) -> Vector:
+    """Return phi with gains l that mirror the poles of an unstable predictor at the unit circle.
+
+    The error has the same spectrum, to a factor, so that a search may cross the limit.
+    """
+    if not form.drift:
+        return phi
+    system = _predictor(form, phi, samples)
+    if not np.all(np.isfinite(system.phi)):
+        return phi
+    z, vectors = np.linalg.eig(system.phi)
+    out = np.abs(z) > _LIMIT
+    if not np.any(out):
+        return phi
+    with np.errstate(all="ignore"):
+        shift = _shift(z[out], vectors[:, out] / vectors[0, out])
+        _, (integral,) = zero_order_hold(_motion(form, phi), [np.eye(form.states)], 1.0)
+    if not np.all(np.isfinite(shift)):
+        return phi
+    found = phi.copy()
+    found[form.gains] += np.linalg.lstsq(integral, shift, rcond=None)[0]
+    return found
+
+
+def limit_slopes(form: Form, phi: Vector, y: Vector) -> Matrix:
+    """Return the derivatives (number, size) by phi of |z| of the predictor's poles at the limit."""
+
+    def sizes(at: Vector) -> Vector:
+        closed = _predictor(form, at, y.size).phi
+        if not np.all(np.isfinite(closed)):
+            return np.full(form.states, np.nan)
+        return np.sort(np.abs(np.linalg.eigvals(closed)))[::-1]
+
+    count = int(np.sum(sizes(phi) > 1.0 - _AT_LIMIT / y.size)) if form.drift else 0
+    slopes = np.zeros((count, form.size))
+    for i, step in enumerate(_steps(form, y) if count else ()):
+        one = step * (np.arange(form.size) == i)
+        slopes[:, i] = (sizes(phi + one)[:count] - sizes(phi - one)[:count]) / (2.0 * step)
+    return slopes
+
+
 def growth(form: Form, phi: Vector, samples: int) -> float:
     """Return by how much unstable poles that are simulated grow over the record, as a logarithm.
 
@@ -217,16 +260,10 @@ def _predictor(form: Form, phi: Vector, samples: int) -> Sampled:
     Its matrices are NaN for parameters that are too large for numbers.
     """
     n, size = form.order, form.states
-    A, B = np.zeros((size, size)), np.zeros((size, 2))
-    A[:n, :n] = observable(phi[:n])
-    A[n - 1, n], A[n, n] = 1.0, -form.rate_of(phi)
+    A, B = _motion(form, phi), np.zeros((size, 2))
     if form.drift:
         B[:, 1] = phi[form.gains]
-    if form.lag:
-        tau = max(form.lag_of(phi), _LEAST_LAG)
-        A[n - 1, n + 1], A[n + 1, n + 1], B[n + 1, 0] = 1.0, -1.0 / tau, 1.0 / tau
-    else:
-        B[n - 1, 0] = 1.0
+    B[n + 1 if form.lag else n - 1, 0] = -A[n + 1, n + 1] if form.lag else 1.0
     if not (np.max(np.abs(A)) <= _LARGEST and np.all(np.isfinite(B))):
         return Sampled(*(np.full((size, width), np.nan) for width in (size, 3, 3)))
     late = math.modf(form.delay_of(phi))[0]
@@ -239,6 +276,16 @@ def _predictor(form: Form, phi: Vector, samples: int) -> Sampled:
     return Sampled(whole, gammas, np.zeros_like(gammas))
 
 
+def _motion(form: Form, phi: Vector) -> Matrix:
+    """Return the matrix of x' = A x + …, with a load and the lag."""
+    n, A = form.order, np.zeros((form.states, form.states))
+    A[:n, :n] = observable(phi[:n])
+    A[n - 1, n], A[n, n] = 1.0, -form.rate_of(phi)
+    if form.lag:
+        A[n - 1, n + 1], A[n + 1, n + 1] = 1.0, -1.0 / max(form.lag_of(phi), _LEAST_LAG)
+    return A
+
+
 def _poles(a: Vector) -> Complex:
     """Return the poles of the plant [1/sample]."""
     return np.asarray(np.linalg.eigvals(observable(a)), dtype=np.complex128)
@@ -246,18 +293,22 @@ def _poles(a: Vector) -> Complex:
 
 def _mirroring(a: Vector, states: int, samples: int) -> Vector:
     """Return the K (states,) that mirrors the unstable poles, those that grow over the record."""
-    K = np.zeros(states, dtype=np.complex128)
-    poles = _poles(a)
+    K, poles = np.zeros(states), _poles(a)
     poles = poles[samples * poles.real > _LARGEST_GROWTH]
-    z = np.exp(poles)
-    for j, pole in enumerate(poles):
+    vectors = np.ones((a.size, poles.size), dtype=np.complex128)
+    for i in range(1, a.size):  # v_1 = 1, v_(i+1) = λ v_i + a_(n−i)
+        vectors[i] = poles * vectors[i - 1] + a[a.size - i]
+    K[: a.size] = _shift(np.exp(poles), vectors)
+    return K
+
+
+def _shift(z: Complex, vectors: Complex) -> Vector:
+    """Return the gains that mirror the eigenvalues z, with eigenvectors whose first element is 1."""
+    weights = np.ones(z.size, dtype=np.complex128)
+    for j in range(z.size):
         others = np.arange(z.size) != j
-        weight = np.prod(z[j] - 1.0 / z.conj()) / np.prod(z[j] - z[others])
-        vector = np.ones(1, dtype=np.complex128)
-        for coefficient in a[:0:-1]:  # v_1 = 1, v_(i+1) = λ v_i + a_(n−i)
-            vector = np.append(vector, pole * vector[-1] + coefficient)
-        K[: a.size] += weight * vector
-    return K.real.copy()
+        weights[j] = np.prod(z[j] - 1.0 / z.conj()) / np.prod(z[j] - z[others])
+    return np.asarray((vectors @ weights).real)
 
 
 def _inputs(form: Form, phi: Vector, u: Vector, y: Vector) -> Matrix:
