@@ -42,9 +42,10 @@ from quell.types import Matrix, Vector
 # First, least and last μ, and the relative gain that a step without damping must predict: as in
 # ``output_error``, chosen by hand. Steps are few, because a start is near.
 _MU, _LEAST_MU, _MOST_MU, _CONVERGED, _STEPS = 1e-3, 1e-8, 1e8, 1e-7, 60
-# Gain in AIC that ends the search, and with which it may end where rounding stops it: a parameter is
-# then off by the root of it, 0.05 and 0.3 of its deviation.
-_SETTLED, _STALLED = 0.0025, 0.1
+# Gain in AIC that ends the search, the number of steps in a row that may gain no more, and the gain
+# with which it may end by them, or where rounding stops it: a parameter is then off by the root of
+# it, 0.1 and 0.3 of its deviation.
+_SETTLED, _SMALL_STEPS, _STALLED = 0.01, 3, 0.1
 # Longest lag and delay, as a share of the record: chosen by hand.
 _LONGEST = 0.25
 # Blocks of the record for the covariance, as in ``output_error``.
@@ -160,7 +161,7 @@ def _gradient(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[Matrix, Vec
 
 def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool]:
     """Return the model of least prediction error near ``at``, and whether the search converged."""
-    mu, floor = _MU, _ROUNDING * float(y @ y)
+    mu, floor, small = _MU, _ROUNDING * float(y @ y), 0
     for _ in range(_STEPS):
         if not math.isfinite(at.power):
             return at, False
@@ -170,6 +171,8 @@ def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool
         if not np.all(np.isfinite(psi)):
             return at, False
         R: Matrix = np.asarray(np.linalg.qr(np.column_stack([psi, at.error]), mode="r"))
+        if not np.all(np.isfinite(R)):
+            return at, False
         first = at.beta.size
         inner, right = R[first:-1, first:-1], R[first:-1, -1]
         inner, step = _within_limits(form, at.phi, inner, right)
@@ -179,9 +182,10 @@ def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool
         if gain <= max(_CONVERGED * at.power, _SETTLED * least):
             return at, True
         moved, mu = _damped_step(form, at, inner, right, size[first:], mu, u, y)
-        if moved is None:
+        small = small + 1 if moved is None or at.power - moved.power <= _SETTLED * least else 0
+        at = at if moved is None else moved
+        if moved is None or small == _SMALL_STEPS:
             return at, gain <= _STALLED * least
-        at = moved
     return at, False
 
 

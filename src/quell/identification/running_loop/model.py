@@ -39,9 +39,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quell.identification.model.sampling import Sampled, observable, states
-from quell.identification.search.delay import delayed
-from quell.lti.discretize import zero_order_hold
+from quell.identification.model.sampling import observable
+from quell.kernels.dispatch import compiled
+from quell.lti.discretize import Stack, zero_order_hold
 from quell.types import Matrix, Vector
 
 # Step of the differences that stand for derivatives, relative to the size of the parameters:
@@ -60,7 +60,18 @@ _LARGEST_GROWTH = math.log(1e3)
 # Largest coefficient of the model [1/sample^n] that is sampled; 1/τ is the largest that has a use.
 _LARGEST = 1e7
 
+# States below this become zero, as in ``sampling``: denormal numbers are slow.
+_TINY = 1e-140
+
 Complex = NDArray[np.complex128]
+Indices = NDArray[np.int64]
+
+
+class Predictor(NamedTuple):
+    """A sampled predictor ``x⁺ = Φ x + Γ v`` for the u before, the u after T's change, and y."""
+
+    phi: Matrix  # Φ − K C (states, states)
+    gamma: Matrix  # (states, 3)
 
 
 class Form(NamedTuple):
@@ -192,32 +203,34 @@ def growth(form: Form, phi: Vector, samples: int) -> float:
 
 def linear_columns(form: Form, phi: Vector, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
     """Return ŷ by b and by each initial state (N, 1 + states), and its part from y (N,)."""
-    system, v = _predictor(form, phi, y.size), _inputs(form, phi, u, y)
-    nothing = np.zeros((y.size, 1))
-    of_u, of_y, of_none = (_with(system, part) for part in (slice(0, 2), slice(2, 3), slice(2, 3)))
-    parts = [states(of_u, v[:, :2])[:, 0]]
-    parts += [states(of_none, nothing, start)[:, 0] for start in np.eye(form.states)]
-    return np.column_stack(parts), states(of_y, v[:, 2:])[:, 0]
+    system, count = _predictor(form, phi, y.size), form.states
+    gamma, start = np.zeros((count, 3, count + 2)), np.zeros((count, count + 2))
+    gamma[:, :2, 0], gamma[:, 2, -1] = system.gamma[:, :2], system.gamma[:, 2]
+    start[:, 1:-1] = np.eye(count)
+    phis = np.repeat(system.phi[:, :, None], count + 2, axis=2)
+    found = _simulated(phis, gamma, np.full(count + 2, _whole(form, phi)), start, u, y)
+    return found[:, :-1], found[:, -1]
 
 
-def predicted(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Vector:
-    """Return ŷ (N,) for the linear parameters ``beta``: b, and the initial state."""
-    system = _predictor(form, phi, y.size)
-    system = system._replace(gamma=system.gamma * np.array([beta[0], beta[0], 1.0]))
-    return states(system, _inputs(form, phi, u, y), beta[1:])[:, 0]
+def predicted(form: Form, phis: list[Vector], beta: Vector, u: Vector, y: Vector) -> Matrix:
+    """Return ŷ (N, number) for each phi and the linear parameters ``beta``: b, initial state."""
+    systems = [_predictor(form, phi, y.size) for phi in phis]
+    gamma = np.stack([one.gamma for one in systems], axis=2)
+    gamma[:, :2] *= beta[0]
+    start = np.repeat(beta[1:, None], len(phis), axis=1)
+    late = np.array([_whole(form, phi) for phi in phis])
+    return _simulated(np.stack([one.phi for one in systems], axis=2), gamma, late, start, u, y)
 
 
 def derivatives(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Matrix:
     """Return the derivatives (N, size) of ŷ by a, l, λ, τ and T, by central differences."""
-    found = np.empty((y.size, form.size))
-    for i, step in enumerate(_steps(form, y)):
-        above, below = phi.copy(), phi.copy()
-        above[i] += step
-        # λ, τ and T are not negative; at zero the difference is one-sided.
-        below[i] -= step if i < form.non_negative.start or phi[i] >= step else 0.0
-        change = predicted(form, above, beta, u, y) - predicted(form, below, beta, u, y)
-        found[:, i] = change / (above[i] - below[i])
-    return found
+    steps = np.diag(_steps(form, y))
+    above, below = phi + steps, phi - steps
+    # λ, τ and T are not negative; at zero the difference is one-sided.
+    for i in range(form.non_negative.start, form.size):
+        below[i, i] = phi[i] if below[i, i] < 0.0 else below[i, i]
+    found = predicted(form, [*above, *below], beta, u, y)
+    return (found[:, : form.size] - found[:, form.size :]) / np.diag(above - below)
 
 
 def responses(form: Form, phi: Vector, samples: int, omega: Vector) -> tuple[Vector, Vector]:
@@ -249,12 +262,7 @@ def _steps(form: Form, y: Vector) -> Vector:
     return _STEP * np.append(rate**powers, times)
 
 
-def _with(system: Sampled, inputs: slice) -> Sampled:
-    gamma = np.ascontiguousarray(system.gamma[:, inputs])
-    return system._replace(gamma=gamma, slope=np.zeros_like(gamma))
-
-
-def _predictor(form: Form, phi: Vector, samples: int) -> Sampled:
+def _predictor(form: Form, phi: Vector, samples: int) -> Predictor:
     """Return the predictor, for the inputs u before, u after the delay's change, y.
 
     Its matrices are NaN for parameters that are too large for numbers.
@@ -265,15 +273,16 @@ def _predictor(form: Form, phi: Vector, samples: int) -> Sampled:
         B[:, 1] = phi[form.gains]
     B[n + 1 if form.lag else n - 1, 0] = -A[n + 1, n + 1] if form.lag else 1.0
     if not (np.max(np.abs(A)) <= _LARGEST and np.all(np.isfinite(B))):
-        return Sampled(*(np.full((size, width), np.nan) for width in (size, 3, 3)))
+        return Predictor(np.full((size, size), np.nan), np.full((size, 3), np.nan))
     late = math.modf(form.delay_of(phi))[0]
     with np.errstate(all="ignore"):
-        whole, (gamma,) = zero_order_hold(A, [B], 1.0)
-        _, (rest,) = zero_order_hold(A, [B[:, :1]], 1.0 - late)
+        # The integral of Φ does not depend on l: most derivatives find it in the cache.
+        whole, (integral,) = zero_order_hold(A, [np.eye(size)], 1.0)
+        _, (rest,) = zero_order_hold(A, [np.eye(size)], 1.0 - late)
+        gamma, now = integral @ B, rest @ B[:, 0]
         K = gamma[:, 1] if form.drift else _mirroring(phi[:n], size, samples)
         whole[:, 0] -= K
-    gammas = np.column_stack([gamma[:, 0] - rest[:, 0], rest[:, 0], K])
-    return Sampled(whole, gammas, np.zeros_like(gammas))
+    return Predictor(whole, np.column_stack([gamma[:, 0] - now, now, K]))
 
 
 def _motion(form: Form, phi: Vector) -> Matrix:
@@ -311,7 +320,54 @@ def _shift(z: Complex, vectors: Complex) -> Vector:
     return np.asarray((vectors @ weights).real)
 
 
-def _inputs(form: Form, phi: Vector, u: Vector, y: Vector) -> Matrix:
-    """Return u before and after the delay's change in each sample, and y (N, 3)."""
-    whole, first = math.floor(form.delay_of(phi)), u.size - y.size
-    return np.column_stack([delayed(u, whole + 1)[first:], delayed(u, whole)[first:], y])
+def _whole(form: Form, phi: Vector) -> int:
+    """Return ⌊T⌋."""
+    return math.floor(form.delay_of(phi))
+
+
+def _simulated(
+    phis: Stack, gammas: Stack, late: Indices, start: Matrix, u: Vector, y: Vector
+) -> Matrix:
+    """Return x_1 (N, number) of systems, whose last axis is their number, that start at ``start``.
+
+    ``late`` is ⌊T⌋ of each. Their loop has the systems inside, so that they are computed together.
+    """
+    out = np.empty((y.size, start.shape[1]))
+    states, inputs = np.stack([start, start]), np.empty((2, start.shape[1]))
+    _simulate(phis, gammas, late, states, inputs, np.ascontiguousarray(u), y.copy(), out)
+    return out
+
+
+@compiled
+def _simulate(
+    phis: Stack,
+    gammas: Stack,
+    late: Indices,
+    states: Stack,
+    inputs: Matrix,
+    u: Vector,
+    y: Vector,
+    out: Matrix,
+) -> None:
+    """Write x_1 into ``out``; ``states`` (2, states, number) and ``inputs`` are work space."""
+    _, n, count = states.shape
+    first, now, then = u.size - y.size, 0, 1
+    for k in range(y.size):
+        for c in range(count):
+            out[k, c] = states[now, 0, c]
+            at = k + first - late[c]
+            inputs[0, c], inputs[1, c] = u[max(at - 1, 0)], u[max(at, 0)]
+        for i in range(n):
+            for c in range(count):
+                states[then, i, c] = gammas[i, 2, c] * y[k]
+            for c in range(count):
+                states[then, i, c] += gammas[i, 0, c] * inputs[0, c]
+            for c in range(count):
+                states[then, i, c] += gammas[i, 1, c] * inputs[1, c]
+            for j in range(n):
+                for c in range(count):
+                    states[then, i, c] += phis[i, j, c] * states[now, j, c]
+            for c in range(count):
+                value = states[then, i, c]
+                states[then, i, c] = value if abs(value) > _TINY else 0.0
+        now, then = then, now

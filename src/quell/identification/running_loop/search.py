@@ -14,6 +14,7 @@ import numpy as np
 
 from quell.identification.model.correlation import autocorrelation
 from quell.identification.model.structure import Structure, linear_columns, nonzero_lengths
+from quell.identification.running_loop.average import gain
 from quell.identification.running_loop.fit import LoopFit, fit, power
 from quell.identification.running_loop.model import Form, is_unstable, placed
 from quell.identification.search.delay import delayed
@@ -24,9 +25,9 @@ from quell.types import Vector
 # shares of a lag in the sum of lag and delay, of the starts. Chosen by hand, so that the trial of
 # benchmarks/running_loop.py finds the same minimum as a start at the true plant.
 _RATES, _GRID, _DENOMINATORS, _SHARES = (0.01, 0.05, 0.2), 6, 3, (0.2, 0.5, 0.8)
-# Difference in AIC up to which a division of lag and delay is open, as in the mean of models, and the
-# shares of the lag that then count.
-_OPEN, _DIVISIONS = 20.0, (0.15, 0.3, 0.5, 0.7, 0.85)
+# Difference in AIC up to which a division of lag and delay is open, as in the mean of models; the
+# difference in b, in its deviations, from which on it matters; and the shares of the lag that count.
+_OPEN, _SAME, _DIVISIONS = 20.0, 0.5, (0.2, 0.4, 0.6, 0.8)
 # Rates at which loads forget, of the starts [1/sample].
 _FORGETTING = (0.001, 0.01, 0.1)
 # Poles of the filters that give unstable denominators [1/sample] and their number, and the number
@@ -62,8 +63,10 @@ def _divided(found: list[LoopFit], u: Vector, y: Vector) -> list[LoopFit]:
     alike = [one for one in found if one.form[3:5] == form[3:5]]
     both = next(one for one in alike if one.form.lag and one.form.delay)
     ends = [one for one in alike if one.form.lag != one.form.delay]
-    if min(one.aic for one in ends) > both.aic + _OPEN:
-        return []
+    near = [gain(one) for one in (both, *ends) if one.aic <= both.aic + _OPEN]
+    values = [value for value, _ in near]
+    if max(values) - min(values) <= _SAME * min(deviation for _, deviation in near):
+        return []  # also if only the fit of both is near
     # A gain of u_l of one fit may have no stable predictor with the lag of another.
     of_lag = both.form.gains.stop - 1
     tried = []
