@@ -13,7 +13,7 @@ import pytest
 import quell as ql
 from quell.controllers.baselines import PID
 from quell.identification import identify_b0
-from quell.identification.running_loop.bandwidth import bandwidth
+from quell.identification.running_loop.bandwidth import RATIOS, Candidate, bandwidth
 from quell.identification.running_loop.model import Form, linear_columns, placed, predicted
 
 from .benchmark_module import benchmark
@@ -141,8 +141,8 @@ def test_the_predictor_is_the_observer_written_out() -> None:
 def test_the_bandwidth_keeps_the_phase_margin_and_no_larger_one_does() -> None:
     """The loop at the result has 60 degrees, to rounding, in ``analyse``; 2 % faster it has less."""
     den = np.array([1.0, 2.0, 0.0])
-    how: dict[str, float] = {"b0": 40.0, "dt": DT, "margin": 60.0, "ratio": 5.0}
-    omega_c = bandwidth(40.0, den, 0.02, 0.013, **how)
+    loops = Candidate(40.0, den, 0.02, 0.013, b0=40.0, dt=DT)
+    omega_c = bandwidth(loops, 60.0, 5.0).omega_c
     margins = [
         ql.analysis.analyse(
             ([40.0], den),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from quell.identification.running_loop.average import (
     total_delay,
     visible_up_to,
 )
-from quell.identification.running_loop.bandwidth import bandwidth
+from quell.identification.running_loop.bandwidth import Candidate, Reach, bandwidth, near
 from quell.identification.running_loop.fit import LoopFit
 from quell.identification.running_loop.search import fits
 from quell.identification.validation import residuals
@@ -33,8 +33,8 @@ _POOR = 0.15
 # Deviations within which the interval of 95 % lies, and within which a lag or delay may be zero
 # (99.7 %).
 _WITHIN_95, _WITHIN_99 = 1.96, 3.0
-# omega_o over omega_c by default: in the usual range of 3 to 10 (Gao 2003; Herbst 2013).
-RATIO = 5.0
+# Longest delay of a loop that is analysed [samples], as in ``quell.plants.sampled``.
+_MOST_SAMPLES = 200
 # Share of the largest difference of AIC whose model still has a weight: exp(−20/2) = 5e-5.
 _MOST_DIFFERENCE = 20.0
 # Numbers of the result in JSON.
@@ -43,6 +43,26 @@ _IN_JSON = (
     *("total_delay_std", "dt", "samples", "noise", "omega_max", "white", "independent"),
     "converged",
 )
+
+
+class Bandwidth(NamedTuple):
+    """The largest omega_c that keeps a phase margin."""
+
+    omega_c: float  #: [rad/s]
+    std: float  #: its standard deviation [rad/s]; NaN if the margin is lost within that of b0
+    ratio: float  #: omega_o over omega_c
+
+
+class MarginNotReached(ValueError):
+    """No omega_c keeps the phase margin that was asked for."""
+
+    def __init__(self, message: str, best: Reach | None = None) -> None:
+        super().__init__(message)
+        stable = best is not None and not math.isnan(best.omega_c)
+        #: the best phase margin [degrees], its omega_c [rad/s] and omega_o/omega_c; None for none
+        self.phase_margin = best.phase if best is not None and stable else None
+        self.omega_c = best.omega_c if best is not None and stable else None
+        self.ratio = best.ratio if best is not None and stable else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,48 +123,64 @@ class InputGain:
             found.append("the error is not white: the deviations may be too small")
         return tuple(found)
 
-    def omega_c(self, phase_margin: float = 60.0, ratio: float = RATIO) -> tuple[float, float]:
-        """Return the largest omega_c that keeps a phase margin, and its deviation [rad/s].
+    def omega_c(self, phase_margin: float = 60.0, ratio: float | None = None) -> Bandwidth:
+        """Return the largest omega_c that keeps a phase margin, its deviation, and the ratio.
 
         It is that of the exactly sampled loop of the fitted plant, with lag and delay, and an ADRC
         with a model-free ESO and this b0. The deviation follows from those of all parameters, to
-        first order.
+        first order. omega_o is at most half of the sample rate 1/dt.
 
         Parameters
         ----------
         phase_margin
             [degrees], above 0 and below 90.
         ratio
-            omega_o over omega_c.
+            omega_o over omega_c. By default nine ratios from 3 to 100 are tried; of those whose
+            omega_c is at least 0.9 times the largest, the least is taken: it has the least noise in
+            u. With ``y'' = b u`` a ratio of 5 has 41° at most, and 60° need one of 30 or more.
 
         Raises
         ------
+        MarginNotReached
+            (a ``ValueError``) for a plant with which no omega_c keeps the margin; it has the best
+            one.
         ValueError
-            for an argument out of range, a b0 of zero, or a plant with which no omega_c keeps it.
+            for an argument out of range, or a b0 of zero.
         """
         margin = checks.positive("phase_margin", phase_margin, "degrees")
         if margin >= 90.0:
             raise ValueError(f"phase_margin = {phase_margin!r}: must be below 90 degrees")
-        ratio = checks.positive("ratio", ratio)
+        ratio = None if ratio is None else checks.positive("ratio", ratio)
+        if self.b0 == 0.0:
+            raise ValueError("b0 is zero: there is no loop; record u and y while u moves y")
+        asked = f"{margin:g}° of phase margin"
+        if self.delay > _MOST_SAMPLES * self.dt:
+            rule = f"the delay of {self.delay:.4g} s is longer than {_MOST_SAMPLES} samples"
+            raise MarginNotReached(f"omega_c for {asked} is not computed: {rule}")
         n = self.order
         at = np.concatenate([self.den[1:], [self.b0, self.lag, self.delay]])
 
-        def largest(values: Vector) -> float:
+        def loops(values: Vector) -> Candidate:
             # The gain that the observer assumes stays b0 where the plant's gain changes.
             den, times = np.append(1.0, values[:n]), np.maximum(values[n + 1 :], 0.0).tolist()
-            how = {"b0": self.b0, "dt": self.dt, "margin": margin, "ratio": ratio}
-            return bandwidth(float(values[n]), den, *times, **how)
+            return Candidate(float(values[n]), den, *times, b0=self.b0, dt=self.dt)
 
-        found = largest(at)
-        if math.isnan(found):
-            rule = "no omega_c keeps it with this plant and ratio"
-            raise ValueError(f"phase_margin = {phase_margin!r} degrees: {rule}; ask for less")
-        slope = np.zeros(at.size)
-        for i, spread in enumerate(np.sqrt(np.diag(self.covariance)).tolist()):
-            if spread > 0.0:
-                slope[i] = (largest(at + spread * np.eye(at.size)[i]) - found) / spread
+        with one_blas_thread():
+            found = bandwidth(loops(at), margin, ratio)
+            if not found.keeps:
+                other = None if ratio is None else bandwidth(loops(at), margin)
+                raise MarginNotReached(_not_reached(asked, found, ratio, other), found)
+            slope = np.zeros(at.size)
+            for i, spread in enumerate(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()):
+                for step in (spread, -spread) if spread > 0.0 else ():
+                    changed = loops(at + step * np.eye(at.size)[i])
+                    moved = near(changed, margin, found.omega_c, found.ratio)
+                    slope[i] = (moved - found.omega_c) / step
+                    if not math.isnan(moved):
+                        break
         variance = float(slope @ self.covariance @ slope)
-        return found, math.sqrt(variance) if variance >= 0.0 else math.nan
+        std = math.sqrt(variance) if variance >= 0.0 else math.nan
+        return Bandwidth(found.omega_c, std, found.ratio)
 
     def describe(self) -> str:
         """Return the report as text."""
@@ -297,6 +333,25 @@ def _result(
         converged=best.converged,
         covariance=covariance,
     )
+
+
+def _not_reached(asked: str, best: Reach, ratio: float | None, other: Reach | None) -> str:
+    """Return why no omega_c keeps the margin, and what to do."""
+    which = "from 3 to 100 omega_c" if ratio is None else f"of {ratio:.3g} omega_c"
+    text = f"no omega_c keeps {asked} with an omega_o {which}"
+    if math.isnan(best.omega_c):
+        text += ": no such loop of this plant, its lag and delay is stable"
+    else:
+        text += (
+            f": the best is {best.phase:.3g}° with omega_c = {best.omega_c:.4g} rad/s and omega_o ="
+            f" {best.ratio:.3g} omega_c"
+        )
+    if other is not None and other.keeps:
+        return text + (
+            f"; omega_o = {other.ratio:.3g} omega_c keeps it with omega_c = {other.omega_c:.4g} "
+            "rad/s"
+        )
+    return text + "; ask for less, or sample faster and make the delay or the lag shorter"
 
 
 def _time_line(name: str, value: float, spread: float) -> str:
