@@ -35,6 +35,8 @@ _POOR = 0.15
 _WITHIN_95, _WITHIN_99 = 1.96, 3.0
 # Longest delay of a loop that is analysed [samples], as in ``quell.plants.sampled``.
 _MOST_SAMPLES = 200
+# Least motion of u and y, and the inverse of their largest size: their squares are numbers then.
+_LEAST_SIZE = 1e-100
 # Share of the largest difference of AIC whose model still has a weight: exp(−20/2) = 5e-5.
 _MOST_DIFFERENCE = 20.0
 # Numbers of the result in JSON.
@@ -270,6 +272,12 @@ def identify_b0(
     for name, value in (("u", u), ("y", y)):
         if np.ptp(value) == 0.0:
             raise ValueError(f"{name} is {value[0]:g} all through: must move")
+        size = float(np.max(np.abs(value)))
+        if not (_LEAST_SIZE <= float(np.ptp(value)) and size <= 1.0 / _LEAST_SIZE):
+            raise ValueError(
+                f"{name} has values up to {size:.3g}: must move by at least {_LEAST_SIZE:g} and "
+                f"have none above {1.0 / _LEAST_SIZE:g}; check its unit, and that the loop is stable"
+            )
     most = min(float(_MOST_DELAY), _MOST_SHARE * u.size)
     if max_delay is not None:
         most = checks.non_negative("max_delay", max_delay, "s") / dt

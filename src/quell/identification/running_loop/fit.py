@@ -52,6 +52,9 @@ _LONGEST = 0.25
 _BLOCKS = 60
 # Relative mean square that counts as zero: rounding of long simulations.
 _ROUNDING = 1e-20
+# Least error of the prediction, relative to y, for deviations: that of the derivatives by
+# differences, which a record without noise would otherwise be taken to determine everything by.
+_LEAST_ERROR = 1e-7
 # Relative singular value that counts as zero, as in ``output_error``.
 _RANK = 1e-12
 
@@ -93,11 +96,12 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
         return _without_model(form, at)
     first, count = at.beta.size, at.beta.size + form.size
     variance = at.power / max(at.error.size - count, 1)
+    variance = max(variance, _LEAST_ERROR**2 * float(np.mean(y**2)))
     known = _known_by_limits(form, at.phi) * math.sqrt(variance)
     psi[:, first:][:, np.isinf(known)] = 0.0
     rows = np.diag(np.concatenate([np.zeros(first), np.where(np.isinf(known), 0.0, known)]) / size)
     R: Matrix = np.asarray(np.linalg.qr(np.vstack([psi, rows]), mode="r"))
-    inverse = np.linalg.pinv(R, rcond=_RANK)
+    inverse = _inverse(R)
     order = np.r_[first:count, :first]  # φ before β
     rows = inverse[order] / size[order, None]
     covariance = variance * rows @ rows.T
@@ -108,6 +112,18 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
     aic += 2.0 * growth(form, at.phi, y.size)
     return LoopFit(form, at.phi, at.beta, covariance, at.error, aic, converged)
+
+
+def _inverse(R: Matrix) -> Matrix:
+    """Return the inverse of a triangle; what the record does not determine has a large one.
+
+    Only parameters that do not vary, those with zeros for a column, have none.
+    """
+    varies = np.any(R, axis=0)
+    U, sizes, V = np.linalg.svd(R[:, varies], full_matrices=False)
+    found = np.zeros((R.shape[1], R.shape[0]))
+    found[varies] = (V.T / np.maximum(sizes, _RANK * sizes[0])) @ U.T
+    return found
 
 
 def _known_by_limits(form: Form, phi: Vector) -> Vector:
