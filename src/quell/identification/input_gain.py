@@ -55,7 +55,7 @@ class Bandwidth(NamedTuple):
     ratio: float  #: omega_o over omega_c
 
 
-class MarginNotReached(ValueError):
+class MarginError(ValueError):
     """No omega_c keeps the phase margin that was asked for."""
 
     def __init__(self, message: str, best: Reach | None = None) -> None:
@@ -143,7 +143,7 @@ class InputGain:
 
         Raises
         ------
-        MarginNotReached
+        MarginError
             (a ``ValueError``) for a plant with which no omega_c keeps the margin; it has the best
             one.
         ValueError
@@ -158,7 +158,7 @@ class InputGain:
         asked = f"{margin:g}° of phase margin"
         if self.delay > _MOST_SAMPLES * self.dt:
             rule = f"the delay of {self.delay:.4g} s is longer than {_MOST_SAMPLES} samples"
-            raise MarginNotReached(f"omega_c for {asked} is not computed: {rule}")
+            raise MarginError(f"omega_c for {asked} is not computed: {rule}")
         n = self.order
         at = np.concatenate([self.den[1:], [self.b0, self.lag, self.delay]])
 
@@ -171,7 +171,7 @@ class InputGain:
             found = bandwidth(loops(at), margin, ratio)
             if not found.keeps:
                 other = None if ratio is None else bandwidth(loops(at), margin)
-                raise MarginNotReached(_not_reached(asked, found, ratio, other), found)
+                raise MarginError(_not_reached(asked, found, ratio, other), found)
             slope = np.zeros(at.size)
             for i, spread in enumerate(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()):
                 for step in (spread, -spread) if spread > 0.0 else ():
@@ -219,13 +219,22 @@ def identify_b0(
     The plant is ``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = b0 u_l + load``, where u_l is u behind a
     lag and a delay, under a drifting load and noise in y (``quell.identification.running_loop``
     has the equations). The controller need not be known: the prediction-error method is consistent
-    in a loop of any controller, as long as u is what reached the plant. All twelve forms of the
-    model, with or without lag and delay, under no load, one that drifts or one that forgets, are
-    fitted; b0 is their mean with Akaike's weights, and its deviation that of the mixture of their
+    in a loop of any controller, as long as u is what reached the plant, and it does not need a
+    stable plant: an unstable one is predicted, not simulated. All twelve forms of the model, with
+    or without lag and delay, under no load, one that drifts or one that forgets, are fitted; b0 is
+    their mean with weights like Akaike's, and its deviation that of the mixture of their
     distributions (Burnham & Anderson, *Model Selection and Multimodel Inference*, 2nd ed. 2002,
     sec. 6.7)::
 
-        w_i ∝ exp(−AIC_i/2),    b0 = Σ w_i b_i,    std² = Σ w_i (var_i + (b_i − b0)²)
+        w_i ∝ exp(−AIC_i/2 + t_i),    b0 = Σ w_i b_i,    std² = Σ w_i (var_i + (b_i − b0)²)
+
+    t_i is the number of parameters of the lag and the delay. They do not count against a form: one
+    without either often fits as well, with a gain that is off by several of its own deviations.
+    Where the record leaves open how lag and delay divide their sum, and this moves b0, fits with
+    given divisions belong to the mean, too.
+
+    The first samples of y, up to one more than the longest delay at the start, are left out: they
+    depend on u before the record.
 
     Parameters
     ----------
@@ -273,11 +282,10 @@ def identify_b0(
         if np.ptp(value) == 0.0:
             raise ValueError(f"{name} is {value[0]:g} all through: must move")
         size = float(np.max(np.abs(value)))
-        if not (_LEAST_SIZE <= float(np.ptp(value)) and size <= 1.0 / _LEAST_SIZE):
-            raise ValueError(
-                f"{name} has values up to {size:.3g}: must move by at least {_LEAST_SIZE:g} and "
-                f"have none above {1.0 / _LEAST_SIZE:g}; check its unit, and that the loop is stable"
-            )
+        if size > 1.0 / _LEAST_SIZE or float(np.ptp(value)) < _LEAST_SIZE:
+            rule = f"must move by at least {_LEAST_SIZE:g} and stay below {1.0 / _LEAST_SIZE:g}"
+            remedy = "check its unit, and that the loop is stable"
+            raise ValueError(f"{name} has values up to {size:.3g}: {rule}; {remedy}")
     most = min(float(_MOST_DELAY), _MOST_SHARE * u.size)
     if max_delay is not None:
         most = checks.non_negative("max_delay", max_delay, "s") / dt

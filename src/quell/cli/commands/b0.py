@@ -111,15 +111,16 @@ def _print_bandwidth(
     console: Console, found: Any, phase_margin: float, ratio: float | None
 ) -> dict[str, Any]:
     """Print and return the omega_c that keeps the phase margin, if b0 is known well enough."""
-    from quell.identification.input_gain import MarginNotReached
+    from quell.identification.input_gain import MarginError
 
     nothing = {"omega_c": None, "omega_c_std": None, "ratio": ratio}
     if found.is_poor:
         print_line(console, "omega_c: not computed, as b0 is not known")
         return nothing
     try:
-        omega_c, spread, ratio = found.omega_c(phase_margin, ratio)
-    except MarginNotReached as error:
+        with console.status("Searching for the omega_c that keeps the phase margin."):
+            omega_c, spread, ratio = found.omega_c(phase_margin, ratio)
+    except MarginError as error:
         print_line(console, f"NOT: {error}")
         return nothing | {"best_phase_margin": error.phase_margin}
     beyond = ""

@@ -52,8 +52,8 @@ _LONGEST = 0.25
 _BLOCKS = 60
 # Relative mean square that counts as zero: rounding of long simulations.
 _ROUNDING = 1e-20
-# Least error of the prediction, relative to y, for deviations: that of the derivatives by
-# differences, which a record without noise would otherwise be taken to determine everything by.
+# Least error of the prediction that counts, relative to y: that of the derivatives by differences.
+# A record without noise would be taken to determine everything otherwise.
 _LEAST_ERROR = 1e-7
 # Relative singular value that counts as zero, as in ``output_error``.
 _RANK = 1e-12
@@ -96,7 +96,8 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
         return _without_model(form, at)
     first, count = at.beta.size, at.beta.size + form.size
     variance = at.power / max(at.error.size - count, 1)
-    variance = max(variance, _LEAST_ERROR**2 * float(np.mean(y**2)))
+    least = _LEAST_ERROR**2 * float(np.mean(y**2))
+    variance = max(variance, least)
     known = _known_by_limits(form, at.phi) * math.sqrt(variance)
     psi[:, first:][:, np.isinf(known)] = 0.0
     rows = np.diag(np.concatenate([np.zeros(first), np.where(np.isinf(known), 0.0, known)]) / size)
@@ -109,9 +110,14 @@ def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     robust = half @ half.T
     if robust[form.size, form.size] > covariance[form.size, form.size]:
         covariance = robust
-    aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
+    aic = y.size * math.log(max(at.power, y.size * least)) + 2.0 * count
     aic += 2.0 * growth(form, at.phi, y.size)
     return LoopFit(form, at.phi, at.beta, covariance, at.error, aic, converged)
+
+
+def is_exact(found: LoopFit, y: Vector) -> bool:
+    """Return whether the error is less than counts."""
+    return float(found.error @ found.error) <= _LEAST_ERROR**2 * float(y @ y)
 
 
 def _inverse(R: Matrix) -> Matrix:

@@ -312,7 +312,7 @@ def _mirroring(a: Vector, states: int, samples: int) -> Vector:
 
 
 def _shift(z: Complex, vectors: Complex) -> Vector:
-    """Return the gains that mirror the eigenvalues z, with eigenvectors whose first element is 1."""
+    """Return the gains that mirror the eigenvalues z; the eigenvectors begin with 1."""
     weights = np.ones(z.size, dtype=np.complex128)
     for j in range(z.size):
         others = np.arange(z.size) != j

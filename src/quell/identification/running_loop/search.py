@@ -3,7 +3,8 @@
 Each form, with or without lag, delay and drifting load, is fitted from several starts: the
 denominators of ``initial_estimate`` and that of a chain of integrators, a grid of delays or lags,
 and of a few bandwidths of the predictor. Forms with a drifting load are left out if the output
-error alone is white. Those with a load that forgets start at the ones whose load does not.
+error alone is white. Those with a load that forgets start at the ones whose load does not. In a
+loop the plant may be unstable, so unstable denominators are among the starts.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from quell.identification.model.correlation import autocorrelation
 from quell.identification.model.structure import Structure, linear_columns, nonzero_lengths
 from quell.identification.running_loop.average import gain
-from quell.identification.running_loop.fit import LoopFit, fit, power
+from quell.identification.running_loop.fit import LoopFit, fit, is_exact, power
 from quell.identification.running_loop.model import Form, is_unstable, placed
 from quell.identification.search.delay import delayed
 from quell.identification.search.initial_estimate import equation, filtered_estimates
@@ -26,7 +27,7 @@ from quell.types import Vector
 # benchmarks/running_loop.py finds the same minimum as a start at the true plant.
 _RATES, _GRID, _DENOMINATORS, _SHARES = (0.01, 0.05, 0.2), 6, 3, (0.2, 0.5, 0.8)
 # Difference in AIC up to which a division of lag and delay is open, as in the mean of models; the
-# difference in b, in its deviations, from which on it matters; and the shares of the lag that count.
+# difference in b, in its deviations, from which on it matters; the shares of the lag that count.
 _OPEN, _SAME, _DIVISIONS = 20.0, 0.5, (0.2, 0.4, 0.6, 0.8)
 # Rates at which loads forget, of the starts [1/sample].
 _FORGETTING = (0.001, 0.01, 0.1)
@@ -44,8 +45,9 @@ def fits(order: int, most: float, u: Vector, y: Vector) -> list[LoopFit]:
     """
     a = _denominators(order, most, u, y)
     found = _family(order, False, [*a], most, u, y)
-    if not _white(min(found, key=lambda one: one.aic), y):
-        a = [min(found, key=lambda one: one.aic).phi[:order], *a]
+    best = min(found, key=lambda one: one.aic)
+    if not (is_exact(best, y) or _white(best, y)):
+        a = [best.phi[:order], *a]
         placed_ones = [placed(one, rate) for one, rate in product(a, _RATES)]
         drifting = _family(order, True, placed_ones, most, u, y)
         found += drifting + [_forgetting(one, u, y) for one in drifting]
