@@ -44,12 +44,12 @@ def fits(order: int, most: float, u: Vector, y: Vector) -> list[LoopFit]:
     u may begin before y; see ``model``.
     """
     a = _denominators(order, most, u, y)
-    found = _family(order, False, [*a], most, u, y)
+    found = _family(order, [], [*a], most, u, y)
     best = min(found, key=lambda one: one.aic)
     if not (is_exact(best, y) or _white(best, y)):
         a = [best.phi[:order], *a]
         placed_ones = [placed(one, rate) for one, rate in product(a, _RATES)]
-        drifting = _family(order, True, placed_ones, most, u, y)
+        drifting = _family(order, found, placed_ones, most, u, y)
         found += drifting + [_forgetting(one, u, y) for one in drifting]
     return found + _divided(found, u, y)
 
@@ -106,7 +106,7 @@ def _unstable(structure: Structure, most: float, u: Vector, y: Vector) -> list[V
     form, n = Form(structure.order, False, True, False), structure.order
     found = []
     for rate in np.geomspace(*_FILTERS):
-        prefilter = np.poly(np.full(n, -rate)).real[:0:-1]
+        prefilter: Vector = np.poly(np.full(n, -rate)).real[:0:-1].astype(np.float64)
         for delay in (0, round(0.25 * most)):
             late = delayed(u, delay)[u.size - y.size :]
             v = np.column_stack([late, np.ones(y.size)])
@@ -122,12 +122,23 @@ def _unstable(structure: Structure, most: float, u: Vector, y: Vector) -> list[V
 
 
 def _family(
-    order: int, drift: bool, starts: list[Vector], most: float, u: Vector, y: Vector
+    order: int, steady: list[LoopFit], starts: list[Vector], most: float, u: Vector, y: Vector
 ) -> list[LoopFit]:
-    """Return the fits with neither, one and both of lag and delay."""
+    """Return the fits with neither, one and both of lag and delay.
+
+    They have a load that drifts if the fits without loads, ``steady``, are given; each form then
+    starts at its own of these, too.
+    """
+    drift = bool(steady)
 
     def best(lag: bool, delay: bool, tried: list[Vector]) -> LoopFit:
         form = Form(order, lag, delay, drift)
+        for one in steady:
+            if one.form[1:3] == form[1:3]:
+                gains = [placed(one.phi[:order], rate)[order:] for rate in _RATES]
+                zero = np.zeros(int(lag))
+                times = one.phi[one.form.times]
+                tried = tried + [np.hstack([one.phi[:order], each, zero, times]) for each in gains]
         return fit(form, min(tried, key=lambda phi: power(form, phi, u, y)), u, y)
 
     times = np.geomspace(0.5, max(most, 1.0), _GRID)
