@@ -129,6 +129,8 @@ def _print_bandwidth(
             f"; omega_o is beyond {found.omega_max:.4g} rad/s, up to where the record shows the "
             "plant: approach it in steps"
         )
+    if ratio * omega_c * found.dt > 0.499:
+        beyond = f"; omega_o is at 0.5/dt, the most for this sample time{beyond}"
     known = math.isfinite(spread)
     deviation = f" ± {spread:.2g}" if known else " (within the deviations no omega_c may keep it)"
     print_line(
