@@ -2,6 +2,7 @@
 
     python benchmarks/running_loop.py [--draws N] [--seed S] [--snr DB] [--json FILE]
     python benchmarks/running_loop.py --controller adrc       N draws with ADRC, pid or unknown
+    python benchmarks/running_loop.py --plants unstable       or integrating, resonant, negative
 
 Each draw has a plant of order 1 or 2 (integrating, damped or oscillating) behind a lag, a delay of
 eighths of a sample, both or neither; an ADRC whose b0 is wrong by up to a factor of 1.6, or a PID;
@@ -11,6 +12,13 @@ power in y is that of y divided by the given ratio. The unknown controller is on
 rounded to a fiftieth of its largest value, and limited at the 95 % quantile of its size: no linear
 model says how u depends on r and y. The loop is simulated apart from the package's own models: by
 scipy at eight steps per sample.
+
+With ``--plants`` the plant is of one kind, under an ADRC: unstable (s − p and s² − p², or with a
+further stable pole), integrating (one or two integrators), resonant (damping 0.01 to 0.1), or any
+of these with a negative gain. Orders are 1 and 2; or as given by ``--orders``, with further stable
+poles. The record has 1500 to 12000 samples; r or u is moved by a chirp, random steps or sines; the
+noise, with or without a load as above, is 1e-4 to 1e-2 of y; the load acts in front of the lag, as
+above, or behind it.
 """
 
 from __future__ import annotations
@@ -32,6 +40,7 @@ from quell.identification import identify_b0
 from quell.types import Vector
 
 DURATION, STEPS = 20.0, 8
+KINDS = ("unstable", "integrating", "resonant")
 
 
 class Loop(NamedTuple):
@@ -97,20 +106,80 @@ def drawn_loop(rng: np.random.Generator) -> Loop:
             return Loop(den, b, lag, delay, dt, omega, controller, text)
 
 
+def drawn_den(rng: np.random.Generator, kind: str, order: int, omega: float) -> tuple[Vector, str]:
+    """Return a denominator of the kind, for a loop of a speed ``omega``, and what it is."""
+    pole = omega * float(np.exp(rng.uniform(np.log(0.02), np.log(0.6))))
+    if kind == "unstable":
+        second = -pole if rng.random() < 0.5 else -omega * float(rng.uniform(0.05, 1.0))
+        roots, text = [pole, second][:order], f"+{pole:.3g} rad/s"
+    elif kind == "integrating":
+        roots, text = [0.0, 0.0 if rng.random() < 0.5 else -pole][:order], "integrating"
+    else:
+        speed, damping = omega * float(rng.uniform(0.2, 1.5)), float(rng.uniform(0.01, 0.1))
+        one = speed * complex(-damping, np.sqrt(1.0 - damping**2))
+        roots, text = [one, one.conjugate()], f"damping {damping:.3f}"
+    roots += [-omega * float(rng.uniform(0.05, 1.0)) for _ in range(order - len(roots))]
+    return np.poly(roots).real, text
+
+
+def drawn_special(rng: np.random.Generator, plants: str, orders: tuple[int, ...]) -> Loop:
+    """Return a stable loop of ADRC and a plant of the kind, with at least 25 degrees."""
+    while True:
+        kind = str(rng.choice(KINDS)) if plants == "negative" else plants
+        order, dt = int(rng.choice(orders)), float(rng.choice([0.001, 0.002, 0.005, 0.01]))
+        order = max(order, 2) if kind == "resonant" else order
+        omega = float(np.exp(rng.uniform(np.log(0.008), np.log(0.08)))) / dt
+        den, text = drawn_den(rng, kind, order, omega)
+        sign = -1.0 if plants == "negative" else float(rng.choice([-1.0, 1.0]))
+        b = float(np.exp(rng.uniform(-3.0, 6.0))) * sign
+        lag = float(rng.choice([0.0, rng.uniform(0.5, 5.0)])) * dt
+        delay = float(rng.choice([0.0, rng.integers(1, 4 * STEPS) / STEPS])) * dt
+        wrong = float(np.exp(rng.uniform(np.log(0.625), np.log(1.6))))
+        observer = ql.ESO.model_free(order, wrong * b, 4.0 * omega, dt)
+        controller = ql.ADRC(observer, omega_c=omega)
+        loop = ql.analysis.analyse(([b], den), controller, delay=delay, actuator_lag=lag)
+        if loop.stable and loop.margins.phase > 25.0:
+            text = f"order {order} {text} lag {lag / dt:.1f} delay {delay / dt:.2f}"
+            return Loop(den, b, lag, delay, dt, omega, controller, f"ADRC {kind} {text}")
+
+
+def motion(rng: np.random.Generator, t: Vector, omega: float) -> tuple[Vector, str]:
+    """Return a reference, or what is added to u, that moves up to the loop's speed."""
+    kind = str(rng.choice(["chirp", "steps", "sines"]))
+    if kind == "steps":
+        length = max(1, round(float(rng.uniform(2.0, 8.0)) / omega / (t[1] - t[0])))
+        return np.repeat(rng.uniform(-1.0, 1.0, t.size // length + 1), length)[: t.size], kind
+    ends = np.array([0.1, rng.uniform(1.5, 4.0)]) * omega
+    if kind == "chirp":
+        hertz, end = ends / (2.0 * np.pi), float(t[-1])
+        return signal.chirp(t, hertz[0], end, hertz[1], method="logarithmic", phi=-90.0), kind
+    speeds = np.exp(rng.uniform(*np.log(ends), 5))
+    return np.sum(np.sin(np.outer(t, speeds)) / 5.0, axis=1), kind
+
+
 def simulated(
-    loop: Loop, r: Vector, added: Vector, noise: Vector, load: Vector
+    loop: Loop, r: Vector, added: Vector, noise: Vector, load: Vector, inside: bool = False
 ) -> tuple[Vector, Vector]:
-    """Return u and y without its noise; the controller measures both together."""
+    """Return u and y without its noise; the controller measures both together.
+
+    The load acts on the plant with ``inside``, else in front of the lag.
+    """
     den = np.polymul(loop.den, [loop.lag, 1.0]) if loop.lag else loop.den
-    system = signal.cont2discrete(signal.tf2ss([loop.b], den), loop.dt / STEPS)
+    A, B, C, _ = signal.tf2ss([loop.b], den)
+    if inside:  # the lag's inverse in front of it: C (s I − A)⁻¹ A B = s C (s I − A)⁻¹ B
+        B = np.hstack([B, B + loop.lag * A @ B])
+    system = signal.cont2discrete((A, B, C, np.zeros((1, B.shape[1]))), loop.dt / STEPS)
     A, B, C = system[0], system[1][:, 0], system[2][0]
+    loads = [system[1][:, -1]]
     whole, part = divmod(round(loop.delay / loop.dt * STEPS), STEPS)
     powers, sums = [np.eye(B.size)], [np.zeros(B.size)]
     for _ in range(STEPS):
         sums.append(A @ sums[-1] + B)
         powers.append(A @ powers[-1])
+        loads.append(A @ loads[-1])
     old, new = powers[STEPS - part] @ sums[part], sums[STEPS - part]
     x, u, y = np.zeros(B.size), np.zeros(r.size + whole + 1), np.zeros(r.size)
+    of_load = np.sum(loads[:-1], axis=0)
     at = whole + 1  # u has zeros before the record
     loop.controller.reset()
     step = loop.controller.step
@@ -118,7 +187,7 @@ def simulated(
         y[k] = C @ x
         u[k + at] = step(r[k], y[k] + noise[k]) + added[k]
         x = powers[STEPS] @ x + new * u[k + at - whole] + old * u[k + at - whole - 1]
-        x = x + sums[STEPS] * load[k]
+        x = x + of_load * load[k]
     return u[at:], y
 
 
@@ -137,20 +206,51 @@ def drawn_record(seed: int, snr: float, unknown: bool = False) -> tuple[Loop, Ve
         other = Unknown(loop.controller, float(np.max(own)) / 50.0, float(np.quantile(own, 0.95)))
         loop = loop._replace(controller=other, text="other" + loop.text[4:])
         _, clean = simulated(loop, *parts, zero, zero)
+    u, y, text = disturbed(rng, loop, parts, clean, 10.0 ** (-snr / 20.0))
+    where = "u" if at_u else "r"
+    return loop, u, y, f"{loop.text} {1e3 * loop.dt:3.0f} ms, chirp in {where}, {text}"
+
+
+def drawn_special_record(
+    seed: int, plants: str, orders: tuple[int, ...]
+) -> tuple[Loop, Vector, Vector, str]:
+    """Return a loop of ADRC and a plant of the kind, u, the measured y, and what was drawn."""
+    rng = np.random.default_rng(seed)
+    loop = drawn_special(rng, plants, orders)
+    t = np.arange(round(float(np.exp(rng.uniform(*np.log([1500.0, 12000.0])))))) * loop.dt
+    moved, how = motion(rng, t, loop.omega)
+    zero, at_u = np.zeros(t.size), rng.random() < 0.3
+    parts = (zero, moved) if at_u else (moved, zero)
+    _, clean = simulated(loop, *parts, zero, zero)
+    ratio = float(np.exp(rng.uniform(np.log(1e-4), np.log(1e-2))))
+    u, y, text = disturbed(rng, loop, parts, clean, ratio, inside=bool(rng.random() < 0.5))
+    where = f"{t.size} of {1e3 * loop.dt:.0f} ms, {how} in {'u' if at_u else 'r'}"
+    return loop, u, y, f"{loop.text} {where}, {ratio:.1e} {text}"
+
+
+def disturbed(
+    rng: np.random.Generator,
+    loop: Loop,
+    parts: tuple[Vector, Vector],
+    clean: Vector,
+    ratio: float,
+    inside: bool = False,
+) -> tuple[Vector, Vector, str]:
+    """Return u and the measured y with noise of ``ratio`` of y, or half of it from a load."""
+    zero = np.zeros(clean.size)
     share = float(rng.choice([0.0, 0.5]))
-    target = 10.0 ** (-snr / 20.0) * float(np.std(clean))
-    noise = np.sqrt(1.0 - share) * target * rng.standard_normal(t.size)
+    target = ratio * float(np.std(clean))
+    noise = np.sqrt(1.0 - share) * target * rng.standard_normal(clean.size)
     load, text = zero, "noise"
     if share:
         memory = float(rng.choice([np.inf, rng.uniform(0.2, 2.0)]))
         pole = np.exp(-loop.dt / memory)
-        load = signal.lfilter([1.0], [1.0, -pole], rng.standard_normal(t.size))
-        _, moved = simulated(loop, zero, zero, zero, load)
+        load = signal.lfilter([1.0], [1.0, -pole], rng.standard_normal(clean.size))
+        _, moved = simulated(loop, zero, zero, zero, load, inside)
         load *= np.sqrt(share) * target / np.std(moved)
-        text = f"load {memory:4.2f} s"
-    u, y = simulated(loop, *parts, noise, load)
-    where = "u" if at_u else "r"
-    return loop, u, y + noise, f"{loop.text} {1e3 * loop.dt:3.0f} ms, chirp in {where}, {text}"
+        text = f"load {memory:4.2f} s{' inside' * inside}"
+    u, y = simulated(loop, *parts, noise, load, inside)
+    return u, y + noise, text
 
 
 def main() -> None:
@@ -162,6 +262,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=40000, help="seed of the first draw")
     parser.add_argument("--snr", type=float, default=30.0, help="signal-to-noise ratio of y [dB]")
     parser.add_argument("--controller", choices=("adrc", "pid", "unknown"))
+    parser.add_argument("--plants", choices=(*KINDS, "negative"))
+    parser.add_argument("--orders", type=int, nargs="+", default=[1, 2], help="with --plants")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", ql.DesignWarning)
@@ -170,12 +272,21 @@ def main() -> None:
     for seed in itertools.count(arguments.seed):
         if len(rows) == arguments.draws:
             break
-        drawn = drawn_loop(np.random.default_rng(seed)).text
-        if kind in ("ADRC", "PID") and not drawn.startswith(kind):
-            continue
-        loop, u, y, text = drawn_record(seed, arguments.snr, kind == "other")
+        if arguments.plants:
+            orders = tuple(arguments.orders)
+            loop, u, y, text = drawn_special_record(seed, arguments.plants, orders)
+        else:
+            drawn = drawn_loop(np.random.default_rng(seed)).text
+            if kind in ("ADRC", "PID") and not drawn.startswith(kind):
+                continue
+            loop, u, y, text = drawn_record(seed, arguments.snr, kind == "other")
         began = time.process_time()
-        found = identify_b0(u, y, loop.dt, loop.den.size - 1)
+        try:
+            found = identify_b0(u, y, loop.dt, loop.den.size - 1)
+        except ValueError as error:
+            print(f"{seed} {text}: refused, {error}")
+            rows.append({"seed": seed, "text": text, "refused": str(error)})
+            continue
         taken = time.process_time() - began
         low, high = found.interval
         row = {
@@ -195,6 +306,9 @@ def main() -> None:
         if not row["covered"] or abs(row["error"]) > 0.05:
             said = "; ".join(found.shortcomings)
             print(f"{seed} {text}: b0 off by {row['error']:+.2%} ± {row['std']:.2%} {said}")
+    refused = [row for row in rows if "refused" in row]
+    rows = [row for row in rows if "refused" not in row]
+    print(f"refused: {len(refused)}")
     for name, part in (
         ("all", rows),
         ("noise alone", [row for row in rows if row["text"].endswith("noise")]),
@@ -204,6 +318,8 @@ def main() -> None:
         ("unknown", [row for row in rows if row["text"].startswith("other")]),
         ("order 1", [row for row in rows if "order 1" in row["text"]]),
         ("order 2", [row for row in rows if "order 2" in row["text"]]),
+        ("order 3", [row for row in rows if "order 3" in row["text"]]),
+        ("order 4", [row for row in rows if "order 4" in row["text"]]),
     ):
         if not part:
             continue
@@ -218,7 +334,7 @@ def main() -> None:
             f"CPU {np.median([row['seconds'] for row in part]):.1f} s"
         )
     if arguments.json:
-        arguments.json.write_text(json.dumps(rows, indent=2, default=float) + "\n")
+        arguments.json.write_text(json.dumps(rows + refused, indent=2, default=float) + "\n")
 
 
 if __name__ == "__main__":

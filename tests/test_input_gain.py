@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import quell as ql
 from quell.controllers.baselines import PID
-from quell.identification import identify_b0
-from quell.identification.running_loop.bandwidth import bandwidth
+from quell.identification import InputGain, identify_b0
+from quell.identification.input_gain import MarginError
+from quell.identification.running_loop.bandwidth import Candidate, bandwidth
 from quell.identification.running_loop.model import Form, linear_columns, placed, predicted
 
 from .benchmark_module import benchmark
@@ -91,6 +93,76 @@ def test_an_unstable_plant_is_found_in_its_loop_under_any_controller() -> None:
     assert max(np.roots(found.den).real) == pytest.approx(3.0, rel=0.1)
 
 
+def unstable_record(pole: float, dt: float, samples: int, **plant: float) -> tuple[Any, Any]:
+    """Return u and y of ``y'' = pole² y − 30 u`` under an ADRC, with steps as reference."""
+    rng = np.random.default_rng(3)
+    controller = ql.ADRC(ql.ESO.model_free(2, -30.0, 6.0 * pole, dt), omega_c=1.5 * pole)
+    given = {"lag": 0.0, "delay": 0.0} | plant
+    den = np.array([1.0, 0.0, -(pole**2)])
+    loop = trial().Loop(den, -30.0, dt=dt, omega=0.0, controller=controller, text="", **given)
+    r, none = np.repeat(rng.uniform(-1.0, 1.0, samples // 50), 50), np.zeros(samples)
+    noise = 1e-3 * rng.standard_normal(samples)
+    u, y = trial().simulated(in_python(loop), r, none, noise, none)
+    return u, y + noise
+
+
+@pytest.mark.filterwarnings("ignore::quell.DesignWarning")
+@pytest.mark.parametrize(
+    ("pole", "dt", "samples", "plant"),
+    [
+        (38.7, 0.005, 4000, {}),
+        (38.7, 0.001, 2000, {"delay": 0.001}),
+        (3.0, 0.005, 2000, {"lag": 0.01}),
+        (0.5, 0.005, 2000, {"delay": 0.005}),
+    ],
+)
+def test_the_gain_of_an_unstable_plant_is_found_and_nothing_else_is_printed(
+    pole: float, dt: float, samples: int, plant: dict[str, float], capfd: Any
+) -> None:
+    """exp(38.7 × 20 s) is no number: a simulated unstable plant ended in LAPACK's complaints."""
+    u, y = unstable_record(pole, dt, samples, **plant)
+    found = identify_b0(u, y, dt, order=2)
+    assert abs(found.b0 + 30.0) < 3.0 * found.b0_std < 0.6
+    assert max(np.roots(found.den).real) == pytest.approx(pole, rel=0.05)
+    assert found.shortcomings == ()
+    assert "LAPACK" not in str(shown := capfd.readouterr())
+    assert "DLASCL" not in str(shown)
+
+
+def test_the_predictor_of_an_unstable_plant_without_loads_is_the_stationary_kalman_filter() -> None:
+    """Its gains equal those of the Riccati equation for noise in y alone, which scipy solves."""
+    from scipy.linalg import solve_discrete_are
+
+    form, rng = Form(2, False, False, False), np.random.default_rng(1)
+    a, y = np.array([-0.02, 0.05]), rng.standard_normal(2000)
+    A = np.array([[-0.05, 1.0], [0.02, 0.0]])  # observable form
+    phi = expm(A)
+    C = np.array([[1.0, 0.0]])
+    P = solve_discrete_are(phi.T, C.T, 1e-14 * np.eye(2), np.eye(1))
+    K = (phi @ P @ C.T / (1.0 + C @ P @ C.T))[:, 0]
+    x, by_hand = np.zeros(2), []
+    for value in y:
+        by_hand.append(x[0])
+        x = phi @ x + K * (value - x[0])
+    found = predicted(form, [a], np.zeros(4), np.zeros(y.size), y)[:, 0]
+    assert found == pytest.approx(by_hand, abs=1e-6)
+
+
+def test_u_before_the_record_does_not_matter() -> None:
+    """A record that begins in motion: the u that still acts in its first samples is not in it."""
+    u, y = record([1.0, 2.0, 3.0], adrc(), 0.0, delay=0.04375)
+    found = identify_b0(u[700:], y[700:], DT, order=2)
+    assert found.b0 == pytest.approx(40.0, rel=1e-4)
+    assert found.delay == pytest.approx(0.04375, rel=2e-3)
+
+
+def test_what_a_record_does_not_determine_is_said() -> None:
+    """One sine and no noise: two numbers, which any b0 of a plant of order 2 can explain."""
+    found = identify_b0(np.sin(5.0 * T), np.sin(5.0 * T + 1.0), DT, order=2)
+    assert found.is_poor
+    assert found.shortcomings[0].startswith("the excitation is too poor")
+
+
 def test_poor_excitation_is_said() -> None:
     """A loop that only holds its place in noise tells nothing of b0; the report and omega_c say so."""
     slow = ql.ADRC(ql.ESO.model_free(2, 25.0, omega_o=1.0, dt=DT), omega_c=0.25)
@@ -133,7 +205,7 @@ def test_the_predictor_is_the_observer_written_out() -> None:
         arrived = late[k + 1] * gain(0.75) + late[k] * (gain(1.0) - gain(0.75))
         e = y[k] - x[0]
         x = np.array([phi_xx * x[0] + gain(1.0) * x[1] + b * arrived, x[1]]) + K * e
-    assert predicted(form, phi, beta, u, y) == pytest.approx(by_hand, abs=1e-12)
+    assert predicted(form, [phi], beta, u, y)[:, 0] == pytest.approx(by_hand, abs=1e-12)
     columns, of_y = linear_columns(form, phi, u, y)
     assert columns @ beta + of_y == pytest.approx(by_hand, abs=1e-12)
 
@@ -141,8 +213,8 @@ def test_the_predictor_is_the_observer_written_out() -> None:
 def test_the_bandwidth_keeps_the_phase_margin_and_no_larger_one_does() -> None:
     """The loop at the result has 60 degrees, to rounding, in ``analyse``; 2 % faster it has less."""
     den = np.array([1.0, 2.0, 0.0])
-    how: dict[str, float] = {"b0": 40.0, "dt": DT, "margin": 60.0, "ratio": 5.0}
-    omega_c = bandwidth(40.0, den, 0.02, 0.013, **how)
+    loops = Candidate(40.0, den, 0.02, 0.013, b0=40.0, dt=DT)
+    omega_c = bandwidth(loops, 60.0, 5.0).omega_c
     margins = [
         ql.analysis.analyse(
             ([40.0], den),
@@ -156,9 +228,73 @@ def test_the_bandwidth_keeps_the_phase_margin_and_no_larger_one_does() -> None:
     assert margins[1] < 59.95
 
 
+@pytest.mark.parametrize("kind", ["unstable", "integrating", "resonant", "negative"])
+def test_the_interval_holds_the_gain_of_plants_of_each_kind(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A draw of ``benchmarks/running_loop.py --plants`` each; 200 of them are its table."""
+    drawn = trial().drawn_special
+    monkeypatch.setattr(trial(), "drawn_special", lambda *how: in_python(drawn(*how)))
+    loop, u, y, _ = trial().drawn_special_record(11, kind, (1, 2))
+    found = identify_b0(u, y, loop.dt, loop.den.size - 1)
+    assert found.b0 == pytest.approx(loop.b, rel=0.05)
+    assert abs(found.b0 - loop.b) < 3.0 * found.b0_std
+
+
+def result(b0: float, den: list[float], delay: float, dt: float) -> InputGain:
+    """Return a result without a lag, whose b0 alone has a deviation, of 1 %."""
+    n = len(den) - 1
+    covariance = np.zeros((n + 3, n + 3))
+    covariance[n, n] = (0.01 * b0) ** 2
+    numbers = {"lag": 0.0, "lag_std": 0.0, "delay": delay, "delay_std": 0.0}
+    return InputGain(
+        **{"order": n, "b0": b0, "b0_std": 0.01 * abs(b0), "den": np.array(den), **numbers},
+        **{"total_delay": delay, "total_delay_std": 0.0, "dt": dt, "samples": 1000, "noise": 0.0},
+        **{"omega_max": 1.0, "white": True, "independent": True, "converged": True},
+        covariance=covariance,
+    )
+
+
+def phase_of(found: InputGain, omega_c: float, ratio: float) -> float:
+    """Return the phase margin of the loop at a bandwidth [degrees]; zero for an unstable one."""
+    observer = ql.ESO.model_free(found.order, found.b0, ratio * omega_c, found.dt)
+    plant, controller = ([found.b0], found.den), ql.ADRC(observer, omega_c)
+    return ql.analysis.analyse(plant, controller, delay=found.delay).margins.phase
+
+
+def test_the_ratio_is_chosen_where_the_usual_one_cannot_keep_the_margin() -> None:
+    """An inertia with a delay of 1 ms has 41° with omega_o = 5 omega_c, however slow the loop."""
+    inertia = result(30.0, [1.0, 0.0, 0.0], 0.001, 0.001)
+    omega_c, std, ratio = inertia.omega_c(60.0)
+    assert phase_of(inertia, omega_c, ratio) == pytest.approx(60.0, abs=0.01)
+    assert 30.0 <= ratio <= 100.0
+    assert 0.0 < std < 0.2 * omega_c
+    with pytest.raises(MarginError, match=r"the best is 41\.2°.*; omega_o = .* keeps it") as caught:
+        inertia.omega_c(60.0, ratio=5.0)
+    assert caught.value.phase_margin == pytest.approx(41.2, abs=0.1)
+
+
+def test_the_range_of_an_unstable_plant_is_found_between_its_ends() -> None:
+    """A slower loop than the pole is unstable, a faster one than the delay allows, too."""
+    found = result(-30.0, [1.0, 0.0, -9.0], 0.002, 0.001)
+    omega_c, _, ratio = found.omega_c(45.0)
+    assert phase_of(found, omega_c, ratio) == pytest.approx(45.0, abs=0.01)
+    assert phase_of(found, 0.05 * omega_c, ratio) == 0.0
+    assert phase_of(found, 1.02 * omega_c, ratio) < 45.0
+
+
+def test_a_plant_that_no_adrc_stabilises_has_no_bandwidth() -> None:
+    """A pole of 38.7 rad/s behind a delay of 100 ms: the error says that no loop is stable."""
+    found = result(-30.0, [1.0, 0.0, -(38.7**2)], 0.1, 0.005)
+    with pytest.raises(MarginError, match="is stable; ask for less") as caught:
+        found.omega_c()
+    assert caught.value.phase_margin is None
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"y": 1e200 * np.cos(T)}, "y has values up to 1e\\+200"),
         ({"order": 5}, "order = 5"),
         ({"dt": 0.0}, "dt = 0.0"),
         ({"u": np.zeros(1500)}, "u is 0 all through: must move"),
@@ -197,3 +333,23 @@ def test_the_command_reads_a_saved_run_and_the_setup_of_its_loop(
     refused = quell("b0", "run.nc")
     assert refused.code == 2
     assert "order: missing; give --order, or with --loop" in refused.err
+
+
+def test_the_command_succeeds_where_no_bandwidth_keeps_the_margin(
+    quell: Callable[..., Shown], tmp_path: Path
+) -> None:
+    """A double integrator with omega_o = 5 omega_c: a line with NOT, null in JSON; without the ratio there is one."""
+    u, y = record([1.0, 0.0, 0.0], adrc(), 1e-3, t=T[:800])
+    rows = np.column_stack([T[:800], u, y])
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="t,u,y", comments="")
+    shown = quell("b0", "run.csv", "--order", "2", "--ratio", "5", "--json", "5.json")
+    assert shown.code == 0, shown.err
+    assert "NOT: no omega_c keeps 60° of phase margin with an omega_o of 5 omega_c" in shown.out
+    told = json.loads((tmp_path / "5.json").read_text())
+    assert told["omega_c"] is None
+    assert told["best_phase_margin"] == pytest.approx(41.2, abs=1.0)
+    shown = quell("b0", "run.csv", "--order", "2", "--json", "free.json")
+    told = json.loads((tmp_path / "free.json").read_text())
+    assert f"omega_o = {told['ratio']:.3g} omega_c" in shown.out
+    assert told["ratio"] > 20.0
+    assert told["omega_c"] > 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from quell.identification.running_loop.average import (
     total_delay,
     visible_up_to,
 )
-from quell.identification.running_loop.bandwidth import bandwidth
+from quell.identification.running_loop.bandwidth import Candidate, Reach, bandwidth, near
 from quell.identification.running_loop.fit import LoopFit
 from quell.identification.running_loop.search import fits
 from quell.identification.validation import residuals
@@ -33,8 +33,10 @@ _POOR = 0.15
 # Deviations within which the interval of 95 % lies, and within which a lag or delay may be zero
 # (99.7 %).
 _WITHIN_95, _WITHIN_99 = 1.96, 3.0
-# omega_o over omega_c by default: in the usual range of 3 to 10 (Gao 2003; Herbst 2013).
-RATIO = 5.0
+# Longest delay of a loop that is analysed [samples], as in ``quell.plants.sampled``.
+_MOST_SAMPLES = 200
+# Least motion of u and y, and the inverse of their largest size: their squares are numbers then.
+_LEAST_SIZE = 1e-100
 # Share of the largest difference of AIC whose model still has a weight: exp(−20/2) = 5e-5.
 _MOST_DIFFERENCE = 20.0
 # Numbers of the result in JSON.
@@ -43,6 +45,26 @@ _IN_JSON = (
     *("total_delay_std", "dt", "samples", "noise", "omega_max", "white", "independent"),
     "converged",
 )
+
+
+class Bandwidth(NamedTuple):
+    """The largest omega_c that keeps a phase margin."""
+
+    omega_c: float  #: [rad/s]
+    std: float  #: its standard deviation [rad/s]; NaN if the margin is lost within that of b0
+    ratio: float  #: omega_o over omega_c
+
+
+class MarginError(ValueError):
+    """No omega_c keeps the phase margin that was asked for."""
+
+    def __init__(self, message: str, best: Reach | None = None) -> None:
+        super().__init__(message)
+        stable = best is not None and not math.isnan(best.omega_c)
+        #: the best phase margin [degrees], its omega_c [rad/s] and omega_o/omega_c; None for none
+        self.phase_margin = best.phase if best is not None and stable else None
+        self.omega_c = best.omega_c if best is not None and stable else None
+        self.ratio = best.ratio if best is not None and stable else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,48 +125,64 @@ class InputGain:
             found.append("the error is not white: the deviations may be too small")
         return tuple(found)
 
-    def omega_c(self, phase_margin: float = 60.0, ratio: float = RATIO) -> tuple[float, float]:
-        """Return the largest omega_c that keeps a phase margin, and its deviation [rad/s].
+    def omega_c(self, phase_margin: float = 60.0, ratio: float | None = None) -> Bandwidth:
+        """Return the largest omega_c that keeps a phase margin, its deviation, and the ratio.
 
         It is that of the exactly sampled loop of the fitted plant, with lag and delay, and an ADRC
         with a model-free ESO and this b0. The deviation follows from those of all parameters, to
-        first order.
+        first order. omega_o is at most half of the sample rate 1/dt.
 
         Parameters
         ----------
         phase_margin
             [degrees], above 0 and below 90.
         ratio
-            omega_o over omega_c.
+            omega_o over omega_c. By default nine ratios from 3 to 100 are tried; of those whose
+            omega_c is at least 0.9 times the largest, the least is taken: it has the least noise in
+            u. With ``y'' = b u`` a ratio of 5 has 41° at most, and 60° need one of 30 or more.
 
         Raises
         ------
+        MarginError
+            (a ``ValueError``) for a plant with which no omega_c keeps the margin; it has the best
+            one.
         ValueError
-            for an argument out of range, a b0 of zero, or a plant with which no omega_c keeps it.
+            for an argument out of range, or a b0 of zero.
         """
         margin = checks.positive("phase_margin", phase_margin, "degrees")
         if margin >= 90.0:
             raise ValueError(f"phase_margin = {phase_margin!r}: must be below 90 degrees")
-        ratio = checks.positive("ratio", ratio)
+        ratio = None if ratio is None else checks.positive("ratio", ratio)
+        if self.b0 == 0.0:
+            raise ValueError("b0 is zero: there is no loop; record u and y while u moves y")
+        asked = f"{margin:g}° of phase margin"
+        if self.delay > _MOST_SAMPLES * self.dt:
+            rule = f"the delay of {self.delay:.4g} s is longer than {_MOST_SAMPLES} samples"
+            raise MarginError(f"omega_c for {asked} is not computed: {rule}")
         n = self.order
         at = np.concatenate([self.den[1:], [self.b0, self.lag, self.delay]])
 
-        def largest(values: Vector) -> float:
+        def loops(values: Vector) -> Candidate:
             # The gain that the observer assumes stays b0 where the plant's gain changes.
             den, times = np.append(1.0, values[:n]), np.maximum(values[n + 1 :], 0.0).tolist()
-            how = {"b0": self.b0, "dt": self.dt, "margin": margin, "ratio": ratio}
-            return bandwidth(float(values[n]), den, *times, **how)
+            return Candidate(float(values[n]), den, *times, b0=self.b0, dt=self.dt)
 
-        found = largest(at)
-        if math.isnan(found):
-            rule = "no omega_c keeps it with this plant and ratio"
-            raise ValueError(f"phase_margin = {phase_margin!r} degrees: {rule}; ask for less")
-        slope = np.zeros(at.size)
-        for i, spread in enumerate(np.sqrt(np.diag(self.covariance)).tolist()):
-            if spread > 0.0:
-                slope[i] = (largest(at + spread * np.eye(at.size)[i]) - found) / spread
+        with one_blas_thread():
+            found = bandwidth(loops(at), margin, ratio)
+            if not found.keeps:
+                other = None if ratio is None else bandwidth(loops(at), margin)
+                raise MarginError(_not_reached(asked, found, ratio, other), found)
+            slope = np.zeros(at.size)
+            for i, spread in enumerate(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()):
+                for step in (spread, -spread) if spread > 0.0 else ():
+                    changed = loops(at + step * np.eye(at.size)[i])
+                    moved = near(changed, margin, found.omega_c, found.ratio)
+                    slope[i] = (moved - found.omega_c) / step
+                    if not math.isnan(moved):
+                        break
         variance = float(slope @ self.covariance @ slope)
-        return found, math.sqrt(variance) if variance >= 0.0 else math.nan
+        std = math.sqrt(variance) if variance >= 0.0 else math.nan
+        return Bandwidth(found.omega_c, std, found.ratio)
 
     def describe(self) -> str:
         """Return the report as text."""
@@ -181,13 +219,22 @@ def identify_b0(
     The plant is ``y^(n) + a_{n−1} y^(n−1) + … + a_0 y = b0 u_l + load``, where u_l is u behind a
     lag and a delay, under a drifting load and noise in y (``quell.identification.running_loop``
     has the equations). The controller need not be known: the prediction-error method is consistent
-    in a loop of any controller, as long as u is what reached the plant. All twelve forms of the
-    model, with or without lag and delay, under no load, one that drifts or one that forgets, are
-    fitted; b0 is their mean with Akaike's weights, and its deviation that of the mixture of their
+    in a loop of any controller, as long as u is what reached the plant, and it does not need a
+    stable plant: an unstable one is predicted, not simulated. All twelve forms of the model, with
+    or without lag and delay, under no load, one that drifts or one that forgets, are fitted; b0 is
+    their mean with weights like Akaike's, and its deviation that of the mixture of their
     distributions (Burnham & Anderson, *Model Selection and Multimodel Inference*, 2nd ed. 2002,
     sec. 6.7)::
 
-        w_i ∝ exp(−AIC_i/2),    b0 = Σ w_i b_i,    std² = Σ w_i (var_i + (b_i − b0)²)
+        w_i ∝ exp(−AIC_i/2 + t_i),    b0 = Σ w_i b_i,    std² = Σ w_i (var_i + (b_i − b0)²)
+
+    t_i is the number of parameters of the lag and the delay. They do not count against a form: one
+    without either often fits as well, with a gain that is off by several of its own deviations.
+    Where the record leaves open how lag and delay divide their sum, and this moves b0, fits with
+    given divisions belong to the mean, too.
+
+    The first samples of y, up to one more than the longest delay at the start, are left out: they
+    depend on u before the record.
 
     Parameters
     ----------
@@ -234,6 +281,11 @@ def identify_b0(
     for name, value in (("u", u), ("y", y)):
         if np.ptp(value) == 0.0:
             raise ValueError(f"{name} is {value[0]:g} all through: must move")
+        size = float(np.max(np.abs(value)))
+        if size > 1.0 / _LEAST_SIZE or float(np.ptp(value)) < _LEAST_SIZE:
+            rule = f"must move by at least {_LEAST_SIZE:g} and stay below {1.0 / _LEAST_SIZE:g}"
+            remedy = "check its unit, and that the loop is stable"
+            raise ValueError(f"{name} has values up to {size:.3g}: {rule}; {remedy}")
     most = min(float(_MOST_DELAY), _MOST_SHARE * u.size)
     if max_delay is not None:
         most = checks.non_negative("max_delay", max_delay, "s") / dt
@@ -242,14 +294,16 @@ def identify_b0(
                 f"max_delay = {max_delay!r} s: must be at most a quarter of the record"
             )
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
+    # The u before the record is not known: the first samples of y, which it reaches, are left out.
+    before = math.ceil(min(most, _MOST_SHARE * u.size)) + 1
     with one_blas_thread():
-        found = fits(order, most, u / scale_u, y / scale_y)
+        found = fits(order, most, u / scale_u, y[before:] / scale_y)
     usable = [one for one in found if _is_usable(one)]
     if not usable:
         raise ValueError(
             f"order = {order}: no model was found; check the order, and that u belongs to y"
         )
-    return _result(usable, u, y, dt, scale_u, scale_y)
+    return _result(usable, u, y[before:], dt, scale_u, scale_y)
 
 
 def _is_usable(one: LoopFit) -> bool:
@@ -260,14 +314,12 @@ def _result(
     found: list[LoopFit], u: Vector, y: Vector, dt: float, scale_u: float, scale_y: float
 ) -> InputGain:
     """Return the mean of the models, and what the best of them has besides b0."""
-    best = min(found, key=lambda one: one.aic)
-    # A fit that did not converge has no valid deviation; it counts if no other comes near to it.
-    settled = [one for one in found if one.converged and one.aic <= best.aic + _MOST_DIFFERENCE]
-    settled = settled or found
-    best = min(settled, key=lambda one: one.aic)
+    # What there is besides b0 is that of a model with free times.
+    best = min((one for one in found if one.form.share is None), key=lambda one: one.aic)
     form, n = best.form, best.form.order
-    near = [one for one in settled if one.aic - best.aic <= _MOST_DIFFERENCE]
-    weights = np.exp(-0.5 * np.array([one.aic - best.aic for one in near]))
+    near = [one for one in found if one.aic - best.aic <= _MOST_DIFFERENCE]
+    scores = np.array([one.aic - 2.0 * one.form.of_times for one in near])
+    weights = np.exp(-0.5 * (scores - np.min(scores)))
     weights /= np.sum(weights)
     unit = scale_y / scale_u / dt**n
     b0, b0_std = mean([gain(one) for one in near], weights)
@@ -276,7 +328,7 @@ def _result(
     spreads = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     lags = min(50, y.size // 4)
     # In a loop u depends on the error of its own sample: only u before it counts.
-    tests = residuals(best.error[1:], u[:-1], lags)
+    tests = residuals(best.error[1:], u[u.size - y.size : -1], lags)
     return InputGain(
         order=n,
         b0=unit * b0,
@@ -289,14 +341,33 @@ def _result(
         total_delay=total * dt,
         total_delay_std=total_std * dt,
         dt=dt,
-        samples=y.size,
+        samples=u.size,
         noise=scale_y * float(np.sqrt(np.mean(best.error**2))),
-        omega_max=visible_up_to(best, u / scale_u, y / scale_y, dt),
+        omega_max=visible_up_to(best, u / scale_u, dt),
         white=tests.white,
         independent=tests.independent,
         converged=best.converged,
         covariance=covariance,
     )
+
+
+def _not_reached(asked: str, best: Reach, ratio: float | None, other: Reach | None) -> str:
+    """Return why no omega_c keeps the margin, and what to do."""
+    which = "from 3 to 100 omega_c" if ratio is None else f"of {ratio:.3g} omega_c"
+    text = f"no omega_c keeps {asked} with an omega_o {which}"
+    if math.isnan(best.omega_c):
+        text += ": no such loop of this plant, its lag and delay is stable"
+    else:
+        text += (
+            f": the best is {best.phase:.3g}° with omega_c = {best.omega_c:.4g} rad/s and omega_o ="
+            f" {best.ratio:.3g} omega_c"
+        )
+    if other is not None and other.keeps:
+        return text + (
+            f"; omega_o = {other.ratio:.3g} omega_c keeps it with omega_c = {other.omega_c:.4g} "
+            "rad/s"
+        )
+    return text + "; ask for less, or sample faster and make the delay or the lag shorter"
 
 
 def _time_line(name: str, value: float, spread: float) -> str:

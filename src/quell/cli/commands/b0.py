@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +51,13 @@ def b0(
     phase_margin
         Phase margin that omega_c is to keep [degrees].
     ratio
-        omega_o over omega_c; that of the loop, or 5, by default.
+        omega_o over omega_c; that of the loop by default, or without one the ratio from 3 to 100
+        that allows the largest omega_c, nearly.
     json
         Write the results to this file, for programs.
     """
     from quell.files import check_writable, write_json
     from quell.identification import identify_b0
-    from quell.identification.input_gain import RATIO
 
     if json is not None:
         check_writable(json, overwrite)
@@ -67,13 +68,13 @@ def b0(
         raise ValueError(
             "order: missing; give --order, or with --loop the setup of an ADRC, which has one"
         )
-    ratio = ran.get("ratio", RATIO) if ratio is None else ratio
+    ratio = ran.get("ratio") if ratio is None else ratio
     console = Console()
     with console.status("Searching; the first time, code is compiled for some seconds."):
         found = identify_b0(read.u, read.y, read.dt, order, max_delay=max_delay)
     print_line(console, f"{record.name}: {read.y.size} samples, dt = {read.dt:g} s, order {order}")
     print_line(console, found.describe())
-    results: dict[str, Any] = found.to_json() | {"ratio": ratio, "phase_margin": phase_margin}
+    results: dict[str, Any] = found.to_json() | {"phase_margin": phase_margin}
     if "b0" in ran:
         results["b_over_b0"] = found.b0 / ran["b0"]
         factor, spread = found.b0 / ran["b0"], found.b0_std / abs(ran["b0"])
@@ -107,22 +108,34 @@ def _of_loop(path: Path, dt: float, trust: bool) -> dict[str, Any]:
 
 
 def _print_bandwidth(
-    console: Console, found: Any, phase_margin: float, ratio: float
+    console: Console, found: Any, phase_margin: float, ratio: float | None
 ) -> dict[str, Any]:
     """Print and return the omega_c that keeps the phase margin, if b0 is known well enough."""
+    from quell.identification.input_gain import MarginError
+
+    nothing = {"omega_c": None, "omega_c_std": None, "ratio": ratio}
     if found.is_poor:
         print_line(console, "omega_c: not computed, as b0 is not known")
-        return {"omega_c": None, "omega_c_std": None}
-    omega_c, spread = found.omega_c(phase_margin, ratio)
+        return nothing
+    try:
+        with console.status("Searching for the omega_c that keeps the phase margin."):
+            omega_c, spread, ratio = found.omega_c(phase_margin, ratio)
+    except MarginError as error:
+        print_line(console, f"NOT: {error}")
+        return nothing | {"best_phase_margin": error.phase_margin}
     beyond = ""
     if ratio * omega_c > found.omega_max:
         beyond = (
             f"; omega_o is beyond {found.omega_max:.4g} rad/s, up to where the record shows the "
             "plant: approach it in steps"
         )
+    if ratio * omega_c * found.dt > 0.499:
+        beyond = f"; omega_o is at 0.5/dt, the most for this sample time{beyond}"
+    known = math.isfinite(spread)
+    deviation = f" ± {spread:.2g}" if known else " (within the deviations no omega_c may keep it)"
     print_line(
         console,
-        f"omega_c = {omega_c:.4g} ± {spread:.2g} rad/s keeps {phase_margin:g}° of phase margin "
+        f"omega_c = {omega_c:.4g}{deviation} rad/s keeps {phase_margin:g}° of phase margin "
         f"with omega_o = {ratio:.3g} omega_c and this b0{beyond}",
     )
-    return {"omega_c": omega_c, "omega_c_std": spread}
+    return {"omega_c": omega_c, "omega_c_std": spread if known else None, "ratio": ratio}

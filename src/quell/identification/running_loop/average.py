@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from quell.identification.running_loop.fit import LoopFit
-from quell.identification.running_loop.model import linear_columns
+from quell.identification.running_loop.model import responses
 from quell.types import Matrix, Vector
 
 # Least ratio of the power that u causes in y to that of noise, by frequency, that shows the plant.
@@ -43,6 +43,9 @@ def gain(one: LoopFit) -> tuple[float, float]:
 
 def total_delay(one: LoopFit) -> tuple[float, float]:
     """Return τ + T and its deviation [samples]."""
+    if one.form.share is not None:
+        place = one.form.times.start
+        return float(one.phi[place]), math.sqrt(max(float(one.covariance[place, place]), 0.0))
     places = [place for place in _places(one)[-2:] if place >= 0]
     variance = float(np.sum(one.covariance[np.ix_(places, places)]))
     total = one.form.lag_of(one.phi) + one.form.delay_of(one.phi)
@@ -56,18 +59,20 @@ def mean(estimates: list[tuple[float, float]], weights: Vector) -> tuple[float, 
     return mean, math.sqrt(float(weights @ (spreads**2 + (values - mean) ** 2)))
 
 
-def visible_up_to(best: LoopFit, u: Vector, y: Vector, dt: float) -> float:
-    """Return the frequency up to which u moves y by more than the noise does [rad/s]."""
+def visible_up_to(best: LoopFit, u: Vector, dt: float) -> float:
+    """Return the frequency up to which u moves y by more than the noise does [rad/s].
+
+    It compares the spectrum of u behind the plant with that of the error behind the noise's model,
+    whose gains hold for an unstable plant, too.
+    """
     from scipy.signal import welch
 
-    form = best.form
-    alone = best.phi.copy()
-    alone[form.gains] = 0.0
-    columns, _ = linear_columns(form, alone, u, y)
-    moved = best.beta[0] * columns[:, 0]
-    noise = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
-    length = max(min(u.size, 64), u.size // _SEGMENTS)
-    frequency, power = welch(moved - np.mean(moved), 1.0 / dt, nperseg=length)
-    _, disturbed = welch(noise, 1.0 / dt, nperseg=length)
-    seen = np.flatnonzero(power > _VISIBLE * disturbed)
-    return float(2.0 * math.pi * frequency[seen[-1]]) if seen.size else 0.0
+    length = min(max(64, u.size // _SEGMENTS), best.error.size)
+    frequency, moving = welch(u, nperseg=length)
+    _, disturbing = welch(best.error, nperseg=length)
+    omega = 2.0 * math.pi * frequency[1:]
+    of_u, of_error = responses(best.form, best.phi, best.error.size, omega)
+    with np.errstate(all="ignore"):
+        moved = (best.beta[0] * of_u) ** 2 * moving[1:]
+        seen = np.flatnonzero(moved > _VISIBLE * of_error**2 * disturbing[1:])
+    return float(omega[seen[-1]]) / dt if seen.size else 0.0

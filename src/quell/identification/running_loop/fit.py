@@ -27,19 +27,34 @@ from typing import NamedTuple
 import numpy as np
 
 from quell.identification.model.structure import nonzero_lengths
-from quell.identification.running_loop.model import Form, derivatives, is_stable, linear_columns
+from quell.identification.running_loop.model import (
+    Form,
+    derivatives,
+    growth,
+    is_stable,
+    limit_slopes,
+    linear_columns,
+    stabilised,
+)
 from quell.identification.search.output_error import block_sums
 from quell.types import Matrix, Vector
 
 # First, least and last μ, and the relative gain that a step without damping must predict: as in
 # ``output_error``, chosen by hand. Steps are few, because a start is near.
 _MU, _LEAST_MU, _MOST_MU, _CONVERGED, _STEPS = 1e-3, 1e-8, 1e8, 1e-7, 60
+# Gain in AIC that ends the search, the number of steps in a row that may gain no more, and the gain
+# with which it may end by them, or where rounding stops it: a parameter is then off by the root of
+# it, 0.1 and 0.3 of its deviation.
+_SETTLED, _SMALL_STEPS, _STALLED = 0.01, 3, 0.1
 # Longest lag and delay, as a share of the record: chosen by hand.
 _LONGEST = 0.25
 # Blocks of the record for the covariance, as in ``output_error``.
 _BLOCKS = 60
 # Relative mean square that counts as zero: rounding of long simulations.
 _ROUNDING = 1e-20
+# Least error of the prediction that counts, relative to y: that of the derivatives by differences.
+# A record without noise would be taken to determine everything otherwise.
+_LEAST_ERROR = 1e-7
 # Relative singular value that counts as zero, as in ``output_error``.
 _RANK = 1e-12
 
@@ -74,34 +89,82 @@ def power(form: Form, phi: Vector, u: Vector, y: Vector) -> float:
 def fit(form: Form, phi: Vector, u: Vector, y: Vector) -> LoopFit:
     """Return the model of least prediction error near ``phi``."""
     at, converged = _descend(form, _solved(form, phi, u, y), u, y)
+    if not math.isfinite(at.power):
+        return _without_model(form, at)
     psi, size = _gradient(form, at, u, y)
+    if not np.all(np.isfinite(psi)):
+        return _without_model(form, at)
     first, count = at.beta.size, at.beta.size + form.size
-    # λ, τ and T at zero, their limit, do not vary.
-    places = first + np.arange(form.size)[form.non_negative]
-    psi[:, places[at.phi[form.non_negative] <= 0.0]] = 0.0
-    R: Matrix = np.asarray(np.linalg.qr(psi, mode="r"))
-    inverse = np.linalg.pinv(R, rcond=_RANK)
     variance = at.power / max(at.error.size - count, 1)
+    least = _LEAST_ERROR**2 * float(np.mean(y**2))
+    variance = max(variance, least)
+    known = _known_by_limits(form, at.phi) * math.sqrt(variance)
+    psi[:, first:][:, np.isinf(known)] = 0.0
+    rows = np.diag(np.concatenate([np.zeros(first), np.where(np.isinf(known), 0.0, known)]) / size)
+    R: Matrix = np.asarray(np.linalg.qr(np.vstack([psi, rows]), mode="r"))
+    inverse = _inverse(R)
     order = np.r_[first:count, :first]  # φ before β
-    with np.errstate(all="ignore"):  # a fit without a stable start has no covariance
-        rows = inverse[order] / size[order, None]
-        covariance = variance * rows @ rows.T
-        half = rows @ (inverse.T @ block_sums(psi, at.error, min(_BLOCKS, at.error.size)).T)
-        robust = half @ half.T
+    rows = inverse[order] / size[order, None]
+    covariance = variance * rows @ rows.T
+    half = rows @ (inverse.T @ block_sums(psi, at.error, min(_BLOCKS, at.error.size)).T)
+    robust = half @ half.T
     if robust[form.size, form.size] > covariance[form.size, form.size]:
         covariance = robust
-    aic = at.error.size * math.log(max(at.power, 1e-300)) + 2.0 * count
+    aic = y.size * math.log(max(at.power, y.size * least)) + 2.0 * count
+    aic += 2.0 * growth(form, at.phi, y.size)
     return LoopFit(form, at.phi, at.beta, covariance, at.error, aic, converged)
+
+
+def is_exact(found: LoopFit, y: Vector) -> bool:
+    """Return whether the error is less than counts."""
+    return float(found.error @ found.error) <= _LEAST_ERROR**2 * float(y @ y)
+
+
+def _inverse(R: Matrix) -> Matrix:
+    """Return the inverse of a triangle; what the record does not determine has a large one.
+
+    Only parameters that do not vary, those with zeros for a column, have none.
+    """
+    varies = np.any(R, axis=0)
+    U, sizes, V = np.linalg.svd(R[:, varies], full_matrices=False)
+    found = np.zeros((R.shape[1], R.shape[0]))
+    found[varies] = (V.T / np.maximum(sizes, _RANK * sizes[0])) @ U.T
+    return found
+
+
+def _known_by_limits(form: Form, phi: Vector) -> Vector:
+    """Return the inverse deviations (size,) that parameters at their limit, zero, have by it.
+
+    λ does not vary. τ or T varies by as much as the other one has: what is known is their sum, and
+    how it is divided counts in the deviation of b.
+    """
+    found = np.zeros(form.size)
+    at_limit = np.arange(form.size)[form.non_negative]
+    at_limit = at_limit[phi[at_limit] <= 0.0]
+    total = form.lag_of(phi) + form.delay_of(phi)
+    found[at_limit] = np.inf
+    if total > 0.0:
+        found[at_limit[at_limit >= form.times.start]] = 1.0 / total
+    return found
+
+
+def _without_model(form: Form, at: _Point) -> LoopFit:
+    """Return what counts as no fit: no start has a prediction."""
+    count = at.beta.size + form.size
+    covariance = np.full((count, count), np.nan)
+    return LoopFit(form, at.phi, at.beta, covariance, at.error, math.inf, False)
 
 
 def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:
     """Return the model with the best β for φ; its power is infinite if it has none."""
+    nothing = _Point(phi, np.zeros(1 + form.states), y, np.empty((0, 0)), math.inf)
+    if not is_stable(form, phi, y.size):
+        return nothing
     with np.errstate(all="ignore"):
         columns, of_y = linear_columns(form, phi, u, y)
         size, target = nonzero_lengths(columns), y - of_y
-        stable = is_stable(form, phi)
-        if not (stable and np.all(np.isfinite(size)) and np.all(np.isfinite(target))):
-            return _Point(phi, np.zeros(size.size), y, columns, math.inf)
+        if not (np.all(np.isfinite(size)) and math.isfinite(float(target @ target))):
+            return nothing
         scaled = columns / size
         R: Matrix = np.asarray(np.linalg.qr(np.column_stack([scaled, target]), mode="r"))
         beta = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=_RANK)[0]
@@ -111,15 +174,16 @@ def _solved(form: Form, phi: Vector, u: Vector, y: Vector) -> _Point:
 
 def _gradient(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
     """Return the columns ψ of β and φ (N, all), scaled to length 1, and their lengths."""
-    psi = np.hstack([at.columns, derivatives(form, at.phi, at.beta, u, y)])
-    size = nonzero_lengths(psi)
-    psi /= size
+    with np.errstate(all="ignore"):  # the caller sees numbers that are not finite
+        psi = np.hstack([at.columns, derivatives(form, at.phi, at.beta, u, y)])
+        size = nonzero_lengths(psi)
+        psi /= np.where(np.isfinite(size), size, np.nan)
     return psi, size
 
 
 def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool]:
     """Return the model of least prediction error near ``at``, and whether the search converged."""
-    mu, floor = _MU, _ROUNDING * float(y @ y)
+    mu, floor, small = _MU, _ROUNDING * float(y @ y), 0
     for _ in range(_STEPS):
         if not math.isfinite(at.power):
             return at, False
@@ -129,16 +193,21 @@ def _descend(form: Form, at: _Point, u: Vector, y: Vector) -> tuple[_Point, bool
         if not np.all(np.isfinite(psi)):
             return at, False
         R: Matrix = np.asarray(np.linalg.qr(np.column_stack([psi, at.error]), mode="r"))
+        if not np.all(np.isfinite(R)):
+            return at, False
         first = at.beta.size
         inner, right = R[first:-1, first:-1], R[first:-1, -1]
         inner, step = _within_limits(form, at.phi, inner, right)
+        inner, step = _along_limit(form, at.phi, inner, right, step, size[first:], y)
         gain = float(right @ right - np.sum((right - inner @ step) ** 2))
-        if gain <= _CONVERGED * at.power:
+        least = at.power / at.error.size  # that much changes AIC by one
+        if gain <= max(_CONVERGED * at.power, _SETTLED * least):
             return at, True
         moved, mu = _damped_step(form, at, inner, right, size[first:], mu, u, y)
-        if moved is None:
-            return at, False
-        at = moved
+        small = small + 1 if moved is None or at.power - moved.power <= _SETTLED * least else 0
+        at = at if moved is None else moved
+        if moved is None or small == _SMALL_STEPS:
+            return at, gain <= _STALLED * least
     return at, False
 
 
@@ -150,6 +219,25 @@ def _within_limits(form: Form, phi: Vector, inner: Matrix, right: Vector) -> tup
     stuck[limited] = (phi[limited] <= 0.0) & (step[limited] <= 0.0)
     if np.any(stuck):
         inner = np.where(stuck, 0.0, inner)
+        step = np.linalg.lstsq(inner, right, rcond=_RANK)[0].astype(np.float64)
+    return inner, step
+
+
+def _along_limit(
+    form: Form, phi: Vector, inner: Matrix, right: Vector, step: Vector, size: Vector, y: Vector
+) -> tuple[Matrix, Vector]:
+    """Return the equations and their solution without a predictor's pole that would leave |z| < 1.
+
+    Loads that hardly move have such poles, and steps that lead out of the limit would all be
+    refused.
+    """
+    slopes = limit_slopes(form, phi, y) / size
+    slopes[:, ~np.any(inner, axis=0)] = 0.0  # those at their own limit
+    slopes = slopes[np.all(np.isfinite(slopes), axis=1)]
+    slopes = slopes[slopes @ step > 0.0]
+    if slopes.size:
+        away = np.linalg.qr(slopes.T)[0]
+        inner = inner - (inner @ away) @ away.T
         step = np.linalg.lstsq(inner, right, rcond=_RANK)[0].astype(np.float64)
     return inner, step
 
@@ -171,8 +259,8 @@ def _damped_step(
         step = np.linalg.lstsq(left, np.append(right, np.zeros(count)), rcond=None)[0]
         phi = at.phi + step / size
         limited = form.non_negative
-        phi[limited] = np.clip(phi[limited], 0.0, _LONGEST * u.size)
-        trial = _solved(form, phi, u, y)
+        phi[limited] = np.clip(phi[limited], 0.0, _LONGEST * y.size)
+        trial = _solved(form, stabilised(form, phi, y.size), u, y)
         if trial.power < at.power:
             return trial, max(0.1 * mu, _LEAST_MU)
         mu = max(10.0 * mu, 1e-6)

@@ -11,12 +11,24 @@ before is that of a Kalman filter, in the innovation form (Ljung, *System Identi
     x⁺ = Φ x + Γ u + K e,      e = y − ŷ,      ŷ = x_1
 
 with ``x = (x_1 … x_n, d, u_l)`` and free gains K, so that the noises' intensities need not be
-known. K is Φ's integral over the sample times ``(l_1 … l_{n+1})``. The predictor's matrix ``Φ − K
+known. K is Φ's integral over the sample times ``(l_1 … l_{n+2})``, the last one, of u_l, for a load
+in front of the lag. The predictor's matrix ``Φ − K
 C`` has to be stable; the plant's need not be.
+
+Without loads only y is noisy, and K follows from the plant. It is zero for a stable plant, whose
+state is simulated. The state of an unstable plant cannot be: its best predictor has the unstable
+poles mirrored at the unit circle, and the others where the plant has them (Anderson & Moore,
+*Optimal Filtering*, 1979, sec. 4.4, for a noise of the state that goes to zero). With λ_j the
+unstable poles, ``z_j = exp(λ_j)``, and v_j the eigenvectors of the plant with ``C v_j = 1``::
+
+    K = Σ_j v_j Π_i (z_j − 1/z_i*) / Π_{i≠j} (z_j − z_i)
 
 A sample is a unit of time, as in ``sampling``. u is held between samples, and T need not be a whole
 number of them: in a sample the u before acts for the part ``T − ⌊T⌋``, then the next one for the
 rest. For given a, l, τ and T, ŷ is linear in b and the initial state.
+
+u may begin before y: its last N samples belong to those of y. So a delay needs no u that is not
+known; before its own first sample u is taken to have had that value.
 """
 
 from __future__ import annotations
@@ -25,10 +37,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from quell.identification.model.sampling import Sampled, observable, states
-from quell.identification.search.delay import delayed
-from quell.lti.discretize import zero_order_hold
+from quell.identification.model.sampling import observable
+from quell.kernels.dispatch import compiled
+from quell.lti.discretize import Stack, zero_order_hold
 from quell.types import Matrix, Vector
 
 # Step of the differences that stand for derivatives, relative to the size of the parameters:
@@ -36,8 +49,29 @@ from quell.types import Matrix, Vector
 _STEP = 1e-4
 # Largest |z| of a stable predictor: one, and rounding of multiple eigenvalues at z = 1.
 _LIMIT = 1.0 + 1e-6
+# Growth over the record by which a pole may be below the limit and count as at it: no effect on ŷ.
+_AT_LIMIT = 0.1
 # Least time constant of the lag [samples], so that 1/τ is finite.
 _LEAST_LAG = 1e-6
+# Growth of an unstable pole's motion over the record, from which on it is not simulated but
+# predicted [log]: a factor of 1000 leaves 13 digits. Below, the predictor would have to settle for
+# a large part of the record.
+_LARGEST_GROWTH = math.log(1e3)
+# Largest coefficient of the model [1/sample^n] that is sampled; 1/τ is the largest that has a use.
+_LARGEST = 1e7
+
+# States below this become zero, as in ``sampling``: denormal numbers are slow.
+_TINY = 1e-140
+
+Complex = NDArray[np.complex128]
+Indices = NDArray[np.int64]
+
+
+class Predictor(NamedTuple):
+    """A sampled predictor ``x⁺ = Φ x + Γ v`` for the u before, the u after T's change, and y."""
+
+    phi: Matrix  # Φ − K C (states, states)
+    gamma: Matrix  # (states, 3)
 
 
 class Form(NamedTuple):
@@ -46,13 +80,15 @@ class Form(NamedTuple):
     order: int  #: n
     lag: bool  #: whether τ is free; else it is 0
     delay: bool  #: whether T is free; else it is 0
-    drift: bool  #: whether l are free; else they are 0, and only y is noisy
+    drift: bool  #: whether l are free; else K follows from the plant, and only y is noisy
     forgets: bool = False  #: whether λ is free; else it is 0
+    share: float | None = None
+    """The given share of τ in τ + T, which is then the only time that is free; None if both are."""
 
     @property
     def gains(self) -> slice:
         """Places of l."""
-        return slice(self.order, self.order + self.drift * (self.order + 1))
+        return slice(self.order, self.order + self.drift * (self.order + 1 + self.lag))
 
     @property
     def times(self) -> slice:
@@ -67,7 +103,13 @@ class Form(NamedTuple):
     @property
     def size(self) -> int:
         """Number of nonlinear parameters."""
-        return self.gains.stop + self.forgets + self.lag + self.delay
+        times = self.lag + self.delay if self.share is None else 1
+        return self.gains.stop + self.forgets + times
+
+    @property
+    def of_times(self) -> int:
+        """Number of parameters that a form without lag and delay does not have."""
+        return self.lag + self.delay + (self.lag and self.drift)
 
     @property
     def states(self) -> int:
@@ -80,11 +122,13 @@ class Form(NamedTuple):
 
     def lag_of(self, phi: Vector) -> float:
         """Return τ [samples]."""
-        return float(phi[self.times][0]) if self.lag else 0.0
+        share = 1.0 if self.share is None else self.share
+        return share * float(phi[self.times][0]) if self.lag else 0.0
 
     def delay_of(self, phi: Vector) -> float:
         """Return T [samples]."""
-        return float(phi[-1]) if self.delay else 0.0
+        share = 0.0 if self.share is None else self.share
+        return (1.0 - share) * float(phi[-1]) if self.delay else 0.0
 
 
 def placed(a: Vector, omega: float) -> Vector:
@@ -93,42 +137,116 @@ def placed(a: Vector, omega: float) -> Vector:
     return np.concatenate([a, target - np.append(a[::-1], 0.0)])
 
 
-def is_stable(form: Form, phi: Vector) -> bool:
-    """Return whether the predictor is stable, or at its limit; one without gains always counts."""
+def is_stable(form: Form, phi: Vector, samples: int) -> bool:
+    """Return whether the predictor is stable, or at its limit; one without loads always is."""
+    closed = _predictor(form, phi, samples).phi
+    if not np.all(np.isfinite(closed)):
+        return False
+    return not form.drift or bool(np.max(np.abs(np.linalg.eigvals(closed))) <= _LIMIT)
+
+
+def is_unstable(form: Form, phi: Vector, samples: int) -> bool:
+    """Return whether the plant has a pole whose motion grows too far to be simulated."""
+    return bool(samples * np.max(_poles(phi[: form.order]).real) > _LARGEST_GROWTH)
+
+
+def stabilised(form: Form, phi: Vector, samples: int) -> Vector:
+    """Return phi with gains l that mirror the poles of an unstable predictor at the unit circle.
+
+    The error has the same spectrum, to a factor, so that a search may cross the limit.
+    """
     if not form.drift:
-        return True
-    closed = _predictor(form, phi).phi
-    return bool(np.all(np.isfinite(closed)) and np.max(np.abs(np.linalg.eigvals(closed))) <= _LIMIT)
+        return phi
+    system = _predictor(form, phi, samples)
+    if not np.all(np.isfinite(system.phi)):
+        return phi
+    z, vectors = np.linalg.eig(system.phi)
+    out = np.abs(z) > _LIMIT
+    if not np.any(out):
+        return phi
+    with np.errstate(all="ignore"):
+        shift = _shift(z[out], vectors[:, out] / vectors[0, out])
+        _, (integral,) = zero_order_hold(_motion(form, phi), [np.eye(form.states)], 1.0)
+    if not np.all(np.isfinite(shift)):
+        return phi
+    found = phi.copy()
+    found[form.gains] += np.linalg.lstsq(integral, shift, rcond=None)[0]
+    return found
+
+
+def limit_slopes(form: Form, phi: Vector, y: Vector) -> Matrix:
+    """Return the derivatives (number, size) by phi of |z| of the predictor's poles at the limit."""
+
+    def sizes(at: Vector) -> Vector:
+        closed = _predictor(form, at, y.size).phi
+        if not np.all(np.isfinite(closed)):
+            return np.full(form.states, np.nan)
+        return np.sort(np.abs(np.linalg.eigvals(closed)))[::-1]
+
+    count = int(np.sum(sizes(phi) > 1.0 - _AT_LIMIT / y.size)) if form.drift else 0
+    slopes = np.zeros((count, form.size))
+    for i, step in enumerate(_steps(form, y) if count else ()):
+        one = step * (np.arange(form.size) == i)
+        slopes[:, i] = (sizes(phi + one)[:count] - sizes(phi - one)[:count]) / (2.0 * step)
+    return slopes
+
+
+def growth(form: Form, phi: Vector, samples: int) -> float:
+    """Return by how much unstable poles that are simulated grow over the record, as a logarithm.
+
+    By twice as much the logarithm of the determinant of the initial state's information grows: the
+    likelihood of the output counts it, its sum of squares does not.
+    """
+    rates = samples * _poles(phi[: form.order]).real
+    return 0.0 if form.drift else float(np.sum(rates[(rates > 0.0) & (rates <= _LARGEST_GROWTH)]))
 
 
 def linear_columns(form: Form, phi: Vector, u: Vector, y: Vector) -> tuple[Matrix, Vector]:
     """Return ŷ by b and by each initial state (N, 1 + states), and its part from y (N,)."""
-    system, v = _predictor(form, phi), _inputs(form, phi, u, y)
-    nothing = np.zeros((u.size, 1))
-    of_u, of_y, of_none = (_with(system, part) for part in (slice(0, 2), slice(2, 3), slice(2, 3)))
-    parts = [states(of_u, v[:, :2])[:, 0]]
-    parts += [states(of_none, nothing, start)[:, 0] for start in np.eye(form.states)]
-    return np.column_stack(parts), states(of_y, v[:, 2:])[:, 0]
+    system, count = _predictor(form, phi, y.size), form.states
+    gamma, start = np.zeros((count, 3, count + 2)), np.zeros((count, count + 2))
+    gamma[:, :2, 0], gamma[:, 2, -1] = system.gamma[:, :2], system.gamma[:, 2]
+    start[:, 1:-1] = np.eye(count)
+    phis = np.repeat(system.phi[:, :, None], count + 2, axis=2)
+    found = _simulated(phis, gamma, np.full(count + 2, _whole(form, phi)), start, u, y)
+    return found[:, :-1], found[:, -1]
 
 
-def predicted(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Vector:
-    """Return ŷ (N,) for the linear parameters ``beta``: b, and the initial state."""
-    system = _predictor(form, phi)
-    system = system._replace(gamma=system.gamma * np.array([beta[0], beta[0], 1.0]))
-    return states(system, _inputs(form, phi, u, y), beta[1:])[:, 0]
+def predicted(form: Form, phis: list[Vector], beta: Vector, u: Vector, y: Vector) -> Matrix:
+    """Return ŷ (N, number) for each phi and the linear parameters ``beta``: b, initial state."""
+    systems = [_predictor(form, phi, y.size) for phi in phis]
+    gamma = np.stack([one.gamma for one in systems], axis=2)
+    gamma[:, :2] *= beta[0]
+    start = np.repeat(beta[1:, None], len(phis), axis=1)
+    late = np.array([_whole(form, phi) for phi in phis])
+    return _simulated(np.stack([one.phi for one in systems], axis=2), gamma, late, start, u, y)
 
 
 def derivatives(form: Form, phi: Vector, beta: Vector, u: Vector, y: Vector) -> Matrix:
     """Return the derivatives (N, size) of ŷ by a, l, λ, τ and T, by central differences."""
-    found = np.empty((u.size, form.size))
-    for i, step in enumerate(_steps(form, y)):
-        above, below = phi.copy(), phi.copy()
-        above[i] += step
-        # λ, τ and T are not negative; at zero the difference is one-sided.
-        below[i] -= step if i < form.non_negative.start or phi[i] >= step else 0.0
-        change = predicted(form, above, beta, u, y) - predicted(form, below, beta, u, y)
-        found[:, i] = change / (above[i] - below[i])
-    return found
+    steps = np.diag(_steps(form, y))
+    above, below = phi + steps, phi - steps
+    # λ, τ and T are not negative; at zero the difference is one-sided.
+    for i in range(form.non_negative.start, form.size):
+        below[i, i] = phi[i] if below[i, i] < 0.0 else below[i, i]
+    found = predicted(form, [*above, *below], beta, u, y)
+    return (found[:, : form.size] - found[:, form.size :]) / np.diag(above - below)
+
+
+def responses(form: Form, phi: Vector, samples: int, omega: Vector) -> tuple[Vector, Vector]:
+    """Return the absolute frequency responses from u and from e to y, with b = 1, at ``omega``.
+
+    ``omega`` is in 1/sample and not zero. The response to e is ``det(z I − Φ + K C)/det(z I − Φ)``.
+    """
+    system = _predictor(form, phi, samples)
+    plant = system.phi.copy()
+    plant[:, 0] += system.gamma[:, 2]
+    z, s = np.exp(1j * omega)[:, None], 1j * omega
+    with np.errstate(all="ignore"):  # a pole at a frequency
+        ratio = (z - np.linalg.eigvals(system.phi)) / (z - np.linalg.eigvals(plant))
+        of_u = 1.0 / np.polyval(np.append(1.0, phi[: form.order][::-1]), s)
+        of_u = of_u / (1.0 + form.lag_of(phi) * s)
+    return np.abs(of_u), np.abs(np.prod(ratio, axis=1))
 
 
 def _steps(form: Form, y: Vector) -> Vector:
@@ -137,40 +255,119 @@ def _steps(form: Form, y: Vector) -> Vector:
     slow = 2.0 * math.pi / y.size
     spread = float(np.std(y)) or 1.0
     rate = float(np.clip(np.std(y[n:] - y[:-n]) / (n * spread), 10.0 * slow, 0.3))
-    powers = np.append(n - np.arange(float(n)), np.arange(1.0, n + 2.0))[: form.gains.stop]
+    gains = np.minimum(np.arange(1.0, n + 3.0), n + 1.0)
+    powers = np.append(n - np.arange(float(n)), gains)[: form.gains.stop]
     powers = np.append(powers, np.ones(int(form.forgets)))
-    return _STEP * np.append(rate**powers, np.full(form.lag + form.delay, 1.0 / rate))
+    times = np.full(form.size - form.times.start, 1.0 / rate)
+    return _STEP * np.append(rate**powers, times)
 
 
-def _with(system: Sampled, inputs: slice) -> Sampled:
-    gamma = np.ascontiguousarray(system.gamma[:, inputs])
-    return system._replace(gamma=gamma, slope=np.zeros_like(gamma))
+def _predictor(form: Form, phi: Vector, samples: int) -> Predictor:
+    """Return the predictor, for the inputs u before, u after the delay's change, y.
 
-
-def _predictor(form: Form, phi: Vector) -> Sampled:
-    """Return the predictor, for the inputs u before, u after the delay's change, y."""
+    Its matrices are NaN for parameters that are too large for numbers.
+    """
     n, size = form.order, form.states
-    A, B = np.zeros((size, size)), np.zeros((size, 2))
-    A[:n, :n] = observable(phi[:n])
-    A[n - 1, n], A[n, n] = 1.0, -form.rate_of(phi)
+    A, B = _motion(form, phi), np.zeros((size, 2))
     if form.drift:
-        B[: n + 1, 1] = phi[form.gains]
-    if form.lag:
-        tau = max(form.lag_of(phi), _LEAST_LAG)
-        A[n - 1, n + 1], A[n + 1, n + 1], B[n + 1, 0] = 1.0, -1.0 / tau, 1.0 / tau
-    else:
-        B[n - 1, 0] = 1.0
+        B[:, 1] = phi[form.gains]
+    B[n + 1 if form.lag else n - 1, 0] = -A[n + 1, n + 1] if form.lag else 1.0
+    if not (np.max(np.abs(A)) <= _LARGEST and np.all(np.isfinite(B))):
+        return Predictor(np.full((size, size), np.nan), np.full((size, 3), np.nan))
     late = math.modf(form.delay_of(phi))[0]
     with np.errstate(all="ignore"):
-        whole, (gamma,) = zero_order_hold(A, [B], 1.0)
-        _, (rest,) = zero_order_hold(A, [B[:, :1]], 1.0 - late)
-    K = gamma[:, 1]
-    whole[:, 0] -= K
-    gammas = np.column_stack([gamma[:, 0] - rest[:, 0], rest[:, 0], K])
-    return Sampled(whole, gammas, np.zeros_like(gammas))
+        # The integral of Φ does not depend on l: most derivatives find it in the cache.
+        whole, (integral,) = zero_order_hold(A, [np.eye(size)], 1.0)
+        _, (rest,) = zero_order_hold(A, [np.eye(size)], 1.0 - late)
+        gamma, now = integral @ B, rest @ B[:, 0]
+        K = gamma[:, 1] if form.drift else _mirroring(phi[:n], size, samples)
+        whole[:, 0] -= K
+    return Predictor(whole, np.column_stack([gamma[:, 0] - now, now, K]))
 
 
-def _inputs(form: Form, phi: Vector, u: Vector, y: Vector) -> Matrix:
-    """Return u before and after the delay's change in each sample, and y (N, 3)."""
-    whole = math.floor(form.delay_of(phi))
-    return np.column_stack([delayed(u, whole + 1), delayed(u, whole), y])
+def _motion(form: Form, phi: Vector) -> Matrix:
+    """Return the matrix of x' = A x + …, with a load and the lag."""
+    n, A = form.order, np.zeros((form.states, form.states))
+    A[:n, :n] = observable(phi[:n])
+    A[n - 1, n], A[n, n] = 1.0, -form.rate_of(phi)
+    if form.lag:
+        A[n - 1, n + 1], A[n + 1, n + 1] = 1.0, -1.0 / max(form.lag_of(phi), _LEAST_LAG)
+    return A
+
+
+def _poles(a: Vector) -> Complex:
+    """Return the poles of the plant [1/sample]."""
+    return np.asarray(np.linalg.eigvals(observable(a)), dtype=np.complex128)
+
+
+def _mirroring(a: Vector, states: int, samples: int) -> Vector:
+    """Return the K (states,) that mirrors the unstable poles, those that grow over the record."""
+    K, poles = np.zeros(states), _poles(a)
+    poles = poles[samples * poles.real > _LARGEST_GROWTH]
+    vectors = np.ones((a.size, poles.size), dtype=np.complex128)
+    for i in range(1, a.size):  # v_1 = 1, v_(i+1) = λ v_i + a_(n−i)
+        vectors[i] = poles * vectors[i - 1] + a[a.size - i]
+    K[: a.size] = _shift(np.exp(poles), vectors)
+    return K
+
+
+def _shift(z: Complex, vectors: Complex) -> Vector:
+    """Return the gains that mirror the eigenvalues z; the eigenvectors begin with 1."""
+    weights = np.ones(z.size, dtype=np.complex128)
+    for j in range(z.size):
+        others = np.arange(z.size) != j
+        weights[j] = np.prod(z[j] - 1.0 / z.conj()) / np.prod(z[j] - z[others])
+    return np.asarray((vectors @ weights).real)
+
+
+def _whole(form: Form, phi: Vector) -> int:
+    """Return ⌊T⌋."""
+    return math.floor(form.delay_of(phi))
+
+
+def _simulated(
+    phis: Stack, gammas: Stack, late: Indices, start: Matrix, u: Vector, y: Vector
+) -> Matrix:
+    """Return x_1 (N, number) of systems, whose last axis is their number, that start at ``start``.
+
+    ``late`` is ⌊T⌋ of each. Their loop has the systems inside, so that they are computed together.
+    """
+    out = np.empty((y.size, start.shape[1]))
+    states, inputs = np.stack([start, start]), np.empty((2, start.shape[1]))
+    _simulate(phis, gammas, late, states, inputs, np.ascontiguousarray(u), y.copy(), out)
+    return out
+
+
+@compiled
+def _simulate(
+    phis: Stack,
+    gammas: Stack,
+    late: Indices,
+    states: Stack,
+    inputs: Matrix,
+    u: Vector,
+    y: Vector,
+    out: Matrix,
+) -> None:
+    """Write x_1 into ``out``; ``states`` (2, states, number) and ``inputs`` are work space."""
+    _, n, count = states.shape
+    first, now, then = u.size - y.size, 0, 1
+    for k in range(y.size):
+        for c in range(count):
+            out[k, c] = states[now, 0, c]
+            at = k + first - late[c]
+            inputs[0, c], inputs[1, c] = u[max(at - 1, 0)], u[max(at, 0)]
+        for i in range(n):
+            for c in range(count):
+                states[then, i, c] = gammas[i, 2, c] * y[k]
+            for c in range(count):
+                states[then, i, c] += gammas[i, 0, c] * inputs[0, c]
+            for c in range(count):
+                states[then, i, c] += gammas[i, 1, c] * inputs[1, c]
+            for j in range(n):
+                for c in range(count):
+                    states[then, i, c] += phis[i, j, c] * states[now, j, c]
+            for c in range(count):
+                value = states[then, i, c]
+                states[then, i, c] = value if abs(value) > _TINY else 0.0
+        now, then = then, now
